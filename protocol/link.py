@@ -1,0 +1,156 @@
+"""Sockets, and nothing else: the learner's ROUTER and the worker's DEALER. The address chooses the transport.
+
+Every option here was learned by an experiment. ROUTER_MANDATORY: a plain ROUTER drops silently at its high-water mark.
+ROUTER_HANDOVER: else a returning worker is locked out until its half-open connection times out. No ZMTP heartbeats: with a
+reader stopped by its high-water mark they lose and reorder messages; our own heartbeats judge silence, and tickets are the
+credit that keeps queues short. MAXMSGSIZE bounds a frame before a byte of it is read. A link belongs to one thread.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+
+import zmq
+
+from protocol.codec import MAX_FRAME_BYTES, MAX_FRAMES, Buffer, decode_to_learner, decode_to_worker
+from protocol.errors import BadMessage, UsageError
+from protocol.messages import ToLearner, ToWorker
+
+LINGER_MS = 2000
+COPY_BELOW_BYTES = 65536  # smaller frames are copied: cheaper than keeping track of them
+
+
+def check_address(address: str) -> str:
+    """Return the address if it can be used. Raises `UsageError` in one line."""
+    scheme, sep, rest = address.partition("://")
+    if not sep or scheme not in {"inproc", "ipc", "tcp"} or not rest:
+        raise UsageError(f"address {address}: expected inproc://NAME, ipc://PATH or tcp://HOST:PORT")
+    if scheme == "tcp" and not rest.rpartition(":")[2].isdecimal() and not rest.endswith(":*"):
+        raise UsageError(f"address {address}: expected a port, as in tcp://127.0.0.1:5555")
+    return address
+
+
+def is_local(address: str) -> bool:
+    """True for addresses that only this machine can reach."""
+    scheme, _, rest = address.partition("://")
+    host = rest.rpartition(":")[0]
+    return scheme in {"inproc", "ipc"} or host in {"localhost", "[::1]"} or host.startswith("127.")
+
+
+def _options(socket: zmq.Socket[bytes]) -> None:
+    socket.linger = LINGER_MS
+    socket.maxmsgsize = MAX_FRAME_BYTES
+    socket.handshake_ivl = 2000
+    socket.sndhwm = 0  # credit bounds what is under way: one Weights, a few tickets and their rollouts
+    socket.rcvhwm = 0
+
+
+def _receive(socket: zmq.Socket[bytes]) -> list[Buffer] | None:
+    """The next message's frames, or None. Reads at most MAX_FRAMES frames and throws the rest away."""
+    frames: list[Buffer] = []
+    try:
+        more = True
+        while more:
+            frame = socket.recv(zmq.NOBLOCK, copy=False)
+            more = frame.more
+            if len(frames) <= MAX_FRAMES:
+                frames.append(frame.buffer if len(frame) >= COPY_BELOW_BYTES else frame.bytes)
+    except zmq.Again:
+        return None
+    return frames
+
+
+class LearnerLink:
+    """The learner's end: many workers, one port."""
+
+    def __init__(self, address: str, context: zmq.Context[zmq.Socket[bytes]] | None = None) -> None:
+        check_address(address)
+        self.context = context or zmq.Context.instance()
+        self._socket = self.context.socket(zmq.ROUTER)
+        _options(self._socket)
+        self._socket.router_mandatory = True
+        self._socket.router_handover = True
+        try:
+            self._socket.bind(address)
+        except zmq.ZMQError as error:
+            self._socket.close(linger=0)
+            raise UsageError(_why_not_bound(address, error)) from error
+        self.address = bytes(self._socket.get(zmq.LAST_ENDPOINT)).decode().rstrip("\0")
+        """where workers connect: the port that was chosen, if it was `*`"""
+
+    def poll(self, timeout_s: float) -> bool:
+        """Wait until something arrives, at most `timeout_s`."""
+        return bool(self._socket.poll(max(0, int(timeout_s * 1000))))
+
+    def receive(self) -> Iterator[tuple[bytes, ToLearner | BadMessage]]:
+        """All that has arrived, with its sender; what cannot be read comes as its error."""
+        while (frames := _receive(self._socket)) is not None:
+            peer = bytes(frames[0])
+            try:
+                yield peer, decode_to_learner(frames[1:])
+            except BadMessage as error:
+                yield peer, error
+
+    def send(self, peer: bytes, frames: Sequence[Buffer]) -> bool:
+        """Send; False if the peer is gone."""
+        try:
+            self._socket.send_multipart([peer, *frames], zmq.NOBLOCK, copy=False)
+        except zmq.ZMQError as error:
+            if error.errno in (zmq.EHOSTUNREACH, zmq.EAGAIN):
+                return False
+            raise
+        return True
+
+    def close(self, linger_s: float = LINGER_MS / 1000) -> None:
+        """Send what is queued, at most `linger_s`, and close."""
+        self._socket.close(linger=int(linger_s * 1000))
+
+
+class WorkerLink:
+    """A worker's end."""
+
+    def __init__(self, address: str, name: str, context: zmq.Context[zmq.Socket[bytes]] | None = None) -> None:
+        check_address(address)
+        self.context = context or zmq.Context.instance()
+        self._socket = self.context.socket(zmq.DEALER)
+        _options(self._socket)
+        self._socket.routing_id = name.encode()
+        self._socket.reconnect_ivl = 100
+        self._socket.reconnect_ivl_max = 2000
+        try:
+            self._socket.connect(address)
+        except zmq.ZMQError as error:
+            self._socket.close(linger=0)
+            raise UsageError(f"address {address}: cannot connect ({error.strerror})") from error
+
+    def poll(self, timeout_s: float) -> bool:
+        """Wait until something arrives, at most `timeout_s`."""
+        return bool(self._socket.poll(max(0, int(timeout_s * 1000))))
+
+    def receive(self) -> Iterator[ToWorker | BadMessage]:
+        """All that has arrived; what cannot be read comes as its error."""
+        while (frames := _receive(self._socket)) is not None:
+            try:
+                yield decode_to_worker(frames)
+            except BadMessage as error:
+                yield error
+
+    def send(self, frames: Sequence[Buffer]) -> None:
+        """Send, or queue while the learner is out of reach (the conversation repairs what is lost)."""
+        with suppress(zmq.Again):
+            self._socket.send_multipart(frames, zmq.NOBLOCK, copy=False)
+
+    def close(self, linger_s: float = LINGER_MS / 1000) -> None:
+        """Send what is queued, at most `linger_s`, and close."""
+        self._socket.close(linger=int(linger_s * 1000))
+
+
+def _why_not_bound(address: str, error: zmq.ZMQError) -> str:
+    match error.errno:
+        case zmq.EADDRINUSE:
+            return f"address {address} is in use; choose another port, or tcp://127.0.0.1:* for any free one"
+        case _:
+            return (
+                f"address {address}: cannot bind ({error.strerror}); expected one of this machine, as tcp://127.0.0.1:5555"
+            )

@@ -1,0 +1,161 @@
+"""The messages: small frozen records, nothing more. Who may say which, and when, stands in `README.md`.
+
+A session is one stay of one worker with one learner; a message of another session is counted and not used.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy.typing as npt
+
+from protocol.rollout import Rollout
+from protocol.specs import RunSpec
+
+PROTOCOL_VERSION = 1
+
+Array = npt.NDArray[Any]
+
+
+class Message(msgspec.Struct, frozen=True, tag=True, forbid_unknown_fields=True):
+    """Base of all messages but `Rollout`, which has a file of its own."""
+
+
+class Hello(Message, frozen=True):
+    """I exist; may I join? Said again, with backoff, until answered."""
+
+    protocol: int
+    worker: str
+    """the worker's name; also its routing id"""
+    host: str
+    pid: int
+    software: str
+    attempt: int
+    """how often this process has begun to join: a repeated Hello keeps it, a new beginning raises it"""
+
+
+class Welcome(Message, frozen=True):
+    """Join: the environment, the policy, T, N, the seed."""
+
+    session: int
+    attempt: int
+    """of the Hello that is answered"""
+    run: RunSpec
+
+
+class Refuse(Message, frozen=True):
+    """Leave, with exit code 2."""
+
+    reason: str
+
+
+class Rejoin(Message, frozen=True):
+    """I do not know this session (I restarted, or gave you up): say Hello again."""
+
+    session: int
+
+
+class Weights(Message, frozen=True):
+    """The newest weights."""
+
+    session: int
+    version: int
+    parameters: Array
+    """[P] float32, the acting part of the flat parameter buffer"""
+    buffers: Array
+    """[B] float32, what the learner keeps for the policy: observation mean and standard deviation"""
+
+
+class Permit(msgspec.Struct, frozen=True, array_like=True):
+    """A ticket as it travels: one rollout, on this lane, in this life of the lane."""
+
+    ticket: int
+    lane: int
+    incarnation: int
+
+
+class Received(msgspec.Struct, frozen=True, array_like=True):
+    """The learner has every rollout of this life of the lane whose sequence is below `below`."""
+
+    lane: int
+    incarnation: int
+    below: int
+
+
+class Collect(Message, frozen=True):
+    """Permission for one rollout on each of these lanes, under weights at least as new as `version`."""
+
+    session: int
+    version: int
+    permits: tuple[Permit, ...]
+    received: tuple[Received, ...] = ()
+
+
+class LaneLife(msgspec.Struct, frozen=True, array_like=True):
+    """A lane, and how often it has been started afresh."""
+
+    lane: int
+    incarnation: int
+
+
+class Release(Message, frozen=True):
+    """These lanes live elsewhere now: close them."""
+
+    session: int
+    lanes: tuple[LaneLife, ...]
+
+
+class Heartbeat(Message, frozen=True):
+    """The worker's account of itself. The learner compares it with its own, and says again what was lost."""
+
+    session: int
+    version: int
+    """newest weights held"""
+    tickets: tuple[int, ...]
+    """held and not finished"""
+    lanes: tuple[LaneLife, ...]
+    steps: int
+    """env steps since the worker started"""
+    stages: dict[str, float]
+    """seconds spent in each stage since the worker started"""
+
+
+class HeartbeatReply(Message, frozen=True):
+    """I am here too, and this is what I have of you."""
+
+    session: int
+    received: tuple[Received, ...]
+
+
+class Drain(Message, frozen=True):
+    """Finish the rollout in hand, send it, leave."""
+
+    reason: str
+
+
+class Goodbye(Message, frozen=True):
+    """I leave on purpose; these tickets I held and did not finish."""
+
+    session: int
+    reason: str
+    tickets: tuple[int, ...]
+
+
+class Failure(Message, frozen=True):
+    """My environment (or I) broke; I leave."""
+
+    session: int
+    error: str
+    traceback: str
+    lane: int | None
+
+
+ToLearner = Hello | Rollout | Heartbeat | Goodbye | Failure
+ToWorker = Welcome | Refuse | Rejoin | Weights | Collect | Release | HeartbeatReply | Drain
+
+__all__ = [
+    "PROTOCOL_VERSION", "Array", "Collect", "Drain", "Failure", "Goodbye", "Heartbeat", "HeartbeatReply", "Hello",
+    "LaneLife", "Message", "Permit", "Received", "Refuse", "Rejoin", "Release", "Rollout", "ToLearner", "ToWorker",
+    "Weights", "Welcome",
+]  # fmt: skip

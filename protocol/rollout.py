@@ -1,0 +1,160 @@
+"""The law of a row. Pure: arrays in, arrays out.
+
+Row t says: in `obs[t]` we did `action[t]`, got `reward[t]` and saw `obs[t+1]`, wherever `valid[t]`. That is gymnasium's
+NEXT_STEP autoreset taken at its word: the step after an episode's end only resets that copy, so its row says nothing and
+is not valid. Hence, for every copy:
+
+    valid[t+1]  ==  not (terminated[t] or truncated[t])
+
+If both flags are set, terminated wins. Every consumer (returns, losses, counts, replay) masks with `valid`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from protocol.errors import BadRollout
+from protocol.specs import RunSpec
+
+Array = npt.NDArray[Any]
+Bools = npt.NDArray[np.bool_]
+Floats = npt.NDArray[np.float32]
+
+
+class Episode(msgspec.Struct, frozen=True, array_like=True):
+    """An episode that ended in this rollout, in raw rewards."""
+
+    reward: float
+    """undiscounted sum of raw rewards: the return"""
+    length: int
+    seconds: float
+
+
+class Rollout(msgspec.Struct, frozen=True, tag=True, forbid_unknown_fields=True):
+    """T steps of a lane of N env copies, all acted under one version."""
+
+    session: int
+    lane: int
+    ticket: int
+    version: int
+    sequence: int
+    """counts the rollouts of this life of the lane, from 0"""
+    obs: tuple[Array, ...]
+    """one array [T+1, N, *leaf] for each leaf of the observation"""
+    action: Array
+    """[T, N, *action] as sampled: int64 from 0, or float32 before it is clipped"""
+    log_prob: Array
+    """[T, N] float32, under the policy that acted"""
+    reward: Array
+    """[T, N] float32, raw"""
+    terminated: Array
+    """[T, N] bool: the task ended, do not bootstrap"""
+    truncated: Array
+    """[T, N] bool: the clock ended, bootstrap from obs[t+1]"""
+    valid: Array
+    """[T, N] bool: False on the one row in which a finished copy resets"""
+    episodes: tuple[Episode, ...] = ()
+
+    @property
+    def env_steps(self) -> int:
+        """Transitions that count."""
+        return int(np.count_nonzero(self.valid))
+
+
+def validate(rollout: Rollout, run: RunSpec) -> None:
+    """Raise `BadRollout`, in one line, if the rollout does not fit the run or breaks the law of a row."""
+    T, N = run.rollout_steps, run.copies
+    action = run.policy.action
+    expected: list[tuple[str, Array, tuple[int, ...], str]] = [
+        ("action", rollout.action, (T, N, *action.shape), action.stored_dtype),
+        ("log_prob", rollout.log_prob, (T, N), "float32"),
+        ("reward", rollout.reward, (T, N), "float32"),
+        ("terminated", rollout.terminated, (T, N), "bool"),
+        ("truncated", rollout.truncated, (T, N), "bool"),
+        ("valid", rollout.valid, (T, N), "bool"),
+    ]
+    if len(rollout.obs) != len(run.policy.observation):
+        raise BadRollout(f"obs expected {len(run.policy.observation)} arrays, got {len(rollout.obs)}")
+    for leaf, array in zip(run.policy.observation, rollout.obs, strict=True):
+        expected.append((f"obs {leaf.path}".strip(), array, (T + 1, N, *leaf.shape), leaf.dtype))
+    for name, array, shape, dtype in expected:
+        if array.shape != shape or array.dtype != np.dtype(dtype):
+            raise BadRollout(
+                f"{name} expected {dtype}{list(shape)}, got {array.dtype}{list(array.shape)}; "
+                "is its environment the same version?"
+            )
+        if array.dtype.kind == "b" and array.size and array.view(np.uint8).max() > 1:
+            raise BadRollout(f"{name} expected bytes 0 and 1, got {array.view(np.uint8).max()}")
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise BadRollout(f"{name} {first_not_finite(array)}")
+    if not 0 <= rollout.lane < run.lanes:
+        raise BadRollout(f"lane expected 0 to {run.lanes - 1}, got {rollout.lane}")
+    if action.sizes and (rollout.action.min() < 0 or (rollout.action >= np.reshape(action.sizes, action.shape)).any()):
+        raise BadRollout(
+            f"action expected 0 to {max(action.sizes) - 1}, got {rollout.action.min()} to {rollout.action.max()}"
+        )
+    ended = rollout.terminated | rollout.truncated
+    if (rollout.valid[1:] == ended[:-1]).any():
+        t, n = np.argwhere(rollout.valid[1:] == ended[:-1])[0]
+        raise BadRollout(f"valid expected {not ended[t, n]} at step {t + 1}, copy {n}, got {bool(rollout.valid[t + 1, n])}")
+    if len(rollout.episodes) != int(np.count_nonzero(ended & rollout.valid)):
+        raise BadRollout(f"episodes expected {int(np.count_nonzero(ended & rollout.valid))}, got {len(rollout.episodes)}")
+
+
+def first_not_finite(array: Array) -> str:
+    """Where the first NaN or infinity of a [T, N, …] array stands, in words."""
+    t, n = np.argwhere(~np.isfinite(array))[0][:2]
+    value = array[t, n][~np.isfinite(array[t, n])] if array.ndim > 2 else array[t, n : n + 1]
+    return f"expected finite values, got {value.flat[0]} at step {t}, copy {n}"
+
+
+class Batch(msgspec.Struct, frozen=True):
+    """Rollouts side by side: T steps of ΣN columns, in lane order."""
+
+    obs: tuple[Array, ...]
+    """one array [T+1, ΣN, *leaf] for each leaf"""
+    action: Array
+    """[T, ΣN, *action]"""
+    log_prob: Floats
+    reward: Floats
+    terminated: Bools
+    truncated: Bools
+    valid: Bools
+    """[T, ΣN] each"""
+    lane: npt.NDArray[np.int64]
+    """[ΣN] the lane of each column"""
+    fresh: Bools
+    """[ΣN] True where the column's lane has just been started: nothing carries over from its last rollout"""
+    episodes: tuple[Episode, ...]
+
+    @property
+    def env_steps(self) -> int:
+        """Transitions that count."""
+        return int(np.count_nonzero(self.valid))
+
+
+def stack(rollouts: Sequence[Rollout]) -> Batch:
+    """Copy rollouts into one writable batch [T, ΣN], sorted by lane and then by sequence."""
+    rows = sorted(rollouts, key=lambda rollout: (rollout.lane, rollout.sequence))
+
+    def side_by_side(arrays: Sequence[Array]) -> Array:
+        return np.concatenate(arrays, axis=1)
+
+    copies = [row.reward.shape[1] for row in rows]
+    return Batch(
+        obs=tuple(side_by_side(leaves) for leaves in zip(*(row.obs for row in rows), strict=True)),
+        action=side_by_side([row.action for row in rows]),
+        log_prob=side_by_side([row.log_prob for row in rows]),
+        reward=side_by_side([row.reward for row in rows]),
+        terminated=side_by_side([row.terminated for row in rows]),
+        truncated=side_by_side([row.truncated for row in rows]),
+        valid=side_by_side([row.valid for row in rows]),
+        lane=np.repeat([row.lane for row in rows], copies),
+        fresh=np.repeat([row.sequence == 0 for row in rows], copies),
+        episodes=tuple(episode for row in rows for episode in row.episodes),
+    )

@@ -1,0 +1,106 @@
+"""A gymnasium space as plain data, and an observation as arrays. Pure.
+
+A Dict or Tuple observation becomes one array per leaf, in the space's own order; leaves stay as they are (raw dtype), and
+only the policy turns them into features.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from protocol.errors import UsageError
+from protocol.specs import ActionSpec, Leaf
+
+Array = npt.NDArray[Any]
+
+OBSERVATIONS = "Box, Discrete, MultiBinary, MultiDiscrete, and Dict and Tuple of these"
+ACTIONS = "Discrete, MultiDiscrete, MultiBinary and Box"
+STORED_KINDS = "biuf"  # bool, integers, floats: what a frame may hold
+
+
+def observation_leaves(space: gymnasium.Space[Any]) -> tuple[Leaf, ...]:
+    """Describe each array of an observation. Raises `UsageError` for a space that is not supported."""
+    return tuple(_leaf("/".join(map(str, path)), leaf) for path, leaf in _walk(space, ()))
+
+
+def _walk(space: gymnasium.Space[Any], path: tuple[str | int, ...]) -> Iterator[tuple[tuple[str | int, ...], Any]]:
+    match space:
+        case spaces.Dict():
+            for key, inner in space.spaces.items():
+                yield from _walk(inner, (*path, key))
+        case spaces.Tuple():
+            for index, inner in enumerate(space.spaces):
+                yield from _walk(inner, (*path, index))
+        case _:
+            yield path, space
+
+
+def _leaf(path: str, space: gymnasium.Space[Any]) -> Leaf:
+    match space:
+        case spaces.Box() if space.dtype.kind in STORED_KINDS and space.dtype.itemsize <= 8:
+            return Leaf(path, "box", space.shape, space.dtype.name)
+        case spaces.Discrete():
+            return Leaf(path, "discrete", (), "int64", (int(space.n),), (int(space.start),))
+        case spaces.MultiDiscrete():
+            return Leaf(path, "multidiscrete", space.shape, "int64", _ints(space.nvec), _ints(space.start))
+        case spaces.MultiBinary():
+            return Leaf(path, "multibinary", space.shape, "int8")
+        case _:
+            where = f" at {path}" if path else ""
+            raise UsageError(f"observation space {space}{where} is not supported; supported are {OBSERVATIONS}")
+
+
+def action_spec(space: gymnasium.Space[Any]) -> ActionSpec:
+    """Describe the action. Raises `UsageError` for a space that is not supported."""
+    match space:
+        case spaces.Discrete():
+            return ActionSpec("discrete", (), "int64", (int(space.n),), (int(space.start),))
+        case spaces.MultiDiscrete():
+            return ActionSpec("multidiscrete", space.shape, space.dtype.name, _ints(space.nvec), _ints(space.start))
+        case spaces.MultiBinary():
+            return ActionSpec("multibinary", space.shape, space.dtype.name)
+        case spaces.Box() if space.dtype.kind == "f":
+            low, high = (tuple(float(x) for x in bound.ravel()) for bound in (space.low, space.high))
+            return ActionSpec("box", space.shape, space.dtype.name, low=low, high=high)
+        case _:
+            raise UsageError(f"action space {space} is not supported; supported are {ACTIONS} (of floats)")
+
+
+def _ints(array: Array) -> tuple[int, ...]:
+    return tuple(int(x) for x in array.ravel())
+
+
+def reader(space: gymnasium.Space[Any]) -> Callable[[Any], tuple[Any, ...]]:
+    """A function from one observation (or a vector environment's batch of them) to its leaves, in order."""
+    paths = [path for path, _ in _walk(space, ())]
+    if paths == [()]:
+        return lambda observation: (observation,)
+
+    def read(observation: Any) -> tuple[Any, ...]:
+        leaves = []
+        for path in paths:
+            leaf = observation
+            for key in path:
+                leaf = leaf[key]
+            leaves.append(leaf)
+        return tuple(leaves)
+
+    return read
+
+
+def writer(spec: ActionSpec) -> Callable[[Array], Array]:
+    """A function from stored actions [N, *action] to what the environment takes: shifted by `start`, or clipped."""
+    dtype = np.dtype(spec.dtype)
+    if spec.kind == "box":
+        low, high = (np.reshape(np.asarray(bound, np.float32), spec.shape) for bound in (spec.low, spec.high))
+        return lambda action: np.clip(action, low, high).astype(dtype, copy=False)
+    start = np.reshape(np.asarray(spec.start or 0, dtype), spec.shape if spec.start else ())
+    if not start.any():
+        return lambda action: action.astype(dtype, copy=False)
+    return lambda action: (action + start).astype(dtype, copy=False)

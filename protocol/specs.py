@@ -1,0 +1,152 @@
+"""Plain data that describe a run: which environment, which policy, how much. They travel in `Welcome`.
+
+This is the one file that may unpickle, and only in `EnvSpec.make`: a factory that the *learner* sent to a worker which
+agreed to run code (an address only this user can reach). Nothing that a worker sends is ever unpickled.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from typing import Literal
+
+import cloudpickle
+import gymnasium
+import msgspec
+
+from protocol.errors import UsageError
+
+Scalar = bool | int | float | str | None
+
+
+class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The environment: a gymnasium id, or a factory that was pickled by the learner."""
+
+    id: str
+    """anything `gymnasium.make` takes: `CartPole-v1`, `ALE/Pong-v5`, `my_package.envs:MyEnv-v0`"""
+    kwargs: dict[str, Scalar] = {}
+    """keyword arguments of `gymnasium.make`"""
+    factory: bytes | None = None
+    """a cloudpickled callable that returns one environment; `id` is then only its name"""
+
+    @staticmethod
+    def of(env: str | Callable[[], object], kwargs: dict[str, Scalar] | None = None) -> EnvSpec:
+        """From an id, or from a callable that takes `kwargs` and returns a `gymnasium.Env`."""
+        if isinstance(env, str):
+            return EnvSpec(env, kwargs or {})
+        return EnvSpec(getattr(env, "__name__", type(env).__name__), kwargs or {}, cloudpickle.dumps(env))
+
+    def make(self, render_mode: str | None = None) -> gymnasium.Env[object, object]:
+        """One env copy. Raises `UsageError` with what to do when the id is unknown or a package is missing."""
+        extra: dict[str, object] = {} if render_mode is None else {"render_mode": render_mode}
+        if self.factory is not None:
+            env = cloudpickle.loads(self.factory)(**self.kwargs, **extra)
+            if not isinstance(env, gymnasium.Env):
+                raise UsageError(f"env factory {self.id}: expected it to return a gymnasium.Env, got {type(env).__name__}")
+            return env
+        try:
+            # The checker is left out: it costs a tenth of a CartPole step, and every row is checked by `Rollout.validate`.
+            return gymnasium.make(self.id, disable_env_checker=True, **self.kwargs, **extra)  # type: ignore[arg-type]
+        except (gymnasium.error.Error, ImportError, TypeError) as error:
+            raise UsageError(_why_not_made(self.id, error)) from error
+
+
+def _why_not_made(env_id: str, error: Exception) -> str:
+    """One line for an environment that cannot be made."""
+    says = str(error).strip().splitlines()[0].strip() if str(error).strip() else type(error).__name__
+    module, colon, _ = env_id.partition(":")
+    match error:
+        case gymnasium.error.DependencyNotInstalled():
+            return f"environment {env_id}: a package it needs is missing; {says}"
+        case ModuleNotFoundError() if colon and error.name and module.split(".")[0] == error.name.split(".")[0]:
+            return f"environment {env_id}: no module named {error.name}; is it installed, or is its folder on PYTHONPATH?"
+        case ImportError():
+            return f"environment {env_id}: a package it needs is missing ({says}); pip install it, then try again"
+        case gymnasium.error.NameNotFound() if env_id.startswith("ALE/"):
+            return f"environment {env_id}: Atari games are an extra; pip install 'millrace[atari]'"
+        case gymnasium.error.UnregisteredEnv():
+            return f"environment {env_id} is not registered: {says}; give one as my_module:{env_id} to import it first"
+        case _:
+            return f"environment {env_id} cannot be made: {says}"
+
+
+def import_module_of(env_id: str) -> None:
+    """Import the `module` of `module:EnvId`, so that its errors are its own and not gymnasium's."""
+    module, colon, _ = env_id.partition(":")
+    if colon:
+        importlib.import_module(module)
+
+
+class Leaf(msgspec.Struct, frozen=True):
+    """One array of an observation; a Dict or Tuple observation has several."""
+
+    path: str
+    """where it stands in the observation, `camera/left`; empty when the observation is one array"""
+    kind: Literal["box", "discrete", "multidiscrete", "multibinary"]
+    shape: tuple[int, ...]
+    dtype: str
+    """numpy's name of the stored dtype, `float32`"""
+    sizes: tuple[int, ...] = ()
+    """how many values each entry can take (discrete, multidiscrete)"""
+    start: tuple[int, ...] = ()
+    """the smallest value of each entry (discrete, multidiscrete)"""
+
+    @property
+    def is_image(self) -> bool:
+        """A three-dimensional array of bytes is an image: it goes through a convolutional network."""
+        return self.kind == "box" and self.dtype == "uint8" and len(self.shape) == 3
+
+
+class ActionSpec(msgspec.Struct, frozen=True):
+    """What the policy chooses."""
+
+    kind: Literal["discrete", "multidiscrete", "multibinary", "box"]
+    shape: tuple[int, ...]
+    dtype: str
+    """dtype that the environment takes; a Box action is stored as float32, unclipped"""
+    sizes: tuple[int, ...] = ()
+    """how many choices each entry has (discrete, multidiscrete)"""
+    start: tuple[int, ...] = ()
+    """the smallest value of each entry (discrete, multidiscrete): stored actions count from 0"""
+    low: tuple[float, ...] = ()
+    """lower bounds (box), flattened; -inf where unbounded"""
+    high: tuple[float, ...] = ()
+    """upper bounds (box), flattened"""
+
+    @property
+    def stored_dtype(self) -> str:
+        """Dtype of `Rollout.action`."""
+        return "float32" if self.kind == "box" else "int64"
+
+
+class PolicySpec(msgspec.Struct, frozen=True):
+    """A policy as plain data: enough to act in numpy (workers) and to learn in torch (learner)."""
+
+    observation: tuple[Leaf, ...]
+    action: ActionSpec
+    net: tuple[int, ...] = (64, 64)
+    """hidden layers of the actor, and of the critic"""
+    activation: Literal["tanh", "relu"] = "tanh"
+    normalize_observations: bool = False
+    """subtract the running mean, divide by the running standard deviation, clip to ±10 (not images)"""
+
+    @property
+    def needs_torch(self) -> bool:
+        """Images need convolutions, which numpy has not; every other policy acts without torch."""
+        return any(leaf.is_image for leaf in self.observation)
+
+
+class RunSpec(msgspec.Struct, frozen=True):
+    """Everything a worker needs to know of the run it joins."""
+
+    env: EnvSpec
+    policy: PolicySpec
+    rollout_steps: int
+    """T"""
+    copies: int
+    """N, env copies in a lane"""
+    lanes: int
+    seed: int
+    heartbeat_s: float = 1.0
+    learner_timeout_s: float = 30.0
+    """a worker that heard nothing of the learner for so long starts again with Hello"""
