@@ -1,0 +1,52 @@
+"""The ledger: what became of every ticket, and of every transition that reached the learner. Plain counts.
+
+    tickets       issued   = used + outstanding + stale + lost
+    transitions   received = used + waiting + stale + duplicate + late + invalid
+
+hold at every moment. `outstanding` tickets are with a worker, or their rollouts wait to be used (`waiting`).
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+
+class Ledger(msgspec.Struct, kw_only=True):
+    """Counts since the run began; a checkpoint carries them."""
+
+    issued: int = 0
+    used: int = 0
+    """tickets whose rollout an update used"""
+    stale: int = 0
+    """tickets whose rollout came under weights older than max_lag allows: dropped, dealt again"""
+    lost: int = 0
+    """tickets whose worker was lost, left or sent what could not be used: dealt again"""
+
+    transitions_received: int = 0
+    transitions_used: int = 0
+    transitions_stale: int = 0
+    transitions_duplicate: int = 0
+    """of rollouts that came twice: one is used"""
+    transitions_late: int = 0
+    """of rollouts of a session that had ended"""
+    transitions_invalid: int = 0
+    """of rollouts that broke the law of a row or did not fit the run"""
+
+    messages_bad: int = 0
+    """messages that could not be read"""
+
+    @property
+    def outstanding(self) -> int:
+        """Tickets that are neither used nor given up."""
+        return self.issued - self.used - self.stale - self.lost
+
+    @property
+    def transitions_waiting(self) -> int:
+        """Transitions that have arrived and are neither used nor dropped."""
+        dropped = self.transitions_stale + self.transitions_duplicate + self.transitions_late + self.transitions_invalid
+        return self.transitions_received - self.transitions_used - dropped
+
+    def counts(self) -> dict[str, int]:
+        """All counts by name, the two derived ones included."""
+        stored = {name: int(getattr(self, name)) for name in self.__struct_fields__}
+        return stored | {"outstanding": self.outstanding, "transitions_waiting": self.transitions_waiting}

@@ -1,0 +1,495 @@
+"""The learner's half of the conversation. Pure: messages and `now` in, messages out; no socket, clock, thread or torch.
+
+The law: a ticket is the permission for one rollout on one lane, and is dealt to the least advanced lane while
+
+    used + outstanding < rollouts_per_update * (version + 1 + max_lag)
+
+A lane has one owner at a time and moves only between rollouts; whoever gets it starts it afresh (its incarnation rises). A
+worker that is lost gives back its lanes and tickets, which are dealt again: that is the whole of failure handling. What a
+Heartbeat shows to be lost on the way is said again. Every ticket and every transition is counted in the ledger.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+
+from learner.ledger import Ledger
+from protocol.messages import (
+    PROTOCOL_VERSION,
+    Array,
+    Collect,
+    Drain,
+    Failure,
+    Goodbye,
+    Heartbeat,
+    HeartbeatReply,
+    Hello,
+    LaneLife,
+    Permit,
+    Received,
+    Refuse,
+    Rejoin,
+    Release,
+    Rollout,
+    ToLearner,
+    ToWorker,
+    Weights,
+    Welcome,
+)
+from protocol.specs import RunSpec
+
+STRIKES = 3  # rollouts or messages that could not be used, after which a worker is refused
+
+
+class Standing(Enum):
+    """Where the learner sees a worker."""
+
+    UNKNOWN = "unknown"
+    ACTIVE = "active"
+    DRAINING = "draining"
+
+
+class Silence:
+    """Event: nothing was heard of the worker for `worker_timeout_s`, or its process is known to be dead."""
+
+
+class Rubbish:
+    """Event: it sent too much that could not be used."""
+
+
+# What each standing becomes; Drain is what the learner says. What an unknown worker says otherwise is answered by Rejoin.
+TABLE: dict[Standing, dict[type, Standing]] = {
+    Standing.UNKNOWN: {Hello: Standing.ACTIVE},
+    Standing.ACTIVE: {
+        Hello: Standing.ACTIVE,
+        Rollout: Standing.ACTIVE,
+        Heartbeat: Standing.ACTIVE,
+        Goodbye: Standing.UNKNOWN,
+        Failure: Standing.UNKNOWN,
+        Silence: Standing.UNKNOWN,
+        Rubbish: Standing.UNKNOWN,
+        Drain: Standing.DRAINING,
+    },
+    Standing.DRAINING: {
+        Rollout: Standing.DRAINING,
+        Heartbeat: Standing.DRAINING,
+        Goodbye: Standing.UNKNOWN,
+        Failure: Standing.UNKNOWN,
+        Silence: Standing.UNKNOWN,
+        Rubbish: Standing.UNKNOWN,
+    },
+}
+
+Out = tuple[bytes, ToWorker]
+
+
+@dataclass(frozen=True)
+class Joined:
+    """A worker joined."""
+
+    worker: str
+    host: str
+    pid: int
+
+
+@dataclass(frozen=True)
+class Left:
+    """A worker is gone; `tickets` of its tickets are dealt again."""
+
+    worker: str
+    why: str
+    tickets: int
+
+
+@dataclass(frozen=True)
+class Turned:
+    """A worker was refused."""
+
+    worker: str
+    why: str
+
+
+@dataclass(frozen=True)
+class Broke:
+    """A worker's environment raised."""
+
+    worker: str
+    host: str
+    lane: int | None
+    error: str
+    traceback: str
+
+
+Event = Joined | Left | Turned | Broke
+
+
+@dataclass
+class Member:
+    """A worker as the learner sees it."""
+
+    peer: bytes
+    hello: Hello
+    session: int
+    order: int
+    heard_s: float
+    standing: Standing = Standing.ACTIVE
+    lanes: set[int] = field(default_factory=set)
+    tickets: dict[int, int] = field(default_factory=dict)  # ticket -> replies said when it was last said
+    replies: int = 0
+    acknowledged: int = -1
+    under_way: int | None = None  # version of the Weights sent and not acknowledged
+    said_at: int = 0  # replies said when it was sent
+    strikes: int = 0
+    heartbeat: Heartbeat | None = None
+
+
+@dataclass
+class Lane:
+    """A lane as the learner sees it."""
+
+    number: int
+    incarnation: int = 0
+    owner: bytes | None = None
+    progress: int = 0  # tickets used or outstanding
+    started: bool = False  # a ticket of this incarnation was dealt
+    moving: bool = False  # it waits for its last tickets to end before it moves to another worker
+    outstanding: set[int] = field(default_factory=set)
+    below: int = 0  # every rollout of this incarnation below this sequence has arrived
+    ahead: set[int] = field(default_factory=set)  # sequences that have arrived out of order
+
+    def restart(self) -> None:
+        """A new life: on new env copies."""
+        self.owner, self.moving = None, False
+        if self.started:
+            self.incarnation += 1
+            self.started, self.below, self.ahead = False, 0, set()
+
+    def arrived(self, sequence: int) -> None:
+        """Take note of a rollout."""
+        self.ahead.add(sequence)
+        while self.below in self.ahead:
+            self.ahead.remove(self.below)
+            self.below += 1
+
+
+@dataclass(frozen=True)
+class Ticket:
+    """A ticket that is with a worker."""
+
+    number: int
+    lane: int
+    incarnation: int
+    version: int
+    peer: bytes
+
+
+class Roster:
+    """Members, lanes, tickets and the ledger."""
+
+    def __init__(
+        self,
+        run: RunSpec,
+        *,
+        rollouts_per_update: int,
+        max_lag: int,
+        worker_timeout_s: float,
+        first_session: int,
+        ledger: Ledger | None = None,
+        version: int = -1,
+        incarnations: Sequence[int] = (),
+    ) -> None:
+        """`version` is -1 until `publish`; `ledger`, and each lane's first incarnation, go on from a checkpoint."""
+        self.run = run
+        self.rollouts_per_update = rollouts_per_update
+        self.max_lag = max_lag
+        self.worker_timeout_s = worker_timeout_s
+        self.ledger = ledger or Ledger()
+        self.version = version
+        self.members: dict[bytes, Member] = {}
+        self.lanes = [Lane(n, incarnations[n] if incarnations else 0) for n in range(run.lanes)]
+        self.tickets: dict[int, Ticket] = {}
+        self.ready: list[Rollout] = []
+        self.events: list[Event] = []
+        self._weights: Weights | None = None
+        self._next_session = first_session
+        self._joins = 0
+        self._draining: str | None = None
+        self._refused: dict[bytes, tuple[int, str]] = {}
+
+    # ---------------------------------------------------------------- in
+
+    def receive(self, peer: bytes, message: ToLearner, now: float) -> list[Out]:
+        """What a worker said. A rollout must have passed `protocol.rollout.validate`; else call `reject`."""
+        if isinstance(message, Hello):
+            return self._hello(peer, message, now)
+        if isinstance(message, Rollout):
+            self.ledger.transitions_received += message.env_steps
+        member = self.members.get(peer)
+        if member is None or member.session != message.session:
+            if isinstance(message, Rollout):
+                self.ledger.transitions_late += message.env_steps
+            return [(peer, Rejoin(message.session))] if not isinstance(message, Goodbye | Failure) else []
+        member.heard_s = now
+        match message:
+            case Rollout():
+                return self._rollout(member, message)
+            case Heartbeat():
+                return self._heartbeat(member, message)
+            case Goodbye(_, reason):
+                return self._forget(member, Goodbye, f"left: {reason}")
+            case Failure(_, error, traceback, lane):
+                hello = member.hello
+                self.events.append(Broke(hello.worker, hello.host, lane, error, traceback))
+                return self._forget(member, Failure, f"broke: {error}")
+
+    def reject(self, peer: bytes, rollout: Rollout | None, why: str, now: float) -> list[Out]:
+        """A message that could not be read (`rollout` is None), or a rollout that cannot be used."""
+        member = self.members.get(peer)
+        if rollout is None:
+            self.ledger.messages_bad += 1
+        else:
+            steps = int(rollout.valid.sum()) if rollout.valid.dtype == bool else 0
+            self.ledger.transitions_received += steps
+            self.ledger.transitions_invalid += steps
+        if member is None:
+            return [(peer, Refuse(f"not understood: {why}"))]
+        member.heard_s = now
+        member.strikes += 1
+        if member.strikes >= STRIKES:
+            self._refused[peer] = (member.hello.pid, why)
+            self.events.append(Turned(member.hello.worker, why))
+            return [(peer, Refuse(why)), *self._forget(member, Rubbish, f"refused: {why}")]
+        if rollout is not None and rollout.ticket in member.tickets:
+            lane = self.lanes[self.tickets[rollout.ticket].lane]
+            self._lose(member, rollout.ticket)
+            lane.arrived(rollout.sequence)
+        return self._deal()
+
+    def gone(self, worker: str, why: str) -> list[Out]:
+        """A worker's process is known to be dead: do not wait for its silence."""
+        found = [member for member in self.members.values() if member.hello.worker == worker]
+        return [out for member in found for out in self._forget(member, Silence, why)]
+
+    def tick(self, now: float) -> list[Out]:
+        """Judge silence. Call it only when every message that has arrived was given to `receive`."""
+        silent = [member for member in self.members.values() if now - member.heard_s > self.worker_timeout_s]
+        why = f"silent for {self.worker_timeout_s:.0f} s"
+        return [out for member in silent for out in self._forget(member, Silence, why)]
+
+    # ---------------------------------------------------------------- the learner's side
+
+    def publish(self, version: int, parameters: Array, buffers: Array) -> list[Out]:
+        """New weights: offer them to every worker, and deal the tickets that they allow."""
+        self.version = version
+        self._weights = Weights(version, parameters, buffers)
+        out = [out for member in self._active() for out in self._offer(member)]
+        return out + self._deal()
+
+    def take(self) -> list[Rollout] | None:
+        """The rollouts of the next update, or None while there are too few. What is too stale is dropped and counted."""
+        for rollout in [r for r in self.ready if self.version - r.version > self.max_lag]:
+            self.ready.remove(rollout)
+            self.ledger.stale += 1
+            self.ledger.transitions_stale += rollout.env_steps
+            self.lanes[rollout.lane].progress -= 1
+        if len(self.ready) < self.rollouts_per_update:
+            return None
+        taken, self.ready = self.ready[: self.rollouts_per_update], self.ready[self.rollouts_per_update :]
+        self.ledger.used += len(taken)
+        self.ledger.transitions_used += sum(rollout.env_steps for rollout in taken)
+        return taken
+
+    def deal(self) -> list[Out]:
+        """Deal what may be dealt, as after a stale drop."""
+        return self._deal()
+
+    def drain(self, reason: str) -> list[Out]:
+        """Ask everybody to leave; no more tickets."""
+        self._draining = reason
+        out: list[Out] = []
+        for member in self._active():
+            member.standing = TABLE[member.standing][Drain]
+            out.append((member.peer, Drain(reason)))
+        return out
+
+    def incarnations(self) -> list[int]:
+        """The next life of each lane, for a checkpoint: one that was dealt a ticket is not lived again."""
+        return [lane.incarnation + lane.started for lane in self.lanes]
+
+    # ---------------------------------------------------------------- inside
+
+    def _active(self) -> list[Member]:
+        return [member for member in self.members.values() if member.standing is Standing.ACTIVE]
+
+    def _hello(self, peer: bytes, hello: Hello, now: float) -> list[Out]:
+        if hello.protocol != PROTOCOL_VERSION:
+            why = f"protocol expected {PROTOCOL_VERSION}, got {hello.protocol}; install the learner's version of millrace"
+            self.events.append(Turned(hello.worker, why))
+            return [(peer, Refuse(why))]
+        pid, why = self._refused.get(peer, (-1, ""))
+        if pid == hello.pid:
+            return [(peer, Refuse(why))]
+        if self._draining is not None:
+            return [(peer, Drain(self._draining))]
+        member = self.members.get(peer)
+        forgotten: list[Out] = []
+        if member is not None:
+            same = (member.hello.host, member.hello.pid) == (hello.host, hello.pid)
+            if same and hello.attempt == member.hello.attempt:
+                return [(peer, Welcome(member.session, hello.attempt, self.run))]
+            if same and hello.attempt < member.hello.attempt:
+                return []
+            forgotten = self._forget(member, Silence, "began again" if same else f"replaced by process {hello.pid}")
+        member = Member(peer, hello, self._next_session, self._joins, now)
+        self._next_session += 1
+        self._joins += 1
+        self.members[peer] = member
+        self.events.append(Joined(hello.worker, hello.host, hello.pid))
+        welcome: list[Out] = [(peer, Welcome(member.session, hello.attempt, self.run))]
+        return forgotten + welcome + self._offer(member) + self._deal()
+
+    def _rollout(self, member: Member, rollout: Rollout) -> list[Out]:
+        self._acknowledge(member, rollout.version)
+        ticket = self.tickets.get(rollout.ticket)
+        if ticket is None:
+            self.ledger.transitions_duplicate += rollout.env_steps
+            return self._offer(member)
+        if (
+            ticket.peer != member.peer
+            or ticket.lane != rollout.lane
+            or not ticket.version <= rollout.version <= self.version
+        ):
+            self.ledger.transitions_received -= rollout.env_steps  # `reject` counts it
+            why = f"ticket {ticket.number} expected lane {ticket.lane} under version {ticket.version} or newer, "
+            return self.reject(member.peer, rollout, why + f"got lane {rollout.lane}, {rollout.version}", member.heard_s)
+        del self.tickets[ticket.number], member.tickets[ticket.number]
+        lane = self.lanes[ticket.lane]
+        lane.outstanding.remove(ticket.number)
+        lane.arrived(rollout.sequence)
+        self.ready.append(rollout)
+        return self._offer(member) + self._deal()
+
+    def _heartbeat(self, member: Member, heartbeat: Heartbeat) -> list[Out]:
+        """Say again what this account shows to be lost: said before a reply that the worker has seen, yet not held."""
+        member.heartbeat = heartbeat
+        peer = member.peer
+        if member.standing is Standing.DRAINING:
+            return [(peer, Drain(self._draining or ""))]
+        self._acknowledge(member, heartbeat.version)
+        if member.under_way is not None and heartbeat.replies > member.said_at:
+            member.under_way = None
+        out = self._offer(member)
+        held = set(heartbeat.tickets)
+        missing = [t for t, said_at in member.tickets.items() if t not in held and heartbeat.replies > said_at]
+        out += self._collect(member, missing)
+        foreign = [life for life in heartbeat.lanes if not self._owns(member, life)]
+        if foreign:
+            out.append((peer, Release(member.session, tuple(foreign))))
+        member.replies += 1
+        out.append((peer, HeartbeatReply(member.session, member.replies, self._received(member.lanes))))
+        return out + self._deal()
+
+    def _owns(self, member: Member, life: LaneLife) -> bool:
+        return life.lane in member.lanes and life.incarnation == self.lanes[life.lane].incarnation
+
+    def _acknowledge(self, member: Member, version: int) -> None:
+        member.acknowledged = max(member.acknowledged, version)
+        if member.under_way is not None and version >= member.under_way:
+            member.under_way = None
+
+    def _offer(self, member: Member) -> list[Out]:
+        """The newest weights, unless the worker has them or older ones are still on their way."""
+        newest = self._weights
+        if newest is None or member.under_way is not None or member.acknowledged >= newest.version:
+            return []
+        if member.standing is not Standing.ACTIVE:
+            return []
+        member.under_way, member.said_at = newest.version, member.replies
+        return [(member.peer, newest)]
+
+    def _received(self, lanes: Iterable[int]) -> tuple[Received, ...]:
+        return tuple(Received(n, self.lanes[n].incarnation, self.lanes[n].below) for n in lanes)
+
+    def _collect(self, member: Member, tickets: Sequence[int]) -> list[Out]:
+        """Collect messages for these outstanding tickets: one for each version that they were dealt under."""
+        out: list[Out] = []
+        for version in sorted({self.tickets[number].version for number in tickets}):
+            chosen = [self.tickets[number] for number in tickets if self.tickets[number].version == version]
+            permits = tuple(Permit(ticket.number, ticket.lane, ticket.incarnation) for ticket in chosen)
+            member.tickets |= {ticket.number: member.replies for ticket in chosen}
+            lanes = sorted({ticket.lane for ticket in chosen})
+            out.append((member.peer, Collect(member.session, version, permits, self._received(lanes))))
+        return out
+
+    def _forget(self, member: Member, event: type, why: str) -> list[Out]:
+        """The worker is gone: its tickets are lost, its lanes have no owner; deal both to the living."""
+        member.standing = TABLE[member.standing][event]
+        del self.members[member.peer]
+        self.events.append(Left(member.hello.worker, why, len(member.tickets)))
+        for number in list(member.tickets):
+            self._lose(member, number)
+        for number in member.lanes:
+            self.lanes[number].restart()
+        return self._deal()
+
+    def _lose(self, member: Member, number: int) -> None:
+        ticket = self.tickets.pop(number)
+        del member.tickets[number]
+        lane = self.lanes[ticket.lane]
+        lane.outstanding.remove(number)
+        lane.progress -= 1
+        self.ledger.lost += 1
+
+    def _deal(self) -> list[Out]:
+        """Place lanes that have no owner, even out, and deal tickets to the least advanced lanes."""
+        if self._weights is None or self._draining is not None or not self._active():
+            return []
+        out = self._place_lanes()
+        room = self.rollouts_per_update * (self.version + 1 + self.max_lag) - self.ledger.used - self.ledger.outstanding
+        queue = [(lane.progress, lane.number) for lane in self.lanes] if room > 0 else []
+        heapq.heapify(queue)
+        dealt: dict[bytes, list[int]] = {}
+        while room > 0:
+            lane = self.lanes[queue[0][1]]
+            if lane.owner is None or lane.moving:
+                break  # the least advanced lane comes first: in a synchronous run no other may take its place
+            number = self.ledger.issued
+            self.tickets[number] = Ticket(number, lane.number, lane.incarnation, self.version, lane.owner)
+            lane.outstanding.add(number)
+            lane.progress += 1
+            lane.started = True
+            heapq.heapreplace(queue, (lane.progress, lane.number))
+            dealt.setdefault(lane.owner, []).append(number)
+            self.ledger.issued += 1
+            room -= 1
+        for peer, numbers in dealt.items():
+            out += self._collect(self.members[peer], numbers)
+        return out
+
+    def _place_lanes(self) -> list[Out]:
+        active = sorted(self._active(), key=lambda member: member.order)
+        for lane in self.lanes:
+            lane.moving = False
+            if lane.owner is None:
+                self._give(lane, min(active, key=lambda member: len(member.lanes)))
+        out: list[Out] = []
+        while True:
+            fullest = max(active, key=lambda member: len(member.lanes))
+            emptiest = min(active, key=lambda member: len(member.lanes))
+            if len(fullest.lanes) - len(emptiest.lanes) < 2:
+                return out
+            lane = min((self.lanes[n] for n in fullest.lanes), key=lambda lane: (len(lane.outstanding), -lane.number))
+            if lane.outstanding:
+                lane.moving = True
+                return out
+            fullest.lanes.remove(lane.number)
+            out.append((fullest.peer, Release(fullest.session, (LaneLife(lane.number, lane.incarnation),))))
+            lane.restart()
+            self._give(lane, emptiest)
+
+    def _give(self, lane: Lane, member: Member) -> None:
+        lane.owner = member.peer
+        member.lanes.add(lane.number)

@@ -1,0 +1,402 @@
+"""The worker's half of the conversation. Pure: messages and `now` in, effects out; no socket, clock, thread or environment.
+
+The law: a ticket is collected once and its rollout is kept until the learner says it has it; asked again for it, the same
+rollout is said again. A rollout starts only under weights at least as new as its ticket asks for. Whatever is lost on the
+way is repaired by the next Heartbeat, because it lists all that this worker holds.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+
+from protocol.messages import (
+    PROTOCOL_VERSION,
+    Collect,
+    Drain,
+    Failure,
+    Goodbye,
+    Heartbeat,
+    HeartbeatReply,
+    Hello,
+    LaneLife,
+    Permit,
+    Received,
+    Refuse,
+    Rejoin,
+    Release,
+    Rollout,
+    ToLearner,
+    ToWorker,
+    Weights,
+    Welcome,
+)
+from protocol.specs import RunSpec
+
+HELLO_FIRST_S, HELLO_MOST_S = 0.25, 4.0
+REMEMBERED_TICKETS = 64  # finished ones, so that a late repeat of their Collect is known for what it is
+
+
+class State(Enum):
+    """Where a worker stands."""
+
+    JOINING = "joining"
+    READY = "ready"
+    DRAINING = "draining"
+    LEFT = "left"
+
+
+class Silence:
+    """Event: the learner has said nothing for `learner_timeout_s` (or, while joining, for too long)."""
+
+
+class Terminate:
+    """Event: this worker was asked to leave (SIGTERM)."""
+
+
+class Emptied:
+    """Event: nothing is in hand any more."""
+
+
+class Broke:
+    """Event: the environment, or this worker, raised."""
+
+
+# What each state becomes; a message that is not listed is ignored in that state.
+TABLE: dict[State, dict[type, State]] = {
+    State.JOINING: {
+        Welcome: State.READY,
+        Refuse: State.LEFT,
+        Drain: State.LEFT,
+        Silence: State.LEFT,
+        Terminate: State.LEFT,
+        Broke: State.LEFT,
+    },
+    State.READY: {
+        Weights: State.READY,
+        Collect: State.READY,
+        Release: State.READY,
+        HeartbeatReply: State.READY,
+        Welcome: State.READY,
+        Rejoin: State.JOINING,
+        Refuse: State.LEFT,
+        Drain: State.DRAINING,
+        Silence: State.JOINING,
+        Terminate: State.DRAINING,
+        Broke: State.LEFT,
+    },
+    State.DRAINING: {
+        Weights: State.DRAINING,
+        HeartbeatReply: State.DRAINING,
+        Rejoin: State.LEFT,
+        Refuse: State.LEFT,
+        Silence: State.LEFT,
+        Terminate: State.LEFT,
+        Emptied: State.LEFT,
+        Broke: State.LEFT,
+    },
+    State.LEFT: {},
+}
+
+
+@dataclass(frozen=True)
+class Say:
+    """Effect: send this."""
+
+    message: ToLearner
+
+
+@dataclass(frozen=True)
+class Begin:
+    """Effect: a new session; forget every env copy of the last one."""
+
+    run: RunSpec
+
+
+@dataclass(frozen=True)
+class Close:
+    """Effect: close the env copies of these lanes."""
+
+    lanes: tuple[LaneLife, ...]
+
+
+@dataclass(frozen=True)
+class Leave:
+    """Effect: the conversation is over."""
+
+    exit_code: int
+    reason: str
+
+
+Effect = Say | Begin | Close | Leave
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """One rollout to collect."""
+
+    ticket: int
+    lane: int
+    incarnation: int
+    sequence: int
+
+
+@dataclass(frozen=True)
+class Task:
+    """Rollouts to collect side by side, all under these weights."""
+
+    session: int
+    weights: Weights
+    assignments: tuple[Assignment, ...]
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Who this worker is."""
+
+    worker: str
+    host: str
+    pid: int
+    software: str
+
+
+@dataclass
+class _Lane:
+    incarnation: int
+    sequence: int = 0
+    held: dict[int, int] = field(default_factory=dict)  # ticket -> oldest version that will do
+    kept: dict[int, Rollout] = field(default_factory=dict)  # ticket -> finished, and not known to have arrived
+    done: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED_TICKETS))
+
+
+class Session:
+    """One worker's side, from its first Hello to its last word."""
+
+    def __init__(
+        self, identity: Identity, now: float, *, join_timeout_s: float = 60.0, rejoin_timeout_s: float = 600.0
+    ) -> None:
+        self.identity = identity
+        self.state = State.JOINING
+        self.run: RunSpec | None = None
+        self.session = 0
+        self.steps = 0
+        """env steps since the worker started; the shell keeps it"""
+        self.stages: dict[str, float] = {}
+        """seconds in each stage; the shell keeps it"""
+        self._patience_s = join_timeout_s
+        self._rejoin_timeout_s = rejoin_timeout_s
+        self._attempt = 0
+        self._heard_s = self._due_s = self._joining_s = now
+        self._backoff_s = HELLO_FIRST_S
+        self._reason = ""
+        self._forget()
+        self._join(now)
+
+    # ---------------------------------------------------------------- in
+
+    def handle(self, message: ToWorker, now: float) -> list[Effect]:
+        """What the learner said."""
+        if type(message) not in TABLE[self.state]:
+            return []
+        if not isinstance(message, Welcome) and getattr(message, "session", self.session) != self.session:
+            return []  # said to an earlier session of ours
+        match message:
+            case Welcome():
+                return self._welcome(message, now)
+            case Refuse(reason):
+                return self._leave(message, 2, reason)
+            case Drain(reason):
+                return self._drain(message, reason)
+            case Rejoin():
+                return self._rejoin(message, "the learner does not know this session", now)
+        self._heard_s = now
+        match message:
+            case Weights(version):
+                if version > self._version:
+                    self._weights = message
+            case Collect(_, version, permits, received):
+                self._arrived(received)
+                return [effect for permit in permits for effect in self._permit(permit, version)]
+            case Release(_, lanes):
+                return self._release(lanes)
+            case HeartbeatReply(_, number, received):
+                self._replies = number
+                self._arrived(received)
+        return []
+
+    def tick(self, now: float) -> list[Effect]:
+        """What is due: Hello, Heartbeat (also to acknowledge new weights), or giving up on a silent learner."""
+        match self.state:
+            case State.LEFT:
+                return []
+            case State.JOINING:
+                if now - self._joining_s > self._patience_s:
+                    return self._leave(Silence(), 1, f"no learner answered for {self._patience_s:.0f} s")
+                if now < self._due_s:
+                    return []
+                self._due_s = now + self._backoff_s
+                self._backoff_s = min(2 * self._backoff_s, HELLO_MOST_S)
+                who = self.identity
+                return [Say(Hello(PROTOCOL_VERSION, who.worker, who.host, who.pid, who.software, self._attempt))]
+        assert self.run is not None
+        if now - self._heard_s > self.run.learner_timeout_s:
+            return self._rejoin(Silence(), f"the learner was silent for {self.run.learner_timeout_s:.0f} s", now)
+        if now < self._due_s and self._said_version == self._version:
+            return []
+        self._due_s = now + self.run.heartbeat_s
+        self._said_version = self._version
+        return [Say(self._heartbeat())]
+
+    def next_due_s(self) -> float:
+        """When `tick` wants to be called at the latest."""
+        return self._due_s
+
+    def terminate(self) -> list[Effect]:
+        """Leave: after the rollout in hand, or at once when asked twice."""
+        return [] if self.state is State.LEFT else self._drain(Terminate(), "told to stop")
+
+    def broke(self, error: str, traceback: str, lane: int | None) -> list[Effect]:
+        """The environment, or this worker, raised: tell the learner, and leave."""
+        told: list[Effect] = []
+        if self.state in (State.READY, State.DRAINING):
+            told.append(Say(Failure(self.session, error, traceback, lane)))
+        return [] if self.state is State.LEFT else told + self._leave(Broke(), 1, error)
+
+    # ---------------------------------------------------------------- collecting
+
+    def next_task(self) -> Task | None:
+        """The oldest startable ticket of every lane, to be collected together; None when there is none."""
+        if self.state is not State.READY or self._weights is None or self._in_hand:
+            return None
+        chosen = []
+        for number, lane in sorted(self._lanes.items()):
+            startable = [ticket for ticket, version in lane.held.items() if version <= self._version]
+            if startable:
+                chosen.append(Assignment(min(startable), number, lane.incarnation, lane.sequence))
+        if not chosen:
+            return None
+        self._in_hand = tuple(assignment.ticket for assignment in chosen)
+        return Task(self.session, self._weights, tuple(chosen))
+
+    def finished(self, rollouts: Sequence[Rollout]) -> list[Effect]:
+        """The task in hand is done."""
+        self._in_hand = ()
+        effects: list[Effect] = []
+        for rollout in rollouts:
+            lane = self._lanes.get(rollout.lane)
+            if rollout.session != self.session or lane is None or rollout.ticket not in lane.held:
+                continue  # the session ended, or the lane was released, while it was collected
+            del lane.held[rollout.ticket]
+            lane.kept[rollout.ticket] = rollout
+            lane.sequence += 1
+            self._said_version = max(self._said_version, rollout.version)
+            effects.append(Say(rollout))
+        if self.state is State.DRAINING:
+            effects += self._goodbye()
+        return effects
+
+    def abandoned(self, task: Task) -> bool:
+        """True when nobody wants this task any more."""
+        return self.state in (State.JOINING, State.LEFT) or task.session != self.session
+
+    # ---------------------------------------------------------------- inside
+
+    @property
+    def _version(self) -> int:
+        return -1 if self._weights is None else self._weights.version
+
+    def _join(self, now: float) -> None:
+        """Begin to join, as if for the first time."""
+        self._attempt += 1
+        self._joining_s = self._due_s = now
+        self._backoff_s = HELLO_FIRST_S
+        self._forget()
+
+    def _forget(self) -> None:
+        """Nothing of a session outlives it."""
+        self._lanes: dict[int, _Lane] = {}
+        self._weights: Weights | None = None
+        self._in_hand: tuple[int, ...] = ()  # tickets being collected
+        self._replies = 0
+        self._said_version = -1  # newest version that a message of ours has named
+
+    def _welcome(self, message: Welcome, now: float) -> list[Effect]:
+        if message.attempt != self._attempt or (self.state is State.READY and message.session == self.session):
+            return []  # an answer to an earlier Hello, or a repeat
+        self._become(message)
+        self._forget()
+        self.run, self.session = message.run, message.session
+        self._heard_s = now
+        self._due_s = now + message.run.heartbeat_s
+        self._patience_s = self._rejoin_timeout_s
+        return [Begin(message.run)]
+
+    def _rejoin(self, event: object, reason: str, now: float) -> list[Effect]:
+        self._become(event)
+        if self.state is State.LEFT:
+            return [Leave(1, reason)]
+        closing = tuple(LaneLife(number, lane.incarnation) for number, lane in self._lanes.items())
+        self._join(now)
+        return [Close(closing), *self.tick(now)]
+
+    def _permit(self, permit: Permit, version: int) -> list[Effect]:
+        lane = self._lanes.get(permit.lane)
+        if lane is None or permit.incarnation > lane.incarnation:
+            lane = self._lanes[permit.lane] = _Lane(permit.incarnation)
+        if permit.incarnation < lane.incarnation or permit.ticket in lane.held or permit.ticket in lane.done:
+            return []
+        if permit.ticket in lane.kept:
+            return [Say(lane.kept[permit.ticket])]
+        lane.held[permit.ticket] = version
+        return []
+
+    def _arrived(self, received: Iterable[Received]) -> None:
+        """Let go of the rollouts that the learner has."""
+        for number, incarnation, below in ((r.lane, r.incarnation, r.below) for r in received):
+            lane = self._lanes.get(number)
+            if lane is None or lane.incarnation != incarnation:
+                continue
+            for ticket, rollout in list(lane.kept.items()):
+                if rollout.sequence < below:
+                    del lane.kept[ticket]
+                    lane.done.append(ticket)
+
+    def _release(self, lives: tuple[LaneLife, ...]) -> list[Effect]:
+        gone = []
+        for life in lives:
+            lane = self._lanes.get(life.lane)
+            if lane is not None and lane.incarnation <= life.incarnation:
+                del self._lanes[life.lane]
+                gone.append(LaneLife(life.lane, lane.incarnation))
+        return [Close(tuple(gone))] if gone else []
+
+    def _heartbeat(self) -> Heartbeat:
+        return Heartbeat(
+            session=self.session,
+            replies=self._replies,
+            version=self._version,
+            tickets=tuple(ticket for lane in self._lanes.values() for ticket in lane.held),
+            lanes=tuple(LaneLife(number, lane.incarnation) for number, lane in self._lanes.items()),
+            steps=self.steps,
+            stages=dict(self.stages),
+        )
+
+    def _drain(self, event: object, reason: str) -> list[Effect]:
+        self._become(event)
+        self._reason = reason
+        if self.state is State.LEFT:
+            return [Leave(0, reason)]
+        return [] if self._in_hand else self._goodbye()
+
+    def _goodbye(self) -> list[Effect]:
+        unfinished = tuple(ticket for lane in self._lanes.values() for ticket in lane.held)
+        return [Say(Goodbye(self.session, self._reason, unfinished)), *self._leave(Emptied(), 0, self._reason)]
+
+    def _leave(self, event: object, exit_code: int, reason: str) -> list[Effect]:
+        self._become(event)
+        return [Leave(exit_code, reason)]
+
+    def _become(self, event: object) -> None:
+        self.state = TABLE[self.state][type(event)]
