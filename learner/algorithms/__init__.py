@@ -1,0 +1,40 @@
+"""The mathematics of learning: no sockets and no files.
+
+One file is one configuration and one class; adding one touches one dict, `ALGORITHMS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from learner.algorithms.ppo import PPO, PPOConfig
+from protocol.rollout import Batch
+
+Floats = npt.NDArray[np.float32]
+
+
+class Algorithm(Protocol):
+    """What the loop of `learner.train` drives."""
+
+    def update(self, batch: Batch, pulse: Callable[[], None]) -> dict[str, float]:
+        """Learn from a batch, calling `pulse` now and then; metrics by the names users know."""
+        ...
+
+    def weights(self) -> tuple[Floats, Floats]:
+        """Copies of the acting parameters and of the policy's buffers: what `Weights` carries."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """A copy of all that the next update depends on, in tensors and plain data."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from there."""
+        ...
+
+
+ALGORITHMS: dict[str, tuple[type[PPOConfig], type[PPO]]] = {"ppo": (PPOConfig, PPO)}

@@ -1,0 +1,49 @@
+"""Losses and what is measured of them. Pure: tensors [B] in, numbers (tensors of no dimension) out; B rows of a minibatch.
+
+Every row given is a valid one: masking is done where minibatches are made.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+Floats = npt.NDArray[np.float32]
+
+
+def standardized(advantage: Tensor) -> Tensor:
+    """Advantages [B] less their mean, over their standard deviation; a single row has none and stays as it is."""
+    if len(advantage) < 2:
+        return advantage
+    std, mean = torch.std_mean(advantage)
+    return (advantage - mean) / (std + 1e-8)
+
+
+def clipped_surrogate(ratio: Tensor, advantage: Tensor, clip_range: float) -> Tensor:
+    """PPO's policy loss (Schulman et al. 2017, eq. 7): −E[min(ρ A, clip(ρ, 1−ε, 1+ε) A)], ρ = π(a)/π_old(a)."""
+    return -torch.minimum(ratio * advantage, ratio.clamp(1 - clip_range, 1 + clip_range) * advantage).mean()
+
+
+def value_loss(value: Tensor, target: Tensor) -> Tensor:
+    """Mean squared error (as Stable-Baselines3 has it, without the half that others put before it)."""
+    return torch.nn.functional.mse_loss(value, target)
+
+
+def approx_kl(log_ratio: Tensor, ratio: Tensor) -> Tensor:
+    """KL(π_old ‖ π) estimated by E[(ρ − 1) − log ρ]: unbiased, never negative (Schulman 2020, "Approximating KL")."""
+    return (ratio - 1 - log_ratio).mean()
+
+
+def clip_fraction(ratio: Tensor, clip_range: float) -> Tensor:
+    """The share of rows whose ratio left [1−ε, 1+ε]."""
+    return ((ratio - 1).abs() > clip_range).float().mean()
+
+
+def explained_variance(value: Floats, target: Floats) -> float:
+    """1 − Var(target − value) / Var(target): 1 is perfect, 0 no better than a constant; NaN where targets do not vary."""
+    variance = float(np.var(target))
+    return 1 - float(np.var(target - value)) / variance if variance > 0 else math.nan

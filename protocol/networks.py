@@ -1,0 +1,201 @@
+"""The same policy in torch: what the learner learns with, and what a worker with images acts with.
+
+The one file of protocol that imports torch. Every parameter stands where `protocol.policy.layout` says, in one flat
+float32 tensor, and every gradient in a second one of the same shape; the named arrays are views into the two. So the
+norm of the gradient is one norm, Adam is one kernel, and publishing is one copy of a prefix. Features come from
+`protocol.policy` (numpy), already normalised: one truth for what a network sees.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from protocol.distributions import LOG_SQRT_2PI
+from protocol.policy import Field, buffer_size, convolutions, features, layout, normalized, size
+from protocol.specs import ActionSpec, PolicySpec
+
+Array = npt.NDArray[Any]
+Floats = npt.NDArray[np.float32]
+
+
+class MLP(torch.autograd.Function):
+    """Hidden layers and a linear head as one node of the graph: a small network's time is the graph's, not the arithmetic's.
+
+    Forward: h₀ = x [B, D];  hᵢ = φ(hᵢ₋₁ Wᵢᵀ + bᵢ);  output = h Wᵀ + b [B, O].
+    Backward: with g = ∂L/∂(pre-activation), ∂L/∂W = gᵀ h, ∂L/∂b = Σ g, ∂L/∂h = g W; φ' is 1 − h² (tanh) or h > 0 (ReLU).
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, relu: bool, *layers: Tensor) -> Tensor:
+        """`layers` alternates weight [out, in] and bias [out]; the last pair is the head."""
+        inputs = [x]
+        *hidden, weight, bias = layers
+        for w, b in zip(hidden[::2], hidden[1::2], strict=True):
+            x = torch.addmm(b, x, w.t())
+            inputs.append(x.relu_() if relu else x.tanh_())
+        ctx.relu = relu
+        ctx.save_for_backward(*inputs, *layers[::2])
+        return torch.addmm(bias, x, weight.t())
+
+    @staticmethod
+    def backward(ctx: Any, *outputs: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradients of x (if wanted) and of each layer's weight and bias."""
+        (g,) = outputs
+        half = len(ctx.saved_tensors) // 2
+        inputs, weights = ctx.saved_tensors[:half], ctx.saved_tensors[half:]
+        found: list[Tensor | None] = []
+        for i in range(half - 1, 0, -1):
+            found += [g.sum(0), g.t() @ inputs[i]]
+            g = g @ weights[i]
+            if ctx.relu:
+                g = torch.ops.aten.threshold_backward(g, inputs[i], 0)
+            else:
+                g = torch.ops.aten.tanh_backward(g, inputs[i])
+        found += [g.sum(0), g.t() @ inputs[0], None, g @ weights[0] if ctx.needs_input_grad[0] else None]
+        return tuple(reversed(found))
+
+
+class ActorCritic:
+    """The networks of a `PolicySpec`: convolutions shared by actor and critic, then an MLP each."""
+
+    def __init__(self, spec: PolicySpec, device: str | torch.device = "cpu", *, seed: int = 0) -> None:
+        """Orthogonal initialisation with each field's gain, zeros where it is 0: the same for the same seed."""
+        acting, critic = layout(spec)
+        self.spec = spec
+        self.fields = (*acting, *critic)
+        self.acting_size = size(acting)
+        self.flat = _initial(self.fields, seed).to(device)  # [P] float32: give this to the optimiser
+        self.flat_grad = torch.zeros_like(self.flat)  # [P] float32: zero it before each backward pass
+        self.flat.grad = self.flat_grad
+        self.parameters: dict[str, Tensor] = {}  # leaves of the graph: views into `flat`, gradients into `flat_grad`
+        at = 0
+        for field in self.fields:
+            end = at + math.prod(field.shape)
+            view = self.flat[at:end].view(field.shape).detach().requires_grad_()
+            view.grad = self.flat_grad[at:end].view(field.shape)
+            self.parameters[field.name] = view
+            at = end
+        self._relu = spec.activation == "relu"
+        self._actor, self._critic = (self._layers(name) for name in ("actor", "critic"))
+        self._images = [self._image(i) for i, leaf in enumerate(spec.observation) if leaf.is_image]
+
+    def _layers(self, name: str) -> list[Tensor]:
+        names = [f"{name}.{i}" for i in range(len(self.spec.net))] + [f"{name}.out"]
+        return [self.parameters[f"{part}.{kind}"] for part in names for kind in ("weight", "bias")]
+
+    def _image(self, i: int) -> tuple[bool, list[tuple[Tensor, Tensor, int]], tuple[Tensor, Tensor]]:
+        leaf = self.spec.observation[i]
+        stack, (channels, _, _), _ = convolutions(leaf)
+        names = [f"image{i}.{j}" for j in range(len(stack))] + [f"image{i}.out"]
+        *convs, out = [(self.parameters[f"{name}.weight"], self.parameters[f"{name}.bias"]) for name in names]
+        last = leaf.shape != (channels, *leaf.shape[1:])
+        return last, [(w, b, conv.stride) for (w, b), conv in zip(convs, stack, strict=True)], out
+
+    def _inputs(self, x: Tensor, images: Sequence[Tensor]) -> Tensor:
+        """Features [B, D] and images [B, *leaf] uint8 -> what both networks take [B, D + IMAGE_FEATURES per image]."""
+        parts = [x]
+        for (channels_last, convs, (weight, bias)), image in zip(self._images, images, strict=True):
+            h = (image.permute(0, 3, 1, 2) if channels_last else image).float() * (1 / 255)
+            for w, b, stride in convs:
+                h = F.relu(F.conv2d(h, w, b, stride))
+            parts.append(F.relu(F.linear(h.flatten(1), weight, bias)))
+        return torch.cat(parts, -1) if images else x
+
+    def _params(self, h: Tensor) -> Tensor:
+        out: Tensor = MLP.apply(h, self._relu, *self._actor)  # type: ignore[no-untyped-call]
+        if self.spec.action.kind != "box":
+            return out
+        return torch.cat([out, self.parameters["actor.log_std"].expand_as(out)], -1)
+
+    def _value(self, h: Tensor) -> Tensor:
+        out: Tensor = MLP.apply(h, self._relu, *self._critic)  # type: ignore[no-untyped-call]
+        return out[:, 0]
+
+    def forward(self, x: Tensor, images: Sequence[Tensor] = ()) -> tuple[Tensor, Tensor]:
+        """Features [B, D] float32 and images [B, *leaf] uint8 -> distribution params [B, P], value [B]."""
+        h = self._inputs(x, images)
+        return self._params(h), self._value(h)
+
+    def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
+        """Distribution params [B, P] alone."""
+        return self._params(self._inputs(x, images))
+
+    def value(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
+        """Value [B] alone."""
+        return self._value(self._inputs(x, images))
+
+
+def _initial(fields: Sequence[Field], seed: int) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    parts = []
+    for field in fields:
+        part = torch.zeros(field.shape)
+        if field.gain:
+            torch.nn.init.orthogonal_(part, field.gain, generator)
+        parts.append(part.flatten())
+    return torch.cat(parts)
+
+
+def log_prob_and_entropy(spec: ActionSpec, params: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+    """Of actions [B, *action] under params [B, P]: log π(action) [B] and the entropy of π [B]; see `distributions`."""
+    match spec.kind:
+        case "discrete":
+            return _categorical(params, action)
+        case "multidiscrete":
+            parts = zip(params.split_with_sizes(spec.sizes, -1), action.reshape(len(params), -1).unbind(-1), strict=True)
+            log_probs, entropies = zip(*(_categorical(logits, choice) for logits, choice in parts), strict=True)
+            return torch.stack(log_probs).sum(0), torch.stack(entropies).sum(0)
+        case "multibinary":
+            bits = action.reshape(params.shape).to(params.dtype)
+            softplus = F.softplus(params)
+            return (bits * params - softplus).sum(-1), (softplus - params * torch.sigmoid(params)).sum(-1)
+        case "box":
+            mean, log_std = params.chunk(2, -1)
+            z = (action.reshape(mean.shape) - mean) * torch.exp(-log_std)
+            return (-0.5 * z * z - log_std - LOG_SQRT_2PI).sum(-1), (log_std + (0.5 + LOG_SQRT_2PI)).sum(-1)
+
+
+def _categorical(logits: Tensor, choice: Tensor) -> tuple[Tensor, Tensor]:
+    log_probs = F.log_softmax(logits, -1)
+    return log_probs.gather(-1, choice[:, None])[:, 0], -(log_probs.exp() * log_probs).sum(-1)
+
+
+class TorchPolicy:
+    """Acts as `NumpyPolicy` does, with images. Lanes go one at a time, so each gets the bits it would get alone."""
+
+    def __init__(self, spec: PolicySpec) -> None:
+        self.spec = spec
+        self._net = ActorCritic(spec)
+        self._buffers = np.empty(0, np.float32)
+
+    def load(self, parameters: Floats, buffers: Floats) -> None:
+        """Act with these from now on. Raises ValueError when the sizes do not fit the spec."""
+        count = self._net.acting_size
+        if parameters.shape != (count,) or buffers.shape != (buffer_size(self.spec),):
+            raise ValueError(
+                f"weights expected {count} parameters and {buffer_size(self.spec)} buffers, "
+                f"got {parameters.shape} and {buffers.shape}"
+            )
+        np.copyto(self._net.flat.numpy()[:count], parameters)
+        self._buffers = buffers
+
+    def __call__(self, leaves: Sequence[Array]) -> Floats:
+        """Distribution parameters [L, N, P] of the actions in these observations [L, N, *leaf]."""
+        x = features(self.spec, leaves)
+        if self.spec.normalize_observations:
+            x = normalized(x, *np.split(self._buffers, 2))
+        images = [array for leaf, array in zip(self.spec.observation, leaves, strict=True) if leaf.is_image]
+        with torch.no_grad():
+            lanes = [
+                self._net.params(torch.tensor(x[lane]), [torch.tensor(image[lane]) for image in images])
+                for lane in range(len(x))
+            ]
+            return np.asarray(torch.stack(lanes).numpy())
