@@ -12,7 +12,7 @@ Heartbeat shows to be lost on the way is said again. Every ticket and every tran
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -385,15 +385,9 @@ class Roster:
         held = set(heartbeat.tickets)
         missing = [t for t, said_at in member.tickets.items() if t not in held and heartbeat.replies > said_at]
         out += self._collect(member, missing)
-        foreign = [life for life in heartbeat.lanes if not self._owns(member, life)]
-        if foreign:
-            out.append((peer, Release(member.session, tuple(foreign))))
         member.replies += 1
         out.append((peer, HeartbeatReply(member.session, member.replies, self._received(member.lanes))))
         return out + self._deal()
-
-    def _owns(self, member: Member, life: LaneLife) -> bool:
-        return life.lane in member.lanes and life.incarnation == self.lanes[life.lane].incarnation
 
     def _acknowledge(self, member: Member, version: int) -> None:
         member.acknowledged = max(member.acknowledged, version)
@@ -410,8 +404,9 @@ class Roster:
         member.under_way, member.said_at = newest.version, member.replies
         return [(member.peer, newest)]
 
-    def _received(self, lanes: Iterable[int]) -> tuple[Received, ...]:
-        return tuple(Received(n, self.lanes[n].incarnation, self.lanes[n].below) for n in lanes)
+    def _received(self, lanes: set[int]) -> tuple[Received, ...]:
+        mine = [self.lanes[number] for number in lanes]
+        return tuple(Received(lane.number, lane.incarnation, lane.below, tuple(lane.ahead)) for lane in mine)
 
     def _collect(self, member: Member, tickets: Sequence[int]) -> list[Out]:
         """Collect messages for these outstanding tickets: one for each version that they were dealt under."""
@@ -420,8 +415,7 @@ class Roster:
             chosen = [self.tickets[number] for number in tickets if self.tickets[number].version == version]
             permits = tuple(Permit(ticket.number, ticket.lane, ticket.incarnation) for ticket in chosen)
             member.tickets |= {ticket.number: member.replies for ticket in chosen}
-            lanes = sorted({ticket.lane for ticket in chosen})
-            out.append((member.peer, Collect(member.session, version, permits, self._received(lanes))))
+            out.append((member.peer, Collect(member.session, version, permits, self._received(member.lanes))))
         return out
 
     def _forget(self, member: Member, event: type, why: str) -> list[Out]:

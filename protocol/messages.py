@@ -57,9 +57,8 @@ class Rejoin(Message, frozen=True):
 
 
 class Weights(Message, frozen=True):
-    """The newest weights."""
+    """The newest weights. They name no session, so that they are encoded once however many workers there are."""
 
-    session: int
     version: int
     parameters: Array
     """[P] float32, the acting part of the flat parameter buffer"""
@@ -76,11 +75,13 @@ class Permit(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Received(msgspec.Struct, frozen=True, array_like=True):
-    """The learner has every rollout of this life of the lane whose sequence is below `below`."""
+    """The learner has the rollouts of this life of the lane whose sequence is below `below`, and those in `ahead`."""
 
     lane: int
     incarnation: int
     below: int
+    ahead: tuple[int, ...] = ()
+    """arrived although an earlier one was lost on the way"""
 
 
 class Collect(Message, frozen=True):
@@ -89,7 +90,8 @@ class Collect(Message, frozen=True):
     session: int
     version: int
     permits: tuple[Permit, ...]
-    received: tuple[Received, ...] = ()
+    received: tuple[Received, ...]
+    """one for each lane that is the worker's: a lane that is missing lives elsewhere"""
 
 
 class LaneLife(msgspec.Struct, frozen=True, array_like=True):
@@ -110,11 +112,12 @@ class Heartbeat(Message, frozen=True):
     """The worker's account of itself. The learner compares it with its own, and says again what was lost."""
 
     session: int
+    replies: int
+    """number of the last HeartbeatReply seen: what the learner said before it has arrived, or is lost"""
     version: int
-    """newest weights held"""
+    """newest weights held; -1 before the first"""
     tickets: tuple[int, ...]
     """held and not finished"""
-    lanes: tuple[LaneLife, ...]
     steps: int
     """env steps since the worker started"""
     stages: dict[str, float]
@@ -122,9 +125,10 @@ class Heartbeat(Message, frozen=True):
 
 
 class HeartbeatReply(Message, frozen=True):
-    """I am here too, and this is what I have of you."""
+    """I am here too, and this is what I have of each of your lanes; a lane that is missing lives elsewhere."""
 
     session: int
+    number: int
     received: tuple[Received, ...]
 
 

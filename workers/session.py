@@ -8,7 +8,7 @@ way is repaired by the next Heartbeat, because it lists all that this worker hol
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -171,6 +171,21 @@ class _Lane:
     done: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED_TICKETS))
 
 
+@dataclass
+class _Stay:
+    """What is held within one session; nothing of it outlives the session."""
+
+    lanes: dict[int, _Lane] = field(default_factory=dict)
+    weights: Weights | None = None
+    in_hand: tuple[int, ...] = ()  # tickets being collected
+    replies: int = 0
+    said_version: int = -1  # newest version that a message of ours has named
+
+    @property
+    def version(self) -> int:
+        return -1 if self.weights is None else self.weights.version
+
+
 class Session:
     """One worker's side, from its first Hello to its last word."""
 
@@ -191,7 +206,7 @@ class Session:
         self._heard_s = self._due_s = self._joining_s = now
         self._backoff_s = HELLO_FIRST_S
         self._reason = ""
-        self._forget()
+        self._stay = _Stay()
         self._join(now)
 
     # ---------------------------------------------------------------- in
@@ -214,16 +229,16 @@ class Session:
         self._heard_s = now
         match message:
             case Weights(version):
-                if version > self._version:
-                    self._weights = message
+                if version > self._stay.version:
+                    self._stay.weights = message
             case Collect(_, version, permits, received):
-                self._arrived(received)
-                return [effect for permit in permits for effect in self._permit(permit, version)]
+                closed = self._arrived(received)
+                return closed + [effect for permit in permits for effect in self._permit(permit, version)]
             case Release(_, lanes):
                 return self._release(lanes)
             case HeartbeatReply(_, number, received):
-                self._replies = number
-                self._arrived(received)
+                self._stay.replies = number
+                return self._arrived(received)
         return []
 
     def tick(self, now: float) -> list[Effect]:
@@ -243,10 +258,10 @@ class Session:
         assert self.run is not None
         if now - self._heard_s > self.run.learner_timeout_s:
             return self._rejoin(Silence(), f"the learner was silent for {self.run.learner_timeout_s:.0f} s", now)
-        if now < self._due_s and self._said_version == self._version:
+        if now < self._due_s and self._stay.said_version == self._stay.version:
             return []
         self._due_s = now + self.run.heartbeat_s
-        self._said_version = self._version
+        self._stay.said_version = self._stay.version
         return [Say(self._heartbeat())]
 
     def next_due_s(self) -> float:
@@ -268,30 +283,30 @@ class Session:
 
     def next_task(self) -> Task | None:
         """The oldest startable ticket of every lane, to be collected together; None when there is none."""
-        if self.state is not State.READY or self._weights is None or self._in_hand:
+        if self.state is not State.READY or self._stay.weights is None or self._stay.in_hand:
             return None
         chosen = []
-        for number, lane in sorted(self._lanes.items()):
-            startable = [ticket for ticket, version in lane.held.items() if version <= self._version]
+        for number, lane in sorted(self._stay.lanes.items()):
+            startable = [ticket for ticket, version in lane.held.items() if version <= self._stay.version]
             if startable:
                 chosen.append(Assignment(min(startable), number, lane.incarnation, lane.sequence))
         if not chosen:
             return None
-        self._in_hand = tuple(assignment.ticket for assignment in chosen)
-        return Task(self.session, self._weights, tuple(chosen))
+        self._stay.in_hand = tuple(assignment.ticket for assignment in chosen)
+        return Task(self.session, self._stay.weights, tuple(chosen))
 
     def finished(self, rollouts: Sequence[Rollout]) -> list[Effect]:
         """The task in hand is done."""
-        self._in_hand = ()
+        self._stay.in_hand = ()
         effects: list[Effect] = []
         for rollout in rollouts:
-            lane = self._lanes.get(rollout.lane)
+            lane = self._stay.lanes.get(rollout.lane)
             if rollout.session != self.session or lane is None or rollout.ticket not in lane.held:
                 continue  # the session ended, or the lane was released, while it was collected
             del lane.held[rollout.ticket]
             lane.kept[rollout.ticket] = rollout
             lane.sequence += 1
-            self._said_version = max(self._said_version, rollout.version)
+            self._stay.said_version = max(self._stay.said_version, rollout.version)
             effects.append(Say(rollout))
         if self.state is State.DRAINING:
             effects += self._goodbye()
@@ -301,32 +316,24 @@ class Session:
         """True when nobody wants this task any more."""
         return self.state in (State.JOINING, State.LEFT) or task.session != self.session
 
-    # ---------------------------------------------------------------- inside
+    def in_memory(self) -> int:
+        """How many tickets and rollouts are held: at most what the learner has outstanding, so memory is bounded."""
+        return sum(len(lane.held) + len(lane.kept) for lane in self._stay.lanes.values())
 
-    @property
-    def _version(self) -> int:
-        return -1 if self._weights is None else self._weights.version
+    # ---------------------------------------------------------------- inside
 
     def _join(self, now: float) -> None:
         """Begin to join, as if for the first time."""
         self._attempt += 1
         self._joining_s = self._due_s = now
         self._backoff_s = HELLO_FIRST_S
-        self._forget()
-
-    def _forget(self) -> None:
-        """Nothing of a session outlives it."""
-        self._lanes: dict[int, _Lane] = {}
-        self._weights: Weights | None = None
-        self._in_hand: tuple[int, ...] = ()  # tickets being collected
-        self._replies = 0
-        self._said_version = -1  # newest version that a message of ours has named
+        self._stay = _Stay()
 
     def _welcome(self, message: Welcome, now: float) -> list[Effect]:
         if message.attempt != self._attempt or (self.state is State.READY and message.session == self.session):
             return []  # an answer to an earlier Hello, or a repeat
         self._become(message)
-        self._forget()
+        self._stay = _Stay()
         self.run, self.session = message.run, message.session
         self._heard_s = now
         self._due_s = now + message.run.heartbeat_s
@@ -337,14 +344,14 @@ class Session:
         self._become(event)
         if self.state is State.LEFT:
             return [Leave(1, reason)]
-        closing = tuple(LaneLife(number, lane.incarnation) for number, lane in self._lanes.items())
+        closing = tuple(LaneLife(number, lane.incarnation) for number, lane in self._stay.lanes.items())
         self._join(now)
         return [Close(closing), *self.tick(now)]
 
     def _permit(self, permit: Permit, version: int) -> list[Effect]:
-        lane = self._lanes.get(permit.lane)
+        lane = self._stay.lanes.get(permit.lane)
         if lane is None or permit.incarnation > lane.incarnation:
-            lane = self._lanes[permit.lane] = _Lane(permit.incarnation)
+            lane = self._stay.lanes[permit.lane] = _Lane(permit.incarnation)
         if permit.incarnation < lane.incarnation or permit.ticket in lane.held or permit.ticket in lane.done:
             return []
         if permit.ticket in lane.kept:
@@ -352,33 +359,35 @@ class Session:
         lane.held[permit.ticket] = version
         return []
 
-    def _arrived(self, received: Iterable[Received]) -> None:
-        """Let go of the rollouts that the learner has."""
-        for number, incarnation, below in ((r.lane, r.incarnation, r.below) for r in received):
-            lane = self._lanes.get(number)
-            if lane is None or lane.incarnation != incarnation:
+    def _arrived(self, received: Sequence[Received]) -> list[Effect]:
+        """Let go of the rollouts that the learner has, and of lanes that live elsewhere (a Release was lost)."""
+        for theirs in received:
+            lane = self._stay.lanes.get(theirs.lane)
+            if lane is None or lane.incarnation != theirs.incarnation:
                 continue
             for ticket, rollout in list(lane.kept.items()):
-                if rollout.sequence < below:
+                if rollout.sequence < theirs.below or rollout.sequence in theirs.ahead:
                     del lane.kept[ticket]
                     lane.done.append(ticket)
+        mine = {theirs.lane for theirs in received}
+        foreign = [LaneLife(number, lane.incarnation) for number, lane in self._stay.lanes.items() if number not in mine]
+        return self._release(foreign)
 
-    def _release(self, lives: tuple[LaneLife, ...]) -> list[Effect]:
+    def _release(self, lives: Sequence[LaneLife]) -> list[Effect]:
         gone = []
         for life in lives:
-            lane = self._lanes.get(life.lane)
+            lane = self._stay.lanes.get(life.lane)
             if lane is not None and lane.incarnation <= life.incarnation:
-                del self._lanes[life.lane]
+                del self._stay.lanes[life.lane]
                 gone.append(LaneLife(life.lane, lane.incarnation))
         return [Close(tuple(gone))] if gone else []
 
     def _heartbeat(self) -> Heartbeat:
         return Heartbeat(
             session=self.session,
-            replies=self._replies,
-            version=self._version,
-            tickets=tuple(ticket for lane in self._lanes.values() for ticket in lane.held),
-            lanes=tuple(LaneLife(number, lane.incarnation) for number, lane in self._lanes.items()),
+            replies=self._stay.replies,
+            version=self._stay.version,
+            tickets=tuple(ticket for lane in self._stay.lanes.values() for ticket in lane.held),
             steps=self.steps,
             stages=dict(self.stages),
         )
@@ -388,10 +397,10 @@ class Session:
         self._reason = reason
         if self.state is State.LEFT:
             return [Leave(0, reason)]
-        return [] if self._in_hand else self._goodbye()
+        return [] if self._stay.in_hand else self._goodbye()
 
     def _goodbye(self) -> list[Effect]:
-        unfinished = tuple(ticket for lane in self._lanes.values() for ticket in lane.held)
+        unfinished = tuple(ticket for lane in self._stay.lanes.values() for ticket in lane.held)
         return [Say(Goodbye(self.session, self._reason, unfinished)), *self._leave(Emptied(), 0, self._reason)]
 
     def _leave(self, event: object, exit_code: int, reason: str) -> list[Effect]:
