@@ -1,0 +1,38 @@
+"""Files that are there whole or not at all.
+
+The law: written beside the target under a name that ends in `.tmp`, flushed to the disk, and only then put in its place; the
+folder is flushed too. Whatever fails, the target stays as it was and nothing is left beside it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import BinaryIO
+
+TEMPORARY = ".tmp"
+
+
+def write_atomically(target: Path, write: Callable[[BinaryIO], object]) -> None:
+    """Let `write` fill the file, then put it in place of the target. Raises what `write` or the file system raises."""
+    temporary = target.with_name(target.name + TEMPORARY)
+    try:
+        with temporary.open("wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, target)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    _flush_folder(target.parent)
+
+
+def _flush_folder(folder: Path) -> None:
+    """Make the new name itself survive a power cut."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

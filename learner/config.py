@@ -1,0 +1,236 @@
+"""The configuration of a run: one record, whose texts are the help of the command line. Pure but for reading TOML files.
+
+Resolution, weakest first: the defaults here < the preset of (algorithm, environment) < a TOML file < flags or keyword
+arguments. A setting has one name: the field `learning_rate` is the TOML key `learning_rate` and the flag `--learning-rate`.
+The algorithm's own settings stand in a TOML table named after it, `[ppo]`, and among the other flags.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args, get_type_hints
+
+import msgspec
+import tomli_w
+from msgspec import Meta
+from tyro.conf import Positional
+
+from learner.algorithms import ALGORITHMS
+from learner.algorithms.ppo import PPOConfig
+from protocol.errors import UsageError
+from protocol.link import check_address
+
+PRESETS = Path(__file__).with_name("presets.toml")
+Scalar = bool | int | float | str
+Count = Annotated[int, Meta(ge=1)]
+Natural = Annotated[int, Meta(ge=0)]
+Seconds = Annotated[float, Meta(gt=0)]
+
+
+class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Everything that decides how a run goes."""
+
+    env: Positional[str] = ""
+    """anything gymnasium.make takes: CartPole-v1, ALE/Pong-v5, my_package.envs:MyEnv-v0"""
+    env_kwargs: dict[str, Scalar] = {}
+    """keyword arguments of gymnasium.make: name value name value …"""
+    algo: str = "ppo"
+    """the algorithm: ppo"""
+    algorithm: PPOConfig = PPOConfig()
+    """the algorithm's own settings"""
+
+    steps: Count = 100_000
+    """env steps to train for, all copies together"""
+    seed: Natural = 1
+    """everything random follows from it"""
+    workers: Count = 2
+    """worker processes on this machine"""
+    envs: Count = 8
+    """env copies, all workers together; a multiple of lanes"""
+    lanes: Count = 4
+    """groups into which the env copies are divided; workers share out the lanes, and results do not depend on the workers"""
+    max_lag: Natural = 0
+    """how many versions old the weights behind a rollout may be; 0 is synchronous"""
+
+    transport: Literal["inproc", "ipc", "tcp"] = "ipc"
+    """how local workers are reached: threads of this process, local sockets, or loopback TCP"""
+    bind: str = "tcp://127.0.0.1:5555"
+    """where `millrace learner` listens for workers"""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """where the learner learns"""
+    torch_threads: Count = 1
+    """threads of PyTorch in the learner; more than 1 pays only for large networks"""
+    run_dir: str = "runs"
+    """where run folders go"""
+
+    eval_episodes: Count = 100
+    """greedy episodes of an evaluation"""
+    eval_every: Natural = 0
+    """env steps between greedy evaluations while training; 0: only the one at the end"""
+    target_return: float | None = None
+    """stop as soon as a greedy evaluation averages at least this"""
+    checkpoint_every_s: Seconds = 60.0
+    """seconds between checkpoints"""
+    keep_checkpoints: Count = 3
+    """how many of the newest checkpoints stay"""
+
+    min_workers: Natural = 0
+    """start when so many workers have joined; 0: all local workers, or the first one"""
+    heartbeat_s: Seconds = 1.0
+    """seconds between a worker's accounts of itself"""
+    worker_timeout_s: Seconds = 5.0
+    """a worker silent for so many seconds is given up, and its lanes go elsewhere"""
+    no_workers_timeout_s: Seconds = 60.0
+    """end the run, after a checkpoint, when no worker has been here for so many seconds"""
+    stall_timeout_s: Seconds = 600.0
+    """end the run, after a checkpoint, when nothing has arrived for so many seconds"""
+    max_env_failures: Natural = 3
+    """end the run when the environment has raised more often than this"""
+
+    def to_toml(self) -> str:
+        """As text that `from_toml` reads: every setting, in the order of the fields; what is not set is "none"."""
+        plain: dict[str, Any] = msgspec.to_builtins(self)
+        tables = {"env_kwargs": plain.pop("env_kwargs"), self.algo: _without_none(plain.pop("algorithm"))}
+        return tomli_w.dumps(_without_none(plain) | tables)
+
+    @staticmethod
+    def from_toml(text: str, where: str = "config.toml") -> Config:
+        """From text, over the defaults alone (no preset). Raises `UsageError` that names `where`."""
+        return checked(_over_toml(Config(), _parse(text, where), where), where)
+
+
+def resolve(env: str = "", *, file: Path | None = None, preset: str = "auto", **keywords: Any) -> Config:
+    """The configuration of a run from all layers, checked. Raises `UsageError` in one line.
+
+    `preset` is "auto" (that of the environment, if there is one), "none", or the environment whose preset to take.
+    """
+    base = lower_layers(env, keywords.get("algo"), file, preset)
+    return checked(over(base, keywords, "keyword argument"))
+
+
+def lower_layers(env: str, algo: str | None, file: Path | None, preset: str = "auto") -> Config:
+    """What stands below flags and keyword arguments: defaults, preset, file. Fields fit their types, and no more."""
+    where = str(file)
+    table: dict[str, Any] = {}
+    if file is not None:
+        try:
+            table = _parse(file.read_text(), where)
+        except (OSError, UnicodeDecodeError) as error:
+            says = error.strerror if isinstance(error, OSError) else "it is not text"
+            raise UsageError(f"config file {where} cannot be read: {says}") from error
+    env = env or str(table.get("env", ""))
+    config = _of_algorithm(algo or str(table.get("algo", "ppo")))
+    if preset != "none":
+        known = tomllib.loads(PRESETS.read_text()).get(config.algo, {})
+        name = env if preset == "auto" else preset
+        if name not in known and preset != "auto":
+            raise UsageError(f"preset {name}: {config.algo} has none of this name{nearest(name, known)}")
+        config = over(config, known.get(name, {}), str(PRESETS))
+    config = _over_toml(config, {**table, "algo": config.algo}, where)
+    return over(config, {"env": env}, "ENV")
+
+
+def over(config: Config, values: Mapping[str, Any], where: str) -> Config:
+    """The configuration with these values, named flatly, laid over it; `env_kwargs` are merged. Types are checked."""
+    config = _of_algorithm(values["algo"]) if values.get("algo", config.algo) != config.algo else config
+    plain: dict[str, Any] = msgspec.to_builtins(config)
+    own: dict[str, Any] = plain["algorithm"]
+    for name, value in values.items():
+        if name in own:
+            own[name] = _fitting(config.algorithm, name, value)
+        elif name == "env_kwargs" and isinstance(value, Mapping):
+            plain[name] |= value
+        elif name in plain and name != "algorithm":
+            plain[name] = _fitting(config, name, value)
+        else:
+            raise UsageError(f"{where}: unknown setting {name}{nearest(name, [*plain, *own])}")
+    return _typed(plain, where)
+
+
+def checked(config: Config, where: str = "") -> Config:
+    """The configuration, if a run can be made of it. Raises `UsageError` that says what could."""
+    at = f"{where}: " if where else ""
+    config = _typed(msgspec.to_builtins(config), where)
+    if not config.env:
+        raise UsageError(f"{at}which environment? expected one that gymnasium.make takes, as in: millrace train CartPole-v1")
+    if config.envs % config.lanes:
+        fewer = config.envs - config.envs % config.lanes
+        near = f"{fewer} or {fewer + config.lanes}" if fewer else f"{config.lanes}"
+        divisor = max(n for n in range(1, min(config.lanes, config.envs) + 1) if config.envs % n == 0)
+        raise UsageError(
+            f"{at}{config.envs} envs cannot be shared evenly among {config.lanes} lanes; take {near}, or {divisor} lanes"
+        )
+    check_address(config.bind)
+    return config
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """`; did you mean …?` if something known is close to the name, else nothing."""
+    found = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
+    return f"; did you mean {found[0]}?" if found else ""
+
+
+def _without_none(plain: dict[str, Any]) -> dict[str, Any]:
+    return {name: "none" if value is None else value for name, value in plain.items()}
+
+
+def _of_algorithm(algo: str) -> Config:
+    if algo not in ALGORITHMS:
+        raise UsageError(f"algo {algo}: expected one of {', '.join(ALGORITHMS)}{nearest(algo, ALGORITHMS)}")
+    return Config(algo=algo, algorithm=ALGORITHMS[algo][0]())
+
+
+def _parse(text: str, where: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise UsageError(f"{where} is not TOML: {error}") from error
+
+
+def _over_toml(config: Config, table: dict[str, Any], where: str) -> Config:
+    """Tables of other algorithms are let be, so that one file can hold the settings of several."""
+    algo = str(table.get("algo", config.algo))
+    top = {name: value for name, value in table.items() if name not in ALGORITHMS}
+    own = table.get(algo, {})
+    if not isinstance(own, dict):
+        raise UsageError(f"{where}: {algo} expected a table, [{algo}], got {own}")
+    if strays := top.keys() & set(msgspec.structs.asdict(config.algorithm)):
+        raise UsageError(f"{where}: {min(strays)} is a setting of the algorithm; put it in the table [{algo}]")
+    if strays := own.keys() & set(msgspec.structs.asdict(config)):
+        raise UsageError(f"{where}: {min(strays)} is a setting of the run; put it above the table [{algo}]")
+    return over(config, top | own, where)
+
+
+def _fitting(record: msgspec.Struct, name: str, value: Any) -> Any:
+    """The value as its field wants it: 1e5 for a whole number is a whole number, and "none" is None where that may be."""
+    default = getattr(type(record)(), name)
+    if value == "none" and default is None:
+        return None
+    if isinstance(value, float) and type(default) is int and value.is_integer():
+        return int(value)
+    return value
+
+
+def _typed(plain: dict[str, Any], where: str) -> Config:
+    """The record of these values. Raises `UsageError` that names the setting, what was expected and what was got."""
+    try:
+        kind: type[msgspec.Struct] = ALGORITHMS[plain["algo"]][0]
+        own = msgspec.convert(plain["algorithm"], kind)
+        return msgspec.structs.replace(msgspec.convert({**plain, "algorithm": {}}, Config), algorithm=own)
+    except msgspec.ValidationError as error:
+        raise UsageError(f"{where}: {_what_is_wrong(plain, str(error))}".removeprefix(": ")) from error
+
+
+def _what_is_wrong(plain: dict[str, Any], says: str) -> str:
+    """Of msgspec's text: the setting, what was expected and what was got."""
+    expected, _, path = says.replace(" | null", ' or "none"').replace("`object`", "table").partition(" - at `$.")
+    name = re.split(r"[.\[`]", path)[0]
+    record = ALGORITHMS[plain["algo"]][0] if name in plain["algorithm"] else Config
+    got = plain["algorithm"].get(name, plain.get(name))
+    if expected.startswith("Invalid enum value"):
+        return f"{name} expected one of {', '.join(get_args(get_type_hints(record)[name]))}, got {got!r}"
+    return f"{name} {expected.replace('`', '').replace('Expected', 'expected').partition(', got ')[0]}, got {got!r}"
