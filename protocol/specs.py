@@ -6,11 +6,9 @@ agreed to run code (an address only this user can reach). Nothing that a worker 
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from typing import Literal
 
-import cloudpickle
 import gymnasium
 import msgspec
 
@@ -34,12 +32,16 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """From an id, or from a callable that takes `kwargs` and returns a `gymnasium.Env`."""
         if isinstance(env, str):
             return EnvSpec(env, kwargs or {})
+        import cloudpickle
+
         return EnvSpec(getattr(env, "__name__", type(env).__name__), kwargs or {}, cloudpickle.dumps(env))
 
     def make(self, render_mode: str | None = None) -> gymnasium.Env[object, object]:
         """One env copy. Raises `UsageError` with what to do when the id is unknown or a package is missing."""
         extra: dict[str, object] = {} if render_mode is None else {"render_mode": render_mode}
         if self.factory is not None:
+            import cloudpickle
+
             env = cloudpickle.loads(self.factory)(**self.kwargs, **extra)
             if not isinstance(env, gymnasium.Env):
                 raise UsageError(f"env factory {self.id}: expected it to return a gymnasium.Env, got {type(env).__name__}")
@@ -68,13 +70,6 @@ def _why_not_made(env_id: str, error: Exception) -> str:
             return f"environment {env_id} is not registered: {says}; give one as my_module:{env_id} to import it first"
         case _:
             return f"environment {env_id} cannot be made: {says}"
-
-
-def import_module_of(env_id: str) -> None:
-    """Import the `module` of `module:EnvId`, so that its errors are its own and not gymnasium's."""
-    module, colon, _ = env_id.partition(":")
-    if colon:
-        importlib.import_module(module)
 
 
 class Leaf(msgspec.Struct, frozen=True):

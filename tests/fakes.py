@@ -267,7 +267,11 @@ class World:
     # ------------------------------------------------------------ fate
 
     def _schedule_faults(self, workers: int) -> None:
-        faults, when = self.faults, lambda: self.random.uniform(0.0, self.faults.until_s)
+        faults = self.faults
+
+        def when() -> float:
+            return self.random.uniform(0.0, faults.until_s)
+
         for _ in range(faults.deaths):
             self.at(when(), self._kill_one)
         for _ in range(faults.freezes):

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable, Sequence
 from time import perf_counter
 from typing import Any, NamedTuple
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -22,20 +21,11 @@ from protocol.spaces import writer
 from protocol.specs import PolicySpec, RunSpec
 from workers.copies import Copies, CopyLoop, CopyRaised, Pulse
 from workers.lane import EnvironmentBroke, Lane, environment_raised
+from workers.session import Assignment
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
 OpenCopies = Callable[[RunSpec, Pulse], Copies]
-
-
-class Assignment(msgspec.Struct, frozen=True):
-    """Collect one rollout on this lane."""
-
-    ticket: int
-    lane: int
-    incarnation: int
-    """if it is not the one that lives here, the lane begins afresh"""
-    sequence: int
 
 
 def make_policy(spec: PolicySpec) -> Policy:

@@ -140,6 +140,7 @@ class Assignment:
     ticket: int
     lane: int
     incarnation: int
+    """if it is not the one that lives here, the lane begins afresh"""
     sequence: int
 
 

@@ -1,0 +1,223 @@
+"""What a run writes while it goes on: metrics, checkpoints, the policy, the summary; and what a resumed run reads back.
+
+The law: a checkpoint is written between two updates, never within one, and holds everything that the next update depends
+on. A disk that is full costs a warning, never the run.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import msgspec
+
+from learner import checkpoint
+from learner.algorithms import Algorithm
+from learner.config import Config
+from learner.evaluate import Evaluation, evaluate
+from learner.hub import Hub
+from learner.ledger import Ledger
+from learner.metrics import EpisodeWindow, MetricsLog, Progress
+from learner.run_folder import Outcome, RunFolder, Summary, load_policy
+from protocol.errors import CheckpointError, RunError
+from protocol.rollout import Batch
+from protocol.specs import RunSpec
+
+log = logging.getLogger("millrace.learner")
+
+EVALUATION_SEED = 1_000_000  # far from the seeds of training
+
+
+class Past(msgspec.Struct, kw_only=True):
+    """Where a run stands: zero at its start, from a checkpoint when it is resumed."""
+
+    version: int = 0
+    env_steps: int = 0
+    wall_s: float = 0.0
+    ledger: Ledger = msgspec.field(default_factory=Ledger)
+    incarnations: list[int] = []
+    episodes: list[Any] = []
+
+
+def recall(folder: RunFolder, algorithm: Algorithm) -> Past:
+    """Load the newest whole checkpoint into the algorithm. Raises `CheckpointError` when there is none."""
+    found, warnings = checkpoint.newest(folder.path)
+    for line in warnings:
+        log.warning("%s", line)
+    try:
+        past = msgspec.convert(found.state["past"], Past)
+        algorithm.load_state_dict(found.state["algorithm"])
+    except (KeyError, ValueError, TypeError, RuntimeError) as error:
+        raise CheckpointError(
+            f"checkpoint {found.path}: expected the state of this configuration, got another ({error}); "
+            "resume it with the settings it was made with"
+        ) from error
+    # The tickets that were outstanding died with the learner that dealt them, and so did the rollouts not yet used.
+    past.ledger.lost += past.ledger.outstanding
+    past.ledger.transitions_late += past.ledger.transitions_waiting
+    return past
+
+
+class Journal:
+    """The written side of one run."""
+
+    def __init__(
+        self,
+        config: Config,
+        folder: RunFolder,
+        spec: RunSpec,
+        algorithm: Algorithm,
+        hub: Hub,
+        past: Past,
+        watch: Callable[[Progress], None],
+    ) -> None:
+        self.config, self.folder, self.spec = config, folder, spec
+        self.algorithm, self.hub = algorithm, hub
+        self.version, self.env_steps = past.version, past.env_steps
+        self.evaluation: Evaluation | None = None
+        self.stages = {"update": 0.0, "other": 0.0}
+        self._window = EpisodeWindow.of_state(past.episodes)
+        self._metrics = MetricsLog(folder.path, past.env_steps)
+        self._watch = watch
+        self._wall_before_s, self._steps_before = past.wall_s, past.env_steps
+        self._began_s = self._saved_s = time.monotonic()
+        self._evaluated_version = -1
+        self._evaluate_at = past.env_steps + config.eval_every
+        self._note = ""
+
+    # ---------------------------------------------------------------- what the loop calls
+
+    def stop_reason(self) -> str | None:
+        """Why the run should end now, or None."""
+        target, evaluation = self.config.target_return, self.evaluation
+        if target is not None and evaluation is not None and evaluation.return_mean >= target:
+            return f"target return {target:g} reached"
+        return "all steps done" if self.env_steps >= self.config.steps else None
+
+    def updated(self, batch: Batch, metrics: Mapping[str, float], update_s: float) -> None:
+        """An update was made and published: count, write, and now and then evaluate and checkpoint."""
+        began_s = time.monotonic()
+        self.version += 1
+        self.env_steps += batch.env_steps
+        self.stages["update"] += update_s
+        self._window.extend(batch.episodes)
+        extra: dict[str, float] = {}
+        if self.config.eval_every and self.env_steps >= self._evaluate_at:
+            self._evaluate_at += self.config.eval_every
+            found = self.evaluate()
+            extra = {"eval/mean_reward": found.return_mean, "eval/mean_ep_length": found.length_mean}
+        progress = self.progress()
+        self._surely(lambda: self._metrics.write(progress, {**metrics, **extra}))
+        self._watch(progress)
+        if began_s - self._saved_s > self.config.checkpoint_every_s:
+            self.save()
+        self.stages["other"] += time.monotonic() - began_s
+
+    def evaluate(self) -> Evaluation:
+        """Greedy episodes of the newest policy; the workers are answered meanwhile."""
+        if self.evaluation is None or self._evaluated_version != self.version:
+            self._write_policy()
+            _, env, policy = load_policy(self.folder.path)
+            env = self.spec.env if self.spec.env.factory is not None else env
+            seed = EVALUATION_SEED + self.config.seed
+            action = self.spec.policy.action
+            self.evaluation = evaluate(env, policy, action, self.config.eval_episodes, seed, self.hub.pulse)
+            self._evaluated_version = self.version
+            self._note = f"greedy return {self.evaluation.return_mean:.1f} after {self.env_steps:,} steps"
+        return self.evaluation
+
+    def save(self) -> None:
+        """A checkpoint and the policy; a disk that does not take them costs a warning."""
+        past = Past(
+            version=self.version,
+            env_steps=self.env_steps,
+            wall_s=self._wall_s(),
+            ledger=self.hub.roster.ledger,
+            incarnations=self.hub.roster.incarnations(),
+            episodes=self._window.state(),
+        )
+        state = {"past": msgspec.to_builtins(past), "algorithm": self.algorithm.state_dict()}
+        self._saved_s = time.monotonic()
+        keep = self.config.keep_checkpoints
+        self._surely(lambda: checkpoint.save(self.folder.path, state, self.env_steps, keep))
+        self._surely(self._write_policy)
+
+    def finish(self, reason: str) -> None:
+        """The summary."""
+        wall_s = self._wall_s()
+        self._surely(
+            lambda: self.folder.write_summary(
+                Summary(
+                    env=self.config.env,
+                    algo=self.config.algo,
+                    seed=self.config.seed,
+                    env_steps=self.env_steps,
+                    updates=self.version,
+                    wall_s=wall_s,
+                    env_steps_per_s=self.env_steps / wall_s if wall_s else 0.0,
+                    stop_reason=reason,
+                    return_mean_100=self._window.return_mean,
+                    evaluation=self._outcome(),
+                    ledger=self.hub.roster.ledger.counts(),
+                    stages=self._stages(),
+                )
+            )
+        )
+        self._watch(self.progress())
+
+    def close(self) -> None:
+        """Close the files."""
+        self._metrics.close()
+
+    def progress(self) -> Progress:
+        """How far the run is."""
+        wall_s = self._wall_s()
+        here_s = wall_s - self._wall_before_s
+        lags = self.hub.lags or [0]
+        return Progress(
+            run=str(self.folder.path),
+            env_steps=self.env_steps,
+            total_steps=self.config.steps,
+            updates=self.version,
+            wall_s=wall_s,
+            steps_per_s=(self.env_steps - self._steps_before) / here_s if here_s else 0.0,
+            return_mean=self._window.return_mean,
+            length_mean=self._window.length_mean,
+            lag_mean=sum(lags) / len(lags),
+            lag_max=max(lags),
+            workers_alive=len(self.hub.roster.members),
+            workers_expected=self.config.workers,
+            ledger=self.hub.roster.ledger.counts(),
+            stages=self._stages(),
+            note=self._note,
+        )
+
+    # ---------------------------------------------------------------- inside
+
+    def _stages(self) -> dict[str, float]:
+        """Seconds: of the learner, and of all workers together (as their last heartbeats told)."""
+        stages = {"learner_wait": self.hub.wait_s} | {f"learner_{name}": s for name, s in self.stages.items()}
+        for member in self.hub.roster.members.values():
+            for name, seconds in (member.heartbeat.stages if member.heartbeat else {}).items():
+                stages[f"worker_{name}"] = stages.get(f"worker_{name}", 0.0) + seconds
+        return stages
+
+    def _outcome(self) -> Outcome | None:
+        found = self.evaluation
+        if found is None or self._evaluated_version != self.version:
+            return None
+        return Outcome(episodes=found.episodes, return_mean=found.return_mean, return_std=found.return_std)
+
+    def _write_policy(self) -> None:
+        self.folder.write_policy(self.spec.policy, self.spec.env, *self.algorithm.weights())
+
+    def _wall_s(self) -> float:
+        return self._wall_before_s + time.monotonic() - self._began_s
+
+    def _surely(self, write: Callable[[], object]) -> None:
+        try:
+            write()
+        except RunError as error:
+            log.warning("%s", error)

@@ -1,0 +1,73 @@
+"""`python -m workers ADDRESS`: one worker process. Imports no torch unless the policy looks at images.
+
+Exit codes: 0 drained, told to stop, or its host is gone; 1 broke, or no learner answered; 2 refused or bad usage.
+"""
+
+from __future__ import annotations
+
+import os
+
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_variable, "1")  # before numpy: workers share the cores by being many
+
+import argparse
+import logging
+import signal
+import socket
+import sys
+import time
+
+from protocol.errors import OurError
+from protocol.link import WorkerLink, check_address
+from workers.session import Session
+from workers.worker import Worker, identity, parent_is_gone
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one worker; the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m workers", description="Step an environment for a learner.")
+    parser.add_argument("address", help="where the learner listens: ipc://PATH or tcp://HOST:PORT")
+    parser.add_argument(
+        "--name", default=f"{socket.gethostname()}-{os.getpid()}", help="this worker's name, unique in the run"
+    )
+    parser.add_argument("--parent", type=int, default=0, help="leave when the process of this pid is no longer the parent")
+    parser.add_argument("--join-timeout-s", type=float, default=60.0, help="leave when no learner has answered for so long")
+    parser.add_argument("--no-code", action="store_true", help="refuse an environment that comes as a pickled callable")
+    options = parser.parse_args(argv)
+    logging.basicConfig(level=logging.INFO, format=f"%(asctime)s worker {options.name}: %(message)s", stream=sys.stderr)
+    try:
+        check_address(options.address)
+        link = WorkerLink(options.address, options.name)
+    except OurError as error:
+        sys.stderr.write(f"worker {options.name}: {error}\n")
+        return error.exit_code
+    stops = _count_signals()
+    session = Session(identity(options.name), time.monotonic(), join_timeout_s=options.join_timeout_s)
+    worker = Worker(
+        link,
+        session,
+        told_to_stop=lambda: len(stops) or int(bool(options.parent) and parent_is_gone(options.parent)),
+        accepts_code=options.address.startswith("ipc://") and not options.no_code,
+    )
+    left = worker.run()
+    if left.exit_code:
+        sys.stderr.write(f"worker {options.name}: {_advice(left.reason, options.address)}\n")
+    return left.exit_code
+
+
+def _count_signals() -> list[int]:
+    """SIGTERM and SIGINT ask to leave: the first after the rollout in hand, the second at once."""
+    received: list[int] = []
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda signum, frame: received.append(signum))
+    return received
+
+
+def _advice(reason: str, address: str) -> str:
+    if reason.startswith("no learner answered"):
+        return f"{reason} at {address}; is the learner running, and is this its address?"
+    return reason
+
+
+if __name__ == "__main__":
+    sys.exit(main())

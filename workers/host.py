@@ -1,0 +1,172 @@
+"""Many workers on this machine: started, watched, restarted with backoff, stopped. Knows nothing of what they say.
+
+The law: a worker that ends on purpose (exit code 0) or was refused (2) stays away; any other comes back, after a pause that
+doubles with each death and starts anew once it has been healthy for a while. No worker outlives its host.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import zmq
+
+from protocol.link import WorkerLink
+from workers.session import Leave, Session
+from workers.worker import Worker, identity
+
+BACKOFF_FIRST_S, BACKOFF_MOST_S, HEALTHY_S = 0.5, 30.0, 30.0
+
+
+class Running(Protocol):
+    """A worker that was started: a process or a thread."""
+
+    def ended(self) -> tuple[int, str] | None:
+        """Exit code and reason, or None while it runs."""
+        ...
+
+    def stop(self) -> None:
+        """Ask it to leave."""
+        ...
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait until it has ended; a process that has not by then is killed."""
+        ...
+
+
+class Process:
+    """A worker process of its own; its stderr goes to a file."""
+
+    def __init__(self, address: str, name: str, log: Path | None) -> None:
+        self._log = log
+        command = [sys.executable, "-P", "-m", "workers", address, "--name", name, "--parent", str(os.getpid())]
+        # A child must find what its parent found: a user's environment may lie beside the user's script.
+        path = os.pathsep.join(entry or os.getcwd() for entry in [*sys.path, str(Path(__file__).parents[1])])
+        threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+        with (log or Path(os.devnull)).open("ab") as stderr:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=stderr if log else None,
+                stderr=stderr if log else None,
+                start_new_session=True,  # Ctrl-C in the terminal is the learner's to answer
+                env={**os.environ, **threads, "PYTHONPATH": path},
+            )
+
+    @property
+    def pid(self) -> int:
+        """Of the process."""
+        return self._process.pid
+
+    def ended(self) -> tuple[int, str] | None:
+        """Exit code and reason; a signal is negative."""
+        code = self._process.poll()
+        if code is None:
+            return None
+        if code < 0:
+            return code, f"was killed by {signal.Signals(-code).name}"
+        return code, f"ended with exit code {code}{self._last_line() if code else ''}"
+
+    def stop(self) -> None:
+        """SIGTERM: it finishes the rollout in hand."""
+        if self._process.poll() is None:
+            self._process.terminate()
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait, then kill."""
+        try:
+            self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def _last_line(self) -> str:
+        lines = self._log.read_text(errors="replace").strip().splitlines() if self._log else []
+        return f" ({lines[-1]})" if lines else ""
+
+
+class Thread:
+    """A worker in a thread of this process, over inproc: for debugging and for tests."""
+
+    def __init__(self, address: str, name: str, context: zmq.Context[Any]) -> None:
+        self._stops = 0
+        self._left: Leave | None = None
+        self._thread = threading.Thread(target=self._run, args=(address, name, context), name=name, daemon=True)
+        self._thread.start()
+
+    def _run(self, address: str, name: str, context: zmq.Context[Any]) -> None:
+        session = Session(identity(name, threading.get_ident() % 1_000_000), time.monotonic())
+        link = WorkerLink(address, name, context)
+        self._left = Worker(link, session, told_to_stop=lambda: self._stops, accepts_code=True).run()
+
+    def ended(self) -> tuple[int, str] | None:
+        """Exit code and reason, as a process would have."""
+        if self._thread.is_alive():
+            return None
+        return (self._left.exit_code, self._left.reason) if self._left else (1, "its thread raised")
+
+    def stop(self) -> None:
+        """Ask it to leave."""
+        self._stops += 1
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait; a thread cannot be killed."""
+        self._thread.join(timeout_s)
+
+
+@dataclass
+class _Place:
+    """One worker's place, whoever fills it."""
+
+    name: str
+    running: Running | None
+    started_s: float
+    backoff_s: float = BACKOFF_FIRST_S
+    restart_s: float | None = None
+
+
+class Host:
+    """N workers, w0 to wN-1."""
+
+    def __init__(self, start: Callable[[str], Running], count: int, clock: Callable[[], float] = time.monotonic) -> None:
+        """`start` starts the worker of that name."""
+        self._start, self._clock = start, clock
+        self._stopping = False
+        self.places = [_Place(f"w{number}", start(f"w{number}"), clock()) for number in range(count)]
+
+    def poll(self) -> list[tuple[str, str]]:
+        """The workers that have ended since the last call, and why; those that are due are started again."""
+        ended, now = [], self._clock()
+        for place in self.places:
+            if place.running is not None and (end := place.running.ended()) is not None:
+                code, why = end
+                ended.append((place.name, why))
+                place.running = None
+                if now - place.started_s > HEALTHY_S:
+                    place.backoff_s = BACKOFF_FIRST_S
+                if code not in (0, 2) and not self._stopping:
+                    place.restart_s = now + place.backoff_s
+                    place.backoff_s = min(2 * place.backoff_s, BACKOFF_MOST_S)
+            if place.restart_s is not None and now >= place.restart_s and not self._stopping:
+                place.restart_s = None
+                place.started_s = now
+                place.running = self._start(place.name)
+        return ended
+
+    def stop(self, timeout_s: float = 5.0) -> None:
+        """Ask all to leave, wait at most `timeout_s` for all together, and kill who is left."""
+        self._stopping = True
+        running = [place.running for place in self.places if place.running is not None]
+        for worker in running:
+            worker.stop()
+        deadline_s = self._clock() + timeout_s
+        for worker in running:
+            worker.wait(max(0.0, deadline_s - self._clock()))
