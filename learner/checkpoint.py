@@ -69,7 +69,7 @@ def newest(folder: Path) -> tuple[Checkpoint, list[str]]:
         except _Unreadable as error:
             warnings.append(f"checkpoint {path} is broken ({error}); trying the one before")
     raise CheckpointError(
-        f"run {folder}: expected a whole checkpoint, got {len(paths)} broken ones; start afresh without --resume"
+        f"run {folder}: expected a whole checkpoint, got {len(paths)} broken; start afresh without --resume"
     )
 
 
