@@ -19,7 +19,7 @@ from learner.metrics import Evaluation
 from learner.run_folder import RunFolder
 from protocol.distributions import distribution
 from protocol.errors import EnvironmentFailed
-from protocol.policy import NumpyPolicy, Policy
+from protocol.policy import Policy, make_policy
 from protocol.spaces import observation_leaves, reader, writer
 from protocol.specs import ActionSpec, EnvSpec, PolicySpec
 
@@ -114,13 +114,7 @@ def _play(
 def load_policy(run: Path) -> tuple[Policy, PolicySpec, EnvSpec]:
     """The policy of a run folder, ready to act, and the environment it was made for. Raises `UsageError` in one line."""
     card, parameters, buffers = RunFolder.open(run).read_policy()
-    policy: Policy
-    if card.policy.needs_torch:
-        from protocol.networks import TorchPolicy
-
-        policy = TorchPolicy(card.policy)
-    else:
-        policy = NumpyPolicy(card.policy)
+    policy = make_policy(card.policy)
     policy.load(parameters, buffers)
     return policy, card.policy, EnvSpec(card.env, card.env_kwargs)
 

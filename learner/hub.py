@@ -47,7 +47,7 @@ class Hub:
         """seconds spent waiting for rollouts since the run began"""
         self.lags: list[int] = []
         """lag of each rollout of the last `gather`"""
-        self._dead_workers, self._watch, self._clock = dead_workers, watch, clock
+        self.dead_workers, self.watch, self._clock = dead_workers, watch, clock
         self._env_failures = 0
         self._failure: EnvironmentFailed | None = None
         self._refusal = ""
@@ -121,7 +121,7 @@ class Hub:
     def _turn(self, timeout_s: float) -> None:
         """One turn of waiting: listen, and see whether the run can go on."""
         self._listen(timeout_s)
-        self._watch()
+        self.watch()
         if self._failure is not None:
             raise self._failure
         self._judge()
@@ -156,7 +156,7 @@ class Hub:
             self._send(self.roster.receive(peer, rollout, now))
 
     def _gone(self) -> None:
-        for worker, why in self._dead_workers():
+        for worker, why in self.dead_workers():
             self._send(self.roster.gone(worker, why))
 
     def _send(self, outs: Sequence[Out]) -> None:
@@ -175,12 +175,12 @@ class Hub:
     def _events(self) -> None:
         events, self.roster.events = self.roster.events, []
         for event in events:
-            level = logging.INFO if isinstance(event, Joined) else logging.WARNING
-            log.log(level, "%s", describe(event))
+            expected = isinstance(event, Joined) or (isinstance(event, Left) and event.on_purpose)
+            log.log(logging.INFO if expected else logging.WARNING, "%s", describe(event))
             match event:
                 case Turned(_, why):
                     self._refusal = why
-                case Broke(worker, host, lane, error, traceback):
+                case Broke(worker, host, _, error, traceback):
                     self._env_failures += 1
                     if self._env_failures > self.max_env_failures:
                         counted = f"that was failure {self._env_failures}, at most {self.max_env_failures} are borne"
@@ -209,7 +209,7 @@ def describe(event: Event) -> str:
         case Joined(worker, host, pid):
             return f"worker {worker} ({host}, pid {pid}) joined"
         case Left(worker, why, tickets):
-            return f"worker {worker} {why}; {tickets} of its tickets are dealt again"
+            return f"worker {worker} {why}" + (f"; {tickets} of its tickets are dealt again" if tickets else "")
         case Turned(worker, why):
             return f"worker {worker} was refused: {why}"
         case Broke(worker, host, lane, error, traceback):

@@ -16,12 +16,13 @@ import msgspec
 from learner import checkpoint
 from learner.algorithms import Algorithm
 from learner.config import Config
-from learner.evaluate import Evaluation, evaluate
+from learner.evaluate import evaluate
 from learner.hub import Hub
 from learner.ledger import Ledger
-from learner.metrics import EpisodeWindow, MetricsLog, Progress
-from learner.run_folder import Outcome, RunFolder, Summary, load_policy
+from learner.metrics import EpisodeWindow, Evaluation, MetricsLog, Progress
+from learner.run_folder import RunFolder, Summary
 from protocol.errors import CheckpointError, RunError
+from protocol.policy import make_policy
 from protocol.rollout import Batch
 from protocol.specs import RunSpec
 
@@ -86,6 +87,7 @@ class Journal:
         self._evaluated_version = -1
         self._evaluate_at = past.env_steps + config.eval_every
         self._note = ""
+        self._worker_stages: dict[int, dict[str, float]] = {}  # by session: those of workers that have left count too
 
     # ---------------------------------------------------------------- what the loop calls
 
@@ -118,12 +120,11 @@ class Journal:
     def evaluate(self) -> Evaluation:
         """Greedy episodes of the newest policy; the workers are answered meanwhile."""
         if self.evaluation is None or self._evaluated_version != self.version:
-            self._write_policy()
-            _, env, policy = load_policy(self.folder.path)
-            env = self.spec.env if self.spec.env.factory is not None else env
-            seed = EVALUATION_SEED + self.config.seed
-            action = self.spec.policy.action
-            self.evaluation = evaluate(env, policy, action, self.config.eval_episodes, seed, self.hub.pulse)
+            spec = self.spec
+            policy = make_policy(spec.policy)
+            policy.load(*self.algorithm.weights())
+            seed, episodes = EVALUATION_SEED + self.config.seed, self.config.eval_episodes
+            self.evaluation = evaluate(spec.env, policy, spec.policy.action, episodes, seed, self.hub.pulse)
             self._evaluated_version = self.version
             self._note = f"greedy return {self.evaluation.return_mean:.1f} after {self.env_steps:,} steps"
         return self.evaluation
@@ -159,7 +160,7 @@ class Journal:
                     env_steps_per_s=self.env_steps / wall_s if wall_s else 0.0,
                     stop_reason=reason,
                     return_mean_100=self._window.return_mean,
-                    evaluation=self._outcome(),
+                    evaluation=self.evaluation if self._evaluated_version == self.version else None,
                     ledger=self.hub.roster.ledger.counts(),
                     stages=self._stages(),
                 )
@@ -200,15 +201,12 @@ class Journal:
         """Seconds: of the learner, and of all workers together (as their last heartbeats told)."""
         stages = {"learner_wait": self.hub.wait_s} | {f"learner_{name}": s for name, s in self.stages.items()}
         for member in self.hub.roster.members.values():
-            for name, seconds in (member.heartbeat.stages if member.heartbeat else {}).items():
+            if member.heartbeat is not None:
+                self._worker_stages[member.session] = member.heartbeat.stages
+        for told in self._worker_stages.values():
+            for name, seconds in told.items():
                 stages[f"worker_{name}"] = stages.get(f"worker_{name}", 0.0) + seconds
         return stages
-
-    def _outcome(self) -> Outcome | None:
-        found = self.evaluation
-        if found is None or self._evaluated_version != self.version:
-            return None
-        return Outcome(episodes=found.episodes, return_mean=found.return_mean, return_std=found.return_std)
 
     def _write_policy(self) -> None:
         self.folder.write_policy(self.spec.policy, self.spec.env, *self.algorithm.weights())

@@ -102,6 +102,7 @@ class Left:
     worker: str
     why: str
     tickets: int
+    on_purpose: bool
 
 
 @dataclass(frozen=True)
@@ -422,7 +423,7 @@ class Roster:
         """The worker is gone: its tickets are lost, its lanes have no owner; deal both to the living."""
         member.standing = TABLE[member.standing][event]
         del self.members[member.peer]
-        self.events.append(Left(member.hello.worker, why, len(member.tickets)))
+        self.events.append(Left(member.hello.worker, why, len(member.tickets), event is Goodbye))
         for number in list(member.tickets):
             self._lose(member, number)
         for number in member.lanes:

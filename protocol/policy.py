@@ -218,3 +218,12 @@ class NumpyPolicy:
         if self._log_std is None:
             return x
         return np.concatenate([x, np.broadcast_to(self._log_std, x.shape)], -1)
+
+
+def make_policy(spec: PolicySpec) -> Policy:
+    """What acts for this spec: numpy for an MLP; torch, imported only then, where there are images."""
+    if not spec.needs_torch:
+        return NumpyPolicy(spec)
+    from protocol.networks import TorchPolicy
+
+    return TorchPolicy(spec)

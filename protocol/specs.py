@@ -14,7 +14,7 @@ import msgspec
 
 from protocol.errors import UsageError
 
-Scalar = bool | int | float | str | None
+Scalar = bool | int | float | str
 
 
 class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

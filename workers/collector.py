@@ -15,10 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from protocol.distributions import distribution
-from protocol.policy import NumpyPolicy, Policy
+from protocol.policy import Policy
 from protocol.rollout import Rollout
 from protocol.spaces import writer
-from protocol.specs import PolicySpec, RunSpec
+from protocol.specs import RunSpec
 from workers.copies import Copies, CopyLoop, CopyRaised, Pulse
 from workers.lane import EnvironmentBroke, Lane, environment_raised
 from workers.session import Assignment
@@ -26,15 +26,6 @@ from workers.session import Assignment
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
 OpenCopies = Callable[[RunSpec, Pulse], Copies]
-
-
-def make_policy(spec: PolicySpec) -> Policy:
-    """What acts for this spec: numpy for an MLP; torch, imported only then, where there are images."""
-    if not spec.needs_torch:
-        return NumpyPolicy(spec)
-    from protocol.networks import TorchPolicy
-
-    return TorchPolicy(spec)
 
 
 def loop_over_copies(run: RunSpec, pulse: Pulse) -> Copies:
@@ -69,6 +60,8 @@ class Collector:
         self._distribution = distribution(run.policy.action)
         self._write = writer(run.policy.action)
         self._lanes: dict[int, Lane] = {}
+        self._leaving: list[Lane] = []  # closed by a pulse, while their copies may be in mid-step
+        self._collecting = False
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
         """Act with these weights from now on."""
@@ -82,6 +75,7 @@ class Collector:
         """
         if len({assignment.lane for assignment in assignments}) < len(assignments):
             raise ValueError(f"collect expected one assignment for each lane, got {assignments}")
+        self._collecting = True
         try:
             lanes = [self._living(assignment, pulse) for assignment in assignments]
             rows = self._new_rows(lanes)
@@ -99,13 +93,15 @@ class Collector:
         except BaseException:
             self.close(assignment.lane for assignment in assignments)
             raise
+        finally:
+            self._collecting = False
+            self.close(())
 
     def close(self, lanes: Iterable[int]) -> None:
-        """Let go of these lanes, those that are here."""
-        for number in lanes:
-            lane = self._lanes.pop(number, None)
-            if lane is not None:
-                lane.copies.close()
+        """Let go of these lanes, those that are here; a pulse may ask for it, and then it is done after the collection."""
+        self._leaving += [self._lanes.pop(lane) for lane in lanes if lane in self._lanes]
+        while self._leaving and not self._collecting:
+            self._leaving.pop().copies.close()
 
     def close_all(self) -> None:
         """Let go of every lane."""
@@ -116,8 +112,8 @@ class Collector:
         lane = self._lanes.get(assignment.lane)
         if lane is not None and lane.incarnation == assignment.incarnation:
             return lane
-        self.close([assignment.lane])
         began = perf_counter()
+        self.close([assignment.lane])
         try:
             copies = self._open_copies(self._run, pulse)
         except CopyRaised as error:
@@ -147,7 +143,6 @@ class Collector:
 
     def _fill(self, rows: _Rows, lanes: Sequence[Lane], pulse: Pulse) -> None:
         """Step all lanes T times."""
-        acting = stepping = 0.0
         for t in range(self._run.rollout_steps):
             pulse()
             began = perf_counter()
@@ -169,10 +164,8 @@ class Collector:
                         lane.number, f"step {t}: its environment gave what cannot be kept: {error}"
                     ) from error
             rows.clock.append(perf_counter())
-            acting += acted - began
-            stepping += rows.clock[-1] - acted
-        self.stages["act"] += acting
-        self.stages["step"] += stepping
+            self.stages["act"] += acted - began
+            self.stages["step"] += rows.clock[-1] - acted
 
     def _rollout(self, rows: _Rows, i: int, lane: Lane, about: Assignment, version: int, session: int) -> Rollout:
         """Lane `i` of the rows, as views."""

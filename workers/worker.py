@@ -19,8 +19,9 @@ from protocol.codec import encode
 from protocol.errors import BadMessage, OurError, UsageError
 from protocol.link import WorkerLink
 from protocol.messages import Weights
+from protocol.policy import make_policy
 from protocol.specs import RunSpec
-from workers.collector import Collector, make_policy
+from workers.collector import Collector
 from workers.lane import EnvironmentBroke
 from workers.session import Begin, Close, Effect, Identity, Leave, Say, Session, Task
 
