@@ -1,0 +1,268 @@
+"""Toy environments: with known answers, with every space, slow and broken ones; for tests and benchmarks.
+
+Importing this file registers each class under its name: `gymnasium.make("workers.envs.toy:Countdown-v0", k=3)`.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from copy import deepcopy
+from typing import Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+Floats = npt.NDArray[np.float32]
+Info = dict[str, Any]
+
+
+class Scripted(gymnasium.Env[Floats, Any]):
+    """Plays a script, one letter a step, again and again: `.` goes on, `t` terminated, `u` truncated, `b` both.
+
+    Observations are [episode, steps in it], both from 0; the reward of a step is the number of steps so far, from 1.
+    """
+
+    def __init__(self, script: str = "...t") -> None:
+        self.observation_space = spaces.Box(0, np.inf, (2,), np.float32)
+        self.action_space = spaces.Discrete(2)
+        self._script = script
+        self._played = self._steps = 0
+        self._episode = -1
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Floats, Info]:
+        """Begin the next episode, where the script stands."""
+        super().reset(seed=seed)
+        self._episode += 1
+        self._steps = 0
+        return self._observation(), {}
+
+    def step(self, action: Any) -> tuple[Floats, float, bool, bool, Info]:
+        """Play the next letter."""
+        letter = self._script[self._played % len(self._script)]
+        self._played += 1
+        self._steps += 1
+        return self._observation(), float(self._steps), letter in "tb", letter in "ub", {}
+
+    def _observation(self) -> Floats:
+        return np.array([self._episode, self._steps], np.float32)
+
+
+class OneStep(Scripted):
+    """Every episode is truncated at its first step."""
+
+    def __init__(self) -> None:
+        super().__init__("u")
+
+
+class Both(Scripted):
+    """Every episode is terminated and truncated at once, at its third step."""
+
+    def __init__(self) -> None:
+        super().__init__("..b")
+
+
+class Countdown(gymnasium.Env[Floats, Any]):
+    """Terminates after `k` steps; the observation is [remaining / k], every step gives `reward`."""
+
+    def __init__(self, k: int = 5, reward: float = 1.0) -> None:
+        self.observation_space = spaces.Box(0, 1, (1,), np.float32)
+        self.action_space = spaces.Discrete(2)
+        self._k, self._reward, self._left = k, reward, k
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Floats, Info]:
+        """Begin at `k`."""
+        super().reset(seed=seed)
+        self._left = self._k
+        return self._observation(), {}
+
+    def step(self, action: Any) -> tuple[Floats, float, bool, bool, Info]:
+        """Count down by one."""
+        self._left -= 1
+        return self._observation(), self._reward, self._left == 0, False, {}
+
+    def _observation(self) -> Floats:
+        return np.array([self._left / self._k], np.float32)
+
+
+class Identity(gymnasium.Env[Floats, Any]):
+    """Shows one of `n` signs, one-hot; the reward is 1 for the action of that number. Truncates after 10 steps."""
+
+    def __init__(self, n: int = 4) -> None:
+        self.observation_space = spaces.Box(0, 1, (n,), np.float32)
+        self.action_space = spaces.Discrete(n)
+        self._n = n
+        self._sign = self._steps = 0
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Floats, Info]:
+        """Show the first sign."""
+        super().reset(seed=seed)
+        self._steps = 0
+        return self._show(), {}
+
+    def step(self, action: Any) -> tuple[Floats, float, bool, bool, Info]:
+        """Judge the action, show the next sign."""
+        reward = float(int(action) == self._sign)
+        self._steps += 1
+        return self._show(), reward, False, self._steps == 10, {}
+
+    def _show(self) -> Floats:
+        self._sign = int(self.np_random.integers(self._n))
+        return np.equal(np.arange(self._n), self._sign).astype(np.float32)
+
+
+class Slow(Countdown):
+    """A countdown that takes `seconds` a step."""
+
+    def __init__(self, seconds: float = 0.01, k: int = 5) -> None:
+        super().__init__(k)
+        self._seconds = seconds
+
+    def step(self, action: Any) -> tuple[Floats, float, bool, bool, Info]:
+        """Sleep, then count."""
+        time.sleep(self._seconds)
+        return super().step(action)
+
+
+class Faulty(Countdown):
+    """A countdown that goes wrong at its step number `after` (from 0) and at all later ones; says how in `fault`.
+
+    With `once`, a path, it goes wrong only if it can create that file: one time, whoever makes the environment again.
+    """
+
+    def __init__(self, after: int = 3, once: str = "", k: int = 5) -> None:
+        super().__init__(k)
+        self._after, self._once, self._total = after, once, 0
+
+    def step(self, action: Any) -> tuple[Floats, float, bool, bool, Info]:
+        """Count down, or go wrong."""
+        row = super().step(action)
+        self._total += 1
+        return self.fault(*row) if self._total > self._after and self._due() else row
+
+    def _due(self) -> bool:
+        if self._once:
+            try:
+                os.close(os.open(self._once, os.O_CREAT | os.O_EXCL))
+            except FileExistsError:
+                return False
+        return True
+
+    def fault(
+        self, observation: Floats, reward: float, terminated: bool, truncated: bool, info: Info
+    ) -> tuple[Floats, float, bool, bool, Info]:
+        """What is wrong with this row."""
+        raise NotImplementedError
+
+
+class Raises(Faulty):
+    """Raises in `step`."""
+
+    def fault(self, *row: Any) -> tuple[Floats, float, bool, bool, Info]:
+        """Raise."""
+        raise ValueError("the toy is broken, as it was asked to be")
+
+
+class NaNReward(Faulty):
+    """Gives a reward that is not a number."""
+
+    def fault(self, observation: Floats, reward: float, *rest: Any) -> tuple[Floats, float, bool, bool, Info]:
+        """Spoil the reward."""
+        return (observation, np.nan, *rest)
+
+
+class NaNObservation(Faulty):
+    """Gives an observation that is not a number."""
+
+    def fault(self, observation: Floats, *rest: Any) -> tuple[Floats, float, bool, bool, Info]:
+        """Spoil the observation."""
+        return (observation * np.float32(np.nan), *rest)
+
+
+class Hangs(Faulty):
+    """Does not come back from `step`, for an hour."""
+
+    def fault(self, *row: Any) -> tuple[Floats, float, bool, bool, Info]:
+        """Hang."""
+        time.sleep(3600)
+        return row
+
+
+class Dies(Faulty):
+    """Takes its process with it, as a crash in C would."""
+
+    def fault(self, *row: Any) -> tuple[Floats, float, bool, bool, Info]:
+        """Die at once."""
+        os.kill(os.getpid(), signal.SIGKILL)
+        return row
+
+
+_BOX = spaces.Box(-1, 1, (3,), np.float32)
+_DISCRETE = spaces.Discrete(4, start=-1)
+_IMAGE = spaces.Box(0, 255, (12, 12, 3), np.uint8)
+_TABLE = spaces.MultiDiscrete(np.array([[2, 3], [4, 5]]), start=np.array([[1, 0], [0, -2]]))
+
+OBSERVATIONS: dict[str, gymnasium.Space[Any]] = {
+    "box": _BOX,
+    "scalar": spaces.Box(-1, 1, (), np.float32),
+    "unbounded": spaces.Box(-np.inf, np.inf, (2, 3), np.float64),
+    "integers": spaces.Box(-5, 5, (2,), np.int16),
+    "bytes": spaces.Box(0, 255, (128,), np.uint8),
+    "image": _IMAGE,
+    "discrete": _DISCRETE,
+    "multidiscrete": _TABLE,
+    "multibinary": spaces.MultiBinary((2, 2)),
+    "dict": spaces.Dict({"position": _BOX, "door": _DISCRETE}),
+    "one": spaces.Dict({"only": _BOX}),
+    "tuple": spaces.Tuple((_BOX, spaces.MultiBinary(3))),
+    "nested": spaces.Dict({"camera": spaces.Dict({"left": _IMAGE}), "arm": spaces.Tuple((_DISCRETE, _BOX))}),
+    "text": spaces.Text(5),
+    "words": spaces.Dict({"said": spaces.Text(5)}),
+}
+ACTIONS: dict[str, gymnasium.Space[Any]] = {
+    "discrete": spaces.Discrete(3),
+    "offset": spaces.Discrete(3, start=5),
+    "multidiscrete": spaces.MultiDiscrete([2, 3]),
+    "table": _TABLE,
+    "multibinary": spaces.MultiBinary(4),
+    "box": spaces.Box(-0.1, 0.1, (2,), np.float32),
+    "scalar": spaces.Box(-0.1, 0.1, (), np.float32),
+    "half": spaces.Box(np.array([0, -np.inf]), np.array([np.inf, 0]), dtype=np.float64),
+    "unbounded": spaces.Box(-np.inf, np.inf, (2, 2), np.float32),
+    "integers": spaces.Box(0, 5, (2,), np.int64),
+    "text": spaces.Text(5),
+}
+UNSUPPORTED_OBSERVATIONS = ("text", "words")
+UNSUPPORTED_ACTIONS = ("integers", "text")
+
+
+class Spaces(gymnasium.Env[Any, Any]):
+    """Observations and actions of a named space; refuses an action outside it. Truncates after 4 steps."""
+
+    def __init__(self, observation: str = "box", action: str = "discrete") -> None:
+        self.observation_space = deepcopy(OBSERVATIONS[observation])
+        self.action_space = deepcopy(ACTIONS[action])
+        self._steps = 0
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
+        """Show a random observation."""
+        super().reset(seed=seed)
+        self._steps = 0
+        self.observation_space.seed(int(self.np_random.integers(2**31)))
+        return self.observation_space.sample(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
+        """Show another. The reward is the sum of the action."""
+        if not self.action_space.contains(action):
+            raise ValueError(f"action expected in {self.action_space}, got {action!r} of type {type(action).__name__}")
+        self._steps += 1
+        return self.observation_space.sample(), float(np.sum(action)), False, self._steps == 4, {}
+
+
+for _toy in (
+    Scripted, OneStep, Both, Countdown, Identity, Slow, Raises, NaNReward, NaNObservation, Hangs, Dies, Spaces,
+):  # fmt: skip
+    gymnasium.register(id=f"{_toy.__name__}-v0", entry_point=f"{__name__}:{_toy.__name__}")
