@@ -1,1 +1,1 @@
-"""Launchers: where a run's processes are placed. Thin: each composes the learner and the workers, which know nothing of it."""
+"""Launchers: where a run's processes are placed. Thin: each composes a learner and workers, which know nothing of it."""

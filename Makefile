@@ -1,0 +1,45 @@
+# `make train` and `make test` work on a fresh clone with python3 >= 3.11 and nothing else.
+PYTHON ?= python3
+BIN := .venv/bin
+PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.PHONY: train test lint type unit docs bench test-learning clean
+
+train: .venv/installed  ## train CartPole-v1 on two worker processes until a greedy evaluation averages 475
+	$(BIN)/millrace train CartPole-v1 --workers 2 --target-return 475 --eval-episodes 20 --eval-every 5000
+
+test: lint type unit  ## everything that CI runs
+
+lint: .venv/installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+type: .venv/installed-dev
+	$(BIN)/mypy
+
+unit: .venv/installed-dev
+	$(BIN)/python -m pytest
+
+test-learning: .venv/installed-dev  ## published scores, three seeds each; half an hour
+	$(BIN)/python -m pytest -m learning --timeout 3600 tests/learning
+
+docs: .venv/installed-dev  ## write the generated parts of protocol/README.md
+	$(BIN)/python -m tests.test_wire_document
+
+bench: .venv/installed-dev
+	$(BIN)/python -m benchmarks.collect
+	$(BIN)/python -m benchmarks.update
+
+.venv/installed: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit("millrace needs Python 3.11 or newer; set PYTHON=") if sys.version_info < (3, 11) else None'
+	$(PYTHON) -m venv .venv
+	$(PIP_INSTALL) --editable .
+	touch $@
+
+.venv/installed-dev: .venv/installed
+	$(PIP_INSTALL) --editable '.[dev]'
+	touch $@
+
+clean:
+	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,0 +1,164 @@
+"""One learner, put together from its parts: link, roster, hub, algorithm, journal. Who its workers are, it does not know.
+
+The law: the first SIGINT or SIGTERM ends the run after the update in hand, with a checkpoint; the second at once.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import zmq
+
+from learner.algorithms import ALGORITHMS, Algorithm
+from learner.config import Config
+from learner.hub import Hub
+from learner.journal import Journal, Past, recall
+from learner.metrics import Progress
+from learner.roster import Roster
+from learner.run_folder import Interrupted, RunFolder
+from learner.train import train
+from protocol.errors import UsageError
+from protocol.link import LearnerLink, is_local
+from protocol.spaces import action_spec, observation_leaves
+from protocol.specs import EnvSpec, PolicySpec, RunSpec
+
+log = logging.getLogger("millrace.learner")
+
+Watch = Callable[[Progress], None]
+DeadWorkers = Callable[[], Iterable[tuple[str, str]]]
+
+
+class Run:
+    """A learner that listens, and has not begun."""
+
+    def __init__(self, config: Config, env: EnvSpec, link: LearnerLink, resume: Path | None, watch: Watch) -> None:
+        """`resume`: the folder of a run that goes on from its newest checkpoint. Raises `OurError` in one line."""
+        import torch
+
+        torch.set_num_threads(config.torch_threads)
+        spec = run_spec(config, env)
+        make = ALGORITHMS[config.algo][1]
+        self.algorithm: Algorithm = make(
+            config.algorithm, spec.policy, total_steps=config.steps, seed=config.seed, device=_device(config)
+        )
+        if resume is None:
+            self.folder, past = RunFolder.create(config), Past()
+        else:
+            self.folder = RunFolder.open(resume)
+            past = recall(self.folder, self.algorithm)
+        roster = Roster(
+            spec,
+            rollouts_per_update=config.lanes,
+            max_lag=config.max_lag,
+            worker_timeout_s=config.worker_timeout_s,
+            first_session=int.from_bytes(os.urandom(6), "little"),
+            ledger=past.ledger,
+            incarnations=past.incarnations,
+        )
+        self.hub = Hub(
+            link,
+            roster,
+            no_workers_timeout_s=config.no_workers_timeout_s,
+            stall_timeout_s=config.stall_timeout_s,
+            max_env_failures=config.max_env_failures,
+        )
+        self.journal = Journal(config, self.folder, spec, self.algorithm, self.hub, past, watch)
+
+    def go(self, workers: int, dead_workers: DeadWorkers = lambda: ()) -> None:
+        """Train until done. `workers`: how many to wait for first; `dead_workers`: names those known to have ended, and why."""
+        signals: list[int] = []
+
+        def check() -> None:
+            if signals:
+                raise Interrupted(self.folder.path)
+
+        self.hub.dead_workers, self.hub.watch = dead_workers, check
+        try:
+            with _signals_into(signals):
+                train(self.algorithm, self.hub, self.journal, workers)
+        except BaseException as error:
+            reason = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error)
+            self.hub.drain(reason, timeout_s=2.0)
+            self.journal.finish(reason)
+            raise
+        finally:
+            self.journal.close()
+
+
+def serve(config: Config, resume: Path | None, watch: Watch) -> Path:
+    """The learner alone, at `config.bind`: workers are started elsewhere. The run folder. Raises `OurError`, `Interrupted`."""
+    if not is_local(config.bind):
+        raise UsageError(
+            f"address {config.bind} can be reached by other machines, and workers cannot prove who they are yet; "
+            "bind to 127.0.0.1"
+        )
+    with ExitStack() as stack:
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        stack.callback(context.term)
+        link = LearnerLink(config.bind, context)
+        stack.callback(link.close)
+        run = Run(config, EnvSpec.of(config.env, config.env_kwargs), link, resume, watch)
+        log.warning("waiting for workers; start one with: python -m workers %s", link.address)
+        run.go(config.min_workers or 1)
+        return run.folder.path
+
+
+def run_spec(config: Config, env: EnvSpec) -> RunSpec:
+    """What the workers are told. Makes one env copy to learn its spaces; raises `UsageError` if it cannot."""
+    copy = env.make()
+    try:
+        policy = PolicySpec(
+            observation_leaves(copy.observation_space),
+            action_spec(copy.action_space),
+            net=config.algorithm.net,
+            activation=config.algorithm.activation,
+            normalize_observations=config.algorithm.normalize_observations,
+        )
+    finally:
+        copy.close()
+    return RunSpec(
+        env=env,
+        policy=policy,
+        rollout_steps=config.algorithm.rollout_steps,
+        copies=config.envs // config.lanes,
+        lanes=config.lanes,
+        seed=config.seed,
+        heartbeat_s=config.heartbeat_s,
+    )
+
+
+def _device(config: Config) -> str:
+    import torch
+
+    if config.device == "cuda" and not torch.cuda.is_available():
+        raise UsageError("device cuda: PyTorch sees no GPU here; use --device cpu")
+    return ("cuda" if torch.cuda.is_available() else "cpu") if config.device == "auto" else config.device
+
+
+@contextmanager
+def _signals_into(received: list[int]) -> Iterator[None]:
+    """The first SIGINT or SIGTERM is noted; the second does what it would have done anyway."""
+    before: dict[int, Any] = {}
+
+    def note(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        for signum, handler in before.items():
+            signal.signal(signum, handler)
+
+    try:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            before[number] = signal.signal(number, note)
+    except ValueError:  # not in the main thread: whoever owns it handles signals
+        before.clear()
+    try:
+        yield
+    finally:
+        for signum, handler in before.items():
+            signal.signal(signum, handler)

@@ -1,0 +1,39 @@
+"""Every test leaves the machine as it found it: no child process, no thread of ours, no temporary folder."""
+
+from __future__ import annotations
+
+import os
+
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_variable, "1")  # as the command line does: bits must not depend on the number of cores
+
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+LEAVE_WITHIN_S = 5.0
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    temporary = tmp_path / "tmp"
+    temporary.mkdir()
+    monkeypatch.setenv("TMPDIR", str(temporary))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    threads = set(threading.enumerate())
+    yield
+    deadline = time.monotonic() + LEAVE_WITHIN_S
+    for child in psutil.Process().children(recursive=True):
+        if child.status() != psutil.STATUS_ZOMBIE:
+            child.wait(max(0.0, deadline - time.monotonic()))
+    started = [thread for thread in threading.enumerate() if thread not in threads and not thread.daemon]
+    for thread in started:
+        thread.join(max(0.0, deadline - time.monotonic()))
+        assert not thread.is_alive(), f"{thread} was left behind"
+    left = [path.name for path in temporary.iterdir() if path.name.startswith("millrace-")]
+    assert not left, f"temporary folders were left behind: {left}"

@@ -1,0 +1,195 @@
+"""Whole runs on this machine: real worker processes, real sockets, real faults."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from learner.config import Config, resolve
+from learner.metrics import Progress, read_rows
+from millrace.launch.local import train
+from protocol.errors import EnvironmentFailed, NoWorkers
+
+SMALL = {"n_epochs": 2, "eval_episodes": 2}  # what is shown here does not hang on learning much
+
+
+def run(tmp_path: Path, env: str, watch: Any = lambda progress: None, resume: Path | None = None, **settings: Any) -> Path:
+    return train(resolve(env, run_dir=str(tmp_path / f"runs{time.monotonic_ns()}"), **settings), resume, watch)
+
+
+def summary(folder: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((folder / "summary.json").read_text())
+    return found
+
+
+def assert_balanced(ledger: dict[str, int]) -> None:
+    assert ledger["issued"] == ledger["used"] + ledger["outstanding"] + ledger["stale"] + ledger["lost"]
+    dropped = sum(ledger[f"transitions_{why}"] for why in ("stale", "duplicate", "late", "invalid", "waiting"))
+    assert ledger["transitions_received"] == ledger["transitions_used"] + dropped
+    assert ledger["outstanding"] >= 0
+
+
+def worker_processes() -> list[psutil.Process]:
+    children = psutil.Process().children(recursive=True)
+    return [child for child in children if child.status() != psutil.STATUS_ZOMBIE and "workers" in child.cmdline()]
+
+
+@pytest.mark.parametrize(
+    ("env", "settings"),
+    [("CartPole-v1", {"steps": 5_000}), ("Pendulum-v1", {"steps": 78_000, "n_epochs": 1, "batch_size": 256})],
+)
+def test_the_same_curve_whatever_the_number_of_workers(tmp_path: Path, env: str, settings: dict[str, Any]) -> None:
+    """20 updates on one seed, in the default lanes: the same bytes for 1, 2 and 4 workers, over inproc, ipc and tcp."""
+    policies = {}
+    for workers in (1, 2, 4):
+        for transport in ("inproc", "ipc", "tcp"):
+            folder = run(tmp_path, env, seed=3, workers=workers, transport=transport, eval_episodes=1, **settings)
+            assert summary(folder)["updates"] >= 20
+            policies[workers, transport] = (folder / "policy.safetensors").read_bytes()
+    policies["again", "ipc"] = (
+        run(tmp_path, env, seed=3, workers=2, eval_episodes=1, **settings) / "policy.safetensors"
+    ).read_bytes()
+    different = {key for key, policy in policies.items() if policy != policies[1, "inproc"]}
+    assert not different
+    other = run(tmp_path, env, seed=4, workers=2, eval_episodes=1, **settings)
+    assert (other / "policy.safetensors").read_bytes() != policies[1, "inproc"], "the seed changes nothing"
+
+
+@pytest.mark.parametrize("max_lag", [0, 1, 4])
+def test_lag_never_exceeds_its_bound(tmp_path: Path, max_lag: int) -> None:
+    folder = run(tmp_path, "CartPole-v1", max_lag=max_lag, steps=8_000, **SMALL)
+    rows = read_rows(folder / "metrics.jsonl")
+    assert max(row["lag/max"] for row in rows) == max_lag, "the bound is not reached, so it does not show"
+    assert all(row["lag/mean"] <= row["lag/max"] and "drop/stale" in row for row in rows)
+    assert_balanced(summary(folder)["ledger"])
+
+
+def test_a_killed_worker_is_replaced_and_the_run_ends_well(tmp_path: Path) -> None:
+    killed: list[int] = []
+    back: list[int] = []
+
+    def watch(progress: Progress) -> None:
+        if progress.updates == 5:
+            victim = worker_processes()[0]
+            killed.append(victim.pid)
+            victim.kill()
+        if killed and progress.workers_alive == 2:
+            back.append(progress.updates)
+
+    folder = run(tmp_path, "CartPole-v1", watch, steps=60_000, **SMALL)
+    found = summary(folder)
+    assert killed
+    assert back, "the killed worker never came back"
+    assert found["stop_reason"] == "all steps done"
+    assert found["env_steps"] >= 60_000
+    assert_balanced(found["ledger"])
+
+
+def test_an_environment_that_raises_ends_the_run_with_its_own_traceback(tmp_path: Path) -> None:
+    with pytest.raises(EnvironmentFailed) as failure:
+        run(tmp_path, "workers.envs.toy:Raises-v0", max_env_failures=1, **SMALL)
+    assert "toy.py" in failure.value.detail, "the traceback is not the worker's"
+    assert "Traceback" in failure.value.detail
+    assert "\n" not in str(failure.value)
+    assert "worker w" in str(failure.value)
+
+
+def test_an_environment_that_raises_once_is_borne(tmp_path: Path) -> None:
+    once = str(tmp_path / "raised")
+    folder = run(
+        tmp_path, "workers.envs.toy:Raises-v0", env_kwargs={"once": once, "after": 30}, workers=1, steps=2_000, **SMALL
+    )
+    found = summary(folder)
+    assert Path(once).exists()
+    assert found["stop_reason"] == "all steps done"
+    assert found["ledger"]["lost"] > 0
+    assert_balanced(found["ledger"])
+
+
+def test_nan_ends_the_run_naming_where(tmp_path: Path) -> None:
+    for env, what in (("NaNObservation", "observation"), ("NaNReward", "reward")):
+        with pytest.raises(EnvironmentFailed, match=rf"lane \d.*{what}.*nan at step \d+, copy \d+"):
+            run(tmp_path, f"workers.envs.toy:{env}-v0", max_env_failures=0, **SMALL)
+
+
+def test_nobody_comes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers that cannot even start: the run ends by its deadline and says what it waited for."""
+    monkeypatch.setattr("workers.host.sys.executable", "/bin/false")
+    with pytest.raises(NoWorkers, match="waited 1 s for 2 workers"):
+        run(tmp_path, "CartPole-v1", no_workers_timeout_s=1.0, **SMALL)
+
+
+# ---------------------------------------------------------------- the learner as a process
+
+
+def start(tmp_path: Path, *flags: str) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", "millrace", "train", "CartPole-v1", "--run-dir", str(tmp_path / "runs"), *flags]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+def wait_for(condition: Any, within_s: float = 60.0) -> Any:
+    deadline = time.monotonic() + within_s
+    while not (found := condition()):
+        assert time.monotonic() < deadline, "it did not happen in time"
+        time.sleep(0.05)
+    return found
+
+
+def checkpoints(tmp_path: Path) -> list[Path]:
+    return sorted(tmp_path.glob("runs/*/checkpoints/*.pt"))
+
+
+def test_ctrl_c_drains_saves_and_says_how_to_resume(tmp_path: Path) -> None:
+    learner = start(tmp_path)
+    wait_for(lambda: any(len(read_rows(path)) > 10 for path in tmp_path.glob("runs/*/metrics.jsonl")))
+    workers = psutil.Process(learner.pid).children()
+    assert len(workers) == 2
+    learner.send_signal(signal.SIGINT)
+    _, stderr = learner.communicate(timeout=30)
+    assert learner.returncode == 130
+    assert b"--resume" in stderr
+    assert b"Traceback" not in stderr
+    assert not any(worker.is_running() for worker in workers), "a worker outlived its learner"
+    (folder,) = tmp_path.glob("runs/*")
+    steps = read_rows(folder / "metrics.jsonl")[-1]["time/total_timesteps"]
+    assert int(checkpoints(tmp_path)[-1].stem) == steps, "the last update was not saved"
+    assert summary(folder)["stop_reason"] == "interrupted"
+
+
+def test_a_learner_that_was_killed_goes_on_from_its_newest_checkpoint(tmp_path: Path) -> None:
+    learner = start(tmp_path, "--checkpoint-every-s", "0.2", "--steps", "40000")
+    wait_for(lambda: len(checkpoints(tmp_path)) >= 3)
+    workers = psutil.Process(learner.pid).children()
+    os.kill(learner.pid, signal.SIGKILL)
+    learner.communicate(timeout=10)
+    _, alive = psutil.wait_procs(workers, timeout=10)
+    assert not alive, "workers outlived their host"
+    (folder,) = tmp_path.glob("runs/*")
+    saved = int(checkpoints(tmp_path)[-1].stem)
+    first: list[Progress] = []
+
+    def watch(progress: Progress) -> None:
+        first.append(progress)
+
+    config = Config.from_toml((folder / "config.toml").read_text())
+    train(config, folder, watch)
+    assert saved < first[0].env_steps <= saved + 256, "it did not go on from the newest checkpoint"
+    assert first[0].wall_s > 0.5, "the clock began again"
+    found = summary(folder)
+    assert found["env_steps"] >= 40_000
+    assert_balanced(found["ledger"])
+    steps = [row["time/total_timesteps"] for row in read_rows(folder / "metrics.jsonl")]
+    assert steps == sorted(set(steps)), "the curve goes over the same steps twice"
+    for left in (tmp_path / "tmp").glob("millrace-*"):  # of the learner that could not clean up
+        assert {path.name for path in left.iterdir()} <= {"learner"}
+        (left / "learner").unlink(missing_ok=True)
+        left.rmdir()
