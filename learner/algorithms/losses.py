@@ -1,6 +1,7 @@
 """Losses and what is measured of them. Pure: tensors [B] in, numbers (tensors of no dimension) out; B rows of a minibatch.
 
-Every row given is a valid one: masking is done where minibatches are made.
+Every row given is a valid one: masking is done where minibatches are made. A loss comes with its gradient, derived by
+hand (a test holds it equal to autograd's): a small minibatch spends more time on the graph than on the arithmetic.
 """
 
 from __future__ import annotations
@@ -23,14 +24,24 @@ def standardized(advantage: Tensor) -> Tensor:
     return (advantage - mean) / (std + 1e-8)
 
 
-def clipped_surrogate(ratio: Tensor, advantage: Tensor, clip_range: float) -> Tensor:
-    """PPO's policy loss (Schulman et al. 2017, eq. 7): −E[min(ρ A, clip(ρ, 1−ε, 1+ε) A)], ρ = π(a)/π_old(a)."""
-    return -torch.minimum(ratio * advantage, ratio.clamp(1 - clip_range, 1 + clip_range) * advantage).mean()
+def clipped_surrogate(ratio: Tensor, advantage: Tensor, clip_range: float) -> tuple[Tensor, Tensor]:
+    """PPO's policy loss (Schulman et al. 2017, eq. 7), and its gradient [B] by log π(a).
+
+    L = −E[min(ρ A, clip(ρ, 1−ε, 1+ε) A)],  ρ = π(a) / π_old(a);    ∂L/∂log π(a) = −ρ A / B where ρ A is the lesser
+    """
+    plain, clipped = ratio * advantage, ratio.clamp(1 - clip_range, 1 + clip_range) * advantage
+    return -torch.minimum(plain, clipped).mean(), (plain * (plain <= clipped)).div_(-len(ratio))
 
 
-def value_loss(value: Tensor, target: Tensor) -> Tensor:
-    """Mean squared error (as Stable-Baselines3 has it, without the half that others put before it)."""
-    return torch.nn.functional.mse_loss(value, target)
+def value_loss(value: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean squared error (as Stable-Baselines3 has it, without the half that others put before it), and its gradient [B]."""
+    error = value - target
+    return (error * error).mean(), error * (2 / len(error))
+
+
+def entropy_loss(entropy: Tensor) -> tuple[Tensor, Tensor]:
+    """Minus the mean entropy, and its gradient [B]."""
+    return -entropy.mean(), torch.full_like(entropy, -1 / len(entropy))
 
 
 def approx_kl(log_ratio: Tensor, ratio: Tensor) -> Tensor:

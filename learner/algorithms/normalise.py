@@ -19,7 +19,7 @@ from protocol.specs import PolicySpec
 
 Doubles = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
-EPSILON = 1e-8  # added to a variance: what never varied is divided by 1e-4
+TINY = 1e-12  # a variance below this share of the squared mean is rounding: it did not vary
 
 
 class RunningMoments:
@@ -42,8 +42,10 @@ class RunningMoments:
 
     @property
     def std(self) -> Doubles:
-        """Standard deviation [*shape] of the population; 1 before there is any."""
-        return np.asarray(np.sqrt(self._squares / self.count + EPSILON) if self.count else np.ones_like(self.mean))
+        """Standard deviation [*shape] of the population; 1 for what never varied."""
+        variance = self._squares / max(self.count, 1)
+        varied = variance > TINY * self.mean**2 + TINY**2
+        return np.sqrt(np.where(varied, variance, 1.0))
 
     def state_dict(self) -> dict[str, Any]:
         """Tensors and numbers, copied."""
@@ -52,7 +54,7 @@ class RunningMoments:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from there."""
         self.count = int(state["count"])
-        self.mean, self._squares = np.array(state["mean"]), np.array(state["squares"])
+        self.mean, self._squares = state["mean"].numpy().copy(), state["squares"].numpy().copy()
 
 
 class ObservationNormaliser:
@@ -136,4 +138,4 @@ class RewardScaler:
         """Go on from there."""
         self._moments.load_state_dict(state["moments"])
         self._copies = int(state["copies"])
-        self._returns = {int(lane): np.array(found) for lane, found in state["returns"].items()}
+        self._returns = {int(lane): found.numpy().copy() for lane, found in state["returns"].items()}

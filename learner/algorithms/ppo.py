@@ -97,7 +97,6 @@ class Minibatch(NamedTuple):
 class Measured(NamedTuple):
     """What one minibatch measured, before it moved the weights."""
 
-    loss: float
     policy_gradient_loss: float
     value_loss: float
     entropy_loss: float
@@ -205,18 +204,20 @@ class PPO:
         config, net = self.config, self.net
         params, value = net.forward(rows.x, rows.images)
         log_prob, entropy = log_prob_and_entropy(self.policy.action, params, rows.action)
-        advantage = losses.standardized(rows.advantage) if config.normalize_advantage else rows.advantage
-        log_ratio = log_prob - rows.log_prob
-        ratio = log_ratio.exp()
-        policy_loss = losses.clipped_surrogate(ratio, advantage, clip_range)
-        value_loss = losses.value_loss(value, rows.target)
-        entropy_loss = -entropy.mean()
-        loss = policy_loss + config.ent_coef * entropy_loss + config.vf_coef * value_loss
+        with torch.no_grad():
+            advantage = losses.standardized(rows.advantage) if config.normalize_advantage else rows.advantage
+            log_ratio = log_prob - rows.log_prob
+            ratio = log_ratio.exp()
+            policy_loss, by_log_prob = losses.clipped_surrogate(ratio, advantage, clip_range)
+            value_loss, by_value = losses.value_loss(value, rows.target)
+            entropy_loss, by_entropy = losses.entropy_loss(entropy)
+            by_entropy *= config.ent_coef
+            by_value *= config.vf_coef
         net.flat_grad.zero_()
-        loss.backward()  # type: ignore[no-untyped-call]
+        torch.autograd.backward((log_prob, entropy, value), (by_log_prob, by_entropy, by_value))
         with torch.no_grad():
             kl, clipped = losses.approx_kl(log_ratio, ratio), losses.clip_fraction(ratio, clip_range)
-            numbers = (loss, policy_loss, value_loss, entropy_loss, kl, clipped, net.flat_grad.norm())
+            numbers = (policy_loss, value_loss, entropy_loss, kl, clipped, net.flat_grad.norm())
             measured = Measured(*torch.stack(numbers).tolist())
             self._check(measured)
             if measured.grad_norm > config.max_grad_norm:
@@ -236,7 +237,9 @@ class PPO:
     def _metrics(self, epochs: list[list[Measured]]) -> dict[str, float]:
         mean = Measured(*np.mean([measured for epoch in epochs for measured in epoch], 0).tolist())
         metrics = {f"train/{name}": number for name, number in mean._asdict().items()}
-        metrics["train/loss"] = epochs[-1][-1].loss
+        last = epochs[-1][-1]
+        weighted = self.config.ent_coef * last.entropy_loss + self.config.vf_coef * last.value_loss
+        metrics["train/loss"] = last.policy_gradient_loss + weighted
         metrics["train/approx_kl"] = float(np.mean([measured.approx_kl for measured in epochs[-1]]))
         metrics["train/n_updates"] = float(self.epochs)
         log_std = self.net.parameters.get("actor.log_std")

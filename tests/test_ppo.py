@@ -1,0 +1,355 @@
+"""PPO's update: what it may not use, what it must repeat bit for bit, what it learns."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+
+from learner.algorithms import ALGORITHMS, Algorithm, losses
+from learner.algorithms.ppo import PPO, Minibatch, PPOConfig
+from protocol.distributions import distribution
+from protocol.errors import RunError
+from protocol.policy import NumpyPolicy, layout, size
+from protocol.rollout import Batch
+from protocol.specs import ActionSpec, Leaf, PolicySpec
+
+Array = npt.NDArray[Any]
+
+BOX = Leaf("", "box", (4,), "float32")
+DISCRETE = PolicySpec((BOX,), ActionSpec("discrete", (), "int64", (4,), (0,)), (16,))
+GAUSSIAN = PolicySpec((BOX,), ActionSpec("box", (2,), "float32", low=(-1.0,) * 2, high=(1.0,) * 2), (16,))
+IMAGE = PolicySpec((BOX, Leaf("i", "box", (8, 8, 1), "uint8")), DISCRETE.action, (16,))
+EVERYTHING = PPOConfig(normalize_rewards=True, learning_rate_schedule="linear", clip_range_schedule="linear", n_epochs=3)
+LANES, COPIES, T = 2, 3, 20
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def normal(spec: PolicySpec) -> PolicySpec:
+    return msgspec.structs.replace(spec, normalize_observations=True)
+
+
+def ppo(config: PPOConfig | None = None, spec: PolicySpec = DISCRETE, seed: int = 0) -> PPO:
+    return PPO(config or PPOConfig(), spec, total_steps=10_000, seed=seed)
+
+
+def batch(algorithm: PPO, seed: int, fresh: bool = False, steps: int = T) -> Batch:
+    """A batch of noise with ends of both kinds, acted on with the algorithm's weights."""
+    generator = np.random.default_rng(seed)
+    N = LANES * COPIES
+    spec = algorithm.policy
+    obs: list[Array] = [generator.normal(2, 3, (steps + 1, N, 4)).astype(np.float32)]
+    if spec.needs_torch:
+        obs.append(generator.integers(0, 256, (steps + 1, N, 8, 8, 1), dtype=np.uint8))
+        params = np.zeros((steps, N, 4), np.float32)
+    else:
+        policy = NumpyPolicy(spec)
+        policy.load(*algorithm.weights())
+        params = policy([leaf[:-1] for leaf in obs])
+    over = distribution(spec.action)
+    action = over.sample(params, over.noise(generator, (steps, N)))
+    ends, kind = generator.random((steps, N)) < 0.15, generator.random((steps, N)) < 0.5
+    valid = np.ones((steps, N), bool)
+    for t in range(1, steps):
+        valid[t] = ~ends[t - 1]
+        ends[t] &= valid[t]
+    return Batch(
+        obs=tuple(obs),
+        action=action,
+        log_prob=over.log_prob(params, action),
+        reward=generator.normal(1, 2, (steps, N)).astype(np.float32),
+        terminated=ends & kind,
+        truncated=ends & ~kind,
+        valid=valid,
+        lane=np.repeat(np.arange(LANES), COPIES),
+        fresh=np.full(N, fresh),
+        episodes=(),
+    )
+
+
+def no_pulse() -> None:
+    pass
+
+
+def same(a: PPO, b: PPO) -> bool:
+    return torch.equal(a.net.flat, b.net.flat) and all(map(np.array_equal, a.weights(), b.weights()))
+
+
+def test_it_is_an_algorithm() -> None:
+    config, made = ALGORITHMS["ppo"]
+    algorithm: Algorithm = made(config(), DISCRETE, total_steps=1, seed=0)
+    assert algorithm.weights()[0].dtype == np.float32
+
+
+@pytest.mark.parametrize("spec", [DISCRETE, GAUSSIAN, normal(GAUSSIAN), IMAGE])
+def test_the_same_batches_give_the_same_bits(spec: PolicySpec) -> None:
+    a, b, other = ppo(EVERYTHING, spec), ppo(EVERYTHING, spec), ppo(EVERYTHING, spec, seed=1)
+    for seed in range(2):
+        metrics = [each.update(batch(each, seed, seed == 0), no_pulse) for each in (a, b)]
+        assert metrics[0] == metrics[1]
+    assert same(a, b)
+    other.update(batch(other, 0), no_pulse)
+    assert not same(a, other)
+
+
+@pytest.mark.parametrize("spec", [normal(DISCRETE), normal(GAUSSIAN), IMAGE])
+def test_a_restored_algorithm_makes_the_next_update_bit_for_bit(spec: PolicySpec) -> None:
+    first = ppo(EVERYTHING, spec)
+    for seed in range(2):
+        first.update(batch(first, seed, seed == 0), no_pulse)
+    file = io.BytesIO()
+    torch.save(first.state_dict(), file)
+    file.seek(0)
+    second = ppo(EVERYTHING, spec, seed=9)
+    second.load_state_dict(torch.load(file, weights_only=True))
+    assert same(first, second)
+    for seed in (2, 3):
+        metrics = [each.update(batch(each, seed), no_pulse) for each in (first, second)]
+        assert metrics[0] == metrics[1]
+        assert same(first, second)
+
+
+def test_a_saved_state_does_not_change_with_the_algorithm() -> None:
+    algorithm = ppo(EVERYTHING, normal(DISCRETE))
+    algorithm.update(batch(algorithm, 0, fresh=True), no_pulse)
+    state = algorithm.state_dict()
+    restored = ppo(EVERYTHING, normal(DISCRETE))
+    restored.load_state_dict(state)
+    algorithm.update(batch(algorithm, 1), no_pulse)
+    late = ppo(EVERYTHING, normal(DISCRETE))
+    late.load_state_dict(state)
+    assert same(restored, late)
+    for each in (restored, late):
+        each.update(batch(each, 1), no_pulse)
+    assert same(restored, late)
+    assert same(restored, algorithm)
+
+
+def test_weights_are_snapshots_of_the_acting_part() -> None:
+    algorithm = ppo(spec=normal(GAUSSIAN))
+    parameters, buffers = algorithm.weights()
+    assert parameters.shape == (size(layout(GAUSSIAN)[0]),)
+    assert buffers.tolist() == [0.0] * 4 + [1.0] * 4
+    before = parameters.copy(), buffers.copy()
+    algorithm.update(batch(algorithm, 0), no_pulse)
+    np.testing.assert_array_equal(parameters, before[0])
+    np.testing.assert_array_equal(buffers, before[1])
+    parameters[:] = 7
+    buffers[:] = 7
+    assert not (algorithm.weights()[0] == 7).any()
+    assert not (algorithm.weights()[1] == 7).any()
+
+
+@pytest.mark.parametrize("spec", [normal(DISCRETE), normal(GAUSSIAN), IMAGE])
+def test_a_row_that_is_not_valid_changes_nothing(spec: PolicySpec) -> None:
+    a, b = ppo(EVERYTHING, spec), ppo(EVERYTHING, spec)
+    clean, rubbish = batch(a, 0), batch(b, 0)
+    reset = ~clean.valid
+    after_termination = reset.copy()
+    after_termination[1:] &= clean.terminated[:-1]  # the obs of any other reset row is what a truncation bootstraps from
+    assert after_termination.any()
+    for array in (rubbish.action, rubbish.log_prob, rubbish.reward):
+        array[reset] = array.dtype.type(3)
+    rubbish.obs[0][:-1][after_termination] = 100
+    for leaf in rubbish.obs[1:]:
+        leaf[:-1][after_termination] = 255
+    assert a.update(clean, no_pulse) == b.update(rubbish, no_pulse)
+    assert same(a, b)
+
+
+@pytest.mark.parametrize("spec", [normal(DISCRETE), normal(GAUSSIAN)])
+def test_losses_see_observations_as_the_worker_did(spec: PolicySpec) -> None:
+    """The statistics change between versions, never between acting and learning: the first ratio is 1."""
+    algorithm = ppo(PPOConfig(n_epochs=1, batch_size=10_000), spec)
+    for seed in range(2):
+        metrics = algorithm.update(batch(algorithm, seed), no_pulse)
+        assert abs(metrics["train/approx_kl"]) < 1e-6
+        assert metrics["train/clip_fraction"] == 0
+    assert algorithm.weights()[1][:4] == pytest.approx([2] * 4, abs=1)
+    assert algorithm.weights()[1][4:] == pytest.approx([3] * 4, abs=1)
+
+
+def test_minibatches_hold_each_valid_row_once_an_epoch_in_nearly_equal_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    algorithm = ppo(PPOConfig(batch_size=25, n_epochs=2))
+    seen: list[Minibatch] = []
+    step = algorithm.step
+
+    def watched(rows: Minibatch, clip_range: float) -> Any:
+        seen.append(rows)
+        return step(rows, clip_range)
+
+    monkeypatch.setattr(algorithm, "step", watched)
+    rows = batch(algorithm, 0)
+    pulses: list[int] = []
+    algorithm.update(rows, lambda: pulses.append(1))
+    count = int(rows.valid.sum())
+    parts = -(-count // 25)
+    assert len(seen) == 2 * parts
+    assert len(pulses) >= 2 * parts
+    assert {len(each.target) for each in seen} <= {count // parts, count // parts + 1}
+    expected = sorted(map(tuple, rows.obs[0][:-1][rows.valid].tolist()))
+    epochs = [torch.cat([each.x for each in seen[at : at + parts]]).tolist() for at in (0, parts)]
+    assert epochs[0] != epochs[1]
+    for epoch in epochs:
+        assert sorted(map(tuple, epoch)) == expected
+
+
+def test_a_minibatch_of_one_row_is_learned_from() -> None:
+    algorithm = ppo(PPOConfig(batch_size=1, n_epochs=1))
+    metrics = algorithm.update(batch(algorithm, 0, steps=2), no_pulse)
+    assert np.isfinite(algorithm.weights()[0]).all()
+    assert np.isfinite(metrics["train/loss"])
+
+
+def test_a_batch_without_a_valid_row_changes_nothing() -> None:
+    a, b = ppo(), ppo()
+    empty = msgspec.structs.replace(batch(a, 0), valid=np.zeros((T, LANES * COPIES), bool))
+    assert a.update(empty, no_pulse) == {}
+    assert same(a, b)
+
+
+def test_target_kl_stops_before_the_step_that_would_go_on() -> None:
+    free, held = (ppo(PPOConfig(learning_rate=0.05, n_epochs=5, target_kl=limit)) for limit in (None, 1e-4))
+    start = held.net.flat.clone()
+    free_metrics, held_metrics = (each.update(batch(each, 0), no_pulse) for each in (free, held))
+    assert free_metrics["train/n_updates"] == 5
+    assert held_metrics["train/n_updates"] == 1
+    assert int(held.state_dict()["optimizer"]["state"][0]["step"]) == 1  # the second minibatch saw how far the first went
+    assert not torch.equal(held.net.flat, start)
+
+
+def test_schedules_follow_the_steps_used() -> None:
+    algorithm = ppo(msgspec.structs.replace(EVERYTHING, learning_rate=1.0e-3, clip_range=0.2))
+    found = []
+    for seed in range(3):
+        left = 1 - algorithm.env_steps / 10_000
+        metrics = algorithm.update(batch(algorithm, seed), no_pulse)
+        assert metrics["train/learning_rate"] == pytest.approx(1e-3 * left)
+        assert metrics["train/clip_range"] == pytest.approx(0.2 * left)
+        found.append(metrics["train/learning_rate"])
+    assert found[0] == 1e-3
+    assert found[2] < found[1] < found[0]
+
+
+@pytest.mark.parametrize("spec", [DISCRETE, GAUSSIAN])
+def test_metrics_have_the_names_of_stable_baselines(spec: PolicySpec) -> None:
+    algorithm = ppo(PPOConfig(ent_coef=0.1, batch_size=1000, n_epochs=1), spec)
+    metrics = algorithm.update(batch(algorithm, 0), no_pulse)
+    names = "approx_kl clip_fraction entropy_loss explained_variance value_loss policy_gradient_loss loss learning_rate "
+    names += "clip_range n_updates" + (" std" if spec is GAUSSIAN else "")
+    assert {f"train/{name}" for name in names.split()} <= set(metrics)
+    parts = (metrics[f"train/{name}"] for name in ("policy_gradient_loss", "value_loss", "entropy_loss"))
+    policy, value, entropy = parts
+    assert metrics["train/loss"] == pytest.approx(policy + 0.5 * value + 0.1 * entropy)
+    if spec is DISCRETE:
+        assert entropy == pytest.approx(-np.log(4), abs=1e-2)
+    else:
+        assert metrics["train/std"] == pytest.approx(1, abs=1e-2)
+
+
+@pytest.mark.parametrize("name", ["log_prob", "reward"])
+def test_a_loss_that_is_not_finite_is_named_and_stops_before_the_weights(name: str) -> None:
+    algorithm = ppo()
+    algorithm.update(batch(algorithm, 0), no_pulse)
+    before = algorithm.net.flat.clone()
+    broken = batch(algorithm, 1)
+    getattr(broken, name)[broken.valid] = 3e38 if name == "reward" else -np.inf
+    with pytest.raises(RunError, match=r"update 1: \w+ expected finite, got"), np.errstate(all="ignore"):
+        algorithm.update(broken, no_pulse)
+    assert torch.equal(algorithm.net.flat, before)
+
+
+def test_gradients_derived_by_hand_are_those_of_autograd() -> None:
+    generator = torch.Generator().manual_seed(0)
+    log_ratio = (0.5 * torch.randn(50, generator=generator, dtype=torch.float64)).requires_grad_()
+    advantage, target = torch.randn(2, 50, generator=generator, dtype=torch.float64)
+    ratio = log_ratio.exp()
+    cases = {
+        "policy": (losses.clipped_surrogate(ratio, advantage, 0.2), log_ratio),
+        "value": (losses.value_loss(log_ratio, target), log_ratio),
+        "entropy": (losses.entropy_loss(log_ratio), log_ratio),
+    }
+    for name, ((loss, gradient), by) in cases.items():
+        (expected,) = torch.autograd.grad(loss, by, retain_graph=True)
+        torch.testing.assert_close(gradient.detach(), expected, msg=name)
+    assert (losses.clipped_surrogate(ratio, advantage, 0.2)[1] == 0).any()  # some rows are clipped
+
+
+def test_surrogate_is_the_papers() -> None:
+    ratio, advantage = torch.tensor([0.5, 0.5, 1.5, 1.5, 1.1]), torch.tensor([1.0, -1.0, 1.0, -1.0, 2.0])
+    loss, _ = losses.clipped_surrogate(ratio, advantage, 0.2)
+    torch.testing.assert_close(loss, -torch.tensor([0.5, -0.8, 1.2, -1.5, 2.2]).mean())
+    assert losses.clip_fraction(ratio, 0.2).item() == pytest.approx(0.8)
+
+
+def test_explained_variance() -> None:
+    target = np.array([1.0, 2.0, 3.0], np.float32)
+    assert losses.explained_variance(target, target) == 1
+    assert losses.explained_variance(np.zeros(3, np.float32), target) == 0
+    assert losses.explained_variance(-target, target) == pytest.approx(-3)
+    assert np.isnan(losses.explained_variance(target, np.ones(3, np.float32)))
+
+
+def test_the_gradient_is_shortened_to_max_grad_norm() -> None:
+    """Adam hides the length of the gradient; its first moment after one step does not."""
+    algorithm = ppo(PPOConfig(max_grad_norm=0.01, batch_size=1000, n_epochs=1))
+    metrics = algorithm.update(batch(algorithm, 0), no_pulse)
+    assert metrics["train/grad_norm"] > 0.01
+    moment = algorithm.state_dict()["optimizer"]["state"][0]["exp_avg"]
+    assert moment.norm().item() == pytest.approx(0.1 * 0.01, rel=1e-4)
+
+
+def identity_batch(algorithm: PPO, generator: np.random.Generator) -> tuple[Batch, float]:
+    """The identity environment: the right action is the observation; each episode is one step, then the copy resets."""
+    steps, N, spec = 32, 8, algorithm.policy
+    choice = generator.integers(0, 4, (steps + 1, N))
+    obs = np.eye(4, dtype=np.float32)[choice]
+    policy, over = NumpyPolicy(spec), distribution(spec.action)
+    policy.load(*algorithm.weights())
+    params = policy([obs[:-1]])
+    action = over.sample(params, over.noise(generator, (steps, N)))
+    valid = np.zeros((steps, N), bool)
+    valid[::2] = True
+    if spec.action.kind == "box":
+        reward = -np.square(action - obs[:-1, :, :2]).sum(-1)
+    else:
+        reward = (action == choice[:-1]).astype(np.float32)
+    rows = Batch(
+        obs=(obs,),
+        action=action,
+        log_prob=over.log_prob(params, action),
+        reward=np.where(valid, reward, 50).astype(np.float32),
+        terminated=valid.copy(),
+        truncated=np.zeros((steps, N), bool),
+        valid=valid,
+        lane=np.repeat(np.arange(2), 4),
+        fresh=np.zeros(N, bool),
+        episodes=(),
+    )
+    return rows, float(reward[valid].mean())
+
+
+@pytest.mark.parametrize(("spec", "start", "goal"), [(normal(DISCRETE), 0.5, 0.95), (normal(GAUSSIAN), -1.5, -0.35)])
+def test_it_learns_the_identity(spec: PolicySpec, start: float, goal: float) -> None:
+    algorithm = ppo(PPOConfig(learning_rate=0.01, n_epochs=5, gamma=0.9), spec)
+    generator = np.random.default_rng(0)
+    scores = []
+    for _ in range(40):
+        rows, score = identity_batch(algorithm, generator)
+        scores.append(score)
+        algorithm.update(rows, no_pulse)
+    assert scores[0] < start
+    assert np.mean(scores[-3:]) > goal

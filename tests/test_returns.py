@@ -1,0 +1,189 @@
+"""GAE and the discounted return against slow sums that look like the papers, over random episode boundaries."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import hypothesis.extra.numpy as hnp
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from learner.algorithms.returns import discounted_return, gae
+
+Array = npt.NDArray[Any]
+GAMMA, LAMBDA = 0.9, 0.8
+
+
+class Rows(NamedTuple):
+    """Columns of a batch, in the order `gae` takes them."""
+
+    reward: Array  # [T, N]
+    values: Array  # [T+1, N]
+    terminated: Array
+    truncated: Array
+    valid: Array
+
+    def gae(self, gamma: float = GAMMA, gae_lambda: float = LAMBDA) -> Array:
+        return gae(*self, gamma, gae_lambda)
+
+
+def lawful(terminated: Array, truncated: Array, first: Array) -> tuple[Array, Array, Array]:
+    """Flags that keep the law of a row: the row after an end is not valid and ends nothing."""
+    terminated, truncated, valid = terminated.copy(), truncated.copy(), np.ones_like(terminated)
+    valid[0] = first
+    for t in range(len(valid)):
+        if t:
+            valid[t] = ~(terminated[t - 1] | truncated[t - 1])
+        terminated[t] &= valid[t]
+        truncated[t] &= valid[t]
+    return terminated, truncated, valid
+
+
+@st.composite
+def rows(draw: st.DrawFn) -> Rows:
+    T, N = draw(st.integers(1, 12)), draw(st.integers(1, 4))
+    generator = np.random.default_rng(draw(st.integers(0, 2**32)))
+    clock = draw(hnp.arrays(bool, (T, N))) & (generator.random((T, N)) < 0.5)
+    terminated, truncated, valid = lawful(draw(hnp.arrays(bool, (T, N))), clock, draw(hnp.arrays(bool, N)))
+    reward, values = (generator.normal(size=(steps, N)).astype(np.float32) for steps in (T, T + 1))
+    return Rows(reward, values, terminated, truncated, valid)
+
+
+def slow_gae(r: Rows, gamma: float, gae_lambda: float) -> Array:
+    """Â_t = Σ_l (γλ)^l δ_{t+l}, up to the end of the episode or of the rollout (Schulman et al. 2016, eq. 16)."""
+    T, N = r.reward.shape
+    found = np.zeros((T, N))
+    for n in range(N):
+        for t in range(T):
+            if not r.valid[t, n]:
+                continue
+            for k in range(t, T):
+                nonterminal = 0.0 if r.terminated[k, n] else 1.0
+                delta = float(r.reward[k, n]) + gamma * nonterminal * float(r.values[k + 1, n]) - float(r.values[k, n])
+                found[t, n] += (gamma * gae_lambda) ** (k - t) * delta
+                if r.terminated[k, n] or r.truncated[k, n]:
+                    break
+    return found
+
+
+@given(rows(), st.floats(0, 1), st.floats(0, 1))
+@settings(max_examples=200, deadline=None)
+def test_gae_is_the_papers_sum(r: Rows, gamma: float, gae_lambda: float) -> None:
+    found = r.gae(gamma, gae_lambda)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, slow_gae(r, gamma, gae_lambda), atol=2e-5)
+
+
+@given(rows(), st.floats(0, 1))
+@settings(max_examples=100, deadline=None)
+def test_lambda_1_is_the_monte_carlo_return_less_the_value(r: Rows, gamma: float) -> None:
+    T, N = r.reward.shape
+    expected = np.zeros((T, N))
+    for n in range(N):
+        for t in range(T):
+            k, g, discount = t, 0.0, 1.0
+            while r.valid[t, n]:
+                g += discount * r.reward[k, n]
+                discount *= gamma
+                if r.terminated[k, n]:
+                    break
+                if r.truncated[k, n] or k == T - 1:
+                    g += discount * r.values[k + 1, n]
+                    break
+                k += 1
+            expected[t, n] = g - r.values[t, n] if r.valid[t, n] else 0
+    np.testing.assert_allclose(r.gae(gamma, 1.0), expected, atol=2e-5)
+
+
+@given(rows())
+@settings(max_examples=100, deadline=None)
+def test_a_batch_with_boundaries_is_its_episodes_put_together(r: Rows) -> None:
+    T, N = r.reward.shape
+    whole = r.gae()
+    for n in range(N):
+        ends = [t for t in range(T) if r.terminated[t, n] or r.truncated[t, n]]
+        starts = [t for t in range(T) if r.valid[t, n] and (t == 0 or not r.valid[t - 1, n])]
+        for start in starts:
+            stop = next((end + 1 for end in ends if end >= start), T)
+            cut = [array[start:stop, n : n + 1] for array in (r.reward, r.terminated, r.truncated, r.valid)]
+            alone = Rows(cut[0], r.values[start : stop + 1, n : n + 1], *cut[1:])
+            np.testing.assert_array_equal(whole[start:stop, n], alone.gae()[:, 0])
+
+
+def one_ending(terminated: bool, truncated: bool) -> Rows:
+    """Three steps of one copy that end at t = 1, and the row that resets it."""
+    flags = np.zeros((4, 1), bool)
+    flags[1] = True
+    reward = np.array([[1.0], [2.0], [99.0], [4.0]], np.float32)
+    values = np.array([[10.0], [20.0], [30.0], [40.0], [50.0]], np.float32)
+    return Rows(reward, values, *lawful(flags & terminated, flags & truncated, np.array([True])))
+
+
+def test_termination_does_not_bootstrap() -> None:
+    np.testing.assert_allclose(one_ending(True, False).gae()[1], 2 - 20)
+
+
+def test_truncation_bootstraps_from_the_final_observation() -> None:
+    np.testing.assert_allclose(one_ending(False, True).gae()[1], 2 + GAMMA * 30 - 20)
+
+
+def test_terminated_wins_when_both_flags_are_set() -> None:
+    np.testing.assert_array_equal(one_ending(True, True).gae(), one_ending(True, False).gae())
+
+
+@pytest.mark.parametrize(("terminated", "truncated"), [(True, False), (False, True), (True, True)])
+def test_an_end_cuts(terminated: bool, truncated: bool) -> None:
+    r = one_ending(terminated, truncated)
+    reward, values = r.reward.copy(), r.values.copy()
+    reward[3:] += 7
+    values[3:] += 5
+    later = r._replace(reward=reward, values=values)
+    np.testing.assert_array_equal(r.gae()[:3], later.gae()[:3])
+
+
+@given(rows(), st.sampled_from([0.0, 1e30, np.nan]))
+@settings(max_examples=100, deadline=None)
+def test_a_row_that_is_not_valid_changes_nothing(r: Rows, rubbish: float) -> None:
+    reward, values = r.reward.copy(), r.values.copy()
+    reward[~r.valid] = rubbish
+    before = np.zeros_like(r.valid)
+    before[1:] = r.truncated[:-1] & ~r.terminated[:-1]
+    values[:-1][~r.valid & ~before] = rubbish  # the value of a reset row's obs is used only to bootstrap a truncation
+    found = r._replace(reward=reward, values=values).gae()
+    np.testing.assert_array_equal(found, r.gae())
+    assert not found[~r.valid].any()
+
+
+@given(rows(), st.floats(0, 1))
+@settings(max_examples=100, deadline=None)
+def test_discounted_return_is_the_sum_of_past_rewards(r: Rows, gamma: float) -> None:
+    T, N = r.reward.shape
+    start = np.arange(1.0, N + 1)
+    found, last = discounted_return(r.reward, r.terminated | r.truncated, r.valid, gamma, start)
+    for n in range(N):
+        past: list[float] = [start[n]]
+        for t in range(T):
+            if r.valid[t, n]:
+                past.append(float(r.reward[t, n]))
+                expected = sum(gamma ** (len(past) - 1 - i) * reward for i, reward in enumerate(past))
+                np.testing.assert_allclose(found[t, n], expected, atol=1e-9)
+            else:
+                assert found[t, n] == 0
+            if not r.valid[t, n] or r.terminated[t, n] or r.truncated[t, n]:
+                past = []
+        np.testing.assert_allclose(last[n], found[-1, n] if past else 0)
+
+
+def test_discounted_return_goes_on_where_the_last_rollout_stopped() -> None:
+    generator = np.random.default_rng(0)
+    reward = generator.normal(size=(10, 3)).astype(np.float32)
+    terminated, truncated, valid = lawful(generator.random((10, 3)) < 0.2, np.zeros((10, 3), bool), np.ones(3, bool))
+    ended = terminated | truncated
+    whole, end = discounted_return(reward, ended, valid, GAMMA, np.zeros(3))
+    first, middle = discounted_return(reward[:4], ended[:4], valid[:4], GAMMA, np.zeros(3))
+    second, last = discounted_return(reward[4:], ended[4:], valid[4:], GAMMA, middle)
+    np.testing.assert_array_equal(whole, np.concatenate([first, second]))
+    np.testing.assert_array_equal(end, last)
