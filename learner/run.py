@@ -72,7 +72,7 @@ class Run:
         self.journal = Journal(config, self.folder, spec, self.algorithm, self.hub, past, watch)
 
     def go(self, workers: int, dead_workers: DeadWorkers = lambda: ()) -> None:
-        """Train until done. `workers`: how many to wait for first; `dead_workers`: names those known to have ended, and why."""
+        """Train until done. `workers`: how many to wait for; `dead_workers` names those known to have ended, and why."""
         signals: list[int] = []
 
         def check() -> None:
@@ -93,7 +93,7 @@ class Run:
 
 
 def serve(config: Config, resume: Path | None, watch: Watch) -> Path:
-    """The learner alone, at `config.bind`: workers are started elsewhere. The run folder. Raises `OurError`, `Interrupted`."""
+    """The learner alone, at `config.bind`: workers are started elsewhere. Its run folder."""
     if not is_local(config.bind):
         raise UsageError(
             f"address {config.bind} can be reached by other machines, and workers cannot prove who they are yet; "

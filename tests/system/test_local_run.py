@@ -19,7 +19,7 @@ from learner.metrics import Progress, read_rows
 from millrace.launch.local import train
 from protocol.errors import EnvironmentFailed, NoWorkers
 
-SMALL = {"n_epochs": 2, "eval_episodes": 2}  # what is shown here does not hang on learning much
+SMALL: dict[str, Any] = {"n_epochs": 2, "eval_episodes": 2}  # what is shown here does not hang on learning much
 
 
 def run(tmp_path: Path, env: str, watch: Any = lambda progress: None, resume: Path | None = None, **settings: Any) -> Path:
@@ -49,7 +49,7 @@ def worker_processes() -> list[psutil.Process]:
 )
 def test_the_same_curve_whatever_the_number_of_workers(tmp_path: Path, env: str, settings: dict[str, Any]) -> None:
     """20 updates on one seed, in the default lanes: the same bytes for 1, 2 and 4 workers, over inproc, ipc and tcp."""
-    policies = {}
+    policies: dict[tuple[int | str, str], bytes] = {}
     for workers in (1, 2, 4):
         for transport in ("inproc", "ipc", "tcp"):
             folder = run(tmp_path, env, seed=3, workers=workers, transport=transport, eval_episodes=1, **settings)
