@@ -30,7 +30,7 @@ OpenCopies = Callable[[RunSpec, Pulse], Copies]
 
 def loop_over_copies(run: RunSpec, pulse: Pulse) -> Copies:
     """The copies of one lane as a loop: what a worker opens unless it is told otherwise."""
-    return CopyLoop(run.env, run.copies, pulse)
+    return CopyLoop(run.env.make, run.copies, pulse)
 
 
 class _Rows(NamedTuple):

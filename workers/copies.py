@@ -18,7 +18,6 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 from protocol.errors import UsageError
 from protocol.spaces import reader
-from protocol.specs import EnvSpec
 
 Array = npt.NDArray[Any]
 Leaves = Sequence[Any]  # for each leaf of the observation: an array [N, *leaf], or a sequence of N observations
@@ -75,12 +74,12 @@ def copy_seeds(seed: int, lane: int, incarnation: int, copies: int) -> list[int]
 class CopyLoop:
     """A loop over N environments."""
 
-    def __init__(self, spec: EnvSpec, copies: int, pulse: Pulse) -> None:
+    def __init__(self, make: Callable[[], gymnasium.Env[Any, Any]], copies: int, pulse: Pulse) -> None:
         self._envs: list[gymnasium.Env[Any, Any]] = []
         for copy in range(copies):
             pulse()
             try:
-                self._envs.append(spec.make())
+                self._envs.append(make())
             except UsageError:
                 self.close()
                 raise
