@@ -89,7 +89,8 @@ def _decode(frames: Sequence[Buffer], kind: Any) -> Any:
     except BadMessage:
         raise
     except Exception as error:  # msgpack and msgspec raise a dozen types on hostile bytes; to us they are one
-        raise BadMessage(f"head is not a message of ours: {type(error).__name__}: {error}") from error
+        said = " ".join(str(error).split())[:200]  # it quotes the peer
+        raise BadMessage(f"head is not a message of ours: {type(error).__name__}: {said}") from error
     if len(used) != len(frames) - 1:
         raise BadMessage(f"{type(message).__name__}: expected {len(used)} arrays, got {len(frames) - 1} frames")
     return message
