@@ -7,10 +7,9 @@ The algorithm's own settings stand in a TOML table named after it, `[ppo]`, and 
 
 from __future__ import annotations
 
-import difflib
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_type_hints
 
@@ -21,6 +20,7 @@ from tyro.conf import Positional
 
 from learner.algorithms import ALGORITHMS
 from learner.algorithms.ppo import PPOConfig
+from learner.nearest import nearest
 from protocol.errors import UsageError
 from protocol.link import check_address
 
@@ -103,17 +103,33 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return checked(_over_toml(Config(), _parse(text, where), where), where)
 
 
-def resolve(env: str = "", *, file: Path | None = None, preset: str = "auto", **keywords: Any) -> Config:
+def resolve(
+    env: str = "", *, file: Path | None = None, resume: Path | None = None, preset: str = "auto", **keywords: Any
+) -> Config:
     """The configuration of a run from all layers, checked. Raises `UsageError` in one line.
 
-    `preset` is "auto" (that of the environment, if there is one), "none", or the environment whose preset to take.
+    `preset` is "auto" (that of the environment, if there is one), "none", or the environment whose preset to take. A run
+    that is resumed has its own file, and no preset.
     """
-    base = lower_layers(env, keywords.get("algo"), file, preset)
+    base = lower_layers(env, algo=keywords.get("algo"), file=file, resume=resume, preset=preset)
     return checked(over(base, keywords, "keyword argument"))
 
 
-def lower_layers(env: str, algo: str | None, file: Path | None, preset: str = "auto") -> Config:
+def lower_layers(
+    env: str,
+    *,
+    algo: str | None = None,
+    file: Path | None = None,
+    resume: Path | None = None,
+    preset: str = "auto",
+) -> Config:
     """What stands below flags and keyword arguments: defaults, preset, file. Fields fit their types, and no more."""
+    if resume is not None:
+        if file is not None:
+            raise UsageError(f"a config file ({file}) or a run to resume ({resume}): expected one, got both")
+        file, preset = resume / "config.toml", "none"
+        if not file.is_file():
+            raise UsageError(f"run {resume}: expected a run folder with a config.toml to resume, got none")
     where = str(file)
     table: dict[str, Any] = {}
     if file is not None:
@@ -122,6 +138,8 @@ def lower_layers(env: str, algo: str | None, file: Path | None, preset: str = "a
         except (OSError, UnicodeDecodeError) as error:
             says = error.strerror if isinstance(error, OSError) else "it is not text"
             raise UsageError(f"config file {where} cannot be read: {says}") from error
+    if resume is not None and env not in ("", table.get("env")):
+        raise UsageError(f"run {resume} is of {table.get('env')}, not of {env}; resume it without naming an environment")
     env = env or str(table.get("env", ""))
     config = _of_algorithm(algo or str(table.get("algo", "ppo")))
     if preset != "none":
@@ -166,12 +184,6 @@ def checked(config: Config, where: str = "") -> Config:
         )
     check_address(config.bind)
     return config
-
-
-def nearest(name: str, known: Iterable[str]) -> str:
-    """`; did you mean …?` if something known is close to the name, else nothing."""
-    found = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
-    return f"; did you mean {found[0]}?" if found else ""
 
 
 def _without_none(plain: dict[str, Any]) -> dict[str, Any]:

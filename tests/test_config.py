@@ -139,9 +139,19 @@ def test_a_file_of_bytes_is_not_text(tmp_path: Path) -> None:
 def test_lower_layers_are_not_yet_judged_as_a_whole(tmp_path: Path) -> None:
     """A flag may still repair what a file alone would break."""
     file = written(tmp_path, "lanes = 3\n")
-    assert lower_layers("CartPole-v1", None, file).lanes == 3
+    assert lower_layers("CartPole-v1", file=file).lanes == 3
     assert resolve("CartPole-v1", file=file, envs=9).envs == 9
     assert "8 envs" in refusal(file=file)
+
+
+def test_a_resumed_run_keeps_its_settings_but_for_those_given(tmp_path: Path) -> None:
+    config = resolve("CartPole-v1", preset="none", gamma=0.5)
+    (tmp_path / "config.toml").write_text(config.to_toml())
+    assert resolve(resume=tmp_path) == resolve("CartPole-v1", resume=tmp_path) == config
+    assert resolve(resume=tmp_path, steps=5).steps == 5
+    assert f"run {tmp_path} is of CartPole-v1, not of Pendulum-v1" in refusal("Pendulum-v1", resume=tmp_path)
+    assert "expected one, got both" in refusal(resume=tmp_path, file=tmp_path / "config.toml")
+    assert "nowhere: expected a run folder with a config.toml to resume, got none" in refusal(resume=tmp_path / "nowhere")
 
 
 def test_every_preset_makes_a_configuration_of_its_own() -> None:

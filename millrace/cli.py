@@ -1,0 +1,156 @@
+"""The command line. Flags are the fields of the configuration, their help the texts under them; nothing is said twice.
+
+The law: what a user did wrong is one line on stderr and exit code 2; what went wrong is one line (and the worker's own
+traceback, if there is one) and exit code 1; 130 after Ctrl-C; a traceback of ours with --debug alone. Imports wait until a
+command needs them, so that `--help` answers at once.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from typing import NamedTuple
+
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_variable, "1")  # before numpy; --torch-threads sets the learner's
+
+from protocol.errors import OurError, UsageError
+
+WHAT = "Worker processes step a gymnasium environment, one PyTorch learner learns."
+
+
+class Command(NamedTuple):
+    """A subcommand."""
+
+    run: Callable[[list[str]], int]
+    usage: str
+    help: str
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line; the exit code."""
+    argv = sys.argv[1:] if argv is None else argv
+    try:
+        return _dispatch(argv)
+    except OurError as error:
+        _say(f"millrace: {error}")
+        if error.detail:
+            _say(error.detail.rstrip())
+        return _trace(argv, error.exit_code)
+    except KeyboardInterrupt as interrupt:
+        run = getattr(interrupt, "run", None)
+        _say(f"millrace: interrupted{f'; go on with: millrace train --resume {run}' if run else ''}")
+        return _trace(argv, 130)
+    except Exception as error:
+        says = (str(error).strip().splitlines() or ["no message"])[0]
+        hint = "" if "--debug" in argv else "; --debug shows the traceback"
+        _say(f"millrace: internal error: {type(error).__name__}: {says}{hint}")
+        return _trace(argv, 1)
+
+
+def _dispatch(argv: list[str]) -> int:
+    if not argv or argv[0] in ("-h", "--help"):
+        print(_overview())
+        return 0
+    if argv[0] == "--version":
+        import millrace
+
+        print(f"millrace {millrace.__version__}")
+        return 0
+    name, *rest = argv
+    if name not in COMMANDS:
+        from learner.nearest import nearest
+
+        raise UsageError(f"unknown command {name}{nearest(name, COMMANDS) or '; millrace --help lists them'}")
+    return COMMANDS[name].run(rest)
+
+
+def _overview() -> str:
+    width = max(len(command.usage) for command in COMMANDS.values())
+    lines = [f"  millrace {command.usage:{width}}  {command.help}" for command in COMMANDS.values()]
+    return "\n".join([WHAT, "", *lines, "", "millrace COMMAND --help tells more; --debug shows tracebacks; --version."])
+
+
+# ---------------------------------------------------------------------------------------------------------- commands
+
+
+def _train(argv: list[str]) -> int:
+    from millrace.run_flags import configuration
+
+    config, resume = configuration("train", argv)
+    from millrace.launch import local
+    from millrace.terminal import watching
+
+    with watching() as watch:
+        run = local.train(config, resume, watch)
+    print(run)
+    return 0
+
+
+def _learner(argv: list[str]) -> int:
+    from millrace.run_flags import configuration
+
+    config, resume = configuration("learner", argv)
+    from learner.run import serve
+    from millrace.terminal import watching
+
+    with watching() as watch:
+        run = serve(config, resume, watch)
+    print(run)
+    return 0
+
+
+def _worker(argv: list[str]) -> int:
+    from workers.__main__ import main as work
+
+    return work([flag for flag in argv if flag != "--debug"])
+
+
+def _evaluate(argv: list[str]) -> int:
+    from learner.evaluate import evaluate, load_policy
+    from millrace.flags import EvaluateFlags, parse
+
+    flags = parse(EvaluateFlags, argv, "evaluate")
+    policy, spec, env = load_policy(flags.run)
+    found = evaluate(env, policy, spec.action, flags.episodes, flags.seed)
+    cut = f", {found.cut} of them cut short" if found.cut else ""
+    print(f"return {found.return_mean:.1f} ± {found.return_std:.1f} over {found.episodes} episodes{cut}")
+    return 0
+
+
+def _plot(argv: list[str]) -> int:
+    from learner.report import plot
+    from millrace.flags import PlotFlags, parse
+
+    flags = parse(PlotFlags, argv, "plot")
+    if not flags.runs:
+        raise UsageError("plot: which runs? expected run folders, as in: millrace plot runs/*")
+    print(plot(flags.runs, flags.out or flags.runs[0] / "curves.png"))
+    return 0
+
+
+COMMANDS = {
+    "train": Command(_train, "train ENV [flags]", "train on this machine: the learner here, worker processes beside it"),
+    "learner": Command(
+        _learner, "learner ENV --bind ADDRESS [flags]", "the learner alone; waits for workers from elsewhere"
+    ),
+    "worker": Command(_worker, "worker ADDRESS [flags]", "one worker process that joins a learner"),
+    "evaluate": Command(_evaluate, "evaluate RUN [flags]", "greedy episodes of a run's newest policy"),
+    "plot": Command(_plot, "plot RUN [RUN ...] [--out FILE]", "learning curves as a PNG"),
+}
+
+
+# ---------------------------------------------------------------------------------------------------------- saying it
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr)
+
+
+def _trace(argv: list[str], exit_code: int) -> int:
+    if "--debug" in argv:
+        import traceback
+
+        traceback.print_exc()
+    return exit_code

@@ -1,0 +1,304 @@
+"""The command line: what a user does wrong is one line and exit code 2, and leaves nothing behind."""
+
+import os
+import re
+import subprocess
+import sys
+import time
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import millrace
+from learner import checkpoint
+from learner.config import Config, resolve
+from learner.metrics import MetricsLog, Progress
+from learner.run_folder import Interrupted, RunFolder
+from millrace.cli import COMMANDS, main
+from protocol.errors import EnvironmentFailed, NoWorkers
+from protocol.policy import layout, size
+from protocol.spaces import action_spec, observation_leaves
+from protocol.specs import EnvSpec, PolicySpec
+
+ROOT = Path(__file__).parent.parent
+Captured = pytest.CaptureFixture[str]
+
+
+def refusal(capsys: Captured, *argv: str, exit_code: int = 2) -> str:
+    """The one line on stderr."""
+    assert main(list(argv)) == exit_code
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    assert err.startswith("millrace: ")
+    assert "Traceback" not in err
+    return err.removeprefix("millrace: ").rstrip()
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
+    """Stands in for the run: what it was asked for. The current folder is an empty one."""
+    calls: list[Any] = []
+
+    def train(config: Config, resume: Path | None, watch: Any, factory: Any = None) -> Path:
+        calls.append((config, resume, factory))
+        watch(Progress(env_steps=5, total_steps=10))
+        return Path("runs/a-run")
+
+    monkeypatch.setattr("millrace.launch.local.train", train)
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    return calls
+
+
+# ------------------------------------------------------------------------------------------------- bad usage of flags
+
+
+@pytest.mark.parametrize(
+    ("argv", "says"),
+    [
+        (["trian"], "unknown command trian; did you mean train?"),
+        (["fly"], "unknown command fly; millrace --help lists them"),
+        (["train"], "which environment? expected one that gymnasium.make takes, as in: millrace train CartPole-v1"),
+        (
+            ["train", "CartPole-v1", "--learning-rat", "1e-3"],
+            "train: unknown flag --learning-rat; did you mean --learning-rate?",
+        ),
+        (["train", "--worker", "3", "CartPole-v1"], "train: unknown flag --worker; did you mean --workers?"),
+        (["train", "CartPole-v1", "--zzz"], "train: unknown flag --zzz"),
+        (["train", "CartPole-v1", "more"], "train: unexpected argument more"),
+        (["train", "CartPole-v1", "--workers", "0"], "workers expected int >= 1, got 0"),
+        (["train", "CartPole-v1", "--envs", "6"], "6 envs cannot be shared evenly among 4 lanes; take 4 or 8, or 3 lanes"),
+        (["train", "CartPole-v1", "--algo", "pp0"], "algo pp0: expected one of ppo; did you mean ppo?"),
+        (
+            ["train", "CartPole-v1", "--preset", "CartPole"],
+            "preset CartPole: ppo has none of this name; did you mean CartPole-v1?",
+        ),
+        (["train", "--config", "/no.toml"], "config file /no.toml cannot be read: No such file or directory"),
+        (["plot"], "plot: which runs? expected run folders, as in: millrace plot runs/*"),
+        (["plot", "/no"], "run /no: expected a run folder to plot, got no such folder"),
+        (["evaluate", "/no"], "run /no: no such folder"),
+        (["evaluate", "/no", "--episode", "3"], "evaluate: unknown flag --episode; did you mean --episodes?"),
+    ],
+)
+def test_bad_usage_is_one_exact_line(asked: list[Any], capsys: Captured, argv: list[str], says: str) -> None:
+    assert refusal(capsys, *argv) == says
+    assert not asked
+    assert not list(Path.cwd().iterdir())
+
+
+@pytest.mark.parametrize(
+    ("argv", "says"),
+    [
+        (["train", "CartPole-v1", "--workers", "two"], "--workers expected a whole number, got 'two'"),
+        (["train", "CartPole-v1", "--learning-rate", "x"], "--learning-rate expected a number, got 'x'"),
+        (["train", "CartPole-v1", "--transport", "udp"], "--transport expected one of 'inproc', 'ipc', 'tcp', got 'udp'"),
+        (["train", "CartPole-v1", "--seed"], "'--seed'"),
+        (["evaluate"], "missing: RUN"),
+    ],
+)
+def test_what_tyro_refuses_is_one_line_too(asked: list[Any], capsys: Captured, argv: list[str], says: str) -> None:
+    line = refusal(capsys, *argv)
+    assert says in line
+    assert line.endswith(f"millrace {argv[0]} --help tells more")
+    assert not asked
+
+
+def test_an_unknown_key_names_its_file(asked: list[Any], capsys: Captured) -> None:
+    Path("my.toml").write_text("[ppo]\nlearning_rat = 1e-3\n")
+    line = refusal(capsys, "train", "CartPole-v1", "--config", "my.toml")
+    assert line == "my.toml: unknown setting learning_rat; did you mean learning_rate?"
+
+
+# ------------------------------------------------------------------------------- bad environments, folders, checkpoints
+
+
+@pytest.mark.parametrize(
+    ("argv", "says"),
+    [
+        (["NoSuch-v0"], "environment NoSuch-v0 is not registered"),
+        (["no_such_module_of_mine:Env-v0"], "no_such_module_of_mine"),
+        (["CartPole-v1", "--env-kwargs", "gravitas", "3"], "gravitas"),
+        pytest.param(["ALE/Pong-v5"], "ALE/Pong-v5", marks=pytest.mark.skipif(bool(find_spec("ale_py")), reason="is here")),
+        pytest.param(["CarRacing-v3"], "box2d", marks=pytest.mark.skipif(bool(find_spec("Box2D")), reason="is here")),
+    ],
+)
+def test_an_environment_that_cannot_be_made_leaves_no_folder(
+    tmp_path: Path, capsys: Captured, argv: list[str], says: str
+) -> None:
+    line = refusal(capsys, "train", *argv, "--run-dir", str(tmp_path / "runs"))
+    assert says in line
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_run_folder_that_exists_is_left_alone(tmp_path: Path, capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("learner.run_folder.time.strftime", lambda *_: "now")
+    (tmp_path / "CartPole-v1-ppo-s1-now").mkdir()
+    line = refusal(capsys, "train", "CartPole-v1", "--run-dir", str(tmp_path))
+    assert re.search(r"run folder \S+/CartPole-v1-ppo-s1-now exists; .*--run-dir", line)
+    assert not list((tmp_path / "CartPole-v1-ppo-s1-now").iterdir())
+
+
+def test_a_broken_checkpoint_is_not_resumed(tmp_path: Path, capsys: Captured) -> None:
+    run = RunFolder.create(resolve("CartPole-v1", run_dir=str(tmp_path))).path
+    line = refusal(capsys, "train", "--resume", str(run), exit_code=1)
+    assert "expected a checkpoint in checkpoints/, got none" in line
+    checkpoint.save(run, {}, 100, keep=3).write_bytes(b"PK broken")
+    line = refusal(capsys, "train", "--resume", str(run), exit_code=1)
+    assert "expected a whole checkpoint, got 1 broken" in line
+    assert "run /nowhere: expected a run folder" in refusal(capsys, "train", "--resume", "/nowhere")
+
+
+# --------------------------------------------------------------------------------------------------------- good usage
+
+
+def test_flags_stand_above_the_file_and_the_preset(asked: list[Any], capsys: Captured) -> None:
+    Path("my.toml").write_text('env = "CartPole-v1"\nseed = 7\n[ppo]\ngamma = 0.5\nnet = [8]\n[env_kwargs]\na = 1\nb = 1\n')
+    argv = "--config my.toml --net 32 16 --target-return -150 --no-normalize-advantage --env-kwargs b 2.5 c True --workers 3"
+    assert main(["train", *argv.split()]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "runs/a-run"
+    ((config, resume, _),) = asked
+    assert resume is None
+    assert config == resolve(
+        "CartPole-v1", seed=7, gamma=0.5, net=(32, 16), target_return=-150.0, normalize_advantage=False, workers=3,
+        env_kwargs={"a": 1, "b": 2.5, "c": True},
+    )  # fmt: skip
+    assert config.algorithm.gae_lambda == 0.8  # of the preset
+
+
+def test_the_environment_may_stand_anywhere_among_the_flags(asked: list[Any]) -> None:
+    assert main(["train", "--workers", "3", "Pendulum-v1", "--seed", "4"]) == 0
+    assert asked[0][0] == resolve("Pendulum-v1", workers=3, seed=4)
+
+
+def test_a_resumed_run_reads_its_own_file(asked: list[Any], capsys: Captured) -> None:
+    run = RunFolder.create(resolve("CartPole-v1", gamma=0.5)).path
+    assert main(["train", "--resume", str(run), "--steps", "9"]) == 0
+    config, resume, _ = asked[0]
+    assert (config, resume) == (resolve("CartPole-v1", gamma=0.5, steps=9), run)
+    capsys.readouterr()
+    assert "is of CartPole-v1, not of Pendulum-v1" in refusal(capsys, "train", "Pendulum-v1", "--resume", str(run))
+
+
+def test_the_python_face_takes_the_same_names(asked: list[Any]) -> None:
+    seen: list[Progress] = []
+    assert millrace.train("CartPole-v1", seed=3, learning_rate=1e-4, watch=seen.append) == Path("runs/a-run")
+    assert asked == [(resolve("CartPole-v1", seed=3, learning_rate=1e-4), None, None)]
+    assert [progress.env_steps for progress in seen] == [5]
+
+
+def test_the_python_face_takes_a_callable(asked: list[Any]) -> None:
+    def my_env() -> None: ...
+
+    millrace.train(my_env, workers=1)
+    ((config, _, factory),) = asked
+    assert (config.env, config.workers) == ("my_env", 1)
+    assert factory is my_env
+
+
+# ------------------------------------------------------------------------------------------------ how a run can go wrong
+
+
+def failing(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
+    def train(*_: Any) -> Path:
+        raise error
+
+    monkeypatch.setattr("millrace.launch.local.train", train)
+
+
+def test_errors_of_ours_are_one_line_with_their_exit_code(capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
+    failing(monkeypatch, NoWorkers("nobody has been here for 60 s"))
+    assert refusal(capsys, "train", "CartPole-v1", exit_code=1) == "nobody has been here for 60 s"
+
+
+def test_the_workers_own_traceback_stands_beneath(capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
+    failing(monkeypatch, EnvironmentFailed("lane 2 raised too often", "Traceback of worker w1:\n  step\nKeyError: 3\n"))
+    assert main(["train", "CartPole-v1"]) == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == ["millrace: lane 2 raised too often", "Traceback of worker w1:", "  step", "KeyError: 3"]
+
+
+def test_an_error_in_millrace_hides_its_traceback_until_asked(capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
+    failing(monkeypatch, ZeroDivisionError("division\nby zero"))
+    line = refusal(capsys, "train", "CartPole-v1", exit_code=1)
+    assert line == "internal error: ZeroDivisionError: division; --debug shows the traceback"
+    assert main(["train", "CartPole-v1", "--debug"]) == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[:2] == ["millrace: internal error: ZeroDivisionError: division", "Traceback (most recent call last):"]
+
+
+def test_an_interrupted_run_says_how_to_go_on(capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
+    failing(monkeypatch, Interrupted(Path("runs/mine")))
+    line = refusal(capsys, "train", "CartPole-v1", exit_code=130)
+    assert line == "interrupted; go on with: millrace train --resume runs/mine"
+    failing(monkeypatch, KeyboardInterrupt())
+    assert refusal(capsys, "train", "CartPole-v1", exit_code=130) == "interrupted"
+
+
+# ------------------------------------------------------------------------------------------------- evaluate, plot, help
+
+
+def test_evaluate_says_mean_and_deviation(tmp_path: Path, capsys: Captured) -> None:
+    run = RunFolder.create(resolve("CartPole-v1", run_dir=str(tmp_path)))
+    env = EnvSpec("CartPole-v1")
+    made = env.make()
+    spec = PolicySpec(observation_leaves(made.observation_space), action_spec(made.action_space), net=(4,))
+    run.write_policy(spec, env, np.zeros(size(layout(spec)[0]), np.float32), np.zeros(0, np.float32))
+    assert main(["evaluate", str(run.path), "--episodes", "30"]) == 0
+    first = capsys.readouterr().out
+    assert re.fullmatch(r"return 9\.\d ± 0\.\d over 30 episodes\n", first)  # always left: it falls after nine steps
+    assert main(["evaluate", str(run.path), "--episodes", "30", "--seed", "1000000"]) == 0
+    assert capsys.readouterr().out == first
+
+
+def test_plot_draws_into_the_run_folder_or_where_it_is_told(tmp_path: Path, capsys: Captured) -> None:
+    run = RunFolder.create(resolve("CartPole-v1", run_dir=str(tmp_path))).path
+    log = MetricsLog(run)
+    for steps in (100, 200):
+        log.write(Progress(env_steps=steps, return_mean=float(steps)), {})
+    log.close()
+    assert main(["plot", str(run)]) == 0
+    assert capsys.readouterr().out == f"{run}/curves.png\n"
+    assert (run / "curves.png").read_bytes().startswith(b"\x89PNG")
+    assert main(["plot", str(run), str(run), "--out", str(tmp_path / "both.png")]) == 0
+    assert (tmp_path / "both.png").stat().st_size > 10_000
+
+
+def test_the_overview_lists_what_there_is(capsys: Captured) -> None:
+    assert main(["--help"]) == 0
+    out = capsys.readouterr().out
+    assert all(f"millrace {name} " in out for name in COMMANDS)
+    assert main([]) == 0
+    assert capsys.readouterr().out == out
+
+
+def test_the_help_is_the_text_under_each_field_with_the_presets_defaults(capsys: Captured) -> None:
+    for argv in (["train", "CartPole-v1", "--help"], ["train", "--help"]):
+        with pytest.raises(SystemExit) as stop:
+            main(argv)
+        assert stop.value.code == 0
+    both = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "--gae-lambda FLOAT λ of the advantage estimate" in both
+    assert both.count("(default: 0.8)") == 1  # of the preset, once the environment is named
+    assert "--env " not in both
+
+
+def test_help_answers_at_once() -> None:
+    """Less than 0.3 s on a quiet machine; a busy one gets more, and torch alone would take longer."""
+    took_s = []
+    for _ in range(3):
+        began_s = time.monotonic()
+        done = subprocess.run(
+            [sys.executable, "-X", "importtime", "-m", "millrace", "--help"],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        took_s.append(time.monotonic() - began_s)
+        assert done.returncode == 0
+        assert not re.search(r"\| +(torch|numpy|gymnasium|rich|tyro)$", done.stderr, re.M)
+    assert min(took_s) < 0.3 + 0.1 * os.getloadavg()[0]
