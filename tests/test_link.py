@@ -210,12 +210,12 @@ def test_a_worker_in_a_thread_of_its_own(ends: Ends) -> None:
 
 
 def test_a_worker_may_come_before_its_learner(ends: Ends) -> None:
-    if ends.address.startswith("tcp"):
-        first = LearnerLink(ends.address, ends.context)
-        ends.address = first.address
-        first.close(linger_s=0.0)
-    worker = ends.worker(ends.address)
-    worker.send(encode(HELLO))
+    with plain.socket() as reserved:  # bound and not listening: nobody else gets the port, and nobody answers there
+        if ends.address.startswith("tcp"):
+            reserved.bind(("127.0.0.1", 0))
+            ends.address = f"tcp://127.0.0.1:{reserved.getsockname()[1]}"
+        worker = ends.worker(ends.address)
+        worker.send(encode(HELLO))
     assert heard(ends.learner()) == [(b"w0", HELLO)]
 
 
