@@ -125,7 +125,7 @@ class MetricsLog:
         if table.exists():
             kept = [row for row in read_rows(table) if (row.get(X) or 0) <= from_env_steps]
             write_atomically(table, lambda file: file.writelines(_line(row) for row in kept))
-        events = folder / "tensorboard" / f"events.out.tfevents.{int(time.time())}.{socket.gethostname()}.{os.getpid()}"
+        events = folder / "tensorboard" / f"events.out.tfevents.{time.time_ns()}.{socket.gethostname()}.{os.getpid()}"
         events.parent.mkdir(exist_ok=True)
         self._table, self._events = _Appender(table), _Appender(events)
         self._events.append(_first_event(from_env_steps))

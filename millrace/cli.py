@@ -32,7 +32,9 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line; the exit code."""
     argv = sys.argv[1:] if argv is None else argv
     try:
-        return _dispatch(argv)
+        exit_code = _dispatch(argv)
+        sys.stdout.flush()
+        return exit_code
     except OurError as error:
         _say(f"millrace: {error}")
         if error.detail:
@@ -42,6 +44,9 @@ def main(argv: list[str] | None = None) -> int:
         run = getattr(interrupt, "run", None)
         _say(f"millrace: interrupted{f'; go on with: millrace train --resume {run}' if run else ''}")
         return _trace(argv, 130)
+    except BrokenPipeError:  # whoever read our output has gone: nobody is left to tell
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except Exception as error:
         says = (str(error).strip().splitlines() or ["no message"])[0]
         hint = "" if "--debug" in argv else "; --debug shows the traceback"

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-
-import msgspec
+from typing import Any
 
 from learner.config import Config, checked, lower_layers, over
 from millrace.flags import parse
 
 
-class RunFlags(msgspec.Struct, frozen=True, kw_only=True):
+class RunFlags(Config, frozen=True, kw_only=True):
     """Train a policy. What is not given here comes from --config, then the preset of the environment, then the defaults."""
 
-    run: Config = Config()
-    """the run"""
     config: Path | None = None
     """a TOML file of settings; a run folder's config.toml repeats that run"""
     preset: str = "auto"
@@ -30,11 +27,14 @@ def configuration(command: str, argv: list[str]) -> tuple[Config, Path | None]:
 
     Flags are read twice, because what lies below them depends on them.
     """
-    unset = RunFlags(run=Config(algo=""))
-    early = parse(RunFlags, [flag for flag in argv if flag not in ("-h", "--help")], command, unset, lenient=True)
-    base = lower_layers(
-        early.run.env, algo=early.run.algo or None, file=early.config, resume=early.resume, preset=early.preset
-    )
-    flags = parse(RunFlags, argv, command, RunFlags(run=msgspec.structs.replace(base, env_kwargs={})))
-    env_kwargs = base.env_kwargs | flags.run.env_kwargs
-    return checked(over(flags.run, {"env_kwargs": env_kwargs}, "")), flags.resume
+    asked = [flag for flag in argv if flag not in ("-h", "--help")]
+    first = parse(RunFlags, asked, command, RunFlags(algo=""), lenient=True)
+    base = lower_layers(first.env, algo=first.algo or None, file=first.config, resume=first.resume, preset=first.preset)
+    below = {**_fields(base), "env_kwargs": {}}
+    flags = parse(RunFlags, argv if asked == argv else ["--help"], command, RunFlags(**below))
+    config = Config(**_fields(flags))
+    return checked(over(config, {"env_kwargs": base.env_kwargs | config.env_kwargs}, "")), flags.resume
+
+
+def _fields(config: Config) -> dict[str, Any]:
+    return {name: getattr(config, name) for name in Config.__struct_fields__}

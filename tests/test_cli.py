@@ -283,7 +283,18 @@ def test_the_help_is_the_text_under_each_field_with_the_presets_defaults(capsys:
     both = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "--gae-lambda FLOAT λ of the advantage estimate" in both
     assert both.count("(default: 0.8)") == 1  # of the preset, once the environment is named
+    assert both.count("[ENV] anything gymnasium.make takes") == 2
+    assert both.count("(default: CartPole-v1)") == 1
     assert "--env " not in both
+
+
+def test_a_reader_that_goes_away_is_no_error() -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing) as pipe:
+        command = [sys.executable, "-m", "millrace", "--help"]
+        done = subprocess.run(command, cwd=ROOT, stdout=pipe, stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (1, "")
 
 
 def test_help_answers_at_once() -> None:
