@@ -147,10 +147,10 @@ def test_weights_are_snapshots_of_the_acting_part() -> None:
     algorithm.update(batch(algorithm, 0), no_pulse)
     np.testing.assert_array_equal(parameters, before[0])
     np.testing.assert_array_equal(buffers, before[1])
-    parameters[:] = 7
-    buffers[:] = 7
-    assert not (algorithm.weights()[0] == 7).any()
-    assert not (algorithm.weights()[1] == 7).any()
+    for array, again in zip(algorithm.weights(), algorithm.weights(), strict=True):
+        array[:] = 7
+        assert not (again == 7).any()
+    assert not any((array == 7).any() for array in algorithm.weights())
 
 
 @pytest.mark.parametrize("spec", [normal(DISCRETE), normal(GAUSSIAN), IMAGE])
@@ -310,6 +310,30 @@ def test_the_gradient_is_shortened_to_max_grad_norm() -> None:
     assert metrics["train/grad_norm"] > 0.01
     moment = algorithm.state_dict()["optimizer"]["state"][0]["exp_avg"]
     assert moment.norm().item() == pytest.approx(0.1 * 0.01, rel=1e-4)
+
+
+@pytest.mark.parametrize("spec", [DISCRETE, GAUSSIAN])
+def test_a_step_follows_the_gradient_of_the_usual_loss(spec: PolicySpec) -> None:
+    config = PPOConfig(vf_coef=0.7, ent_coef=0.3, max_grad_norm=1e9, clip_range=0.1)
+    algorithm, generator = ppo(config, spec), torch.Generator().manual_seed(0)
+    x, advantage, target = (torch.randn(s, generator=generator) for s in [(30, 4), (30,), (30,)])
+    params, value = algorithm.net.forward(x)
+    if spec is DISCRETE:
+        usual: Any = torch.distributions.Categorical(logits=params)
+        action = torch.randint(4, (30,), generator=generator)
+    else:
+        usual = torch.distributions.Independent(torch.distributions.Normal(params[:, :2], params[:, 2:].exp()), 1)
+        action = torch.randn((30, 2), generator=generator)
+    old = usual.log_prob(action).detach() + 0.2 * torch.randn(30, generator=generator)
+    ratio = (usual.log_prob(action) - old).exp()
+    a = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+    policy_loss = -torch.min(ratio * a, ratio.clamp(0.9, 1.1) * a).mean()
+    (policy_loss + 0.7 * (value - target).square().mean() - 0.3 * usual.entropy().mean()).backward()
+    expected = algorithm.net.flat_grad.clone()
+    measured = algorithm.step(Minibatch(x, (), action, old, advantage, target), 0.1)
+    torch.testing.assert_close(algorithm.net.flat_grad, expected, atol=1e-5, rtol=1e-4)
+    assert measured.clip_fraction > 0
+    assert measured.policy_gradient_loss == pytest.approx(policy_loss.item(), rel=1e-4)
 
 
 def identity_batch(algorithm: PPO, generator: np.random.Generator) -> tuple[Batch, float]:

@@ -136,12 +136,15 @@ def test_terminated_wins_when_both_flags_are_set() -> None:
 
 @pytest.mark.parametrize(("terminated", "truncated"), [(True, False), (False, True), (True, True)])
 def test_an_end_cuts(terminated: bool, truncated: bool) -> None:
+    """Even where no reset row stands between two episodes."""
     r = one_ending(terminated, truncated)
+    r = r._replace(valid=np.ones_like(r.valid))
     reward, values = r.reward.copy(), r.values.copy()
     reward[3:] += 7
-    values[3:] += 5
+    values[4:] += 5
     later = r._replace(reward=reward, values=values)
-    np.testing.assert_array_equal(r.gae()[:3], later.gae()[:3])
+    assert r.gae()[2] != later.gae()[2]
+    np.testing.assert_array_equal(r.gae()[:2], later.gae()[:2])
 
 
 @given(rows(), st.sampled_from([0.0, 1e30, np.nan]))
