@@ -12,7 +12,7 @@ import numpy.typing as npt
 import pytest
 import torch
 
-from learner.algorithms import ALGORITHMS, Algorithm, losses
+from learner.algorithms import ALGORITHMS, Algorithm
 from learner.algorithms.ppo import PPO, Minibatch, PPOConfig
 from protocol.distributions import distribution
 from protocol.errors import RunError
@@ -270,37 +270,6 @@ def test_a_loss_that_is_not_finite_is_named_and_stops_before_the_weights(name: s
     with pytest.raises(RunError, match=r"update 1: \w+ expected finite, got"), np.errstate(all="ignore"):
         algorithm.update(broken, no_pulse)
     assert torch.equal(algorithm.net.flat, before)
-
-
-def test_gradients_derived_by_hand_are_those_of_autograd() -> None:
-    generator = torch.Generator().manual_seed(0)
-    log_ratio = (0.5 * torch.randn(50, generator=generator, dtype=torch.float64)).requires_grad_()
-    advantage, target = torch.randn(2, 50, generator=generator, dtype=torch.float64)
-    ratio = log_ratio.exp()
-    cases = {
-        "policy": (losses.clipped_surrogate(ratio, advantage, 0.2), log_ratio),
-        "value": (losses.value_loss(log_ratio, target), log_ratio),
-        "entropy": (losses.entropy_loss(log_ratio), log_ratio),
-    }
-    for name, ((loss, gradient), by) in cases.items():
-        (expected,) = torch.autograd.grad(loss, by, retain_graph=True)
-        torch.testing.assert_close(gradient.detach(), expected, msg=name)
-    assert (losses.clipped_surrogate(ratio, advantage, 0.2)[1] == 0).any()  # some rows are clipped
-
-
-def test_surrogate_is_the_papers() -> None:
-    ratio, advantage = torch.tensor([0.5, 0.5, 1.5, 1.5, 1.1]), torch.tensor([1.0, -1.0, 1.0, -1.0, 2.0])
-    loss, _ = losses.clipped_surrogate(ratio, advantage, 0.2)
-    torch.testing.assert_close(loss, -torch.tensor([0.5, -0.8, 1.2, -1.5, 2.2]).mean())
-    assert losses.clip_fraction(ratio, 0.2).item() == pytest.approx(0.8)
-
-
-def test_explained_variance() -> None:
-    target = np.array([1.0, 2.0, 3.0], np.float32)
-    assert losses.explained_variance(target, target) == 1
-    assert losses.explained_variance(np.zeros(3, np.float32), target) == 0
-    assert losses.explained_variance(-target, target) == pytest.approx(-3)
-    assert np.isnan(losses.explained_variance(target, np.ones(3, np.float32)))
 
 
 def test_the_gradient_is_shortened_to_max_grad_norm() -> None:
