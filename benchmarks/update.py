@@ -21,7 +21,8 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor, nn
 
-from learner.algorithms.ppo import PPO, Minibatch, PPOConfig
+from learner.algorithms.ppo import PPO, Minibatch
+from learner.hyperparameters import PPOConfig
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
 RESULTS = Path(__file__).parent / "results"

@@ -18,8 +18,7 @@ import tomli_w
 from msgspec import Meta
 from tyro.conf import Positional
 
-from learner.algorithms import ALGORITHMS
-from learner.algorithms.ppo import PPOConfig
+from learner.hyperparameters import HYPERPARAMETERS, PPOConfig
 from learner.nearest import nearest
 from protocol.errors import UsageError
 from protocol.link import check_address
@@ -191,9 +190,9 @@ def _without_none(plain: dict[str, Any]) -> dict[str, Any]:
 
 
 def _of_algorithm(algo: str) -> Config:
-    if algo not in ALGORITHMS:
-        raise UsageError(f"algo {algo}: expected one of {', '.join(ALGORITHMS)}{nearest(algo, ALGORITHMS)}")
-    return Config(algo=algo, algorithm=ALGORITHMS[algo][0]())
+    if algo not in HYPERPARAMETERS:
+        raise UsageError(f"algo {algo}: expected one of {', '.join(HYPERPARAMETERS)}{nearest(algo, HYPERPARAMETERS)}")
+    return Config(algo=algo, algorithm=HYPERPARAMETERS[algo]())
 
 
 def _parse(text: str, where: str) -> dict[str, Any]:
@@ -206,7 +205,7 @@ def _parse(text: str, where: str) -> dict[str, Any]:
 def _over_toml(config: Config, table: dict[str, Any], where: str) -> Config:
     """Tables of other algorithms are let be, so that one file can hold the settings of several."""
     algo = str(table.get("algo", config.algo))
-    top = {name: value for name, value in table.items() if name not in ALGORITHMS}
+    top = {name: value for name, value in table.items() if name not in HYPERPARAMETERS}
     own = table.get(algo, {})
     if not isinstance(own, dict):
         raise UsageError(f"{where}: {algo} expected a table, [{algo}], got {own}")
@@ -230,7 +229,7 @@ def _fitting(record: msgspec.Struct, name: str, value: Any) -> Any:
 def _typed(plain: dict[str, Any], where: str) -> Config:
     """The record of these values. Raises `UsageError` that names the setting, what was expected and what was got."""
     try:
-        kind: type[msgspec.Struct] = ALGORITHMS[plain["algo"]][0]
+        kind: type[msgspec.Struct] = HYPERPARAMETERS[plain["algo"]]
         own = msgspec.convert(plain["algorithm"], kind)
         return msgspec.structs.replace(msgspec.convert({**plain, "algorithm": {}}, Config), algorithm=own)
     except msgspec.ValidationError as error:
@@ -241,7 +240,7 @@ def _what_is_wrong(plain: dict[str, Any], says: str) -> str:
     """Of msgspec's text: the setting, what was expected and what was got."""
     expected, _, path = says.replace(" | null", ' or "none"').replace("`object`", "table").partition(" - at `$.")
     name = re.split(r"[.\[`]", path)[0]
-    record = ALGORITHMS[plain["algo"]][0] if name in plain["algorithm"] else Config
+    record = HYPERPARAMETERS[plain["algo"]] if name in plain["algorithm"] else Config
     got = plain["algorithm"].get(name, plain.get(name))
     if expected.startswith("Invalid enum value"):
         return f"{name} expected one of {', '.join(get_args(get_type_hints(record)[name]))}, got {got!r}"

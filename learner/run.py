@@ -44,7 +44,7 @@ class Run:
 
         torch.set_num_threads(config.torch_threads)
         spec = run_spec(config, env)
-        make = ALGORITHMS[config.algo][1]
+        make = ALGORITHMS[config.algo]
         self.algorithm: Algorithm = make(
             config.algorithm, spec.policy, total_steps=config.steps, seed=config.seed, device=_device(config)
         )

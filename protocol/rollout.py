@@ -130,6 +130,8 @@ class Batch(msgspec.Struct, frozen=True):
     """[ΣN] the lane of each column"""
     fresh: Bools
     """[ΣN] True where the column's lane has just been started: nothing carries over from its last rollout"""
+    copies: int
+    """N: each lane has this many neighbouring columns, or a multiple when it has several rollouts here"""
     episodes: tuple[Episode, ...]
 
     @property
@@ -139,13 +141,13 @@ class Batch(msgspec.Struct, frozen=True):
 
 
 def stack(rollouts: Sequence[Rollout]) -> Batch:
-    """Copy rollouts into one writable batch [T, ΣN], sorted by lane and then by sequence."""
-    rows = sorted(rollouts, key=lambda rollout: (rollout.lane, rollout.sequence))
+    """Copy rollouts into one writable batch [T, ΣN], in lane order; those of one lane stay in the order they came in."""
+    rows = sorted(rollouts, key=lambda rollout: rollout.lane)
 
     def side_by_side(arrays: Sequence[Array]) -> Array:
         return np.concatenate(arrays, axis=1)
 
-    copies = [row.reward.shape[1] for row in rows]
+    copies = rows[0].reward.shape[1]
     return Batch(
         obs=tuple(side_by_side(leaves) for leaves in zip(*(row.obs for row in rows), strict=True)),
         action=side_by_side([row.action for row in rows]),
@@ -156,5 +158,6 @@ def stack(rollouts: Sequence[Rollout]) -> Batch:
         valid=side_by_side([row.valid for row in rows]),
         lane=np.repeat([row.lane for row in rows], copies),
         fresh=np.repeat([row.sequence == 0 for row in rows], copies),
+        copies=copies,
         episodes=tuple(episode for row in rows for episode in row.episodes),
     )

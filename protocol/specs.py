@@ -6,6 +6,7 @@ agreed to run code (an address only this user can reach). Nothing that a worker 
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable
 from typing import Literal
 
@@ -47,29 +48,36 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 raise UsageError(f"env factory {self.id}: expected it to return a gymnasium.Env, got {type(env).__name__}")
             return env
         try:
-            # The checker is left out: it costs a tenth of a CartPole step, and every row is checked by `Rollout.validate`.
+            # The checker is left out: it costs a tenth of a CartPole step, and `Rollout.validate` checks every row.
             return gymnasium.make(self.id, disable_env_checker=True, **self.kwargs, **extra)  # type: ignore[arg-type]
-        except (gymnasium.error.Error, ImportError, TypeError) as error:
+        except (gymnasium.error.Error, ImportError) as error:
             raise UsageError(_why_not_made(self.id, error)) from error
+        except Exception as error:  # its own constructor raised, whatever that may be
+            line = f"environment {self.id} cannot be made: {type(error).__name__}: {_first_line(error)}"
+            raise UsageError(line, traceback.format_exc()) from error
 
 
 def _why_not_made(env_id: str, error: Exception) -> str:
-    """One line for an environment that cannot be made."""
-    says = str(error).strip().splitlines()[0].strip() if str(error).strip() else type(error).__name__
+    """One line for an environment that is not known, or whose package is missing."""
     module, colon, _ = env_id.partition(":")
+    says = _first_line(error)
     match error:
+        case gymnasium.error.NamespaceNotFound() if env_id.startswith("ALE/"):
+            return f"environment {env_id}: Atari games are an extra; pip install 'millrace[atari]'"
         case gymnasium.error.DependencyNotInstalled():
-            return f"environment {env_id}: a package it needs is missing; {says}"
-        case ModuleNotFoundError() if colon and error.name and module.split(".")[0] == error.name.split(".")[0]:
-            return f"environment {env_id}: no module named {error.name}; is it installed, or is its folder on PYTHONPATH?"
+            return f"environment {env_id}: {says}"
+        case ModuleNotFoundError() if colon and f"'{module.split('.')[0]}" in says:
+            return f"environment {env_id}: no module named {module}; is it installed, or its folder on PYTHONPATH?"
         case ImportError():
             return f"environment {env_id}: a package it needs is missing ({says}); pip install it, then try again"
-        case gymnasium.error.NameNotFound() if env_id.startswith("ALE/"):
-            return f"environment {env_id}: Atari games are an extra; pip install 'millrace[atari]'"
-        case gymnasium.error.UnregisteredEnv():
-            return f"environment {env_id} is not registered: {says}; give one as my_module:{env_id} to import it first"
+        case gymnasium.error.UnregisteredEnv() if not colon:
+            return f"environment {env_id} is not registered: {says} One of your own is given as my_module:MyEnv-v0"
         case _:
             return f"environment {env_id} cannot be made: {says}"
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or ["no message"])[0].strip()
 
 
 class Leaf(msgspec.Struct, frozen=True):

@@ -7,8 +7,8 @@ import msgspec
 import pytest
 
 from learner.algorithms import ALGORITHMS
-from learner.algorithms.ppo import PPOConfig
 from learner.config import PRESETS, Config, lower_layers, resolve
+from learner.hyperparameters import HYPERPARAMETERS, PPOConfig
 from protocol.errors import UsageError
 
 
@@ -158,13 +158,17 @@ def test_every_preset_makes_a_configuration_of_its_own() -> None:
     import tomllib
 
     for algo, presets in tomllib.loads(PRESETS.read_text()).items():
-        assert algo in ALGORITHMS
+        assert algo in HYPERPARAMETERS
         for env in presets:
             assert resolve(env, algo=algo) != resolve(env, algo=algo, preset="none")
+
+
+def test_every_algorithm_has_its_settings() -> None:
+    assert ALGORITHMS.keys() == HYPERPARAMETERS.keys()
 
 
 def test_no_setting_of_an_algorithm_hides_one_of_the_run() -> None:
     """They share the flags' namespace."""
     own = {field.name for field in msgspec.structs.fields(Config)}
-    for kind, _ in ALGORITHMS.values():
+    for kind in HYPERPARAMETERS.values():
         assert not own & {field.name for field in msgspec.structs.fields(kind)}

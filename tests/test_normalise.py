@@ -79,7 +79,12 @@ def test_only_measured_features_of_valid_rows_are_counted() -> None:
 
 
 def batch(
-    reward: Array, lane: list[int], fresh: list[bool], ended: Array | None = None, first_valid: Array | None = None
+    reward: Array,
+    lane: list[int],
+    fresh: list[bool],
+    ended: Array | None = None,
+    first_valid: Array | None = None,
+    copies: int = 2,
 ) -> Batch:
     """Rewards [T, ΣN] with ends; the row after an end is not valid."""
     T, N = reward.shape
@@ -96,6 +101,7 @@ def batch(
         valid=valid,
         lane=np.array(lane),
         fresh=np.array(fresh),
+        copies=copies,
         episodes=(),
     )
 
@@ -163,7 +169,7 @@ def test_the_reward_of_a_row_that_is_not_valid_changes_nothing() -> None:
 
 
 def test_what_never_varied_is_divided_by_one() -> None:
-    constant = batch(np.full((1, 3), 0.3), [0, 0, 0], [True] * 3)
+    constant = batch(np.full((1, 3), 0.3), [0, 0, 0], [True] * 3, copies=3)
     np.testing.assert_array_equal(RewardScaler(GAMMA).scale(constant), constant.reward)
     moments = RunningMoments((2,))
     for _ in range(10):

@@ -13,7 +13,8 @@ import pytest
 import torch
 
 from learner.algorithms import ALGORITHMS, Algorithm
-from learner.algorithms.ppo import PPO, Minibatch, PPOConfig
+from learner.algorithms.ppo import PPO, Minibatch
+from learner.hyperparameters import PPOConfig
 from protocol.distributions import distribution
 from protocol.errors import RunError
 from protocol.policy import NumpyPolicy, layout, size
@@ -76,6 +77,7 @@ def batch(algorithm: PPO, seed: int, fresh: bool = False, steps: int = T) -> Bat
         valid=valid,
         lane=np.repeat(np.arange(LANES), COPIES),
         fresh=np.full(N, fresh),
+        copies=COPIES,
         episodes=(),
     )
 
@@ -89,8 +91,7 @@ def same(a: PPO, b: PPO) -> bool:
 
 
 def test_it_is_an_algorithm() -> None:
-    config, made = ALGORITHMS["ppo"]
-    algorithm: Algorithm = made(config(), DISCRETE, total_steps=1, seed=0)
+    algorithm: Algorithm = ALGORITHMS["ppo"](PPOConfig(), DISCRETE, total_steps=1, seed=0)
     assert algorithm.weights()[0].dtype == np.float32
 
 
@@ -330,6 +331,7 @@ def identity_batch(algorithm: PPO, generator: np.random.Generator) -> tuple[Batc
         valid=valid,
         lane=np.repeat(np.arange(2), 4),
         fresh=np.zeros(N, bool),
+        copies=4,
         episodes=(),
     )
     return rows, float(reward[valid].mean())

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from learner import checkpoint
-from learner.algorithms.ppo import PPO, PPOConfig
+from learner.algorithms.ppo import PPO
 from learner.config import resolve
+from learner.hyperparameters import PPOConfig
 from learner.journal import Past, recall
 from learner.ledger import Ledger
 from learner.run import run_spec

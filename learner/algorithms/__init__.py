@@ -1,6 +1,6 @@
 """The mathematics of learning: no sockets and no files.
 
-One file is one configuration and one class; adding one touches one dict, `ALGORITHMS`.
+One file is one class, with its settings in `learner.hyperparameters`; each is entered in one dict there and here.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from learner.algorithms.ppo import PPO, PPOConfig
+from learner.algorithms.ppo import PPO
 from protocol.rollout import Batch
 
 Floats = npt.NDArray[np.float32]
@@ -37,4 +37,4 @@ class Algorithm(Protocol):
         ...
 
 
-ALGORITHMS: dict[str, tuple[type[PPOConfig], type[PPO]]] = {"ppo": (PPOConfig, PPO)}
+ALGORITHMS: dict[str, type[PPO]] = {"ppo": PPO}

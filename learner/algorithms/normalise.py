@@ -5,7 +5,6 @@ Only valid rows are counted. The learner alone updates; workers act with the flo
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -97,19 +96,17 @@ class RewardScaler:
     def __init__(self, gamma: float) -> None:
         self._gamma = gamma
         self._moments = RunningMoments()
-        self._copies = 0
         self._returns: dict[int, Doubles] = {}  # lane -> [copies]
 
     def scale(self, batch: Batch) -> Floats:
         """Count the batch, then give its rewards [T, ΣN], scaled."""
         ended = batch.terminated | batch.truncated
-        self._count_copies(batch)
-        for at in range(0, len(batch.lane), self._copies):  # a lane's rollouts stand in the order they were collected
-            columns = slice(at, at + self._copies)
+        for at in range(0, len(batch.lane), batch.copies):  # a lane's rollouts stand in the order they were collected
+            columns = slice(at, at + batch.copies)
             lane = int(batch.lane[at])
             start = self._returns.get(lane)
             if start is None or batch.fresh[at]:
-                start = np.zeros(self._copies)
+                start = np.zeros(batch.copies)
             valid = batch.valid[:, columns]
             found, self._returns[lane] = discounted_return(
                 batch.reward[:, columns], ended[:, columns], valid, self._gamma, start
@@ -117,25 +114,14 @@ class RewardScaler:
             self._moments.update(found[valid])
         return (batch.reward / self._moments.std).astype(np.float32)
 
-    def _count_copies(self, batch: Batch) -> None:
-        """Find N, of which each lane has a multiple here; a lane that was just started has exactly N fresh columns."""
-        lanes = np.unique(batch.lane)
-        columns = [np.count_nonzero(batch.lane == lane) for lane in lanes]
-        fresh = [np.count_nonzero(batch.fresh[batch.lane == lane]) for lane in lanes]
-        copies = math.gcd(self._copies, *columns, *fresh)
-        if copies != self._copies:
-            self._copies, self._returns = copies, {}
-
     def state_dict(self) -> dict[str, Any]:
         """Tensors and numbers, copied."""
         return {
             "moments": self._moments.state_dict(),
-            "copies": self._copies,
             "returns": {lane: torch.tensor(found) for lane, found in self._returns.items()},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from there."""
         self._moments.load_state_dict(state["moments"])
-        self._copies = int(state["copies"])
         self._returns = {int(lane): found.numpy().copy() for lane, found in state["returns"].items()}

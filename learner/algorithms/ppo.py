@@ -1,4 +1,4 @@
-"""PPO (Schulman et al. 2017): its configuration and its update. No sockets, no files, no clock; randomness by a seed.
+"""PPO (Schulman et al. 2017); its settings stand in `learner.hyperparameters`. No sockets, no files, no clock; seeded.
 
 One update uses a batch for `n_epochs` epochs of minibatches. Rows that are not valid never enter one. With one torch
 thread on a CPU the same batches give the same bits, also after `load_state_dict`.
@@ -9,9 +9,8 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -20,6 +19,7 @@ from torch import Tensor
 from learner.algorithms import losses
 from learner.algorithms.normalise import ObservationNormaliser, RewardScaler
 from learner.algorithms.returns import gae
+from learner.hyperparameters import PPOConfig
 from protocol.errors import RunError
 from protocol.networks import ActorCritic, log_prob_and_entropy
 from protocol.policy import features, normalized
@@ -28,54 +28,8 @@ from protocol.specs import PolicySpec
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
-Positive = Annotated[float, msgspec.Meta(gt=0)]
-NotNegative = Annotated[float, msgspec.Meta(ge=0)]
-Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
-Count = Annotated[int, msgspec.Meta(ge=1)]
-Schedule = Literal["constant", "linear"]
 
 VALUE_ROWS = 1024  # observations whose values are computed at once: bounds memory
-
-
-class PPOConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Proximal policy optimisation."""
-
-    learning_rate: Positive = 3e-4
-    """step size of Adam"""
-    learning_rate_schedule: Schedule = "constant"
-    """linear: falls to zero over the run"""
-    rollout_steps: Count = 128
-    """T, steps of each env copy in a rollout"""
-    batch_size: Count = 64
-    """rows of a minibatch, at most"""
-    n_epochs: Count = 10
-    """times each row is used in an update"""
-    gamma: Share = 0.99
-    """discount"""
-    gae_lambda: Share = 0.95
-    """λ of the advantage estimate: 1 is the Monte-Carlo return, 0 one step"""
-    clip_range: Positive = 0.2
-    """how far the probability of an action may move in an update: its ratio is clipped to 1 ± this"""
-    clip_range_schedule: Schedule = "constant"
-    """linear: falls to zero over the run"""
-    ent_coef: NotNegative = 0.0
-    """weight of the entropy bonus"""
-    vf_coef: NotNegative = 0.5
-    """weight of the value loss"""
-    max_grad_norm: Positive = 0.5
-    """longer gradients are shortened to this"""
-    normalize_advantage: bool = True
-    """advantages of a minibatch get mean 0 and standard deviation 1"""
-    target_kl: Positive | None = None
-    """stop the update once the policy moved further than 1.5 times this"""
-    net: tuple[Count, ...] = (64, 64)
-    """hidden layers of the actor, and of the critic"""
-    activation: Literal["tanh", "relu"] = "tanh"
-    """of the hidden layers"""
-    normalize_observations: bool = False
-    """subtract the running mean, divide by the running standard deviation, clip to ±10 (not images)"""
-    normalize_rewards: bool = False
-    """divide rewards by the running standard deviation of the discounted return"""
 
 
 class Minibatch(NamedTuple):
