@@ -256,16 +256,16 @@ def test_tickets_are_dealt_while_used_and_outstanding_are_below_the_bound(max_la
 def test_a_stale_drop_makes_room_for_a_fresh_ticket() -> None:
     learner = Learner(lanes=2, max_lag=1, per_update=2)
     learner.joins(A)
-    learner.delivers(0)
+    learner.delivers(1)
     learner.publish(1)
-    learner.publish(2)  # ticket 0 was acted under version 0: staler than max_lag
+    learner.publish(2)  # ticket 1 was acted under version 0: staler than max_lag
     issued = learner.roster.ledger.issued
     assert learner.roster.take() is None
     outs = learner.balanced(learner.roster.deal())
     assert learner.roster.ledger.stale == 1
     assert learner.roster.ledger.transitions_stale == 1
     assert [permit.ticket for permit in permits(outs)] == [issued]
-    assert [permit.lane for permit in permits(outs)] == [0]  # the lane whose rollout was dropped
+    assert [permit.lane for permit in permits(outs)] == [1]  # the lane whose rollout was dropped
 
 
 def test_a_rollout_exactly_max_lag_old_is_used() -> None:
