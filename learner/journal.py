@@ -79,6 +79,8 @@ class Journal:
         self.version, self.env_steps = past.version, past.env_steps
         self.evaluation: Evaluation | None = None
         self.stages = {"update": 0.0, "other": 0.0}
+        self.workers_expected = 0
+        """how many workers there should be; 0: any number"""
         self._window = EpisodeWindow.of_state(past.episodes)
         self._metrics = MetricsLog(folder.path, past.env_steps)
         self._watch = watch
@@ -87,6 +89,7 @@ class Journal:
         self._evaluated_version = -1
         self._evaluate_at = past.env_steps + config.eval_every
         self._note = ""
+        self._workers_alive = 0
         self._worker_stages: dict[int, dict[str, float]] = {}  # by session: those of workers that have left count too
 
     # ---------------------------------------------------------------- what the loop calls
@@ -103,13 +106,14 @@ class Journal:
         began_s = time.monotonic()
         self.version += 1
         self.env_steps += batch.env_steps
+        self._workers_alive = len(self.hub.roster.members)
         self.stages["update"] += update_s
         self._window.extend(batch.episodes)
         extra: dict[str, float] = {}
         if self.config.eval_every and self.env_steps >= self._evaluate_at:
             self._evaluate_at += self.config.eval_every
             found = self.evaluate()
-            extra = {"eval/mean_reward": found.return_mean, "eval/mean_ep_length": found.length_mean}
+            extra = found.metrics()
         progress = self.progress()
         self._surely(lambda: self._metrics.write(progress, {**metrics, **extra}))
         self._watch(progress)
@@ -126,7 +130,7 @@ class Journal:
             seed, episodes = EVALUATION_SEED + self.config.seed, self.config.eval_episodes
             self.evaluation = evaluate(spec.env, policy, spec.policy.action, episodes, seed, self.hub.pulse)
             self._evaluated_version = self.version
-            self._note = f"greedy return {self.evaluation.return_mean:.1f} after {self.env_steps:,} steps"
+            self._note = f"{self.env_steps:,} env steps: greedy {self.evaluation}"
         return self.evaluation
 
     def save(self) -> None:
@@ -188,8 +192,8 @@ class Journal:
             length_mean=self._window.length_mean,
             lag_mean=sum(lags) / len(lags),
             lag_max=max(lags),
-            workers_alive=len(self.hub.roster.members),
-            workers_expected=self.config.workers,
+            workers_alive=self._workers_alive,
+            workers_expected=self.workers_expected,
             ledger=self.hub.roster.ledger.counts(),
             stages=self._stages(),
             note=self._note,

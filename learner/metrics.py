@@ -81,6 +81,10 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
     cut: int = 0
     """episodes that did not end by themselves, and were counted as they stood"""
 
+    def __str__(self) -> str:
+        cut = f", {self.cut} of them cut short" if self.cut else ""
+        return f"return {self.return_mean:.1f} ± {self.return_std:.1f} over {self.episodes} episodes{cut}"
+
     def metrics(self) -> dict[str, float]:
         """By the names users know, to be written with a row."""
         return {"eval/mean_reward": self.return_mean, "eval/mean_ep_length": self.length_mean}

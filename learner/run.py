@@ -53,6 +53,7 @@ class Run:
         else:
             self.folder = RunFolder.open(resume)
             past = recall(self.folder, self.algorithm)
+            self.folder.write_config(config)
         roster = Roster(
             spec,
             rollouts_per_update=config.lanes,

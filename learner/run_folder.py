@@ -103,7 +103,7 @@ class RunFolder:
         except OSError as error:
             raise UsageError(f"run folder {path} cannot be made: {error.strerror}; choose another --run-dir") from error
         folder = RunFolder(path)
-        folder._write("config.toml", f"# Repeat this run: millrace train --config THIS_FILE\n{config.to_toml()}".encode())
+        folder.write_config(config)
         return folder
 
     @staticmethod
@@ -114,6 +114,10 @@ class RunFolder:
         if not (path / "config.toml").is_file():
             raise UsageError(f"run {path}: expected a run folder, got one without config.toml")
         return RunFolder(path)
+
+    def write_config(self, config: Config) -> None:
+        """config.toml: at the start, and again when a run is resumed with other settings."""
+        self._write("config.toml", f"# Repeat this run: millrace train --config THIS_FILE\n{config.to_toml()}".encode())
 
     def config(self) -> Config:
         """The configuration of the run."""
@@ -167,6 +171,13 @@ class RunFolder:
     def write_summary(self, summary: Summary) -> None:
         """summary.json."""
         self._write("summary.json", msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n")
+
+    def summary(self) -> Summary | None:
+        """What `write_summary` wrote, or None if there is nothing whole."""
+        try:
+            return msgspec.json.decode((self.path / "summary.json").read_bytes(), type=Summary)
+        except (OSError, msgspec.MsgspecError):
+            return None
 
     def _write(self, name: str, content: bytes) -> None:
         try:

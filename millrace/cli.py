@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -81,7 +82,7 @@ def _overview() -> str:
 
 
 def _train(argv: list[str]) -> int:
-    from millrace.run_flags import configuration
+    from learner.flags import configuration
 
     config, resume = configuration("train", argv)
     from millrace.launch import local
@@ -89,12 +90,11 @@ def _train(argv: list[str]) -> int:
 
     with watching() as watch:
         run = local.train(config, resume, watch)
-    print(run)
-    return 0
+    return _told(run)
 
 
 def _learner(argv: list[str]) -> int:
-    from millrace.run_flags import configuration
+    from learner.flags import configuration
 
     config, resume = configuration("learner", argv)
     from learner.run import serve
@@ -102,7 +102,19 @@ def _learner(argv: list[str]) -> int:
 
     with watching() as watch:
         run = serve(config, resume, watch)
-    print(run)
+    return _told(run)
+
+
+def _told(run: Path) -> int:
+    """How a run ended, and where it is."""
+    from learner.run_folder import RunFolder
+
+    summary = RunFolder(run).summary()
+    if summary is not None:
+        print(f"{summary.stop_reason}: {summary.env_steps:,} env steps in {summary.wall_s:.1f} s")
+        if summary.evaluation is not None:
+            print(f"greedy {summary.evaluation}")
+    print(f"run folder: {run}")
     return 0
 
 
@@ -114,19 +126,20 @@ def _worker(argv: list[str]) -> int:
 
 def _evaluate(argv: list[str]) -> int:
     from learner.evaluate import evaluate, load_policy
-    from millrace.flags import EvaluateFlags, parse
+    from learner.flags import parse
+    from millrace.flags import EvaluateFlags
 
     flags = parse(EvaluateFlags, argv, "evaluate")
     policy, spec, env = load_policy(flags.run)
     found = evaluate(env, policy, spec.action, flags.episodes, flags.seed)
-    cut = f", {found.cut} of them cut short" if found.cut else ""
-    print(f"return {found.return_mean:.1f} ± {found.return_std:.1f} over {found.episodes} episodes{cut}")
+    print(found)
     return 0
 
 
 def _plot(argv: list[str]) -> int:
+    from learner.flags import parse
     from learner.report import plot
-    from millrace.flags import PlotFlags, parse
+    from millrace.flags import PlotFlags
 
     flags = parse(PlotFlags, argv, "plot")
     if not flags.runs:

@@ -50,7 +50,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         try:
             # The checker is left out: it costs a tenth of a CartPole step, and `Rollout.validate` checks every row.
             return gymnasium.make(self.id, disable_env_checker=True, **self.kwargs, **extra)  # type: ignore[arg-type]
-        except (gymnasium.error.Error, ImportError) as error:
+        except (gymnasium.error.Error, ImportError, TypeError) as error:  # TypeError: keyword arguments it does not take
             raise UsageError(_why_not_made(self.id, error)) from error
         except Exception as error:  # its own constructor raised, whatever that may be
             line = f"environment {self.id} cannot be made: {type(error).__name__}: {_first_line(error)}"

@@ -105,7 +105,7 @@ def test_every_file_says_first_what_it_holds() -> None:
 
 
 @pytest.mark.parametrize(
-    "module", ["workers.__main__", "millrace.cli", "millrace.flags", "learner.report", "learner.evaluate"]
+    "module", ["workers.__main__", "millrace.cli", "learner.flags", "learner.report", "learner.evaluate"]
 )
 def test_what_must_start_quickly_imports_no_torch(module: str) -> None:
     asks = f"import sys, {module}; assert not sys.modules.keys() & {{'torch', 'matplotlib', 'tensorboard'}}"

@@ -40,6 +40,7 @@ def train(config: Config, resume: Path | None, watch: Watch, factory: Callable[.
         run = Run(config, env, link, resume, watch)
         host = Host(_starter(config, link.address, context, run.folder.path), config.workers)
         stack.callback(host.stop)
+        run.journal.workers_expected = config.workers
         run.go(config.min_workers or config.workers, host.poll)
         return run.folder.path
 

@@ -1,0 +1,50 @@
+"""`python -m learner ENV --bind ADDRESS`: the learner alone, as `millrace learner`, with a log line now and then."""
+
+from __future__ import annotations
+
+import os
+
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_variable, "1")  # before numpy; --torch-threads sets the learner's
+
+import logging
+import sys
+import time
+
+from learner.flags import configuration
+from learner.metrics import Progress
+from learner.run_folder import Interrupted
+from protocol.errors import OurError
+
+log = logging.getLogger("millrace.learner")
+
+LINE_EVERY_S = 10.0
+
+
+def main(argv: list[str]) -> int:
+    """Serve until the run is over; the exit code."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s learner: %(message)s", stream=sys.stderr)
+    said_s = [-LINE_EVERY_S]
+
+    def watch(progress: Progress) -> None:
+        if time.monotonic() - said_s[0] > LINE_EVERY_S:
+            said_s[0] = time.monotonic()
+            steps = f"{progress.env_steps:,} of {progress.total_steps:,} env steps"
+            log.info("%s, return %s, %d workers", steps, progress.return_mean, progress.workers_alive)
+
+    try:
+        config, resume = configuration("learner", argv)
+        from learner.run import serve  # torch: not before the flags are known to be right
+
+        log.info("run folder: %s", serve(config, resume, watch))
+    except OurError as error:
+        sys.stderr.write("\n".join(filter(None, [f"learner: {error}", error.detail.rstrip()])) + "\n")
+        return error.exit_code
+    except Interrupted as interrupt:
+        sys.stderr.write(f"learner: interrupted; go on with: python -m learner --resume {interrupt.run}\n")
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
