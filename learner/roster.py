@@ -168,6 +168,10 @@ class Lane:
             self.incarnation += 1
             self.started, self.below, self.ahead = False, 0, set()
 
+    def awaits(self, sequence: int) -> bool:
+        """Whether an outstanding rollout can have this sequence."""
+        return self.below <= sequence < self.below + len(self.ahead) + len(self.outstanding) and sequence not in self.ahead
+
     def arrived(self, sequence: int) -> None:
         """Take note of a rollout."""
         self.ahead.add(sequence)
@@ -218,7 +222,7 @@ class Roster:
         self._next_session = first_session
         self._joins = 0
         self._draining: str | None = None
-        self._refused: dict[bytes, tuple[int, str]] = {}
+        self._refused: dict[bytes, tuple[int, str]] = {}  # the life that was refused, and why
 
     # ---------------------------------------------------------------- in
 
@@ -240,11 +244,13 @@ class Roster:
             case Heartbeat():
                 return self._heartbeat(member, message)
             case Goodbye(_, reason):
-                return self._forget(member, Goodbye, f"left: {reason}")
+                self._forget(member, Goodbye, f"left: {reason}")
+                return self._deal()
             case Failure(_, error, traceback, lane):
                 hello = member.hello
                 self.events.append(Broke(hello.worker, hello.host, lane, error, traceback))
-                return self._forget(member, Failure, f"broke: {error}")
+                self._forget(member, Failure, f"broke: {error}")
+                return self._deal()
 
     def reject(self, peer: bytes, rollout: Rollout | None, why: str, now: float) -> list[Out]:
         """A message that could not be read (`rollout` is None), or a rollout that cannot be used."""
@@ -255,30 +261,39 @@ class Roster:
             steps = int(rollout.valid.sum()) if rollout.valid.dtype == bool else 0
             self.ledger.transitions_received += steps
             self.ledger.transitions_invalid += steps
+        if rollout is not None and (member is None or member.session != rollout.session):
+            return [(peer, Rejoin(rollout.session))]
         if member is None:
             return [(peer, Refuse(f"not understood: {why}"))]
         member.heard_s = now
         member.strikes += 1
         if member.strikes >= STRIKES:
-            self._refused[peer] = (member.hello.pid, why)
+            self._refused[peer] = (member.hello.life, why)
             self.events.append(Turned(member.hello.worker, why))
-            return [(peer, Refuse(why)), *self._forget(member, Rubbish, f"refused: {why}")]
+            self._forget(member, Rubbish, f"refused: {why}")
+            return [(peer, Refuse(why)), *self._deal()]
         if rollout is not None and rollout.ticket in member.tickets:
             lane = self.lanes[self.tickets[rollout.ticket].lane]
+            if lane.awaits(rollout.sequence):
+                lane.arrived(rollout.sequence)
             self._lose(member, rollout.ticket)
-            lane.arrived(rollout.sequence)
         return self._deal()
 
     def gone(self, worker: str, why: str) -> list[Out]:
         """A worker's process is known to be dead: do not wait for its silence."""
-        found = [member for member in self.members.values() if member.hello.worker == worker]
-        return [out for member in found for out in self._forget(member, Silence, why)]
+        member = self.members.get(worker.encode())
+        if member is None:
+            return []
+        self._forget(member, Silence, why)
+        return self._deal()
 
     def tick(self, now: float) -> list[Out]:
         """Judge silence. Call it only when every message that has arrived was given to `receive`."""
         silent = [member for member in self.members.values() if now - member.heard_s > self.worker_timeout_s]
         why = f"silent for {self.worker_timeout_s:.0f} s"
-        return [out for member in silent for out in self._forget(member, Silence, why)]
+        for member in silent:
+            self._forget(member, Silence, why)
+        return self._deal() if silent else []
 
     # ---------------------------------------------------------------- the learner's side
 
@@ -326,34 +341,41 @@ class Roster:
         return [member for member in self.members.values() if member.standing is Standing.ACTIVE]
 
     def _hello(self, peer: bytes, hello: Hello, now: float) -> list[Out]:
+        why = ""
         if hello.protocol != PROTOCOL_VERSION:
             why = f"protocol expected {PROTOCOL_VERSION}, got {hello.protocol}; install the learner's version of millrace"
+        elif hello.worker.encode() != peer:
+            why = f"name expected {peer[:40]!r}, its routing id, got {hello.worker[:40]!r}"
+        if why:
             self.events.append(Turned(hello.worker, why))
             return [(peer, Refuse(why))]
-        pid, why = self._refused.get(peer, (-1, ""))
-        if pid == hello.pid:
+        life, why = self._refused.get(peer, (-1, ""))
+        if life == hello.life:
             return [(peer, Refuse(why))]
         if self._draining is not None:
             return [(peer, Drain(self._draining))]
         member = self.members.get(peer)
-        forgotten: list[Out] = []
         if member is not None:
-            same = (member.hello.host, member.hello.pid) == (hello.host, hello.pid)
+            same = member.hello.life == hello.life
             if same and hello.attempt == member.hello.attempt:
+                member.heard_s = now
                 return [(peer, Welcome(member.session, hello.attempt, self.run))]
             if same and hello.attempt < member.hello.attempt:
                 return []
-            forgotten = self._forget(member, Silence, "began again" if same else f"replaced by process {hello.pid}")
+            if not same:
+                why = f"another process, on {hello.host}, joined as {hello.worker}; give each worker a name of its own"
+                self._refused[peer] = (member.hello.life, why)
+            self._forget(member, Silence, "began again" if same else f"replaced by process {hello.pid}")
         member = Member(peer, hello, self._next_session, self._joins, now)
         self._next_session += 1
         self._joins += 1
         self.members[peer] = member
         self.events.append(Joined(hello.worker, hello.host, hello.pid))
         welcome: list[Out] = [(peer, Welcome(member.session, hello.attempt, self.run))]
-        return forgotten + welcome + self._offer(member) + self._deal()
+        return welcome + self._offer(member) + self._deal()
 
     def _rollout(self, member: Member, rollout: Rollout) -> list[Out]:
-        self._acknowledge(member, rollout.version)
+        self._acknowledge(member, min(rollout.version, self.version))
         ticket = self.tickets.get(rollout.ticket)
         if ticket is None:
             self.ledger.transitions_duplicate += rollout.env_steps
@@ -362,10 +384,12 @@ class Roster:
             ticket.peer != member.peer
             or ticket.lane != rollout.lane
             or not ticket.version <= rollout.version <= self.version
+            or not self.lanes[ticket.lane].awaits(rollout.sequence)
         ):
             self.ledger.transitions_received -= rollout.env_steps  # `reject` counts it
             why = f"ticket {ticket.number} expected lane {ticket.lane} under version {ticket.version} or newer, "
-            return self.reject(member.peer, rollout, why + f"got lane {rollout.lane}, {rollout.version}", member.heard_s)
+            why += f"got lane {rollout.lane}, version {rollout.version}, sequence {rollout.sequence}"
+            return self.reject(member.peer, rollout, why, member.heard_s)
         del self.tickets[ticket.number], member.tickets[ticket.number]
         lane = self.lanes[ticket.lane]
         lane.outstanding.remove(ticket.number)
@@ -379,12 +403,13 @@ class Roster:
         peer = member.peer
         if member.standing is Standing.DRAINING:
             return [(peer, Drain(self._draining or ""))]
-        self._acknowledge(member, heartbeat.version)
-        if member.under_way is not None and heartbeat.replies > member.said_at:
+        self._acknowledge(member, min(heartbeat.version, self.version))
+        seen = min(heartbeat.replies, member.replies)
+        if member.under_way is not None and seen > member.said_at:
             member.under_way = None
         out = self._offer(member)
         held = set(heartbeat.tickets)
-        missing = [t for t, said_at in member.tickets.items() if t not in held and heartbeat.replies > said_at]
+        missing = [t for t, said_at in member.tickets.items() if t not in held and seen > said_at]
         out += self._collect(member, missing)
         member.replies += 1
         out.append((peer, HeartbeatReply(member.session, member.replies, self._received(member.lanes))))
@@ -419,8 +444,8 @@ class Roster:
             out.append((member.peer, Collect(member.session, version, permits, self._received(member.lanes))))
         return out
 
-    def _forget(self, member: Member, event: type, why: str) -> list[Out]:
-        """The worker is gone: its tickets are lost, its lanes have no owner; deal both to the living."""
+    def _forget(self, member: Member, event: type, why: str) -> None:
+        """The worker is gone: its tickets are lost, its lanes have no owner. `_deal` gives both to the living."""
         member.standing = TABLE[member.standing][event]
         del self.members[member.peer]
         self.events.append(Left(member.hello.worker, why, len(member.tickets), event is Goodbye))
@@ -428,7 +453,6 @@ class Roster:
             self._lose(member, number)
         for number in member.lanes:
             self.lanes[number].restart()
-        return self._deal()
 
     def _lose(self, member: Member, number: int) -> None:
         ticket = self.tickets.pop(number)

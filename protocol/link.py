@@ -8,6 +8,7 @@ credit that keeps queues short. MAXMSGSIZE bounds a frame before a byte of it is
 
 from __future__ import annotations
 
+import ipaddress
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 
@@ -18,6 +19,8 @@ from protocol.errors import BadMessage, UsageError
 from protocol.messages import ToLearner, ToWorker
 
 LINGER_MS = 2000
+QUEUE = 1000  # messages: for a peer that talks and does not read
+MESSAGES_AT_ONCE = 10_000
 COPY_BELOW_BYTES = 65536  # smaller frames are copied: cheaper than keeping track of them
 
 
@@ -26,8 +29,10 @@ def check_address(address: str) -> str:
     scheme, sep, rest = address.partition("://")
     if not sep or scheme not in {"inproc", "ipc", "tcp"} or not rest:
         raise UsageError(f"address {address}: expected inproc://NAME, ipc://PATH or tcp://HOST:PORT")
-    if scheme == "tcp" and not rest.rpartition(":")[2].isdecimal() and not rest.endswith(":*"):
-        raise UsageError(f"address {address}: expected a port, as in tcp://127.0.0.1:5555")
+    if scheme == "tcp":
+        port = rest.rpartition(":")[2]
+        if port != "*" and not (port.isdecimal() and 0 < int(port) < 65536):
+            raise UsageError(f"address {address}: expected a port, 1 to 65535, as in tcp://127.0.0.1:5555")
     return address
 
 
@@ -35,26 +40,31 @@ def is_local(address: str) -> bool:
     """True for addresses that only this machine can reach."""
     scheme, _, rest = address.partition("://")
     host = rest.rpartition(":")[0]
-    return scheme in {"inproc", "ipc"} or host in {"localhost", "[::1]"} or host.startswith("127.")
+    if scheme in {"inproc", "ipc"} or host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:  # a name; whatever it is resolved to, it is not ours to trust
+        return False
 
 
 def _options(socket: zmq.Socket[bytes]) -> None:
     socket.linger = LINGER_MS
     socket.maxmsgsize = MAX_FRAME_BYTES
     socket.handshake_ivl = 2000
-    socket.sndhwm = 0  # credit bounds what is under way: one Weights, a few tickets and their rollouts
-    socket.rcvhwm = 0
+    # Credit bounds what is under way (one Weights, a few tickets and their rollouts) far below these.
+    socket.sndhwm = socket.rcvhwm = QUEUE
 
 
 def _receive(socket: zmq.Socket[bytes]) -> list[Buffer] | None:
-    """The next message's frames, or None. Reads at most MAX_FRAMES frames and throws the rest away."""
+    """The next message's frames, or None. Of one with too many it keeps enough to show that, and throws the rest away."""
     frames: list[Buffer] = []
     try:
         more = True
         while more:
             frame = socket.recv(zmq.NOBLOCK, copy=False)
             more = frame.more
-            if len(frames) <= MAX_FRAMES:
+            if len(frames) < MAX_FRAMES + 2:  # the sender's name, and one too many
                 frames.append(frame.buffer if len(frame) >= COPY_BELOW_BYTES else frame.bytes)
     except zmq.Again:
         return None
@@ -84,8 +94,11 @@ class LearnerLink:
         return bool(self._socket.poll(max(0, int(timeout_s * 1000))))
 
     def receive(self) -> Iterator[tuple[bytes, ToLearner | BadMessage]]:
-        """All that has arrived, with its sender; what cannot be read comes as its error."""
-        while (frames := _receive(self._socket)) is not None:
+        """What has arrived, with its sender; what cannot be read comes as its error. At most MESSAGES_AT_ONCE."""
+        for _ in range(MESSAGES_AT_ONCE):  # a flood must not keep the learner here
+            frames = _receive(self._socket)
+            if frames is None:
+                return
             peer = bytes(frames[0])
             try:
                 yield peer, decode_to_learner(frames[1:])
@@ -112,6 +125,8 @@ class WorkerLink:
 
     def __init__(self, address: str, name: str, context: zmq.Context[zmq.Socket[bytes]] | None = None) -> None:
         check_address(address)
+        if not 1 <= len(name.encode()) <= 255:
+            raise UsageError(f"worker name {name[:40]!r}: expected 1 to 255 bytes, got {len(name.encode())}")
         self.context = context or zmq.Context.instance()
         self._socket = self.context.socket(zmq.DEALER)
         _options(self._socket)

@@ -30,6 +30,8 @@ class Hello(Message, frozen=True):
     """the worker's name; also its routing id"""
     host: str
     pid: int
+    life: int
+    """drawn at random by each process (pids repeat in containers)"""
     software: str
     attempt: int
     """how often this process has begun to join: a repeated Hello keeps it, a new beginning raises it"""

@@ -11,6 +11,7 @@ If both flags are set, terminated wins. Every consumer (returns, losses, counts,
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from protocol.errors import BadRollout
-from protocol.specs import RunSpec
+from protocol.specs import Leaf, RunSpec
 
 Array = npt.NDArray[Any]
 Bools = npt.NDArray[np.bool_]
@@ -81,7 +82,7 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
     if len(rollout.obs) != len(run.policy.observation):
         raise BadRollout(f"obs expected {len(run.policy.observation)} arrays, got {len(rollout.obs)}")
     for leaf, array in zip(run.policy.observation, rollout.obs, strict=True):
-        expected.append((f"obs {leaf.path}".strip(), array, (T + 1, N, *leaf.shape), leaf.dtype))
+        expected.append((_named(leaf), array, (T + 1, N, *leaf.shape), leaf.dtype))
     for name, array, shape, dtype in expected:
         if array.shape != shape or array.dtype != np.dtype(dtype):
             raise BadRollout(
@@ -94,9 +95,15 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
             raise BadRollout(f"{name} {first_not_finite(array)}")
     if not 0 <= rollout.lane < run.lanes:
         raise BadRollout(f"lane expected 0 to {run.lanes - 1}, got {rollout.lane}")
-    if action.sizes and (rollout.action.min() < 0 or (rollout.action >= np.reshape(action.sizes, action.shape)).any()):
+    for leaf, array in zip(run.policy.observation, rollout.obs, strict=True):
+        if leaf.sizes:
+            counts = array - np.reshape(leaf.start, leaf.shape)
+            if (counts < 0).any() or (counts >= np.reshape(leaf.sizes, leaf.shape)).any():
+                raise BadRollout(f"{_named(leaf)} expected values of its space, got {array.min()} to {array.max()}")
+    choices = np.reshape(action.sizes, action.shape) if action.sizes else 2
+    if action.kind != "box" and ((rollout.action < 0).any() or (rollout.action >= choices).any()):
         raise BadRollout(
-            f"action expected 0 to {max(action.sizes) - 1}, got {rollout.action.min()} to {rollout.action.max()}"
+            f"action expected 0 to {max(action.sizes, default=2) - 1}, got {rollout.action.min()} to {rollout.action.max()}"
         )
     ended = rollout.terminated | rollout.truncated
     if (rollout.valid[1:] == ended[:-1]).any():
@@ -104,6 +111,13 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
         raise BadRollout(f"valid expected {not ended[t, n]} at step {t + 1}, copy {n}, got {bool(rollout.valid[t + 1, n])}")
     if len(rollout.episodes) != int(np.count_nonzero(ended & rollout.valid)):
         raise BadRollout(f"episodes expected {int(np.count_nonzero(ended & rollout.valid))}, got {len(rollout.episodes)}")
+    for episode in rollout.episodes:
+        if not (math.isfinite(episode.reward) and episode.length > 0 and 0 <= episode.seconds < math.inf):
+            raise BadRollout(f"episode expected a finite return, a length and a duration, got {episode}")
+
+
+def _named(leaf: Leaf) -> str:
+    return f"obs {leaf.path}".strip()
 
 
 def first_not_finite(array: Array) -> str:

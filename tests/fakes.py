@@ -62,6 +62,7 @@ class Faults:
     loss: float = 0.0
     repeat: float = 0.0
     delay_s: float = 0.05
+    spoiled: float = 0.0  # rollouts that break the law of a row
     deaths: int = 0
     freezes: int = 0
     late_joiners: int = 0
@@ -72,7 +73,7 @@ class Faults:
 
 @dataclass
 class FakeWorker:
-    """A worker process: dies, freezes, comes back under the same name with another pid."""
+    """A worker process: dies, freezes, comes back under the same name, and pid."""
 
     name: bytes
     session: Session
@@ -90,7 +91,7 @@ class World:
         self.run = run_spec(lanes)
         self.max_lag, self.per_update = max_lag, per_update
         self.now = 0.0
-        self.pids = itertools.count(1)
+        self.lives = itertools.count(1)
         self.order = itertools.count()
         self.queue: list[tuple[float, int, Callable[[], None]]] = []
         self.arrival: dict[tuple[bytes, str], float] = {}  # a stream's last delivery: order is kept within it
@@ -160,14 +161,18 @@ class World:
                     self.workers.pop(worker.name, None)
 
     def _hears(self, peer: bytes, message: ToLearner) -> None:
-        self.to_workers(self.roster.receive(peer, message, self.now))
+        faulty = self.now < self.faults.until_s and self.random.random() < self.faults.spoiled
+        if faulty and isinstance(message, Rollout):
+            self.to_workers(self.roster.reject(peer, message, "spoiled", self.now))
+        else:
+            self.to_workers(self.roster.receive(peer, message, self.now))
         self.check()
         self._learn()
 
     # ------------------------------------------------------------ worker
 
     def spawn(self, name: bytes) -> None:
-        who = Identity(name.decode(), "host", next(self.pids), "fake")
+        who = Identity(name.decode(), "host", 1, next(self.lives), "fake")  # in a container every pid is 1
         worker = FakeWorker(name, Session(who, self.now, join_timeout_s=1e9, rejoin_timeout_s=1e9))
         self.workers[name] = worker
 

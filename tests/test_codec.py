@@ -261,4 +261,4 @@ def test_what_cannot_be_sent_is_not_sent(array: Any) -> None:
 
 def test_a_head_that_the_other_side_would_refuse_is_not_sent() -> None:
     with pytest.raises(ValueError, match="head expected at most"):
-        encode(Hello(1, "w", "h", 1, "x" * MAX_HEAD_BYTES, 1))
+        encode(Hello(1, "w", "h", 1, 1, "x" * MAX_HEAD_BYTES, 1))

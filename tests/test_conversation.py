@@ -20,6 +20,7 @@ def case(seed: int) -> World:
         loss=draw.choice([0.0, 0.0, 0.05, 0.3]),
         repeat=draw.choice([0.0, 0.2]),
         delay_s=draw.choice([0.01, 0.1, 0.8]),
+        spoiled=draw.choice([0.0, 0.0, 0.05]),
         deaths=draw.randint(0, 4),
         freezes=draw.randint(0, 3),
         late_joiners=draw.randint(0, 2),

@@ -70,7 +70,7 @@ class Learner:
         return self.balanced(self.roster.receive(peer, message, self.now))
 
     def joins(self, peer: bytes, *, pid: int = 1, attempt: int = 1, host: str = "host") -> list[Out]:
-        return self.says(peer, Hello(PROTOCOL_VERSION, peer.decode(), host, pid, "fake", attempt))
+        return self.says(peer, Hello(PROTOCOL_VERSION, peer.decode(), host, pid, 1000 * len(host) + pid, "fake", attempt))
 
     def session(self, peer: bytes) -> int:
         return self.roster.members[peer].session
@@ -171,7 +171,6 @@ def test_a_repeated_hello_is_answered_by_the_same_welcome() -> None:
     assert learner.roster.ledger.lost == 0
 
 
-@pytest.mark.xfail(strict=True, reason="roster.py: a repeated Hello is no sign of life; goes with the fix")
 def test_a_repeated_hello_is_a_sign_of_life() -> None:
     learner = Learner()
     learner.joins(A)
@@ -208,9 +207,26 @@ def test_the_same_name_from_another_process_replaces_the_old_one(pid: int, host:
     assert Left("a", f"replaced by process {pid}", 2, False) in learner.roster.events
 
 
+def test_the_one_that_was_replaced_is_told_why_when_it_comes_back() -> None:
+    """Two live processes under one name must not take it from each other for ever."""
+    learner = Learner(lanes=2)
+    learner.joins(A)
+    learner.joins(A, pid=2)
+    (refuse,) = of(learner.joins(A, pid=1, attempt=2), Refuse)
+    assert "give each worker a name of its own" in refuse.reason
+    assert learner.roster.members[A].hello.pid == 2
+
+
+def test_a_name_that_is_not_the_routing_id_is_refused() -> None:
+    learner = Learner()
+    (refuse,) = of(learner.says(A, Hello(PROTOCOL_VERSION, "b", "host", 1, 1001, "fake", 1)), Refuse)
+    assert "routing id" in refuse.reason
+    assert learner.roster.members == {}
+
+
 def test_another_protocol_is_refused_and_says_what_to_do() -> None:
     learner = Learner()
-    outs = learner.says(A, Hello(PROTOCOL_VERSION + 1, "a", "host", 1, "fake", 1))
+    outs = learner.says(A, Hello(PROTOCOL_VERSION + 1, "a", "host", 1, 1001, "fake", 1))
     (refuse,) = of(outs, Refuse)
     assert f"expected {PROTOCOL_VERSION}, got {PROTOCOL_VERSION + 1}" in refuse.reason
     assert learner.roster.members == {}
@@ -704,7 +720,6 @@ def test_whatever_dtype_a_bad_rollouts_flags_have_they_are_counted_without_raisi
     assert learner.roster.ledger.transitions_invalid == 0
 
 
-@pytest.mark.xfail(strict=True, reason="roster.py: reject does not look at the session; goes with the fix")
 def test_a_late_bad_rollout_of_an_ended_session_does_not_touch_the_ticket_of_the_same_number() -> None:
     """A learner that resumed counts tickets on from its checkpoint, so numbers come again."""
     learner = Learner(lanes=1)
@@ -715,7 +730,6 @@ def test_a_late_bad_rollout_of_an_ended_session_does_not_touch_the_ticket_of_the
     assert learner.roster.lanes[0].ahead == set()
 
 
-@pytest.mark.xfail(strict=True, reason="roster.py: sequences are believed; goes with the fix")
 @pytest.mark.parametrize("sequence", [-1, 1, 1 << 62])
 def test_a_rollout_whose_sequence_cannot_be_is_not_used(sequence: int) -> None:
     """Else `ahead` grows by one for every rollout, and goes out with every reply."""
@@ -938,7 +952,7 @@ def in_standing(standing: Standing) -> Learner:
 
 
 EVERY_MESSAGE: list[ToLearner] = [
-    Hello(PROTOCOL_VERSION, "a", "host", 1, "fake", 1),
+    Hello(PROTOCOL_VERSION, "a", "host", 1, 1001, "fake", 1),
     fake_rollout(100, 0, 0, 0, 0),
     Heartbeat(100, 0, 0, (0,), 0, {}),
     Goodbye(100, "bye", ()),

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
 from protocol.errors import BadRollout, UsageError
-from protocol.rollout import Array, Rollout, validate
+from protocol.rollout import Array, Episode, Rollout, validate
 from protocol.spaces import action_spec, observation_leaves, reader, writer
 from protocol.specs import RunSpec
 from tests.collecting import TOY, a_collector, bits, collect, over_sync, run_of
@@ -138,9 +138,9 @@ def test_observations_without_a_fixed_array_are_refused(space: gymnasium.Space[o
 # ------------------------------------------------------------------------------------------------ what the learner refuses
 
 
-def altered(**changes: object) -> str:
+def altered(observation: str = "box", action_space: str = "discrete", **changes: object) -> str:
     """What `validate` says of a good rollout after these changes."""
-    run = run_of(f"{TOY}Spaces-v0", T=6, N=3)
+    run = run_of(f"{TOY}Spaces-v0", T=6, N=3, kwargs={"observation": observation, "action": action_space})
     (good,) = collect(a_collector(run), run)
     fields = {name: getattr(good, name) for name in good.__struct_fields__} | {
         name: change(getattr(good, name)) for name, change in changes.items() if callable(change)
@@ -179,3 +179,14 @@ def test_a_rollout_that_breaks_the_law_is_refused_in_one_line() -> None:
     assert altered(terminated=lambda a: _with(a, (5, 2), True)) == "episodes expected 4, got 3"
     assert altered(episodes=lambda e: e[1:]) == "episodes expected 3, got 2"
     assert altered(valid=lambda a: (a.view(np.uint8) * 3).view(bool)) == "valid expected bytes 0 and 1, got 3"
+
+
+def test_values_that_are_not_of_the_space_are_refused() -> None:
+    """Else the learner's one-hot features would be indexed out of their bounds."""
+    low = altered(observation="discrete", obs=lambda o: (o[0] - 100,))
+    assert low.startswith("obs expected ")
+    assert altered(observation="discrete", obs=lambda o: (o[0] + 100,)).startswith("obs expected ")
+    assert altered(observation="multidiscrete", obs=lambda o: (o[0] + 100,)).startswith("obs expected ")
+    assert altered(action_space="multibinary", action=lambda a: a + 2).startswith("action expected 0 to 1, got ")
+    assert altered(episodes=lambda e: (Episode(float("nan"), 1, 1.0), *e[1:])).startswith("episode expected a finite return")
+    assert altered(episodes=lambda e: (Episode(1.0, 0, 1.0), *e[1:])).startswith("episode expected a finite return")

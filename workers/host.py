@@ -103,7 +103,7 @@ class Thread:
         self._thread.start()
 
     def _run(self, address: str, name: str, context: zmq.Context[Any]) -> None:
-        session = Session(identity(name, threading.get_ident() % 1_000_000), time.monotonic())
+        session = Session(identity(name), time.monotonic())
         link = WorkerLink(address, name, context)
         self._left = Worker(link, session, told_to_stop=lambda: self._stops, accepts_code=True).run()
 

@@ -160,6 +160,8 @@ class Identity:
     worker: str
     host: str
     pid: int
+    life: int
+    """drawn at random: no two processes, or threads, have the same"""
     software: str
 
 
@@ -214,6 +216,8 @@ class Session:
 
     def handle(self, message: ToWorker, now: float) -> list[Effect]:
         """What the learner said."""
+        if isinstance(message, Drain):  # said again to one that drains already: a sign of life
+            self._heard_s = now
         if type(message) not in TABLE[self.state]:
             return []
         if not isinstance(message, Welcome) and getattr(message, "session", self.session) != self.session:
@@ -238,7 +242,7 @@ class Session:
             case Release(_, lanes):
                 return self._release(lanes)
             case HeartbeatReply(_, number, received):
-                self._stay.replies = number
+                self._stay.replies = max(number, self._stay.replies)
                 return self._arrived(received)
         return []
 
@@ -255,7 +259,7 @@ class Session:
                 self._due_s = now + self._backoff_s
                 self._backoff_s = min(2 * self._backoff_s, HELLO_MOST_S)
                 who = self.identity
-                return [Say(Hello(PROTOCOL_VERSION, who.worker, who.host, who.pid, who.software, self._attempt))]
+                return [Say(Hello(PROTOCOL_VERSION, who.worker, who.host, who.pid, who.life, who.software, self._attempt))]
         assert self.run is not None
         if now - self._heard_s > self.run.learner_timeout_s:
             return self._rejoin(Silence(), f"the learner was silent for {self.run.learner_timeout_s:.0f} s", now)

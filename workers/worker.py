@@ -159,14 +159,14 @@ def _line(error: Exception) -> str:
     return (text.strip().splitlines() or [type(error).__name__])[0][:1000]
 
 
-def identity(name: str, thread: int = 0) -> Identity:
+def identity(name: str) -> Identity:
     """Who this process (or thread of it) is."""
     try:
         software = f"millrace {version('millrace')}"
     except PackageNotFoundError:
         software = "millrace"
     software = f"{software}, python {platform.python_version()}"
-    return Identity(name, socket.gethostname(), os.getpid() + thread, software)
+    return Identity(name, socket.gethostname(), os.getpid(), int.from_bytes(os.urandom(6), "little"), software)
 
 
 def parent_is_gone(parent: int) -> bool:
