@@ -30,6 +30,7 @@ docs: .venv/installed-dev  ## write the generated parts of protocol/README.md
 bench: .venv/installed-dev
 	$(BIN)/python -m benchmarks.collect
 	$(BIN)/python -m benchmarks.update
+	$(BIN)/python -m benchmarks.worker
 
 .venv/installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit("millrace needs Python 3.11 or newer; set PYTHON=") if sys.version_info < (3, 11) else None'

@@ -1,0 +1,72 @@
+"""What a worker process costs: seconds from exec to first rollout, and resident memory: `python -m benchmarks.worker`.
+
+A real `python -m workers` over ipc and a bare hub. Two policies: an MLP, which acts in numpy and imports no torch, and an
+image policy, which needs it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+from rich.console import Console
+from rich.table import Table
+
+from learner.config import resolve
+from learner.hub import Hub
+from learner.roster import Roster
+from learner.run import run_spec
+from protocol.link import LearnerLink
+from protocol.policy import buffer_size, layout, size
+from protocol.specs import EnvSpec
+from workers.host import Process
+
+RESULTS = Path(__file__).parent / "results"
+CASES = {
+    "MLP, CartPole-v1": EnvSpec("CartPole-v1"),
+    "image, 12 x 12 x 3": EnvSpec("workers.envs.toy:Spaces-v0", {"observation": "image"}),
+}
+
+
+def start_one(env: EnvSpec) -> tuple[float, float]:
+    """Seconds from exec to the first rollout, and resident megabytes after it."""
+    run = run_spec(resolve(env.id, lanes=1, envs=8, rollout_steps=128), env)
+    acting, _ = layout(run.policy)
+    with tempfile.TemporaryDirectory() as folder:
+        link = LearnerLink(f"ipc://{folder}/learner")
+        roster = Roster(run, rollouts_per_update=1, max_lag=0, worker_timeout_s=60, first_session=1)
+        hub = Hub(link, roster, no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=0)
+        hub.publish(0, np.zeros(size(acting), np.float32), np.zeros(buffer_size(run.policy), np.float32))
+        began_s = time.perf_counter()
+        worker = Process(link.address, "w0", Path(folder) / "log")
+        hub.gather()
+        took_s = time.perf_counter() - began_s
+        resident = psutil.Process(worker.pid).memory_info().rss / 2**20
+        hub.drain("measured")
+        worker.wait(10)
+        link.close(0)
+    return took_s, resident
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="what a worker process costs")
+    parser.add_argument("--rounds", type=int, default=7)
+    rounds = parser.parse_args().rounds
+    turns = [{name: start_one(env) for name, env in CASES.items()} for _ in range(rounds)]
+    table = Table("policy", "to first rollout, s", "resident, MB", title=f"A worker process, medians of {rounds}")
+    found = {name: [statistics.median(column) for column in zip(*(t[name] for t in turns), strict=True)] for name in CASES}
+    for name, (seconds, megabytes) in found.items():
+        table.add_row(name, f"{seconds:.2f}", f"{megabytes:.0f}")
+    Console().print(table)
+    RESULTS.mkdir(exist_ok=True)
+    (RESULTS / "worker.json").write_text(json.dumps(found, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
