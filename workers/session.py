@@ -253,7 +253,7 @@ class Session:
                 return []
             case State.JOINING:
                 if now - self._joining_s > self._patience_s:
-                    return self._leave(Silence(), 1, f"no learner answered for {self._patience_s:.0f} s")
+                    return self._leave(Silence(), 1, f"no learner answered for {self._patience_s:g} s")
                 if now < self._due_s:
                     return []
                 self._due_s = now + self._backoff_s

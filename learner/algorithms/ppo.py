@@ -137,7 +137,7 @@ class PPO:
 
     def _tensor(self, array: Array) -> Tensor:
         """[T, N, …] as [T · N, …] on the device of the weights."""
-        return torch.from_numpy(array.reshape(-1, *array.shape[2:])).to(self.net.flat.device)
+        return torch.from_numpy(array.reshape(array.shape[0] * array.shape[1], *array.shape[2:])).to(self.net.flat.device)
 
     def _epoch(self, rows: Minibatch, valid: Tensor, clip_range: float, pulse: Callable[[], None]) -> list[Measured]:
         """Use each valid row once, in minibatches of nearly equal size."""

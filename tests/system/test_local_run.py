@@ -5,19 +5,22 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import psutil
 import pytest
 
+import millrace
 from learner.config import Config, resolve
 from learner.metrics import Progress, read_rows
 from millrace.launch.local import train
-from protocol.errors import EnvironmentFailed, NoWorkers
+from protocol.errors import EnvironmentFailed, NoWorkers, UsageError
 
 SMALL: dict[str, Any] = {"n_epochs": 2, "eval_episodes": 2}  # what is shown here does not hang on learning much
 
@@ -126,6 +129,84 @@ def test_nobody_comes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("workers.host.sys.executable", "/bin/false")
     with pytest.raises(NoWorkers, match="waited 1 s for 2 workers"):
         run(tmp_path, "CartPole-v1", no_workers_timeout_s=1.0, **SMALL)
+
+
+@pytest.mark.parametrize(
+    ("observation", "action", "transport"),
+    [
+        ("image", "discrete", "ipc"),
+        ("nested", "table", "inproc"),
+        ("dict", "multibinary", "inproc"),
+        ("unbounded", "half", "inproc"),
+        ("multidiscrete", "offset", "inproc"),
+        ("tuple", "unbounded", "inproc"),
+    ],
+)
+def test_every_kind_of_space_is_learned_on(tmp_path: Path, observation: str, action: str, transport: str) -> None:
+    kwargs = {"observation": observation, "action": action}
+    settings: dict[str, Any] = {
+        "env_kwargs": kwargs,
+        "transport": transport,
+        "rollout_steps": 16,
+        "steps": 200,
+        "normalize_observations": True,
+    }
+    folder = run(tmp_path, "workers.envs.toy:Spaces-v0", **settings, **SMALL)
+    found = summary(folder)
+    assert found["updates"] >= 2
+    assert found["ledger"]["transitions_invalid"] == 0
+    assert found["evaluation"]["episodes"] == 2
+
+
+def test_an_environment_may_be_a_callable_and_travels_to_local_workers_only(tmp_path: Path) -> None:
+    def balance(gravity: float = 9.8) -> gymnasium.Env[Any, Any]:
+        env = gymnasium.make("CartPole-v1")
+        env.unwrapped.gravity = gravity  # type: ignore[attr-defined]
+        return env
+
+    settings: dict[str, Any] = {"steps": 1_000, "run_dir": str(tmp_path), "env_kwargs": {"gravity": 5.0}, **SMALL}
+    folder = millrace.train(balance, **settings)
+    assert summary(folder)["env"] == "balance"
+    with pytest.raises(UsageError, match="ipc or inproc only"):
+        millrace.train(balance, transport="tcp", **settings)
+
+
+def test_learner_and_workers_as_processes_of_their_own(tmp_path: Path) -> None:
+    address = f"ipc://{tmp_path}/learner"
+    flags = ["CartPole-v1", "--bind", address, "--min-workers", "2", "--steps", "2000", "--eval-episodes", "2"]
+    command = [sys.executable, "-m", "learner", *flags, "--run-dir", str(tmp_path / "runs")]
+    learner = subprocess.Popen(command, stderr=subprocess.PIPE)
+    workers = [subprocess.Popen([sys.executable, "-m", "workers", address], stderr=subprocess.PIPE) for _ in range(2)]
+    _, said = learner.communicate(timeout=60)
+    assert learner.returncode == 0, said
+    for worker in workers:
+        _, said = worker.communicate(timeout=20)
+        assert worker.returncode == 0, said
+    assert [summary(folder)["stop_reason"] for folder in (tmp_path / "runs").iterdir()] == ["all steps done"]
+
+
+def test_a_worker_says_that_nobody_answers(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "workers", f"ipc://{tmp_path}/nobody", "--join-timeout-s", "0.5"]
+    worker = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
+    assert worker.returncode == 1
+    assert worker.stderr.count("\n") == 1
+    assert "no learner answered for 0.5 s" in worker.stderr
+    assert "is the learner running" in worker.stderr
+
+
+def test_an_occupied_port_is_one_line_and_leaves_no_folder(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        address = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
+        command = [sys.executable, "-m", "millrace", "learner", "CartPole-v1", "--bind", address]
+        learner = subprocess.run(
+            [*command, "--run-dir", str(tmp_path / "runs")], capture_output=True, text=True, timeout=60, check=False
+        )
+    assert learner.returncode == 2
+    assert (
+        learner.stderr
+        == f"millrace: address {address} is in use; choose another port, or tcp://127.0.0.1:* for any free one\n"
+    )
+    assert not (tmp_path / "runs").exists()
 
 
 # ---------------------------------------------------------------- the learner as a process
