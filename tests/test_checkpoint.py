@@ -7,6 +7,7 @@ import resource
 import shutil
 import signal
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -66,22 +67,22 @@ def test_a_failure_at_any_step_leaves_the_old_one_whole(tmp_path: Path, monkeypa
     assert checkpoint.newest(tmp_path)[0].state["flat"][0] == 1
 
 
-@pytest.fixture
+@contextmanager
 def files_end_at_4_kb() -> Iterator[None]:
-    """The kernel refuses to let any file grow beyond 4 KiB, as a full disk does."""
+    """The kernel refuses to let any file of this process grow beyond 4 KiB, as a full disk does: pytest's own log too."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    signal.signal(signal.SIGXFSZ, handler)
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
 
 
-@pytest.mark.usefixtures("files_end_at_4_kb")
 def test_a_disk_that_is_full_in_mid_file_leaves_nothing_behind(tmp_path: Path) -> None:
-    small = {"flat": torch.ones(1)}
-    checkpoint.save(tmp_path, small, 100, keep=3)
-    with pytest.raises(CheckpointError, match="not written") as caught:
+    checkpoint.save(tmp_path, {"flat": torch.ones(1)}, 100, keep=3)
+    with files_end_at_4_kb(), pytest.raises(CheckpointError, match="not written") as caught:
         checkpoint.save(tmp_path, {"flat": torch.ones(100_000)}, 200, keep=3)
     assert "\n" not in str(caught.value)
     assert files(tmp_path) == ["000000000100.pt"]

@@ -16,6 +16,8 @@ import signal
 import socket
 import sys
 import time
+from contextlib import suppress
+from pathlib import Path
 
 from protocol.errors import OurError
 from protocol.link import WorkerLink, check_address
@@ -50,6 +52,8 @@ def main(argv: list[str] | None = None) -> int:
         accepts_code=options.address.startswith("ipc://") and not options.no_code,
     )
     left = worker.run()
+    if options.parent and parent_is_gone(options.parent):
+        _tidy_up_after(options.address)
     if left.exit_code:
         sys.stderr.write(f"worker {options.name}: {_advice(left.reason, options.address)}\n")
     return left.exit_code
@@ -61,6 +65,15 @@ def _count_signals() -> list[int]:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda signum, frame: received.append(signum))
     return received
+
+
+def _tidy_up_after(address: str) -> None:
+    """A host that was killed could not remove its socket and the folder that it had made for it."""
+    scheme, _, path = address.partition("://")
+    if scheme == "ipc" and Path(path).parent.name.startswith("millrace-"):
+        Path(path).unlink(missing_ok=True)
+        with suppress(OSError):
+            Path(path).parent.rmdir()
 
 
 def _advice(reason: str, address: str) -> str:
