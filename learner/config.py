@@ -43,7 +43,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """the algorithm's own settings"""
 
     steps: Count = 100_000
-    """env steps to train for, all copies together"""
+    """env steps to train for, all copies together: it ends when one more update would pass them"""
     seed: Natural = 1
     """everything random follows from it"""
     workers: Count = 2

@@ -99,7 +99,9 @@ class Journal:
         target, evaluation = self.config.target_return, self.evaluation
         if target is not None and evaluation is not None and evaluation.return_mean >= target:
             return f"target return {target:g} reached"
-        return "all steps done" if self.env_steps >= self.config.steps else None
+        one_more = self.spec.rollout_steps * self.config.envs
+        enough = self.version > 0 and self.env_steps + one_more > self.config.steps
+        return "all steps done" if enough else None
 
     def updated(self, batch: Batch, metrics: Mapping[str, float], update_s: float) -> None:
         """An update was made and published: count, write, and now and then evaluate and checkpoint."""

@@ -48,7 +48,7 @@ def worker_processes() -> list[psutil.Process]:
 
 @pytest.mark.parametrize(
     ("env", "settings"),
-    [("CartPole-v1", {"steps": 5_000}), ("Pendulum-v1", {"steps": 78_000, "n_epochs": 1, "batch_size": 256})],
+    [("CartPole-v1", {"steps": 5_300}), ("Pendulum-v1", {"steps": 84_000, "n_epochs": 1, "batch_size": 256})],
 )
 def test_the_same_curve_whatever_the_number_of_workers(tmp_path: Path, env: str, settings: dict[str, Any]) -> None:
     """20 updates on one seed, in the default lanes: the same bytes for 1, 2 and 4 workers, over inproc, ipc and tcp."""
@@ -93,7 +93,7 @@ def test_a_killed_worker_is_replaced_and_the_run_ends_well(tmp_path: Path) -> No
     assert killed
     assert back, "the killed worker never came back"
     assert found["stop_reason"] == "all steps done"
-    assert found["env_steps"] >= 60_000
+    assert 60_000 - 256 < found["env_steps"] <= 60_000
     assert_balanced(found["ledger"])
 
 
@@ -148,7 +148,7 @@ def test_every_kind_of_space_is_learned_on(tmp_path: Path, observation: str, act
         "env_kwargs": kwargs,
         "transport": transport,
         "rollout_steps": 16,
-        "steps": 200,
+        "steps": 400,
         "normalize_observations": True,
     }
     folder = run(tmp_path, "workers.envs.toy:Spaces-v0", **settings, **SMALL)
@@ -267,7 +267,7 @@ def test_a_learner_that_was_killed_goes_on_from_its_newest_checkpoint(tmp_path: 
     assert saved < first[0].env_steps <= saved + 256, "it did not go on from the newest checkpoint"
     assert first[0].wall_s > 0.5, "the clock began again"
     found = summary(folder)
-    assert found["env_steps"] >= 40_000
+    assert 40_000 - 256 < found["env_steps"] <= 40_000
     assert_balanced(found["ledger"])
     steps = [row["time/total_timesteps"] for row in read_rows(folder / "metrics.jsonl")]
     assert steps == sorted(set(steps)), "the curve goes over the same steps twice"
