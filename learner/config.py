@@ -18,7 +18,7 @@ import tomli_w
 from msgspec import Meta
 from tyro.conf import Positional
 
-from learner.hyperparameters import HYPERPARAMETERS, PPOConfig
+from learner.hyperparameters import HYPERPARAMETERS, Hyperparameters, PPOConfig
 from learner.nearest import nearest
 from protocol.errors import UsageError
 from protocol.link import check_address
@@ -38,8 +38,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     env_kwargs: dict[str, Scalar] = {}
     """keyword arguments of gymnasium.make: name value name value …"""
     algo: str = "ppo"
-    """the algorithm: ppo"""
-    algorithm: PPOConfig = PPOConfig()
+    """the algorithm: one of those in learner/hyperparameters.py"""
+    algorithm: Hyperparameters = PPOConfig()
     """the algorithm's own settings"""
 
     steps: Count = 100_000

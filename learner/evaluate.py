@@ -21,7 +21,7 @@ from protocol.distributions import distribution
 from protocol.errors import EnvironmentFailed
 from protocol.policy import Policy, make_policy
 from protocol.spaces import observation_leaves, reader, writer
-from protocol.specs import ActionSpec, EnvSpec, PolicySpec
+from protocol.specs import EnvSpec, PolicySpec
 
 Array = npt.NDArray[Any]
 COPIES = 20
@@ -31,7 +31,7 @@ LONGEST_EPISODE = 100_000  # env steps; an environment without a time limit must
 def evaluate(
     env_spec: EnvSpec,
     policy: Policy,
-    action_spec: ActionSpec,
+    spec: PolicySpec,
     episodes: int,
     seed: int,
     pulse: Callable[[], None] = lambda: None,
@@ -39,7 +39,7 @@ def evaluate(
     """Act greedily for so many episodes; `pulse` is called at every step. Raises `EnvironmentFailed` if it raises."""
     envs = [env_spec.make() for _ in range(min(episodes, COPIES))]
     try:
-        returns, lengths, cut = _play(envs, policy, action_spec, episodes, seed, pulse)
+        returns, lengths, cut = _play(envs, policy, spec, episodes, seed, pulse)
     finally:
         for env in envs:
             env.close()
@@ -88,13 +88,13 @@ class _Copy:
 def _play(
     envs: list[gymnasium.Env[Any, Any]],
     policy: Policy,
-    action_spec: ActionSpec,
+    spec: PolicySpec,
     episodes: int,
     seed: int,
     pulse: Callable[[], None],
 ) -> tuple[list[float], list[int], int]:
     space = envs[0].observation_space
-    read, write, mode = reader(space), writer(action_spec), distribution(action_spec).mode
+    read, write, mode = reader(space), writer(spec.action), distribution(spec).mode
     dtypes = [leaf.dtype for leaf in observation_leaves(space)]
     seeds = np.random.SeedSequence(seed).generate_state(len(envs))
     quotas = [episodes // len(envs) + (i < episodes % len(envs)) for i in range(len(envs))]

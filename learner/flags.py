@@ -82,15 +82,16 @@ def parse(kind: type[Record], argv: list[str], command: str, default: Record | N
         flag = next((word for word in unknown if word.startswith("-")), None)
         if flag is None:
             raise UsageError(f"{command}: unexpected argument {unknown[0]}")
-        raise UsageError(f"{command}: unknown flag {flag}{nearest(flag.lstrip('-'), _names(kind), '--')}")
+        raise UsageError(f"{command}: unknown flag {flag}{nearest(flag.lstrip('-'), _names(kind, default), '--')}")
     return record
 
 
-def _names(kind: type[msgspec.Struct]) -> Iterator[str]:
-    """Of all flags of a record, those of records within it too, without the dashes before them."""
+def _names(kind: type[msgspec.Struct], default: msgspec.Struct | None) -> Iterator[str]:
+    """Of all flags of a record, those of the records within it too, without the dashes before them."""
     for field in msgspec.structs.fields(kind):
-        if isinstance(field.type, type) and issubclass(field.type, msgspec.Struct):
-            yield from _names(field.type)
+        value = getattr(default, field.name, None)
+        if isinstance(value, msgspec.Struct):
+            yield from _names(type(value), value)
         else:
             name = field.name.replace("_", "-")
             yield name

@@ -130,7 +130,7 @@ class Journal:
             policy = make_policy(spec.policy)
             policy.load(*self.algorithm.weights())
             seed, episodes = EVALUATION_SEED + self.config.seed, self.config.eval_episodes
-            self.evaluation = evaluate(spec.env, policy, spec.policy.action, episodes, seed, self.hub.pulse)
+            self.evaluation = evaluate(spec.env, policy, spec.policy, episodes, seed, self.hub.pulse)
             self._evaluated_version = self.version
             self._note = f"{self.env_steps:,} env steps: greedy {self.evaluation}"
         return self.evaluation

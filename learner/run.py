@@ -27,7 +27,7 @@ from learner.train import train
 from protocol.errors import UsageError
 from protocol.link import LearnerLink, is_local
 from protocol.spaces import action_spec, observation_leaves
-from protocol.specs import EnvSpec, PolicySpec, RunSpec
+from protocol.specs import EnvSpec, RunSpec
 
 log = logging.getLogger("millrace.learner")
 
@@ -115,13 +115,8 @@ def run_spec(config: Config, env: EnvSpec) -> RunSpec:
     """What the workers are told. Makes one env copy to learn its spaces; raises `UsageError` if it cannot."""
     copy = env.make()
     try:
-        policy = PolicySpec(
-            observation_leaves(copy.observation_space),
-            action_spec(copy.action_space),
-            net=config.algorithm.net,
-            activation=config.algorithm.activation,
-            normalize_observations=config.algorithm.normalize_observations,
-        )
+        observation, action = observation_leaves(copy.observation_space), action_spec(copy.action_space)
+        policy = ALGORITHMS[config.algo].policy_spec(config.algorithm, observation, action)
     finally:
         copy.close()
     return RunSpec(

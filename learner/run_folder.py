@@ -26,7 +26,7 @@ import numpy.typing as npt
 from learner.atomic import write_atomically
 from learner.metrics import Evaluation
 from protocol.errors import RunError, UsageError
-from protocol.policy import Field, buffer_size, layout, size, views
+from protocol.policy import Field, buffer_fields, layout, size, views
 from protocol.specs import EnvSpec, PolicySpec, Scalar
 
 if TYPE_CHECKING:
@@ -36,7 +36,6 @@ Floats = npt.NDArray[np.float32]
 POLICY_FORMAT = 1
 POLICY_ARRAYS = "policy.safetensors"
 POLICY_CARD = "policy.json"
-BUFFERS = ("observation_mean", "observation_std")
 
 
 class Interrupted(KeyboardInterrupt):
@@ -131,14 +130,14 @@ class RunFolder:
         from safetensors.numpy import save
 
         acting, _ = layout(spec)
-        arrays = views(parameters[: size(acting)], acting) | _named_buffers(spec, buffers)
+        arrays = views(parameters[: size(acting)], acting) | views(buffers, buffer_fields(spec))
         card = PolicyCard(
             format=POLICY_FORMAT,
             env=env.id,
             env_kwargs=env.kwargs,
             policy=spec,
             arrays=_array_cards(acting),
-            buffers=tuple(_named_buffers(spec, buffers)),
+            buffers=tuple(views(buffers, buffer_fields(spec))),
         )
         self._write(POLICY_ARRAYS, save({name: np.ascontiguousarray(array) for name, array in arrays.items()}))
         self._write(POLICY_CARD, msgspec.json.format(msgspec.json.encode(card), indent=2) + b"\n")
@@ -159,7 +158,7 @@ class RunFolder:
             raise UsageError(f"policy of run {self.path}: expected format {POLICY_FORMAT}, got {card.format}")
         acting, _ = layout(card.policy)
         wanted = {field.name: field.shape for field in acting}
-        wanted |= {name: (buffer_size(card.policy) // 2,) for name in card.buffers}
+        wanted |= {field.name: field.shape for field in buffer_fields(card.policy)}
         for name in sorted(arrays.keys() | wanted.keys()):
             shape = arrays[name].shape if name in arrays else "nothing"
             if name not in wanted or shape != wanted[name] or arrays[name].dtype != np.float32:
@@ -204,10 +203,6 @@ def sanitised(env: str) -> str:
 def _array_cards(fields: tuple[Field, ...]) -> tuple[ArrayCard, ...]:
     starts = [size(fields[:i]) for i in range(len(fields))]
     return tuple(ArrayCard(field.name, field.shape, start) for field, start in zip(fields, starts, strict=True))
-
-
-def _named_buffers(spec: PolicySpec, buffers: Floats) -> dict[str, Floats]:
-    return dict(zip(BUFFERS, np.split(buffers, 2), strict=True)) if buffer_size(spec) else {}
 
 
 def _flat(arrays: list[Floats]) -> Floats:

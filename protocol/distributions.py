@@ -6,6 +6,7 @@ comparison, and the log-probabilities of a whole rollout are computed at once fr
     Categorical   P = Σ sizes   logits; action = argmax(logits + Gumbel noise)               (Gumbel-max trick)
     Bernoulli     P = K         logits; action = logits + logistic noise > 0
     Gaussian      P = 2 D       mean, log standard deviation; action = mean + exp(log_std) · normal noise, not clipped
+    EpsilonGreedy P = n + 1     action values, ε; action = a uniform one where noise₀ < ε, else argmax
 
 `protocol.networks` has the same log-probabilities in torch, with entropies; a test holds them equal.
 """
@@ -18,7 +19,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from protocol.specs import ActionSpec
+from protocol.specs import PolicySpec
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
@@ -140,12 +141,42 @@ class Gaussian:
         return np.asarray((np.float32(-0.5) * z * z - log_std - np.float32(LOG_SQRT_2PI)).sum(-1))
 
 
-def distribution(spec: ActionSpec) -> Distribution:
-    """The distribution over such actions."""
-    match spec.kind:
+class EpsilonGreedy:
+    """The best of n actions, or with probability ε a uniform one (Discrete)."""
+
+    def __init__(self, actions: int) -> None:
+        self.params_size = actions + 1
+        self._actions = actions
+
+    def noise(self, generator: np.random.Generator, shape: tuple[int, ...]) -> Floats:
+        """Uniform(0, 1) noise [*shape, 2]: whether to explore, and which action."""
+        return generator.random((*shape, 2), dtype=np.float32)
+
+    def sample(self, params: Floats, noise: Floats) -> Array:
+        """A draw, int64 from 0."""
+        uniform = (noise[..., 1] * self._actions).astype(np.int64)  # below n: float32 noise is at most 1 - 2**-24
+        return np.where(noise[..., 0] < params[..., -1], uniform, self.mode(params))
+
+    def mode(self, params: Floats) -> Array:
+        """The best action."""
+        return np.asarray(params[..., :-1].argmax(-1))
+
+    def log_prob(self, params: Floats, action: Array) -> Floats:
+        """log(ε / n + (1 − ε) [action is the best]) [...], at least −69."""
+        epsilon = params[..., -1]
+        chance = epsilon / np.float32(self._actions) + (1 - epsilon) * (action == self.mode(params))
+        return np.asarray(np.log(np.maximum(chance, _TINY)), np.float32)
+
+
+def distribution(spec: PolicySpec) -> Distribution:
+    """The distribution of such a policy over its actions."""
+    action = spec.action
+    if spec.head == "q":
+        return EpsilonGreedy(action.sizes[0])
+    match action.kind:
         case "discrete" | "multidiscrete":
-            return Categorical(spec.sizes, spec.shape)
+            return Categorical(action.sizes, action.shape)
         case "multibinary":
-            return Bernoulli(spec.shape)
+            return Bernoulli(action.shape)
         case "box":
-            return Gaussian(spec.shape)
+            return Gaussian(action.shape)

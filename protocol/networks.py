@@ -19,7 +19,18 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from protocol.distributions import LOG_SQRT_2PI
-from protocol.policy import Field, buffer_size, convolutions, features, layout, normalized, size
+from protocol.policy import (
+    Field,
+    buffer_fields,
+    buffer_size,
+    convolutions,
+    features,
+    hidden_names,
+    layout,
+    normalized,
+    size,
+    views,
+)
 from protocol.specs import ActionSpec, PolicySpec
 
 Array = npt.NDArray[Any]
@@ -63,8 +74,8 @@ class MLP(torch.autograd.Function):
         return tuple(reversed(found))
 
 
-class ActorCritic:
-    """The networks of a `PolicySpec`: convolutions shared by actor and critic, then an MLP each."""
+class FlatNetwork:
+    """Named parameters that are views into one flat tensor, and the convolutions that images go through first."""
 
     def __init__(self, spec: PolicySpec, device: str | torch.device = "cpu", *, seed: int = 0) -> None:
         """Orthogonal initialisation with each field's gain, zeros where it is 0: the same for the same seed."""
@@ -84,12 +95,23 @@ class ActorCritic:
             self.parameters[field.name] = view
             at = end
         self._relu = spec.activation == "relu"
-        self._actor, self._critic = (self._layers(name) for name in ("actor", "critic"))
         self._images = [self._image(i) for i, leaf in enumerate(spec.observation) if leaf.is_image]
 
-    def _layers(self, name: str) -> list[Tensor]:
-        names = [f"{name}.{i}" for i in range(len(self.spec.net))] + [f"{name}.out"]
-        return [self.parameters[f"{part}.{kind}"] for part in names for kind in ("weight", "bias")]
+    def layers(self, names: Sequence[str]) -> list[Tensor]:
+        """Weights and biases in turn, as `MLP` takes them."""
+        return [self.parameters[f"{name}.{kind}"] for name in names for kind in ("weight", "bias")]
+
+    def mlp(self, x: Tensor, layers: Sequence[Tensor]) -> Tensor:
+        """Hidden layers with the activation between them, the last one linear."""
+        out: Tensor = MLP.apply(x, self._relu, *layers)  # type: ignore[no-untyped-call]
+        return out
+
+    def hidden(self, x: Tensor, layers: Sequence[Tensor]) -> Tensor:
+        """Hidden layers, each with its activation."""
+        if not layers:
+            return x
+        out = self.mlp(x, layers)
+        return torch.relu(out) if self._relu else torch.tanh(out)
 
     def _image(self, i: int) -> tuple[bool, list[tuple[Tensor, Tensor, int]], tuple[Tensor, Tensor]]:
         leaf = self.spec.observation[i]
@@ -99,8 +121,8 @@ class ActorCritic:
         last = leaf.shape != (channels, *leaf.shape[1:])
         return last, [(w, b, conv.stride) for (w, b), conv in zip(convs, stack, strict=True)], out
 
-    def _inputs(self, x: Tensor, images: Sequence[Tensor]) -> Tensor:
-        """Features [B, D] and images [B, *leaf] uint8 -> what both networks take [B, D + IMAGE_FEATURES per image]."""
+    def inputs(self, x: Tensor, images: Sequence[Tensor]) -> Tensor:
+        """Features [B, D] and images [B, *leaf] uint8 -> what the MLPs take [B, D + IMAGE_FEATURES per image]."""
         parts = [x]
         for (channels_last, convs, (weight, bias)), image in zip(self._images, images, strict=True):
             h = (image.permute(0, 3, 1, 2) if channels_last else image).float() * (1 / 255)
@@ -109,28 +131,56 @@ class ActorCritic:
             parts.append(F.relu(F.linear(h.flatten(1), weight, bias)))
         return torch.cat(parts, -1) if images else x
 
+
+class ActorCritic(FlatNetwork):
+    """An actor and a critic: an MLP each, or two heads on one."""
+
+    def __init__(self, spec: PolicySpec, device: str | torch.device = "cpu", *, seed: int = 0) -> None:
+        super().__init__(spec, device, seed=seed)
+        trunk = hidden_names(spec)
+        self._trunk = self.layers(trunk) if spec.shared_net else []
+        self._actor = self.layers(["actor.out"] if spec.shared_net else [*trunk, "actor.out"])
+        self._critic = self.layers(["critic.out"] if spec.shared_net else [*hidden_names(spec, "critic"), "critic.out"])
+
     def _params(self, h: Tensor) -> Tensor:
-        out: Tensor = MLP.apply(h, self._relu, *self._actor)  # type: ignore[no-untyped-call]
+        out = self.mlp(h, self._actor)
         if self.spec.action.kind != "box":
             return out
         return torch.cat([out, self.parameters["actor.log_std"].expand_as(out)], -1)
 
-    def _value(self, h: Tensor) -> Tensor:
-        out: Tensor = MLP.apply(h, self._relu, *self._critic)  # type: ignore[no-untyped-call]
-        return out[:, 0]
+    def _common(self, x: Tensor, images: Sequence[Tensor]) -> Tensor:
+        return self.hidden(self.inputs(x, images), self._trunk)
 
     def forward(self, x: Tensor, images: Sequence[Tensor] = ()) -> tuple[Tensor, Tensor]:
         """Features [B, D] float32 and images [B, *leaf] uint8 -> distribution params [B, P], value [B]."""
-        h = self._inputs(x, images)
-        return self._params(h), self._value(h)
+        h = self._common(x, images)
+        return self._params(h), self.mlp(h, self._critic)[:, 0]
 
     def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
         """Distribution params [B, P] alone."""
-        return self._params(self._inputs(x, images))
+        return self._params(self._common(x, images))
 
     def value(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
         """Value [B] alone."""
-        return self._value(self._inputs(x, images))
+        return self.mlp(self._common(x, images), self._critic)[:, 0]
+
+
+class QNetwork(FlatNetwork):
+    """The value of every action, plain or dueling."""
+
+    def __init__(self, spec: PolicySpec, device: str | torch.device = "cpu", *, seed: int = 0) -> None:
+        super().__init__(spec, device, seed=seed)
+        self._plain = self.layers([*hidden_names(spec), "q.out"])
+        self._hidden = self.layers(hidden_names(spec))
+
+    def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
+        """Action values [B, n] of features [B, D] float32 and images [B, *leaf] uint8."""
+        h = self.inputs(x, images)
+        if not self.spec.dueling:
+            return self.mlp(h, self._plain)
+        h = self.hidden(h, self._hidden)
+        advantage, value = self.mlp(h, self.layers(["q.out"])), self.mlp(h, self.layers(["q.value"]))
+        return value + advantage - advantage.mean(-1, keepdim=True)
 
 
 def _initial(fields: Sequence[Field], seed: int) -> Tensor:
@@ -173,8 +223,8 @@ class TorchPolicy:
 
     def __init__(self, spec: PolicySpec) -> None:
         self.spec = spec
-        self._net = ActorCritic(spec)
-        self._buffers = np.empty(0, np.float32)
+        self._net = QNetwork(spec) if spec.head == "q" else ActorCritic(spec)
+        self._buffers: dict[str, Floats] = {}
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
         """Act with these from now on. Raises ValueError when the sizes do not fit the spec."""
@@ -185,17 +235,20 @@ class TorchPolicy:
                 f"got {parameters.shape} and {buffers.shape}"
             )
         np.copyto(self._net.flat.numpy()[:count], parameters)
-        self._buffers = buffers
+        self._buffers = views(buffers, buffer_fields(self.spec))
 
     def __call__(self, leaves: Sequence[Array]) -> Floats:
         """Distribution parameters [L, N, P] of the actions in these observations [L, N, *leaf]."""
         x = features(self.spec, leaves)
         if self.spec.normalize_observations:
-            x = normalized(x, *np.split(self._buffers, 2))
+            x = normalized(x, self._buffers["observation_mean"], self._buffers["observation_std"])
         images = [array for leaf, array in zip(self.spec.observation, leaves, strict=True) if leaf.is_image]
         with torch.no_grad():
             lanes = [
                 self._net.params(torch.tensor(x[lane]), [torch.tensor(image[lane]) for image in images])
                 for lane in range(len(x))
             ]
-            return np.asarray(torch.stack(lanes).numpy())
+            out = np.asarray(torch.stack(lanes).numpy())
+        if self.spec.head != "q":
+            return out
+        return np.concatenate([out, np.broadcast_to(self._buffers["epsilon"], (*out.shape[:-1], 1))], -1)

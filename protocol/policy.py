@@ -89,20 +89,38 @@ def layout(spec: PolicySpec) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
             channels = conv.channels
         acting += _linear(f"image{i}.out", flattened, IMAGE_FEATURES, math.sqrt(2))
         width += IMAGE_FEATURES
+    hidden, last = _hidden(_trunk(spec), width, spec.net)
+    acting += hidden
     action = spec.action
-    outputs = math.prod(action.shape) if action.kind == "box" else distribution(action).params_size
-    acting += _mlp("actor", width, spec.net, outputs, gain=0.01)
+    if spec.head == "q":
+        if spec.dueling:
+            acting += _linear("q.value", last, 1, 1.0)
+        return tuple(acting + _linear("q.out", last, action.sizes[0], 1.0)), ()
+    outputs = math.prod(action.shape) if action.kind == "box" else distribution(spec).params_size
+    acting += _linear("actor.out", last, outputs, 0.01)
     if action.kind == "box":
         acting.append(Field("actor.log_std", (outputs,), 0))
-    return tuple(acting), tuple(_mlp("critic", width, spec.net, 1, gain=1.0))
+    critic, last = ([], last) if spec.shared_net else _hidden("critic", width, spec.net)
+    return tuple(acting), (*critic, *_linear("critic.out", last, 1, 1.0))
 
 
-def _mlp(name: str, width: int, hidden: Sequence[int], outputs: int, gain: float) -> list[Field]:
+def _trunk(spec: PolicySpec) -> str:
+    """Name of the hidden layers that acting goes through."""
+    return "q" if spec.head == "q" else "shared" if spec.shared_net else "actor"
+
+
+def hidden_names(spec: PolicySpec, name: str = "") -> list[str]:
+    """Names of the hidden layers that acting goes through, or of those of `critic`."""
+    return [f"{name or _trunk(spec)}.{i}" for i in range(len(spec.net))]
+
+
+def _hidden(name: str, width: int, sizes: Sequence[int]) -> tuple[list[Field], int]:
+    """Hidden layers, and the width of the last one."""
     fields: list[Field] = []
-    for i, size in enumerate(hidden):
+    for i, size in enumerate(sizes):
         fields += _linear(f"{name}.{i}", width, size, math.sqrt(2))
         width = size
-    return fields + _linear(f"{name}.out", width, outputs, gain)
+    return fields, width
 
 
 def _linear(name: str, inputs: int, outputs: int, gain: float) -> list[Field]:
@@ -158,9 +176,19 @@ def normalized(x: Floats, mean: Floats, std: Floats) -> Floats:
     return np.asarray(np.clip((x - mean) / std, -CLIP, CLIP))
 
 
+def buffer_fields(spec: PolicySpec) -> tuple[Field, ...]:
+    """What `Weights.buffers` holds: the observations' means and standard deviations, if they are normalised; then ε."""
+    fields: list[Field] = []
+    if spec.normalize_observations:
+        fields += [Field(name, (feature_size(spec),), 0) for name in ("observation_mean", "observation_std")]
+    if spec.head == "q":
+        fields.append(Field("epsilon", (1,), 0))
+    return tuple(fields)
+
+
 def buffer_size(spec: PolicySpec) -> int:
-    """Length of `Weights.buffers`: the observations' means, then their standard deviations, if they are normalised."""
-    return 2 * feature_size(spec) if spec.normalize_observations else 0
+    """Length of `Weights.buffers`."""
+    return size(buffer_fields(spec))
 
 
 class Policy(Protocol):
@@ -181,9 +209,8 @@ class NumpyPolicy:
     def __init__(self, spec: PolicySpec) -> None:
         self.spec = spec
         self._fields, _ = layout(spec)
-        self._layers: list[tuple[Floats, Floats]] = []
-        self._log_std: Floats | None = None
-        self._normal: tuple[Floats, Floats] | None = None
+        self._parameters: dict[str, Floats] = {}
+        self._buffers: dict[str, Floats] = {}
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
         """Act with these from now on: views, no copies. Raises ValueError when the sizes do not fit the spec."""
@@ -192,32 +219,38 @@ class NumpyPolicy:
                 f"weights expected {size(self._fields)} parameters and {buffer_size(self.spec)} buffers, "
                 f"got {parameters.shape} and {buffers.shape}"
             )
-        found = views(parameters, self._fields)
-        names = [f"actor.{i}" for i in range(len(self.spec.net))] + ["actor.out"]
-        self._layers = [(found[f"{name}.weight"].T, found[f"{name}.bias"]) for name in names]
-        self._log_std = found.get("actor.log_std")
-        if self.spec.normalize_observations:
-            self._normal = (buffers[: len(buffers) // 2], buffers[len(buffers) // 2 :])
+        self._parameters = views(parameters, self._fields)
+        self._buffers = views(buffers, buffer_fields(self.spec))
+        self._hidden = [self._linear(name) for name in hidden_names(self.spec)]
+        self._out = self._linear("q.out" if self.spec.head == "q" else "actor.out")
+        self._beside = self._parameters.get("actor.log_std", self._buffers.get("epsilon"))
+
+    def _linear(self, name: str) -> tuple[Floats, Floats]:
+        return self._parameters[f"{name}.weight"].T, self._parameters[f"{name}.bias"]
 
     def __call__(self, leaves: Sequence[Array]) -> Floats:
         """Distribution parameters [L, N, P] of the actions in these observations [L, N, *leaf]."""
         x = features(self.spec, leaves)
-        if self._normal is not None:
-            x = normalized(x, *self._normal)
+        if self.spec.normalize_observations:
+            x = normalized(x, self._buffers["observation_mean"], self._buffers["observation_std"])
         relu = self.spec.activation == "relu"
-        *hidden, (weight, bias) = self._layers
-        for w, b in hidden:
+        for w, b in self._hidden:
             x = np.matmul(x, w)
             x += b
             if relu:
                 np.maximum(x, 0, out=x)
             else:
                 np.tanh(x, out=x)
-        x = np.asarray(np.matmul(x, weight))
-        x += bias
-        if self._log_std is None:
-            return x
-        return np.concatenate([x, np.broadcast_to(self._log_std, x.shape)], -1)
+        weight, bias = self._out
+        out = np.asarray(np.matmul(x, weight))
+        out += bias
+        if self.spec.dueling:
+            weight, bias = self._linear("q.value")
+            out += np.matmul(x, weight) + bias - out.mean(-1, keepdims=True)
+        if self._beside is None:
+            return out
+        beside = np.broadcast_to(self._beside, (*out.shape[:-1], len(self._beside)))
+        return np.concatenate([out, beside], -1)
 
 
 def make_policy(spec: PolicySpec) -> Policy:

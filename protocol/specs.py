@@ -128,10 +128,16 @@ class PolicySpec(msgspec.Struct, frozen=True):
     observation: tuple[Leaf, ...]
     action: ActionSpec
     net: tuple[int, ...] = (64, 64)
-    """hidden layers of the actor, and of the critic"""
+    """hidden layers of the actor, and of the critic; or of the action values"""
     activation: Literal["tanh", "relu"] = "tanh"
     normalize_observations: bool = False
     """subtract the running mean, divide by the running standard deviation, clip to ±10 (not images)"""
+    head: Literal["actor_critic", "q"] = "actor_critic"
+    """a distribution over actions and a value, or the value of every (discrete) action, acted on epsilon-greedily"""
+    shared_net: bool = False
+    """actor and critic share their hidden layers"""
+    dueling: bool = False
+    """action values are a state's value and each action's advantage over the mean (Wang et al. 2016)"""
 
     @property
     def needs_torch(self) -> bool:

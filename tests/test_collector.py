@@ -53,7 +53,7 @@ def random_leaf(leaf: Leaf, generator: np.random.Generator, lead: tuple[int, ...
 @pytest.mark.parametrize("run", [DISCRETE, GAUSSIAN, TABLE, BITS], ids=["discrete", "gaussian", "table", "bits"])
 def test_any_lanes_of_any_size_act_the_same_alone_and_beside_others(run: RunSpec, activation: str) -> None:
     spec = msgspec.structs.replace(run.policy, activation=activation)
-    chosen = distribution(spec.action)
+    chosen = distribution(spec)
     policy = random_policy(spec)
     generator = np.random.default_rng(0)
     for N in range(1, 65):
@@ -146,7 +146,7 @@ def test_an_environment_that_writes_into_its_action_does_not_change_the_rollout(
 def test_log_probabilities_are_those_of_the_policy_in_these_observations(run: RunSpec) -> None:
     (rollout,) = collect(a_collector(run), run)
     params = random_policy(run.policy)([leaf[:-1] for leaf in rollout.obs])
-    expected = distribution(run.policy.action).log_prob(params, rollout.action)
+    expected = distribution(run.policy).log_prob(params, rollout.action)
     np.testing.assert_allclose(rollout.log_prob, expected, rtol=1e-4, atol=1e-5)
 
 

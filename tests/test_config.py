@@ -26,17 +26,22 @@ def refusal(env: str = "CartPole-v1", **keywords: Any) -> str:
     return text
 
 
+def ppo(config: Config) -> PPOConfig:
+    assert isinstance(config.algorithm, PPOConfig)
+    return config.algorithm
+
+
 def test_each_layer_overrides_the_one_below(tmp_path: Path) -> None:
     file = written(tmp_path, "seed = 7\nworkers = 5\n[ppo]\ngamma = 0.5\nclip_range = 0.3\n")
     unknown_env = resolve("MountainCar-v0")
     assert unknown_env.algorithm == PPOConfig()
     preset = resolve("CartPole-v1")
-    assert (preset.algorithm.gae_lambda, preset.algorithm.gamma) == (0.8, 0.98)
-    assert preset.algorithm.learning_rate_schedule == "linear"
+    assert (ppo(preset).gae_lambda, preset.algorithm.gamma) == (0.8, 0.98)
+    assert ppo(preset).learning_rate_schedule == "linear"
     config = resolve("CartPole-v1", file=file, workers=3, clip_range=0.1)
-    assert config.algorithm.gae_lambda == 0.8  # preset over default
+    assert ppo(config).gae_lambda == 0.8  # preset over default
     assert (config.seed, config.algorithm.gamma) == (7, 0.5)  # file over preset
-    assert (config.workers, config.algorithm.clip_range) == (3, 0.1)  # keyword over file
+    assert (config.workers, ppo(config).clip_range) == (3, 0.1)  # keyword over file
 
 
 def test_a_preset_can_be_left_out_or_borrowed() -> None:

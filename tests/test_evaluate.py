@@ -84,13 +84,13 @@ def made() -> list[Echo]:
 
 
 ECHO = EnvSpec("millrace-tests/Echo-v0")
-ACTION = action_spec(spaces.Discrete(5))
+SPEC = PolicySpec((), action_spec(spaces.Discrete(5)))
 
 
 def test_greedy_actions_reach_the_environment(made: list[Echo]) -> None:
-    found = evaluate(ECHO, Says(), ACTION, episodes=2, seed=1)
+    found = evaluate(ECHO, Says(), SPEC, episodes=2, seed=1)
     assert (found.return_mean, found.return_std, found.length_mean) == (3.0, 0.0, 3.0)  # one episode each of two copies
-    wrong = evaluate(ECHO, Says(always=4), ACTION, episodes=40, seed=1)
+    wrong = evaluate(ECHO, Says(always=4), SPEC, episodes=40, seed=1)
     assert wrong.return_std > 0
     assert 0.5 < wrong.return_mean < 1.5  # one in five by chance, of 3 and 6 steps
     assert all(env.closed for env in made)
@@ -98,7 +98,7 @@ def test_greedy_actions_reach_the_environment(made: list[Echo]) -> None:
 
 def test_each_copy_plays_its_share_and_short_episodes_gain_nothing(made: list[Echo]) -> None:
     policy = Says()
-    found = evaluate(ECHO, policy, ACTION, episodes=2 * COPIES + 5, seed=1)
+    found = evaluate(ECHO, policy, SPEC, episodes=2 * COPIES + 5, seed=1)
     assert len(made) == COPIES
     assert found.episodes == 2 * COPIES + 5
     assert Counter(env.episode for env in made) == {2: COPIES - 5, 3: 5}  # nobody starts one that is not wanted
@@ -109,7 +109,7 @@ def test_each_copy_plays_its_share_and_short_episodes_gain_nothing(made: list[Ec
 
 
 def test_the_same_seed_gives_the_same_episodes_and_no_two_copies_the_same(made: list[Echo]) -> None:
-    first, again, other = (evaluate(ECHO, Says(always=0), ACTION, 30, seed) for seed in (1, 1, 2))
+    first, again, other = (evaluate(ECHO, Says(always=0), SPEC, 30, seed) for seed in (1, 1, 2))
     assert first == again != other
     starts = [env.seeds[0] for env in made[:COPIES]]
     assert len(set(starts)) == COPIES
@@ -119,13 +119,13 @@ def test_the_same_seed_gives_the_same_episodes_and_no_two_copies_the_same(made: 
 
 def test_the_learner_pulses_at_every_step() -> None:
     beats: list[None] = []
-    evaluate(ECHO, Says(), ACTION, 1, seed=1, pulse=lambda: beats.append(None))
+    evaluate(ECHO, Says(), SPEC, 1, seed=1, pulse=lambda: beats.append(None))
     assert len(beats) == 3
 
 
 def test_an_environment_that_raises_is_named_with_its_traceback(made: list[Echo]) -> None:
     with pytest.raises(EnvironmentFailed) as caught:
-        evaluate(EnvSpec(ECHO.id, {"fails_at": 2}), Says(), ACTION, 3, seed=1)
+        evaluate(EnvSpec(ECHO.id, {"fails_at": 2}), Says(), SPEC, 3, seed=1)
     assert str(caught.value) == (
         "environment millrace-tests/Echo-v0 raised while the policy was evaluated: RuntimeError: the spring broke"
     )
@@ -138,12 +138,12 @@ def test_a_pulse_that_raises_is_not_the_environments_fault() -> None:
         raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        evaluate(ECHO, Says(), ACTION, 1, seed=1, pulse=gone)
+        evaluate(ECHO, Says(), SPEC, 1, seed=1, pulse=gone)
 
 
 def test_an_episode_without_end_is_cut_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(evaluate_module, "LONGEST_EPISODE", 50)
-    found = evaluate(EnvSpec(ECHO.id, {"endless": True}), Says(), ACTION, 2, seed=1)
+    found = evaluate(EnvSpec(ECHO.id, {"endless": True}), Says(), SPEC, 2, seed=1)
     assert (found.episodes, found.cut, found.length_mean) == (2, 2, 50.0)
 
 
@@ -160,10 +160,10 @@ def test_a_run_folder_is_enough_to_act_again(tmp_path: Path, env_id: str) -> Non
     folder.write_policy(spec, env, parameters, rng.random(buffer_size(spec), dtype=np.float32) + 0.5)
     policy, found_spec, found_env = load_policy(folder.path)
     assert (found_spec, found_env) == (spec, env)
-    first = evaluate(found_env, policy, found_spec.action, 3, seed=1)
-    assert first == evaluate(env, load_policy(folder.path)[0], spec.action, 3, seed=1)
+    first = evaluate(found_env, policy, found_spec, 3, seed=1)
+    assert first == evaluate(env, load_policy(folder.path)[0], spec, 3, seed=1)
     folder.write_policy(spec, env, -parameters, np.ones(buffer_size(spec), np.float32))
-    assert first != evaluate(env, load_policy(folder.path)[0], spec.action, 3, seed=1)
+    assert first != evaluate(env, load_policy(folder.path)[0], spec, 3, seed=1)
 
 
 def test_a_folder_without_a_policy_is_said(tmp_path: Path) -> None:

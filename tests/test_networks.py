@@ -92,7 +92,7 @@ def test_numpy_and_torch_agree(
     np.testing.assert_allclose(params.detach(), expected, atol=1e-5, rtol=1e-5)
     np.testing.assert_array_equal(value.detach(), torch_net.value(torch.tensor(x[0])).detach())
 
-    over = distribution(spec.action)
+    over = distribution(spec)
     actions = over.sample(expected, over.noise(generator, (7,)))
     log_prob, entropy = log_prob_and_entropy(spec.action, torch.tensor(expected), torch.tensor(actions))
     np.testing.assert_allclose(log_prob, over.log_prob(expected, actions), atol=1e-5, rtol=1e-5)
@@ -102,7 +102,7 @@ def test_numpy_and_torch_agree(
 @pytest.mark.parametrize("kind", ["discrete", "multidiscrete", "multibinary"])
 def test_entropy_is_minus_the_expected_log_probability(kind: str) -> None:
     spec = ACTIONS[kind]
-    params = torch.randn(1, distribution(spec).params_size, generator=torch.Generator().manual_seed(0))
+    params = torch.randn(1, distribution(PolicySpec((), spec)).params_size, generator=torch.Generator().manual_seed(0))
     choices = [range(n) for n in spec.sizes or (2,) * math.prod(spec.shape)]
     every = torch.tensor(list(itertools.product(*choices))).reshape(-1, *spec.shape)
     log_prob, entropy = log_prob_and_entropy(spec, params.expand(len(every), -1), every)

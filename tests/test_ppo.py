@@ -60,7 +60,7 @@ def batch(algorithm: PPO, seed: int, fresh: bool = False, steps: int = T) -> Bat
         policy = NumpyPolicy(spec)
         policy.load(*algorithm.weights())
         params = policy([leaf[:-1] for leaf in obs])
-    over = distribution(spec.action)
+    over = distribution(spec)
     action = over.sample(params, over.noise(generator, (steps, N)))
     ends, kind = generator.random((steps, N)) < 0.15, generator.random((steps, N)) < 0.5
     valid = np.ones((steps, N), bool)
@@ -311,7 +311,7 @@ def identity_batch(algorithm: PPO, generator: np.random.Generator) -> tuple[Batc
     steps, N, spec = 32, 8, algorithm.policy
     choice = generator.integers(0, 4, (steps + 1, N))
     obs = np.eye(4, dtype=np.float32)[choice]
-    policy, over = NumpyPolicy(spec), distribution(spec.action)
+    policy, over = NumpyPolicy(spec), distribution(spec)
     policy.load(*algorithm.weights())
     params = policy([obs[:-1]])
     action = over.sample(params, over.noise(generator, (steps, N)))

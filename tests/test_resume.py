@@ -11,7 +11,7 @@ import pytest
 
 from learner import checkpoint
 from learner.algorithms.ppo import PPO
-from learner.config import resolve
+from learner.config import Config, resolve
 from learner.hyperparameters import PPOConfig
 from learner.journal import Past, recall
 from learner.ledger import Ledger
@@ -23,6 +23,11 @@ from protocol.rollout import Batch, Rollout, stack
 from protocol.specs import EnvSpec, RunSpec
 from workers.collector import Collector
 from workers.session import Assignment
+
+
+def ppo(config: Config) -> PPOConfig:
+    assert isinstance(config.algorithm, PPOConfig)
+    return config.algorithm
 
 
 def record(run: RunSpec, algorithm: PPO, batches: int) -> list[Batch]:
@@ -47,8 +52,7 @@ def test_the_next_update_is_the_same_as_without_a_stop(tmp_path: Path, env: str)
     run = run_spec(config, EnvSpec(env))
 
     def algorithm() -> PPO:
-        assert isinstance(config.algorithm, PPOConfig)
-        return PPO(config.algorithm, run.policy, total_steps=10_000, seed=1)
+        return PPO(ppo(config), run.policy, total_steps=10_000, seed=1)
 
     straight = algorithm()
     first, second, third = record(run, straight, 3)
@@ -74,7 +78,7 @@ def test_the_next_update_is_the_same_as_without_a_stop(tmp_path: Path, env: str)
 def test_tickets_of_the_learner_that_died_are_lost_and_the_ledger_balances(tmp_path: Path) -> None:
     config = resolve("CartPole-v1", run_dir=str(tmp_path))
     run = run_spec(config, EnvSpec("CartPole-v1"))
-    algorithm = PPO(config.algorithm, run.policy, total_steps=1, seed=1)
+    algorithm = PPO(ppo(config), run.policy, total_steps=1, seed=1)
     folder = RunFolder.create(config)
     past = Past(ledger=Ledger(issued=10, used=6, transitions_received=80, transitions_used=60))
     state = {"past": msgspec.to_builtins(past), "algorithm": algorithm.state_dict()}
@@ -89,11 +93,11 @@ def test_a_checkpoint_of_another_network_is_refused_in_one_line(tmp_path: Path) 
     folder = RunFolder.create(config)
     state = {
         "past": msgspec.to_builtins(Past()),
-        "algorithm": PPO(config.algorithm, run.policy, total_steps=1, seed=1).state_dict(),
+        "algorithm": PPO(ppo(config), run.policy, total_steps=1, seed=1).state_dict(),
     }
     checkpoint.save(folder.path, state, env_steps=0, keep=1)
     wider = resolve("CartPole-v1", net=(32, 32), run_dir=str(tmp_path))
-    other = PPO(wider.algorithm, run_spec(wider, EnvSpec("CartPole-v1")).policy, total_steps=1, seed=1)
+    other = PPO(ppo(wider), run_spec(wider, EnvSpec("CartPole-v1")).policy, total_steps=1, seed=1)
     with pytest.raises(CheckpointError, match="expected the state of this configuration") as failure:
         recall(folder, other)
     assert "\n" not in str(failure.value)

@@ -57,7 +57,7 @@ class Collector:
         self._run = run
         self._policy = policy
         self._open_copies = open_copies
-        self._distribution = distribution(run.policy.action)
+        self._distribution = distribution(run.policy)
         self._write = writer(run.policy.action)
         self._lanes: dict[int, Lane] = {}
         self._leaving: list[Lane] = []  # closed by a pulse, while their copies may be in mid-step

@@ -13,12 +13,22 @@ import numpy.typing as npt
 
 from learner.algorithms.ppo import PPO
 from protocol.rollout import Batch
+from protocol.specs import ActionSpec, Leaf, PolicySpec
 
 Floats = npt.NDArray[np.float32]
 
 
 class Algorithm(Protocol):
     """What the loop of `learner.train` drives."""
+
+    @staticmethod
+    def policy_spec(config: Any, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
+        """The policy that it learns. Raises `UsageError`, in one line, when it cannot learn on such spaces."""
+        ...
+
+    def __init__(self, config: Any, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
+        """`config` is its record of `learner.hyperparameters`; raises `UsageError` when that cannot be done here."""
+        ...
 
     def update(self, batch: Batch, pulse: Callable[[], None]) -> dict[str, float]:
         """Learn from a batch, calling `pulse` now and then; metrics by the names users know."""
@@ -37,4 +47,4 @@ class Algorithm(Protocol):
         ...
 
 
-ALGORITHMS: dict[str, type[PPO]] = {"ppo": PPO}
+ALGORITHMS: dict[str, type[Algorithm]] = {"ppo": PPO}

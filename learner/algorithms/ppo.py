@@ -24,7 +24,7 @@ from protocol.errors import RunError
 from protocol.networks import ActorCritic, log_prob_and_entropy
 from protocol.policy import features, normalized
 from protocol.rollout import Batch
-from protocol.specs import PolicySpec
+from protocol.specs import ActionSpec, Leaf, PolicySpec
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
@@ -61,6 +61,17 @@ class Measured(NamedTuple):
 
 class PPO:
     """The policy, its optimiser and their schedules."""
+
+    @staticmethod
+    def policy_spec(config: PPOConfig, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
+        """An actor and a critic, on any of the supported spaces."""
+        return PolicySpec(
+            observation,
+            action,
+            net=config.net,
+            activation=config.activation,
+            normalize_observations=config.normalize_observations,
+        )
 
     def __init__(self, config: PPOConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
         self.config = config
