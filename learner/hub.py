@@ -10,7 +10,8 @@ import logging
 import time
 from collections.abc import Callable, Iterable, Sequence
 
-from learner.roster import Broke, Event, Joined, Left, Out, Roster, Turned
+from learner.events import Broke, Event, Joined, Left, Turned
+from learner.roster import Out, Roster
 from protocol.codec import Buffer, encode
 from protocol.errors import BadMessage, BadRollout, EnvironmentFailed, NoWorkers, Stalled
 from protocol.link import LearnerLink

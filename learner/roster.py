@@ -14,9 +14,11 @@ from __future__ import annotations
 import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from enum import Enum
 
+from learner.events import Broke, Event, Joined, Left, Turned
+from learner.lanes import Lane, Ticket
 from learner.ledger import Ledger
+from learner.standing import TABLE, Rubbish, Silence, Standing
 from protocol.messages import (
     PROTOCOL_VERSION,
     Array,
@@ -44,87 +46,7 @@ from protocol.specs import RunSpec
 STRIKES = 3  # rollouts or messages that could not be used, after which a worker is refused
 
 
-class Standing(Enum):
-    """Where the learner sees a worker."""
-
-    UNKNOWN = "unknown"
-    ACTIVE = "active"
-    DRAINING = "draining"
-
-
-class Silence:
-    """Event: nothing was heard of the worker for `worker_timeout_s`, or its process is known to be dead."""
-
-
-class Rubbish:
-    """Event: it sent too much that could not be used."""
-
-
-# What each standing becomes; Drain is what the learner says. What an unknown worker says otherwise is answered by Rejoin.
-TABLE: dict[Standing, dict[type, Standing]] = {
-    Standing.UNKNOWN: {Hello: Standing.ACTIVE},
-    Standing.ACTIVE: {
-        Hello: Standing.ACTIVE,
-        Rollout: Standing.ACTIVE,
-        Heartbeat: Standing.ACTIVE,
-        Goodbye: Standing.UNKNOWN,
-        Failure: Standing.UNKNOWN,
-        Silence: Standing.UNKNOWN,
-        Rubbish: Standing.UNKNOWN,
-        Drain: Standing.DRAINING,
-    },
-    Standing.DRAINING: {
-        Rollout: Standing.DRAINING,
-        Heartbeat: Standing.DRAINING,
-        Goodbye: Standing.UNKNOWN,
-        Failure: Standing.UNKNOWN,
-        Silence: Standing.UNKNOWN,
-        Rubbish: Standing.UNKNOWN,
-    },
-}
-
 Out = tuple[bytes, ToWorker]
-
-
-@dataclass(frozen=True)
-class Joined:
-    """A worker joined."""
-
-    worker: str
-    host: str
-    pid: int
-
-
-@dataclass(frozen=True)
-class Left:
-    """A worker is gone; `tickets` of its tickets are dealt again."""
-
-    worker: str
-    why: str
-    tickets: int
-    on_purpose: bool
-
-
-@dataclass(frozen=True)
-class Turned:
-    """A worker was refused."""
-
-    worker: str
-    why: str
-
-
-@dataclass(frozen=True)
-class Broke:
-    """A worker's environment raised."""
-
-    worker: str
-    host: str
-    lane: int | None
-    error: str
-    traceback: str
-
-
-Event = Joined | Left | Turned | Broke
 
 
 @dataclass
@@ -145,50 +67,6 @@ class Member:
     said_at: int = 0  # replies said when it was sent
     strikes: int = 0
     heartbeat: Heartbeat | None = None
-
-
-@dataclass
-class Lane:
-    """A lane as the learner sees it."""
-
-    number: int
-    incarnation: int = 0
-    owner: bytes | None = None
-    progress: int = 0  # tickets used or outstanding
-    started: bool = False  # a ticket of this incarnation was dealt
-    moving: bool = False  # it waits for its last tickets to end before it moves to another worker
-    outstanding: set[int] = field(default_factory=set)
-    below: int = 0  # every rollout of this incarnation below this sequence has arrived
-    ahead: set[int] = field(default_factory=set)  # sequences that have arrived out of order
-
-    def restart(self) -> None:
-        """A new life: on new env copies."""
-        self.owner, self.moving = None, False
-        if self.started:
-            self.incarnation += 1
-            self.started, self.below, self.ahead = False, 0, set()
-
-    def awaits(self, sequence: int) -> bool:
-        """Whether an outstanding rollout can have this sequence."""
-        return self.below <= sequence < self.below + len(self.ahead) + len(self.outstanding) and sequence not in self.ahead
-
-    def arrived(self, sequence: int) -> None:
-        """Take note of a rollout."""
-        self.ahead.add(sequence)
-        while self.below in self.ahead:
-            self.ahead.remove(self.below)
-            self.below += 1
-
-
-@dataclass(frozen=True)
-class Ticket:
-    """A ticket that is with a worker."""
-
-    number: int
-    lane: int
-    incarnation: int
-    version: int
-    peer: bytes
 
 
 class Roster:

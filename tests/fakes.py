@@ -19,7 +19,7 @@ from learner.ledger import Ledger
 from learner.roster import Out, Roster
 from protocol.messages import Rollout, ToLearner, ToWorker
 from protocol.specs import ActionSpec, EnvSpec, Leaf, PolicySpec, RunSpec
-from workers.session import Effect, Identity, Leave, Say, Session, State, Task
+from workers.session import Effect, Identity, Leave, Say, Session, Task
 
 PARAMETERS = np.zeros(1, np.float32)
 BUFFERS = np.zeros(0, np.float32)
@@ -338,6 +338,3 @@ class World:
             for worker in self.workers.values():
                 holds = worker.session.in_memory()
                 assert holds <= self.per_update * (1 + self.max_lag), f"{worker.name!r} holds {holds} rollouts"
-
-
-__all__ = ["State", "World"]

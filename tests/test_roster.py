@@ -9,8 +9,10 @@ import msgspec
 import numpy as np
 import pytest
 
+from learner.events import Broke, Joined, Left, Turned
 from learner.ledger import Ledger
-from learner.roster import STRIKES, TABLE, Broke, Joined, Left, Out, Roster, Rubbish, Silence, Standing, Turned
+from learner.roster import STRIKES, Out, Roster
+from learner.standing import TABLE, Rubbish, Silence, Standing
 from protocol.messages import (
     PROTOCOL_VERSION,
     Collect,

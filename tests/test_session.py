@@ -35,7 +35,6 @@ from tests.fakes import BUFFERS, PARAMETERS, fake_rollouts, run_spec
 from workers.session import (
     HELLO_FIRST_S,
     HELLO_MOST_S,
-    TABLE,
     Begin,
     Close,
     Effect,
@@ -43,9 +42,9 @@ from workers.session import (
     Leave,
     Say,
     Session,
-    State,
     Task,
 )
+from workers.states import TABLE, State
 
 M = TypeVar("M")
 

@@ -18,10 +18,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from learner import roster
+from learner import roster, standing
 from protocol import codec, link, messages, rollout, specs
 from protocol.messages import PROTOCOL_VERSION, Collect, Permit, Received, Rollout, ToLearner, ToWorker, Weights
-from workers import session
+from workers import session, states
 
 DOCUMENT = Path(__file__).parent.parent / "protocol" / "README.md"
 BEGIN, END = "<!-- generated {name}: `make docs` writes what follows -->", "<!-- end of {name} -->"
@@ -200,8 +200,8 @@ PARTS = {
     "example": part_example,
     "dtypes": part_dtypes,
     "messages": part_messages,
-    "worker table": lambda: state_table(session.TABLE),
-    "learner table": lambda: state_table(roster.TABLE),
+    "worker table": lambda: state_table(states.TABLE),
+    "learner table": lambda: state_table(standing.TABLE),
     "limits": part_limits,
 }
 
@@ -254,15 +254,15 @@ def test_every_limit_is_in_the_document() -> None:
 
 
 def test_every_state_has_a_row_in_its_table() -> None:
-    assert set(session.TABLE) == set(session.State)
-    assert set(roster.TABLE) == set(roster.Standing)
+    assert set(states.TABLE) == set(states.State)
+    assert set(standing.TABLE) == set(standing.Standing)
 
 
 def test_a_worker_is_told_by_its_table_what_to_do_with_every_message() -> None:
     """Every message to a worker is heeded in some state, and every message to a learner in some standing."""
-    heeded = {event for row in session.TABLE.values() for event in row if is_message(event)}
+    heeded = {event for row in states.TABLE.values() for event in row if is_message(event)}
     assert heeded == set(ToWorker.__args__)
-    heard = {event for row in roster.TABLE.values() for event in row if is_message(event)}
+    heard = {event for row in standing.TABLE.values() for event in row if is_message(event)}
     assert heard - {messages.Drain} == set(ToLearner.__args__)
 
 

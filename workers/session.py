@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from enum import Enum
 
 from protocol.messages import (
     PROTOCOL_VERSION,
@@ -34,71 +33,10 @@ from protocol.messages import (
     Welcome,
 )
 from protocol.specs import RunSpec
+from workers.states import TABLE, Broke, Emptied, Silence, State, Terminate
 
 HELLO_FIRST_S, HELLO_MOST_S = 0.25, 4.0
 REMEMBERED_TICKETS = 64  # finished ones, so that a late repeat of their Collect is known for what it is
-
-
-class State(Enum):
-    """Where a worker stands."""
-
-    JOINING = "joining"
-    READY = "ready"
-    DRAINING = "draining"
-    LEFT = "left"
-
-
-class Silence:
-    """Event: the learner has said nothing for `learner_timeout_s` (or, while joining, for too long)."""
-
-
-class Terminate:
-    """Event: this worker was asked to leave (SIGTERM)."""
-
-
-class Emptied:
-    """Event: nothing is in hand any more."""
-
-
-class Broke:
-    """Event: the environment, or this worker, raised."""
-
-
-# What each state becomes; a message that is not listed is ignored in that state.
-TABLE: dict[State, dict[type, State]] = {
-    State.JOINING: {
-        Welcome: State.READY,
-        Refuse: State.LEFT,
-        Drain: State.LEFT,
-        Silence: State.LEFT,
-        Terminate: State.LEFT,
-        Broke: State.LEFT,
-    },
-    State.READY: {
-        Weights: State.READY,
-        Collect: State.READY,
-        Release: State.READY,
-        HeartbeatReply: State.READY,
-        Welcome: State.READY,
-        Rejoin: State.JOINING,
-        Refuse: State.LEFT,
-        Drain: State.DRAINING,
-        Silence: State.JOINING,
-        Terminate: State.DRAINING,
-        Broke: State.LEFT,
-    },
-    State.DRAINING: {
-        Weights: State.DRAINING,
-        HeartbeatReply: State.DRAINING,
-        Rejoin: State.LEFT,
-        Refuse: State.LEFT,
-        Silence: State.LEFT,
-        Terminate: State.LEFT,
-        Emptied: State.LEFT,
-        Broke: State.LEFT,
-    },
-    State.LEFT: {},
-}
 
 
 @dataclass(frozen=True)
