@@ -1,1 +1,9 @@
-"""Environments that come with millrace. Importing a module here registers its ids with gymnasium."""
+"""Environments that come with millrace. Importing this registers them with gymnasium; the toys register themselves."""
+
+import gymnasium
+
+gymnasium.register(
+    id="millrace/CartDoublePendulum-v0",
+    entry_point="workers.envs.double_pendulum:CartDoublePendulum",
+    max_episode_steps=500,
+)

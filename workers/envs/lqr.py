@@ -1,0 +1,58 @@
+"""The linear-quadratic regulator of the cart with two links: what a learned policy is compared with. Pure; numpy alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from workers.envs.double_pendulum import DT_S, SUBSTEPS, CartDoublePendulum, Doubles, Floats, Physics, linear_model
+
+
+def discrete_model(physics: Physics, dt_s: float = DT_S, substeps: int = SUBSTEPS) -> tuple[Doubles, Doubles]:
+    """A [6, 6] and B [6] of state' = A state + B F: exactly what a step does in the linearised environment."""
+    a, b = linear_model(physics)
+    h = dt_s / substeps
+    rate = np.zeros((7, 7))  # of the state and, below it, the constant force
+    rate[:6, :6], rate[:6, 6] = h * a, h * b
+    term = step = np.eye(7)
+    for n in range(1, 5):  # Runge–Kutta of fourth order is the exponential series up to its fourth power
+        term = term @ rate / n
+        step = step + term
+    step = np.linalg.matrix_power(step, substeps)
+    return step[:6, :6], step[:6, 6]
+
+
+def lqr_gain(
+    physics: Physics,
+    dt_s: float = DT_S,
+    substeps: int = SUBSTEPS,
+    *,
+    state_cost: Sequence[float] = (1, 10, 10, 0.1, 0.1, 0.1),
+    force_cost: float = 0.01,
+) -> Doubles:
+    """K [6] of the force F = −K state that minimises the sum of stateᵀ diag(state_cost) state + force_cost F².
+
+    Iterates the discrete Riccati equation P = Q + Aᵀ P (A − B K), K = Bᵀ P A / (force_cost + Bᵀ P B) until P stands still.
+    """
+    a, b = discrete_model(physics, dt_s, substeps)
+    q = np.diag(np.asarray(state_cost, np.float64))
+    p = q
+    for _ in range(100_000):
+        gain = b @ p @ a / (force_cost + b @ p @ b)
+        last, p = p, q + a.T @ p @ (a - np.outer(b, gain))
+        p = (p + p.T) / 2
+        if np.abs(p - last).max() <= 1e-10 * np.abs(p).max():
+            return np.asarray(gain)
+    raise ValueError("the Riccati equation expected to settle, got no limit; are the costs and the constants sensible?")
+
+
+class LQR:
+    """The policy of `lqr_gain` for an environment of this class: observation [6] to action [1]."""
+
+    def __init__(self, env: CartDoublePendulum) -> None:
+        self._gain = lqr_gain(env.physics, env.dt_s, env.substeps) / env.force_limit_N
+
+    def __call__(self, observation: Floats) -> Floats:
+        """The action, within its space."""
+        return np.clip([-self._gain @ observation], -1, 1).astype(np.float32)
