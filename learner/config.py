@@ -72,8 +72,12 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """env steps between greedy evaluations while training; 0: only the one at the end"""
     target_return: float | None = None
     """stop as soon as a greedy evaluation averages at least this"""
+    target_mean_return: float | None = None
+    """stop as soon as the last 100 training episodes average at least this"""
     checkpoint_every_s: Seconds = 60.0
     """seconds between checkpoints"""
+    checkpoint_every_episodes: Natural = 0
+    """episodes between checkpoints, besides those by time; 0: by time alone"""
     keep_checkpoints: Count = 3
     """how many of the newest checkpoints stay"""
 

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from learner.metrics import Evaluation
-from learner.run_folder import RunFolder
+from learner.run_folder import RunFolder, Which
 from protocol.distributions import distribution
 from protocol.errors import EnvironmentFailed
 from protocol.policy import Policy, make_policy
@@ -111,9 +111,9 @@ def _play(
     return list(returns), list(lengths), sum(cuts)
 
 
-def load_policy(run: Path) -> tuple[Policy, PolicySpec, EnvSpec]:
+def load_policy(run: Path, which: Which = "final") -> tuple[Policy, PolicySpec, EnvSpec]:
     """The policy of a run folder, ready to act, and the environment it was made for. Raises `UsageError` in one line."""
-    card, parameters, buffers = RunFolder.open(run).read_policy()
+    card, parameters, buffers = RunFolder.open(run).read_policy(which)
     policy = make_policy(card.policy)
     policy.load(parameters, buffers)
     return policy, card.policy, EnvSpec(card.env, card.env_kwargs)

@@ -7,11 +7,16 @@ on. A disk that is full costs a warning, never the run.
 from __future__ import annotations
 
 import logging
+import platform
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
+from importlib import metadata
 from typing import Any
 
 import msgspec
+import numpy as np
+import numpy.typing as npt
 
 from learner import checkpoint
 from learner.algorithms import Algorithm
@@ -20,15 +25,17 @@ from learner.evaluate import evaluate
 from learner.hub import Hub
 from learner.ledger import Ledger
 from learner.metrics import EpisodeWindow, Evaluation, MetricsLog, Progress
-from learner.run_folder import RunFolder, Summary
-from protocol.errors import CheckpointError, RunError
+from learner.run_folder import Best, RunFolder, Summary
+from protocol.errors import CheckpointError, RunError, UsageError
 from protocol.policy import make_policy
 from protocol.rollout import Batch
 from protocol.specs import RunSpec
 
 log = logging.getLogger("millrace.learner")
 
-EVALUATION_SEED = 1_000_000  # far from the seeds of training
+Floats = npt.NDArray[np.float32]
+
+EVALUATION_SEED, CONFIRMATION_SEED = 1_000_000, 2_000_000  # far from the seeds of training, and from each other
 
 
 class Past(msgspec.Struct, kw_only=True):
@@ -40,6 +47,8 @@ class Past(msgspec.Struct, kw_only=True):
     ledger: Ledger = msgspec.field(default_factory=Ledger)
     incarnations: list[int] = []
     episodes: list[Any] = []
+    best: list[float] | None = None
+    """mean return and env steps of the best evaluation; its policy lies in the run folder"""
 
 
 def recall(folder: RunFolder, algorithm: Algorithm) -> Past:
@@ -59,6 +68,15 @@ def recall(folder: RunFolder, algorithm: Algorithm) -> Past:
     past.ledger.lost += past.ledger.outstanding
     past.ledger.transitions_late += past.ledger.transitions_waiting
     return past
+
+
+def versions() -> dict[str, str]:
+    """Of millrace, and of what decides its results."""
+    found = {"python": platform.python_version()}
+    for package in ("millrace", "torch", "gymnasium", "numpy"):
+        with suppress(metadata.PackageNotFoundError):
+            found[package] = metadata.version(package)
+    return found
 
 
 class Journal:
@@ -89,7 +107,10 @@ class Journal:
         self._evaluated_version = -1
         self._evaluate_at = past.env_steps + config.eval_every
         self._note = ""
+        self._confirmed: Best | None = None
         self._workers_alive = 0
+        self._best = past.best
+        self._episodes_until_save = config.checkpoint_every_episodes
         self._worker_stages: dict[int, dict[str, float]] = {}  # by session: those of workers that have left count too
 
     # ---------------------------------------------------------------- what the loop calls
@@ -99,6 +120,9 @@ class Journal:
         target, evaluation = self.config.target_return, self.evaluation
         if target is not None and evaluation is not None and evaluation.return_mean >= target:
             return f"target return {target:g} reached"
+        target = self.config.target_mean_return
+        if target is not None and self._window.full and (self._window.return_mean or 0.0) >= target:
+            return f"mean return {target:g} of the last episodes reached"
         one_more = self.spec.rollout_steps * self.config.envs
         enough = self.version > 0 and self.env_steps + one_more > self.config.steps
         return "all steps done" if enough else None
@@ -116,21 +140,20 @@ class Journal:
             self._evaluate_at += self.config.eval_every
             found = self.evaluate()
             extra = found.metrics()
+            self._keep_if_best(found)
         progress = self.progress()
         self._surely(lambda: self._metrics.write(progress, {**metrics, **extra}))
         self._watch(progress)
-        if began_s - self._saved_s > self.config.checkpoint_every_s:
+        self._episodes_until_save -= len(batch.episodes)
+        by_episodes = self.config.checkpoint_every_episodes and self._episodes_until_save <= 0
+        if by_episodes or began_s - self._saved_s > self.config.checkpoint_every_s:
             self.save()
         self.stages["other"] += time.monotonic() - began_s
 
     def evaluate(self) -> Evaluation:
         """Greedy episodes of the newest policy; the workers are answered meanwhile."""
         if self.evaluation is None or self._evaluated_version != self.version:
-            spec = self.spec
-            policy = make_policy(spec.policy)
-            policy.load(*self.algorithm.weights())
-            seed, episodes = EVALUATION_SEED + self.config.seed, self.config.eval_episodes
-            self.evaluation = evaluate(spec.env, policy, spec.policy, episodes, seed, self.hub.pulse)
+            self.evaluation = self._evaluated(*self.algorithm.weights(), EVALUATION_SEED)
             self._evaluated_version = self.version
             self._note = f"{self.env_steps:,} env steps: greedy {self.evaluation}"
         return self.evaluation
@@ -144,12 +167,29 @@ class Journal:
             ledger=self.hub.roster.ledger,
             incarnations=self.hub.roster.incarnations(),
             episodes=self._window.state(),
+            best=self._best,
         )
         state = {"past": msgspec.to_builtins(past), "algorithm": self.algorithm.state_dict()}
         self._saved_s = time.monotonic()
+        self._episodes_until_save = self.config.checkpoint_every_episodes
         keep = self.config.keep_checkpoints
         self._surely(lambda: checkpoint.save(self.folder.path, state, self.env_steps, keep))
         self._surely(self._write_policy)
+
+    def conclude(self) -> None:
+        """Evaluate the final policy, and once more the best one, on episodes that it was not chosen by."""
+        found = self.evaluate()
+        if self.config.eval_every:
+            self._keep_if_best(found)
+        if self._best is not None:
+            chosen_by, env_steps = self._best
+            try:
+                _, parameters, buffers = self.folder.read_policy("best")
+            except UsageError as error:  # the disk did not take it
+                log.warning("%s", error)
+                return
+            again = self._evaluated(parameters, buffers, CONFIRMATION_SEED)
+            self._confirmed = Best(env_steps=int(env_steps), chosen_by=chosen_by, evaluation=again)
 
     def finish(self, reason: str) -> None:
         """The summary."""
@@ -167,8 +207,10 @@ class Journal:
                     stop_reason=reason,
                     return_mean_100=self._window.return_mean,
                     evaluation=self.evaluation if self._evaluated_version == self.version else None,
+                    best=self._confirmed,
                     ledger=self.hub.roster.ledger.counts(),
                     stages=self._stages(),
+                    versions=versions(),
                 )
             )
         )
@@ -213,6 +255,19 @@ class Journal:
             for name, seconds in told.items():
                 stages[f"worker_{name}"] = stages.get(f"worker_{name}", 0.0) + seconds
         return stages
+
+    def _evaluated(self, parameters: Floats, buffers: Floats, seed: int) -> Evaluation:
+        policy = make_policy(self.spec.policy)
+        policy.load(parameters, buffers)
+        episodes, env = self.config.eval_episodes, self.spec.env
+        return evaluate(env, policy, self.spec.policy, episodes, seed + self.config.seed, self.hub.pulse)
+
+    def _keep_if_best(self, found: Evaluation) -> None:
+        """The first of equals stays: it needed the fewest steps."""
+        if self._best is None or found.return_mean > self._best[0]:
+            weights = self.algorithm.weights()
+            self._best = [found.return_mean, self.env_steps]
+            self._surely(lambda: self.folder.write_policy(self.spec.policy, self.spec.env, *weights, which="best"))
 
     def _write_policy(self) -> None:
         self.folder.write_policy(self.spec.policy, self.spec.env, *self.algorithm.weights())

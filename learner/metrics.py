@@ -101,6 +101,11 @@ class EpisodeWindow:
         self._episodes.extend(episodes)
 
     @property
+    def full(self) -> bool:
+        """True once there are 100."""
+        return len(self._episodes) == WINDOW
+
+    @property
     def return_mean(self) -> float | None:
         """Mean return, or None before the first episode has ended."""
         return float(np.mean([episode.reward for episode in self._episodes])) if self._episodes else None

@@ -6,6 +6,7 @@
       tensorboard/                                                 }
       checkpoints/          learner.checkpoint
       policy.safetensors    the arrays that act, by name           } all that another program needs to act,
+      best.safetensors      those of the best evaluation           }
       policy.json           what they mean                         } the same bytes for the same policy
       summary.json          how the run went
 
@@ -17,6 +18,7 @@ from __future__ import annotations
 import re
 import time
 from pathlib import Path
+from typing import Literal
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -34,7 +36,8 @@ if TYPE_CHECKING:
 
 Floats = npt.NDArray[np.float32]
 POLICY_FORMAT = 1
-POLICY_ARRAYS = "policy.safetensors"
+Which = Literal["final", "best"]
+POLICY_ARRAYS = {"final": "policy.safetensors", "best": "best.safetensors"}
 POLICY_CARD = "policy.json"
 
 
@@ -44,6 +47,17 @@ class Interrupted(KeyboardInterrupt):
     def __init__(self, run: Path) -> None:
         super().__init__(str(run))
         self.run = run
+
+
+class Best(msgspec.Struct, frozen=True, kw_only=True):
+    """The policy that did best in the run's own evaluations."""
+
+    env_steps: int
+    """when that was"""
+    chosen_by: float
+    """the mean return it was chosen by: the highest of several, so it flatters"""
+    evaluation: Evaluation
+    """of the same policy, once more and on other episodes"""
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
@@ -60,8 +74,13 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     return_mean_100: float | None
     """mean return of the last 100 training episodes"""
     evaluation: Evaluation | None
-    ledger: dict[str, int]
-    stages: dict[str, float]
+    """of the final policy"""
+    best: Best | None = None
+    """of the policy that did best in the run's own evaluations, if it made any"""
+    ledger: dict[str, int] = {}
+    stages: dict[str, float] = {}
+    versions: dict[str, str] = {}
+    """of millrace and of what decides its results"""
 
 
 class ArrayCard(msgspec.Struct, frozen=True):
@@ -125,8 +144,10 @@ class RunFolder:
         where = self.path / "config.toml"
         return Config.from_toml(where.read_text(), str(where))
 
-    def write_policy(self, spec: PolicySpec, env: EnvSpec, parameters: Floats, buffers: Floats) -> None:
-        """policy.safetensors and policy.json. `parameters` starts with the acting part; the critic's is left out."""
+    def write_policy(
+        self, spec: PolicySpec, env: EnvSpec, parameters: Floats, buffers: Floats, which: Which = "final"
+    ) -> None:
+        """The arrays and policy.json. `parameters` starts with the acting part; the critic's is left out."""
         from safetensors.numpy import save
 
         acting, _ = layout(spec)
@@ -139,10 +160,10 @@ class RunFolder:
             arrays=_array_cards(acting),
             buffers=tuple(views(buffers, buffer_fields(spec))),
         )
-        self._write(POLICY_ARRAYS, save({name: np.ascontiguousarray(array) for name, array in arrays.items()}))
+        self._write(POLICY_ARRAYS[which], save({name: np.ascontiguousarray(array) for name, array in arrays.items()}))
         self._write(POLICY_CARD, msgspec.json.format(msgspec.json.encode(card), indent=2) + b"\n")
 
-    def read_policy(self) -> tuple[PolicyCard, Floats, Floats]:
+    def read_policy(self, which: Which = "final") -> tuple[PolicyCard, Floats, Floats]:
         """The card, and the parameters and buffers as `Policy.load` takes them. Raises `UsageError` in one line."""
         from safetensors import SafetensorError
         from safetensors.numpy import load
@@ -151,7 +172,7 @@ class RunFolder:
             raise UsageError(f"run {self.path}: expected a {POLICY_CARD}, got none; has the run saved its policy yet?")
         try:
             card = _read_card((self.path / POLICY_CARD).read_bytes())
-            arrays = load((self.path / POLICY_ARRAYS).read_bytes())
+            arrays = load((self.path / POLICY_ARRAYS[which]).read_bytes())
         except (OSError, msgspec.MsgspecError, SafetensorError) as error:
             raise UsageError(f"policy of run {self.path} cannot be read: {error}") from error
         if card.format != POLICY_FORMAT:

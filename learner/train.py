@@ -38,6 +38,6 @@ def train(algorithm: Algorithm, hub: Hub, journal: Journal, workers: int) -> str
         journal.updated(batch, metrics, time.monotonic() - began_s)
     journal.save()
     hub.drain(reason)
-    journal.evaluate()
+    journal.conclude()
     journal.finish(reason)
     return reason

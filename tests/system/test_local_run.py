@@ -13,11 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import numpy as np
 import psutil
 import pytest
 
 import millrace
 from learner.config import Config, resolve
+from learner.evaluate import load_policy
 from learner.metrics import Progress, read_rows
 from millrace.launch.local import train
 from protocol.errors import EnvironmentFailed, NoWorkers, UsageError
@@ -74,6 +76,35 @@ def test_lag_never_exceeds_its_bound(tmp_path: Path, max_lag: int) -> None:
     assert max(row["lag/max"] for row in rows) == max_lag, "the bound is not reached, so it does not show"
     assert all(row["lag/mean"] <= row["lag/max"] and "drop/stale" in row for row in rows)
     assert_balanced(summary(folder)["ledger"])
+
+
+def test_the_best_policy_by_the_runs_own_evaluations_is_kept_and_tried_again(tmp_path: Path) -> None:
+    """The greedy return of CartPole rises and falls; what is kept is the highest point, not the last."""
+    settings: dict[str, Any] = {"steps": 12_000, "eval_every": 1_000, "eval_episodes": 20, "learning_rate": 0.01}
+    folder = run(tmp_path, "CartPole-v1", seed=2, **settings)
+    evaluations = {
+        row["time/total_timesteps"]: row["eval/mean_reward"]
+        for row in read_rows(folder / "metrics.jsonl")
+        if "eval/mean_reward" in row
+    }
+    best = summary(folder)["best"]
+    assert len(evaluations) >= 10
+    assert best["chosen_by"] == max(evaluations.values()) == evaluations[best["env_steps"]]
+    assert best["evaluation"]["episodes"] == 20
+    final, kept = (load_policy(folder, which) for which in ("final", "best"))
+    assert best["env_steps"] < summary(folder)["env_steps"]
+    zeros = [np.zeros((1, 1, 4), np.float32)]
+    assert not np.array_equal(final[0](zeros), kept[0](zeros))
+
+
+def test_a_run_stops_at_a_mean_return_and_saves_every_so_many_episodes(tmp_path: Path) -> None:
+    settings: dict[str, Any] = {"checkpoint_every_episodes": 30, "keep_checkpoints": 1000, "eval_episodes": 1}
+    folder = run(tmp_path, "CartPole-v1", target_mean_return=40.0, **settings)
+    found = summary(folder)
+    assert found["stop_reason"] == "mean return 40 of the last episodes reached"
+    assert found["return_mean_100"] >= 40
+    assert found["env_steps"] < 50_000
+    assert len(list((folder / "checkpoints").iterdir())) >= 4
 
 
 def test_a_killed_worker_is_replaced_and_the_run_ends_well(tmp_path: Path) -> None:
