@@ -11,7 +11,7 @@ import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple, get_args, get_type_hints
 
 import msgspec
 import tomli_w
@@ -118,6 +118,28 @@ def resolve(
     return checked(over(base, keywords, "keyword argument"))
 
 
+class Preset(NamedTuple):
+    """A whole run by name: environment, algorithm and settings."""
+
+    about: str
+    settings: dict[str, Any]
+
+
+def named_presets() -> dict[str, Preset]:
+    """The presets that `--preset NAME` takes besides those of an environment."""
+    tables: dict[str, dict[str, Any]] = _presets().get("named", {})
+    return {name: Preset(table.pop("about"), table) for name, table in tables.items()}
+
+
+def presets_of_environments() -> list[tuple[str, str]]:
+    """Algorithm and environment of every preset that is taken by itself."""
+    return [(algo, env) for algo, envs in _presets().items() if algo != "named" for env in envs]
+
+
+def _presets() -> dict[str, Any]:
+    return tomllib.loads(PRESETS.read_text())
+
+
 def lower_layers(
     env: str,
     *,
@@ -143,13 +165,18 @@ def lower_layers(
             raise UsageError(f"config file {where} cannot be read: {says}") from error
     if resume is not None and env not in ("", table.get("env")):
         raise UsageError(f"run {resume} is of {table.get('env')}, not of {env}; resume it without naming an environment")
-    env = env or str(table.get("env", ""))
-    config = _of_algorithm(algo or str(table.get("algo", "ppo")))
-    if preset != "none":
-        known = tomllib.loads(PRESETS.read_text()).get(config.algo, {})
+    named = named_presets()
+    whole = named[preset].settings if preset in named else {}
+    env = env or str(table.get("env", whole.get("env", "")))
+    config = _of_algorithm(algo or str(table.get("algo", whole.get("algo", "ppo"))))
+    if preset in named:
+        config = over(config, {**whole, "algo": config.algo}, str(PRESETS))
+    elif preset != "none":
+        known = _presets().get(config.algo, {})
         name = env if preset == "auto" else preset
         if name not in known and preset != "auto":
-            raise UsageError(f"preset {name}: {config.algo} has none of this name{nearest(name, known)}")
+            near = nearest(name, [*known, *named])
+            raise UsageError(f"preset {name}: {config.algo} has none of this name{near or '; millrace presets lists them'}")
         config = over(config, known.get(name, {}), str(PRESETS))
     config = _over_toml(config, {**table, "algo": config.algo}, where)
     return over(config, {"env": env}, "ENV")

@@ -7,7 +7,7 @@ import msgspec
 import pytest
 
 from learner.algorithms import ALGORITHMS
-from learner.config import PRESETS, Config, lower_layers, resolve
+from learner.config import PRESETS, Config, lower_layers, named_presets, resolve
 from learner.hyperparameters import HYPERPARAMETERS, PPOConfig
 from protocol.errors import UsageError
 
@@ -163,9 +163,19 @@ def test_every_preset_makes_a_configuration_of_its_own() -> None:
     import tomllib
 
     for algo, presets in tomllib.loads(PRESETS.read_text()).items():
+        if algo == "named":
+            continue
         assert algo in HYPERPARAMETERS
         for env in presets:
             assert resolve(env, algo=algo) != resolve(env, algo=algo, preset="none")
+
+
+def test_every_named_preset_is_a_whole_run() -> None:
+    assert named_presets()
+    for name, preset in named_presets().items():
+        config = resolve(preset=name)
+        assert (config.env, config.algo) == (preset.settings["env"], preset.settings["algo"])
+        assert preset.about
 
 
 def test_every_algorithm_has_its_settings() -> None:
