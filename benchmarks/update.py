@@ -21,7 +21,8 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor, nn
 
-from learner.algorithms.ppo import PPO, Minibatch
+from learner.algorithms.actor_critic import Minibatch
+from learner.algorithms.ppo import PPO
 from learner.hyperparameters import PPOConfig
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 

@@ -14,6 +14,7 @@ NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 Schedule = Literal["constant", "linear"]
+Optimizer = Literal["rmsprop", "adam"]
 
 
 class Hyperparameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -31,13 +32,28 @@ class Hyperparameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     """discount"""
 
 
-class PPOConfig(Hyperparameters, frozen=True):
-    """Proximal policy optimisation."""
+class ActorCriticHyperparameters(Hyperparameters, frozen=True):
+    """What every algorithm with an actor and a critic has."""
 
+    shared_net: bool = False
+    """actor and critic share their hidden layers"""
     learning_rate: Positive = 3e-4
-    """step size of Adam"""
+    """step size of the optimiser"""
     learning_rate_schedule: Schedule = "constant"
     """linear: falls to zero over the run"""
+    ent_coef: NotNegative = 0.0
+    """weight of the entropy bonus"""
+    vf_coef: NotNegative = 0.5
+    """weight of the value loss"""
+    max_grad_norm: Positive = 0.5
+    """longer gradients are shortened to this"""
+    normalize_rewards: bool = False
+    """divide rewards by the running standard deviation of the discounted return"""
+
+
+class PPOConfig(ActorCriticHyperparameters, frozen=True):
+    """Proximal policy optimisation."""
+
     batch_size: Count = 64
     """rows of a minibatch, at most"""
     n_epochs: Count = 10
@@ -48,18 +64,125 @@ class PPOConfig(Hyperparameters, frozen=True):
     """how far the probability of an action may move in an update: its ratio is clipped to 1 ± this"""
     clip_range_schedule: Schedule = "constant"
     """linear: falls to zero over the run"""
-    ent_coef: NotNegative = 0.0
-    """weight of the entropy bonus"""
-    vf_coef: NotNegative = 0.5
-    """weight of the value loss"""
-    max_grad_norm: Positive = 0.5
-    """longer gradients are shortened to this"""
+    clip_range_vf: Positive | None = None
+    """how far a value may move in an update, in units of (scaled) reward; none: any distance"""
     normalize_advantage: bool = True
     """advantages of a minibatch get mean 0 and standard deviation 1"""
     target_kl: Positive | None = None
     """stop the update once the policy moved further than 1.5 times this"""
-    normalize_rewards: bool = False
-    """divide rewards by the running standard deviation of the discounted return"""
 
 
-HYPERPARAMETERS: dict[str, type[Hyperparameters]] = {"ppo": PPOConfig}
+class A2CConfig(ActorCriticHyperparameters, frozen=True):
+    """Advantage actor-critic: one gradient step on each batch."""
+
+    rollout_steps: Count = 8
+    """T, steps of each env copy in a rollout"""
+    learning_rate: Positive = 7e-4
+    """step size of the optimiser"""
+    optimizer: Optimizer = "rmsprop"
+    """rmsprop (α 0.99) or adam; ε is 1e-5"""
+    gae_lambda: Share = 1.0
+    """λ of the advantage estimate: 1 is the Monte-Carlo return, 0 one step"""
+    normalize_advantage: bool = False
+    """advantages of a batch get mean 0 and standard deviation 1"""
+
+
+class ImpalaConfig(ActorCriticHyperparameters, frozen=True):
+    """Actor-critic with V-trace: learns from rollouts of older weights too (max_lag above 0)."""
+
+    rollout_steps: Count = 32
+    """T, steps of each env copy in a rollout"""
+    learning_rate: Positive = 7e-4
+    """step size of the optimiser"""
+    optimizer: Optimizer = "rmsprop"
+    """rmsprop (α 0.99) or adam; ε is 1e-5"""
+    n_epochs: Count = 1
+    """times each row is used in an update; V-trace is computed anew each time"""
+    minibatches: Count = 1
+    """gradient steps of an epoch, each on its own share of the rows"""
+    vtrace_lambda: Share = 1.0
+    """λ of V-trace: 1 is the paper's, 0 one step"""
+    rho_bar: Positive = 1.0
+    """importance weights of rewards are clipped to this: infinity would fit the values of the newest policy"""
+    c_bar: Positive = 1.0
+    """importance weights of traces are clipped to this: how far back a surprise is told"""
+
+
+class REINFORCEConfig(ActorCriticHyperparameters, frozen=True):
+    """Monte-Carlo policy gradient on whole episodes."""
+
+    rollout_steps: Count = 1001
+    """T, steps of each env copy in a rollout: more than an episode can have"""
+    learning_rate: Positive = 1e-3
+    """step size of the optimiser"""
+    optimizer: Optimizer = "adam"
+    """rmsprop (α 0.99) or adam; ε is 1e-5"""
+    baseline: bool = True
+    """subtract the critic's value from the return"""
+    normalize_returns: bool = True
+    """returns, less the baseline, get mean 0 and standard deviation 1 over the batch"""
+
+
+class DQNConfig(Hyperparameters, frozen=True):
+    """Deep Q-learning."""
+
+    rollout_steps: Count = 32
+    """T, steps of each env copy in a rollout"""
+    activation: Literal["tanh", "relu"] = "relu"
+    """of the hidden layers"""
+    learning_rate: Positive = 3e-4
+    """step size of the optimiser"""
+    learning_rate_schedule: Schedule = "constant"
+    """linear: falls to zero over the run"""
+    optimizer: Literal["adam", "adamw"] = "adam"
+    """adamw: also lets weights decay, by 0.01 of the learning rate"""
+    amsgrad: bool = False
+    """divide by the largest second moment so far instead of the present one"""
+    batch_size: Count = 64
+    """transitions of a gradient step"""
+    gradient_steps: Count = 64
+    """gradient steps of an update, that is for envs x rollout_steps env steps: the replay ratio, however many the workers"""
+    learning_starts: Annotated[int, msgspec.Meta(ge=0)] = 1000
+    """env steps before the first gradient step"""
+    replay_size: Count = 100_000
+    """transitions kept, the newest (the final observation of a truncated episode takes the place of one)"""
+    replay: Literal["uniform", "prioritized"] = "uniform"
+    """prioritized: transitions are drawn by the size of their last error"""
+    priority_alpha: Share = 0.6
+    """how much priorities count: 0 is uniform, 1 in proportion to the error"""
+    priority_beta: Share = 0.4
+    """how far losses are weighted against what priorities distort; grows to 1, all of it, over the run"""
+    n_step: Count = 1
+    """steps of reward before the target bootstraps"""
+    double: bool = True
+    """the network chooses the next action, the target network values it"""
+    dueling: bool = False
+    """action values are a state's value and each action's advantage over the mean"""
+    target: Literal["polyak", "hard"] = "hard"
+    """the target network follows a little at each gradient step, or is a copy made now and then"""
+    tau: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.005
+    """how far a polyak target follows at each gradient step"""
+    target_every: Count = 250
+    """gradient steps between two copies of a hard target"""
+    epsilon_start: Share = 1.0
+    """chance of a random action at first"""
+    epsilon_end: Share = 0.05
+    """and at last"""
+    epsilon_schedule: Literal["linear", "exponential"] = "linear"
+    """how it falls: straight, or by the same share in every step"""
+    epsilon_steps: Count = 10_000
+    """env steps, all copies together, until it has fallen (exponential: until the distance has fallen to 1/e)"""
+    loss: Literal["huber", "squared"] = "huber"
+    """of the error of an action value; huber is linear beyond 1"""
+    max_grad_norm: Positive | None = 10.0
+    """longer gradients are shortened to this"""
+    max_grad_value: Positive | None = None
+    """larger entries of a gradient are cut to this, before it is shortened"""
+
+
+HYPERPARAMETERS: dict[str, type[Hyperparameters]] = {
+    "ppo": PPOConfig,
+    "a2c": A2CConfig,
+    "impala": ImpalaConfig,
+    "reinforce": REINFORCEConfig,
+}

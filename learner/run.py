@@ -117,6 +117,8 @@ def run_spec(config: Config, env: EnvSpec) -> RunSpec:
     try:
         observation, action = observation_leaves(copy.observation_space), action_spec(copy.action_space)
         policy = ALGORITHMS[config.algo].policy_spec(config.algorithm, observation, action)
+        if getattr(ALGORITHMS[config.algo], "whole_episodes", False):
+            _check_whole_episodes(config, copy.spec.max_episode_steps if copy.spec else None)
     finally:
         copy.close()
     return RunSpec(
@@ -128,6 +130,16 @@ def run_spec(config: Config, env: EnvSpec) -> RunSpec:
         seed=config.seed,
         heartbeat_s=config.heartbeat_s,
     )
+
+
+def _check_whole_episodes(config: Config, longest: int | None) -> None:
+    """Where the clock ends episodes, a rollout must have room for one and for the row that resets before it."""
+    steps = config.algorithm.rollout_steps
+    if longest is not None and steps <= longest:
+        raise UsageError(
+            f"rollout_steps {steps}: {config.algo} learns from whole episodes, and those of {config.env} take up to "
+            f"{longest} steps; expected at least {longest + 1}"
+        )
 
 
 def _device(config: Config) -> str:

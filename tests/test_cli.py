@@ -15,6 +15,7 @@ import pytest
 import millrace
 from learner import checkpoint
 from learner.config import Config, resolve
+from learner.hyperparameters import HYPERPARAMETERS
 from learner.metrics import MetricsLog, Progress
 from learner.run_folder import Interrupted, RunFolder
 from millrace.cli import COMMANDS, main
@@ -25,6 +26,7 @@ from protocol.specs import EnvSpec, PolicySpec
 
 ROOT = Path(__file__).parent.parent
 Captured = pytest.CaptureFixture[str]
+ALGORITHMS = ", ".join(HYPERPARAMETERS)
 
 
 def refusal(capsys: Captured, *argv: str, exit_code: int = 2) -> str:
@@ -72,7 +74,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
         (["train", "CartPole-v1", "more"], "train: unexpected argument more"),
         (["train", "CartPole-v1", "--workers", "0"], "workers expected int >= 1, got 0"),
         (["train", "CartPole-v1", "--envs", "6"], "6 envs cannot be shared evenly among 4 lanes; take 4 or 8, or 3 lanes"),
-        (["train", "CartPole-v1", "--algo", "pp0"], "algo pp0: expected one of ppo; did you mean ppo?"),
+        (["train", "CartPole-v1", "--algo", "pp0"], f"algo pp0: expected one of {ALGORITHMS}; did you mean ppo?"),
         (
             ["train", "CartPole-v1", "--preset", "CartPole"],
             "preset CartPole: ppo has none of this name; did you mean CartPole-v1?",

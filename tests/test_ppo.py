@@ -13,7 +13,8 @@ import pytest
 import torch
 
 from learner.algorithms import ALGORITHMS, Algorithm
-from learner.algorithms.ppo import PPO, Minibatch
+from learner.algorithms.actor_critic import Minibatch
+from learner.algorithms.ppo import PPO
 from learner.hyperparameters import PPOConfig
 from protocol.distributions import distribution
 from protocol.errors import RunError
@@ -236,7 +237,7 @@ def test_schedules_follow_the_steps_used() -> None:
     algorithm = ppo(msgspec.structs.replace(EVERYTHING, learning_rate=1.0e-3, clip_range=0.2))
     found = []
     for seed in range(3):
-        left = 1 - algorithm.env_steps / 10_000
+        left = 1 - algorithm.parts.env_steps / 10_000
         metrics = algorithm.update(batch(algorithm, seed), no_pulse)
         assert metrics["train/learning_rate"] == pytest.approx(1e-3 * left)
         assert metrics["train/clip_range"] == pytest.approx(0.2 * left)

@@ -11,7 +11,10 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from learner.algorithms.a2c import A2C
+from learner.algorithms.impala import Impala
 from learner.algorithms.ppo import PPO
+from learner.algorithms.reinforce import REINFORCE
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
@@ -47,4 +50,4 @@ class Algorithm(Protocol):
         ...
 
 
-ALGORITHMS: dict[str, type[Algorithm]] = {"ppo": PPO}
+ALGORITHMS: dict[str, type[Algorithm]] = {"ppo": PPO, "a2c": A2C, "impala": Impala, "reinforce": REINFORCE}

@@ -33,10 +33,27 @@ def clipped_surrogate(ratio: Tensor, advantage: Tensor, clip_range: float) -> tu
     return -torch.minimum(plain, clipped).mean(), (plain * (plain <= clipped)).div_(-len(ratio))
 
 
+def policy_gradient(log_prob: Tensor, advantage: Tensor) -> tuple[Tensor, Tensor]:
+    """L = −E[A log π(a)] (Sutton et al. 1999), and its gradient [B] by log π(a)."""
+    return -(log_prob * advantage).mean(), advantage / -len(advantage)
+
+
 def value_loss(value: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     """Mean squared error (as Stable-Baselines3 has it, without the half that others put before it), and its gradient [B]."""
     error = value - target
     return (error * error).mean(), error * (2 / len(error))
+
+
+def clipped_value_loss(value: Tensor, target: Tensor, before: Tensor, clip_range: float) -> tuple[Tensor, Tensor]:
+    """The value loss of OpenAI's PPO, and its gradient [B]: moving further than this from `before` earns nothing.
+
+    L = E[max((V − G)², (clip(V, V_old−ε, V_old+ε) − G)²)].  Stable-Baselines3 takes the second alone, which also lets go
+    of a value that went too far the wrong way.
+    """
+    moved, error = value - before, value - target
+    held = torch.where(moved.abs() <= clip_range, value, before + moved.clamp(-clip_range, clip_range)) - target
+    plain, clipped = error * error, held * held
+    return torch.maximum(plain, clipped).mean(), error * (plain >= clipped) * (2 / len(error))
 
 
 def entropy_loss(entropy: Tensor) -> tuple[Tensor, Tensor]:

@@ -7,6 +7,8 @@ not valid is zero and touches no other, whatever stands in it.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
@@ -38,6 +40,51 @@ def gae(
     for t in range(T - 2, -1, -1):
         advantage[t] += carried[t] * advantage[t + 1]
     return advantage
+
+
+def vtrace(
+    reward: Floats,
+    values: Floats,
+    log_ratio: Floats,
+    terminated: Bools,
+    truncated: Bools,
+    valid: Bools,
+    gamma: float,
+    vtrace_lambda: float = 1.0,
+    rho_bar: float = 1.0,
+    c_bar: float = 1.0,
+) -> tuple[Floats, Floats]:
+    """V-trace targets vs and policy-gradient advantages, [T, N] float32 each (Espeholt et al. 2018, eq. 1 and section 4.2).
+
+        ρₜ = min(ρ̄, π(aₜ) / μ(aₜ)),  cₜ = λ min(c̄, π(aₜ) / μ(aₜ));  `log_ratio` [T, N] is log π(aₜ) − log μ(aₜ)
+        δₜ = ρₜ (rₜ + γ V(sₜ₊₁) [not terminated] − V(sₜ))
+        vsₜ = V(sₜ) + δₜ + γ cₜ (vsₜ₊₁ − V(sₜ₊₁)) [neither terminated nor truncated]
+        Aₜ = ρₜ (rₜ + γ v′ₜ₊₁ [not terminated] − V(sₜ)),  v′ = λ vs + (1−λ) V within the episode, V where it was cut
+
+    With λ = 1, as in the paper, v′ is vs; with π = μ, A is `gae` and vs is A + V, for any λ.
+    """
+    T, N = reward.shape
+    assert values.shape == (T + 1, N), f"values expected {(T + 1, N)}, got {values.shape}"
+    zero, discount, mix = np.float32(0), np.float32(gamma), np.float32(vtrace_lambda)
+    log_ratio = np.where(valid, log_ratio, zero)
+    rho = np.exp(np.minimum(log_ratio, np.float32(math.log(rho_bar))))  # clipped first: exp cannot overflow
+    c = np.exp(np.minimum(log_ratio, np.float32(math.log(c_bar))))
+    bootstrap = np.where(terminated, zero, values[1:])
+    delta = np.where(valid, rho * (reward + discount * bootstrap - values[:-1]), zero)
+    goes_on = valid & ~(terminated | truncated)
+    goes_on[-1] = False
+    ahead = np.zeros_like(delta)  # vs − V of the next row, where the episode goes on in this rollout
+    found = delta.copy()  # vs − V
+    for t in range(T - 2, -1, -1):
+        ahead[t] = np.where(goes_on[t], found[t + 1], zero)
+        found[t] += discount * mix * c[t] * ahead[t]
+    target = np.where(valid, found + values[:-1], zero)
+    return target, delta + rho * discount * mix * ahead
+
+
+def complete(ended: Bools, valid: Bools) -> Bools:
+    """[T, N] True for valid rows whose episode ends within the rollout: all the reward that follows them is known."""
+    return np.asarray(np.logical_or.accumulate((ended & valid)[::-1])[::-1] & valid)
 
 
 def discounted_return(
