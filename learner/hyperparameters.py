@@ -174,15 +174,16 @@ class DQNConfig(Hyperparameters, frozen=True):
     """env steps, all copies together, until it has fallen (exponential: until the distance has fallen to 1/e)"""
     loss: Literal["huber", "squared"] = "huber"
     """of the error of an action value; huber is linear beyond 1"""
-    max_grad_norm: Positive | None = 10.0
-    """longer gradients are shortened to this"""
+    max_grad_norm: Positive | None = None
+    """longer gradients are shortened to this; none: as they are"""
     max_grad_value: Positive | None = None
-    """larger entries of a gradient are cut to this, before it is shortened"""
+    """larger entries of a gradient are cut to this, before it is shortened; none: as they are"""
 
 
 HYPERPARAMETERS: dict[str, type[Hyperparameters]] = {
     "ppo": PPOConfig,
     "a2c": A2CConfig,
+    "dqn": DQNConfig,
     "impala": ImpalaConfig,
     "reinforce": REINFORCEConfig,
 }

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from learner.algorithms.a2c import A2C
+from learner.algorithms.dqn import DQN
 from learner.algorithms.impala import Impala
 from learner.algorithms.ppo import PPO
 from learner.algorithms.reinforce import REINFORCE
@@ -50,4 +51,10 @@ class Algorithm(Protocol):
         ...
 
 
-ALGORITHMS: dict[str, type[Algorithm]] = {"ppo": PPO, "a2c": A2C, "impala": Impala, "reinforce": REINFORCE}
+ALGORITHMS: dict[str, type[Algorithm]] = {
+    "ppo": PPO,
+    "a2c": A2C,
+    "dqn": DQN,
+    "impala": Impala,
+    "reinforce": REINFORCE,
+}

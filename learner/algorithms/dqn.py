@@ -1,0 +1,235 @@
+"""DQN (Mnih et al. 2015), double, dueling, n-step and prioritised if asked; its settings stand in `learner.hyperparameters`.
+
+No sockets, no files, no clock; seeded. One update keeps a batch in the replay and then makes a fixed number of gradient
+steps, so how often a transition is learned from is a setting, not a matter of speed. Observations are kept raw and
+normalised when they are drawn, by the statistics of that moment. ε falls with the env steps used and is published with
+the weights. With one torch thread on a CPU the same batches give the same bits, also after `load_state_dict`.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from learner.algorithms.normalise import ObservationNormaliser
+from learner.algorithms.replay import Replay, Sample
+from learner.hyperparameters import DQNConfig
+from protocol.errors import RunError, UsageError
+from protocol.networks import QNetwork
+from protocol.policy import features, normalized
+from protocol.rollout import Batch
+from protocol.specs import ActionSpec, Leaf, PolicySpec
+
+Array = npt.NDArray[Any]
+Floats = npt.NDArray[np.float32]
+
+
+class Measured(NamedTuple):
+    """What one gradient step measured, before it moved the weights."""
+
+    loss: float
+    q_mean: float  # of the actions that were taken
+    grad_norm: float  # before it was cut or shortened
+
+
+def huber_loss(error: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """E[w (½ e² where |e| ≤ 1, else |e| − ½)] of errors [B] and weights [B], and its gradient [B] by the errors."""
+    held = error.clamp(-1, 1)
+    return (weight * held * (error - 0.5 * held)).mean(), weight * held / len(error)
+
+
+def squared_loss(error: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """E[w e²] of errors [B] and weights [B], and its gradient [B] by the errors."""
+    return (weight * error * error).mean(), weight * error * (2 / len(error))
+
+
+LOSSES = {"huber": huber_loss, "squared": squared_loss}
+
+
+def exploration_rate(config: DQNConfig, env_steps: int) -> float:
+    """ε after so many env steps of all copies together."""
+    start, end, done = config.epsilon_start, config.epsilon_end, env_steps / config.epsilon_steps
+    return end + (start - end) * (max(0.0, 1 - done) if config.epsilon_schedule == "linear" else math.exp(-done))
+
+
+class DQN:
+    """Action values, those of the target, their optimiser, and the replay."""
+
+    @staticmethod
+    def policy_spec(config: DQNConfig, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
+        """Action values, on any of the supported observations; one choice among a few is the only action it can learn."""
+        if action.kind != "discrete":
+            shape = list(action.shape)
+            raise UsageError(f"dqn: expected an action space Discrete(n), got {action.kind}{shape}; take --algo ppo for it")
+        return PolicySpec(
+            observation,
+            action,
+            net=config.net,
+            activation=config.activation,
+            normalize_observations=config.normalize_observations,
+            head="q",
+            dueling=config.dueling,
+        )
+
+    def __init__(self, config: DQNConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
+        self.config = config
+        self.policy = policy
+        self.replay = Replay(
+            policy.observation,
+            size=config.replay_size,
+            n_step=config.n_step,
+            gamma=config.gamma,
+            seed=seed,
+            alpha=config.priority_alpha if config.replay == "prioritized" else None,
+        )
+        self.net = QNetwork(policy, device, seed=seed)
+        self.target = QNetwork(policy, device, seed=seed)
+        self.env_steps = 0  # transitions used so far: where the schedules are
+        self.version = 0  # updates made
+        self.gradient_steps = 0  # what Stable-Baselines3 calls n_updates
+        self._total_steps = total_steps
+        optimizer = torch.optim.Adam if config.optimizer == "adam" else torch.optim.AdamW
+        self._optimizer = optimizer([self.net.flat], lr=config.learning_rate, amsgrad=config.amsgrad, fused=True)
+        # The normaliser asks for the measured features alone, whichever head acts on them.
+        self._normaliser = ObservationNormaliser(msgspec.structs.replace(policy, head="actor_critic"))
+        self._statistics = self._normaliser.buffers()
+
+    def update(self, batch: Batch, pulse: Callable[[], None]) -> dict[str, float]:
+        """Keep a batch and learn from the replay, calling `pulse` between gradient steps; gives the metrics.
+
+        Raises `RunError` when a loss or a gradient is not finite, before it reaches the weights.
+        """
+        config = self.config
+        done = min(1.0, self.env_steps / self._total_steps)  # 0 in the first update, and below 1 in the last
+        learning_rate = config.learning_rate * (1 - done if config.learning_rate_schedule == "linear" else 1)
+        self._optimizer.param_groups[0]["lr"] = learning_rate
+        beta = config.priority_beta + (1 - config.priority_beta) * done
+        self.replay.add(batch)
+        self._normaliser.update(features(self.policy, batch.obs)[:-1], batch.valid)
+        self._statistics = self._normaliser.buffers()
+        self.env_steps += batch.env_steps
+        self.version += 1
+        measured: list[Measured] = []
+        if self.env_steps >= config.learning_starts and len(self.replay):
+            for _ in range(config.gradient_steps):
+                measured.append(self.step(self.replay.sample(config.batch_size, beta)))
+                pulse()
+        metrics = {
+            "rollout/exploration_rate": exploration_rate(config, self.env_steps),
+            "train/learning_rate": learning_rate,
+            "train/n_updates": float(self.gradient_steps),
+            "replay/size": float(len(self.replay)),
+            "replay/bytes": float(self.replay.bytes),
+        }
+        if measured:
+            mean = Measured(*np.mean(measured, 0).tolist())
+            metrics |= {f"train/{name}": number for name, number in mean._asdict().items()}
+            metrics["replay/env_steps_per_gradient_step"] = batch.env_steps / len(measured)
+        return metrics
+
+    def step(self, sample: Sample) -> Measured:
+        """One gradient step on a minibatch, and what follows it: the target, the priorities."""
+        config, net = self.config, self.net
+        action, weight = self._tensor(sample.action)[:, None], self._tensor(sample.weight)
+        target = self.targets(sample)
+        values = net.params(*self._inputs(sample.leaves))
+        with torch.no_grad():
+            chosen = values.gather(1, action)[:, 0]
+            error = chosen - target
+            loss, by_chosen = LOSSES[config.loss](error, weight)
+            net.flat_grad.zero_()
+        torch.autograd.backward(values, torch.zeros_like(values).scatter_(1, action, by_chosen[:, None]))
+        with torch.no_grad():
+            measured = Measured(*torch.stack((loss, chosen.mean(), net.flat_grad.norm())).tolist())
+            self._check(measured)
+            self._bound_gradient(measured.grad_norm)
+        self._optimizer.step()
+        self.gradient_steps += 1
+        self._follow()
+        self.replay.reprioritise(sample.slots, error.cpu().numpy())
+        return measured
+
+    def targets(self, sample: Sample) -> Tensor:
+        """What action values should be [B]:  Σ γⁱ r + γᵏ Q′(s′, a′), where the task has not terminated (there γᵏ is 0).
+
+        a′ = argmax Q′(s′, ·), or argmax Q(s′, ·) if double (van Hasselt et al. 2016), with Q′ the target network.
+        """
+        inputs = self._inputs(sample.next_leaves)
+        with torch.no_grad():
+            values = self.target.params(*inputs)
+            if self.config.double:
+                value = values.gather(1, self.net.params(*inputs).argmax(1, keepdim=True))[:, 0]
+            else:
+                value = values.amax(1)
+            return self._tensor(sample.reward) + self._tensor(sample.discount) * value
+
+    def _inputs(self, leaves: Sequence[Array]) -> tuple[Tensor, list[Tensor]]:
+        """Features [B, D], normalised by the present statistics, and images [B, *leaf] uint8."""
+        x = features(self.policy, leaves)
+        if self.policy.normalize_observations:
+            x = normalized(x, *np.split(self._statistics, 2))
+        images = [self._tensor(array) for leaf, array in zip(self.policy.observation, leaves, strict=True) if leaf.is_image]
+        return self._tensor(x), images
+
+    def _tensor(self, array: Array) -> Tensor:
+        return torch.from_numpy(array).to(self.net.flat.device)
+
+    def _check(self, measured: Measured) -> None:
+        for name, number in measured._asdict().items():
+            if not math.isfinite(number):
+                raise RunError(
+                    f"learner: update {self.version}: {name} expected finite, got {number}; this step was not taken; "
+                    "try a lower learning_rate, or normalize_observations"
+                )
+
+    def _bound_gradient(self, norm: float) -> None:
+        config, gradient = self.config, self.net.flat_grad
+        if config.max_grad_value is not None:
+            gradient.clamp_(-config.max_grad_value, config.max_grad_value)
+            norm = gradient.norm().item() if config.max_grad_norm is not None else norm
+        if config.max_grad_norm is not None and norm > config.max_grad_norm:
+            gradient.mul_(config.max_grad_norm / norm)
+
+    def _follow(self) -> None:
+        """The target network, one gradient step on."""
+        if self.config.target == "polyak":
+            self.target.flat.lerp_(self.net.flat, self.config.tau)
+        elif self.gradient_steps % self.config.target_every == 0:
+            self.target.flat.copy_(self.net.flat)
+
+    def weights(self) -> tuple[Floats, Floats]:
+        """Copies of the action values' parameters [P] and of the buffers: the observations' statistics, then ε."""
+        epsilon = np.float32(exploration_rate(self.config, self.env_steps))
+        return self.net.flat.cpu().numpy().copy(), np.append(self._statistics, epsilon)
+
+    def state_dict(self) -> dict[str, Any]:
+        """A copy of all that the next update depends on: tensors and plain data (`torch.load(weights_only=True)`)."""
+        return {
+            "parameters": self.net.flat.clone(),
+            "target": self.target.flat.clone(),
+            "optimizer": copy.deepcopy(self._optimizer.state_dict()),
+            "observations": self._normaliser.state_dict(),
+            "replay": self.replay.state_dict(),
+            "env_steps": self.env_steps,
+            "version": self.version,
+            "gradient_steps": self.gradient_steps,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from there: the next update is the one that would have followed, bit for bit."""
+        self.net.flat.copy_(state["parameters"])
+        self.target.flat.copy_(state["target"])
+        self._optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
+        self._normaliser.load_state_dict(state["observations"])
+        self._statistics = self._normaliser.buffers()
+        self.replay.load_state_dict(state["replay"])
+        self.env_steps, self.version = state["env_steps"], state["version"]
+        self.gradient_steps = state["gradient_steps"]

@@ -1,0 +1,247 @@
+"""What was seen, kept to be learned from again: a ring of preallocated numpy arrays. No sockets, no files; seeded.
+
+A slot holds an observation as it came and, where a valid row began there, that row: action, reward, whether it
+terminated, and the slot of the observation that it led to. So each observation stands once, and the steps of n-step
+returns are followed from slot to slot when they are drawn. A slot without a row is the final observation of a truncated
+episode, or the newest of a copy, which its next rollout fills in.
+
+The law: rows that are not valid are never kept. What a row leads to is younger than it, so the ring, which overwrites
+the oldest first, never breaks a chain that has a living beginning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from learner.algorithms.sum_tree import SumTree
+from learner.memory import GIB, available_bytes
+from protocol.errors import UsageError
+from protocol.rollout import Batch
+from protocol.specs import Leaf
+
+Array = npt.NDArray[Any]
+Bools = npt.NDArray[np.bool_]
+Doubles = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.float32]
+Ints = npt.NDArray[np.int64]
+
+TINY = 1e-6  # added to errors, so that no transition is never drawn again
+NOWHERE = -1
+
+
+class Sample(NamedTuple):
+    """B transitions of n steps, or fewer where the episode, or what is known of it, ends before."""
+
+    slots: Ints  # [B] where they stand
+    leaves: tuple[Array, ...]  # [B, *leaf] each
+    action: Ints  # [B]
+    reward: Floats  # [B] Σ γⁱ r over its k steps
+    discount: Floats  # [B] γᵏ; 0 where the task ended
+    next_leaves: tuple[Array, ...]  # [B, *leaf] each, k steps later
+    weight: Floats  # [B] by which to multiply its loss: importance sampling, at most 1
+
+
+def memory_bytes(observation: Sequence[Leaf], size: int, prioritized: bool) -> int:
+    """What a replay of so many slots takes, when it is full."""
+    row = sum(int(np.prod(leaf.shape)) * np.dtype(leaf.dtype).itemsize for leaf in observation)
+    row += sum(np.dtype(kind).itemsize for kind in (np.int64, np.float32, np.bool_, np.int64, np.bool_))
+    return size * row + (SumTree.memory_bytes(size) if prioritized else 0)
+
+
+def refuse_what_does_not_fit(observation: Sequence[Leaf], size: int, prioritized: bool) -> None:
+    """Raise `UsageError`, with the size that fits. Twice the memory is asked for: a checkpoint is a copy."""
+    needed, free = 2 * memory_bytes(observation, size, prioritized), available_bytes()
+    if free is None or needed <= free:
+        return
+    fits = size * free // needed
+    fits -= fits % 10 ** max(0, len(str(fits)) - 2)
+    raise UsageError(
+        f"replay_size {size}: {size} transitions take {needed / 2 / GIB:.1f} GiB, and as much again while a checkpoint is "
+        f"written, but {free / GIB:.1f} GiB of memory are free; take --replay-size {fits} or less"
+    )
+
+
+class Replay:
+    """The newest transitions of all lanes."""
+
+    def __init__(
+        self,
+        observation: tuple[Leaf, ...],
+        *,
+        size: int,
+        n_step: int,
+        gamma: float,
+        seed: int,
+        alpha: float | None = None,
+    ) -> None:
+        """`alpha`: draw in proportion to (error)^alpha, or uniformly if None. Raises `UsageError` if it cannot fit."""
+        refuse_what_does_not_fit(observation, size, alpha is not None)
+        self.size = size  # slots
+        self.bytes = memory_bytes(observation, size, alpha is not None)
+        self._n_step, self._gamma, self._alpha = n_step, gamma, alpha
+        self._generator = np.random.default_rng(seed)
+        self._obs = tuple(np.zeros((size, *leaf.shape), leaf.dtype) for leaf in observation)
+        self._action: Ints = np.zeros(size, np.int64)
+        self._reward: Floats = np.zeros(size, np.float32)
+        self._terminated: Bools = np.zeros(size, bool)
+        self._follows: Ints = np.zeros(size, np.int64)  # slot of the next observation; itself if terminated
+        self._is_row: Bools = np.zeros(size, bool)
+        self._tree = None if alpha is None else SumTree(size)
+        self._highest = 1.0  # error ever seen: what is new gets it
+        self._written = 0  # slots ever written; the next one is this, modulo the size
+        self._rows = 0
+        self._newest: dict[int, Ints] = {}  # lane -> [copies] the count at which its last observation was written
+
+    def __len__(self) -> int:
+        """Transitions that can be drawn."""
+        return self._rows
+
+    # ---------------------------------------------------------------- writing
+
+    def add(self, batch: Batch) -> None:
+        """Keep the valid rows. Raises `UsageError` when a single rollout is more than fits."""
+        for at in range(0, len(batch.lane), batch.copies):  # a lane's rollouts stand in the order they were collected
+            self._add(batch, slice(at, at + batch.copies), int(batch.lane[at]))
+
+    def _add(self, batch: Batch, columns: slice, lane: int) -> None:
+        obs = [leaf[:, columns] for leaf in batch.obs]  # [T+1, N, *leaf] each
+        valid, terminated = batch.valid[:, columns], batch.terminated[:, columns]
+        most = valid.size + valid.shape[1]
+        if most > self.size:
+            raise UsageError(f"replay_size {self.size}: a rollout takes up to {most}; take --replay-size {most} or more")
+        newest = self._newest.get(lane) if not batch.fresh[columns.start] else None
+        goes_on, newest = self._going_on([leaf[0] for leaf in obs], newest, most)
+        needed = np.zeros((len(valid) + 1, valid.shape[1]), bool)  # [T+1, N] which observations are kept
+        needed[:-1] = valid
+        needed[1:] |= valid & ~terminated
+        needed[0] &= ~goes_on
+        written = np.full(needed.shape, NOWHERE)  # [T+1, N] the count at which each was written
+        written[needed] = self._written + np.arange(np.count_nonzero(needed))
+        written[0][goes_on] = newest[goes_on]
+        self._written += int(np.count_nonzero(needed))
+        slot = written % self.size
+        self._clear(slot[needed])
+        for kept, leaf in zip(self._obs, obs, strict=True):
+            kept[slot[needed]] = leaf[needed]
+        rows = slot[:-1][valid]
+        self._action[rows] = batch.action[:, columns][valid]
+        self._reward[rows] = batch.reward[:, columns][valid]
+        self._terminated[rows] = terminated[valid]
+        self._follows[rows] = np.where(terminated[valid], rows, slot[1:][valid])
+        self._is_row[rows] = True
+        self._rows += len(rows)
+        if self._tree is not None and self._alpha is not None:
+            self._tree.set(rows, self._highest**self._alpha)
+        ended = terminated[-1] | batch.truncated[-1, columns] | ~valid[-1]
+        self._newest[lane] = np.where(ended, NOWHERE, written[-1])
+
+    def _going_on(self, first: Sequence[Array], newest: Ints | None, room: int) -> tuple[Bools, Ints]:
+        """[N] whether a copy's rollout begins with the newest observation kept of it, and where that was written.
+
+        A rollout between may have been dropped (stale, lost), hence the comparison; and the ring may reach it.
+        """
+        if newest is None:
+            newest = np.full(len(first[0]), NOWHERE)
+        goes_on = (newest != NOWHERE) & (newest + self.size >= self._written + room)
+        for kept, leaf in zip(self._obs, first, strict=True):
+            same = kept[newest % self.size] == leaf
+            goes_on &= same.reshape(len(leaf), -1).all(1)
+        return goes_on, newest
+
+    def _clear(self, slots: Ints) -> None:
+        self._rows -= int(np.count_nonzero(self._is_row[slots]))
+        self._is_row[slots] = False
+        if self._tree is not None:
+            self._tree.set(slots, 0.0)
+
+    # ---------------------------------------------------------------- reading
+
+    def sample(self, count: int, beta: float = 1.0) -> Sample:
+        """Draw transitions, with replacement; `beta` is how far the weights undo the drawing by priority."""
+        slots, weight = self._uniform(count) if self._tree is None else self._by_priority(self._tree, count, beta)
+        reward, discount, last = self._follow(slots)
+        return Sample(
+            slots=slots,
+            leaves=tuple(leaf[slots] for leaf in self._obs),
+            action=self._action[slots],
+            reward=reward.astype(np.float32),
+            discount=discount.astype(np.float32),
+            next_leaves=tuple(leaf[last] for leaf in self._obs),
+            weight=weight,
+        )
+
+    def _uniform(self, count: int) -> tuple[Ints, Floats]:
+        used = min(self._written, self.size)
+        slots = self._generator.integers(0, used, count)
+        while not (found := self._is_row[slots]).all():  # at least half of the slots, nearly always nearly all
+            slots[~found] = self._generator.integers(0, used, np.count_nonzero(~found))
+        return slots, np.ones(count, np.float32)
+
+    def _by_priority(self, tree: SumTree, count: int, beta: float) -> tuple[Ints, Floats]:
+        """P(i) = pᵢ^α / Σ p^α;  wᵢ = (rows · P(i))^−β, over the greatest of them (Schaul et al. 2016, section 3.4)."""
+        slots = tree.draw(self._generator, count)
+        chance = tree.weights[slots] / tree.total
+        weight = (self._rows * chance) ** -beta
+        return slots, (weight / weight.max()).astype(np.float32)
+
+    def _follow(self, slots: Ints) -> tuple[Doubles, Doubles, Ints]:
+        """From each slot, up to n steps on: the discounted rewards, γᵏ (0 if the task ended), and where that leads."""
+        reward, discount, at = np.zeros(len(slots)), np.ones(len(slots)), slots
+        going = np.ones(len(slots), bool)
+        for _ in range(self._n_step):
+            terminated = self._terminated[at]
+            reward += np.where(going, discount * self._reward[at], 0)
+            discount = np.where(going, discount * self._gamma * ~terminated, discount)
+            at = np.where(going, self._follows[at], at)
+            going &= ~terminated & self._is_row[at]
+        return reward, discount, at
+
+    def reprioritise(self, slots: Ints, error: Floats) -> None:
+        """Draw these transitions [B] from now on by the size of their errors [B]."""
+        if self._tree is None or self._alpha is None:
+            return
+        priority = np.abs(error).astype(np.float64) + TINY
+        self._highest = max(self._highest, float(priority.max()))
+        self._tree.set(slots, priority**self._alpha)
+
+    # ---------------------------------------------------------------- saving
+
+    def _arrays(self) -> dict[str, Array]:
+        """All that is kept for each slot."""
+        own = {name: getattr(self, f"_{name}") for name in ("action", "reward", "terminated", "follows", "is_row")}
+        tree = {} if self._tree is None else {"weight": self._tree.weights}
+        return {f"obs{i}": leaf for i, leaf in enumerate(self._obs)} | own | tree
+
+    def state_dict(self) -> dict[str, Any]:
+        """A copy, in tensors and plain data: only of the slots that are used."""
+        used = min(self._written, self.size)
+        return {
+            "size": self.size,
+            "arrays": {name: torch.tensor(array[:used]) for name, array in self._arrays().items()},
+            "newest": {lane: torch.tensor(written) for lane, written in self._newest.items()},
+            "written": self._written,
+            "highest": self._highest,
+            "generator": self._generator.bit_generator.state,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from there, bit for bit. Raises ValueError when it is of another size."""
+        if state["size"] != self.size:
+            raise ValueError(f"replay_size expected {state['size']}, got {self.size}")
+        self._written, self._highest = state["written"], state["highest"]
+        used = min(self._written, self.size)
+        self._is_row[used:] = False
+        for name, array in self._arrays().items():
+            if name != "weight":
+                array[:used] = state["arrays"][name].numpy()
+        if self._tree is not None:
+            self._tree.set(np.arange(self.size), 0.0)
+            self._tree.set(np.arange(used), state["arrays"]["weight"].numpy())
+        self._rows = int(np.count_nonzero(self._is_row))
+        self._newest = {int(lane): written.numpy().copy() for lane, written in state["newest"].items()}
+        self._generator.bit_generator.state = state["generator"]

@@ -1,0 +1,66 @@
+"""Drawing numbers in proportion to their weights, and changing weights, in a logarithm of their number. numpy, vectorised.
+
+The law: every inner node is the sum of its two children, computed anew from them whenever one changes; so the tree is a
+function of its leaves to the bit, and no rounding builds up.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Doubles = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+
+class SumTree:
+    """`size` weights, 0 at first. Node i has the children 2i and 2i + 1; the leaves are the nodes from `size` on.
+
+    `size` need not be a power of two: then leaves stand at two depths, and every node but the root still has one parent.
+    """
+
+    def __init__(self, size: int) -> None:
+        self._size = max(size, 2)
+        self._nodes: Doubles = np.zeros(2 * self._size)
+        self._depth = (2 * self._size - 1).bit_length() - 1  # of the deepest leaf; the root's is 0
+
+    @staticmethod
+    def memory_bytes(size: int) -> int:
+        """What a tree of so many weights takes."""
+        return 2 * max(size, 2) * np.dtype(np.float64).itemsize
+
+    @property
+    def total(self) -> float:
+        """The sum of all weights."""
+        return float(self._nodes[1])
+
+    @property
+    def weights(self) -> Doubles:
+        """The weights [size], to read."""
+        return self._nodes[self._size :]
+
+    def set(self, index: Ints, weight: npt.NDArray[Any] | float) -> None:
+        """Give these weights, none negative; of an index that stands twice, the last one counts."""
+        nodes, i = self._nodes, index + self._size
+        nodes[i] = weight
+        for _ in range(self._depth):
+            i = np.maximum(i >> 1, 1)
+            nodes[i] = nodes[2 * i] + nodes[2 * i + 1]
+
+    def find(self, mass: Doubles) -> Ints:
+        """Where the running sum of weights passes `mass` [B], each in [0, total): never at a weight of 0, if one is not."""
+        nodes, i, mass = self._nodes, np.ones(len(mass), np.int64), mass.copy()
+        for _ in range(self._depth):
+            inner = i < self._size
+            child = np.where(inner, 2 * i, i)
+            left, right = nodes[child], nodes[np.where(inner, child + 1, child)]
+            to_right = inner & (mass >= left) & (right > 0)
+            mass -= np.where(to_right, left, 0)
+            i = child + to_right
+        return i - self._size
+
+    def draw(self, generator: np.random.Generator, count: int) -> Ints:
+        """`count` indices in proportion to their weights, one from each of as many equal shares of the sum."""
+        return self.find((np.arange(count) + generator.random(count)) * (self.total / count))
