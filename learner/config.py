@@ -169,15 +169,13 @@ def lower_layers(
     whole = named[preset].settings if preset in named else {}
     env = env or str(table.get("env", whole.get("env", "")))
     config = _of_algorithm(algo or str(table.get("algo", whole.get("algo", "ppo"))))
-    if preset in named:
-        config = over(config, {**whole, "algo": config.algo}, str(PRESETS))
-    elif preset != "none":
+    if preset != "none":
         known = _presets().get(config.algo, {})
-        name = env if preset == "auto" else preset
-        if name not in known and preset != "auto":
+        name = env if preset == "auto" or preset in named else preset
+        if name not in known and name == preset:
             near = nearest(name, [*known, *named])
             raise UsageError(f"preset {name}: {config.algo} has none of this name{near or '; millrace presets lists them'}")
-        config = over(config, known.get(name, {}), str(PRESETS))
+        config = over(over(config, known.get(name, {}), str(PRESETS)), {**whole, "algo": config.algo}, str(PRESETS))
     config = _over_toml(config, {**table, "algo": config.algo}, where)
     return over(config, {"env": env}, "ENV")
 
