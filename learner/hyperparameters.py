@@ -47,6 +47,8 @@ class ActorCriticHyperparameters(Hyperparameters, frozen=True):
     """weight of the value loss"""
     max_grad_norm: Positive = 0.5
     """longer gradients are shortened to this"""
+    log_std_init: float = 0.0
+    """logarithm of the first standard deviation of Box actions"""
     normalize_rewards: bool = False
     """divide rewards by the running standard deviation of the discounted return"""
 

@@ -92,6 +92,8 @@ class Parts:
         self.config = config
         self.policy = policy
         self.net = ActorCritic(policy, device, seed=seed)
+        if policy.action.kind == "box":
+            self.net.parameters["actor.log_std"].detach().fill_(config.log_std_init)
         self.optimizer = make_optimizer(optimizer, self.net, config.learning_rate)
         self.generator = torch.Generator().manual_seed(seed)
         self.env_steps = 0  # transitions used so far: where the schedules are
