@@ -130,9 +130,43 @@ def _evaluate(argv: list[str]) -> int:
     from millrace.flags import EvaluateFlags
 
     flags = parse(EvaluateFlags, argv, "evaluate")
+    episodes = flags.episodes if flags.episodes is not None else 3 if flags.video else 100
+    _at_least("episodes", episodes, 1)
+    _at_least("seed", flags.seed, 0)
     policy, spec, env = load_policy(flags.run)
-    found = evaluate(env, policy, spec.action, flags.episodes, flags.seed)
-    print(found)
+    if not flags.video:
+        print(evaluate(env, policy, spec, episodes, flags.seed))
+        return 0
+    from learner.video import film
+
+    found, films = film(flags.run, env, policy, spec, episodes, flags.seed)
+    print("\n".join(map(str, [found, *films])))
+    return 0
+
+
+def _record(argv: list[str]) -> int:
+    from learner.flags import parse
+    from learner.record import record
+    from millrace.flags import RecordFlags
+
+    flags = parse(RecordFlags, argv, "record")
+    _at_least("steps", flags.steps, 1)
+    _at_least("seed", flags.seed, 0)
+    print(record(flags.run, flags.out, flags.steps, flags.seed, stochastic=flags.stochastic, npy=flags.npy))
+    if flags.npy is not None:
+        print(f"rows of observation and action: {flags.npy}")
+    return 0
+
+
+def _report(argv: list[str]) -> int:
+    from learner.flags import parse
+    from learner.page import write_page
+    from millrace.flags import ReportFlags
+
+    flags = parse(ReportFlags, argv, "report")
+    if not flags.runs:
+        raise UsageError("report: which runs? expected run folders, as in: millrace report runs/*")
+    print(write_page(flags.runs, flags.out or flags.runs[0] / "report.html"))
     return 0
 
 
@@ -148,14 +182,21 @@ def _plot(argv: list[str]) -> int:
     return 0
 
 
+def _at_least(name: str, value: int, least: int) -> None:
+    if value < least:
+        raise UsageError(f"{name} expected int >= {least}, got {value}")
+
+
 COMMANDS = {
     "train": Command(_train, "train ENV [flags]", "train on this machine: the learner here, worker processes beside it"),
     "learner": Command(
         _learner, "learner ENV --bind ADDRESS [flags]", "the learner alone; waits for workers from elsewhere"
     ),
     "worker": Command(_worker, "worker ADDRESS [flags]", "one worker process that joins a learner"),
-    "evaluate": Command(_evaluate, "evaluate RUN [flags]", "greedy episodes of a run's newest policy"),
+    "evaluate": Command(_evaluate, "evaluate RUN [--video] [flags]", "greedy episodes of a run's newest policy"),
+    "record": Command(_record, "record RUN --out DATASET [flags]", "episodes of a run's newest policy as a Minari dataset"),
     "plot": Command(_plot, "plot RUN [RUN ...] [--out FILE]", "learning curves as a PNG"),
+    "report": Command(_report, "report RUN [RUN ...] [--out FILE]", "runs side by side as one HTML page"),
 }
 
 

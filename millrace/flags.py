@@ -13,10 +13,12 @@ class EvaluateFlags(msgspec.Struct, frozen=True, kw_only=True):
 
     run: Positional[Path]
     """the run folder"""
-    episodes: int = 100
-    """how many"""
+    episodes: int | None = None
+    """how many; if not given 100, and 3 with --video"""
     seed: int = 1_000_000
     """of the episodes; another seed, other episodes"""
+    video: bool = False
+    """film them: an mp4 of each in the run's videos folder (pip install 'millrace[video]')"""
     debug: bool = False
     """show the traceback of an error"""
 
@@ -28,5 +30,35 @@ class PlotFlags(msgspec.Struct, frozen=True, kw_only=True):
     """run folders"""
     out: Path | None = None
     """the PNG; curves.png in the first run folder if not given"""
+    debug: bool = False
+    """show the traceback of an error"""
+
+
+class RecordFlags(msgspec.Struct, frozen=True, kw_only=True):
+    """A Minari dataset of a run's newest policy: whole episodes, raw rewards (pip install 'millrace[record]')."""
+
+    run: Positional[Path]
+    """the run folder"""
+    out: str
+    """the dataset's id, as in cartpole/expert-v0; it is written where MINARI_DATASETS_PATH says, or to ~/.minari/datasets"""
+    steps: int = 50_000
+    """env steps; the last episode is finished, and cut only where that would double them"""
+    npy: Path | None = None
+    """also write this file: an array of rows [observation, action], float32, flattened, one for each step"""
+    stochastic: bool = False
+    """draw actions from the policy, as in training, instead of taking the most probable"""
+    seed: int = 2_000_000
+    """of the episodes and of the drawn actions"""
+    debug: bool = False
+    """show the traceback of an error"""
+
+
+class ReportFlags(msgspec.Struct, frozen=True, kw_only=True):
+    """One HTML page about runs side by side: results, learning curves, settings, ledger, stages, films."""
+
+    runs: Positional[tuple[Path, ...]]
+    """run folders"""
+    out: Path | None = None
+    """the page; report.html in the first run folder if not given"""
     debug: bool = False
     """show the traceback of an error"""
