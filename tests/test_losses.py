@@ -16,6 +16,8 @@ def test_gradients_derived_by_hand_are_those_of_autograd() -> None:
     ratio = log_ratio.exp()
     cases = {
         "policy": (losses.clipped_surrogate(ratio, advantage, 0.2), log_ratio),
+        "plain policy": (losses.policy_gradient(log_ratio, advantage), log_ratio),
+        "clipped value": (losses.clipped_value_loss(log_ratio, target, advantage, 0.4), log_ratio),
         "value": (losses.value_loss(log_ratio, target), log_ratio),
         "entropy": (losses.entropy_loss(log_ratio), log_ratio),
     }
@@ -30,6 +32,14 @@ def test_surrogate_is_the_papers() -> None:
     loss, _ = losses.clipped_surrogate(ratio, advantage, 0.2)
     torch.testing.assert_close(loss, -torch.tensor([0.5, -0.8, 1.2, -1.5, 2.2]).mean())
     assert losses.clip_fraction(ratio, 0.2).item() == pytest.approx(0.8)
+
+
+def test_a_clipped_value_earns_nothing_by_moving_further() -> None:
+    """Before 0, clipped to ±1, target 5: at 0.5 it is drawn on, at 2 it has gone far enough, at −2 it is drawn back."""
+    value, target = torch.tensor([0.5, 2.0, -2.0]), torch.tensor([5.0, 5.0, 5.0])
+    loss, gradient = losses.clipped_value_loss(value, target, torch.zeros(3), 1.0)
+    torch.testing.assert_close(loss, torch.tensor([4.5**2, 4.0**2, 7.0**2]).mean())
+    torch.testing.assert_close(gradient, torch.tensor([-9.0, 0.0, -14.0]) / 3)
 
 
 def test_explained_variance() -> None:

@@ -8,7 +8,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 import pytest
 import torch
 
@@ -16,20 +15,24 @@ from learner.algorithms import ALGORITHMS, Algorithm
 from learner.algorithms.actor_critic import Minibatch
 from learner.algorithms.ppo import PPO
 from learner.hyperparameters import PPOConfig
-from protocol.distributions import distribution
 from protocol.errors import RunError
-from protocol.policy import NumpyPolicy, layout, size
-from protocol.rollout import Batch
-from protocol.specs import ActionSpec, Leaf, PolicySpec
+from protocol.policy import layout, size
+from protocol.specs import PolicySpec
+from tests.batches import (
+    COPIES,
+    DISCRETE,
+    GAUSSIAN,
+    IMAGE,
+    LANES,
+    T,
+    batch,
+    identity_batch,
+    no_pulse,
+    normal,
+    shared,
+)
 
-Array = npt.NDArray[Any]
-
-BOX = Leaf("", "box", (4,), "float32")
-DISCRETE = PolicySpec((BOX,), ActionSpec("discrete", (), "int64", (4,), (0,)), (16,))
-GAUSSIAN = PolicySpec((BOX,), ActionSpec("box", (2,), "float32", low=(-1.0,) * 2, high=(1.0,) * 2), (16,))
-IMAGE = PolicySpec((BOX, Leaf("i", "box", (8, 8, 1), "uint8")), DISCRETE.action, (16,))
 EVERYTHING = PPOConfig(normalize_rewards=True, learning_rate_schedule="linear", clip_range_schedule="linear", n_epochs=3)
-LANES, COPIES, T = 2, 3, 20
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -40,51 +43,8 @@ def _one_thread() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-def normal(spec: PolicySpec) -> PolicySpec:
-    return msgspec.structs.replace(spec, normalize_observations=True)
-
-
 def ppo(config: PPOConfig | None = None, spec: PolicySpec = DISCRETE, seed: int = 0) -> PPO:
     return PPO(config or PPOConfig(), spec, total_steps=10_000, seed=seed)
-
-
-def batch(algorithm: PPO, seed: int, fresh: bool = False, steps: int = T) -> Batch:
-    """A batch of noise with ends of both kinds, acted on with the algorithm's weights."""
-    generator = np.random.default_rng(seed)
-    N = LANES * COPIES
-    spec = algorithm.policy
-    obs: list[Array] = [generator.normal(2, 3, (steps + 1, N, 4)).astype(np.float32)]
-    if spec.needs_torch:
-        obs.append(generator.integers(0, 256, (steps + 1, N, 8, 8, 1), dtype=np.uint8))
-        params = np.zeros((steps, N, 4), np.float32)
-    else:
-        policy = NumpyPolicy(spec)
-        policy.load(*algorithm.weights())
-        params = policy([leaf[:-1] for leaf in obs])
-    over = distribution(spec)
-    action = over.sample(params, over.noise(generator, (steps, N)))
-    ends, kind = generator.random((steps, N)) < 0.15, generator.random((steps, N)) < 0.5
-    valid = np.ones((steps, N), bool)
-    for t in range(1, steps):
-        valid[t] = ~ends[t - 1]
-        ends[t] &= valid[t]
-    return Batch(
-        obs=tuple(obs),
-        action=action,
-        log_prob=over.log_prob(params, action),
-        reward=generator.normal(1, 2, (steps, N)).astype(np.float32),
-        terminated=ends & kind,
-        truncated=ends & ~kind,
-        valid=valid,
-        lane=np.repeat(np.arange(LANES), COPIES),
-        fresh=np.full(N, fresh),
-        copies=COPIES,
-        episodes=(),
-    )
-
-
-def no_pulse() -> None:
-    pass
 
 
 def same(a: PPO, b: PPO) -> bool:
@@ -96,7 +56,7 @@ def test_it_is_an_algorithm() -> None:
     assert algorithm.weights()[0].dtype == np.float32
 
 
-@pytest.mark.parametrize("spec", [DISCRETE, GAUSSIAN, normal(GAUSSIAN), IMAGE])
+@pytest.mark.parametrize("spec", [DISCRETE, GAUSSIAN, normal(GAUSSIAN), IMAGE, shared(IMAGE)])
 def test_the_same_batches_give_the_same_bits(spec: PolicySpec) -> None:
     a, b, other = ppo(EVERYTHING, spec), ppo(EVERYTHING, spec), ppo(EVERYTHING, spec, seed=1)
     for seed in range(2):
@@ -307,35 +267,39 @@ def test_a_step_follows_the_gradient_of_the_usual_loss(spec: PolicySpec) -> None
     assert measured.policy_gradient_loss == pytest.approx(policy_loss.item(), rel=1e-4)
 
 
-def identity_batch(algorithm: PPO, generator: np.random.Generator) -> tuple[Batch, float]:
-    """The identity environment: the right action is the observation; each episode is one step, then the copy resets."""
-    steps, N, spec = 32, 8, algorithm.policy
-    choice = generator.integers(0, 4, (steps + 1, N))
-    obs = np.eye(4, dtype=np.float32)[choice]
-    policy, over = NumpyPolicy(spec), distribution(spec)
-    policy.load(*algorithm.weights())
-    params = policy([obs[:-1]])
-    action = over.sample(params, over.noise(generator, (steps, N)))
-    valid = np.zeros((steps, N), bool)
-    valid[::2] = True
-    if spec.action.kind == "box":
-        reward = -np.square(action - obs[:-1, :, :2]).sum(-1)
-    else:
-        reward = (action == choice[:-1]).astype(np.float32)
-    rows = Batch(
-        obs=(obs,),
-        action=action,
-        log_prob=over.log_prob(params, action),
-        reward=np.where(valid, reward, 50).astype(np.float32),
-        terminated=valid.copy(),
-        truncated=np.zeros((steps, N), bool),
-        valid=valid,
-        lane=np.repeat(np.arange(2), 4),
-        fresh=np.zeros(N, bool),
-        copies=4,
-        episodes=(),
+def test_clipped_values_move_less() -> None:
+    """With a step size that moves them far in an epoch, and nothing else to learn."""
+    moved = []
+    for limit in (None, 0.05):
+        config = PPOConfig(
+            clip_range_vf=limit, learning_rate=0.01, n_epochs=10, batch_size=1000, ent_coef=0.0, max_grad_norm=1e9
+        )
+        algorithm = ppo(config)
+        rows = batch(algorithm, 0)
+        seen = algorithm.parts.see(rows)
+        before = algorithm.parts.values(seen, no_pulse)
+        algorithm.update(rows, no_pulse)
+        moved.append(float(np.abs(algorithm.parts.values(seen, no_pulse) - before)[:-1][rows.valid].mean()))
+    assert moved[0] > 0.4
+    assert moved[1] < 0.6 * moved[0]
+
+
+@pytest.mark.parametrize("before", [-3.0, 0.0, 0.7, 5.0])
+def test_a_step_with_clipped_values_follows_the_gradient_of_the_usual_loss(before: float) -> None:
+    """The value before the update is the target less the advantage, which is standardised only afterwards."""
+    algorithm, generator = (
+        ppo(PPOConfig(vf_coef=1.0, max_grad_norm=1e9, clip_range_vf=0.5)),
+        torch.Generator().manual_seed(0),
     )
-    return rows, float(reward[valid].mean())
+    x, target = torch.randn(30, 4, generator=generator), torch.randn(30, generator=generator)
+    old = torch.full((30,), before)
+    _, value = algorithm.net.forward(x)
+    clipped = old + (value - old).clamp(-0.5, 0.5)
+    torch.maximum((value - target).square(), (clipped - target).square()).mean().backward()  # type: ignore[no-untyped-call]
+    expected = algorithm.net.flat_grad.clone()[algorithm.net.acting_size :]
+    algorithm.step(Minibatch(x, (), torch.zeros(30, dtype=torch.int64), torch.zeros(30), target - old, target), 0.2)
+    found = algorithm.net.flat_grad[algorithm.net.acting_size :]
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize(("spec", "start", "goal"), [(normal(DISCRETE), 0.5, 0.95), (normal(GAUSSIAN), -1.5, -0.35)])
