@@ -9,6 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -82,6 +83,17 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
         (["train", "--config", "/no.toml"], "config file /no.toml cannot be read: No such file or directory"),
         (["plot"], "plot: which runs? expected run folders, as in: millrace plot runs/*"),
         (["plot", "/no"], "run /no: expected a run folder to plot, got no such folder"),
+        (["report"], "report: which runs? expected run folders, as in: millrace report runs/*"),
+        (["report", "/no"], "run /no: expected a run folder to report on, got no such folder"),
+        (["record", "/no", "--out", "cartpole/expert-v0"], "run /no: no such folder"),
+        (["record", "/no", "--out", "cartpole/expert-v0", "--steps", "0"], "steps expected int >= 1, got 0"),
+        (["record", "/no", "--out", "cartpole/expert-v0", "--seed", "-1"], "seed expected int >= 0, got -1"),
+        (
+            ["record", "/no", "--out", "cartpole/expert-v0", "--step", "9"],
+            "record: unknown flag --step; did you mean --steps?",
+        ),
+        (["evaluate", "/no", "--episodes", "0"], "episodes expected int >= 1, got 0"),
+        (["evaluate", "/no", "--video"], "run /no: no such folder"),
         (["evaluate", "/no"], "run /no: no such folder"),
         (["evaluate", "/no", "--episode", "3"], "evaluate: unknown flag --episode; did you mean --episodes?"),
     ],
@@ -100,6 +112,7 @@ def test_bad_usage_is_one_exact_line(asked: list[Any], capsys: Captured, argv: l
         (["train", "CartPole-v1", "--transport", "udp"], "--transport expected one of 'inproc', 'ipc', 'tcp', got 'udp'"),
         (["train", "CartPole-v1", "--seed"], "'--seed'"),
         (["evaluate"], "missing: RUN"),
+        (["record", "runs/a"], "--out"),
     ],
 )
 def test_what_tyro_refuses_is_one_line_too(asked: list[Any], capsys: Captured, argv: list[str], says: str) -> None:
@@ -243,17 +256,92 @@ def test_an_interrupted_run_says_how_to_go_on(capsys: Captured, monkeypatch: pyt
 # ------------------------------------------------------------------------------------------------- evaluate, plot, help
 
 
-def test_evaluate_says_mean_and_deviation(tmp_path: Path, capsys: Captured) -> None:
-    run = RunFolder.create(resolve("CartPole-v1", run_dir=str(tmp_path)))
-    env = EnvSpec("CartPole-v1")
+def a_run_that_acts(tmp_path: Path, env_id: str = "CartPole-v1") -> Path:
+    """Its policy is all zeros: always left, in CartPole, where it falls after nine steps."""
+    run = RunFolder.create(resolve(env_id, run_dir=str(tmp_path)))
+    env = EnvSpec(env_id)
     made = env.make()
     spec = PolicySpec(observation_leaves(made.observation_space), action_spec(made.action_space), net=(4,))
     run.write_policy(spec, env, np.zeros(size(layout(spec)[0]), np.float32), np.zeros(0, np.float32))
-    assert main(["evaluate", str(run.path), "--episodes", "30"]) == 0
+    return run.path
+
+
+def test_evaluate_says_mean_and_deviation(tmp_path: Path, capsys: Captured) -> None:
+    run = a_run_that_acts(tmp_path)
+    assert main(["evaluate", str(run), "--episodes", "30"]) == 0
     first = capsys.readouterr().out
-    assert re.fullmatch(r"return 9\.\d ± 0\.\d over 30 episodes\n", first)  # always left: it falls after nine steps
-    assert main(["evaluate", str(run.path), "--episodes", "30", "--seed", "1000000"]) == 0
+    assert re.fullmatch(r"return 9\.\d ± 0\.\d over 30 episodes\n", first)
+    assert main(["evaluate", str(run), "--episodes", "30", "--seed", "1000000"]) == 0
     assert capsys.readouterr().out == first
+    assert main(["evaluate", str(run)]) == 0
+    assert "over 100 episodes" in capsys.readouterr().out
+    assert not (run / "videos").exists()
+
+
+def test_evaluate_films_a_few_episodes(tmp_path: Path, capsys: Captured) -> None:
+    run = a_run_that_acts(tmp_path)
+    for _ in range(2):  # the same films, over again
+        assert main(["evaluate", str(run), "--video", "--episodes", "2", "--seed", "7"]) == 0
+        said, *films = capsys.readouterr().out.splitlines()
+        assert re.fullmatch(r"return \d+\.\d ± \d\.\d over 2 episodes", said)
+        assert films == [f"{run}/videos/seed-7-episode-{i}.mp4" for i in range(2)]
+        assert sorted(path.name for path in (run / "videos").iterdir()) == [Path(film).name for film in films]
+    assert all(b"ftyp" in Path(film).read_bytes()[:12] for film in films)
+
+
+def test_what_cannot_be_filmed_is_said(tmp_path: Path, capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = a_run_that_acts(tmp_path, "millrace-tests/Blind-v0")
+    line = refusal(capsys, "evaluate", str(run), "--video")
+    assert line == "environment millrace-tests/Blind-v0 cannot be filmed: expected it to render rgb_array, got ['ansi']"
+    assert not list((run / "videos").iterdir())
+    monkeypatch.setattr("gymnasium.envs.classic_control.cartpole.CartPoleEnv.render", no_pygame)
+    line = refusal(capsys, "evaluate", str(a_run_that_acts(tmp_path)), "--video")
+    assert line == "environment CartPole-v1 cannot be filmed: pygame is not installed; pip install 'millrace[video]'"
+    monkeypatch.setitem(sys.modules, "moviepy", None)
+    line = refusal(capsys, "evaluate", str(run), "--video")
+    assert line == "videos need moviepy, which is an extra; pip install 'millrace[video]'"
+
+
+def no_pygame(*_: Any) -> None:
+    raise gymnasium.error.DependencyNotInstalled("pygame is not installed")
+
+
+class Blind(gymnasium.Env[Any, Any]):
+    """Has no pictures."""
+
+    metadata = {"render_modes": ["ansi"]}
+    observation_space = gymnasium.spaces.Discrete(2)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        self.render_mode = render_mode
+
+
+gymnasium.register("millrace-tests/Blind-v0", entry_point=lambda **kwargs: Blind(**kwargs))
+
+
+def test_record_says_what_stands_in_the_dataset(tmp_path: Path, capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
+    run, rows = a_run_that_acts(tmp_path), tmp_path / "rows.npy"
+    flags = ["--out", "cartpole/left-v0", "--steps", "50", "--npy", str(rows)]
+    assert main(["record", str(run), *flags]) == 0
+    first, second = capsys.readouterr().out.splitlines()
+    said = re.fullmatch(r"dataset cartpole/left-v0: (\d+) steps, 6 episodes, return 9\.\d ± 0\.\d", first)
+    assert said is not None
+    assert second == f"rows of observation and action: {rows}"
+    assert np.load(rows, allow_pickle=False).shape == (int(said[1]), 5)
+    assert (tmp_path / "datasets" / "cartpole" / "left-v0" / "data" / "main_data.hdf5").is_file()
+    assert "dataset cartpole/left-v0 is there already" in refusal(capsys, "record", str(run), *flags)
+
+
+def test_report_writes_into_the_run_folder_or_where_it_is_told(tmp_path: Path, capsys: Captured) -> None:
+    run = RunFolder.create(resolve("CartPole-v1", run_dir=str(tmp_path))).path
+    MetricsLog(run).close()
+    assert main(["report", str(run)]) == 0
+    assert capsys.readouterr().out == f"{run}/report.html\n"
+    assert (run / "report.html").read_text().startswith("<!doctype html>")
+    assert main(["report", str(run), "--out", str(tmp_path / "both.html")]) == 0
+    assert (tmp_path / "both.html").read_bytes() == (run / "report.html").read_bytes()
 
 
 def test_plot_draws_into_the_run_folder_or_where_it_is_told(tmp_path: Path, capsys: Captured) -> None:

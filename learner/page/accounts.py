@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from html import escape
 
-from learner.page.charts import COLOURS
+from learner.page.charts import COLOURS, MINUS
 from learner.page.parts import dot, section, time_text
 from learner.page.runs import Told
 
@@ -39,7 +39,8 @@ def _balance(told: Told, name: str, prefix: str, kinds: tuple[str, tuple[str, ..
             count = counts.get(prefix + part, 0)
             row += f'<td class="sign">{sign}</td><td class="number{"" if count else " none"}">{count:,}</td>'
         off = counts[prefix + whole] - sum(counts.get(prefix + part, 0) for part in parts)
-        verdict = '<td class="good">balances</td>' if not off else f'<td class="bad">off by {off:,}</td>'
+        wrong = f"off by {off:,}".replace("-", MINUS)
+        verdict = f'<td class="bad">{wrong}</td>' if off else '<td class="good">balances</td>'
         rows.append(f"<tr>{row}{verdict}</tr>")
     return f'<table class="ledger"><thead><tr>{heads}<th></th></tr></thead><tbody>{"".join(rows)}</tbody></table>'
 

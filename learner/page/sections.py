@@ -83,15 +83,12 @@ def curves(told: Told) -> str:
         legend = "".join(f"<li>{dot(line)}{escape(_legend(line))}</li>" for line in lines)
         if any(trace.kind == "dots" for trace in traces):
             legend += '<li><i class="ring"></i>greedy evaluations</li>'
-        drawn = chart(traces, *size, "env steps", f"Learning curves of {env}") if traces else _NO_EPISODE
+        drawn = chart(traces, *size, "env steps", f"Learning curves of {env}") if traces else ""
         panels.append(f'<figure><h3>{escape(env)}</h3><ul class="legend">{legend}</ul>{drawn}</figure>')
     about = f"Return, mean of the last {WINDOW} training episodes."
     if any(len(line.curves) > 1 for line in told.lines):
         about += " Bold: the mean over seeds. Band: from the worst to the best. Thin: each seed."
     return section("Learning curves", about, f'<div class="panels n{min(len(told.envs), 2)}">{"".join(panels)}</div>')
-
-
-_NO_EPISODE = '<p class="none">No episode has ended yet.</p>'
 
 
 def _legend(line: Line) -> str:
