@@ -1,0 +1,81 @@
+"""Whole runs of DQN on this machine: the same bytes and the same replay ratio, however many the workers, and with lag."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from learner.config import resolve
+from learner.metrics import read_rows
+from millrace.launch.local import train
+from protocol.errors import UsageError
+
+SMALL: dict[str, Any] = {
+    "algo": "dqn",
+    "preset": "none",
+    "transport": "inproc",
+    "seed": 3,
+    "rollout_steps": 16,
+    "learning_starts": 300,
+    "gradient_steps": 16,
+    "eval_episodes": 1,
+}
+BATCH = 8 * 16  # rows of an update, with those that are not valid
+
+
+def run(tmp_path: Path, **settings: Any) -> Path:
+    keywords = SMALL | {"steps": 3_000} | settings
+    name = "-".join(f"{value}" for value in settings.values() if not isinstance(value, dict)).replace("/", "_")
+    return train(resolve(keywords.pop("env", "CartPole-v1"), run_dir=str(tmp_path / name), **keywords), None, lambda _: None)
+
+
+def ratios(folder: Path) -> list[float]:
+    """Env steps per gradient step of each update that made any."""
+    rows = read_rows(folder / "metrics.jsonl")
+    return [ratio for row in rows if (ratio := row.get("replay/env_steps_per_gradient_step")) is not None]
+
+
+@pytest.mark.parametrize(
+    "settings", [{}, {"replay": "prioritized", "n_step": 3, "dueling": True, "normalize_observations": True}]
+)
+def test_the_same_curve_and_replay_ratio_whatever_the_number_of_workers(tmp_path: Path, settings: dict[str, Any]) -> None:
+    policies, found = {}, {}
+    for workers in (1, 2, 4):
+        folder = run(tmp_path, workers=workers, **settings)
+        policies[workers] = (folder / "policy.safetensors").read_bytes()
+        found[workers] = ratios(folder)
+        summary = json.loads((folder / "summary.json").read_text())
+        assert summary["updates"] > 20
+    assert policies[1] == policies[2] == policies[4]
+    assert found[1] == found[2] == found[4]
+    assert all(0.8 * BATCH <= 16 * ratio <= BATCH for ratio in found[1])
+
+
+@pytest.mark.parametrize("workers", [1, 4])
+def test_the_replay_ratio_holds_while_collecting_and_learning_overlap(tmp_path: Path, workers: int) -> None:
+    """With rollouts up to 4 versions old, a lane stands in a batch twice, or not at all; the ratio is the same."""
+    folder = run(tmp_path, workers=workers, max_lag=4, n_step=3)
+    rows = read_rows(folder / "metrics.jsonl")
+    made = rows[-1]["train/n_updates"]
+    assert made is not None
+    first = next(i for i, row in enumerate(rows) if row["train/n_updates"])
+    assert made == 16 * (len(rows) - first)
+    assert all(0.8 * BATCH <= 16 * ratio <= BATCH for ratio in ratios(folder))
+    sizes = [row["replay/size"] for row in rows]
+    assert sizes == [row["time/total_timesteps"] for row in rows]
+
+
+def test_images_are_learned_on(tmp_path: Path) -> None:
+    kwargs = {"observation": "nested", "action": "offset"}
+    folder = run(tmp_path, env="workers.envs.toy:Spaces-v0", env_kwargs=kwargs, steps=800, gradient_steps=2)
+    assert ratios(folder)
+
+
+def test_what_dqn_cannot_learn_is_refused_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(
+        UsageError, match=r"dqn: expected an action space Discrete\(n\), got box\[1\]; take --algo ppo for it"
+    ):
+        run(tmp_path, env="Pendulum-v1")
