@@ -325,6 +325,8 @@ def test_beyond_a_limit_it_is_over(index: int, limit: float, side: int) -> None:
         observation, reward, terminated, truncated, _ = env.step(push())
         assert (terminated, truncated, reward == 0) == (over, False, over)
         assert observation in env.observation_space
+        if part < 2 and index < 3:  # as it is, not as far as it may go
+            np.testing.assert_array_equal(observation, np.array(env.state, np.float32))
 
 
 def test_the_clock_truncates_and_does_not_terminate() -> None:
@@ -411,15 +413,21 @@ def test_a_picture() -> None:
     first = env.render()
     assert (first.shape, first.dtype) == ((400, 600, 3), np.uint8)
     assert len(np.unique(first.reshape(-1, 3), axis=0)) > 10
-    env.state = (-1.0, 0.3, -0.4, 0.0, 0.0, 0.0)
+    env.state = (-1.0, 0.3, 0.2, 0.0, 0.0, 0.0)
     env.step(push(1.0))
-    second = env.render()
+    second, (x, theta, phi, *_), metre = env.render(), env.state, 600 / 5.6  # the track, and 0.4 m on either side
     assert (first != second).any(2).sum() > 1000
-    background = first[0, 0]
-    middle = np.flatnonzero((second != background).any(2)[: round(400 * 0.6)].any(0)).mean()  # of the links
-    assert middle == pytest.approx(300 - 600 / 5.6, abs=25)
+    drawn = (second != second[0, 0]).any(2)
+    top = int(np.flatnonzero(drawn.any(1))[0])
+    tip = x + 0.5 * (np.sin(theta) + np.sin(phi))
+    assert np.flatnonzero(drawn[top]).mean() == pytest.approx(300 + metre * tip, abs=2)
+    joint, mass = 255, 10  # pixels: where the links begin, the radius of their ends
+    assert top == pytest.approx(joint - metre * 0.5 * (np.cos(theta) + np.cos(phi)) - mass, abs=2)
+    env.reset()
+    assert env.push == 0
     env.close()
     env.close()
+    assert env.render() is not None  # drawn on a new screen
 
 
 @pytest.mark.usefixtures("no_screen")
