@@ -53,10 +53,17 @@ class Recorded(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def record(
-    run: Path, dataset_id: str, steps: int, seed: int, *, stochastic: bool = False, npy: Path | None = None
+    run: Path,
+    dataset_id: str,
+    steps: int,
+    seed: int,
+    *,
+    stochastic: bool = False,
+    npy: Path | None = None,
+    best: bool = False,
 ) -> Recorded:
     """Play the policy of a run folder and write a dataset of so many steps. Raises `OurError`, and leaves nothing then."""
-    policy, spec, env_spec = load_policy(run)
+    policy, spec, env_spec = load_policy(run, "best" if best else "final")
     if npy is not None and not npy.parent.is_dir():
         raise UsageError(f"{npy} cannot be written: no such folder {npy.parent}")
     env = env_spec.make()

@@ -18,8 +18,7 @@ from __future__ import annotations
 import re
 import time
 from pathlib import Path
-from typing import Literal
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
 import numpy as np

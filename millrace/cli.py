@@ -133,7 +133,7 @@ def _evaluate(argv: list[str]) -> int:
     episodes = flags.episodes if flags.episodes is not None else 3 if flags.video else 100
     _at_least("episodes", episodes, 1)
     _at_least("seed", flags.seed, 0)
-    policy, spec, env = load_policy(flags.run)
+    policy, spec, env = load_policy(flags.run, "best" if flags.best else "final")
     if not flags.video:
         print(evaluate(env, policy, spec, episodes, flags.seed))
         return 0
@@ -152,7 +152,7 @@ def _record(argv: list[str]) -> int:
     flags = parse(RecordFlags, argv, "record")
     _at_least("steps", flags.steps, 1)
     _at_least("seed", flags.seed, 0)
-    print(record(flags.run, flags.out, flags.steps, flags.seed, stochastic=flags.stochastic, npy=flags.npy))
+    print(record(flags.run, flags.out, flags.steps, flags.seed, stochastic=flags.stochastic, npy=flags.npy, best=flags.best))
     if flags.npy is not None:
         print(f"rows of observation and action: {flags.npy}")
     return 0
@@ -182,6 +182,20 @@ def _plot(argv: list[str]) -> int:
     return 0
 
 
+def _presets(argv: list[str]) -> int:
+    if argv:
+        raise UsageError(f"presets: unexpected argument {argv[0]}")
+    from learner.config import named_presets, presets_of_environments
+
+    print("Taken by themselves, by environment and --algo:\n")
+    for algo, env in presets_of_environments():
+        print(f"  millrace train {env} --algo {algo}")
+    print("\nWhole runs by name:\n")
+    for name, preset in named_presets().items():
+        print(f"  millrace train --preset {name:24}  {preset.about}")
+    return 0
+
+
 def _at_least(name: str, value: int, least: int) -> None:
     if value < least:
         raise UsageError(f"{name} expected int >= {least}, got {value}")
@@ -196,6 +210,7 @@ COMMANDS = {
     "evaluate": Command(_evaluate, "evaluate RUN [--video] [flags]", "greedy episodes of a run's newest policy"),
     "record": Command(_record, "record RUN --out DATASET [flags]", "episodes of a run's newest policy as a Minari dataset"),
     "plot": Command(_plot, "plot RUN [RUN ...] [--out FILE]", "learning curves as a PNG"),
+    "presets": Command(_presets, "presets", "settings that are known to work, by environment and by name"),
     "report": Command(_report, "report RUN [RUN ...] [--out FILE]", "runs side by side as one HTML page"),
 }
 

@@ -17,6 +17,8 @@ class EvaluateFlags(msgspec.Struct, frozen=True, kw_only=True):
     """how many; if not given 100, and 3 with --video"""
     seed: int = 1_000_000
     """of the episodes; another seed, other episodes"""
+    best: bool = False
+    """of the policy that did best in the run's own evaluations (--eval-every), instead of the newest"""
     video: bool = False
     """film them: an mp4 of each in the run's videos folder (pip install 'millrace[video]')"""
     debug: bool = False
@@ -43,6 +45,8 @@ class RecordFlags(msgspec.Struct, frozen=True, kw_only=True):
     """the dataset's id, as in cartpole/expert-v0; it is written where MINARI_DATASETS_PATH says, or to ~/.minari/datasets"""
     steps: int = 50_000
     """env steps; the last episode is finished, and cut only where that would double them"""
+    best: bool = False
+    """the policy that did best in the run's own evaluations (--eval-every), instead of the newest"""
     npy: Path | None = None
     """also write this file: an array of rows [observation, action], float32, flattened, one for each step"""
     stochastic: bool = False

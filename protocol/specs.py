@@ -15,6 +15,7 @@ import msgspec
 
 from protocol.errors import UsageError
 
+OWN_ENVS = "workers.envs"  # the module that registers millrace/…: gymnasium imports it, as it would a user's own
 Scalar = bool | int | float | str
 
 
@@ -48,8 +49,9 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 raise UsageError(f"env factory {self.id}: expected it to return a gymnasium.Env, got {type(env).__name__}")
             return env
         try:
+            env_id = f"{OWN_ENVS}:{self.id}" if self.id.startswith("millrace/") else self.id
             # The checker is left out: it costs a tenth of a CartPole step, and `Rollout.validate` checks every row.
-            return gymnasium.make(self.id, disable_env_checker=True, **self.kwargs, **extra)  # type: ignore[arg-type]
+            return gymnasium.make(env_id, disable_env_checker=True, **self.kwargs, **extra)  # type: ignore[arg-type]
         except (gymnasium.error.Error, ImportError, TypeError) as error:  # TypeError: keyword arguments it does not take
             raise UsageError(_why_not_made(self.id, error)) from error
         except Exception as error:  # its own constructor raised, whatever that may be

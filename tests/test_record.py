@@ -160,6 +160,12 @@ def test_what_is_kept_is_a_copy() -> None:
     assert (assembler.waiting, assembler.left_out) == (0, 0)
 
 
+def test_the_episode_that_ended_first_comes_first() -> None:
+    ((_, rollout),) = lives([[[0, 0], [0, 1], [1, 0], [0, 1]]], steps=4)
+    episodes = EpisodeAssembler(taken).add(rollout, 0)
+    assert [(int(episode.obs[0][0, 1]), episode.length) for episode in episodes] == [(1, 2), (0, 3), (1, 1)]
+
+
 # ----------------------------------------------------------------------------------------------- a policy -> a dataset
 
 
@@ -280,6 +286,17 @@ def test_the_environment_comes_back_with_the_dataset_and_each_episode_can_be_rep
         assert np.array_equal(obs, episode.observations[-1])
         assert (terminated, truncated) == (episode.terminations[-1], episode.truncations[-1])
     env.close()
+
+
+def test_images_are_kept_as_they_are(root: Path) -> None:
+    env = Box()
+    env.observation_space = spaces.Box(0, 255, (8, 9, 3), np.uint8)
+    images = np.random.default_rng(0).integers(0, 256, (3, 8, 9, 3), np.uint8)
+    with dataset_module.MinariDataset("tests/images-v0", env, "two steps") as dataset:
+        flags = np.zeros(2, bool)
+        dataset.add(RecordedEpisode((images,), np.zeros((2, 2), np.float32), np.zeros(2), flags, flags))
+    (episode,) = read("tests/images-v0")
+    assert np.array_equal(episode.observations, images)
 
 
 def test_the_same_seed_plays_the_same_and_drawn_actions_are_not_the_most_probable(tmp_path: Path) -> None:
