@@ -159,6 +159,20 @@ def test_what_stands_for_the_value_after_an_end(terminated: bool, truncated: boo
     np.testing.assert_allclose(advantage[1], 2 + GAMMA * after - 20, rtol=1e-6)
 
 
+@pytest.mark.parametrize(("terminated", "truncated"), [(True, False), (False, True), (True, True)])
+def test_an_end_cuts(terminated: bool, truncated: bool) -> None:
+    """Even where no reset row stands between two episodes."""
+    o = three_steps(terminated, truncated)
+    r = o.rows._replace(valid=np.ones_like(o.rows.valid))
+    reward, values = r.reward.copy(), r.values.copy()
+    reward[3:] += 7
+    values[4:] += 5
+    found, later = on_policy(r).vtrace(), on_policy(r._replace(reward=reward, values=values)).vtrace()
+    for a, b in zip(found, later, strict=True):
+        assert a[2] != b[2]
+        np.testing.assert_array_equal(a[:2], b[:2])
+
+
 def test_the_advantage_looks_ahead_to_the_target_not_to_the_value() -> None:
     target, advantage = three_steps(True, False, ratio=0.5).vtrace()
     np.testing.assert_allclose(target[1], 2)
