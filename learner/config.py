@@ -81,6 +81,9 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     keep_checkpoints: Count = 3
     """how many of the newest checkpoints stay"""
 
+    record: str = ""
+    """id of a Minari dataset of every whole training episode, as cartpole/ppo-v0 (pip install 'millrace[record]')"""
+
     min_workers: Natural = 0
     """start when so many workers have joined; 0: all local workers, or the first one"""
     heartbeat_s: Seconds = 1.0

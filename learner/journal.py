@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import platform
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from importlib import metadata
 from typing import Any
@@ -25,10 +25,11 @@ from learner.evaluate import evaluate
 from learner.hub import Hub
 from learner.ledger import Ledger
 from learner.metrics import EpisodeWindow, Evaluation, MetricsLog, Progress
+from learner.record import TrainingRecorder
 from learner.run_folder import Best, RunFolder, Summary
 from protocol.errors import CheckpointError, RunError, UsageError
 from protocol.policy import make_policy
-from protocol.rollout import Batch
+from protocol.rollout import Batch, Rollout
 from protocol.specs import RunSpec
 
 log = logging.getLogger("millrace.learner")
@@ -108,6 +109,10 @@ class Journal:
         self._evaluate_at = past.env_steps + config.eval_every
         self._note = ""
         self._confirmed: Best | None = None
+        self._recorder: TrainingRecorder | None = None
+        if config.record:
+            about = f"All whole training episodes of millrace run {folder.path.resolve().name}, as acted."
+            self._recorder = TrainingRecorder(config.record, spec.env, spec.policy, about)
         self._workers_alive = 0
         self._best = past.best
         self._episodes_until_save = config.checkpoint_every_episodes
@@ -126,6 +131,11 @@ class Journal:
         one_more = self.spec.rollout_steps * self.config.envs
         enough = self.version > 0 and self.env_steps + one_more > self.config.steps
         return "all steps done" if enough else None
+
+    def gathered(self, rollouts: Sequence[Rollout]) -> None:
+        """Rollouts that are about to be learned from: keep their episodes, if they are to be recorded."""
+        if self._recorder is not None:
+            self._recorder.add(rollouts, self.hub.roster.lives)
 
     def updated(self, batch: Batch, metrics: Mapping[str, float], update_s: float) -> None:
         """An update was made and published: count, write, and now and then evaluate and checkpoint."""
@@ -217,8 +227,10 @@ class Journal:
         self._watch(self.progress())
 
     def close(self) -> None:
-        """Close the files."""
+        """Close the files, and the dataset if episodes were recorded: also when the run was cut short."""
         self._metrics.close()
+        if self._recorder is not None:
+            log.warning("%s", self._recorder.close())
 
     def progress(self) -> Progress:
         """How far the run is."""

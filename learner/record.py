@@ -11,7 +11,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -24,13 +24,14 @@ import numpy.typing as npt
 
 from learner.atomic import write_atomically
 from learner.dataset import MinariDataset
-from learner.episodes import RecordedEpisode
+from learner.episodes import EpisodeAssembler, RecordedEpisode
 from learner.evaluate import load_policy
 from protocol.distributions import distribution
 from protocol.errors import EnvironmentFailed, RunError, UsageError
 from protocol.policy import Policy
+from protocol.rollout import Rollout
 from protocol.spaces import reader, writer
-from protocol.specs import PolicySpec
+from protocol.specs import EnvSpec, PolicySpec
 
 Array = npt.NDArray[Any]
 
@@ -91,6 +92,41 @@ def record(
         return_std=float(np.std(returns)),
         cut=cut,
     )
+
+
+class TrainingRecorder:
+    """Every whole episode of training, as it was acted, into a dataset. What cannot be whole is counted."""
+
+    def __init__(self, dataset_id: str, env_spec: EnvSpec, spec: PolicySpec, about: str) -> None:
+        """Raises `UsageError` in one line where the dataset cannot be made."""
+        self._env = env_spec.make()
+        self._assembler = EpisodeAssembler(writer(spec.action))
+        self._id = dataset_id
+        self._episodes = 0
+        try:
+            self._dataset = MinariDataset(dataset_id, self._env, about)
+        except BaseException:
+            self._env.close()
+            raise
+
+    def add(self, rollouts: Sequence[Rollout], lives: Mapping[int, int]) -> None:
+        """Rollouts of an update; `lives`: the incarnation of the lane of each ticket."""
+        for rollout in rollouts:
+            for episode in self._assembler.add(rollout, lives[rollout.ticket]):
+                self._dataset.add(episode)
+                self._episodes += 1
+
+    def close(self) -> str:
+        """Write what there is; what it is, in one line. Without a whole episode there is no dataset."""
+        try:
+            if self._episodes:
+                self._dataset.close()
+            else:
+                self._dataset.discard()
+        finally:
+            self._env.close()
+        parts = self._assembler.waiting + self._assembler.left_out
+        return f"dataset {self._id}: {self._episodes:,} training episodes; {parts:,} steps of others left out"
 
 
 class Player:

@@ -95,6 +95,8 @@ class Roster:
         self.lanes = [Lane(n, incarnations[n] if incarnations else 0) for n in range(run.lanes)]
         self.tickets: dict[int, Ticket] = {}
         self.ready: list[Rollout] = []
+        self.lives: dict[int, int] = {}
+        """incarnation of the lane in which each rollout that is ready, or was taken last, was collected, by its ticket"""
         self.events: list[Event] = []
         self._weights: Weights | None = None
         self._next_session = first_session
@@ -184,13 +186,15 @@ class Roster:
 
     def take(self) -> list[Rollout] | None:
         """The rollouts of the next update, or None while there are too few. What is too stale is dropped and counted."""
-        for rollout in [r for r in self.ready if self.version - r.version > self.max_lag]:
-            self.ready.remove(rollout)
+        stale = [rollout for rollout in self.ready if self.version - rollout.version > self.max_lag]
+        self.ready = [rollout for rollout in self.ready if self.version - rollout.version <= self.max_lag]
+        for rollout in stale:
             self.ledger.stale += 1
             self.ledger.transitions_stale += rollout.env_steps
             self.lanes[rollout.lane].progress -= 1
         if len(self.ready) < self.rollouts_per_update:
             return None
+        self.lives = {rollout.ticket: self.lives[rollout.ticket] for rollout in self.ready}
         taken, self.ready = self.ready[: self.rollouts_per_update], self.ready[self.rollouts_per_update :]
         self.ledger.used += len(taken)
         self.ledger.transitions_used += sum(rollout.env_steps for rollout in taken)
@@ -273,6 +277,7 @@ class Roster:
         lane.outstanding.remove(ticket.number)
         lane.arrived(rollout.sequence)
         self.ready.append(rollout)
+        self.lives[ticket.number] = ticket.incarnation
         return self._offer(member) + self._deal()
 
     def _heartbeat(self, member: Member, heartbeat: Heartbeat) -> list[Out]:

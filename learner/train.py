@@ -31,6 +31,7 @@ def train(algorithm: Algorithm, hub: Hub, journal: Journal, workers: int) -> str
         except (RunError, Interrupted):
             journal.save()
             raise
+        journal.gathered(rollouts)
         began_s = time.monotonic()
         batch = stack(rollouts)
         metrics = algorithm.update(batch, hub.pulse)

@@ -107,6 +107,23 @@ def test_a_run_stops_at_a_mean_return_and_saves_every_so_many_episodes(tmp_path:
     assert len(list((folder / "checkpoints").iterdir())) >= 4
 
 
+def test_training_episodes_are_recorded_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    minari = pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
+    folder = run(tmp_path, "CartPole-v1", steps=3_000, max_lag=1, record="cartpole/training-v0", **SMALL)
+    dataset = minari.load_dataset("cartpole/training-v0")
+    episodes = list(dataset.iterate_episodes())
+    assert len(episodes) > 20
+    rows = read_rows(folder / "metrics.jsonl")
+    for episode in episodes:
+        assert len(episode.observations) == len(episode.rewards) + 1
+        assert bool(episode.terminations[-1]) or bool(episode.truncations[-1])
+        assert not (episode.terminations[:-1] | episode.truncations[:-1]).any()
+        assert np.abs(episode.observations[0]).max() <= 0.05, "it does not begin with a reset of CartPole"
+    assert dataset.total_steps <= rows[-1]["time/total_timesteps"]
+    assert dataset.total_steps > 0.8 * rows[-1]["time/total_timesteps"]
+
+
 def test_a_killed_worker_is_replaced_and_the_run_ends_well(tmp_path: Path) -> None:
     killed: list[int] = []
     back: list[int] = []
