@@ -208,16 +208,19 @@ def test_a_full_ring_keeps_the_newest_and_breaks_no_chain(seed: int, n_step: int
     assert min(lanes.rows) not in found
 
 
-def test_a_copy_whose_newest_observation_was_overwritten_begins_a_new_chain() -> None:
+@pytest.mark.parametrize("others", [2, 4])  # it is overwritten by the very rollout that would go on from it; was so before
+def test_a_copy_whose_newest_observation_is_overwritten_begins_a_new_chain(others: int) -> None:
     lanes = Lanes(0, ends=0.0)
     kept = replay(size=25, n_step=4)
     first = lanes.used(lanes.rollout(0))
     kept.add(first)
-    for _ in range(4):
+    for _ in range(others):
         kept.add(lanes.used(lanes.rollout(1)))
     again = lanes.used(lanes.rollout(0))  # begins where the first ended; that slot is another's by now
     kept.add(again)
-    assert set(again.obs[0][:-1].ravel().tolist()) <= check(kept.sample(1000), lanes, 4)
+    found = check(kept.sample(1000), lanes, 4)
+    assert set(again.obs[0][:-1].ravel().tolist()) <= found
+    assert len(found) == len(kept)
 
 
 def test_a_fresh_lane_cuts_even_where_observations_are_the_same() -> None:
@@ -343,8 +346,8 @@ def test_a_restored_replay_goes_on_to_the_bit(size: int, alpha: float | None) ->
         for a, b in zip(*drawn, strict=True):
             np.testing.assert_array_equal(a, b)
         for each in (first, second):
-            each.add(batch)
             each.reprioritise(drawn[0].slots, np.linspace(0, 3, 50, dtype=np.float32))
+            each.add(batch)
         assert len(first) == len(second)
     check(second.sample(500), lanes, 3)
 

@@ -202,7 +202,7 @@ class Replay:
         return reward, discount, at
 
     def reprioritise(self, slots: Ints, error: Floats) -> None:
-        """Draw these transitions [B] from now on by the size of their errors [B]."""
+        """Draw these transitions [B], none added since they were drawn, from now on by the size of their errors [B]."""
         if self._tree is None or self._alpha is None:
             return
         priority = np.abs(error).astype(np.float64) + TINY
