@@ -239,6 +239,31 @@ def test_a_fresh_lane_cuts_even_where_observations_are_the_same() -> None:
     assert drawn.discount[drawn.leaves[0][:, 0] == first.obs[0][0, 0, 0]] == pytest.approx(GAMMA**4)
 
 
+def test_nothing_goes_on_from_an_end_even_where_observations_are_the_same() -> None:
+    """The rollout that reset the copy was dropped, and the next one begins as the truncated episode ended."""
+    lanes, kept = Lanes(0, lanes=1, copies=1, T=2, ends=0.0), replay(n_step=4)
+    first, second = lanes.rollout(0), lanes.rollout(0)
+    first.truncated[-1] = True
+    kept.add(first)
+    kept.add(second)
+    drawn = kept.sample(100)
+    assert drawn.discount[drawn.leaves[0][:, 0] == first.obs[0][0, 0, 0]] == pytest.approx(GAMMA**2)
+    assert len(kept) == 4
+
+
+def test_an_observation_stands_once_and_only_where_it_is_needed() -> None:
+    """One slot for each row, for each end by the clock alone, and for the newest observation of each copy that goes on."""
+    lanes, kept = Lanes(4, ends=0.3), replay()
+    rows = clocks = 0
+    for _ in range(5):
+        batch = side_by_side(lanes.rollout(0), lanes.rollout(1))
+        kept.add(batch)
+        rows += batch.env_steps
+        clocks += int(np.count_nonzero(batch.truncated & ~batch.terminated))
+        newest = np.count_nonzero(batch.valid[-1] & ~(batch.terminated | batch.truncated)[-1])
+        assert kept._written == rows + clocks + newest
+
+
 @pytest.mark.parametrize("alpha", [None, 0.6])
 def test_rows_that_are_not_valid_are_never_kept(alpha: float | None) -> None:
     lanes = Lanes(3, ends=0.3)

@@ -198,7 +198,7 @@ class Replay:
             reward += np.where(going, discount * self._reward[at], 0)
             discount = np.where(going, discount * self._gamma * ~terminated, discount)
             at = np.where(going, self._follows[at], at)
-            going &= ~terminated & self._is_row[at]
+            going &= self._is_row[at]  # a row that terminated leads to itself, worth nothing more
         return reward, discount, at
 
     def reprioritise(self, slots: Ints, error: Floats) -> None:
