@@ -115,8 +115,10 @@ class REINFORCEConfig(ActorCriticHyperparameters, frozen=True):
 
     rollout_steps: Count = 1001
     """T, steps of each env copy in a rollout: more than an episode can have"""
-    learning_rate: Positive = 1e-3
+    learning_rate: Positive = 2e-3
     """step size of the optimiser"""
+    normalize_rewards: bool = True
+    """divide rewards by the running standard deviation of the discounted return; else the baseline drowns the gradient"""
     optimizer: Optimizer = "adam"
     """rmsprop (α 0.99) or adam; ε is 1e-5"""
     baseline: bool = True

@@ -19,7 +19,7 @@ from protocol.rollout import Batch
 from protocol.specs import PolicySpec
 from tests.batches import DISCRETE, GAUSSIAN, batch, no_pulse, normal, shared
 
-FREE: dict[str, Any] = {"max_grad_norm": 1e9, "gamma": 0.9, "ent_coef": 0.01}
+FREE: dict[str, Any] = {"max_grad_norm": 1e9, "gamma": 0.9, "ent_coef": 0.01, "normalize_rewards": False}
 
 
 def a2c(spec: PolicySpec = DISCRETE, **settings: Any) -> A2C:
@@ -67,7 +67,7 @@ def test_an_update_is_one_step_on_all_valid_rows(monkeypatch: pytest.MonkeyPatch
 @pytest.mark.parametrize("normalize", [True, False])
 def test_its_gradient_is_that_of_ppos_first_minibatch(spec: PolicySpec, normalize: bool) -> None:
     """Where the policy has not moved, the clipped surrogate is the policy gradient."""
-    settings = {**FREE, "gae_lambda": 0.8, "normalize_advantage": normalize, "normalize_rewards": True}
+    settings = FREE | {"gae_lambda": 0.8, "normalize_advantage": normalize, "normalize_rewards": True}
     one, other = a2c(spec, **settings), ppo(spec, **settings)
     assert torch.equal(one.net.flat, other.net.flat)
     rows = batch(one, 0)

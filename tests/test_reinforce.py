@@ -24,6 +24,7 @@ GAMMA = 0.9
 
 
 def reinforce(spec: PolicySpec = DISCRETE, **settings: Any) -> REINFORCE:
+    settings = {"normalize_rewards": False, **settings}
     return REINFORCE(REINFORCEConfig(gamma=GAMMA, **settings), spec, total_steps=10_000, seed=0)
 
 
