@@ -223,7 +223,7 @@ def test_a_step_follows_the_gradient_of_the_usual_loss(dueling: bool) -> None:
         ({}, None),
         ({"max_grad_norm": 0.01}, "norm"),
         ({"max_grad_value": 0.01}, "value"),
-        ({"max_grad_norm": 0.01, "max_grad_value": 0.001}, "both"),
+        ({"max_grad_norm": 0.01, "max_grad_value": 0.005}, "both"),
     ],
 )
 def test_gradients_are_shortened_and_cut_as_asked(settings: dict[str, Any], bound: str | None) -> None:
@@ -236,14 +236,28 @@ def test_gradients_are_shortened_and_cut_as_asked(settings: dict[str, Any], boun
     if bound is None:
         assert gradient.norm().item() == pytest.approx(measured.grad_norm, rel=1e-4)
     if bound in ("norm", "both"):
-        assert gradient.norm().item() <= 0.01 * 1.0001
-    if bound == "norm":
         assert gradient.norm().item() == pytest.approx(0.01, rel=1e-4)
-    if bound in ("value", "both"):
-        limit = 0.01 if bound == "value" else 0.001
-        assert gradient.abs().max().item() <= limit * 1.0001
+    if bound == "both":  # cut first: the largest entries are as large as one another
+        assert (gradient.abs() > 0.999 * gradient.abs().max()).sum() > 10
     if bound == "value":
         assert gradient.abs().max().item() == pytest.approx(0.01, rel=1e-4)
+
+
+def test_optimisers_differ_as_they_should() -> None:
+    settings: dict[str, dict[str, Any]] = {"adam": {}, "amsgrad": {"amsgrad": True}, "adamw": {"optimizer": "adamw"}}
+    made = {name: dqn(changed(PLAIN, **own)) for name, own in settings.items()}
+    start = made["adam"].net.flat.clone()
+    for each in made.values():
+        each.replay.add(batch(0))
+        each.step(each.replay.sample(64))
+    adam = made["adam"].net.flat
+    torch.testing.assert_close(
+        made["adamw"].net.flat - adam, -start * made["adam"].config.learning_rate * 0.01, atol=1e-7, rtol=0.1
+    )
+    assert not torch.equal(made["adamw"].net.flat, adam)
+    assert {name for name, each in made.items() if "max_exp_avg_sq" in each.state_dict()["optimizer"]["state"][0]} == {
+        "amsgrad"
+    }
 
 
 def test_a_polyak_target_follows_at_every_gradient_step() -> None:
