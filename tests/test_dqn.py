@@ -331,6 +331,21 @@ def test_it_is_an_algorithm() -> None:
     assert algorithm.weights()[0].dtype == algorithm.weights()[1].dtype == np.float32
 
 
+def test_weights_are_snapshots() -> None:
+    made = dqn(EVERYTHING)
+    parameters, buffers = made.weights()
+    before = parameters.copy(), buffers.copy()
+    for seed in range(3):
+        made.update(batch(seed), no_pulse)
+    np.testing.assert_array_equal(parameters, before[0])
+    np.testing.assert_array_equal(buffers, before[1])
+    assert not (made.weights()[0] == parameters).all()
+    for array, again in zip(made.weights(), made.weights(), strict=True):
+        array[:] = 7
+        assert not (again == 7).any()
+    assert not any((array == 7).any() for array in made.weights())
+
+
 def test_what_is_published_acts_as_the_network_and_explores_by_epsilon() -> None:
     made = dqn(changed(EVERYTHING, epsilon_start=0.75, epsilon_end=0.25, epsilon_steps=10**6))
     for seed in range(2):
