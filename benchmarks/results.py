@@ -19,8 +19,8 @@ from learner.run_folder import RunFolder, Summary
 OUT = Path(__file__).parents[1] / "docs" / "results.md"
 HEAD = """# Results
 
-Greedy episodes, each seed's mean return over 100 of them (or as the command says). *Best* is the policy that did best in the run's own evaluations,
-tried again on other episodes than those it was chosen by; *final* is the last one. Made by
+Greedy episodes, each seed's mean return over 100 of them (or as the command says). *Best* is the policy that did best in the
+run's own evaluations, tried again on other episodes than those it was chosen by; *final* is the last one. Made by
 `python -m benchmarks.results RUN …` from run folders.
 
 | environment | algorithm | env steps | best | final | seconds | command (for each seed) |
@@ -68,13 +68,7 @@ def main() -> None:
             groups[command(config)].append((config, summary))
     rows = [row(runs) for _, runs in sorted(groups.items(), key=lambda item: (item[1][0][0].env, item[1][0][0].algo))]
     versions = sorted({", ".join(f"{k} {v}" for k, v in s.versions.items()) for runs in groups.values() for _, s in runs})
-    OUT.write_text(
-        HEAD
-        + "\n".join(rows)
-        + "\n\nTwo cores, no GPU, shared with other work while most of these ran: read the seconds as upper bounds. Versions: "
-        + "; ".join(versions)
-        + ".\n"
-    )
+    OUT.write_text(HEAD + "\n".join(rows) + "\n\nTwo cores, no GPU. Versions: " + "; ".join(versions) + ".\n")
     print(OUT)
 
 
