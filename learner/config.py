@@ -18,7 +18,7 @@ import tomli_w
 from msgspec import Meta
 from tyro.conf import Positional
 
-from learner.hyperparameters import HYPERPARAMETERS, Hyperparameters, PPOConfig
+from learner.hyperparameters import HYPERPARAMETERS, Hyperparameters, PPOConfig, elsewhere
 from learner.nearest import nearest
 from protocol.errors import UsageError
 from protocol.link import check_address
@@ -196,7 +196,7 @@ def over(config: Config, values: Mapping[str, Any], where: str) -> Config:
         elif name in plain and name != "algorithm":
             plain[name] = _fitting(config, name, value)
         else:
-            raise UsageError(f"{where}: unknown setting {name}{nearest(name, [*plain, *own])}")
+            raise UsageError(f"{where}: unknown setting {name}{elsewhere(name) or nearest(name, [*plain, *own])}")
     return _typed(plain, where)
 
 
@@ -275,5 +275,11 @@ def _what_is_wrong(plain: dict[str, Any], says: str) -> str:
     record = HYPERPARAMETERS[plain["algo"]] if name in plain["algorithm"] else Config
     got = plain["algorithm"].get(name, plain.get(name))
     if expected.startswith("Invalid enum value"):
-        return f"{name} expected one of {', '.join(get_args(get_type_hints(record)[name]))}, got {got!r}"
+        return f"{name} expected one of {', '.join(_choices(get_type_hints(record)[name]))}, got {got!r}"
     return f"{name} {expected.replace('`', '').replace('Expected', 'expected').partition(', got ')[0]}, got {got!r}"
+
+
+def _choices(hint: Any) -> list[str]:
+    """What a Literal allows, or a Literal or None."""
+    found = [_choices(part) if get_args(part) else ["none" if part is type(None) else str(part)] for part in get_args(hint)]
+    return [choice for choices in found for choice in choices]

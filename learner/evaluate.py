@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from learner.metrics import Evaluation
 from learner.run_folder import RunFolder, Which
+from protocol.core import zero_state
 from protocol.distributions import distribution
 from protocol.errors import EnvironmentFailed
 from protocol.policy import Policy, make_policy
@@ -100,12 +101,16 @@ def _play(
     quotas = [episodes // len(envs) + (i < episodes % len(envs)) for i in range(len(envs))]
     playing = [_Copy(env, int(own), quota) for env, own, quota in zip(envs, seeds, quotas, strict=True)]
     done: list[tuple[float, int, bool]] = []
+    state = zero_state(spec, 1, len(playing))
     while playing:
         pulse()
         rows = zip(*(read(copy.obs) for copy in playing), strict=True)
         leaves = [np.asarray(row, dtype)[None] for row, dtype in zip(rows, dtypes, strict=True)]  # [1, N, *leaf]
-        actions = write(mode(policy(leaves)[0]))  # [N, *action]
-        done += [end for copy, action in zip(playing, actions, strict=True) if (end := copy.step(action)) is not None]
+        actions = write(mode(policy(leaves, state)[0]))  # [N, *action]
+        ends = [copy.step(action) for copy, action in zip(playing, actions, strict=True)]
+        done += [end for end in ends if end is not None]
+        state[0, [end is not None for end in ends]] = 0.0
+        state = state[:, [copy.left > 0 for copy in playing]]
         playing = [copy for copy in playing if copy.left]
     returns, lengths, cuts = zip(*done, strict=True)
     return list(returns), list(lengths), sum(cuts)

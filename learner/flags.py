@@ -15,6 +15,7 @@ import tyro
 from tyro.conf import OmitArgPrefixes, PositionalMetavarFromFieldName
 
 from learner.config import Config, checked, lower_layers, over
+from learner.hyperparameters import elsewhere
 from learner.nearest import nearest
 from protocol.errors import UsageError
 
@@ -82,7 +83,9 @@ def parse(kind: type[Record], argv: list[str], command: str, default: Record | N
         flag = next((word for word in unknown if word.startswith("-")), None)
         if flag is None:
             raise UsageError(f"{command}: unexpected argument {unknown[0]}")
-        raise UsageError(f"{command}: unknown flag {flag}{nearest(flag.lstrip('-'), _names(kind, default), '--')}")
+        name = flag.lstrip("-")
+        other = elsewhere(name.replace("-", "_")) if issubclass(kind, Config) else ""
+        raise UsageError(f"{command}: unknown flag {flag}{other or nearest(name, _names(kind, default), '--')}")
     return record
 
 

@@ -53,7 +53,16 @@ class ActorCriticHyperparameters(Hyperparameters, frozen=True):
     """divide rewards by the running standard deviation of the discounted return"""
 
 
-class PPOConfig(ActorCriticHyperparameters, frozen=True):
+class RecurrentHyperparameters(ActorCriticHyperparameters, frozen=True):
+    """What every algorithm has whose policy can remember: it learns from rows in their order."""
+
+    core: Literal["lstm", "gru"] | None = None
+    """what remembers the episode so far, before the hidden layers; minibatches are then whole columns of env copies"""
+    core_size: Count = 64
+    """units of the core"""
+
+
+class PPOConfig(RecurrentHyperparameters, frozen=True):
     """Proximal policy optimisation."""
 
     batch_size: Count = 64
@@ -74,7 +83,7 @@ class PPOConfig(ActorCriticHyperparameters, frozen=True):
     """stop the update once the policy moved further than 1.5 times this"""
 
 
-class A2CConfig(ActorCriticHyperparameters, frozen=True):
+class A2CConfig(RecurrentHyperparameters, frozen=True):
     """Advantage actor-critic: one gradient step on each batch."""
 
     rollout_steps: Count = 8
@@ -89,7 +98,7 @@ class A2CConfig(ActorCriticHyperparameters, frozen=True):
     """advantages of a batch get mean 0 and standard deviation 1"""
 
 
-class ImpalaConfig(ActorCriticHyperparameters, frozen=True):
+class ImpalaConfig(RecurrentHyperparameters, frozen=True):
     """Actor-critic with V-trace: learns from rollouts of older weights too (max_lag above 0)."""
 
     rollout_steps: Count = 32
@@ -191,3 +200,9 @@ HYPERPARAMETERS: dict[str, type[Hyperparameters]] = {
     "impala": ImpalaConfig,
     "reinforce": REINFORCEConfig,
 }
+
+
+def elsewhere(name: str) -> str:
+    """`; … have it` if a setting is one of other algorithms, else nothing."""
+    owners = [algo for algo, record in HYPERPARAMETERS.items() if name in record.__struct_fields__]
+    return f"; it is one of {', '.join(owners)} alone" if owners else ""

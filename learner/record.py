@@ -26,6 +26,7 @@ from learner.atomic import write_atomically
 from learner.dataset import MinariDataset
 from learner.episodes import EpisodeAssembler, RecordedEpisode
 from learner.evaluate import load_policy
+from protocol.core import zero_state
 from protocol.distributions import distribution
 from protocol.errors import EnvironmentFailed, RunError, UsageError
 from protocol.policy import Policy
@@ -150,6 +151,7 @@ class Player:
         actions: list[Any] = []
         try:
             observation, _ = self._env.reset(seed=seed)
+            self._state = zero_state(self._spec, 1, 1)
             seen = [self._leaves(observation)]
             while not flags or not any(flags[-1]):
                 action = self._act(seen[-1])
@@ -178,7 +180,7 @@ class Player:
 
     def _act(self, leaves: list[Array]) -> Any:
         """What the environment takes."""
-        params = self._policy([leaf[None, None] for leaf in leaves])[0]  # [1, P]
+        params = self._policy([leaf[None, None] for leaf in leaves], self._state)[0]  # [1, P]
         if not self._stochastic:
             return self._write(self._distribution.mode(params))[0]
         return self._write(self._distribution.sample(params, self._distribution.noise(self._generator, (1,))))[0]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from protocol.core import zero_state
 from protocol.distributions import LOG_SQRT_2PI
 from protocol.policy import (
     Field,
@@ -35,6 +36,14 @@ from protocol.specs import ActionSpec, PolicySpec
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
+
+
+class Memory(NamedTuple):
+    """What a core needs besides T steps of C columns, which lie in time order [T · C, …]."""
+
+    state: Tensor  # [C, S] float32, before the first step
+    carried: Tensor  # [T, C] float32: 0 where an episode begins, and the state with it, else 1
+    wanted: Tensor | None = None  # [B] int64, the rows of T · C that come out; None: all
 
 
 class MLP(torch.autograd.Function):
@@ -131,9 +140,23 @@ class FlatNetwork:
             parts.append(F.relu(F.linear(h.flatten(1), weight, bias)))
         return torch.cat(parts, -1) if images else x
 
+    def core(self, x: Tensor, memory: Memory) -> tuple[Tensor, Tensor]:
+        """Inputs [T · C, D] -> what the core says of them [T · C, H], and its state after the last [C, S]; see `core.py`."""
+        weights = [self.parameters[f"core.{side}.{kind}"] for kind in ("weight", "bias") for side in ("input", "state")]
+        found, state = [], memory.state
+        for step, carried in zip(x.view(*memory.carried.shape, -1), memory.carried.unsqueeze(-1), strict=True):
+            state = state * carried
+            if self.spec.core == "lstm":
+                h, c = torch.lstm_cell(step, state.chunk(2, -1), *weights)
+                state = torch.cat((h, c), -1)
+            else:
+                h = state = torch.gru_cell(step, state, *weights)
+            found.append(h)
+        return torch.cat(found), state
+
 
 class ActorCritic(FlatNetwork):
-    """An actor and a critic: an MLP each, or two heads on one."""
+    """An actor and a critic: an MLP each, or two heads on one; both on one core, if there is one."""
 
     def __init__(self, spec: PolicySpec, device: str | torch.device = "cpu", *, seed: int = 0) -> None:
         super().__init__(spec, device, seed=seed)
@@ -148,21 +171,35 @@ class ActorCritic(FlatNetwork):
             return out
         return torch.cat([out, self.parameters["actor.log_std"].expand_as(out)], -1)
 
-    def _common(self, x: Tensor, images: Sequence[Tensor]) -> Tensor:
-        return self.hidden(self.inputs(x, images), self._trunk)
+    def _common(self, x: Tensor, images: Sequence[Tensor], memory: Memory | None) -> Tensor:
+        h = self.inputs(x, images)
+        if memory is not None:
+            h, _ = self.core(h, memory)
+            h = h if memory.wanted is None else h[memory.wanted]
+        return self.hidden(h, self._trunk)
 
-    def forward(self, x: Tensor, images: Sequence[Tensor] = ()) -> tuple[Tensor, Tensor]:
-        """Features [B, D] float32 and images [B, *leaf] uint8 -> distribution params [B, P], value [B]."""
-        h = self._common(x, images)
+    def forward(self, x: Tensor, images: Sequence[Tensor] = (), memory: Memory | None = None) -> tuple[Tensor, Tensor]:
+        """Features [B, D] float32 and images [B, *leaf] uint8 -> distribution params [B, P], value [B].
+
+        With a core they are [T · C, …] and `memory` tells how they follow each other, and which B of them are wanted.
+        """
+        h = self._common(x, images, memory)
         return self._params(h), self.mlp(h, self._critic)[:, 0]
 
-    def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
+    def params(self, x: Tensor, images: Sequence[Tensor] = (), memory: Memory | None = None) -> Tensor:
         """Distribution params [B, P] alone."""
-        return self._params(self._common(x, images))
+        return self._params(self._common(x, images, memory))
 
-    def value(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
+    def value(self, x: Tensor, images: Sequence[Tensor] = (), memory: Memory | None = None) -> Tensor:
         """Value [B] alone."""
-        return self.mlp(self._common(x, images), self._critic)[:, 0]
+        return self.mlp(self._common(x, images, memory), self._critic)[:, 0]
+
+    def act(self, x: Tensor, images: Sequence[Tensor], state: Tensor) -> tuple[Tensor, Tensor]:
+        """Distribution params [B, P] of one step of B copies, and the core's state after it [B, S]."""
+        h = self.inputs(x, images)
+        if self.spec.core is not None:
+            h, state = self.core(h, Memory(state, torch.ones(1, len(x))))
+        return self._params(self.hidden(h, self._trunk)), state
 
 
 class QNetwork(FlatNetwork):
@@ -237,18 +274,24 @@ class TorchPolicy:
         np.copyto(self._net.flat.numpy()[:count], parameters)
         self._buffers = views(buffers, buffer_fields(self.spec))
 
-    def __call__(self, leaves: Sequence[Array]) -> Floats:
-        """Distribution parameters [L, N, P] of the actions in these observations [L, N, *leaf]."""
+    def __call__(self, leaves: Sequence[Array], state: Floats | None = None) -> Floats:
+        """Distribution parameters [L, N, P] of the actions in these observations [L, N, *leaf]; see `Policy`."""
         x = features(self.spec, leaves)
         if self.spec.normalize_observations:
             x = normalized(x, self._buffers["observation_mean"], self._buffers["observation_std"])
         images = [array for leaf, array in zip(self.spec.observation, leaves, strict=True) if leaf.is_image]
-        with torch.no_grad():
-            lanes = [
-                self._net.params(torch.tensor(x[lane]), [torch.tensor(image[lane]) for image in images])
-                for lane in range(len(x))
-            ]
-            out = np.asarray(torch.stack(lanes).numpy())
+        state = zero_state(self.spec, *x.shape[:-1]) if state is None else state
+        out = np.stack([self._lane(x[lane], [image[lane] for image in images], state[lane]) for lane in range(len(x))])
         if self.spec.head != "q":
             return out
         return np.concatenate([out, np.broadcast_to(self._buffers["epsilon"], (*out.shape[:-1], 1))], -1)
+
+    def _lane(self, x: Floats, images: Sequence[Array], state: Floats) -> Floats:
+        """Of one lane: [N, D], [N, *leaf] each, [N, S], which is moved on -> [N, P]."""
+        inputs = torch.tensor(x), [torch.tensor(image) for image in images]
+        with torch.no_grad():
+            if isinstance(self._net, QNetwork):
+                return np.asarray(self._net.params(*inputs).numpy())
+            params, after = self._net.act(*inputs, torch.tensor(state))
+        state[:] = after.numpy()
+        return np.asarray(params.numpy())

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from protocol.core import advance, core_shapes, zero_state
 from protocol.distributions import distribution
 from protocol.specs import Leaf, PolicySpec
 
@@ -89,6 +90,10 @@ def layout(spec: PolicySpec) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
             channels = conv.channels
         acting += _linear(f"image{i}.out", flattened, IMAGE_FEATURES, math.sqrt(2))
         width += IMAGE_FEATURES
+    if spec.core is not None:
+        from_input, from_state = core_shapes(spec, width)
+        acting += [*_linear("core.input", *from_input[::-1], 1.0), *_linear("core.state", *from_state[::-1], 1.0)]
+        width = spec.core_size
     hidden, last = _hidden(_trunk(spec), width, spec.net)
     acting += hidden
     action = spec.action
@@ -192,19 +197,22 @@ def buffer_size(spec: PolicySpec) -> int:
 
 
 class Policy(Protocol):
-    """What a collector acts with. Leaves are [L, N, *leaf]; params are [L, N, P] float32."""
+    """What a collector acts with. Leaves are [L, N, *leaf]; params are [L, N, P] float32.
+
+    `state` [L, N, S] float32 is what a policy with a core remembers, and is moved on in place (`protocol.core`).
+    """
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
         """Act with these from now on."""
         ...
 
-    def __call__(self, leaves: Sequence[Array]) -> Floats:
-        """Distribution parameters of the actions in these observations."""
+    def __call__(self, leaves: Sequence[Array], state: Floats | None = None) -> Floats:
+        """Distribution parameters of the actions in these observations. No state: the first of their episodes."""
         ...
 
 
 class NumpyPolicy:
-    """The forward pass of an MLP policy: tanh or ReLU layers, a linear head."""
+    """The forward pass of an MLP policy: a core if it has one, tanh or ReLU layers, a linear head."""
 
     def __init__(self, spec: PolicySpec) -> None:
         self.spec = spec
@@ -228,11 +236,13 @@ class NumpyPolicy:
     def _linear(self, name: str) -> tuple[Floats, Floats]:
         return self._parameters[f"{name}.weight"].T, self._parameters[f"{name}.bias"]
 
-    def __call__(self, leaves: Sequence[Array]) -> Floats:
-        """Distribution parameters [L, N, P] of the actions in these observations [L, N, *leaf]."""
+    def __call__(self, leaves: Sequence[Array], state: Floats | None = None) -> Floats:
+        """Distribution parameters [L, N, P] of the actions in these observations [L, N, *leaf]; see `Policy`."""
         x = features(self.spec, leaves)
         if self.spec.normalize_observations:
             x = normalized(x, self._buffers["observation_mean"], self._buffers["observation_std"])
+        if self.spec.core is not None:
+            x = advance(self.spec, self._parameters, x, zero_state(self.spec, *x.shape[:-1]) if state is None else state)
         relu = self.spec.activation == "relu"
         for w, b in self._hidden:
             x = np.matmul(x, w)

@@ -59,6 +59,8 @@ class Rollout(msgspec.Struct, frozen=True, tag=True, forbid_unknown_fields=True)
     """[T, N] bool: the clock ended, bootstrap from obs[t+1]"""
     valid: Array
     """[T, N] bool: False on the one row in which a finished copy resets"""
+    state: Array
+    """[N, S] float32: what the policy's core remembered before obs[0]; S is 0 without one"""
     episodes: tuple[Episode, ...] = ()
 
     @property
@@ -78,6 +80,7 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
         ("terminated", rollout.terminated, (T, N), "bool"),
         ("truncated", rollout.truncated, (T, N), "bool"),
         ("valid", rollout.valid, (T, N), "bool"),
+        ("state", rollout.state[None], (1, N, run.policy.state_size), "float32"),  # [step, copy, …], as errors name it
     ]
     if len(rollout.obs) != len(run.policy.observation):
         raise BadRollout(f"obs expected {len(run.policy.observation)} arrays, got {len(rollout.obs)}")
@@ -140,6 +143,8 @@ class Batch(msgspec.Struct, frozen=True):
     truncated: Bools
     valid: Bools
     """[T, ΣN] each"""
+    state: Floats
+    """[ΣN, S] what the policy's core remembered before obs[0]"""
     lane: npt.NDArray[np.int64]
     """[ΣN] the lane of each column"""
     fresh: Bools
@@ -170,6 +175,7 @@ def stack(rollouts: Sequence[Rollout]) -> Batch:
         terminated=side_by_side([row.terminated for row in rows]),
         truncated=side_by_side([row.truncated for row in rows]),
         valid=side_by_side([row.valid for row in rows]),
+        state=np.concatenate([row.state for row in rows]),
         lane=np.repeat([row.lane for row in rows], copies),
         fresh=np.repeat([row.sequence == 0 for row in rows], copies),
         copies=copies,

@@ -140,6 +140,15 @@ class PolicySpec(msgspec.Struct, frozen=True):
     """actor and critic share their hidden layers"""
     dueling: bool = False
     """action values are a state's value and each action's advantage over the mean (Wang et al. 2016)"""
+    core: Literal["lstm", "gru"] | None = None
+    """what remembers, between an observation's features and the hidden layers; none: nothing is remembered"""
+    core_size: int = 64
+    """units of the core"""
+
+    @property
+    def state_size(self) -> int:
+        """S, how many numbers an env copy carries from one observation to the next: the core's memory."""
+        return 0 if self.core is None else self.core_size * (2 if self.core == "lstm" else 1)
 
     @property
     def needs_torch(self) -> bool:

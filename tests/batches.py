@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import msgspec
 import numpy as np
@@ -38,8 +38,23 @@ def shared(spec: PolicySpec) -> PolicySpec:
     return msgspec.structs.replace(spec, shared_net=True)
 
 
+def recurrent(spec: PolicySpec, core: Literal["lstm", "gru"]) -> PolicySpec:
+    return msgspec.structs.replace(spec, core=core, core_size=8)
+
+
 def no_pulse() -> None:
     pass
+
+
+def remembering(algorithm: Acting, obs: Array, valid: Array, state: Array) -> Array:
+    """Params [T, N, P] of the algorithm's policy, which begins with `state` [N, S] and forgets by the law of a row."""
+    policy = NumpyPolicy(algorithm.policy)
+    policy.load(*algorithm.weights())
+    now, found = state[None].copy(), []
+    for step, row in zip(obs, valid, strict=True):
+        found.append(policy([step[None]], now)[0])
+        now[0, ~row] = 0
+    return np.stack(found)
 
 
 def batch(algorithm: Acting, seed: int, fresh: bool = False, steps: int = T) -> Batch:
@@ -48,20 +63,19 @@ def batch(algorithm: Acting, seed: int, fresh: bool = False, steps: int = T) -> 
     N = LANES * COPIES
     spec = algorithm.policy
     obs: list[Array] = [generator.normal(2, 3, (steps + 1, N, 4)).astype(np.float32)]
-    if spec.needs_torch:
-        obs.append(generator.integers(0, 256, (steps + 1, N, 8, 8, 1), dtype=np.uint8))
-        params = np.zeros((steps, N, 4), np.float32)
-    else:
-        policy = NumpyPolicy(spec)
-        policy.load(*algorithm.weights())
-        params = policy([leaf[:-1] for leaf in obs])
-    over = distribution(spec)
-    action = over.sample(params, over.noise(generator, (steps, N)))
     ends, kind = generator.random((steps, N)) < 0.15, generator.random((steps, N)) < 0.5
     valid = np.ones((steps, N), bool)
     for t in range(1, steps):
         valid[t] = ~ends[t - 1]
         ends[t] &= valid[t]
+    state = generator.uniform(-0.5, 0.5, (N, spec.state_size)).astype(np.float32)
+    if spec.needs_torch:
+        obs.append(generator.integers(0, 256, (steps + 1, N, 8, 8, 1), dtype=np.uint8))
+        params = np.zeros((steps, N, 4), np.float32)
+    else:
+        params = remembering(algorithm, obs[0][:-1], valid, state)
+    over = distribution(spec)
+    action = over.sample(params, over.noise(generator, (steps, N)))
     return Batch(
         obs=tuple(obs),
         action=action,
@@ -70,6 +84,7 @@ def batch(algorithm: Acting, seed: int, fresh: bool = False, steps: int = T) -> 
         terminated=ends & kind,
         truncated=ends & ~kind,
         valid=valid,
+        state=state,
         lane=np.repeat(np.arange(LANES), COPIES),
         fresh=np.full(N, fresh),
         copies=COPIES,
@@ -82,12 +97,11 @@ def identity_batch(algorithm: Acting, generator: np.random.Generator) -> tuple[B
     steps, N, spec = 32, 8, algorithm.policy
     choice = generator.integers(0, 4, (steps + 1, N))
     obs = np.eye(4, dtype=np.float32)[choice]
-    policy, over = NumpyPolicy(spec), distribution(spec)
-    policy.load(*algorithm.weights())
-    params = policy([obs[:-1]])
-    action = over.sample(params, over.noise(generator, (steps, N)))
+    over = distribution(spec)
     valid = np.zeros((steps, N), bool)
     valid[::2] = True
+    params = remembering(algorithm, obs[:-1], valid, np.zeros((N, spec.state_size), np.float32))
+    action = over.sample(params, over.noise(generator, (steps, N)))
     if spec.action.kind == "box":
         reward = -np.square(action - obs[:-1, :, :2]).sum(-1)
     else:
@@ -100,6 +114,7 @@ def identity_batch(algorithm: Acting, generator: np.random.Generator) -> tuple[B
         terminated=valid.copy(),
         truncated=np.zeros((steps, N), bool),
         valid=valid,
+        state=np.zeros((N, spec.state_size), np.float32),
         lane=np.repeat(np.arange(2), 4),
         fresh=np.zeros(N, bool),
         copies=4,

@@ -85,7 +85,7 @@ def collect(
 
 def bits(rollout: Rollout) -> dict[str, object]:
     """All of a rollout that must not depend on who collects it, as bytes."""
-    fields = ("action", "log_prob", "reward", "terminated", "truncated", "valid")
+    fields = ("action", "log_prob", "reward", "terminated", "truncated", "valid", "state")
     found: dict[str, object] = {name: getattr(rollout, name).tobytes() for name in fields}
     found["obs"] = [leaf.tobytes() for leaf in rollout.obs]
     found["episodes"] = [(episode.reward, episode.length) for episode in rollout.episodes]

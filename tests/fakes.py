@@ -47,6 +47,7 @@ def fake_rollout(session: int, lane: int, ticket: int, version: int, sequence: i
         terminated=np.zeros((1, 1), bool),
         truncated=np.zeros((1, 1), bool),
         valid=np.ones((1, 1), bool),
+        state=np.zeros((1, 0), np.float32),
     )
 
 

@@ -72,6 +72,10 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
         ),
         (["train", "--worker", "3", "CartPole-v1"], "train: unknown flag --worker; did you mean --workers?"),
         (["train", "CartPole-v1", "--zzz"], "train: unknown flag --zzz"),
+        (
+            ["train", "CartPole-v1", "--algo", "dqn", "--core", "lstm"],
+            "train: unknown flag --core; it is one of ppo, a2c, impala alone",
+        ),
         (["train", "CartPole-v1", "more"], "train: unexpected argument more"),
         (["train", "CartPole-v1", "--workers", "0"], "workers expected int >= 1, got 0"),
         (["train", "CartPole-v1", "--envs", "6"], "6 envs cannot be shared evenly among 4 lanes; take 4 or 8, or 3 lanes"),

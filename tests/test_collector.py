@@ -26,12 +26,15 @@ from workers.session import Assignment
 
 SPACES = f"{TOY}Spaces-v0"
 DISCRETE, GAUSSIAN = run_of("CartPole-v1"), run_of("Pendulum-v1")
+LSTM, GRU = run_of("CartPole-v1", core="lstm", core_size=9), run_of(f"{TOY}Recall-v0", core="gru", net=())
 TABLE = run_of(SPACES, kwargs={"observation": "dict", "action": "table"}, normalize_observations=True)
 BITS = run_of(SPACES, kwargs={"observation": "bytes", "action": "multibinary"}, activation="relu")
 
 
 @pytest.mark.parametrize("copies", [1, 2, 5, 17])
-@pytest.mark.parametrize("run", [DISCRETE, GAUSSIAN, TABLE, BITS], ids=["discrete", "gaussian", "table", "bits"])
+@pytest.mark.parametrize(
+    "run", [DISCRETE, GAUSSIAN, TABLE, BITS, LSTM, GRU], ids=["discrete", "gaussian", "table", "bits", "lstm", "gru"]
+)
 def test_a_lane_collects_the_same_bits_alone_and_beside_others(run: RunSpec, copies: int) -> None:
     run = msgspec.structs.replace(run, copies=copies, rollout_steps=5)
     together, apart = a_collector(run), a_collector(run)

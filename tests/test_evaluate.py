@@ -70,7 +70,7 @@ class Says:
     def load(self, parameters: Any, buffers: Any) -> None:
         pass
 
-    def __call__(self, leaves: Sequence[Array]) -> Any:
+    def __call__(self, leaves: Sequence[Array], state: Array | None = None) -> Any:
         (seen,) = leaves
         assert seen.shape[0] == 1
         self.rows[seen.shape[1]] += 1

@@ -303,7 +303,7 @@ def test_garbage_comes_out_as_bad_message_with_its_sender_and_does_not_raise(tcp
 def test_a_message_of_too_many_frames_is_not_cut_to_one_that_passes(tcp: Ends) -> None:
     learner = tcp.learner()
     one = np.zeros(1, np.float32)
-    most = Rollout(1, 0, 0, 0, 0, (one,) * (MAX_FRAMES - 7), one, one, one, one, one, one)
+    most = Rollout(1, 0, 0, 0, 0, (one,) * (MAX_FRAMES - 8), one, one, one, one, one, one, one)
     frames = encode(most)
     assert len(frames) == MAX_FRAMES
     tcp.raw(learner).send_multipart([*frames, b"one too many"])

@@ -99,6 +99,7 @@ def batch(
         terminated=ended & (np.arange(T)[:, None] % 2 == 0),  # either flag ends
         truncated=ended & (np.arange(T)[:, None] % 2 == 1),
         valid=valid,
+        state=np.zeros((len(lane), 0), np.float32),
         lane=np.array(lane),
         fresh=np.array(fresh),
         copies=copies,

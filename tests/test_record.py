@@ -67,6 +67,7 @@ def lives(ends: list[list[list[int]]], steps: int) -> Iterator[tuple[int, Rollou
                     terminated=np.array(terminated[at]),
                     truncated=np.array(truncated[at]),
                     valid=np.array(valid[at]),
+                    state=np.zeros((N, 0), np.float32),
                 ),
             )
 

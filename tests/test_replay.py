@@ -97,6 +97,7 @@ class Lanes:
             terminated=terminated,
             truncated=truncated,
             valid=valid,
+            state=np.zeros((N, 0), np.float32),
             lane=np.full(N, lane),
             fresh=np.full(N, fresh),
             copies=N,

@@ -37,6 +37,7 @@ class _Rows(NamedTuple):
     """The rows of L lanes while they are collected."""
 
     obs: tuple[Array, ...]  # [L, T+1, N, *leaf] each
+    state: Floats  # [L, N, S] what the policy remembers, moved on from step to step
     noise: Floats  # [L, T, N, noise]
     params: Floats  # [L, T, N, P]
     action: Array  # [L, T, N, *action]
@@ -132,6 +133,7 @@ class Collector:
                 array[i, 0] = leaf
         return _Rows(
             obs=obs,
+            state=np.stack([lane.state for lane in lanes]),
             noise=np.stack([self._distribution.noise(lane.generator, (T, N)) for lane in lanes]),
             params=np.empty((L, T, N, self._distribution.params_size), np.float32),
             action=np.empty((L, T, N, *action.shape), action.stored_dtype),
@@ -143,11 +145,13 @@ class Collector:
 
     def _fill(self, rows: _Rows, lanes: Sequence[Lane], pulse: Pulse) -> None:
         """Step all lanes T times."""
+        resets = np.stack([lane.ended for lane in lanes])  # [L, N] row t is not valid
         for t in range(self._run.rollout_steps):
             pulse()
             began = perf_counter()
             with np.errstate(all="ignore"):  # a NaN is named once the rows are full
-                params = self._policy([leaf[:, t] for leaf in rows.obs])
+                params = self._policy([leaf[:, t] for leaf in rows.obs], rows.state)
+                rows.state[resets] = 0.0
                 action = self._distribution.sample(params, rows.noise[:, t])
                 taken = self._write(action)
             rows.params[:, t] = params
@@ -163,6 +167,7 @@ class Collector:
                     raise EnvironmentBroke(
                         lane.number, f"step {t}: its environment gave what cannot be kept: {error}"
                     ) from error
+            resets = rows.terminated[:, t] | rows.truncated[:, t]
             rows.clock.append(perf_counter())
             self.stages["act"] += acted - began
             self.stages["step"] += rows.clock[-1] - acted
@@ -175,6 +180,7 @@ class Collector:
             reward = rows.reward[i].astype(np.float32)
         lane.check_sense(obs, reward)
         lane.obs = tuple(array[-1].copy() for array in obs)
+        before, lane.state = lane.state, rows.state[i].copy()
         self.steps += int(np.count_nonzero(valid))
         return Rollout(
             session=session,
@@ -189,5 +195,6 @@ class Collector:
             terminated=rows.terminated[i],
             truncated=rows.truncated[i],
             valid=valid,
+            state=before,
             episodes=episodes,
         )

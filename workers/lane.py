@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from protocol.core import zero_state
 from protocol.errors import RunError, UsageError
 from protocol.rollout import Episode, first_not_finite
 from protocol.spaces import action_spec, observation_leaves
@@ -53,6 +54,7 @@ class Lane:
         self.obs = tuple(
             np.empty((run.copies, *leaf.shape), leaf.dtype) for leaf in run.policy.observation
         )  # [N, *leaf] each
+        self.state = zero_state(run.policy, run.copies)  # [N, S] what the policy remembers
         self.ended = np.zeros(run.copies, bool)  # [N] the next step only resets this copy
         self._run = run
         self._seeds = copy_seeds(run.seed, number, incarnation, run.copies)

@@ -48,7 +48,7 @@ class A2C:
         values, ends = parts.values(seen, pulse), (batch.terminated, batch.truncated, batch.valid)
         advantage = gae(parts.rewards(batch), values, *ends, config.gamma, config.gae_lambda)
         target = advantage + values[:-1]
-        rows = parts.rows(batch, seen, advantage, target).rows(parts.index(batch.valid))
+        rows = parts.only(parts.rows(batch, seen, advantage, target), batch.valid)
         if config.normalize_advantage:
             rows = rows._replace(advantage=losses.standardized(rows.advantage))
         measured = parts.policy_gradient_step(rows)

@@ -9,26 +9,30 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from msgspec.structs import replace
 from torch import Tensor
 
 from learner.algorithms import losses
 from learner.algorithms.normalise import ObservationNormaliser, RewardScaler
-from learner.hyperparameters import ActorCriticHyperparameters
+from learner.hyperparameters import ActorCriticHyperparameters, RecurrentHyperparameters
 from protocol.errors import RunError
-from protocol.networks import ActorCritic, log_prob_and_entropy
+from protocol.networks import ActorCritic, Memory, log_prob_and_entropy
 from protocol.policy import features, normalized
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
 Array = npt.NDArray[Any]
+Bools = npt.NDArray[np.bool_]
 Floats = npt.NDArray[np.float32]
 Pulse = Callable[[], None]
+Rows = Tensor | slice
+View = tuple[Tensor, list[Tensor], Memory | None]  # what the network takes
 
 AT_ONCE = 1024  # observations that are looked at together where no gradient is wanted: bounds memory
 
@@ -42,11 +46,29 @@ class Minibatch(NamedTuple):
     log_prob: Tensor  # [B] float32, by the worker, as acted
     advantage: Tensor  # [B] float32
     target: Tensor  # [B] float32, the returns to fit values to
+    memory: Memory | None = None  # with a core: x and images are [T · C, …], and B of them are wanted
 
-    def rows(self, index: Tensor) -> Minibatch:
-        """Some of these rows, copied."""
-        x, images, *rest = self
-        return Minibatch(x[index], tuple(image[index] for image in images), *(part[index] for part in rest))
+    def rows(self, index: Tensor, seen: Tensor | None = None, memory: Memory | None = None) -> Minibatch:
+        """Some of these rows, copied; `seen`: the observations to look at, if others are needed besides."""
+        seen = index if seen is None else seen
+        return Minibatch(
+            self.x[seen],
+            tuple(image[seen] for image in self.images),
+            self.action[index],
+            self.log_prob[index],
+            self.advantage[index],
+            self.target[index],
+            memory,
+        )
+
+    def columns(self, chosen: Tensor, mask: Tensor) -> Minibatch:
+        """The rows of whole columns, in time order, where `mask` [T, C] is True; the core sees the others too."""
+        assert self.memory is not None
+        state, carried, _ = self.memory
+        seen = _rows_of(len(carried), carried.shape[1], chosen)
+        inside = mask.flatten()[seen]
+        memory = Memory(state[chosen], carried[:, chosen], torch.nonzero(inside)[:, 0])
+        return self.rows(seen[inside], seen, memory)
 
 
 class Seen(NamedTuple):
@@ -55,11 +77,18 @@ class Seen(NamedTuple):
     raw: Floats  # [T+1, ΣN, D] features, not yet normalised
     x: Tensor  # [(T+1) · ΣN, D] float32, normalised features
     images: tuple[Tensor, ...]  # [(T+1) · ΣN, *leaf] uint8 each
+    memory: Memory  # of all T+1 steps
+
+    def view(self, steps: int, columns: Rows, rows: Rows) -> View:
+        """What the network looks at: these rows, with the memory of the first steps of these columns, if they have one."""
+        state, carried, _ = self.memory
+        memory = Memory(state[columns], carried[:steps, columns]) if state.shape[1] else None
+        return self.x[rows], [image[rows] for image in self.images], memory
 
 
 def policy_spec(config: ActorCriticHyperparameters, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
     """An actor and a critic, on any of the supported spaces."""
-    return PolicySpec(
+    spec = PolicySpec(
         observation,
         action,
         net=config.net,
@@ -67,6 +96,9 @@ def policy_spec(config: ActorCriticHyperparameters, observation: tuple[Leaf, ...
         normalize_observations=config.normalize_observations,
         shared_net=config.shared_net,
     )
+    if isinstance(config, RecurrentHyperparameters):
+        spec = replace(spec, core=config.core, core_size=config.core_size)
+    return spec
 
 
 def make_optimizer(kind: Literal["adam", "rmsprop"], net: ActorCritic, learning_rate: float) -> torch.optim.Optimizer:
@@ -110,7 +142,9 @@ class Parts:
         raw = features(self.policy, batch.obs)
         x = normalized(raw, *np.split(self._buffers, 2)) if self.policy.normalize_observations else raw
         images = [array for leaf, array in zip(self.policy.observation, batch.obs, strict=True) if leaf.is_image]
-        return Seen(raw, self.tensor(x), tuple(map(self.tensor, images)))
+        carried = np.concatenate([np.ones((1, raw.shape[1]), bool), batch.valid]).astype(np.float32)
+        memory = Memory(self._to_device(batch.state), self._to_device(carried))
+        return Seen(raw, self.tensor(x), tuple(map(self.tensor, images)), memory)
 
     def rewards(self, batch: Batch) -> Floats:
         """[T, ΣN] of a batch, scaled if they are to be; ask once for each batch."""
@@ -118,44 +152,70 @@ class Parts:
 
     def values(self, seen: Seen, pulse: Pulse) -> Floats:
         """V(obs) [T+1, ΣN], a piece at a time."""
-        found = []
-        with torch.no_grad():
-            for x, *images in _pieces(seen.x, *seen.images):
-                found.append(self.net.value(x, images))
-                pulse()
-        return np.asarray(torch.cat(found).cpu().numpy()).reshape(seen.raw.shape[:2])
+        return self._looked(seen, len(seen.raw), lambda view, _: self.net.value(*view), pulse)
 
     def log_probs(self, seen: Seen, batch: Batch, pulse: Pulse) -> Floats:
         """Log π(action) [T, ΣN] under the newest weights, a piece at a time."""
-        found, count = [], batch.valid.size
+        action = self.tensor(batch.action)
+
+        def look(view: View, rows: Rows) -> Tensor:
+            return log_prob_and_entropy(self.policy.action, self.net.params(*view), action[rows])[0]
+
+        return self._looked(seen, len(batch.valid), look, pulse)
+
+    def _looked(self, seen: Seen, steps: int, look: Callable[[View, Rows], Tensor], pulse: Pulse) -> Floats:
+        """One number of each observation of the first steps, [steps, ΣN], a piece at a time: no gradient is wanted."""
+        found = torch.empty(steps * seen.raw.shape[1], device=self.net.flat.device)
         with torch.no_grad():
-            parts = (seen.x[:count], self.tensor(batch.action), *(image[:count] for image in seen.images))
-            for x, action, *images in _pieces(*parts):
-                params = self.net.params(x, images)
-                found.append(log_prob_and_entropy(self.policy.action, params, action)[0])
+            for columns, rows in self._pieces(steps, seen.raw.shape[1]):
+                found[rows] = look(seen.view(steps, columns, rows), rows)
                 pulse()
-        return np.asarray(torch.cat(found).cpu().numpy()).reshape(batch.valid.shape)
+        return np.asarray(found.cpu().numpy()).reshape(steps, -1)
+
+    def _pieces(self, steps: int, columns: int) -> Iterator[tuple[Rows, Rows]]:
+        """Columns and rows of pieces of about AT_ONCE rows: neighbouring rows, or with a core whole columns."""
+        if self.policy.core is None:
+            for at in range(0, steps * columns, AT_ONCE):
+                yield slice(None), slice(at, min(at + AT_ONCE, steps * columns))
+            return
+        for some in torch.split(torch.arange(columns, device=self.net.flat.device), max(1, AT_ONCE // steps)):
+            yield some, _rows_of(steps, columns, some)
 
     def rows(self, batch: Batch, seen: Seen, advantage: Floats, target: Floats) -> Minibatch:
         """All T · ΣN rows, those that are not valid too."""
-        count = batch.valid.size
-        return Minibatch(
-            seen.x[:count],
-            tuple(image[:count] for image in seen.images),
-            *(self.tensor(array) for array in (batch.action, batch.log_prob, advantage, target)),
-        )
+        x, images, memory = seen.view(len(batch.valid), slice(None), slice(batch.valid.size))
+        action, log_prob = self.tensor(batch.action), self.tensor(batch.log_prob)
+        return Minibatch(x, tuple(images), action, log_prob, self.tensor(advantage), self.tensor(target), memory)
+
+    def only(self, rows: Minibatch, mask: Bools) -> Minibatch:
+        """Those of all rows where `mask` [T, ΣN] is True."""
+        if rows.memory is None:
+            return rows.rows(self._to_device(np.flatnonzero(mask)))
+        return rows.columns(self._to_device(np.arange(mask.shape[1])), self._to_device(mask))
+
+    def minibatches(self, rows: Minibatch, mask: Bools, parts: int) -> Iterator[Minibatch]:
+        """Each of all rows where `mask` [T, ΣN] is True once, at random, in so many parts of nearly equal size.
+
+        With a core, which learns what to remember from what came of it, whole columns go together: no more parts than they.
+        """
+        if rows.memory is None:
+            for index in self._shuffled(np.flatnonzero(mask), parts):
+                yield rows.rows(index)
+            return
+        told = mask.any(0)  # a column without a row would make an empty minibatch
+        for chosen in self._shuffled(np.flatnonzero(told), min(parts, int(told.sum()))):
+            yield rows.columns(chosen, self._to_device(mask))
 
     def tensor(self, array: Array) -> Tensor:
         """[T, N, …] as [T · N, …] on the device of the weights."""
-        return torch.from_numpy(array.reshape(array.shape[0] * array.shape[1], *array.shape[2:])).to(self.net.flat.device)
+        return self._to_device(array.reshape(array.shape[0] * array.shape[1], *array.shape[2:]))
 
-    def index(self, mask: npt.NDArray[np.bool_]) -> Tensor:
-        """The numbers of the rows [T, ΣN] that are True."""
-        return torch.from_numpy(np.flatnonzero(mask)).to(self.net.flat.device)
+    def _to_device(self, array: Array) -> Tensor:
+        return torch.from_numpy(array).to(self.net.flat.device)
 
-    def shuffled(self, index: Tensor, parts: int) -> tuple[Tensor, ...]:
-        """The numbers of some rows in so many minibatches of nearly equal size, on the device of the weights."""
-        return index[torch.randperm(len(index), generator=self.generator)].to(self.net.flat.device).tensor_split(parts)
+    def _shuffled(self, index: Array, parts: int) -> tuple[Tensor, ...]:
+        order = torch.randperm(len(index), generator=self.generator)
+        return self._to_device(index[order.numpy()]).tensor_split(parts)
 
     # ---------------------------------------------------------------- a step
 
@@ -171,7 +231,7 @@ class Parts:
 
     def forward(self, rows: Minibatch) -> tuple[Tensor, Tensor, Tensor]:
         """Log π(action), the entropy of π, and V: [B] each."""
-        params, value = self.net.forward(rows.x, rows.images)
+        params, value = self.net.forward(rows.x, rows.images, rows.memory)
         return *log_prob_and_entropy(self.policy.action, params, rows.action), value
 
     def backward(
@@ -261,6 +321,6 @@ class Parts:
         self.env_steps, self.version = state["env_steps"], state["version"]
 
 
-def _pieces(*tensors: Tensor) -> zip[tuple[Tensor, ...]]:
-    """Tensors of the same length, `AT_ONCE` rows at a time."""
-    return zip(*(torch.split(tensor, AT_ONCE) for tensor in tensors), strict=True)
+def _rows_of(steps: int, columns: int, chosen: Tensor) -> Tensor:
+    """The numbers of the rows of some columns, in time order, of `steps` by `columns` rows."""
+    return (torch.arange(steps, device=chosen.device)[:, None] * columns + chosen).flatten()

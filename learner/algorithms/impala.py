@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from learner.algorithms import actor_critic, losses
 from learner.algorithms.actor_critic import Minibatch, Parts, Seen
@@ -49,12 +48,11 @@ class Impala:
         parts = self.parts
         parts.set_learning_rate()
         seen, reward = parts.see(batch), parts.rewards(batch)
-        valid = torch.from_numpy(np.flatnonzero(batch.valid))
         measured: list[dict[str, float]] = []
         for _ in range(self.config.n_epochs):
             rows, told = self._rows(batch, seen, reward, pulse)
-            for index in parts.shuffled(valid, min(self.config.minibatches, len(valid))):
-                measured.append(parts.policy_gradient_step(rows.rows(index)) | told)
+            for minibatch in parts.minibatches(rows, batch.valid, min(self.config.minibatches, batch.env_steps)):
+                measured.append(parts.policy_gradient_step(minibatch) | told)
                 pulse()
         parts.used(batch, seen)
         return parts.metrics(measured)

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor
 
 from learner.algorithms import actor_critic, losses
 from learner.algorithms.actor_critic import Minibatch, Parts
@@ -22,6 +21,7 @@ from learner.hyperparameters import PPOConfig
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
+Bools = npt.NDArray[np.bool_]
 Floats = npt.NDArray[np.float32]
 
 
@@ -66,10 +66,10 @@ class PPO:
         values, ends = parts.values(seen, pulse), (batch.terminated, batch.truncated, batch.valid)
         advantage = gae(parts.rewards(batch), values, *ends, config.gamma, config.gae_lambda)
         target = advantage + values[:-1]
-        rows, valid = parts.rows(batch, seen, advantage, target), torch.from_numpy(np.flatnonzero(batch.valid))
+        rows = parts.rows(batch, seen, advantage, target)
         epochs: list[list[Measured]] = []
         while len(epochs) < config.n_epochs and not self._too_far(epochs):
-            epochs.append(self._epoch(rows, valid, clip_range, pulse))
+            epochs.append(self._epoch(rows, batch.valid, clip_range, pulse))
         parts.used(batch, seen)
         self.epochs += len(epochs)
         return self._metrics(epochs) | {
@@ -77,11 +77,12 @@ class PPO:
             "train/clip_range": clip_range,
         }
 
-    def _epoch(self, rows: Minibatch, valid: Tensor, clip_range: float, pulse: Callable[[], None]) -> list[Measured]:
+    def _epoch(self, rows: Minibatch, valid: Bools, clip_range: float, pulse: Callable[[], None]) -> list[Measured]:
         """Use each valid row once, in minibatches of nearly equal size."""
         found: list[Measured] = []
-        for index in self.parts.shuffled(valid, math.ceil(len(valid) / self.config.batch_size)):
-            found.append(self.step(rows.rows(index), clip_range))
+        parts = math.ceil(np.count_nonzero(valid) / self.config.batch_size)
+        for minibatch in self.parts.minibatches(rows, valid, parts):
+            found.append(self.step(minibatch, clip_range))
             pulse()
             if self._too_far([found]):
                 break

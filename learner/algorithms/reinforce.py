@@ -58,7 +58,7 @@ class REINFORCE:
         known = complete(batch.terminated | batch.truncated, batch.valid)
         measured = []
         if known.any():
-            rows = parts.rows(batch, seen, advantage, target).rows(parts.index(known))
+            rows = parts.only(parts.rows(batch, seen, advantage, target), known)
             if config.normalize_returns:
                 rows = rows._replace(advantage=losses.standardized(rows.advantage))
             measured.append(parts.policy_gradient_step(rows, critic=config.baseline))

@@ -114,6 +114,31 @@ class Identity(gymnasium.Env[Floats, Any]):
         return np.equal(np.arange(self._n), self._sign).astype(np.float32)
 
 
+class Recall(gymnasium.Env[Floats, Any]):
+    """Shows one of `n` signs, one-hot, for one step; the reward of the step `delay` steps later is 1 for its number.
+
+    In between, and when it asks, the observation is zeros: without memory the mean return is 1 / n.
+    """
+
+    def __init__(self, n: int = 3, delay: int = 3) -> None:
+        self.observation_space = spaces.Box(0, 1, (n,), np.float32)
+        self.action_space = spaces.Discrete(n)
+        self._n, self._delay = n, delay
+        self._sign = self._steps = 0
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Floats, Info]:
+        """Show a sign."""
+        super().reset(seed=seed)
+        self._steps, self._sign = 0, int(self.np_random.integers(self._n))
+        return np.eye(self._n, dtype=np.float32)[self._sign], {}
+
+    def step(self, action: Any) -> tuple[Floats, float, bool, bool, Info]:
+        """Show nothing; judge the last action."""
+        self._steps += 1
+        last = self._steps > self._delay
+        return np.zeros(self._n, np.float32), float(last and int(action) == self._sign), last, False, {}
+
+
 class Slow(Countdown):
     """A countdown that takes `seconds` a step."""
 
@@ -264,6 +289,6 @@ class Spaces(gymnasium.Env[Any, Any]):
 
 
 for _toy in (
-    Scripted, OneStep, Both, Countdown, Identity, Slow, Raises, NaNReward, NaNObservation, Hangs, Dies, Spaces,
+    Scripted, OneStep, Both, Countdown, Identity, Recall, Slow, Raises, NaNReward, NaNObservation, Hangs, Dies, Spaces,
 ):  # fmt: skip
     gymnasium.register(id=f"{_toy.__name__}-v0", entry_point=f"{__name__}:{_toy.__name__}")
