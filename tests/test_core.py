@@ -16,6 +16,7 @@ from learner.algorithms.actor_critic import Minibatch
 from learner.algorithms.ppo import PPO
 from learner.evaluate import evaluate
 from learner.hyperparameters import HYPERPARAMETERS, PPOConfig
+from learner.record import Player
 from protocol.core import advance, zero_state
 from protocol.distributions import distribution
 from protocol.errors import BadRollout
@@ -26,6 +27,7 @@ from protocol.specs import EnvSpec, PolicySpec, RunSpec
 from tests.batches import DISCRETE, GAUSSIAN, IMAGE, batch, no_pulse, normal, recurrent, shared
 from tests.collecting import TOY, a_collector, collect, random_policy, run_of
 from workers.collector import Collector
+from workers.envs.toy import Scripted
 from workers.session import Assignment
 
 Array = npt.NDArray[Any]
@@ -280,19 +282,34 @@ def test_without_a_core_it_is_not() -> None:
     assert learned("ppo", None, 60) < 0.6
 
 
+class Ragged(Scripted):
+    """Episodes of any length up to 9: copies stop playing at different times."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        found = super().reset(seed=seed)
+        self._script, self._played = "." * int(self.np_random.integers(9)) + "t", 0
+        return found
+
+
+class Watching:
+    """A policy whose state counts the observations of an episode, as `Scripted` shows them."""
+
+    def load(self, parameters: Array, buffers: Array) -> None: ...
+
+    def __call__(self, leaves: Any, state: Array | None = None) -> Array:
+        assert state is not None
+        assert state.shape[:2] == leaves[0].shape[:2]
+        np.testing.assert_array_equal(state[..., 0], leaves[0][..., 1])
+        state += 1
+        return np.zeros((*leaves[0].shape[:2], 2), np.float32)
+
+
 def test_an_evaluation_begins_each_episode_without_memory() -> None:
-    class Watching:
-        """Counts the observations since the state was zero: what Scripted shows, if it is made zero where it must."""
+    spec = run_of(f"{TOY}Scripted-v0", core="gru").policy
+    assert evaluate(EnvSpec.of(Ragged), Watching(), spec, 50, seed=0).episodes == 50
 
-        def load(self, parameters: Array, buffers: Array) -> None: ...
 
-        def __call__(self, leaves: Any, state: Array | None = None) -> Array:
-            assert state is not None
-            assert state.shape[:2] == leaves[0].shape[:2]
-            np.testing.assert_array_equal(state[..., 0], leaves[0][..., 1])
-            state += 1
-            return np.zeros((*leaves[0].shape[:2], 2), np.float32)
-
-    run = run_of(f"{TOY}Scripted-v0", kwargs={"script": "..t....u.t"}, core="gru")
-    found = evaluate(run.env, Watching(), run.policy, 50, seed=0)
-    assert (found.episodes, found.cut) == (50, 0)
+def test_a_recording_begins_each_episode_without_memory() -> None:
+    spec = run_of(f"{TOY}Scripted-v0", core="gru").policy
+    player = Player(Ragged(), Watching(), spec, seed=0)
+    assert len({player.episode(longest=100).length for _ in range(9)}) > 2
