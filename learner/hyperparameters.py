@@ -26,6 +26,8 @@ class Hyperparameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     """hidden layers of the actor, and of the critic; or of the action values"""
     activation: Literal["tanh", "relu"] = "tanh"
     """of the hidden layers"""
+    encoder: str | None = None
+    """a torch module of your own before all other layers, my_package.networks:factory; see protocol/encoder.py"""
     normalize_observations: bool = False
     """subtract the running mean, divide by the running standard deviation, clip to ±10 (not images)"""
     gamma: Share = 0.99

@@ -14,6 +14,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import msgspec
 import zmq
 
 from learner.algorithms import ALGORITHMS, Algorithm
@@ -117,6 +118,11 @@ def run_spec(config: Config, env: EnvSpec) -> RunSpec:
     try:
         observation, action = observation_leaves(copy.observation_space), action_spec(copy.action_space)
         policy = ALGORITHMS[config.algo].policy_spec(config.algorithm, observation, action)
+        if config.algorithm.encoder is not None:
+            from protocol.encoder import describe_encoder
+
+            encoder = describe_encoder(config.algorithm.encoder, observation, action)
+            policy = msgspec.structs.replace(policy, encoder=encoder)
         if getattr(ALGORITHMS[config.algo], "whole_episodes", False):
             _check_whole_episodes(config, copy.spec.max_episode_steps if copy.spec else None)
     finally:

@@ -1,7 +1,7 @@
 """The same policy in torch: what the learner learns with, and what a worker with images acts with.
 
-The one file of protocol that imports torch. Every parameter stands where `protocol.policy.layout` says, in one flat
-float32 tensor, and every gradient in a second one of the same shape; the named arrays are views into the two. So the
+Beside `encoder.py` the one file of protocol that imports torch. Every parameter stands where `protocol.policy.layout`
+says, in one flat float32 tensor, and every gradient in a second one; the named arrays are views into the two. So the
 norm of the gradient is one norm, Adam is one kernel, and publishing is one copy of a prefix. Features come from
 `protocol.policy` (numpy), already normalised: one truth for what a network sees.
 """
@@ -20,6 +20,7 @@ from torch.nn import functional as F
 
 from protocol.core import zero_state
 from protocol.distributions import LOG_SQRT_2PI
+from protocol.encoder import make_encoder
 from protocol.policy import (
     Field,
     buffer_fields,
@@ -104,7 +105,19 @@ class FlatNetwork:
             self.parameters[field.name] = view
             at = end
         self._relu = spec.activation == "relu"
-        self._images = [self._image(i) for i, leaf in enumerate(spec.observation) if leaf.is_image]
+        self._encoder = None if spec.encoder is None else self._own(make_encoder(spec, seed).to(device))
+        images = [i for i, leaf in enumerate(spec.observation) if leaf.is_image]
+        self._images = [] if self._encoder else [self._image(i) for i in images]
+
+    def _own(self, encoder: torch.nn.Module) -> torch.nn.Module:
+        """Let the encoder's parameters live where all others do; they keep their first values."""
+        for name, parameter in encoder.named_parameters():
+            place = self.parameters[f"encoder.{name}"]
+            with torch.no_grad():
+                place.copy_(parameter)
+            parameter.data, parameter.grad = place.data, place.grad
+            self.parameters[f"encoder.{name}"] = parameter
+        return encoder
 
     def layers(self, names: Sequence[str]) -> list[Tensor]:
         """Weights and biases in turn, as `MLP` takes them."""
@@ -131,7 +144,13 @@ class FlatNetwork:
         return last, [(w, b, conv.stride) for (w, b), conv in zip(convs, stack, strict=True)], out
 
     def inputs(self, x: Tensor, images: Sequence[Tensor]) -> Tensor:
-        """Features [B, D] and images [B, *leaf] uint8 -> what the MLPs take [B, D + IMAGE_FEATURES per image]."""
+        """Features [B, D] and images [B, *leaf] uint8 -> what the MLPs take [B, D + IMAGE_FEATURES per image].
+
+        Or [B, K], what the encoder makes of them.
+        """
+        if self._encoder is not None:
+            out: Tensor = self._encoder(x, *images)
+            return out
         parts = [x]
         for (channels_last, convs, (weight, bias)), image in zip(self._images, images, strict=True):
             h = (image.permute(0, 3, 1, 2) if channels_last else image).float() * (1 / 255)

@@ -34,7 +34,7 @@ class Field(NamedTuple):
     name: str
     shape: tuple[int, ...]
     gain: float
-    """of the orthogonal initialisation; 0 for biases and log standard deviations, which start at zero"""
+    """of the orthogonal initialisation; 0: starts at zero (biases, log standard deviations) or by itself (encoders)"""
 
 
 class Conv(NamedTuple):
@@ -77,8 +77,11 @@ def layout(spec: PolicySpec) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
     """The fields of the flat buffer: those needed to act, then the critic's. Linear weights are [out, in]."""
     acting: list[Field] = []
     width = feature_size(spec)
+    if spec.encoder is not None:
+        acting += [Field(f"encoder.{name}", shape, 0) for name, shape in spec.encoder.arrays]
+        width = spec.encoder.size
     for i, leaf in enumerate(spec.observation):
-        if not leaf.is_image:
+        if not leaf.is_image or spec.encoder is not None:
             continue
         stack, (channels, _, _), flattened = convolutions(leaf)
         for j, conv in enumerate(stack):

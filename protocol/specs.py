@@ -124,6 +124,17 @@ class ActionSpec(msgspec.Struct, frozen=True):
         return "float32" if self.kind == "box" else "int64"
 
 
+class EncoderSpec(msgspec.Struct, frozen=True):
+    """A torch module of the user's own, which stands before all other layers; see `protocol/encoder.py`."""
+
+    factory: str
+    """`my_package.networks:encoder`, a callable that makes it"""
+    arrays: tuple[tuple[str, tuple[int, ...]], ...]
+    """name and shape of each of its parameters, in its order"""
+    size: int
+    """how many features it gives"""
+
+
 class PolicySpec(msgspec.Struct, frozen=True):
     """A policy as plain data: enough to act in numpy (workers) and to learn in torch (learner)."""
 
@@ -140,6 +151,8 @@ class PolicySpec(msgspec.Struct, frozen=True):
     """actor and critic share their hidden layers"""
     dueling: bool = False
     """action values are a state's value and each action's advantage over the mean (Wang et al. 2016)"""
+    encoder: EncoderSpec | None = None
+    """a module of the user's own before all other layers; none: the arrays as they are, and convolutions of images"""
     core: Literal["lstm", "gru"] | None = None
     """what remembers, between an observation's features and the hidden layers; none: nothing is remembered"""
     core_size: int = 64
@@ -152,8 +165,8 @@ class PolicySpec(msgspec.Struct, frozen=True):
 
     @property
     def needs_torch(self) -> bool:
-        """Images need convolutions, which numpy has not; every other policy acts without torch."""
-        return any(leaf.is_image for leaf in self.observation)
+        """Images need convolutions, which numpy has not, and modules are torch's; every other policy acts without it."""
+        return self.encoder is not None or any(leaf.is_image for leaf in self.observation)
 
 
 class RunSpec(msgspec.Struct, frozen=True):

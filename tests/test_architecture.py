@@ -18,7 +18,7 @@ FORBIDDEN = {
 }
 MAY_PRINT = {"millrace/cli.py", "millrace/terminal.py"}
 MAY_UNPICKLE = {"protocol/specs.py"}
-MAY_IMPORT_TORCH = {"protocol/networks.py"}
+MAY_IMPORT_TORCH = {"protocol/encoder.py", "protocol/networks.py"}
 
 
 def sources(*folders: str) -> list[str]:

@@ -35,6 +35,7 @@ RECORDS: tuple[type, ...] = (
     specs.RunSpec,
     specs.EnvSpec,
     specs.PolicySpec,
+    specs.EncoderSpec,
     specs.Leaf,
     specs.ActionSpec,
 )
