@@ -1,7 +1,8 @@
 """docs/results.md from run folders, what was learned by which command: `python -m benchmarks.results RUN …`.
 
 A run counts by the policy that did best in its own evaluations, tried again on 100 other episodes; the final policy stands
-beside it. Runs that differ in nothing but their seed make one row.
+beside it. Where a run was told to play fewer episodes, its policies are played here. Runs that differ in nothing but their
+seed make one row.
 """
 
 from __future__ import annotations
@@ -10,22 +11,58 @@ import argparse
 import shlex
 from collections import defaultdict
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 
 from learner.config import Config, resolve
-from learner.run_folder import RunFolder, Summary
+from learner.evaluate import evaluate, load_policy
+from learner.metrics import Evaluation
+from learner.run_folder import RunFolder, Summary, Which
 
 OUT = Path(__file__).parents[1] / "docs" / "results.md"
+EPISODES = 100
+OTHER_EPISODES = 1_000_000  # the seed of `millrace evaluate`: episodes that no choice was made by
 HEAD = """# Results
 
-Greedy episodes, each seed's mean return over 100 of them (or as the command says). *Best* is the policy that did best in the
-run's own evaluations, tried again on other episodes than those it was chosen by; *final* is the last one. Made by
+Greedy episodes: the mean return over 100 of them, for seeds 1, 2 and 3. *Best* is the policy that did best in the run's own
+evaluations, tried again on other episodes than those it was chosen by; *final* is the last one. Made by
 `python -m benchmarks.results RUN …` from run folders.
 
 | environment | algorithm | env steps | best | final | seconds | command (for each seed) |
 |---|---|---|---|---|---|---|
 """
+TAIL = """
+
+Two cores, no GPU, shared with other work while these ran: read the seconds as upper bounds. Versions: {versions}.
+"""
+
+
+class Run(NamedTuple):
+    """One run folder, as the table needs it."""
+
+    config: Config
+    summary: Summary
+    best: float | None
+    final: float | None
+
+
+def read(path: Path) -> Run | None:
+    """A run that ended, or None."""
+    folder = RunFolder.open(path)
+    config, summary = folder.config(), folder.summary()
+    if summary is None:
+        return None
+    best = _played(path, summary.best.evaluation if summary.best else None, "best")
+    return Run(config, summary, best, _played(path, summary.evaluation, "final"))
+
+
+def _played(path: Path, found: Evaluation | None, which: Which) -> float | None:
+    """The mean return, over as many episodes as the table says."""
+    if found is not None and found.episodes != EPISODES:
+        policy, spec, env = load_policy(path, which)
+        found = evaluate(env, policy, spec, EPISODES, OTHER_EPISODES)
+    return None if found is None else found.return_mean
 
 
 def command(config: Config) -> str:
@@ -45,30 +82,31 @@ def command(config: Config) -> str:
     return shlex.join(words)
 
 
-def row(runs: list[tuple[Config, Summary]]) -> str:
+def row(runs: list[Run]) -> str:
     """One line of the table."""
-    runs = sorted(runs, key=lambda run: run[0].seed)
-    config = runs[0][0]
-    best = [f"{s.best.evaluation.return_mean:.0f}" if s.best else "–" for _, s in runs]
-    final = [f"{s.evaluation.return_mean:.0f}" if s.evaluation else "–" for _, s in runs]
-    steps = f"{max(s.env_steps for _, s in runs):,}"
-    seconds = f"{max(s.wall_s for _, s in runs):.0f}"
-    cells = [config.env, config.algo, steps, ", ".join(best), ", ".join(final), seconds, f"`{command(config)}`"]
-    return f"| {' | '.join(cells)} |"
+    runs = sorted(runs, key=lambda run: run.config.seed)
+    config = runs[0].config
+    best, final = _means([run.best for run in runs]), _means([run.final for run in runs])
+    steps = f"{max(run.summary.env_steps for run in runs):,}"
+    seconds = f"{max(run.summary.wall_s for run in runs):.0f}"
+    return f"| {' | '.join([config.env, config.algo, steps, best, final, seconds, f'`{command(config)}`'])} |"
+
+
+def _means(found: list[float | None]) -> str:
+    return ", ".join("–" if mean is None else f"{mean:,.0f}" for mean in found)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="docs/results.md from run folders")
     parser.add_argument("runs", type=Path, nargs="+")
-    groups: dict[str, list[tuple[Config, Summary]]] = defaultdict(list)
+    groups: dict[str, list[Run]] = defaultdict(list)
     for path in parser.parse_args().runs:
-        folder = RunFolder.open(path)
-        config, summary = folder.config(), folder.summary()
-        if summary is not None:
-            groups[command(config)].append((config, summary))
-    rows = [row(runs) for _, runs in sorted(groups.items(), key=lambda item: (item[1][0][0].env, item[1][0][0].algo))]
-    versions = sorted({", ".join(f"{k} {v}" for k, v in s.versions.items()) for runs in groups.values() for _, s in runs})
-    OUT.write_text(HEAD + "\n".join(rows) + "\n\nTwo cores, no GPU. Versions: " + "; ".join(versions) + ".\n")
+        run = read(path)
+        if run is not None:
+            groups[command(run.config)].append(run)
+    by_env = sorted(groups.values(), key=lambda runs: (runs[0].config.env, runs[0].config.algo))
+    versions = {", ".join(f"{k} {v}" for k, v in run.summary.versions.items()) for runs in by_env for run in runs}
+    OUT.write_text(HEAD + "\n".join(map(row, by_env)) + TAIL.format(versions="; ".join(sorted(versions))))
     print(OUT)
 
 
