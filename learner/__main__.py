@@ -11,6 +11,7 @@ import logging
 import sys
 import time
 
+from learner.event_log import JsonLines
 from learner.flags import configuration
 from learner.metrics import Progress
 from learner.run_folder import Interrupted
@@ -23,7 +24,10 @@ LINE_EVERY_S = 10.0
 
 def main(argv: list[str]) -> int:
     """Serve until the run is over; the exit code."""
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s learner: %(message)s", stream=sys.stderr)
+    handler = logging.StreamHandler()
+    plain = logging.Formatter("%(asctime)s learner: %(message)s")
+    handler.setFormatter(JsonLines() if "--log-json" in argv else plain)
+    logging.basicConfig(level=logging.INFO, handlers=[handler])
     said_s = [-LINE_EVERY_S]
 
     def watch(progress: Progress) -> None:

@@ -43,4 +43,22 @@ class Broke:
     traceback: str
 
 
-Event = Joined | Left | Turned | Broke
+@dataclass(frozen=True)
+class Told:
+    """A worker was told to join again: its session had ended. `late` transitions that it sent are counted, not used."""
+
+    worker: str
+    session: int
+    late: int
+
+
+@dataclass(frozen=True)
+class Stale:
+    """A rollout was dropped because it was acted on under weights older than max_lag allows."""
+
+    lane: int
+    lag: int
+    transitions: int
+
+
+Event = Joined | Left | Turned | Broke | Told | Stale

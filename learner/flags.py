@@ -39,6 +39,8 @@ class RunFlags(Config, frozen=True, kw_only=True):
     """the environment whose preset to take, or none"""
     resume: Path | None = None
     """a run folder to go on with, from its newest checkpoint"""
+    log_json: bool = False
+    """say what happens as JSON, one event a line, on stderr; and nothing else"""
     debug: bool = False
     """show the traceback of an error"""
 

@@ -10,12 +10,14 @@ import logging
 import time
 from collections.abc import Callable, Iterable, Sequence
 
-from learner.events import Broke, Event, Joined, Left, Turned
+from learner.events import Broke, Event, Joined, Left, Stale, Told, Turned
+from learner.metrics import Progress
 from learner.roster import Out, Roster
+from learner.status import status
 from protocol.codec import Buffer, encode
 from protocol.errors import BadMessage, BadRollout, EnvironmentFailed, NoWorkers, Stalled
 from protocol.link import LearnerLink
-from protocol.messages import Array, Rollout, ToWorker, Weights
+from protocol.messages import Array, Inquire, Rollout, ToWorker, Weights
 from protocol.rollout import validate
 
 log = logging.getLogger("millrace.learner")
@@ -48,6 +50,8 @@ class Hub:
         """seconds spent waiting for rollouts since the run began"""
         self.lags: list[int] = []
         """lag of each rollout of the last `gather`"""
+        self.progress = Progress()
+        """of the run, for whoever asks: the journal keeps it"""
         self.dead_workers, self.watch, self._clock = dead_workers, watch, clock
         self._env_failures = 0
         self._failure: EnvironmentFailed | None = None
@@ -143,6 +147,8 @@ class Hub:
                     self._send(self.roster.reject(peer, None, str(message), now))
                 case Rollout():
                     self._rollout(peer, message, now)
+                case Inquire():
+                    self.link.send(peer, encode(status(self.roster, self.progress, now)))
                 case _:
                     self._send(self.roster.receive(peer, message, now))
 
@@ -176,8 +182,8 @@ class Hub:
     def _events(self) -> None:
         events, self.roster.events = self.roster.events, []
         for event in events:
-            expected = isinstance(event, Joined) or (isinstance(event, Left) and event.on_purpose)
-            log.log(logging.INFO if expected else logging.WARNING, "%s", describe(event))
+            expected = isinstance(event, Joined | Told | Stale) or (isinstance(event, Left) and event.on_purpose)
+            log.log(logging.INFO if expected else logging.WARNING, "%s", describe(event), extra={"event": event})
             match event:
                 case Turned(_, why):
                     self._refusal = why
@@ -215,3 +221,8 @@ def describe(event: Event) -> str:
             return f"worker {worker} was refused: {why}"
         case Broke(worker, host, lane, error, traceback):
             return f"worker {worker} ({host}): lane {lane}: {error}\n{traceback}"
+        case Told(worker, _, late):
+            counted = f"; {late} transitions that it sent are counted, not used" if late else ""
+            return f"worker {worker} was told to join again: its session had ended{counted}"
+        case Stale(lane, lag, transitions):
+            return f"a rollout of lane {lane} was dropped: {lag} versions old, {transitions} transitions"

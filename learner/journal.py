@@ -117,6 +117,7 @@ class Journal:
         self._best = past.best
         self._episodes_until_save = config.checkpoint_every_episodes
         self._worker_stages: dict[int, dict[str, float]] = {}  # by session: those of workers that have left count too
+        hub.progress = self.progress()
 
     # ---------------------------------------------------------------- what the loop calls
 
@@ -153,6 +154,7 @@ class Journal:
             self._keep_if_best(found)
         progress = self.progress()
         self._surely(lambda: self._metrics.write(progress, {**metrics, **extra}))
+        self.hub.progress = progress
         self._watch(progress)
         self._episodes_until_save -= len(batch.episodes)
         by_episodes = self.config.checkpoint_every_episodes and self._episodes_until_save <= 0

@@ -15,7 +15,7 @@ import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from learner.events import Broke, Event, Joined, Left, Turned
+from learner.events import Broke, Event, Joined, Left, Stale, Told, Turned
 from learner.lanes import Lane, Ticket
 from learner.ledger import Ledger
 from learner.standing import TABLE, Rubbish, Silence, Standing
@@ -43,6 +43,7 @@ from protocol.messages import (
 )
 from protocol.specs import RunSpec
 
+MEASURE_S = 0.5  # at least, between two accounts that a worker's speed is measured by
 STRIKES = 3  # rollouts or messages that could not be used, after which a worker is refused
 
 
@@ -67,6 +68,8 @@ class Member:
     said_at: int = 0  # replies said when it was sent
     strikes: int = 0
     heartbeat: Heartbeat | None = None
+    steps_per_s: float = 0.0
+    counted: tuple[int, float] = (0, 0.0)  # env steps that its last measured account told of, and when
 
 
 class Roster:
@@ -116,6 +119,9 @@ class Roster:
         if member is None or member.session != message.session:
             if isinstance(message, Rollout):
                 self.ledger.transitions_late += message.env_steps
+            if not isinstance(message, Goodbye | Failure):
+                late = message.env_steps if isinstance(message, Rollout) else 0
+                self.events.append(Told(peer.decode(errors="replace")[:40], message.session, late))
             return [(peer, Rejoin(message.session))] if not isinstance(message, Goodbye | Failure) else []
         member.heard_s = now
         match message:
@@ -192,6 +198,7 @@ class Roster:
             self.ledger.stale += 1
             self.ledger.transitions_stale += rollout.env_steps
             self.lanes[rollout.lane].progress -= 1
+            self.events.append(Stale(rollout.lane, self.version - rollout.version, rollout.env_steps))
         if len(self.ready) < self.rollouts_per_update:
             return None
         self.lives = {rollout.ticket: self.lives[rollout.ticket] for rollout in self.ready}
@@ -283,6 +290,10 @@ class Roster:
     def _heartbeat(self, member: Member, heartbeat: Heartbeat) -> list[Out]:
         """Say again what this account shows to be lost: said before a reply that the worker has seen, yet not held."""
         member.heartbeat = heartbeat
+        steps, since_s = member.counted
+        if member.heard_s - since_s >= MEASURE_S:  # new weights make an account come early: too short a time to measure
+            member.steps_per_s = (heartbeat.steps - steps) / (member.heard_s - since_s) if since_s else 0.0
+            member.counted = heartbeat.steps, member.heard_s
         peer = member.peer
         if member.standing is Standing.DRAINING:
             return [(peer, Drain(self._draining or ""))]

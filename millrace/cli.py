@@ -88,7 +88,7 @@ def _train(argv: list[str]) -> int:
     from millrace.launch import local
     from millrace.terminal import watching
 
-    with watching() as watch:
+    with watching("--log-json" in argv) as watch:
         run = local.train(config, resume, watch)
     return _told(run)
 
@@ -100,7 +100,7 @@ def _learner(argv: list[str]) -> int:
     from learner.run import serve
     from millrace.terminal import watching
 
-    with watching() as watch:
+    with watching("--log-json" in argv) as watch:
         run = serve(config, resume, watch)
     return _told(run)
 
@@ -196,6 +196,23 @@ def _presets(argv: list[str]) -> int:
     return 0
 
 
+def _status(argv: list[str]) -> int:
+    from learner.flags import parse
+    from millrace.flags import StatusFlags
+
+    flags = parse(StatusFlags, argv, "status")
+    from millrace.status import observe, observer_name
+    from protocol.link import WorkerLink, check_address
+
+    check_address(flags.address)
+    link = WorkerLink(flags.address, observer_name())
+    try:
+        observe(link, flags)
+    finally:
+        link.close(linger_s=0)
+    return 0
+
+
 def _at_least(name: str, value: int, least: int) -> None:
     if value < least:
         raise UsageError(f"{name} expected int >= {least}, got {value}")
@@ -207,6 +224,7 @@ COMMANDS = {
         _learner, "learner ENV --bind ADDRESS [flags]", "the learner alone; waits for workers from elsewhere"
     ),
     "worker": Command(_worker, "worker ADDRESS [flags]", "one worker process that joins a learner"),
+    "status": Command(_status, "status ADDRESS [--watch]", "how a run is: its workers, their speed, what was dropped"),
     "evaluate": Command(_evaluate, "evaluate RUN [--video] [flags]", "greedy episodes of a run's newest policy"),
     "record": Command(_record, "record RUN --out DATASET [flags]", "episodes of a run's newest policy as a Minari dataset"),
     "plot": Command(_plot, "plot RUN [RUN ...] [--out FILE]", "learning curves as a PNG"),

@@ -25,6 +25,21 @@ class EvaluateFlags(msgspec.Struct, frozen=True, kw_only=True):
     """show the traceback of an error"""
 
 
+class StatusFlags(msgspec.Struct, frozen=True, kw_only=True):
+    """How a run is: its workers, their speed, memory and silence, and what was dropped."""
+
+    address: Positional[str]
+    """where the learner listens, as tcp://HOST:5555"""
+    watch: bool = False
+    """again every second, until Ctrl-C or the learner has gone"""
+    json: bool = False
+    """one line of JSON instead of a table"""
+    timeout_s: float = 5.0
+    """how long to wait for an answer"""
+    debug: bool = False
+    """show the traceback of an error"""
+
+
 class PlotFlags(msgspec.Struct, frozen=True, kw_only=True):
     """Learning curves as a PNG: a panel for each environment, a colour for each algorithm, seeds as a band."""
 

@@ -20,6 +20,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from learner.event_log import JsonLines, progress_line
 from learner.metrics import Progress
 
 REDRAW_EVERY_S = 0.2
@@ -44,20 +45,24 @@ class Screen(Protocol):
 
 
 @contextmanager
-def watching(clock: Callable[[], float] = time.monotonic) -> Iterator[Callable[[Progress], None]]:
+def watching(log_json: bool = False, clock: Callable[[], float] = time.monotonic) -> Iterator[Callable[[Progress], None]]:
     """A function to call with each progress; what the log of millrace says meanwhile is shown too."""
-    block = sys.stdout.isatty()
-    screen: Screen = Block(Console()) if block else Lines()
+    block = sys.stdout.isatty() and not log_json
+    screen: Screen = Block(Console()) if block else Events() if log_json else Lines()
     pace = Pace(screen, REDRAW_EVERY_S if block else LINE_EVERY_S, clock)
-    handler = _Said(screen)
+    handler = _events_handler() if log_json else _Said(screen)
     logger = logging.getLogger("millrace")
+    level = logger.level
     logger.addHandler(handler)
+    if log_json:
+        logger.setLevel(logging.INFO)
     try:
         yield pace
     finally:
         pace.close()
         screen.close()
         logger.removeHandler(handler)
+        logger.setLevel(level)
 
 
 class Pace:
@@ -105,6 +110,26 @@ class Lines:
 
     def close(self) -> None:
         """Nothing to do."""
+
+
+class Events:
+    """JSON lines on stderr, for machines."""
+
+    def show(self, progress: Progress) -> None:
+        """One line."""
+        sys.stderr.write(f"{progress_line(progress, time.time())}\n")
+
+    def say(self, line: str) -> None:
+        """Nothing: notes stand in the progress, and what the log says is a line of its own."""
+
+    def close(self) -> None:
+        """Nothing to do."""
+
+
+def _events_handler() -> logging.Handler:
+    handler = logging.StreamHandler()
+    handler.setFormatter(JsonLines())
+    return handler
 
 
 class Block:

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from protocol.errors import BadMessage
-from protocol.messages import ToLearner, ToWorker
+from protocol.messages import Inquire, ToLearner, ToObserver, ToWorker
 
 Array = npt.NDArray[Any]
 Buffer = bytes | memoryview
@@ -34,7 +34,7 @@ DTYPES = frozenset(["|b1", "|i1", "|u1", "<i2", "<u2", "<i4", "<u4", "<i8", "<u8
 assert sys.byteorder == "little", "millrace sends arrays as they lie in memory and knows little-endian machines only"
 
 
-def encode(message: ToLearner | ToWorker) -> list[Buffer]:
+def encode(message: ToLearner | Inquire | ToWorker | ToObserver) -> list[Buffer]:
     """Frames of a message. Arrays are not copied: do not change them afterwards."""
     frames: list[Buffer] = [b""]
 
@@ -53,15 +53,21 @@ def encode(message: ToLearner | ToWorker) -> list[Buffer]:
     return frames
 
 
-def decode_to_learner(frames: Sequence[Buffer]) -> ToLearner:
-    """What a worker said. Raises `BadMessage`, whatever the bytes."""
-    message: ToLearner = _decode(frames, ToLearner)
+def decode_to_learner(frames: Sequence[Buffer]) -> ToLearner | Inquire:
+    """What a worker said, or an observer. Raises `BadMessage`, whatever the bytes."""
+    message: ToLearner | Inquire = _decode(frames, ToLearner | Inquire)
     return message
 
 
 def decode_to_worker(frames: Sequence[Buffer]) -> ToWorker:
     """What the learner said. Raises `BadMessage`, whatever the bytes."""
     message: ToWorker = _decode(frames, ToWorker)
+    return message
+
+
+def decode_to_observer(frames: Sequence[Buffer]) -> ToObserver:
+    """What the learner answered. Raises `BadMessage`, whatever the bytes."""
+    message: ToObserver = _decode(frames, ToObserver)
     return message
 
 

@@ -18,15 +18,14 @@ import torch
 
 from protocol.errors import UsageError
 from protocol.policy import feature_size
-from protocol.specs import ActionSpec, EncoderSpec, Leaf, PolicySpec
+from protocol.specs import ActionSpec, EncoderSpec, Leaf, NamedShape, PolicySpec
 
 
 def describe_encoder(factory: str, observation: tuple[Leaf, ...], action: ActionSpec) -> EncoderSpec:
     """Make one, to learn its parameters and its output's size. Raises `UsageError` in one line."""
     spec = PolicySpec(observation, action)
     module = _make(factory, spec, seed=0)
-    arrays = tuple((name, tuple(parameter.shape)) for name, parameter in module.named_parameters())
-    return EncoderSpec(factory, arrays, _output_size(factory, module, spec))
+    return EncoderSpec(factory, _arrays(module), _output_size(factory, module, spec))
 
 
 def make_encoder(spec: PolicySpec, seed: int) -> torch.nn.Module:
@@ -34,15 +33,19 @@ def make_encoder(spec: PolicySpec, seed: int) -> torch.nn.Module:
     wanted = spec.encoder
     assert wanted is not None
     module = _make(wanted.factory, spec, seed)
-    arrays = tuple((name, tuple(parameter.shape)) for name, parameter in module.named_parameters())
+    arrays = _arrays(module)
     if arrays != wanted.arrays:
-        ours, theirs = dict(arrays), dict(wanted.arrays)
+        ours, theirs = ({each.name: each.shape for each in of} for of in (arrays, wanted.arrays))
         name = next((name for name in [*ours, *theirs] if ours.get(name) != theirs.get(name)), "order")
         raise UsageError(
             f"encoder {wanted.factory}: parameter {name} expected {theirs.get(name, 'none')} as the learner has it, got "
             f"{ours.get(name, 'none')}; install the same version of it here and there"
         )
     return module
+
+
+def _arrays(module: torch.nn.Module) -> tuple[NamedShape, ...]:
+    return tuple(NamedShape(name, tuple(parameter.shape)) for name, parameter in module.named_parameters())
 
 
 def _make(factory: str, spec: PolicySpec, seed: int) -> torch.nn.Module:

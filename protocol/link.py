@@ -9,14 +9,17 @@ credit that keeps queues short. MAXMSGSIZE bounds a frame before a byte of it is
 from __future__ import annotations
 
 import ipaddress
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from typing import TypeVar
 
 import zmq
 
-from protocol.codec import MAX_FRAME_BYTES, MAX_FRAMES, Buffer, decode_to_learner, decode_to_worker
+from protocol.codec import MAX_FRAME_BYTES, MAX_FRAMES, Buffer, decode_to_learner, decode_to_observer, decode_to_worker
 from protocol.errors import BadMessage, UsageError
-from protocol.messages import ToLearner, ToWorker
+from protocol.messages import Inquire, ToLearner, ToObserver, ToWorker
+
+Said = TypeVar("Said")
 
 LINGER_MS = 2000
 QUEUE = 1000  # messages: for a peer that talks and does not read
@@ -93,7 +96,7 @@ class LearnerLink:
         """Wait until something arrives, at most `timeout_s`."""
         return bool(self._socket.poll(max(0, int(timeout_s * 1000))))
 
-    def receive(self) -> Iterator[tuple[bytes, ToLearner | BadMessage]]:
+    def receive(self) -> Iterator[tuple[bytes, ToLearner | Inquire | BadMessage]]:
         """What has arrived, with its sender; what cannot be read comes as its error. At most MESSAGES_AT_ONCE."""
         for _ in range(MESSAGES_AT_ONCE):  # a flood must not keep the learner here
             frames = _receive(self._socket)
@@ -145,9 +148,16 @@ class WorkerLink:
 
     def receive(self) -> Iterator[ToWorker | BadMessage]:
         """All that has arrived; what cannot be read comes as its error."""
+        return self._received(decode_to_worker)
+
+    def answers(self) -> Iterator[ToObserver | BadMessage]:
+        """All that has arrived for an observer, who is no worker: answers to Inquire."""
+        return self._received(decode_to_observer)
+
+    def _received(self, decode: Callable[[Sequence[Buffer]], Said]) -> Iterator[Said | BadMessage]:
         while (frames := _receive(self._socket)) is not None:
             try:
-                yield decode_to_worker(frames)
+                yield decode(frames)
             except BadMessage as error:
                 yield error
 

@@ -124,6 +124,8 @@ class Heartbeat(Message, frozen=True):
     """env steps since the worker started"""
     stages: dict[str, float]
     """seconds spent in each stage since the worker started"""
+    resident_bytes: int
+    """memory of the worker's process; 0 where that is not known"""
 
 
 class HeartbeatReply(Message, frozen=True):
@@ -157,11 +159,67 @@ class Failure(Message, frozen=True):
     lane: int | None
 
 
+class Inquire(Message, frozen=True):
+    """How is the run? From anybody who may connect; one who asks need not be a worker."""
+
+
+class WorkerStatus(msgspec.Struct, frozen=True):
+    """A worker as the learner sees it."""
+
+    worker: str
+    """its name"""
+    host: str
+    pid: int
+    standing: str
+    """active, or draining"""
+    lanes: tuple[int, ...]
+    """those that live there: none, if it is a spare"""
+    tickets: int
+    """dealt to it, and not back"""
+    steps: int
+    """env steps since it started"""
+    steps_per_s: float
+    """between its last two accounts of itself"""
+    version: int
+    """newest weights that it is known to hold; -1 before the first"""
+    silent_s: float
+    """seconds since its last message"""
+    resident_bytes: int
+    """memory of its process; 0 where that is not known"""
+    strikes: int
+    """messages and rollouts of it that could not be used"""
+
+
+class Status(Message, frozen=True):
+    """The answer to Inquire."""
+
+    env: str
+    version: int
+    """how many updates the learner has made; -1 before the first weights"""
+    env_steps: int
+    """used by updates, since the run began"""
+    total_steps: int
+    """when it ends"""
+    steps_per_s: float
+    """env steps used per second, since this learner started"""
+    return_mean: float | None
+    """of the last 100 episodes, raw rewards"""
+    lag_mean: float
+    """of the rollouts of the last update, in versions"""
+    lag_max: int
+    """of the rollouts of the last update, in versions"""
+    workers: tuple[WorkerStatus, ...]
+    """in the order in which they joined"""
+    ledger: dict[str, int]
+    """what became of every ticket, transition and message"""
+
+
 ToLearner = Hello | Rollout | Heartbeat | Goodbye | Failure
 ToWorker = Welcome | Refuse | Rejoin | Weights | Collect | Release | HeartbeatReply | Drain
+ToObserver = Status
 
 __all__ = [
     "PROTOCOL_VERSION", "Array", "Collect", "Drain", "Failure", "Goodbye", "Heartbeat", "HeartbeatReply", "Hello",
-    "LaneLife", "Message", "Permit", "Received", "Refuse", "Rejoin", "Release", "Rollout", "ToLearner", "ToWorker",
-    "Weights", "Welcome",
+    "Inquire", "LaneLife", "Message", "Permit", "Received", "Refuse", "Rejoin", "Release", "Rollout", "Status",
+    "ToLearner", "ToObserver", "ToWorker", "Weights", "Welcome", "WorkerStatus",
 ]  # fmt: skip

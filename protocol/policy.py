@@ -78,7 +78,7 @@ def layout(spec: PolicySpec) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
     acting: list[Field] = []
     width = feature_size(spec)
     if spec.encoder is not None:
-        acting += [Field(f"encoder.{name}", shape, 0) for name, shape in spec.encoder.arrays]
+        acting += [Field(f"encoder.{array.name}", array.shape, 0) for array in spec.encoder.arrays]
         width = spec.encoder.size
     for i, leaf in enumerate(spec.observation):
         if not leaf.is_image or spec.encoder is not None:

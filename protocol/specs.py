@@ -124,13 +124,22 @@ class ActionSpec(msgspec.Struct, frozen=True):
         return "float32" if self.kind == "box" else "int64"
 
 
+class NamedShape(msgspec.Struct, frozen=True, array_like=True):
+    """An array by its name, and how large it is."""
+
+    name: str
+    """as torch's `named_parameters` has it"""
+    shape: tuple[int, ...]
+    """its sides"""
+
+
 class EncoderSpec(msgspec.Struct, frozen=True):
     """A torch module of the user's own, which stands before all other layers; see `protocol/encoder.py`."""
 
     factory: str
     """`my_package.networks:encoder`, a callable that makes it"""
-    arrays: tuple[tuple[str, tuple[int, ...]], ...]
-    """name and shape of each of its parameters, in its order"""
+    arrays: tuple[NamedShape, ...]
+    """its parameters, in its order"""
     size: int
     """how many features it gives"""
 

@@ -20,7 +20,7 @@ from protocol.encoder import describe_encoder, make_encoder
 from protocol.errors import UsageError
 from protocol.networks import ActorCritic, QNetwork, TorchPolicy
 from protocol.policy import layout, make_policy, size
-from protocol.specs import EnvSpec, PolicySpec
+from protocol.specs import EnvSpec, NamedShape, PolicySpec
 from tests.batches import DISCRETE, IMAGE, batch, no_pulse, recurrent
 
 HERE = "tests.encoders"
@@ -86,11 +86,11 @@ def test_acting_with_it_is_learning_with_it(spec: PolicySpec) -> None:
 def test_one_that_is_different_here_is_refused() -> None:
     spec = encoded(DISCRETE)
     assert spec.encoder is not None
-    (first, _), *rest = spec.encoder.arrays
-    other = msgspec.structs.replace(spec.encoder, arrays=((first, (7, 4)), *rest))
-    with pytest.raises(UsageError, match=rf"parameter {first} expected \(7, 4\) as the learner has it, got \(12, 4\)"):
+    first, *rest = spec.encoder.arrays
+    other = msgspec.structs.replace(spec.encoder, arrays=(NamedShape(first.name, (7, 4)), *rest))
+    with pytest.raises(UsageError, match=rf"parameter {first.name} expected \(7, 4\) as the learner has it, got \(12, 4\)"):
         ActorCritic(msgspec.structs.replace(spec, encoder=other))
-    more = msgspec.structs.replace(spec.encoder, arrays=(*spec.encoder.arrays, ("more", (1,))))
+    more = msgspec.structs.replace(spec.encoder, arrays=(*spec.encoder.arrays, NamedShape("more", (1,))))
     with pytest.raises(UsageError, match=r"parameter more expected \(1,\) as the learner has it, got none"):
         ActorCritic(msgspec.structs.replace(spec, encoder=more))
 

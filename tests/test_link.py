@@ -26,6 +26,7 @@ from protocol.messages import (
     Heartbeat,
     HeartbeatReply,
     Hello,
+    Inquire,
     LaneLife,
     Permit,
     Received,
@@ -48,7 +49,7 @@ HELLO = Hello(PROTOCOL_VERSION, "w0", "host", 1, 1, "fake", 1)
 TO_LEARNER: list[ToLearner] = [
     HELLO,
     fake_rollout(1, 2, 3, 4, 5),
-    Heartbeat(1, 2, 3, (4, 5), 6, {"env": 0.5}),
+    Heartbeat(1, 2, 3, (4, 5), 6, {"env": 0.5}, 7),
     Goodbye(1, "told to stop", (4,)),
     Failure(1, "ValueError: ünïcode", "Traceback: …", None),
 ]
@@ -118,9 +119,9 @@ def tcp() -> Iterator[Ends]:
     ends.close()
 
 
-def heard(link: LearnerLink, messages: int = 1) -> list[tuple[bytes, ToLearner | BadMessage]]:
+def heard(link: LearnerLink, messages: int = 1) -> list[tuple[bytes, ToLearner | Inquire | BadMessage]]:
     """So many messages, with their senders; fails at the deadline."""
-    got: list[tuple[bytes, ToLearner | BadMessage]] = []
+    got: list[tuple[bytes, ToLearner | Inquire | BadMessage]] = []
     while len(got) < messages:
         assert link.poll(DEADLINE_S), f"only {len(got)} of {messages} messages arrived"
         got += link.receive()

@@ -107,7 +107,7 @@ class Learner:
         """A Heartbeat: by default of a worker that lost nothing."""
         held = self.tickets(peer) if tickets is None else tickets
         seen = self.roster.members[peer].replies if replies is None else replies
-        return self.says(peer, Heartbeat(self.session(peer), seen, version, tuple(held), 0, {}))
+        return self.says(peer, Heartbeat(self.session(peer), seen, version, tuple(held), 0, {}, 0))
 
     def take(self) -> list[Rollout]:
         taken = self.roster.take()
@@ -240,7 +240,7 @@ def test_a_message_of_no_session_of_ours_is_answered_by_rejoin(known: bool) -> N
     learner = Learner()
     if known:
         learner.joins(A)
-    for message in (Heartbeat(5, 0, 0, (), 0, {}), fake_rollout(5, 0, 0, 0, 0)):
+    for message in (Heartbeat(5, 0, 0, (), 0, {}, 0), fake_rollout(5, 0, 0, 0, 0)):
         assert learner.says(A, message) == [(A, Rejoin(5))]
 
 
@@ -956,7 +956,7 @@ def in_standing(standing: Standing) -> Learner:
 EVERY_MESSAGE: list[ToLearner] = [
     Hello(PROTOCOL_VERSION, "a", "host", 1, 1001, "fake", 1),
     fake_rollout(100, 0, 0, 0, 0),
-    Heartbeat(100, 0, 0, (0,), 0, {}),
+    Heartbeat(100, 0, 0, (0,), 0, {}, 0),
     Goodbye(100, "bye", ()),
     Failure(100, "broke", "", None),
 ]

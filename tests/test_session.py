@@ -360,7 +360,7 @@ def test_a_heartbeat_every_heartbeat_s_says_all_that_is_held() -> None:
     session.steps, session.stages = 120, {"env": 0.5}
     assert session.tick(0.9) == []
     (heartbeat,) = said(session.tick(1.0), Heartbeat)
-    assert heartbeat == Heartbeat(SESSION, 4, 0, (7, 8), 120, {"env": 0.5})
+    assert heartbeat == Heartbeat(SESSION, 4, 0, (7, 8), 120, {"env": 0.5}, 0)
     assert session.next_due_s() == 2.0
 
 

@@ -31,11 +31,13 @@ RECORDS: tuple[type, ...] = (
     messages.Permit,
     messages.Received,
     messages.LaneLife,
+    messages.WorkerStatus,
     rollout.Episode,
     specs.RunSpec,
     specs.EnvSpec,
     specs.PolicySpec,
     specs.EncoderSpec,
+    specs.NamedShape,
     specs.Leaf,
     specs.ActionSpec,
 )
@@ -184,6 +186,8 @@ def part_messages() -> str:
     parts += [record(kind) for kind in ToLearner.__args__]
     parts.append("### What the learner says\n")
     parts += [record(kind) for kind in ToWorker.__args__]
+    parts.append("### What an observer says, and is told\n")
+    parts += [record(messages.Inquire), record(messages.Status)]
     parts.append("### Records inside messages\n")
     parts += [record(kind) for kind in RECORDS]
     return "\n".join(parts)
@@ -232,7 +236,12 @@ def test_every_generated_part_of_the_document_has_a_maker() -> None:
     assert sorted(found) == sorted(PARTS)
 
 
-@pytest.mark.parametrize("kind", [*ToLearner.__args__, *ToWorker.__args__, *RECORDS], ids=lambda kind: kind.__name__)
+OF_OBSERVERS = (messages.Inquire, messages.Status)
+
+
+@pytest.mark.parametrize(
+    "kind", [*ToLearner.__args__, *ToWorker.__args__, *OF_OBSERVERS, *RECORDS], ids=lambda kind: kind.__name__
+)
 def test_every_message_and_field_says_what_it_means(kind: type) -> None:
     assert ast.get_docstring(class_of(kind))
     assert [name for name, _, _, meaning in fields_of(kind) if not (meaning or WORDS.get(name))] == []
@@ -240,7 +249,7 @@ def test_every_message_and_field_says_what_it_means(kind: type) -> None:
 
 def test_every_record_that_travels_is_described() -> None:
     """Whatever a field's type names, the document has a heading for."""
-    described = {*ToLearner.__args__, *ToWorker.__args__, *RECORDS}
+    described = {*ToLearner.__args__, *ToWorker.__args__, *OF_OBSERVERS, *RECORDS}
     for kind in described:
         for field in msgspec.structs.fields(kind):
             for name in re.findall(r"\b[A-Z]\w+", str(field.type)):

@@ -141,6 +141,8 @@ class Session:
         """env steps since the worker started; the shell keeps it"""
         self.stages: dict[str, float] = {}
         """seconds in each stage; the shell keeps it"""
+        self.resident_bytes = 0
+        """memory of this process; the shell keeps it"""
         self._patience_s = join_timeout_s
         self._rejoin_timeout_s = rejoin_timeout_s
         self._attempt = 0
@@ -333,6 +335,7 @@ class Session:
             tickets=tuple(ticket for lane in self._stay.lanes.values() for ticket in lane.held),
             steps=self.steps,
             stages=dict(self.stages),
+            resident_bytes=self.resident_bytes,
         )
 
     def _drain(self, event: object, reason: str) -> list[Effect]:

@@ -14,6 +14,7 @@ import time
 import traceback
 from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
 from protocol.codec import encode
 from protocol.errors import BadMessage, OurError, UsageError
@@ -30,6 +31,7 @@ log = logging.getLogger("millrace.worker")
 PULSE_S = 0.05  # how often the inbox is looked into while collecting
 IDLE_S = 0.5  # longest sleep while idle, so that a signal or a dead parent is noticed
 MAX_TRACEBACK = 20_000  # characters
+STATM = Path("/proc/self/statm")  # pages: all, resident, …
 
 
 class _Abandoned(Exception):
@@ -124,6 +126,7 @@ class Worker:
         if self._collector is not None:
             self._session.steps = self._collector.steps
             self._session.stages = {**self._collector.stages, "wait": self._waited_s}
+            self._session.resident_bytes = _resident_bytes()
 
     def _do(self, effects: list[Effect]) -> None:
         for effect in effects:
@@ -152,6 +155,14 @@ class Worker:
             self._loaded = None
         except (OurError, ImportError) as error:
             self._do(self._session.broke(_line(error), traceback.format_exc(), None))
+
+
+def _resident_bytes() -> int:
+    """Memory of this process; 0 where the system does not tell it so."""
+    try:
+        return int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        return 0
 
 
 def _line(error: Exception) -> str:
