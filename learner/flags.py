@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import re
 from collections.abc import Iterator
@@ -48,13 +49,19 @@ class RunFlags(Config, frozen=True, kw_only=True):
 def configuration(command: str, argv: list[str]) -> tuple[Config, Path | None]:
     """The configuration from all its layers, and the run to resume.
 
-    Flags are read twice, because what lies below them depends on them.
+    Flags are read more than once, because what lies below them depends on them.
     """
     asked = [flag for flag in argv if flag not in ("-h", "--help")]
     first = parse(RunFlags, asked, command, RunFlags(algo=""), lenient=True)
-    base = lower_layers(first.env, algo=first.algo or None, file=first.config, resume=first.resume, preset=first.preset)
-    below = {**_fields(base), "env_kwargs": {}}
-    flags = parse(RunFlags, argv if asked == argv else ["--help"], command, RunFlags(**below))
+    below = functools.partial(
+        lower_layers, algo=first.algo or None, file=first.config, resume=first.resume, preset=first.preset
+    )
+    algorithm = below("").algorithm
+    if type(algorithm) is not type(first.algorithm):  # its own flags were not known, and their values looked like ENV
+        first = parse(RunFlags, asked, command, RunFlags(algo="", algorithm=algorithm), lenient=True)
+    base = below(first.env)
+    default = RunFlags(**{**_fields(base), "env_kwargs": {}})
+    flags = parse(RunFlags, argv if asked == argv else ["--help"], command, default)
     config = Config(**_fields(flags))
     return checked(over(config, {"env_kwargs": base.env_kwargs | config.env_kwargs}, "")), flags.resume
 

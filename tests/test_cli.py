@@ -193,6 +193,25 @@ def test_the_environment_may_stand_anywhere_among_the_flags(asked: list[Any]) ->
     assert asked[0][0] == resolve("Pendulum-v1", workers=3, seed=4)
 
 
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["--algo", "a2c", "--optimizer", "adam", "CartPole-v1"],
+        ["CartPole-v1", "--algo", "a2c", "--optimizer", "adam"],
+        ["--config", "my.toml", "--optimizer", "adam"],
+    ],
+)
+def test_the_value_of_an_algorithms_own_flag_is_not_the_environment(asked: list[Any], argv: list[str]) -> None:
+    Path("my.toml").write_text('env = "CartPole-v1"\nalgo = "a2c"\n')
+    assert main(["train", *argv]) == 0
+    assert asked[0][0] == resolve("CartPole-v1", algo="a2c", optimizer="adam")
+
+
+def test_a_named_run_takes_its_algorithms_own_flags(asked: list[Any]) -> None:
+    assert main(["train", "--preset", "cartpole-dqn", "--target", "hard", "--tau", "0.5"]) == 0
+    assert asked[0][0] == resolve(preset="cartpole-dqn", target="hard", tau=0.5)
+
+
 def test_a_resumed_run_reads_its_own_file(asked: list[Any], capsys: Captured) -> None:
     run = RunFolder.create(resolve("CartPole-v1", gamma=0.5)).path
     assert main(["train", "--resume", str(run), "--steps", "9"]) == 0
