@@ -1,5 +1,6 @@
 """The configuration: its layers in order, its one-line refusals, its file."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -171,6 +172,14 @@ def test_every_preset_makes_a_configuration_of_its_own() -> None:
         assert algo in HYPERPARAMETERS
         for env in presets:
             assert resolve(env, algo=algo) != resolve(env, algo=algo, preset="none")
+
+
+def test_every_named_preset_is_on_the_page_of_the_notebooks() -> None:
+    page = Path(__file__).parents[1] / "docs" / "notebooks.md"
+    assert set(re.findall(r"--preset ([\w-]+)", page.read_text())) == set(named_presets())
+    images = re.findall(r"\]\((images/[^)]+)\)", page.read_text())
+    assert len(images) == 5
+    assert all((page.parent / image).is_file() for image in images)
 
 
 def test_every_named_preset_is_a_whole_run() -> None:
