@@ -114,8 +114,8 @@ def resolve(
 ) -> Config:
     """The configuration of a run from all layers, checked. Raises `UsageError` in one line.
 
-    `preset` is "auto" (that of the environment, if there is one), "none", or the environment whose preset to take. A run
-    that is resumed has its own file, and no preset.
+    `preset` is "auto" (that of the environment, if there is one), "none", the environment whose preset to take, or the name
+    of a whole run. A run that is resumed has its own file, and no preset.
     """
     base = lower_layers(env, algo=keywords.get("algo"), file=file, resume=resume, preset=preset)
     return checked(over(base, keywords, "keyword argument"))

@@ -37,7 +37,7 @@ class RunFlags(Config, frozen=True, kw_only=True):
     config: Path | None = None
     """a TOML file of settings; a run folder's config.toml repeats that run"""
     preset: str = "auto"
-    """the environment whose preset to take, or none"""
+    """a whole run by name (millrace presets lists them), the environment whose preset to take, or none"""
     resume: Path | None = None
     """a run folder to go on with, from its newest checkpoint"""
     log_json: bool = False
