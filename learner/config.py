@@ -92,6 +92,10 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """a worker silent for so many seconds is given up, and its lanes go elsewhere"""
     no_workers_timeout_s: Seconds = 60.0
     """end the run, after a checkpoint, when no worker has been here for so many seconds"""
+    step_timeout_s: Seconds = 120.0
+    """a local worker process that takes so many seconds for a step of one env copy is ended, and started again"""
+    pin_workers: bool = False
+    """each local worker process keeps to one core"""
     stall_timeout_s: Seconds = 600.0
     """end the run, after a checkpoint, when nothing has arrived for so many seconds"""
     max_env_failures: Natural = 3

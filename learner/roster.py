@@ -105,6 +105,7 @@ class Roster:
         self._next_session = first_session
         self._joins = 0
         self._draining: str | None = None
+        self._silent: set[str] = set()  # names of those given up for their silence, until they join again
         self._refused: dict[bytes, tuple[int, str]] = {}  # the life that was refused, and why
 
     # ---------------------------------------------------------------- in
@@ -169,6 +170,9 @@ class Roster:
         """A worker's process is known to be dead: do not wait for its silence."""
         member = self.members.get(worker.encode())
         if member is None:
+            if worker in self._silent:  # given up already, and now it is known why
+                self._silent.discard(worker)
+                self.events.append(Left(worker, why, 0, False))
             return []
         self._forget(member, Silence, why)
         return self._deal()
@@ -178,6 +182,7 @@ class Roster:
         silent = [member for member in self.members.values() if now - member.heard_s > self.worker_timeout_s]
         why = f"silent for {self.worker_timeout_s:.0f} s"
         for member in silent:
+            self._silent.add(member.hello.worker)
             self._forget(member, Silence, why)
         return self._deal() if silent else []
 
@@ -259,6 +264,7 @@ class Roster:
         self._next_session += 1
         self._joins += 1
         self.members[peer] = member
+        self._silent.discard(hello.worker)
         self.events.append(Joined(hello.worker, hello.host, hello.pid))
         welcome: list[Out] = [(peer, Welcome(member.session, hello.attempt, self.run))]
         return welcome + self._offer(member) + self._deal()

@@ -984,3 +984,20 @@ def test_the_table_names_the_standing_that_follows_an_event(standing: Standing, 
         for _ in range(STRIKES):
             learner.roster.reject(A, None, "rubbish", 0.0)
     assert standing_of(learner, A) is TABLE[standing][event] is Standing.UNKNOWN
+
+
+def test_why_one_was_silent_is_told_once_it_is_known() -> None:
+    learner = Learner()
+    learner.joins(b"a")
+    learner.joins(b"b")
+    learner.now += TIMEOUT_S + 1
+    learner.balanced(learner.roster.tick(learner.now))
+    learner.roster.events.clear()
+    for _ in range(2):
+        learner.balanced(learner.roster.gone("a", "was ended: too slow"))
+    assert learner.roster.events == [Left("a", "was ended: too slow", 0, False)]
+    learner.joins(b"b", attempt=2)
+    learner.says(b"b", Goodbye(learner.session(b"b"), "told to stop", ()))
+    learner.roster.events.clear()
+    learner.balanced(learner.roster.gone("b", "ended with exit code 0"))
+    assert learner.roster.events == []

@@ -22,6 +22,7 @@ from pathlib import Path
 from protocol.errors import OurError
 from protocol.link import WorkerLink, check_address
 from workers.session import Session
+from workers.watchdog import Watchdog
 from workers.worker import Worker, identity, parent_is_gone
 
 
@@ -35,6 +36,10 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--parent", type=int, default=0, help="leave when the process of this pid is no longer the parent")
     parser.add_argument("--join-timeout-s", type=float, default=60.0, help="leave when no learner has answered for so long")
     parser.add_argument("--no-code", action="store_true", help="refuse an environment that comes as a pickled callable")
+    parser.add_argument(
+        "--step-timeout-s", type=float, default=120.0, help="end when a step of one env copy takes longer; 0: however long"
+    )
+    parser.add_argument("--core", type=int, help="run on this core alone")
     options = parser.parse_args(argv)
     logging.basicConfig(level=logging.INFO, format=f"%(asctime)s worker {options.name}: %(message)s", stream=sys.stderr)
     try:
@@ -43,15 +48,21 @@ def main(argv: list[str] | None = None) -> int:
     except OurError as error:
         sys.stderr.write(f"worker {options.name}: {error}\n")
         return error.exit_code
+    if options.core is not None:
+        os.sched_setaffinity(0, {options.core})
+    watchdog = Watchdog(options.step_timeout_s) if options.step_timeout_s else None
     stops = _count_signals()
     session = Session(identity(options.name), time.monotonic(), join_timeout_s=options.join_timeout_s)
     worker = Worker(
         link,
         session,
         told_to_stop=lambda: len(stops) or int(bool(options.parent) and parent_is_gone(options.parent)),
+        alive=watchdog.feed if watchdog else lambda now: None,
         accepts_code=options.address.startswith("ipc://") and not options.no_code,
     )
     left = worker.run()
+    if watchdog:
+        watchdog.stop()
     if options.parent and parent_is_gone(options.parent):
         _tidy_up_after(options.address)
     if left.exit_code:

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -21,6 +21,7 @@ import zmq
 
 from protocol.link import WorkerLink
 from workers.session import Leave, Session
+from workers.watchdog import where_it_hung
 from workers.worker import Worker, identity
 
 BACKOFF_FIRST_S, BACKOFF_MOST_S, HEALTHY_S = 0.5, 30.0, 30.0
@@ -45,9 +46,10 @@ class Running(Protocol):
 class Process:
     """A worker process of its own; its stderr goes to a file."""
 
-    def __init__(self, address: str, name: str, log: Path | None) -> None:
+    def __init__(self, address: str, name: str, log: Path | None, flags: Sequence[str] = ()) -> None:
+        """`flags`: further ones of `python -m workers`."""
         self._log = log
-        command = [sys.executable, "-P", "-m", "workers", address, "--name", name, "--parent", str(os.getpid())]
+        command = [sys.executable, "-P", "-m", "workers", address, "--name", name, "--parent", str(os.getpid()), *flags]
         # A child must find what its parent found: a user's environment may lie beside the user's script.
         path = os.pathsep.join(entry or os.getcwd() for entry in [*sys.path, str(Path(__file__).parents[1])])
         threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -73,7 +75,11 @@ class Process:
             return None
         if code < 0:
             return code, f"was killed by {signal.Signals(-code).name}"
-        return code, f"ended with exit code {code}{self._last_line() if code else ''}"
+        said = self._log.read_text(errors="replace") if self._log and code else ""
+        if (where := where_it_hung(said)) is not None:
+            return code, f"was ended: a step of its environment took too long (--step-timeout-s), at {where}"
+        last = said.strip().splitlines()[-1:]
+        return code, f"ended with exit code {code}{f' ({last[0]})' if last else ''}"
 
     def stop(self) -> None:
         """SIGTERM: it finishes the rollout in hand."""
@@ -87,10 +93,6 @@ class Process:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-
-    def _last_line(self) -> str:
-        lines = self._log.read_text(errors="replace").strip().splitlines() if self._log else []
-        return f" ({lines[-1]})" if lines else ""
 
 
 class Thread:

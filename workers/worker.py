@@ -47,12 +47,16 @@ class Worker:
         session: Session,
         *,
         told_to_stop: Callable[[], int] = lambda: 0,
+        alive: Callable[[float], None] = lambda now: None,
         accepts_code: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`told_to_stop` counts the requests to leave; `accepts_code`: an environment factory may be unpickled."""
+        """`told_to_stop` counts the requests to leave; `alive` is called now and then, unless the environment hangs;
+        `accepts_code`: an environment factory may be unpickled.
+        """
         self._link, self._session, self._clock = link, session, clock
         self._told_to_stop, self._accepts_code = told_to_stop, accepts_code
+        self._alive = alive
         self._stops_heeded = 0
         self._collector: Collector | None = None
         self._loaded: Weights | None = None
@@ -79,6 +83,7 @@ class Worker:
     def _listen(self, timeout_s: float) -> None:
         """Heed signals, then everything that has arrived."""
         began_s = self._clock()
+        self._alive(began_s)
         arrived = self._link.poll(timeout_s)
         self._waited_s += self._clock() - began_s
         while self._stops_heeded < self._told_to_stop():

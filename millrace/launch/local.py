@@ -62,4 +62,14 @@ def _starter(config: Config, address: str, context: zmq.Context[zmq.Socket[bytes
         return lambda name: Thread(address, name, context)
     logs = run / "workers"
     logs.mkdir(exist_ok=True)
-    return lambda name: Process(address, name, logs / f"{name}.log")
+    if config.pin_workers and not hasattr(os, "sched_setaffinity"):
+        raise UsageError("pin_workers: this system does not let a process keep to one core")
+    cores = sorted(os.sched_getaffinity(0)) if config.pin_workers else []
+
+    def start(name: str) -> Process:
+        flags = ["--step-timeout-s", str(config.step_timeout_s)]
+        if cores:
+            flags += ["--core", str(cores[int(name.removeprefix("w")) % len(cores)])]
+        return Process(address, name, logs / f"{name}.log", flags)
+
+    return start

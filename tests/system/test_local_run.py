@@ -22,7 +22,7 @@ from learner.config import Config, resolve
 from learner.evaluate import load_policy
 from learner.metrics import Progress, read_rows
 from millrace.launch.local import train
-from protocol.errors import EnvironmentFailed, NoWorkers, UsageError
+from protocol.errors import EnvironmentFailed, NoWorkers, Stalled, UsageError
 
 SMALL: dict[str, Any] = {"n_epochs": 2, "eval_episodes": 2}  # what is shown here does not hang on learning much
 
@@ -319,3 +319,16 @@ def test_a_learner_that_was_killed_goes_on_from_its_newest_checkpoint(tmp_path: 
     assert_balanced(found["ledger"])
     steps = [row["time/total_timesteps"] for row in read_rows(folder / "metrics.jsonl")]
     assert steps == sorted(set(steps)), "the curve goes over the same steps twice"
+
+
+@pytest.mark.parametrize("worker_timeout_s", [1.0, 30.0], ids=["given up before", "not yet given up"])
+def test_a_worker_whose_environment_hangs_is_ended_and_replaced(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, worker_timeout_s: float
+) -> None:
+    caplog.set_level("INFO", "millrace")
+    settings = {"step_timeout_s": 2.0, "worker_timeout_s": worker_timeout_s, "stall_timeout_s": 6.0, **SMALL}
+    with pytest.raises(Stalled):
+        run(tmp_path, "workers.envs.toy:Hangs-v0", workers=1, steps=100_000, **settings)
+    said = [record.getMessage() for record in caplog.records]
+    assert len([line for line in said if "joined" in line]) >= 2
+    assert [line for line in said if "took too long" in line and "toy.py" in line]
