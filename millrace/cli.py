@@ -32,6 +32,8 @@ class Command(NamedTuple):
 def main(argv: list[str] | None = None) -> int:
     """Run the command line; the exit code."""
     argv = sys.argv[1:] if argv is None else argv
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # last: a module of the user's own is found here, and hides none of those installed
     try:
         exit_code = _dispatch(argv)
         sys.stdout.flush()

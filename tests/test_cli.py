@@ -426,3 +426,21 @@ def test_help_answers_at_once() -> None:
         assert done.returncode == 0
         assert not re.search(r"\| +(torch|numpy|gymnasium|rich|tyro)$", done.stderr, re.M)
     assert min(took_s) < 0.3 + 0.1 * os.getloadavg()[0]
+
+
+def test_modules_of_the_users_own_are_found_where_the_command_is_given(tmp_path: Path) -> None:
+    """An environment and an encoder that lie in the working directory, which an installed command does not search."""
+    (tmp_path / "mine.py").write_text(
+        "import gymnasium, torch\n"
+        "from gymnasium.envs.classic_control import CartPoleEnv\n"
+        "gymnasium.register('Mine-v0', CartPoleEnv, max_episode_steps=20)\n"
+        "def encoder(features, images):\n    return torch.nn.Linear(features, 8)\n"
+    )
+    argv = ["train", "mine:Mine-v0", "--encoder", "mine:encoder", "--steps", "300", "--workers", "1", "--eval-episodes", "1"]
+    root = Path(__file__).parents[1]
+    found = subprocess.run(
+        [sys.executable, "-P", "-m", "millrace", *argv],
+        cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(root)}, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert found.returncode == 0, found.stderr
+    assert "all steps done" in found.stdout
