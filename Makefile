@@ -21,7 +21,7 @@ type: .venv/installed-dev
 unit: .venv/installed-dev
 	$(BIN)/python -m pytest
 
-test-learning: .venv/installed-dev  ## published scores, three seeds each; half an hour
+test-learning: .venv/installed-dev  ## published scores, three seeds each; forty minutes
 	$(BIN)/python -m pytest -m learning --timeout 3600 tests/learning
 
 docs: .venv/installed-dev  ## write the generated parts of protocol/README.md
