@@ -156,11 +156,19 @@ class Faulty(Countdown):
     """A countdown that goes wrong at its step number `after` (from 0) and at all later ones; says how in `fault`.
 
     With `once`, a path, it goes wrong only if it can create that file: one time, whoever makes the environment again.
+    With `only_seed` it goes wrong only where that was the seed of its first reset: in one copy of one life of one lane.
     """
 
-    def __init__(self, after: int = 3, once: str = "", k: int = 5) -> None:
+    def __init__(self, after: int = 3, once: str = "", k: int = 5, only_seed: int | None = None) -> None:
         super().__init__(k)
         self._after, self._once, self._total = after, once, 0
+        self._only_seed = only_seed
+        self._seed: int | None = None
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Floats, Info]:
+        """Begin at `k`."""
+        self._seed = seed if self._seed is None else self._seed
+        return super().reset(seed=seed)
 
     def step(self, action: Any) -> tuple[Floats, float, bool, bool, Info]:
         """Count down, or go wrong."""
@@ -169,6 +177,8 @@ class Faulty(Countdown):
         return self.fault(*row) if self._total > self._after and self._due() else row
 
     def _due(self) -> bool:
+        if self._only_seed not in (None, self._seed):
+            return False
         if self._once:
             try:
                 os.close(os.open(self._once, os.O_CREAT | os.O_EXCL))
