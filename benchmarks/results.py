@@ -34,10 +34,11 @@ evaluations, tried again on other episodes than those it was chosen by; *final* 
 """
 TAIL = """
 
-On HalfCheetah-v5 CleanRL's settings (in this learner) ended at 1,818. What makes the difference is a first log standard deviation of
--2, so that the first actions are small, together with a shorter horizon (gamma 0.98, lambda 0.92), a narrow clip (0.1) and 20 epochs;
-observations and rewards are normalised in both. Settings and sources stand in [`learner/presets.toml`](../learner/presets.toml).
-[off_policy.md](off_policy.md) shows what V-trace is good for, [notebooks.md](notebooks.md) the runs of five teaching notebooks.
+On HalfCheetah-v5 CleanRL's settings (in this learner) ended at 1,818. What makes the difference is a first log standard
+deviation of -2, so that the first actions are small, together with a shorter horizon (gamma 0.98, lambda 0.92), a
+narrow clip (0.1) and 20 epochs; observations and rewards are normalised in both. Settings and sources stand in
+[`learner/presets.toml`](../learner/presets.toml). [off_policy.md](off_policy.md) shows what V-trace is good for,
+[notebooks.md](notebooks.md) the runs of five teaching notebooks.
 
 Two cores, no GPU, shared with other work while these ran: read the seconds as upper bounds. Versions: {versions}.
 """
