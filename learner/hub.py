@@ -12,10 +12,12 @@ from collections.abc import Callable, Iterable, Sequence
 
 from learner.events import Broke, Event, Joined, Left, Turned
 from learner.roster import Out, Roster
+from protocol.address import name_of
 from protocol.codec import Buffer, encode
 from protocol.errors import BadMessage, BadRollout, EnvironmentFailed, NoWorkers, Stalled
 from protocol.link import LearnerLink
 from protocol.messages import Array, Rollout, ToWorker, Weights
+from protocol.rarely import Rarely, again
 from protocol.rollout import validate
 
 log = logging.getLogger("millrace.learner")
@@ -49,6 +51,7 @@ class Hub:
         self.lags: list[int] = []
         """lag of each rollout of the last `gather`"""
         self.dead_workers, self.watch, self._clock = dead_workers, watch, clock
+        self._lid = Rarely()
         self._env_failures = 0
         self._failure: EnvironmentFailed | None = None
         self._refusal = ""
@@ -104,6 +107,7 @@ class Hub:
         deadline_s = self._clock() + timeout_s
         while self.roster.members and self._clock() < deadline_s:
             self._receive(POLL_S)
+            self._shut_out()
             self._gone()
         for member in self.roster.members.values():
             log.warning("worker %s did not say goodbye within %.0f s", member.hello.worker, timeout_s)
@@ -129,6 +133,7 @@ class Hub:
 
     def _listen(self, timeout_s: float) -> None:
         self._receive(timeout_s)
+        self._shut_out()
         self._gone()
         self._send(self.roster.tick(self._clock()))
 
@@ -139,7 +144,7 @@ class Hub:
             now = self._clock()
             match message:
                 case BadMessage():
-                    log.warning("message from %s: %s", peer[:40], message)
+                    self._complain(peer, f"message from {name_of(peer)[:40]!r}: {message}", now)
                     self._send(self.roster.reject(peer, None, str(message), now))
                 case Rollout():
                     self._rollout(peer, message, now)
@@ -150,11 +155,22 @@ class Hub:
         try:
             validate(rollout, self.roster.run)
         except BadRollout as error:
-            why = f"worker {peer.decode(errors='replace')}: rollout of ticket {rollout.ticket}: {error}"
-            log.warning("%s", why)
+            why = f"worker {name_of(peer).decode(errors='replace')}: rollout of ticket {rollout.ticket}: {error}"
+            self._complain(peer, why, now)
             self._send(self.roster.reject(peer, rollout, why, now))
         else:
             self._send(self.roster.receive(peer, rollout, now))
+
+    def _complain(self, peer: bytes, line: str, now: float) -> None:
+        """A line about what a peer sent, unless there was one a short while ago."""
+        if (kept_back := self._lid.due(self.link.speaker(peer), now)) is not None:
+            log.warning("%s%s", line, again(kept_back))
+
+    def _shut_out(self) -> None:
+        """Forget the members whose key was revoked: ZeroMQ asks about a key at the handshake alone."""
+        for peer in list(self.roster.members):
+            if why := self.link.why_not(peer):
+                self._send(self.roster.revoke(peer, why))
 
     def _gone(self) -> None:
         for worker, why in self.dead_workers():

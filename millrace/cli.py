@@ -196,6 +196,14 @@ def _presets(argv: list[str]) -> int:
     return 0
 
 
+def _keys(argv: list[str]) -> int:
+    from millrace.keys import keys
+
+    for line in keys(argv):
+        print(line)
+    return 0
+
+
 def _at_least(name: str, value: int, least: int) -> None:
     if value < least:
         raise UsageError(f"{name} expected int >= {least}, got {value}")
@@ -206,7 +214,8 @@ COMMANDS = {
     "learner": Command(
         _learner, "learner ENV --bind ADDRESS [flags]", "the learner alone; waits for workers from elsewhere"
     ),
-    "worker": Command(_worker, "worker ADDRESS [flags]", "one worker process that joins a learner"),
+    "worker": Command(_worker, "worker ADDRESS [--token FILE] [flags]", "one worker process that joins a learner"),
+    "keys": Command(_keys, "keys new|show|allow|revoke [NAME]", "who may join learners of this machine from others"),
     "evaluate": Command(_evaluate, "evaluate RUN [--video] [flags]", "greedy episodes of a run's newest policy"),
     "record": Command(_record, "record RUN --out DATASET [flags]", "episodes of a run's newest policy as a Minari dataset"),
     "plot": Command(_plot, "plot RUN [RUN ...] [--out FILE]", "learning curves as a PNG"),
