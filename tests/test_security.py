@@ -288,7 +288,11 @@ def test_plain_bytes_are_counted_and_do_no_harm(net: Net, keys: bool, caplog: py
     until(lambda: learner.refused == 1, learner)
     worker = net.worker(learner, token() if keys else None)
     worker.send(encode(hello()))
-    assert [message for _, message in heard(learner)] == [hello()]
+    got: list[ToLearner | BadMessage] = []
+    while hello() not in got:
+        got += [message for _, message in heard(learner)]
+    assert not (keys and len(got) > 1), "what came without a key was read"
+    assert {type(message) for message in got} <= {Hello, BadMessage}
     assert "was not let in" in lines(caplog, "millrace.door")[0]
 
 
@@ -422,7 +426,7 @@ class Tap(threading.Thread):
             ways = {near.fileno(): (near, far), far.fileno(): (far, near)}
             while ready := poller.poll(int(DEADLINE_S * 1000)):
                 for descriptor, _ in ready:
-                    source, sink = ways[int(descriptor)]  # type: ignore[call-overload]
+                    source, sink = ways[int(descriptor)]
                     try:
                         data = source.recv(65536)
                         sink.sendall(data)
@@ -497,12 +501,6 @@ def test_another_key_cannot_speak_in_a_workers_session_nor_take_it_over(net: Net
     assert other.session != member.session
     assert learner.speaker(other.peer) == "home"
 
-    def comes_back() -> bool:
-        worker.send(encode(Heartbeat(member.session, 0, 0, (), 7, {})))
-        return member.heartbeat is not None
-
-    serve(hub, comes_back, worker)
-
 
 def test_what_is_meant_for_one_key_is_not_sent_to_another(net: Net) -> None:
     learner = net.keyed()
@@ -541,7 +539,11 @@ def test_two_workers_of_one_name_and_two_keys_do_not_disturb_each_other(net: Net
     serve(hub, lambda: len(hub.roster.members) == 2)
     for worker in workers:
         assert worker.poll(DEADLINE_S)
-        assert {type(message) for message in worker.receive()} <= {Welcome, Weights, Collect}
+        got = list(worker.receive())
+        assert {type(message) for message in got} <= {Welcome, Weights, Collect}
+        session = next(message.session for message in got if isinstance(message, Welcome))
+        worker.send(encode(Heartbeat(session, 0, 0, (), 0, {})))
+    serve(hub, lambda: all(member.heartbeat is not None for member in hub.roster.members.values()))
 
 
 def test_the_table_of_who_spoke_last_stays_small(net: Net, monkeypatch: pytest.MonkeyPatch) -> None:
