@@ -52,6 +52,7 @@ class Hub:
         """lag of each rollout of the last `gather`"""
         self.dead_workers, self.watch, self._clock = dead_workers, watch, clock
         self._lid = Rarely()
+        self._draining = False
         self._env_failures = 0
         self._failure: EnvironmentFailed | None = None
         self._refusal = ""
@@ -103,6 +104,7 @@ class Hub:
 
     def drain(self, reason: str, timeout_s: float = 5.0) -> None:
         """Ask every worker to leave and wait for their Goodbye, at most `timeout_s`; what they still send is counted."""
+        self._draining = True
         self._send(self.roster.drain(reason))
         deadline_s = self._clock() + timeout_s
         while self.roster.members and self._clock() < deadline_s:
@@ -192,7 +194,7 @@ class Hub:
     def _events(self) -> None:
         events, self.roster.events = self.roster.events, []
         for event in events:
-            expected = isinstance(event, Joined) or (isinstance(event, Left) and event.on_purpose)
+            expected = isinstance(event, Joined) or (isinstance(event, Left) and event.on_purpose and self._draining)
             log.log(logging.INFO if expected else logging.WARNING, "%s", describe(event))
             match event:
                 case Turned(_, why):
