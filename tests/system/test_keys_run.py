@@ -149,7 +149,8 @@ def test_an_insecure_learner_warns_and_a_worker_of_it_runs_no_code(cluster: Clus
 def test_a_run_on_this_machine_over_sealed_tcp_learns_the_same(tmp_path: Path) -> None:
     """Keys that no file holds, made for this run; the weights are those of a run without, bit for bit."""
     policies = []
-    for name, settings in {"ipc": {}, "sealed": {"transport": "tcp", "keys": str(tmp_path / "keys")}}.items():
+    runs: dict[str, dict[str, Any]] = {"ipc": {}, "sealed": {"transport": "tcp", "keys": str(tmp_path / "keys")}}
+    for name, settings in runs.items():
         config = resolve("CartPole-v1", run_dir=str(tmp_path / name), seed=3, steps=3_000, eval_episodes=1, **settings)
         policies.append((train(config, None, lambda progress: None) / "policy.safetensors").read_bytes())
     assert policies[0] == policies[1]
