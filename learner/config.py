@@ -20,7 +20,7 @@ from tyro.conf import Positional
 
 from learner.hyperparameters import HYPERPARAMETERS, Hyperparameters, PPOConfig
 from learner.nearest import nearest
-from protocol.address import check_address
+from protocol.address import advertised, check_address
 from protocol.errors import UsageError
 
 PRESETS = Path(__file__).with_name("presets.toml")
@@ -220,6 +220,12 @@ def checked(config: Config, where: str = "") -> Config:
             f"{at}{config.envs} envs cannot be shared evenly among {config.lanes} lanes; take {near}, or {divisor} lanes"
         )
     check_address(config.bind)
+    try:
+        check_address(advertised("tcp://*:1", config.advertise, "machine"))
+    except UsageError:
+        raise UsageError(
+            f"{at}advertise {config.advertise}: expected a host name or an IP address, without a port"
+        ) from None
     return config
 
 

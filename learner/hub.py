@@ -64,11 +64,12 @@ class Hub:
     def wait_for(self, workers: int) -> None:
         """Wait until so many workers have joined. Raises `NoWorkers` after `no_workers_timeout_s`."""
         deadline_s = self._clock() + self.no_workers_timeout_s
+        token = "" if self.link.keyring is None else " --token FILE"
         while len(self.roster.members) < workers:
             if self._clock() > deadline_s:
                 raise NoWorkers(
                     f"waited {self.no_workers_timeout_s:.0f} s for {workers} workers at {self.link.address}, "
-                    f"{len(self.roster.members)} came{self._because()}; start one: python -m workers {self.link.address}"
+                    f"{len(self.roster.members)} came{self._because()}; start one: python -m workers {self.link.address}{token}"
                 )
             self._turn(POLL_S)
 
@@ -219,7 +220,9 @@ class Hub:
             raise NoWorkers(f"no worker for {self.no_workers_timeout_s:.0f} s at {self.link.address}{self._because()}")
 
     def _because(self) -> str:
-        return f" (the last one was refused: {self._refusal})" if self._refusal else ""
+        if self._refusal:
+            return f" (the last one was refused: {self._refusal})"
+        return f" ({self.link.refused} were not let in; the log says why)" if self.link.refused else ""
 
 
 def describe(event: Event) -> str:

@@ -10,7 +10,6 @@ that others can read. A secret that others can read is not used. A list that can
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import os
 import stat
@@ -137,6 +136,8 @@ class KeyFolder:
     @contextmanager
     def _editing(self) -> Iterator[None]:
         """One at a time: two commands at once must not lose each other's entry."""
+        import fcntl  # not on every system; workers do without
+
         folder = os.open(self.path, os.O_RDONLY)
         try:
             fcntl.flock(folder, fcntl.LOCK_EX)

@@ -12,6 +12,7 @@ import re
 import tomllib
 from dataclasses import dataclass, field
 from datetime import datetime
+from functools import cached_property
 from typing import Any
 
 import msgspec
@@ -84,8 +85,8 @@ class Token:
             raw = base64.b64decode(text[len(TOKEN_PREFIX) :] + "=", altchars=b"-_", validate=True)
         except ValueError:
             raw = b""
-        body, check = raw[: 2 * KEY_BYTES], raw[2 * KEY_BYTES :]
-        if check != _check(body) or Token(body[:KEY_BYTES], Key(b"", body[KEY_BYTES:])).to_text() != text:
+        body = raw[: 2 * KEY_BYTES]
+        if Token(body[:KEY_BYTES], Key(b"", body[KEY_BYTES:])).to_text() != text:  # the checksum, and how it is written
             raise UsageError(f"{where}: the join token is damaged (its checksum does not fit); copy it again")
         return Token(body[:KEY_BYTES], Key.of_secret(body[KEY_BYTES:]))
 
@@ -112,17 +113,22 @@ class Allowed:
 
     def why_not(self, public: bytes) -> str:
         """Why a message, or a handshake, under this key is refused; empty if it is not."""
-        mine = [client for client in self.clients if client.public == public.hex()]
-        if not mine:
+        client = self._known.get(public)
+        if client is None:
             return f"its key {fingerprint(public)} is not allowed here"
-        revoked = [client for client in mine if client.revoked is not None]
-        if revoked:
-            return f"its key {revoked[0].name} ({fingerprint(public)}) was revoked"
+        if client.revoked is not None:
+            return f"its key {client.name} ({fingerprint(public)}) was revoked"
         return ""
 
     def name_of(self, public: bytes) -> str:
         """The name of the client with this key, or its fingerprint."""
-        return next((client.name for client in self.clients if client.public == public.hex()), fingerprint(public))
+        client = self._known.get(public)
+        return fingerprint(public) if client is None else client.name
+
+    @cached_property
+    def _known(self) -> dict[bytes, Client]:
+        """By public key; of one that stands twice, the entry that was revoked."""
+        return {bytes.fromhex(one.public): one for one in sorted(self.clients, key=lambda one: one.revoked is not None)}
 
     def valid(self, name: str) -> Client | None:
         """The client of this name that may connect."""

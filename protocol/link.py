@@ -7,7 +7,8 @@ credit that keeps queues short. MAXMSGSIZE bounds a frame before a byte of it is
 
 With keys, a peer is a routing id *and* the key under which it speaks, which libzmq vouches for on every message. So whoever
 claims another's routing id under a key of its own is another peer: it cannot speak in that worker's session, nor end it. It
-cannot even cut its connection, because a worker's routing id then ends in a tag that only the holder of its key can make.
+cannot even cut its connection (a handover leaves the earlier one open and deaf), because a worker's routing id then ends in
+a tag that only the holder of its key can make.
 """
 
 from __future__ import annotations

@@ -103,6 +103,10 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
             ["learner", "CartPole-v1", "--bind", "tcp://::1:5555"],
             "address tcp://::1:5555: expected an IPv6 address in brackets, as in tcp://[::1]:5555",
         ),
+        (
+            ["learner", "CartPole-v1", "--advertise", "tcp://host:5555"],
+            "advertise tcp://host:5555: expected a host name or an IP address, without a port",
+        ),
     ],
 )
 def test_bad_usage_is_one_exact_line(asked: list[Any], capsys: Captured, argv: list[str], says: str) -> None:
