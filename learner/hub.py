@@ -64,12 +64,12 @@ class Hub:
     def wait_for(self, workers: int) -> None:
         """Wait until so many workers have joined. Raises `NoWorkers` after `no_workers_timeout_s`."""
         deadline_s = self._clock() + self.no_workers_timeout_s
-        token = "" if self.link.keyring is None else " --token FILE"
+        start = f"python -m workers {self.link.address}{'' if self.link.keyring is None else ' --token FILE'}"
         while len(self.roster.members) < workers:
             if self._clock() > deadline_s:
                 raise NoWorkers(
                     f"waited {self.no_workers_timeout_s:.0f} s for {workers} workers at {self.link.address}, "
-                    f"{len(self.roster.members)} came{self._because()}; start one: python -m workers {self.link.address}{token}"
+                    f"{len(self.roster.members)} came{self._because()}; start one: {start}"
                 )
             self._turn(POLL_S)
 
