@@ -132,7 +132,7 @@ def test_a_worker_without_a_token_says_why_it_cannot_join(cluster: Cluster) -> N
 
 def test_an_insecure_learner_warns_and_a_worker_of_it_runs_no_code(cluster: Cluster) -> None:
     argv = ["workers.envs.toy:Spaces-v0", "--insecure", "--bind", "tcp://0.0.0.0:*", "--advertise", "127.0.0.1"]
-    cluster.start("learner", "learner", *argv, "--run-dir", str(cluster.folder / "runs"))
+    cluster.start("learner", "millrace", "learner", *argv, "--run-dir", str(cluster.folder / "runs"))
     line = cluster.until(
         lambda: next((one for one in cluster.said("learner").splitlines() if "millrace worker " in one), "")
     )
