@@ -330,6 +330,7 @@ def test_trouble_that_is_over_is_forgotten(net: Net) -> None:
     until(lambda: worker.trouble is not None, worker)
     address = first.address
     first.close(0.0)
+    first.context.term()  # then the port is free
     learner = net.learner(Keyring(SERVER, Allowed().adding("lab", LAB.public, NOW)), address)
     worker.send(encode(hello()))
     until(lambda: worker.trouble is None, worker)
