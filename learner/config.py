@@ -20,8 +20,8 @@ from tyro.conf import Positional
 
 from learner.hyperparameters import HYPERPARAMETERS, Hyperparameters, PPOConfig, elsewhere
 from learner.nearest import nearest
+from protocol.address import advertised, check_address
 from protocol.errors import UsageError
-from protocol.link import check_address
 
 PRESETS = Path(__file__).with_name("presets.toml")
 Scalar = bool | int | float | str
@@ -58,7 +58,13 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     transport: Literal["inproc", "ipc", "tcp"] = "ipc"
     """how local workers are reached: threads of this process, local sockets, or loopback TCP"""
     bind: str = "tcp://127.0.0.1:5555"
-    """where `millrace learner` listens for workers"""
+    """where `millrace learner` listens for workers; tcp://0.0.0.0:5555 is for other machines, and needs keys"""
+    advertise: str = ""
+    """the host that workers on other machines are told; if not given, this machine's name"""
+    keys: str = ""
+    """folder of keys (or MILLRACE_KEYS): then loopback TCP needs keys too; if not given, ~/.config/millrace/keys"""
+    insecure: bool = False
+    """let other machines connect without keys: whoever reaches the port can read the run, spoil it and stop it"""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """where the learner learns"""
     torch_threads: Count = 1
@@ -218,6 +224,12 @@ def checked(config: Config, where: str = "") -> Config:
             f"{at}{config.envs} envs cannot be shared evenly among {config.lanes} lanes; take {near}, or {divisor} lanes"
         )
     check_address(config.bind)
+    try:
+        check_address(advertised("tcp://*:1", config.advertise, "machine"))
+    except UsageError:
+        raise UsageError(
+            f"{at}advertise {config.advertise}: expected a host name or an IP address, without a port"
+        ) from None
     return config
 
 

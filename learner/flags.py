@@ -25,7 +25,7 @@ PLAINER = {
     r"could not convert string to float: ": "expected a number, got ",
     r"^Error parsing (\S+): ": r"\1 ",
     r"^invalid choice (\S+) for argument '(\S+)'\. Expected one of \((.*)\)$": r"\2 expected one of \3, got \1",
-    r"^Missing from millrace \w+: ?(.*) \(required\)$": r"missing: \1",
+    r"^Missing from millrace [\w ]+: ?(.*) \(required\)$": r"missing: \1",
 }
 
 Record = TypeVar("Record", bound=msgspec.Struct)

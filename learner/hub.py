@@ -14,10 +14,12 @@ from learner.events import Broke, Event, Joined, Left, Stale, Told, Turned
 from learner.metrics import Progress
 from learner.roster import Out, Roster
 from learner.status import status
+from protocol.address import name_of
 from protocol.codec import Buffer, encode
 from protocol.errors import BadMessage, BadRollout, EnvironmentFailed, NoWorkers, Stalled
 from protocol.link import LearnerLink
 from protocol.messages import Array, Inquire, Rollout, ToWorker, Weights
+from protocol.rarely import Rarely, again
 from protocol.rollout import validate
 
 log = logging.getLogger("millrace.learner")
@@ -53,6 +55,8 @@ class Hub:
         self.progress = Progress()
         """of the run, for whoever asks: the journal keeps it"""
         self.dead_workers, self.watch, self._clock = dead_workers, watch, clock
+        self._lid = Rarely()
+        self._draining = False
         self._env_failures = 0
         self._failure: EnvironmentFailed | None = None
         self._refusal = ""
@@ -64,11 +68,12 @@ class Hub:
     def wait_for(self, workers: int) -> None:
         """Wait until so many workers have joined. Raises `NoWorkers` after `no_workers_timeout_s`."""
         deadline_s = self._clock() + self.no_workers_timeout_s
+        start = f"python -m workers {self.link.address}{'' if self.link.keyring is None else ' --token FILE'}"
         while len(self.roster.members) < workers:
             if self._clock() > deadline_s:
                 raise NoWorkers(
                     f"waited {self.no_workers_timeout_s:.0f} s for {workers} workers at {self.link.address}, "
-                    f"{len(self.roster.members)} came{self._because()}; start one: python -m workers {self.link.address}"
+                    f"{len(self.roster.members)} came{self._because()}; start one: {start}"
                 )
             self._turn(POLL_S)
 
@@ -104,10 +109,12 @@ class Hub:
 
     def drain(self, reason: str, timeout_s: float = 5.0) -> None:
         """Ask every worker to leave and wait for their Goodbye, at most `timeout_s`; what they still send is counted."""
+        self._draining = True
         self._send(self.roster.drain(reason))
         deadline_s = self._clock() + timeout_s
         while self.roster.members and self._clock() < deadline_s:
             self._receive(POLL_S)
+            self._shut_out()
             self._gone()
         for member in self.roster.members.values():
             log.warning("worker %s did not say goodbye within %.0f s", member.hello.worker, timeout_s)
@@ -133,6 +140,7 @@ class Hub:
 
     def _listen(self, timeout_s: float) -> None:
         self._receive(timeout_s)
+        self._shut_out()
         self._gone()
         self._send(self.roster.tick(self._clock()))
 
@@ -143,7 +151,7 @@ class Hub:
             now = self._clock()
             match message:
                 case BadMessage():
-                    log.warning("message from %s: %s", peer[:40], message)
+                    self._complain(peer, f"message from {name_of(peer)[:40]!r}: {message}", now)
                     self._send(self.roster.reject(peer, None, str(message), now))
                 case Rollout():
                     self._rollout(peer, message, now)
@@ -156,11 +164,22 @@ class Hub:
         try:
             validate(rollout, self.roster.run)
         except BadRollout as error:
-            why = f"worker {peer.decode(errors='replace')}: rollout of ticket {rollout.ticket}: {error}"
-            log.warning("%s", why)
+            why = f"worker {name_of(peer).decode(errors='replace')}: rollout of ticket {rollout.ticket}: {error}"
+            self._complain(peer, why, now)
             self._send(self.roster.reject(peer, rollout, why, now))
         else:
             self._send(self.roster.receive(peer, rollout, now))
+
+    def _complain(self, peer: bytes, line: str, now: float) -> None:
+        """A line about what a peer sent, unless there was one a short while ago."""
+        if (kept_back := self._lid.due(self.link.speaker(peer), now)) is not None:
+            log.warning("%s%s", line, again(kept_back))
+
+    def _shut_out(self) -> None:
+        """Forget the members whose key was revoked: ZeroMQ asks about a key at the handshake alone."""
+        for peer in list(self.roster.members):
+            if why := self.link.why_not(peer):
+                self._send(self.roster.revoke(peer, why))
 
     def _gone(self) -> None:
         for worker, why in self.dead_workers():
@@ -182,7 +201,8 @@ class Hub:
     def _events(self) -> None:
         events, self.roster.events = self.roster.events, []
         for event in events:
-            expected = isinstance(event, Joined | Told | Stale) or (isinstance(event, Left) and event.on_purpose)
+            leaving = isinstance(event, Left) and event.on_purpose and self._draining
+            expected = leaving or isinstance(event, Joined | Told | Stale)
             log.log(logging.INFO if expected else logging.WARNING, "%s", describe(event), extra={"event": event})
             match event:
                 case Turned(_, why):
@@ -207,7 +227,9 @@ class Hub:
             raise NoWorkers(f"no worker for {self.no_workers_timeout_s:.0f} s at {self.link.address}{self._because()}")
 
     def _because(self) -> str:
-        return f" (the last one was refused: {self._refusal})" if self._refusal else ""
+        if self._refusal:
+            return f" (the last one was refused: {self._refusal})"
+        return f" ({self.link.refused} were not let in; the log says why)" if self.link.refused else ""
 
 
 def describe(event: Event) -> str:

@@ -18,7 +18,8 @@ from dataclasses import dataclass, field
 from learner.events import Broke, Event, Joined, Left, Stale, Told, Turned
 from learner.lanes import Lane, Ticket
 from learner.ledger import Ledger
-from learner.standing import TABLE, Rubbish, Silence, Standing
+from learner.standing import TABLE, Revoked, Rubbish, Silence, Standing
+from protocol.address import name_of
 from protocol.messages import (
     PROTOCOL_VERSION,
     Array,
@@ -45,7 +46,7 @@ from protocol.specs import RunSpec
 
 MEASURE_S = 0.5  # at least, between two accounts that a worker's speed is measured by
 STRIKES = 3  # rollouts or messages that could not be used, after which a worker is refused
-
+REMEMBERED_REFUSALS = 1000  # processes; who has many names must not fill the memory
 
 Out = tuple[bytes, ToWorker]
 
@@ -122,7 +123,7 @@ class Roster:
                 self.ledger.transitions_late += message.env_steps
             if not isinstance(message, Goodbye | Failure):
                 late = message.env_steps if isinstance(message, Rollout) else 0
-                self.events.append(Told(peer.decode(errors="replace")[:40], message.session, late))
+                self.events.append(Told(name_of(peer).decode(errors="replace")[:40], message.session, late))
             return [(peer, Rejoin(message.session))] if not isinstance(message, Goodbye | Failure) else []
         member.heard_s = now
         match message:
@@ -155,7 +156,7 @@ class Roster:
         member.heard_s = now
         member.strikes += 1
         if member.strikes >= STRIKES:
-            self._refused[peer] = (member.hello.life, why)
+            self._refuse(member, why)
             self.events.append(Turned(member.hello.worker, why))
             self._forget(member, Rubbish, f"refused: {why}")
             return [(peer, Refuse(why)), *self._deal()]
@@ -168,7 +169,7 @@ class Roster:
 
     def gone(self, worker: str, why: str) -> list[Out]:
         """A worker's process is known to be dead: do not wait for its silence."""
-        member = self.members.get(worker.encode())
+        member = next((member for member in self.members.values() if member.hello.worker == worker), None)
         if member is None:
             if worker in self._silent:  # given up already, and now it is known why
                 self._silent.discard(worker)
@@ -176,6 +177,13 @@ class Roster:
             return []
         self._forget(member, Silence, why)
         return self._deal()
+
+    def revoke(self, peer: bytes, why: str) -> list[Out]:
+        """A member may speak no more: it is told so and forgotten at once, whatever it holds."""
+        member = self.members[peer]
+        self.events.append(Turned(member.hello.worker, why))
+        self._forget(member, Revoked, f"was shut out: {why}")
+        return [(peer, Refuse(why)), *self._deal()]
 
     def tick(self, now: float) -> list[Out]:
         """Judge silence. Call it only when every message that has arrived was given to `receive`."""
@@ -238,8 +246,8 @@ class Roster:
         why = ""
         if hello.protocol != PROTOCOL_VERSION:
             why = f"protocol expected {PROTOCOL_VERSION}, got {hello.protocol}; install the learner's version of millrace"
-        elif hello.worker.encode() != peer:
-            why = f"name expected {peer[:40]!r}, its routing id, got {hello.worker[:40]!r}"
+        elif hello.worker.encode() != name_of(peer):
+            why = f"name expected {name_of(peer)[:40]!r}, as in its routing id, got {hello.worker[:40]!r}"
         if why:
             self.events.append(Turned(hello.worker, why))
             return [(peer, Refuse(why))]
@@ -258,7 +266,7 @@ class Roster:
                 return []
             if not same:
                 why = f"another process, on {hello.host}, joined as {hello.worker}; give each worker a name of its own"
-                self._refused[peer] = (member.hello.life, why)
+                self._refuse(member, why)
             self._forget(member, Silence, "began again" if same else f"replaced by process {hello.pid}")
         member = Member(peer, hello, self._next_session, self._joins, now)
         self._next_session += 1
@@ -268,6 +276,13 @@ class Roster:
         self.events.append(Joined(hello.worker, hello.host, hello.pid))
         welcome: list[Out] = [(peer, Welcome(member.session, hello.attempt, self.run))]
         return welcome + self._offer(member) + self._deal()
+
+    def _refuse(self, member: Member, why: str) -> None:
+        """Remember that this process was refused: it must not come back."""
+        self._refused.pop(member.peer, None)
+        self._refused[member.peer] = (member.hello.life, why)
+        if len(self._refused) > REMEMBERED_REFUSALS:
+            del self._refused[next(iter(self._refused))]
 
     def _rollout(self, member: Member, rollout: Rollout) -> list[Out]:
         self._acknowledge(member, min(rollout.version, self.version))

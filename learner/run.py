@@ -10,6 +10,7 @@ import os
 import signal
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -21,12 +22,13 @@ from learner.algorithms import ALGORITHMS, Algorithm
 from learner.config import Config
 from learner.hub import Hub
 from learner.journal import Journal, Past, recall
+from learner.listening import join_lines, keyring_for
 from learner.metrics import Progress
 from learner.roster import Roster
 from learner.run_folder import Interrupted, RunFolder
 from learner.train import train
 from protocol.errors import UsageError
-from protocol.link import LearnerLink, is_local
+from protocol.link import LearnerLink
 from protocol.spaces import action_spec, observation_leaves
 from protocol.specs import EnvSpec, RunSpec
 
@@ -96,18 +98,15 @@ class Run:
 
 def serve(config: Config, resume: Path | None, watch: Watch) -> Path:
     """The learner alone, at `config.bind`: workers are started elsewhere. Its run folder."""
-    if not is_local(config.bind):
-        raise UsageError(
-            f"address {config.bind} can be reached by other machines, and workers cannot prove who they are yet; "
-            "bind to 127.0.0.1"
-        )
+    keyring = keyring_for(config, datetime.now(UTC).replace(microsecond=0))
     with ExitStack() as stack:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         stack.callback(context.term)
-        link = LearnerLink(config.bind, context)
+        link = LearnerLink(config.bind, context, keyring)
         stack.callback(link.close)
         run = Run(config, EnvSpec.of(config.env, config.env_kwargs), link, resume, watch)
-        log.warning("waiting for workers; start one with: python -m workers %s", link.address)
+        for line in join_lines(link.address, config.advertise, keyring):
+            log.warning("%s", line)
         run.go(config.min_workers or 1)
         return run.folder.path
 

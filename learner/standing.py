@@ -23,6 +23,10 @@ class Rubbish:
     """Event: it sent too much that could not be used."""
 
 
+class Revoked:
+    """Event: the key under which it speaks may connect no more."""
+
+
 # What each standing becomes; Drain is what the learner says. What an unknown worker says otherwise is answered by Rejoin.
 TABLE: dict[Standing, dict[type, Standing]] = {
     Standing.UNKNOWN: {Hello: Standing.ACTIVE},
@@ -34,6 +38,7 @@ TABLE: dict[Standing, dict[type, Standing]] = {
         Failure: Standing.UNKNOWN,
         Silence: Standing.UNKNOWN,
         Rubbish: Standing.UNKNOWN,
+        Revoked: Standing.UNKNOWN,
         Drain: Standing.DRAINING,
     },
     Standing.DRAINING: {
@@ -43,5 +48,6 @@ TABLE: dict[Standing, dict[type, Standing]] = {
         Failure: Standing.UNKNOWN,
         Silence: Standing.UNKNOWN,
         Rubbish: Standing.UNKNOWN,
+        Revoked: Standing.UNKNOWN,
     },
 }

@@ -204,14 +204,24 @@ def _status(argv: list[str]) -> int:
 
     flags = parse(StatusFlags, argv, "status")
     from millrace.status import observe, observer_name
-    from protocol.link import WorkerLink, check_address
+    from protocol.key_folder import read_token
+    from protocol.link import WorkerLink
+    from workers.trust import entry
 
-    check_address(flags.address)
-    link = WorkerLink(flags.address, observer_name())
+    token = entry(flags.address, read_token(flags.token), insecure=flags.insecure)
+    link = WorkerLink(flags.address, observer_name(), token=token)
     try:
         observe(link, flags)
     finally:
         link.close(linger_s=0)
+    return 0
+
+
+def _keys(argv: list[str]) -> int:
+    from millrace.keys import keys
+
+    for line in keys(argv):
+        print(line)
     return 0
 
 
@@ -225,8 +235,9 @@ COMMANDS = {
     "learner": Command(
         _learner, "learner ENV --bind ADDRESS [flags]", "the learner alone; waits for workers from elsewhere"
     ),
-    "worker": Command(_worker, "worker ADDRESS [flags]", "one worker process that joins a learner"),
+    "worker": Command(_worker, "worker ADDRESS [--token FILE] [flags]", "one worker process that joins a learner"),
     "status": Command(_status, "status ADDRESS [--watch]", "how a run is: its workers, their speed, what was dropped"),
+    "keys": Command(_keys, "keys new|show|allow|revoke [NAME]", "who may join learners of this machine from others"),
     "evaluate": Command(_evaluate, "evaluate RUN [--video] [flags]", "greedy episodes of a run's newest policy"),
     "record": Command(_record, "record RUN --out DATASET [flags]", "episodes of a run's newest policy as a Minari dataset"),
     "plot": Command(_plot, "plot RUN [RUN ...] [--out FILE]", "learning curves as a PNG"),

@@ -1,4 +1,4 @@
-"""The flags of the commands that look at runs."""
+"""The flags of the commands that look at runs, or edit keys."""
 
 from __future__ import annotations
 
@@ -36,6 +36,10 @@ class StatusFlags(msgspec.Struct, frozen=True, kw_only=True):
     """one line of JSON instead of a table"""
     timeout_s: float = 5.0
     """how long to wait for an answer"""
+    token: str = ""
+    """file of a join token (or MILLRACE_TOKEN), as a worker there needs it"""
+    insecure: bool = False
+    """ask without a token on another machine, and believe whoever answers"""
     debug: bool = False
     """show the traceback of an error"""
 
@@ -81,3 +85,43 @@ class ReportFlags(msgspec.Struct, frozen=True, kw_only=True):
     """the page; report.html in the first run folder if not given"""
     debug: bool = False
     """show the traceback of an error"""
+
+
+class KeysFlags(msgspec.Struct, frozen=True, kw_only=True):
+    """What every command about keys takes."""
+
+    keys: str = ""
+    """the key folder (or MILLRACE_KEYS); ~/.config/millrace/keys if not given"""
+    debug: bool = False
+    """show the traceback of an error"""
+
+
+class KeysNewFlags(KeysFlags, frozen=True, kw_only=True):
+    """Make a key for workers, allow it here, and write its join token into the key folder (0600)."""
+
+    name: Positional[str]
+    """what to call it: `millrace keys revoke NAME` shuts out all who use it, and nobody else"""
+    server: str = ""
+    """public key of a learner elsewhere: the token is for that one, which must then allow the key that is printed"""
+    print_token: bool = False
+    """print the token and nothing else, as for a secret store: whoever sees it can join"""
+
+
+class KeysShowFlags(KeysFlags, frozen=True, kw_only=True):
+    """The learner's public key, and the clients: names, public keys, dates, and whether they may connect."""
+
+
+class KeysAllowFlags(KeysFlags, frozen=True, kw_only=True):
+    """Allow a client that made its key itself (`millrace keys new NAME --server …`, on its machine)."""
+
+    public: Positional[str]
+    """its public key, 64 hexadecimal digits"""
+    name: Positional[str]
+    """what to call it"""
+
+
+class KeysRevokeFlags(KeysFlags, frozen=True, kw_only=True):
+    """Shut a client out: learners that run notice within a second or two and cut its workers off."""
+
+    name: Positional[str]
+    """of the client"""

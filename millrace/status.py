@@ -49,7 +49,8 @@ def ask(link: WorkerLink, timeout_s: float, clock: Callable[[], float] = time.mo
             for message in link.answers():
                 if isinstance(message, Status):
                     return message
-    raise RunError(f"no learner answered within {timeout_s:g} s; is it running, and is this its address?")
+    trouble = f": {link.trouble.line}" if link.trouble else "; is it running, and is this its address?"
+    raise RunError(f"no learner answered within {timeout_s:g} s{trouble}")
 
 
 def observe(link: WorkerLink, flags: StatusFlags) -> None:

@@ -4,68 +4,78 @@ Every option here was learned by an experiment. ROUTER_MANDATORY: a plain ROUTER
 ROUTER_HANDOVER: else a returning worker is locked out until its half-open connection times out. No ZMTP heartbeats: with a
 reader stopped by its high-water mark they lose and reorder messages; our own heartbeats judge silence, and tickets are the
 credit that keeps queues short. MAXMSGSIZE bounds a frame before a byte of it is read. A link belongs to one thread.
+
+With keys, a peer is a routing id *and* the key under which it speaks, which libzmq vouches for on every message. So whoever
+claims another's routing id under a key of its own is another peer: it cannot speak in that worker's session, nor end it. It
+cannot even cut its connection (a handover leaves the earlier one open and deaf), because a worker's routing id then ends in
+a tag that only the holder of its key can make.
 """
 
 from __future__ import annotations
 
-import ipaddress
+import hashlib
+import logging
+import os
+import struct
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from typing import TypeVar
 
 import zmq
 
-from protocol.codec import MAX_FRAME_BYTES, MAX_FRAMES, Buffer, decode_to_learner, decode_to_observer, decode_to_worker
-from protocol.errors import BadMessage, UsageError
-from protocol.messages import Inquire, ToLearner, ToObserver, ToWorker
+from protocol.address import check_address, name_of, needs_ipv6, resolves
+from protocol.codec import (
+    MAX_FRAME_BYTES,
+    MAX_FRAMES,
+    Buffer,
+    decode_to_learner,
+    decode_to_observer,
+    decode_to_worker,
+    encode,
+)
+from protocol.errors import BadMessage, RunError, UsageError
+from protocol.handshake import HANDSHAKE_MS, WATCHED_BY_WORKER, Trouble, trouble
+from protocol.key_folder import Keyring
+from protocol.keys import Token
+from protocol.messages import Inquire, Refuse, ToLearner, ToObserver, ToWorker
+from protocol.rarely import Rarely, again
+from protocol.security import Door, connect_with
 
 Said = TypeVar("Said")
+
+log = logging.getLogger("millrace.link")
 
 LINGER_MS = 2000
 QUEUE = 1000  # messages: for a peer that talks and does not read
 MESSAGES_AT_ONCE = 10_000
 COPY_BELOW_BYTES = 65536  # smaller frames are copied: cheaper than keeping track of them
+CURVE_BYTES = 33  # what encryption adds to a frame
+HOLDERS = 10_000  # routing ids whose last speaker is remembered
+TAG_CHARACTERS = 32
 
 
-def check_address(address: str) -> str:
-    """Return the address if it can be used. Raises `UsageError` in one line."""
-    scheme, sep, rest = address.partition("://")
-    if not sep or scheme not in {"inproc", "ipc", "tcp"} or not rest:
-        raise UsageError(f"address {address}: expected inproc://NAME, ipc://PATH or tcp://HOST:PORT")
-    if scheme == "tcp":
-        port = rest.rpartition(":")[2]
-        if port != "*" and not (port.isdecimal() and 0 < int(port) < 65536):
-            raise UsageError(f"address {address}: expected a port, 1 to 65535, as in tcp://127.0.0.1:5555")
-    return address
-
-
-def is_local(address: str) -> bool:
-    """True for addresses that only this machine can reach."""
-    scheme, _, rest = address.partition("://")
-    host = rest.rpartition(":")[0]
-    if scheme in {"inproc", "ipc"} or host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:  # a name; whatever it is resolved to, it is not ours to trust
-        return False
-
-
-def _options(socket: zmq.Socket[bytes]) -> None:
+def _options(socket: zmq.Socket[bytes], address: str, curve: bool) -> None:
     socket.linger = LINGER_MS
-    socket.maxmsgsize = MAX_FRAME_BYTES
-    socket.handshake_ivl = 2000
+    socket.maxmsgsize = MAX_FRAME_BYTES + (CURVE_BYTES if curve else 0)
+    socket.handshake_ivl = HANDSHAKE_MS
+    socket.ipv6 = needs_ipv6(address)
     # Credit bounds what is under way (one Weights, a few tickets and their rollouts) far below these.
     socket.sndhwm = socket.rcvhwm = QUEUE
 
 
-def _receive(socket: zmq.Socket[bytes]) -> list[Buffer] | None:
-    """The next message's frames, or None. Of one with too many it keeps enough to show that, and throws the rest away."""
+def _receive(socket: zmq.Socket[bytes], said_by: list[str] | None = None) -> list[Buffer] | None:
+    """The next message's frames, or None. Of one with too many it keeps enough to show that, and throws the rest away.
+
+    `said_by`, if given, is filled with the key of each frame's sender, as libzmq proved it in the handshake.
+    """
     frames: list[Buffer] = []
     try:
         more = True
         while more:
             frame = socket.recv(zmq.NOBLOCK, copy=False)
+            if said_by is not None and not frames:
+                said_by[:] = [_user(frame)]
             more = frame.more
             if len(frames) < MAX_FRAMES + 2:  # the sender's name, and one too many
                 frames.append(frame.buffer if len(frame) >= COPY_BELOW_BYTES else frame.bytes)
@@ -74,42 +84,110 @@ def _receive(socket: zmq.Socket[bytes]) -> list[Buffer] | None:
     return frames
 
 
+def _user(frame: zmq.Frame) -> str:
+    try:
+        return str(frame.get("User-Id"))
+    except zmq.ZMQError:  # there is none, which must not happen: nobody has such a key
+        return ""
+
+
 class LearnerLink:
     """The learner's end: many workers, one port."""
 
-    def __init__(self, address: str, context: zmq.Context[zmq.Socket[bytes]] | None = None) -> None:
+    def __init__(
+        self, address: str, context: zmq.Context[zmq.Socket[bytes]] | None = None, keyring: Keyring | None = None
+    ) -> None:
+        """With a keyring (tcp alone) only those on it get in. There can be one such link in a context."""
         check_address(address)
         self.context = context or zmq.Context.instance()
+        self.keyring = keyring
+        self.refused_messages = 0
+        """messages under keys that may speak no more"""
+        self._holders: dict[bytes, str] = {}  # routing id -> key under which it spoke last
+        self._lid = Rarely()
         self._socket = self.context.socket(zmq.ROUTER)
-        _options(self._socket)
+        _options(self._socket, address, keyring is not None)
         self._socket.router_mandatory = True
         self._socket.router_handover = True
+        self._door: Door | None = None
         try:
+            if address.startswith("tcp://"):
+                self._door = Door(self._socket, keyring)  # before the port is bound
             self._socket.bind(address)
+        except UsageError:
+            self.close(linger_s=0.0)
+            raise
         except zmq.ZMQError as error:
-            self._socket.close(linger=0)
+            self.close(linger_s=0.0)
             raise UsageError(_why_not_bound(address, error)) from error
         self.address = bytes(self._socket.get(zmq.LAST_ENDPOINT)).decode().rstrip("\0")
         """where workers connect: the port that was chosen, if it was `*`"""
 
+    @property
+    def refused(self) -> int:
+        """Handshakes that failed, of those who were not let in."""
+        return self._door.refused if self._door is not None else 0
+
     def poll(self, timeout_s: float) -> bool:
-        """Wait until something arrives, at most `timeout_s`."""
+        """Wait until something arrives, at most `timeout_s`. Raises `RunError` if nobody stands at the door."""
+        if self._door is not None and not self._door.is_alive():
+            raise RunError(
+                f"the door of {self.address} is shut: its thread has ended, see the log; start again with --resume"
+            )
         return bool(self._socket.poll(max(0, int(timeout_s * 1000))))
 
     def receive(self) -> Iterator[tuple[bytes, ToLearner | Inquire | BadMessage]]:
         """What has arrived, with its sender; what cannot be read comes as its error. At most MESSAGES_AT_ONCE."""
+        said_by: list[str] | None = None if self.keyring is None else []
         for _ in range(MESSAGES_AT_ONCE):  # a flood must not keep the learner here
-            frames = _receive(self._socket)
+            frames = _receive(self._socket, said_by)
             if frames is None:
                 return
             peer = bytes(frames[0])
+            if said_by is not None:
+                peer = self._held(peer, said_by[0])
+                if self._turned_away(peer):
+                    continue
             try:
                 yield peer, decode_to_learner(frames[1:])
             except BadMessage as error:
                 yield peer, error
 
+    def why_not(self, peer: bytes) -> str:
+        """Why this peer may speak no more; empty if it may."""
+        return "" if self.keyring is None else self.keyring.allowed.why_not(_key_of(peer))
+
+    def speaker(self, peer: bytes) -> str:
+        """Who answers for what this peer sends: the name of its key, or else its own."""
+        return (
+            name_of(peer).decode(errors="replace") if self.keyring is None else self.keyring.allowed.name_of(_key_of(peer))
+        )
+
+    def _held(self, routing_id: bytes, key: str) -> bytes:
+        """The peer that speaks from this routing id now."""
+        self._holders.pop(routing_id, None)  # the one that spoke longest ago stands first
+        self._holders[routing_id] = key
+        if len(self._holders) > HOLDERS:
+            del self._holders[next(iter(self._holders))]
+        return b"%s\0%s" % (routing_id, key.encode())
+
+    def _turned_away(self, peer: bytes) -> bool:
+        """A message under a key that may speak no more is counted, answered and not read."""
+        why = self.why_not(peer)
+        if why:
+            self.refused_messages += 1
+            self.send(peer, encode(Refuse(why)))
+            if (kept_back := self._lid.due(why, time.monotonic())) is not None:
+                log.warning("worker %s is not heard: %s%s", name_of(peer).decode(errors="replace"), why, again(kept_back))
+        return bool(why)
+
     def send(self, peer: bytes, frames: Sequence[Buffer]) -> bool:
         """Send; False if the peer is gone."""
+        if self.keyring is not None:
+            routing_id, _, key = peer.rpartition(b"\0")
+            if self._holders.get(routing_id) != key.decode():
+                return False  # another one speaks from there now
+            peer = routing_id
         try:
             self._socket.send_multipart([peer, *frames], zmq.NOBLOCK, copy=False)
         except zmq.ZMQError as error:
@@ -120,31 +198,93 @@ class LearnerLink:
 
     def close(self, linger_s: float = LINGER_MS / 1000) -> None:
         """Send what is queued, at most `linger_s`, and close."""
+        if self._door is not None and not self._socket.closed:
+            self._socket.disable_monitor()  # before its reader goes: libzmq would wait for one
         self._socket.close(linger=int(linger_s * 1000))
+        if self._door is not None:
+            self._door.close()
 
 
 class WorkerLink:
     """A worker's end."""
 
-    def __init__(self, address: str, name: str, context: zmq.Context[zmq.Socket[bytes]] | None = None) -> None:
+    def __init__(
+        self,
+        address: str,
+        name: str,
+        context: zmq.Context[zmq.Socket[bytes]] | None = None,
+        token: Token | None = None,
+    ) -> None:
+        """With a token (tcp alone) it speaks with that token's learner and nobody else."""
         check_address(address)
-        if not 1 <= len(name.encode()) <= 255:
-            raise UsageError(f"worker name {name[:40]!r}: expected 1 to 255 bytes, got {len(name.encode())}")
+        longest = 255 - (TAG_CHARACTERS + 1)
+        if not 1 <= len(name.encode()) <= longest or "\0" in name:
+            raise UsageError(f"worker name {name[:40]!r}: expected 1 to {longest} bytes, got {len(name.encode())}")
+        self.address, self.token = address, token
+        self.trouble: Trouble | None = None
+        """why there is no connection, as far as that is known"""
+        self._connected = False
+        self._lid = Rarely()
         self.context = context or zmq.Context.instance()
         self._socket = self.context.socket(zmq.DEALER)
-        _options(self._socket)
-        self._socket.routing_id = name.encode()
+        _options(self._socket, address, token is not None)
+        self._socket.routing_id = _routing_id(name, token)
         self._socket.reconnect_ivl = 100
         self._socket.reconnect_ivl_max = 2000
+        self._monitor: zmq.Socket[bytes] | None = None
+        self._poller = zmq.Poller()
+        self._poller.register(self._socket, zmq.POLLIN)
+        if address.startswith("tcp://"):
+            self._watch()
+        if token is not None:
+            connect_with(self._socket, token)
         try:
             self._socket.connect(address)
         except zmq.ZMQError as error:
-            self._socket.close(linger=0)
+            self.close(linger_s=0.0)
             raise UsageError(f"address {address}: cannot connect ({error.strerror})") from error
+        if not resolves(address):
+            self._say(Trouble(f"the host of {address} is not known here; is it spelt right?"))
 
     def poll(self, timeout_s: float) -> bool:
-        """Wait until something arrives, at most `timeout_s`."""
-        return bool(self._socket.poll(max(0, int(timeout_s * 1000))))
+        """Wait until something arrives, at most `timeout_s`; also no longer than until the learner has refused our key."""
+        deadline_s = time.monotonic() + timeout_s
+        while True:
+            left_s = max(0.0, deadline_s - time.monotonic())
+            ready = dict(self._poller.poll(int(left_s * 1000)))
+            if self._monitor in ready:
+                self._look()
+            if self._socket in ready or left_s == 0.0 or (self.trouble is not None and self.trouble.final):
+                return self._socket in ready
+
+    def _watch(self) -> None:
+        name = f"inproc://millrace-worker-{os.urandom(6).hex()}"
+        self._socket.monitor(name, WATCHED_BY_WORKER)
+        self._monitor = self.context.socket(zmq.PAIR)
+        self._monitor.linger = 0
+        self._monitor.rcvhwm = 0  # libzmq waits where nobody reads, and an environment's step may take minutes
+        self._monitor.connect(name)
+        self._poller.register(self._monitor, zmq.POLLIN)
+
+    def _look(self) -> None:
+        """What became of the connection."""
+        assert self._monitor is not None
+        with suppress(zmq.Again):
+            while True:
+                event, value = struct.unpack("=HI", self._monitor.recv_multipart(zmq.NOBLOCK)[0])
+                if event == zmq.EVENT_DISCONNECTED:
+                    if not self._connected and self.trouble is None:
+                        self._say(Trouble(f"{self.address} closes the connection at once; is it a millrace learner?"))
+                    self._connected = False
+                elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+                    self._connected, self.trouble = True, None
+                else:
+                    self._say(trouble(event, value, self.address, self.token))
+
+    def _say(self, found: Trouble) -> None:
+        self.trouble = found
+        if not found.final and (kept_back := self._lid.due(found.line, time.monotonic())) is not None:
+            log.warning("%s%s", found.line, again(kept_back))
 
     def receive(self) -> Iterator[ToWorker | BadMessage]:
         """All that has arrived; what cannot be read comes as its error."""
@@ -168,7 +308,26 @@ class WorkerLink:
 
     def close(self, linger_s: float = LINGER_MS / 1000) -> None:
         """Send what is queued, at most `linger_s`, and close."""
+        if self._monitor is not None and not self._socket.closed:
+            self._socket.disable_monitor()  # before its reader goes: libzmq would wait for one
+            self._monitor.close(linger=0)
         self._socket.close(linger=int(linger_s * 1000))
+
+
+def _routing_id(name: str, token: Token | None) -> bytes:
+    """The name; under a key with a tag behind it that nobody can make who has another key."""
+    if token is None:
+        return name.encode()
+    tag = hashlib.blake2b(name.encode(), key=token.client.secret, digest_size=TAG_CHARACTERS // 2)
+    return b"%s\0%s" % (name.encode(), tag.hexdigest().encode())
+
+
+def _key_of(peer: bytes) -> bytes:
+    """The public key under which a peer speaks; empty, which nobody has, if there is none."""
+    try:
+        return bytes.fromhex(peer.rpartition(b"\0")[2].decode())
+    except ValueError:
+        return b""
 
 
 def _why_not_bound(address: str, error: zmq.ZMQError) -> str:

@@ -1,13 +1,14 @@
 """Plain data that describe a run: which environment, which policy, how much. They travel in `Welcome`.
 
 This is the one file that may unpickle, and only in `EnvSpec.make`: a factory that the *learner* sent to a worker which
-agreed to run code (an address only this user can reach). Nothing that a worker sends is ever unpickled.
+agreed to run code (`Code`). Nothing that a worker sends is ever unpickled.
 """
 
 from __future__ import annotations
 
 import traceback
 from collections.abc import Callable
+from enum import Enum
 from typing import Literal
 
 import gymnasium
@@ -17,6 +18,17 @@ from protocol.errors import UsageError
 
 OWN_ENVS = "workers.envs"  # the module that registers millrace/…: gymnasium imports it, as it would a user's own
 Scalar = bool | int | float | str
+
+
+class Code(Enum):
+    """How much code a learner may have a worker run, by how sure the worker is of who the learner is."""
+
+    REGISTERED = 0
+    """environments that are registered where the worker runs, by their ids alone: anybody may have answered"""
+    MODULES = 1
+    """also `module:EnvId`, which imports the module: somebody on this machine has answered"""
+    CALLABLES = 2
+    """also pickled callables: the learner whose key is pinned, or one that only this user can be"""
 
 
 class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -37,6 +49,20 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         import cloudpickle
 
         return EnvSpec(getattr(env, "__name__", type(env).__name__), kwargs or {}, cloudpickle.dumps(env))
+
+    def why_not(self, code: Code) -> str:
+        """Why a worker that runs so much code cannot make it; empty if it can."""
+        if self.factory is not None and code is not Code.CALLABLES:
+            return (
+                f"environment {self.id} is a callable, which this worker does not unpickle; it may come over ipc, inproc or "
+                "with a token (and not with --no-code), else name it as my_module:MyEnv-v0"
+            )
+        if self.factory is None and ":" in self.id and code is Code.REGISTERED:
+            return (
+                f"environment {self.id} imports a module, which this worker does not do for a learner it cannot be sure of; "
+                "give it a token (and not --no-code)"
+            )
+        return ""
 
     def make(self, render_mode: str | None = None) -> gymnasium.Env[object, object]:
         """One env copy. Raises `UsageError` with what to do when the id is unknown or a package is missing."""
@@ -192,3 +218,12 @@ class RunSpec(msgspec.Struct, frozen=True):
     heartbeat_s: float = 1.0
     learner_timeout_s: float = 30.0
     """a worker that heard nothing of the learner for so long starts again with Hello"""
+
+    def why_not(self, code: Code) -> str:
+        """Why a worker that runs so much code cannot take part; empty if it can."""
+        if self.policy.encoder is not None and code is Code.REGISTERED:
+            return (
+                f"encoder {self.policy.encoder.factory} imports a module, which this worker does not do for a learner it "
+                "cannot be sure of; give it a token (and not --no-code)"
+            )
+        return self.env.why_not(code)

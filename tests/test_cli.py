@@ -100,6 +100,17 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
         (["evaluate", "/no", "--video"], "run /no: no such folder"),
         (["evaluate", "/no"], "run /no: no such folder"),
         (["evaluate", "/no", "--episode", "3"], "evaluate: unknown flag --episode; did you mean --episodes?"),
+        (["keys"], "keys: which command? expected one of new, show, allow, revoke"),
+        (["keys", "nw"], "keys nw: no such command; did you mean new?; expected one of new, show, allow, revoke"),
+        (["keys", "show", "--key", "x"], "keys show: unknown flag --key; did you mean --keys?"),
+        (
+            ["learner", "CartPole-v1", "--bind", "tcp://::1:5555"],
+            "address tcp://::1:5555: expected an IPv6 address in brackets, as in tcp://[::1]:5555",
+        ),
+        (
+            ["learner", "CartPole-v1", "--advertise", "tcp://host:5555"],
+            "advertise tcp://host:5555: expected a host name or an IP address, without a port",
+        ),
     ],
 )
 def test_bad_usage_is_one_exact_line(asked: list[Any], capsys: Captured, argv: list[str], says: str) -> None:
@@ -274,6 +285,70 @@ def test_an_interrupted_run_says_how_to_go_on(capsys: Captured, monkeypatch: pyt
     assert line == "interrupted; go on with: millrace train --resume runs/mine"
     failing(monkeypatch, KeyboardInterrupt())
     assert refusal(capsys, "train", "CartPole-v1", exit_code=130) == "interrupted"
+
+
+# --------------------------------------------------------------------------------------------------------------- keys
+
+
+def test_keys_are_made_shown_allowed_and_revoked(tmp_path: Path, capsys: Captured) -> None:
+    here, there = ["--keys", str(tmp_path / "here")], ["--keys", str(tmp_path / "there")]
+
+    def says(*argv: str) -> list[str]:
+        assert main(["keys", *argv]) == 0
+        return capsys.readouterr().out.splitlines()
+
+    assert says("new", "lab", *here)[0] == f"token: {tmp_path}/here/lab.token"
+    folder, learner, lab = says("show", *here)
+    assert folder == f"key folder: {tmp_path}/here"
+    assert re.fullmatch(r"learner: [0-9a-f]{64}", learner)
+    assert re.fullmatch(r"lab  [0-9a-f]{64}  made \d{4}-\d\d-\d\d \d\d:\d\d  may connect", lab)
+
+    _, allow = says("new", "home", "--server", learner.split()[1], *there)
+    advice = allow.removeprefix("on the learner's machine: millrace ").split()
+    assert advice[:2] == ["keys", "allow"]
+    assert says(*advice[1:], *here) == ["home may connect"]
+
+    assert "is shut out" in says("revoke", "lab", *here)[0]
+    shown = says("show", *here)
+    assert re.search(r"^lab .* revoked \d{4}", shown[2])
+    assert re.search(r"^home .* may connect$", shown[3])
+    line = refusal(capsys, "keys", "revoke", "lab", *here)
+    assert line == "key lab: revoked already; those that may connect: home"
+    assert "expected a public key of 64 hexadecimal digits, got 1 characters" in refusal(
+        capsys, "keys", "allow", "x", "y", *here
+    )
+
+    secrets = [
+        (tmp_path / "here" / "server.key").read_text().strip(),
+        (tmp_path / "there" / "home.token").read_text().strip(),
+    ]
+    assert not [secret for secret in secrets for line in (*shown, allow) if secret in line]
+
+
+def test_a_token_is_printed_only_when_asked_for(tmp_path: Path, capsys: Captured) -> None:
+    assert main(["keys", "new", "quiet", "--keys", str(tmp_path / "k")]) == 0
+    assert "millrace1." not in capsys.readouterr().out
+    assert main(["keys", "new", "loud", "--print-token", "--keys", str(tmp_path / "k")]) == 0
+    assert capsys.readouterr().out == (tmp_path / "k" / "loud.token").read_text()
+
+
+def worker_says(capsys: Captured, *argv: str) -> str:
+    """A worker's one line before it has connected anywhere."""
+    assert main(["worker", *argv]) == 2
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    return err
+
+
+def test_a_worker_without_a_token_does_not_go_to_another_machine(tmp_path: Path, capsys: Captured) -> None:
+    assert "expected --token FILE (or MILLRACE_TOKEN)" in worker_says(capsys, "tcp://192.0.2.1:5555")
+    (tmp_path / "open.token").touch(mode=0o644)
+    (tmp_path / "open.token").chmod(0o644)
+    line = worker_says(capsys, "tcp://192.0.2.1:5555", "--token", str(tmp_path / "open.token"))
+    assert "can be read by others (mode 0644); chmod 600" in line
+    (tmp_path / "open.token").chmod(0o600)
+    assert "is empty" in worker_says(capsys, "tcp://192.0.2.1:5555", "--token", str(tmp_path / "open.token"))
+    assert "got the token itself" in worker_says(capsys, "tcp://192.0.2.1:5555", "--token", "millrace1.abc")
 
 
 # ------------------------------------------------------------------------------------------------- evaluate, plot, help

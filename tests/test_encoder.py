@@ -20,7 +20,7 @@ from protocol.encoder import describe_encoder, make_encoder
 from protocol.errors import UsageError
 from protocol.networks import ActorCritic, QNetwork, TorchPolicy
 from protocol.policy import layout, make_policy, size
-from protocol.specs import EnvSpec, NamedShape, PolicySpec
+from protocol.specs import Code, EnvSpec, NamedShape, PolicySpec
 from tests.batches import DISCRETE, IMAGE, batch, no_pulse, recurrent
 
 HERE = "tests.encoders"
@@ -135,3 +135,10 @@ def test_a_setting_names_it_and_a_run_folder_keeps_it(tmp_path: Path) -> None:
     obs = np.ones((1, 1, 4), np.float32)
     with torch.no_grad():
         np.testing.assert_allclose(policy([obs])[0, :, :2], net.params(torch.tensor(obs[0])).numpy(), atol=1e-6)
+
+
+def test_a_worker_that_cannot_be_sure_of_the_learner_imports_no_encoder() -> None:
+    run = run_spec(resolve("CartPole-v1", encoder=f"{HERE}:mixer"), EnvSpec("CartPole-v1"))
+    assert "imports a module" in run.why_not(Code.REGISTERED)
+    assert run.why_not(Code.MODULES) == ""
+    assert msgspec.structs.replace(run, policy=DISCRETE).why_not(Code.REGISTERED) == ""

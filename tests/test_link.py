@@ -14,9 +14,10 @@ import pytest
 import zmq
 
 import protocol.link
+from protocol.address import check_address, is_local
 from protocol.codec import MAX_FRAMES, decode_to_worker, encode
 from protocol.errors import BadMessage, UsageError
-from protocol.link import COPY_BELOW_BYTES, LearnerLink, WorkerLink, check_address, is_local
+from protocol.link import COPY_BELOW_BYTES, LearnerLink, WorkerLink
 from protocol.messages import (
     PROTOCOL_VERSION,
     Collect,

@@ -620,6 +620,18 @@ def test_a_failure_before_any_session_has_nobody_to_be_told_to() -> None:
     assert joining().broke("no such environment", "", None) == [Leave(1, "no such environment")]
 
 
+def test_a_run_that_it_will_not_take_part_in_is_left_with_exit_code_2_and_a_word() -> None:
+    assert ready().decline("no code") == [Say(Goodbye(SESSION, "no code", ())), Leave(2, "no code")]
+
+
+def test_one_whose_key_is_refused_leaves_with_exit_code_2_whatever_it_was_doing() -> None:
+    for state in (State.JOINING, State.READY, State.DRAINING):
+        session = in_state(state)
+        assert session.turned_away("refused") == [Leave(2, "refused")]
+        assert session.state is State.LEFT
+        assert session.turned_away("refused") == []
+
+
 def test_one_that_has_left_says_nothing_more() -> None:
     session = in_state(State.LEFT)
     for message in EVERY_MESSAGE:

@@ -20,8 +20,11 @@ from contextlib import suppress
 from pathlib import Path
 
 from protocol.errors import OurError
-from protocol.link import WorkerLink, check_address
+from protocol.key_folder import TOKEN_VARIABLE, read_token
+from protocol.link import WorkerLink
+from protocol.specs import Code
 from workers.session import Session
+from workers.trust import entry, trusted
 from workers.watchdog import Watchdog
 from workers.worker import Worker, identity, parent_is_gone
 
@@ -35,7 +38,15 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--parent", type=int, default=0, help="leave when the process of this pid is no longer the parent")
     parser.add_argument("--join-timeout-s", type=float, default=60.0, help="leave when no learner has answered for so long")
-    parser.add_argument("--no-code", action="store_true", help="refuse an environment that comes as a pickled callable")
+    parser.add_argument(
+        "--token", default="", help=f"file of the join token; or {TOKEN_VARIABLE}, which holds a file or a token"
+    )
+    parser.add_argument(
+        "--insecure", action="store_true", help="believe whoever answers on another machine; no code of theirs"
+    )
+    parser.add_argument(
+        "--no-code", action="store_true", help="only environments registered here: no pickled callables, no modules"
+    )
     parser.add_argument(
         "--step-timeout-s", type=float, default=120.0, help="end when a step of one env copy takes longer; 0: however long"
     )
@@ -43,8 +54,8 @@ def main(argv: list[str] | None = None) -> int:
     options = parser.parse_args(argv)
     logging.basicConfig(level=logging.INFO, format=f"%(asctime)s worker {options.name}: %(message)s", stream=sys.stderr)
     try:
-        check_address(options.address)
-        link = WorkerLink(options.address, options.name)
+        token = entry(options.address, read_token(options.token), insecure=options.insecure)
+        link = WorkerLink(options.address, options.name, token=token)
     except OurError as error:
         sys.stderr.write(f"worker {options.name}: {error}\n")
         return error.exit_code
@@ -58,7 +69,7 @@ def main(argv: list[str] | None = None) -> int:
         session,
         told_to_stop=lambda: len(stops) or int(bool(options.parent) and parent_is_gone(options.parent)),
         alive=watchdog.feed if watchdog else lambda now: None,
-        accepts_code=options.address.startswith("ipc://") and not options.no_code,
+        code=Code.REGISTERED if options.no_code else trusted(options.address, token),
     )
     left = worker.run()
     if watchdog:
@@ -66,7 +77,7 @@ def main(argv: list[str] | None = None) -> int:
     if options.parent and parent_is_gone(options.parent):
         _tidy_up_after(options.address)
     if left.exit_code:
-        sys.stderr.write(f"worker {options.name}: {_advice(left.reason, options.address)}\n")
+        sys.stderr.write(f"worker {options.name}: {_advice(left.reason, link)}\n")
     return left.exit_code
 
 
@@ -87,10 +98,12 @@ def _tidy_up_after(address: str) -> None:
             Path(path).parent.rmdir()
 
 
-def _advice(reason: str, address: str) -> str:
-    if reason.startswith("no learner answered"):
-        return f"{reason} at {address}; is the learner running, and is this its address?"
-    return reason
+def _advice(reason: str, link: WorkerLink) -> str:
+    if not reason.startswith("no learner answered"):
+        return reason
+    if link.trouble is not None:
+        return f"{reason}: {link.trouble.line}"
+    return f"{reason} at {link.address}; is the learner running, and is this its address?"
 
 
 if __name__ == "__main__":

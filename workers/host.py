@@ -19,7 +19,10 @@ from typing import Any, Protocol
 
 import zmq
 
+from protocol.key_folder import TOKEN_VARIABLE
+from protocol.keys import Token
 from protocol.link import WorkerLink
+from protocol.specs import Code
 from workers.session import Leave, Session
 from workers.watchdog import where_it_hung
 from workers.worker import Worker, identity
@@ -46,13 +49,16 @@ class Running(Protocol):
 class Process:
     """A worker process of its own; its stderr goes to a file."""
 
-    def __init__(self, address: str, name: str, log: Path | None, flags: Sequence[str] = ()) -> None:
+    def __init__(
+        self, address: str, name: str, log: Path | None, token: Token | None = None, flags: Sequence[str] = ()
+    ) -> None:
         """`flags`: further ones of `python -m workers`."""
         self._log = log
         command = [sys.executable, "-P", "-m", "workers", address, "--name", name, "--parent", str(os.getpid()), *flags]
         # A child must find what its parent found: a user's environment may lie beside the user's script.
         path = os.pathsep.join(entry or os.getcwd() for entry in [*sys.path, str(Path(__file__).parents[1])])
         threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+        secret = {} if token is None else {TOKEN_VARIABLE: token.to_text()}
         with (log or Path(os.devnull)).open("ab") as stderr:
             self._process = subprocess.Popen(
                 command,
@@ -60,7 +66,7 @@ class Process:
                 stdout=stderr if log else None,
                 stderr=stderr if log else None,
                 start_new_session=True,  # Ctrl-C in the terminal is the learner's to answer
-                env={**os.environ, **threads, "PYTHONPATH": path},
+                env={**os.environ, **threads, **secret, "PYTHONPATH": path},
             )
 
     @property
@@ -107,7 +113,7 @@ class Thread:
     def _run(self, address: str, name: str, context: zmq.Context[Any]) -> None:
         session = Session(identity(name), time.monotonic())
         link = WorkerLink(address, name, context)
-        self._left = Worker(link, session, told_to_stop=lambda: self._stops, accepts_code=True).run()
+        self._left = Worker(link, session, told_to_stop=lambda: self._stops, code=Code.CALLABLES).run()
 
     def ended(self) -> tuple[int, str] | None:
         """Exit code and reason, as a process would have."""

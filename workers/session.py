@@ -224,6 +224,14 @@ class Session:
             told.append(Say(Failure(self.session, error, traceback, lane)))
         return [] if self.state is State.LEFT else told + self._leave(Broke(), 1, error)
 
+    def decline(self, reason: str) -> list[Effect]:
+        """Leave a run that this worker will not take part in."""
+        return [Say(Goodbye(self.session, reason, ())), *self._leave(Broke(), 2, reason)]
+
+    def turned_away(self, reason: str) -> list[Effect]:
+        """The learner's end does not let this worker in, and will not."""
+        return [] if self.state is State.LEFT else self._leave(Refuse(reason), 2, reason)
+
     # ---------------------------------------------------------------- collecting
 
     def next_task(self) -> Task | None:

@@ -17,11 +17,11 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from protocol.codec import encode
-from protocol.errors import BadMessage, OurError, UsageError
+from protocol.errors import BadMessage, OurError
 from protocol.link import WorkerLink
 from protocol.messages import Weights
 from protocol.policy import make_policy
-from protocol.specs import RunSpec
+from protocol.specs import Code, RunSpec
 from workers.collector import Collector
 from workers.lane import EnvironmentBroke
 from workers.session import Begin, Close, Effect, Identity, Leave, Say, Session, Task
@@ -48,14 +48,14 @@ class Worker:
         *,
         told_to_stop: Callable[[], int] = lambda: 0,
         alive: Callable[[float], None] = lambda now: None,
-        accepts_code: bool = False,
+        code: Code = Code.MODULES,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """`told_to_stop` counts the requests to leave; `alive` is called now and then, unless the environment hangs;
-        `accepts_code`: an environment factory may be unpickled.
+        `code`: how much the learner may have it run.
         """
         self._link, self._session, self._clock = link, session, clock
-        self._told_to_stop, self._accepts_code = told_to_stop, accepts_code
+        self._told_to_stop, self._code = told_to_stop, code
         self._alive = alive
         self._stops_heeded = 0
         self._collector: Collector | None = None
@@ -89,6 +89,8 @@ class Worker:
         while self._stops_heeded < self._told_to_stop():
             self._stops_heeded += 1
             self._do(self._session.terminate())
+        if (trouble := self._link.trouble) is not None and trouble.final:
+            self._do(self._session.turned_away(trouble.line))
         if not arrived:
             return
         for message in self._link.receive():
@@ -150,12 +152,10 @@ class Worker:
         """A new session: a new collector, and nothing of the old one."""
         if self._collector is not None:
             self._collector.close_all()
+        if why := run.why_not(self._code):
+            self._do(self._session.decline(why))
+            return
         try:
-            if run.env.factory is not None and not self._accepts_code:
-                raise UsageError(
-                    f"environment {run.env.id} is a callable, which this worker does not unpickle; it may come over ipc or "
-                    "inproc only, else name it as my_module:MyEnv-v0"
-                )
             self._collector = Collector(run, make_policy(run.policy))
             self._loaded = None
         except (OurError, ImportError) as error:

@@ -11,13 +11,17 @@ import tempfile
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from datetime import UTC, datetime
 from pathlib import Path
 
 import zmq
 
 from learner.config import Config
+from learner.listening import throwaway
 from learner.run import Run, Watch
 from protocol.errors import UsageError
+from protocol.key_folder import asked_folder
+from protocol.keys import Token
 from protocol.link import LearnerLink
 from protocol.specs import EnvSpec
 from workers.host import Host, Process, Running, Thread
@@ -28,17 +32,19 @@ def train(config: Config, resume: Path | None, watch: Watch, factory: Callable[.
 
     Raises `OurError`, or `Interrupted` when the user stopped it.
     """
-    if factory is not None and config.transport == "tcp":
-        raise UsageError("an environment factory is code: it travels over ipc or inproc only, not over tcp")
+    sealed = config.transport == "tcp" and asked_folder(config.keys) is not None and not config.insecure
+    if factory is not None and config.transport == "tcp" and not sealed:
+        raise UsageError("an environment factory is code: it travels over ipc or inproc only, or over tcp with --keys")
     with ExitStack() as stack:
         address = _address(config, stack)
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         stack.callback(context.term)
-        link = LearnerLink(address, context)
+        keyring, token = throwaway("local", datetime.now(UTC)) if sealed else (None, None)
+        link = LearnerLink(address, context, keyring)
         stack.callback(link.close, 0.5)
         env = EnvSpec.of(config.env if factory is None else factory, config.env_kwargs)
         run = Run(config, env, link, resume, watch)
-        host = Host(_starter(config, link.address, context, run.folder.path), config.workers)
+        host = Host(_starter(config, link.address, token, context, run.folder.path), config.workers)
         stack.callback(host.stop)
         run.journal.workers_expected = config.workers
         run.go(config.min_workers or config.workers, host.poll)
@@ -57,7 +63,9 @@ def _address(config: Config, stack: ExitStack) -> str:
             return f"ipc://{folder}/learner"
 
 
-def _starter(config: Config, address: str, context: zmq.Context[zmq.Socket[bytes]], run: Path) -> Callable[[str], Running]:
+def _starter(
+    config: Config, address: str, token: Token | None, context: zmq.Context[zmq.Socket[bytes]], run: Path
+) -> Callable[[str], Running]:
     if config.transport == "inproc":
         return lambda name: Thread(address, name, context)
     logs = run / "workers"
@@ -70,6 +78,6 @@ def _starter(config: Config, address: str, context: zmq.Context[zmq.Socket[bytes
         flags = ["--step-timeout-s", str(config.step_timeout_s)]
         if cores:
             flags += ["--core", str(cores[int(name.removeprefix("w")) % len(cores)])]
-        return Process(address, name, logs / f"{name}.log", flags)
+        return Process(address, name, logs / f"{name}.log", token, flags)
 
     return start

@@ -1,0 +1,214 @@
+"""Keys, join tokens and the list of clients that may connect, as text and as records. Pure: no files, no sockets, no clock.
+
+The law: what is damaged is named as such and never half used; no text of ours (a repr, an error) holds a secret half; a key
+that is not on the list, or was revoked, may do nothing.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import re
+import tomllib
+from dataclasses import dataclass, field
+from datetime import datetime
+from functools import cached_property
+from typing import Any
+
+import msgspec
+import zmq
+import zmq.utils.z85
+
+from protocol.errors import UsageError
+
+KEY_BYTES = 32
+CHECK_BYTES = 4
+TOKEN_PREFIX = "millrace1."  # the number is the version of what follows
+TOKEN_CHARACTERS = len(TOKEN_PREFIX) + -(-(2 * KEY_BYTES + CHECK_BYTES) * 4 // 3)
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+LIST_HEADER = """\
+# The clients that may connect to learners of this machine. `millrace keys` edits it; a learner that runs reads it within
+# a second or two. A client with a date at `revoked`, or without an entry, is shut out, and cut off if it is connected.
+"""
+
+
+@dataclass(frozen=True)
+class Key:
+    """One CURVE key, both halves, 32 bytes each."""
+
+    public: bytes
+    secret: bytes = field(repr=False)
+
+    @staticmethod
+    def new() -> Key:
+        """Drawn at random by libzmq's cryptography."""
+        public, secret = zmq.curve_keypair()
+        return Key(zmq.utils.z85.decode(public), zmq.utils.z85.decode(secret))
+
+    @staticmethod
+    def of_secret(secret: bytes) -> Key:
+        """The key of this secret half."""
+        return Key(zmq.utils.z85.decode(zmq.curve_public(zmq.utils.z85.encode(secret))), secret)
+
+
+@dataclass(frozen=True)
+class Token:
+    """What a worker needs to join: whom to believe, and who it is."""
+
+    server: bytes
+    """public key of the learner, 32 bytes"""
+    client: Key
+
+    def to_text(self) -> str:
+        """One line of letters, digits, `-` and `_`."""
+        body = self.server + self.client.secret
+        return TOKEN_PREFIX + base64.urlsafe_b64encode(body + _check(body)).decode().rstrip("=")
+
+    @staticmethod
+    def from_text(text: str, where: str) -> Token:
+        """From one line. Raises `UsageError` that names `where`, and never repeats the text: half of it is secret."""
+        text = text.strip()
+        if not text:
+            raise UsageError(f"{where} is empty: expected a join token, one line that begins with {TOKEN_PREFIX}")
+        if not text.startswith(TOKEN_PREFIX):
+            other = re.match(r"millrace(\d+)\.", text)
+            got = f"one of version {other[1]}; install the learner's version of millrace" if other else "something else"
+            raise UsageError(f"{where}: expected a join token, one line that begins with {TOKEN_PREFIX}, got {got}")
+        if len(text.split()) > 1:
+            raise UsageError(f"{where}: expected a join token in one line and nothing else, got {len(text.split())} words")
+        if len(text) != TOKEN_CHARACTERS:
+            what = "cut short" if len(text) < TOKEN_CHARACTERS else "too long"
+            raise UsageError(
+                f"{where}: the join token is {what}: expected {TOKEN_CHARACTERS} characters, got {len(text)}; copy it again"
+            )
+        try:
+            raw = base64.b64decode(text[len(TOKEN_PREFIX) :] + "=", altchars=b"-_", validate=True)
+        except ValueError:
+            raw = b""
+        body = raw[: 2 * KEY_BYTES]
+        if Token(body[:KEY_BYTES], Key(b"", body[KEY_BYTES:])).to_text() != text:  # the checksum, and how it is written
+            raise UsageError(f"{where}: the join token is damaged (its checksum does not fit); copy it again")
+        return Token(body[:KEY_BYTES], Key.of_secret(body[KEY_BYTES:]))
+
+
+def _check(body: bytes) -> bytes:
+    return hashlib.sha256(TOKEN_PREFIX.encode() + body).digest()[:CHECK_BYTES]
+
+
+class Client(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """One client's public half, and what people know of it."""
+
+    name: str
+    public: str
+    """64 hexadecimal digits"""
+    made: datetime
+    revoked: datetime | None = None
+
+
+@dataclass(frozen=True)
+class Allowed:
+    """Who may connect: every client there ever was, with the revoked ones marked."""
+
+    clients: tuple[Client, ...] = ()
+
+    def why_not(self, public: bytes) -> str:
+        """Why a message, or a handshake, under this key is refused; empty if it is not."""
+        client = self._known.get(public)
+        if client is None:
+            return f"its key {fingerprint(public)} is not allowed here"
+        if client.revoked is not None:
+            return f"its key {client.name} ({fingerprint(public)}) was revoked"
+        return ""
+
+    def name_of(self, public: bytes) -> str:
+        """The name of the client with this key, or its fingerprint."""
+        client = self._known.get(public)
+        return fingerprint(public) if client is None else client.name
+
+    @cached_property
+    def _known(self) -> dict[bytes, Client]:
+        """By public key; of one that stands twice, the entry that was revoked."""
+        return {bytes.fromhex(one.public): one for one in sorted(self.clients, key=lambda one: one.revoked is not None)}
+
+    def valid(self, name: str) -> Client | None:
+        """The client of this name that may connect."""
+        return next((client for client in self.clients if client.name == name and client.revoked is None), None)
+
+    def names(self) -> list[str]:
+        """Of those that may connect."""
+        return [client.name for client in self.clients if client.revoked is None]
+
+    def adding(self, name: str, public: bytes, made: datetime) -> Allowed:
+        """With one more. Raises `UsageError` if the name is taken, or the key was there before."""
+        check_name(name)
+        if self.valid(name) is not None:
+            raise UsageError(f"key {name} is there already; take another name, or revoke it first")
+        known = next((client for client in self.clients if client.public == public.hex()), None)
+        if known is not None:
+            state = "is allowed already" if known.revoked is None else "was revoked, and stays so; make a new one"
+            raise UsageError(f"public key {fingerprint(public)} ({known.name}) {state}")
+        return Allowed((*self.clients, Client(name, public.hex(), made)))
+
+    def revoking(self, name: str, now: datetime) -> Allowed:
+        """Without this one. Raises `UsageError` if nobody of this name may connect."""
+        victim = self.valid(name)
+        if victim is None:
+            before = any(client.name == name for client in self.clients)
+            raise UsageError(f"key {name}: {'revoked already' if before else 'there is none of this name'}{_those(self)}")
+        gone = msgspec.structs.replace(victim, revoked=now)
+        return Allowed(tuple(gone if client is victim else client for client in self.clients))
+
+    def to_toml(self) -> str:
+        """As text that `from_toml` reads."""
+        import tomli_w
+
+        plain = [{k: v for k, v in msgspec.structs.asdict(client).items() if v is not None} for client in self.clients]
+        return LIST_HEADER + "\n" + tomli_w.dumps({"client": plain})
+
+    @staticmethod
+    def from_toml(text: str, where: str) -> Allowed:
+        """From text. Raises `UsageError` that names `where`: a list that is not understood allows nobody."""
+        try:
+            table: dict[str, Any] = tomllib.loads(text)
+            clients = msgspec.convert(table.pop("client", []), tuple[Client, ...])
+        except (tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
+            raise UsageError(f"{where} cannot be understood: {error}") from error
+        if table:
+            raise UsageError(f"{where}: expected tables [[client]] alone, got {min(table)}")
+        for client in clients:
+            check_name(client.name, f"{where}: ")
+            public_key(client.public, f"{where}: client {client.name}")
+        return Allowed(clients)
+
+
+def _those(allowed: Allowed) -> str:
+    return f"; those that may connect: {', '.join(allowed.names()) or 'none'}"
+
+
+def check_name(name: str, where: str = "") -> str:
+    """Return the name if a client may have it: it is part of a file's name."""
+    if not NAME.fullmatch(name):
+        raise UsageError(
+            f"{where}name {name[:70]!r}: expected 1 to 64 letters, digits, '.', '_' or '-', beginning with one of the former"
+        )
+    return name
+
+
+def public_key(text: str, where: str) -> bytes:
+    """The 32 bytes of a public key that is written in hexadecimal digits."""
+    try:
+        key = bytes.fromhex(text) if text.isascii() and not re.search(r"\s", text) else b""
+    except ValueError:
+        key = b""
+    if len(key) != KEY_BYTES:
+        if text.strip().startswith(TOKEN_PREFIX):
+            raise UsageError(
+                f"{where}: expected a public key, got a join token, which is secret; millrace keys show lists public keys"
+            )
+        raise UsageError(f"{where}: expected a public key of {2 * KEY_BYTES} hexadecimal digits, got {len(text)} characters")
+    return key
+
+
+def fingerprint(public: bytes) -> str:
+    """The beginning of a public key: enough for people to tell keys apart."""
+    return public.hex()[:12]
