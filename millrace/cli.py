@@ -235,7 +235,7 @@ COMMANDS = {
     "learner": Command(
         _learner, "learner ENV --bind ADDRESS [flags]", "the learner alone; waits for workers from elsewhere"
     ),
-    "worker": Command(_worker, "worker ADDRESS [--token FILE] [flags]", "one worker process that joins a learner"),
+    "worker": Command(_worker, "worker ADDRESS [--token FILE] [--processes N]", "workers here that join a learner"),
     "status": Command(_status, "status ADDRESS [--watch]", "how a run is: its workers, their speed, what was dropped"),
     "keys": Command(_keys, "keys new|show|allow|revoke [NAME]", "who may join learners of this machine from others"),
     "evaluate": Command(_evaluate, "evaluate RUN [--video] [flags]", "greedy episodes of a run's newest policy"),

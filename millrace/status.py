@@ -32,7 +32,7 @@ DROPS = {
     "transitions_invalid": "transitions that broke the law of a row",
     "messages_bad": "messages that could not be read",
 }
-COLUMNS = ("worker", "host", "pid", "standing", "lanes", "tickets", "steps/s", "weights", "silent", "memory", "strikes")
+LEFT = ("worker", "host", "lanes")  # columns of words; those of numbers stand to the right
 
 
 def observer_name() -> str:
@@ -79,20 +79,26 @@ def shown(status: Status) -> RenderableType:
     lag = f"lag {status.lag_mean:.1f} (max {status.lag_max})"
     run = f"{status.env}: {done}, {status.steps_per_s:,.0f} steps/s, return {score}, update {max(status.version, 0)}, {lag}"
     table = Table(box=None, pad_edge=False, header_style="dim")
-    for name in COLUMNS:
-        table.add_column(name, justify="left" if name in ("worker", "host", "standing", "lanes") else "right")
-    for worker in status.workers:
-        table.add_row(*_cells(worker, status.version))
+    rows = [_cells(worker, status.version) for worker in status.workers]
+    for name in rows[0] if rows else ():
+        table.add_column(name, justify="left" if name in LEFT else "right")
+    for row in rows:
+        table.add_row(*row.values())
     dropped = [f"{status.ledger[name]:,} {what}" for name, what in DROPS.items() if status.ledger.get(name)]
     workers = table if status.workers else Text("no worker is here", style="bold yellow")
     return Group(Text(run, style="bold"), Text(""), workers, Text(""), Text(f"dropped: {', '.join(dropped) or 'nothing'}"))
 
 
-def _cells(worker: WorkerStatus, version: int) -> list[str]:
+def _cells(worker: WorkerStatus, version: int) -> dict[str, str]:
     behind = version - worker.version
-    weights = "none" if worker.version < 0 else "newest" if behind <= 0 else f"{behind} behind"
-    memory = f"{worker.resident_bytes / 2**20:,.0f} MB" if worker.resident_bytes else "-"
-    who = [worker.worker, worker.host, str(worker.pid), worker.standing]
-    lanes = ",".join(map(str, worker.lanes)) or "spare"
-    rest = [f"{worker.steps_per_s:,.0f}", weights, f"{worker.silent_s:.1f} s", memory, str(worker.strikes)]
-    return [*who, lanes, str(worker.tickets), *rest]
+    return {
+        "worker": worker.worker + (f" ({worker.strikes} strikes)" if worker.strikes else ""),
+        "host": worker.host,
+        "pid": str(worker.pid),
+        "lanes": "draining" if worker.standing == "draining" else ",".join(map(str, worker.lanes)) or "spare",
+        "tickets": str(worker.tickets),
+        "steps/s": f"{worker.steps_per_s:,.0f}",
+        "weights": "none" if worker.version < 0 else "newest" if behind <= 0 else f"{behind} behind",
+        "silent": f"{worker.silent_s:.1f} s",
+        "memory": f"{worker.resident_bytes / 2**20:,.0f} MB" if worker.resident_bytes else "-",
+    }

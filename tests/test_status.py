@@ -163,6 +163,7 @@ def test_it_is_shown_as_a_table() -> None:
 def test_a_run_without_workers_says_so() -> None:
     text = as_text(told(Learner()))
     assert "no worker is here" in text
+    assert "silent" not in text
     assert "dropped: nothing" in text
 
 
@@ -234,3 +235,16 @@ def test_a_run_that_is_watched_by_a_machine_says_nothing_but_json(capsys: pytest
 
 def test_a_question_is_a_message_without_a_session() -> None:
     assert len(encode(Inquire())) == 1
+
+
+def test_what_is_unusual_about_a_worker_is_shown() -> None:
+    learner = Learner(lanes=1)
+    for name in (b"w0", b"w1"):
+        learner.joins(name)
+    learner.roster.reject(b"w1", None, "rubbish", learner.now)
+    text = as_text(told(learner))
+    assert "spare" in text
+    assert "w1 (1 strikes)" in text
+    assert "none" in text
+    learner.roster.drain("done")
+    assert "draining" in as_text(told(learner))

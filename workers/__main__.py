@@ -19,14 +19,18 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from protocol.errors import OurError
+from protocol.errors import OurError, UsageError
 from protocol.key_folder import TOKEN_VARIABLE, read_token
+from protocol.keys import Token
 from protocol.link import WorkerLink
 from protocol.specs import Code
-from workers.session import Session
+from workers.host import NOBODY, Host, Process
+from workers.session import NO_LEARNER, Session
 from workers.trust import entry, trusted
 from workers.watchdog import Watchdog
 from workers.worker import Worker, identity, parent_is_gone
+
+log = logging.getLogger("millrace.worker")
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -51,10 +55,19 @@ def main(argv: list[str] | None = None) -> int:
         "--step-timeout-s", type=float, default=120.0, help="end when a step of one env copy takes longer; 0: however long"
     )
     parser.add_argument("--core", type=int, help="run on this core alone")
+    parser.add_argument(
+        "--processes",
+        type=int,
+        default=1,
+        help="so many workers, each in a process of its own, restarted when it breaks",
+    )
+    parser.add_argument("--pin", action="store_true", help="with --processes: each keeps to one core")
     options = parser.parse_args(argv)
     logging.basicConfig(level=logging.INFO, format=f"%(asctime)s worker {options.name}: %(message)s", stream=sys.stderr)
     try:
         token = entry(options.address, read_token(options.token), insecure=options.insecure)
+        if options.processes != 1:
+            return _host(options, token)
         link = WorkerLink(options.address, options.name, token=token)
     except OurError as error:
         sys.stderr.write(f"worker {options.name}: {error}\n")
@@ -78,7 +91,24 @@ def main(argv: list[str] | None = None) -> int:
         _tidy_up_after(options.address)
     if left.exit_code:
         sys.stderr.write(f"worker {options.name}: {_advice(left.reason, link)}\n")
-    return left.exit_code
+    return NOBODY if options.parent and left.reason.startswith(NO_LEARNER) else left.exit_code
+
+
+def _host(options: argparse.Namespace, token: Token | None) -> int:
+    """Many workers, and this process to look after them."""
+    if options.processes < 1:
+        raise UsageError(f"processes expected int >= 1, got {options.processes}")
+    cores = sorted(os.sched_getaffinity(0)) if options.pin else []
+    flags = ["--join-timeout-s", str(options.join_timeout_s), "--step-timeout-s", str(options.step_timeout_s)]
+    flags += [flag for flag, given in (("--insecure", options.insecure), ("--no-code", options.no_code)) if given]
+
+    def start(name: str) -> Process:
+        pinned = ["--core", str(cores[int(name.removeprefix("w")) % len(cores)])] if cores else []
+        return Process(options.address, f"{options.name}-{name}", None, token, [*flags, *pinned])
+
+    stops = _count_signals()
+    host = Host(start, options.processes)
+    return host.keep(lambda: len(stops), lambda line: log.warning("%s", line))
 
 
 def _count_signals() -> list[int]:
@@ -99,7 +129,7 @@ def _tidy_up_after(address: str) -> None:
 
 
 def _advice(reason: str, link: WorkerLink) -> str:
-    if not reason.startswith("no learner answered"):
+    if not reason.startswith(NO_LEARNER):
         return reason
     if link.trouble is not None:
         return f"{reason}: {link.trouble.line}"

@@ -1,7 +1,8 @@
 """Many workers on this machine: started, watched, restarted with backoff, stopped. Knows nothing of what they say.
 
-The law: a worker that ends on purpose (exit code 0) or was refused (2) stays away; any other comes back, after a pause that
-doubles with each death and starts anew once it has been healthy for a while. No worker outlives its host.
+The law: a worker that ends on purpose (exit code 0), was refused (2) or found no learner for too long (NOBODY) stays away;
+any other comes back, after a pause that doubles with each death and starts anew once it has been healthy for a while. No
+worker outlives its host.
 """
 
 from __future__ import annotations
@@ -28,6 +29,9 @@ from workers.watchdog import where_it_hung
 from workers.worker import Worker, identity
 
 BACKOFF_FIRST_S, BACKOFF_MOST_S, HEALTHY_S = 0.5, 30.0, 30.0
+POLL_S = 0.1
+LEAVE_WITHIN_S = 30.0  # of being told to: a rollout of a slow environment takes its time
+NOBODY = 69  # sysexits' EX_UNAVAILABLE: no learner answered; a worker says it to its host alone, anybody else is told 1
 
 
 class Running(Protocol):
@@ -139,6 +143,7 @@ class _Place:
     started_s: float
     backoff_s: float = BACKOFF_FIRST_S
     restart_s: float | None = None
+    code: int = 0  # with which the last one ended
 
 
 class Host:
@@ -157,10 +162,10 @@ class Host:
             if place.running is not None and (end := place.running.ended()) is not None:
                 code, why = end
                 ended.append((place.name, why))
-                place.running = None
+                place.running, place.code = None, code
                 if now - place.started_s > HEALTHY_S:
                     place.backoff_s = BACKOFF_FIRST_S
-                if code not in (0, 2) and not self._stopping:
+                if code not in (0, 2, NOBODY) and not self._stopping:
                     place.restart_s = now + place.backoff_s
                     place.backoff_s = min(2 * place.backoff_s, BACKOFF_MOST_S)
             if place.restart_s is not None and now >= place.restart_s and not self._stopping:
@@ -169,12 +174,44 @@ class Host:
                 place.running = self._start(place.name)
         return ended
 
+    @property
+    def empty(self) -> bool:
+        """Nobody is here, and nobody will come back."""
+        return all(place.running is None and (place.restart_s is None or self._stopping) for place in self.places)
+
+    @property
+    def exit_code(self) -> int:
+        """What became of the workers: 2 if one was refused, 1 if one ended badly, else 0."""
+        codes = {place.code for place in self.places}
+        return 2 if 2 in codes else 1 if codes - {0} else 0
+
+    def ask_to_leave(self) -> None:
+        """All: after the rollout in hand, or at once when asked again. Nobody is started any more."""
+        self._stopping = True
+        for place in self.places:
+            if place.running is not None:
+                place.running.stop()
+
     def stop(self, timeout_s: float = 5.0) -> None:
         """Ask all to leave, wait at most `timeout_s` for all together, and kill who is left."""
-        self._stopping = True
-        running = [place.running for place in self.places if place.running is not None]
-        for worker in running:
-            worker.stop()
+        self.ask_to_leave()
         deadline_s = self._clock() + timeout_s
-        for worker in running:
-            worker.wait(max(0.0, deadline_s - self._clock()))
+        for place in self.places:
+            if place.running is not None:
+                place.running.wait(max(0.0, deadline_s - self._clock()))
+
+    def keep(self, told_to_stop: Callable[[], int], say: Callable[[str], None]) -> int:
+        """Until nobody is here any more; the exit code. Each request to stop is passed on to all."""
+        heeded, leave_by_s = 0, float("inf")
+        while True:
+            for name, why in self.poll():
+                say(f"{name} {why}")
+            if self.empty:
+                return self.exit_code
+            if heeded < told_to_stop():
+                heeded += 1
+                leave_by_s = min(leave_by_s, self._clock() + LEAVE_WITHIN_S)
+                self.ask_to_leave()
+            if self._clock() > leave_by_s:
+                self.stop(0.0)
+            time.sleep(POLL_S)

@@ -36,6 +36,7 @@ from protocol.specs import RunSpec
 from workers.states import TABLE, Broke, Emptied, Silence, State, Terminate
 
 HELLO_FIRST_S, HELLO_MOST_S = 0.25, 4.0
+NO_LEARNER = "no learner answered"
 REMEMBERED_TICKETS = 64  # finished ones, so that a late repeat of their Collect is known for what it is
 
 
@@ -193,7 +194,7 @@ class Session:
                 return []
             case State.JOINING:
                 if now - self._joining_s > self._patience_s:
-                    return self._leave(Silence(), 1, f"no learner answered for {self._patience_s:g} s")
+                    return self._leave(Silence(), 1, f"{NO_LEARNER} for {self._patience_s:g} s")
                 if now < self._due_s:
                     return []
                 self._due_s = now + self._backoff_s
