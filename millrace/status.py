@@ -19,7 +19,7 @@ from rich.text import Text
 
 from millrace.flags import StatusFlags
 from protocol.codec import encode
-from protocol.errors import RunError
+from protocol.errors import Refused, RunError
 from protocol.link import WorkerLink
 from protocol.messages import Inquire, Status, WorkerStatus
 
@@ -49,6 +49,8 @@ def ask(link: WorkerLink, timeout_s: float, clock: Callable[[], float] = time.mo
             for message in link.answers():
                 if isinstance(message, Status):
                     return message
+        if link.trouble is not None and link.trouble.final:
+            raise Refused(link.trouble.line)
     trouble = f": {link.trouble.line}" if link.trouble else "; is it running, and is this its address?"
     raise RunError(f"no learner answered within {timeout_s:g} s{trouble}")
 
