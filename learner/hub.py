@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 
 from learner.events import Broke, Event, Joined, Left, Stale, Told, Turned
+from learner.freshness import Freshness
 from learner.metrics import Progress
 from learner.roster import Out, Roster
 from learner.status import status
@@ -52,6 +53,8 @@ class Hub:
         """seconds spent waiting for rollouts since the run began"""
         self.lags: list[int] = []
         """lag of each rollout of the last `gather`"""
+        self.freshness = Freshness()
+        """of the weights that rollouts were acted on under"""
         self.progress = Progress()
         """of the run, for whoever asks: the journal keeps it"""
         self.dead_workers, self.watch, self._clock = dead_workers, watch, clock
@@ -79,6 +82,7 @@ class Hub:
 
     def publish(self, version: int, parameters: Array, buffers: Array) -> None:
         """Broadcast new weights and deal the tickets that they allow. The arrays must not change afterwards."""
+        self.freshness.published(version, self._clock())
         self._send(self.roster.publish(version, parameters, buffers))
 
     def gather(self) -> list[Rollout]:
@@ -92,6 +96,7 @@ class Hub:
             if taken is not None:
                 self.wait_s += self._clock() - started_s
                 self.lags = [self.roster.version - rollout.version for rollout in taken]
+                self.freshness.used(self.lags)
                 return taken
             self._turn(POLL_S)
             now = self._clock()
@@ -168,6 +173,7 @@ class Hub:
             self._complain(peer, why, now)
             self._send(self.roster.reject(peer, rollout, why, now))
         else:
+            self.freshness.arrived(name_of(peer).decode(errors="replace"), rollout.version, now)
             self._send(self.roster.receive(peer, rollout, now))
 
     def _complain(self, peer: bytes, line: str, now: float) -> None:

@@ -221,6 +221,8 @@ class Journal:
                     evaluation=self.evaluation if self._evaluated_version == self.version else None,
                     best=self._confirmed,
                     ledger=self.hub.roster.ledger.counts(),
+                    lags=self.hub.freshness.histogram(),
+                    first_use_s=self.hub.freshness.first_use_s(),
                     stages=self._stages(),
                     versions=versions(),
                 )

@@ -77,6 +77,10 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     best: Best | None = None
     """of the policy that did best in the run's own evaluations, if it made any"""
     ledger: dict[str, int] = {}
+    lags: dict[str, int] = {}
+    """rollouts that updates used, by their lag, since this learner started"""
+    first_use_s: dict[str, float] = {}
+    """of each worker: median seconds from publishing new weights to the arrival of its first rollout under them"""
     stages: dict[str, float] = {}
     versions: dict[str, str] = {}
     """of millrace and of what decides its results"""

@@ -140,11 +140,11 @@ class Recall(gymnasium.Env[Floats, Any]):
 
 
 class Slow(Countdown):
-    """A countdown that takes `seconds` a step."""
+    """A countdown that takes `seconds` a step, and MILLRACE_TOY_SLEEPS_S more: one worker may be slower than others."""
 
     def __init__(self, seconds: float = 0.01, k: int = 5) -> None:
         super().__init__(k)
-        self._seconds = seconds
+        self._seconds = seconds + float(os.environ.get("MILLRACE_TOY_SLEEPS_S", "0"))
 
     def step(self, action: Any) -> tuple[Floats, float, bool, bool, Info]:
         """Sleep, then count."""

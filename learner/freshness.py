@@ -1,0 +1,47 @@
+"""How old the weights are that rollouts were acted on under, and how long new ones take to be used. Pure.
+
+The lag of a rollout is the learner's version minus the rollout's, when it is used. From publishing weights to the arrival
+of a worker's first rollout under them passes what the network, the worker and one rollout take together.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict, deque
+from collections.abc import Iterable
+from statistics import median
+
+REMEMBERED = 1_000  # versions, and measurements of each worker: the newest
+
+
+class Freshness:
+    """Since this learner started."""
+
+    def __init__(self) -> None:
+        self.lags: Counter[int] = Counter()
+        """rollouts that were used, by their lag"""
+        self._published_s: dict[int, float] = {}
+        self._seen: dict[str, int] = {}  # newest version that a rollout of this worker was acted on under
+        self._first_use_s: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=REMEMBERED))
+
+    def published(self, version: int, now: float) -> None:
+        """New weights were sent."""
+        self._published_s[version] = now
+        self._published_s.pop(version - REMEMBERED, None)
+
+    def arrived(self, worker: str, version: int, now: float) -> None:
+        """A rollout of this worker came, acted on under this version."""
+        if version > self._seen.get(worker, -1) and version in self._published_s:
+            self._first_use_s[worker].append(now - self._published_s[version])
+        self._seen[worker] = max(version, self._seen.get(worker, -1))
+
+    def used(self, lags: Iterable[int]) -> None:
+        """Rollouts with these lags went into an update."""
+        self.lags.update(lags)
+
+    def histogram(self) -> dict[str, int]:
+        """Rollouts by lag, from the smallest; a JSON object has strings for keys."""
+        return {str(lag): self.lags[lag] for lag in sorted(self.lags)}
+
+    def first_use_s(self) -> dict[str, float]:
+        """Of each worker, the median of the seconds from publishing to the arrival of its first rollout under it."""
+        return {worker: median(seconds) for worker, seconds in sorted(self._first_use_s.items())}
