@@ -84,6 +84,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """seconds between checkpoints"""
     checkpoint_every_episodes: Natural = 0
     """episodes between checkpoints, besides those by time; 0: by time alone"""
+    checkpoint_every_updates: Natural = 0
+    """updates between checkpoints, besides those by time; 0: by time alone"""
     keep_checkpoints: Count = 3
     """how many of the newest checkpoints stay"""
 

@@ -157,8 +157,9 @@ class Journal:
         self.hub.progress = progress
         self._watch(progress)
         self._episodes_until_save -= len(batch.episodes)
+        every = self.config.checkpoint_every_updates
         by_episodes = self.config.checkpoint_every_episodes and self._episodes_until_save <= 0
-        if by_episodes or began_s - self._saved_s > self.config.checkpoint_every_s:
+        if by_episodes or (every and self.version % every == 0) or began_s - self._saved_s > self.config.checkpoint_every_s:
             self.save()
         self.stages["other"] += time.monotonic() - began_s
 

@@ -107,6 +107,13 @@ def test_a_run_stops_at_a_mean_return_and_saves_every_so_many_episodes(tmp_path:
     assert len(list((folder / "checkpoints").iterdir())) >= 4
 
 
+def test_a_checkpoint_is_saved_every_so_many_updates(tmp_path: Path) -> None:
+    settings: dict[str, Any] = {"checkpoint_every_updates": 3, "keep_checkpoints": 100, "steps": 2_560, **SMALL}
+    folder = run(tmp_path, "CartPole-v1", **settings)
+    updates = summary(folder)["updates"]
+    assert len(list((folder / "checkpoints").iterdir())) == updates // 3 + (updates % 3 > 0)
+
+
 def test_training_episodes_are_recorded_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     minari = pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
