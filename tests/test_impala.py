@@ -84,9 +84,7 @@ def watch(algorithm: Impala, monkeypatch: pytest.MonkeyPatch) -> list[Minibatch]
 
 def by_row(given: list[Minibatch]) -> list[tuple[float, ...]]:
     """Rows of minibatches, sorted: features, advantage, target."""
-    return sorted(
-        tuple(torch.cat([m.x[i], m.advantage[i, None], m.target[i, None]]).tolist()) for m in given for i in range(len(m.x))
-    )
+    return sorted((*m.x[i].tolist(), float(m.advantage[i]), float(m.target[i])) for m in given for i in range(len(m.x)))
 
 
 def test_vtrace_is_computed_in_time_order_before_rows_are_shared_out(monkeypatch: pytest.MonkeyPatch) -> None:

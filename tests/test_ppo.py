@@ -163,7 +163,7 @@ def test_minibatches_hold_each_valid_row_once_an_epoch_in_nearly_equal_parts(mon
     assert len(pulses) >= 2 * parts
     assert {len(each.target) for each in seen} <= {count // parts, count // parts + 1}
     expected = sorted(map(tuple, rows.obs[0][:-1][rows.valid].tolist()))
-    epochs = [torch.cat([each.x for each in seen[at : at + parts]]).tolist() for at in (0, parts)]
+    epochs = [np.concatenate([each.x for each in seen[at : at + parts]]).tolist() for at in (0, parts)]
     assert epochs[0] != epochs[1]
     for epoch in epochs:
         assert sorted(map(tuple, epoch)) == expected

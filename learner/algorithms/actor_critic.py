@@ -19,6 +19,7 @@ from msgspec.structs import replace
 from torch import Tensor
 
 from learner.algorithms import losses
+from learner.algorithms.fused import MOST_ROWS, FusedActorCritic, applies
 from learner.algorithms.normalise import ObservationNormaliser, RewardScaler
 from learner.hyperparameters import ActorCriticHyperparameters, RecurrentHyperparameters
 from protocol.errors import RunError
@@ -38,17 +39,22 @@ AT_ONCE = 1024  # observations that are looked at together where no gradient is 
 
 
 class Minibatch(NamedTuple):
-    """B rows of a batch."""
+    """B rows of a batch: tensors, or numpy arrays where the update is fused (`fused.py`)."""
 
-    x: Tensor  # [B, D] float32, normalised features
-    images: tuple[Tensor, ...]  # [B, *leaf] uint8 each
-    action: Tensor  # [B, *action] int64, or float32 unclipped
-    log_prob: Tensor  # [B] float32, by the worker, as acted
-    advantage: Tensor  # [B] float32
-    target: Tensor  # [B] float32, the returns to fit values to
+    x: Any  # [B, D] float32, normalised features
+    images: tuple[Any, ...]  # [B, *leaf] uint8 each
+    action: Any  # [B, *action] int64, or float32 unclipped
+    log_prob: Any  # [B] float32, by the worker, as acted
+    advantage: Any  # [B] float32
+    target: Any  # [B] float32, the returns to fit values to
     memory: Memory | None = None  # with a core: x and images are [T · C, …], and B of them are wanted
 
-    def rows(self, index: Tensor, seen: Tensor | None = None, memory: Memory | None = None) -> Minibatch:
+    def in_numpy(self) -> Minibatch:
+        """The same memory as numpy arrays."""
+        x, _, action, log_prob, advantage, target, _ = self
+        return Minibatch(x.numpy(), (), action.numpy(), log_prob.numpy(), advantage.numpy(), target.numpy())
+
+    def rows(self, index: Any, seen: Tensor | None = None, memory: Memory | None = None) -> Minibatch:
         """Some of these rows, copied; `seen`: the observations to look at, if others are needed besides."""
         seen = index if seen is None else seen
         return Minibatch(
@@ -128,6 +134,9 @@ class Parts:
             self.net.parameters["actor.log_std"].detach().fill_(config.log_std_init)
         self.optimizer = make_optimizer(optimizer, self.net, config.learning_rate)
         self.generator = torch.Generator().manual_seed(seed)
+        self._fused: FusedActorCritic | None = None
+        if device == "cpu" and applies(policy):
+            self._fused = FusedActorCritic(policy, self.net.flat.numpy(), self.net.flat_grad.numpy())
         self.env_steps = 0  # transitions used so far: where the schedules are
         self.version = 0  # updates made
         self._total_steps = total_steps
@@ -190,7 +199,8 @@ class Parts:
     def only(self, rows: Minibatch, mask: Bools) -> Minibatch:
         """Those of all rows where `mask` [T, ΣN] is True."""
         if rows.memory is None:
-            return rows.rows(self._to_device(np.flatnonzero(mask)))
+            index = np.flatnonzero(mask)
+            return rows.in_numpy().rows(index) if self._small(len(index)) else rows.rows(self._to_device(index))
         return rows.columns(self._to_device(np.arange(mask.shape[1])), self._to_device(mask))
 
     def minibatches(self, rows: Minibatch, mask: Bools, parts: int) -> Iterator[Minibatch]:
@@ -199,7 +209,13 @@ class Parts:
         With a core, which learns what to remember from what came of it, whole columns go together: no more parts than they.
         """
         if rows.memory is None:
-            for index in self._shuffled(np.flatnonzero(mask), parts):
+            valid = np.flatnonzero(mask)
+            if self._small(math.ceil(len(valid) / parts)):
+                rows = rows.in_numpy()
+                for some in np.array_split(self._in_any_order(valid), parts):
+                    yield rows.rows(some)
+                return
+            for index in self._shuffled(valid, parts):
                 yield rows.rows(index)
             return
         told = mask.any(0)  # a column without a row would make an empty minibatch
@@ -213,9 +229,16 @@ class Parts:
     def _to_device(self, array: Array) -> Tensor:
         return torch.from_numpy(array).to(self.net.flat.device)
 
+    def _small(self, rows: int) -> bool:
+        """True for a minibatch that is learned from without a graph."""
+        return self._fused is not None and rows <= MOST_ROWS
+
+    def _in_any_order(self, index: Array) -> Array:
+        shuffled: Array = index[torch.randperm(len(index), generator=self.generator).numpy()]
+        return shuffled
+
     def _shuffled(self, index: Array, parts: int) -> tuple[Tensor, ...]:
-        order = torch.randperm(len(index), generator=self.generator)
-        return self._to_device(index[order.numpy()]).tensor_split(parts)
+        return self._to_device(self._in_any_order(index)).tensor_split(parts)
 
     # ---------------------------------------------------------------- a step
 
@@ -229,23 +252,30 @@ class Parts:
         self.optimizer.param_groups[0]["lr"] = found
         return found
 
-    def forward(self, rows: Minibatch) -> tuple[Tensor, Tensor, Tensor]:
-        """Log π(action), the entropy of π, and V: [B] each."""
+    def forward(self, rows: Minibatch) -> tuple[Any, Any, Any]:
+        """Log π(action), the entropy of π, and V: [B] each, of the kind that the rows are."""
+        if isinstance(rows.x, np.ndarray):
+            assert self._fused is not None
+            return self._fused.forward(rows.x, rows.action)
         params, value = self.net.forward(rows.x, rows.images, rows.memory)
         return *log_prob_and_entropy(self.policy.action, params, rows.action), value
 
-    def backward(
-        self, outputs: Sequence[Tensor], gradients: Sequence[Tensor], numbers: Mapping[str, Tensor]
-    ) -> dict[str, float]:
+    def backward(self, outputs: Sequence[Any], gradients: Sequence[Any], numbers: Mapping[str, Any]) -> dict[str, float]:
         """The gradient by the weights, in place, shortened; and the numbers, read, with its norm before it was.
 
         Raises `RunError` when one of them is not finite.
         """
         gradient = self.net.flat_grad
-        gradient.zero_()
-        torch.autograd.backward(outputs, gradients)
+        if isinstance(outputs[0], np.ndarray):
+            assert self._fused is not None
+            self._fused.backward(*gradients)
+            flat = gradient.numpy()
+            read = [*map(float, numbers.values()), math.sqrt(float(np.dot(flat, flat)))]
+        else:
+            gradient.zero_()
+            torch.autograd.backward(outputs, gradients)
+            read = torch.stack((*(number.detach() for number in numbers.values()), gradient.norm())).tolist()
         with torch.no_grad():
-            read = torch.stack((*numbers.values(), gradient.norm())).tolist()
             measured = dict(zip((*numbers, "grad_norm"), read, strict=True))
             for name, number in measured.items():
                 if not math.isfinite(number):

@@ -1,12 +1,14 @@
-"""Losses and what is measured of them. Pure: tensors [B] in, numbers (tensors of no dimension) out; B rows of a minibatch.
+"""Losses and what is measured of them. Pure: arrays [B] in, numbers (arrays of no dimension) out; B rows of a minibatch.
 
-Every row given is a valid one: masking is done where minibatches are made. A loss comes with its gradient, derived by
-hand (a test holds it equal to autograd's): a small minibatch spends more time on the graph than on the arithmetic.
+Arrays are torch's, or numpy's where the update is fused: the formula is the same. Every row given is a valid one: masking is
+done where minibatches are made. A loss comes with its gradient, derived by hand (a test holds it equal to autograd's): a
+small minibatch spends more time on the graph than on the arithmetic.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -14,61 +16,78 @@ import torch
 from torch import Tensor
 
 Floats = npt.NDArray[np.float32]
+A = TypeVar("A", Tensor, npt.NDArray[Any])
 
 
-def standardized(advantage: Tensor) -> Tensor:
+def _of(array: object) -> Any:
+    """The library whose array it is."""
+    return np if isinstance(array, np.ndarray) else torch
+
+
+def ratio(log_prob: A, before: A) -> tuple[A, A]:
+    """Log ρ and ρ = π(a) / π_old(a), [B] each."""
+    log_ratio = log_prob - before
+    return log_ratio, _of(log_ratio).exp(log_ratio)
+
+
+def standardized(advantage: A) -> A:
     """Advantages [B] less their mean, over their standard deviation; a single row has none and stays as it is."""
     if len(advantage) < 2:
         return advantage
-    std, mean = torch.std_mean(advantage)
-    return (advantage - mean) / (std + 1e-8)
+    std = advantage.std(ddof=1) if isinstance(advantage, np.ndarray) else advantage.std()
+    found: A = (advantage - advantage.mean()) / (std + 1e-8)
+    return found
 
 
-def clipped_surrogate(ratio: Tensor, advantage: Tensor, clip_range: float) -> tuple[Tensor, Tensor]:
+def clipped_surrogate(ratio: A, advantage: A, clip_range: float) -> tuple[A, A]:
     """PPO's policy loss (Schulman et al. 2017, eq. 7), and its gradient [B] by log π(a).
 
     L = −E[min(ρ A, clip(ρ, 1−ε, 1+ε) A)],  ρ = π(a) / π_old(a);    ∂L/∂log π(a) = −ρ A / B where ρ A is the lesser
     """
-    plain, clipped = ratio * advantage, ratio.clamp(1 - clip_range, 1 + clip_range) * advantage
-    return -torch.minimum(plain, clipped).mean(), (plain * (plain <= clipped)).div_(-len(ratio))
+    xp = _of(ratio)
+    plain, clipped = ratio * advantage, xp.clip(ratio, 1 - clip_range, 1 + clip_range) * advantage
+    return -xp.minimum(plain, clipped).mean(), plain * (plain <= clipped) / -len(ratio)
 
 
-def policy_gradient(log_prob: Tensor, advantage: Tensor) -> tuple[Tensor, Tensor]:
+def policy_gradient(log_prob: A, advantage: A) -> tuple[A, A]:
     """L = −E[A log π(a)] (Sutton et al. 1999), and its gradient [B] by log π(a)."""
     return -(log_prob * advantage).mean(), advantage / -len(advantage)
 
 
-def value_loss(value: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+def value_loss(value: A, target: A) -> tuple[A, A]:
     """Mean squared error (as Stable-Baselines3 has it, without the half that others put before it), and its gradient [B]."""
     error = value - target
     return (error * error).mean(), error * (2 / len(error))
 
 
-def clipped_value_loss(value: Tensor, target: Tensor, before: Tensor, clip_range: float) -> tuple[Tensor, Tensor]:
+def clipped_value_loss(value: A, target: A, before: A, clip_range: float) -> tuple[A, A]:
     """The value loss of OpenAI's PPO, and its gradient [B]: moving further than this from `before` earns nothing.
 
     L = E[max((V − G)², (clip(V, V_old−ε, V_old+ε) − G)²)].  Stable-Baselines3 takes the second alone, which also lets go
     of a value that went too far the wrong way.
     """
     moved, error = value - before, value - target
-    held = torch.where(moved.abs() <= clip_range, value, before + moved.clamp(-clip_range, clip_range)) - target
+    xp = _of(value)
+    held = xp.where(abs(moved) <= clip_range, value, before + xp.clip(moved, -clip_range, clip_range)) - target
     plain, clipped = error * error, held * held
-    return torch.maximum(plain, clipped).mean(), error * (plain >= clipped) * (2 / len(error))
+    return xp.maximum(plain, clipped).mean(), error * (plain >= clipped) * (2 / len(error))
 
 
-def entropy_loss(entropy: Tensor) -> tuple[Tensor, Tensor]:
+def entropy_loss(entropy: A) -> tuple[A, A]:
     """Minus the mean entropy, and its gradient [B]."""
-    return -entropy.mean(), torch.full_like(entropy, -1 / len(entropy))
+    return -entropy.mean(), _of(entropy).full_like(entropy, -1 / len(entropy))
 
 
-def approx_kl(log_ratio: Tensor, ratio: Tensor) -> Tensor:
+def approx_kl(log_ratio: A, ratio: A) -> A:
     """KL(π_old ‖ π) estimated by E[(ρ − 1) − log ρ]: unbiased, never negative (Schulman 2020, "Approximating KL")."""
-    return (ratio - 1 - log_ratio).mean()
+    found: A = (ratio - 1 - log_ratio).mean()
+    return found
 
 
-def clip_fraction(ratio: Tensor, clip_range: float) -> Tensor:
+def clip_fraction(ratio: A, clip_range: float) -> A:
     """The share of rows whose ratio left [1−ε, 1+ε]."""
-    return ((ratio - 1).abs() > clip_range).float().mean()
+    found: A = ((abs(ratio - 1) > clip_range) * 1.0).mean()
+    return found
 
 
 def explained_variance(value: Floats, target: Floats) -> float:

@@ -97,8 +97,7 @@ class PPO:
         log_prob, entropy, value = self.parts.forward(rows)
         with torch.no_grad():
             advantage = losses.standardized(rows.advantage) if config.normalize_advantage else rows.advantage
-            log_ratio = log_prob - rows.log_prob
-            ratio = log_ratio.exp()
+            log_ratio, ratio = losses.ratio(log_prob, rows.log_prob)
             policy_loss, by_log_prob = losses.clipped_surrogate(ratio, advantage, clip_range)
             if config.clip_range_vf is None:
                 value_loss, by_value = losses.value_loss(value, rows.target)

@@ -1,0 +1,183 @@
+"""The update without a graph is the update with one: outputs, gradients, losses, a thousand steps; and when it is chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from learner.algorithms import ALGORITHMS
+from learner.algorithms.actor_critic import Minibatch
+from learner.algorithms.fused import FusedActorCritic, applies
+from learner.algorithms.ppo import PPO
+from learner.hyperparameters import HYPERPARAMETERS, PPOConfig
+from protocol.networks import ActorCritic, log_prob_and_entropy
+from protocol.policy import layout, size
+from protocol.specs import ActionSpec, Leaf, PolicySpec
+from tests.batches import DISCRETE, GAUSSIAN, IMAGE, batch, no_pulse, normal, recurrent, shared
+from tests.test_networks import ACTIONS
+
+Array = npt.NDArray[Any]
+BOX = (Leaf("", "box", (4,), "float32"),)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def some_actions(spec: ActionSpec, rows: int, generator: np.random.Generator) -> Array:
+    if spec.kind == "box":
+        return generator.normal(size=(rows, *spec.shape)).astype(np.float32)
+    high = np.reshape(spec.sizes, spec.shape) if spec.sizes else 2
+    return generator.integers(0, high, (rows, *spec.shape))
+
+
+def make(spec: PolicySpec, seed: int) -> tuple[ActorCritic, FusedActorCritic]:
+    net = ActorCritic(spec)
+    net.flat.copy_(torch.tensor(np.random.default_rng(seed).normal(0, 0.4, len(net.flat)), dtype=torch.float32))
+    return net, FusedActorCritic(spec, net.flat.numpy(), net.flat_grad.numpy())
+
+
+@given(
+    st.sampled_from(sorted(ACTIONS)),
+    st.sampled_from(["tanh", "relu"]),
+    st.lists(st.integers(1, 9), max_size=3),
+    st.booleans(),
+    st.integers(1, 40),
+    st.integers(0, 2**32),
+)
+@settings(max_examples=200, deadline=None)
+def test_outputs_and_gradients_are_autograds(
+    action: str, activation: Any, net: list[int], shared_net: bool, rows: int, seed: int
+) -> None:
+    generator = np.random.default_rng(seed)
+    spec = PolicySpec(BOX, ACTIONS[action], tuple(net), activation, shared_net=shared_net)
+    with_graph, fused = make(spec, seed)
+    x, taken = generator.normal(size=(rows, 4)).astype(np.float32), some_actions(spec.action, rows, generator)
+    params, value = with_graph.forward(torch.tensor(x))
+    expected = (*log_prob_and_entropy(spec.action, params, torch.tensor(taken)), value)
+    found = fused.forward(x, taken)
+    for ours, theirs in zip(found, expected, strict=True):
+        np.testing.assert_allclose(ours, theirs.detach().numpy(), rtol=1e-4, atol=1e-4)
+    given_back = [generator.normal(size=rows).astype(np.float32) for _ in range(3)]
+    with_graph.flat_grad.zero_()
+    torch.autograd.backward(expected, [torch.tensor(each) for each in given_back])
+    reference = with_graph.flat_grad.numpy().copy()
+    with_graph.flat_grad.fill_(7.0)  # every gradient is written, none added to
+    fused.backward(*given_back)
+    np.testing.assert_allclose(
+        with_graph.flat_grad.numpy(), reference, rtol=1e-3, atol=1e-5 * max(1, np.abs(reference).max())
+    )
+
+
+@pytest.mark.parametrize("action", sorted(ACTIONS))
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+@pytest.mark.parametrize("shared_net", [False, True])
+def test_the_gradient_is_the_slope_in_float64(action: str, activation: Any, shared_net: bool) -> None:
+    """Central differences of a weighted sum of all outputs, by every parameter."""
+    generator = np.random.default_rng(3)
+    spec = PolicySpec(BOX, ACTIONS[action], (5, 3), activation, shared_net=shared_net)
+    flat = generator.normal(0, 0.5, sum(map(size, layout(spec))))
+    grad = np.full_like(flat, np.nan)
+    fused = FusedActorCritic(spec, flat, grad)
+    x, taken = generator.normal(size=(6, 4)), some_actions(spec.action, 6, generator)
+    weights = generator.normal(size=(3, 6))
+
+    def total() -> float:
+        return float(sum((w * out).sum() for w, out in zip(weights, fused.forward(x, taken), strict=True)))
+
+    total()
+    fused.backward(*weights.copy())
+    step = 1e-6
+    for i in range(len(flat)):
+        middle = flat[i]
+        flat[i] = middle + step
+        above = total()
+        flat[i] = middle - step
+        below = total()
+        flat[i] = middle
+        assert abs((above - below) / (2 * step) - grad[i]) < 1e-6 * max(1, abs(grad[i])), i
+
+
+SETTINGS: list[tuple[str, dict[str, Any]]] = [
+    ("ppo", {"ent_coef": 0.01, "batch_size": 32}),
+    ("ppo", {"clip_range_vf": 0.1, "normalize_advantage": False, "max_grad_norm": 0.1}),
+    ("ppo", {"target_kl": 0.01, "shared_net": True}),
+    ("a2c", {"ent_coef": 0.01, "normalize_advantage": True, "optimizer": "adam"}),
+    ("impala", {"n_epochs": 2, "minibatches": 3}),
+    ("reinforce", {"ent_coef": 0.01, "rollout_steps": 20}),
+]
+
+
+@pytest.mark.parametrize("spec", [DISCRETE, normal(GAUSSIAN)], ids=["discrete", "gaussian"])
+@pytest.mark.parametrize(("name", "changes"), SETTINGS)
+def test_an_update_is_the_same_either_way(
+    name: str, changes: dict[str, Any], spec: PolicySpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = msgspec.convert(changes, HYPERPARAMETERS[name])
+    spec = shared(spec) if config.shared_net else spec  # type: ignore[attr-defined]
+    found: list[tuple[Array, dict[str, float]]] = []
+    for most in (512, 0):
+        monkeypatch.setattr("learner.algorithms.actor_critic.MOST_ROWS", most)
+        algorithm: Any = ALGORITHMS[name](config, spec, total_steps=1_000, seed=0)
+        for seed in range(3):
+            metrics = algorithm.update(batch(algorithm, seed, fresh=seed == 0), no_pulse)
+        found.append((algorithm.net.flat.numpy().copy(), metrics))
+    np.testing.assert_allclose(found[0][0], found[1][0], atol=2e-5)
+    assert found[0][1] == pytest.approx(found[1][1], rel=1e-3, abs=1e-4, nan_ok=True)
+
+
+def test_a_thousand_steps_stay_together() -> None:
+    """Two copies of the same policy, one with the graph and one without, on the same minibatches."""
+    generator = np.random.default_rng(0)
+    config = PPOConfig(ent_coef=0.01)
+    spec = PolicySpec(BOX, ACTIONS["discrete"])
+    one, other = (PPO(config, spec, total_steps=1, seed=0) for _ in range(2))
+    for _ in range(1_000):
+        x = generator.normal(size=(64, 4)).astype(np.float32)
+        action = (x[:, 0] > 0) + 2 * (x[:, 1] > 0)
+        target, advantage = x.sum(-1), generator.normal(size=64).astype(np.float32)
+        rows = Minibatch(x, (), action, np.full(64, -1.386, np.float32), advantage, target)
+        first = one.step(rows, 0.2)
+        tensors: list[Any] = [torch.tensor(part) if len(part) else () for part in rows[:6]]
+        second = other.step(Minibatch(*tensors), 0.2)
+    assert float((one.net.flat - other.net.flat).abs().max()) < 1e-3
+    assert first._asdict() == pytest.approx(second._asdict(), rel=1e-2, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("spec", "expected"),
+    [
+        (DISCRETE, True),
+        (shared(GAUSSIAN), True),
+        (IMAGE, False),
+        (recurrent(DISCRETE, "gru"), False),
+        (msgspec.structs.replace(DISCRETE, head="q"), False),
+    ],
+)
+def test_it_is_for_layers_and_nothing_else(spec: PolicySpec, expected: bool) -> None:
+    assert applies(spec) == expected
+
+
+def test_large_minibatches_keep_the_graph(monkeypatch: pytest.MonkeyPatch) -> None:
+    kinds: list[type] = []
+    for most in (30, 29):
+        monkeypatch.setattr("learner.algorithms.actor_critic.MOST_ROWS", most)
+        algorithm = PPO(PPOConfig(batch_size=30, n_epochs=1), DISCRETE, total_steps=1, seed=0)
+        rows = batch(algorithm, 0)
+        given_rows = algorithm.parts.rows(rows, algorithm.parts.see(rows), rows.reward, rows.reward)
+        mask = np.zeros_like(rows.valid)
+        mask.reshape(-1)[:60] = True
+        kinds.append(type(next(algorithm.parts.minibatches(given_rows, mask, 2)).x))
+    assert kinds == [np.ndarray, torch.Tensor]
