@@ -1,7 +1,7 @@
 """The shell round the roster: link + roster + clock. `gather` is the only place where the learner waits.
 
-The law: the inbox is emptied before silence is judged, so a long update never kills a healthy worker; every wait has a
-deadline and says what it waits for.
+The law: the inbox is emptied before silence is judged, and a learner that was away itself listens for a while first, so a
+long update, or a stop, never kills a healthy worker; every wait has a deadline and says what it waits for.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ log = logging.getLogger("millrace.learner")
 
 POLL_S = 0.1
 SAY_WAITING_EVERY_S = 10.0
+AWAY_S = 0.5  # a learner that has not listened for longer was busy, or stopped
 
 
 class Hub:
@@ -60,6 +61,7 @@ class Hub:
         self.dead_workers, self.watch, self._clock = dead_workers, watch, clock
         self._lid = Rarely()
         self._draining = False
+        self._listened_s = self._judge_s = clock()
         self._env_failures = 0
         self._failure: EnvironmentFailed | None = None
         self._refusal = ""
@@ -147,7 +149,13 @@ class Hub:
         self._receive(timeout_s)
         self._shut_out()
         self._gone()
-        self._send(self.roster.tick(self._clock()))
+        now = self._clock()
+        if now - self._listened_s > timeout_s + AWAY_S:
+            # What was said meanwhile may still lie in the kernel: ZeroMQ's thread was stopped, as we were.
+            self._judge_s = now + AWAY_S
+        self._listened_s = now
+        if now >= self._judge_s:
+            self._send(self.roster.tick(now))
 
     def _receive(self, timeout_s: float) -> None:
         if not self.link.poll(timeout_s):

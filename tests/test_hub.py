@@ -1,0 +1,89 @@
+"""The shell round the roster, over a link and a clock that are not real: when silence counts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import cast
+
+from learner.hub import AWAY_S, POLL_S, Hub
+from learner.roster import Roster
+from protocol.codec import Buffer
+from protocol.link import LearnerLink
+from protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello, ToLearner
+from tests.fakes import run_spec
+
+WORKER_TIMEOUT_S = 3.0
+
+
+class FakeLink:
+    """Holds what workers have said until it is asked for; waiting takes time."""
+
+    address, keyring = "fake", None
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        self.inbox: list[tuple[bytes, ToLearner]] = []
+
+    def poll(self, timeout_s: float) -> bool:
+        if not self.inbox:
+            self.now += timeout_s
+        return bool(self.inbox)
+
+    def receive(self) -> Iterator[tuple[bytes, ToLearner]]:
+        while self.inbox:
+            yield self.inbox.pop(0)
+
+    def send(self, peer: bytes, frames: Sequence[Buffer]) -> bool:
+        return True
+
+    def why_not(self, peer: bytes) -> str:
+        return ""
+
+
+def hub_with_a_worker() -> tuple[FakeLink, Hub, Heartbeat]:
+    link = FakeLink()
+    roster = Roster(run_spec(lanes=1), rollouts_per_update=1, max_lag=0, worker_timeout_s=WORKER_TIMEOUT_S, first_session=1)
+    hub = Hub(
+        cast(LearnerLink, link),
+        roster,
+        no_workers_timeout_s=60.0,
+        stall_timeout_s=600.0,
+        max_env_failures=0,
+        clock=lambda: link.now,
+    )
+    link.inbox.append((b"w0", Hello(PROTOCOL_VERSION, "w0", "host", 1, 1, "fake", 1)))
+    hub.wait_for(1)
+    return link, hub, Heartbeat(1, 0, -1, (), 0, {}, 0)
+
+
+def listen(hub: Hub, link: FakeLink, seconds: float) -> None:
+    until_s = link.now + seconds
+    while link.now < until_s:
+        hub.pulse()
+        link.now += POLL_S
+
+
+def test_a_silent_worker_is_given_up_while_the_learner_listens() -> None:
+    link, hub, _ = hub_with_a_worker()
+    listen(hub, link, WORKER_TIMEOUT_S - 2 * POLL_S)
+    assert hub.roster.members
+    listen(hub, link, 4 * POLL_S)
+    assert not hub.roster.members
+
+
+def test_a_learner_that_was_stopped_listens_before_it_judges() -> None:
+    """Its inbox is empty when it wakes, because what fills it was stopped too."""
+    link, hub, heartbeat = hub_with_a_worker()
+    link.now += 2 * WORKER_TIMEOUT_S
+    hub.pulse()
+    assert hub.roster.members, "the worker was given up before what it had said could arrive"
+    link.inbox.append((b"w0", heartbeat))
+    listen(hub, link, 2 * AWAY_S)
+    assert hub.roster.members
+
+
+def test_a_learner_that_was_stopped_judges_after_a_while() -> None:
+    link, hub, _ = hub_with_a_worker()
+    link.now += 2 * WORKER_TIMEOUT_S
+    listen(hub, link, AWAY_S + 2 * POLL_S)
+    assert not hub.roster.members
