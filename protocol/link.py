@@ -47,6 +47,7 @@ Said = TypeVar("Said")
 log = logging.getLogger("millrace.link")
 
 LINGER_MS = 2000
+UNACKNOWLEDGED_MS = 5000  # of TCP: after a long cut it would else wait as long again before it tries, and longer each time
 QUEUE = 1000  # messages: for a peer that talks and does not read
 MESSAGES_AT_ONCE = 10_000
 COPY_BELOW_BYTES = 65536  # smaller frames are copied: cheaper than keeping track of them
@@ -59,6 +60,8 @@ def _options(socket: zmq.Socket[bytes], address: str, curve: bool) -> None:
     socket.linger = LINGER_MS
     socket.maxmsgsize = MAX_FRAME_BYTES + (CURVE_BYTES if curve else 0)
     socket.handshake_ivl = HANDSHAKE_MS
+    socket.connect_timeout = 2000
+    socket.tcp_maxrt = UNACKNOWLEDGED_MS
     socket.ipv6 = needs_ipv6(address)
     # Credit bounds what is under way (one Weights, a few tickets and their rollouts) far below these.
     socket.sndhwm = socket.rcvhwm = QUEUE
