@@ -3,7 +3,8 @@
 Every option here was learned by an experiment. ROUTER_MANDATORY: a plain ROUTER drops silently at its high-water mark.
 ROUTER_HANDOVER: else a returning worker is locked out until its half-open connection times out. No ZMTP heartbeats: with a
 reader stopped by its high-water mark they lose and reorder messages; our own heartbeats judge silence, and tickets are the
-credit that keeps queues short. MAXMSGSIZE bounds a frame before a byte of it is read. A link belongs to one thread.
+credit that keeps queues short. MAXMSGSIZE bounds a frame before a byte of it is read. TCP_MAXRT and keepalive: a connection
+whose other end has vanished is closed, and made anew by the worker, in seconds. A link belongs to one thread.
 
 With keys, a peer is a routing id *and* the key under which it speaks, which libzmq vouches for on every message. So whoever
 claims another's routing id under a key of its own is another peer: it cannot speak in that worker's session, nor end it. It
@@ -47,7 +48,7 @@ Said = TypeVar("Said")
 log = logging.getLogger("millrace.link")
 
 LINGER_MS = 2000
-UNACKNOWLEDGED_MS = 5000  # of TCP: after a long cut it would else wait as long again before it tries, and longer each time
+UNACKNOWLEDGED_MS = 5000  # TCP waits ever longer between two tries: after a cut, as long again as the cut was
 QUEUE = 1000  # messages: for a peer that talks and does not read
 MESSAGES_AT_ONCE = 10_000
 COPY_BELOW_BYTES = 65536  # smaller frames are copied: cheaper than keeping track of them
@@ -62,6 +63,8 @@ def _options(socket: zmq.Socket[bytes], address: str, curve: bool) -> None:
     socket.handshake_ivl = HANDSHAKE_MS
     socket.connect_timeout = 2000
     socket.tcp_maxrt = UNACKNOWLEDGED_MS
+    # A host that vanished while nothing was on its way: nobody would notice, and its connection would stay for ever.
+    socket.tcp_keepalive, socket.tcp_keepalive_idle, socket.tcp_keepalive_intvl, socket.tcp_keepalive_cnt = 1, 15, 5, 3
     socket.ipv6 = needs_ipv6(address)
     # Credit bounds what is under way (one Weights, a few tickets and their rollouts) far below these.
     socket.sndhwm = socket.rcvhwm = QUEUE
