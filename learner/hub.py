@@ -217,7 +217,9 @@ class Hub:
         for event in events:
             leaving = isinstance(event, Left) and event.on_purpose and self._draining
             expected = leaving or isinstance(event, Joined | Told | Stale)
-            log.log(logging.INFO if expected else logging.WARNING, "%s", describe(event), extra={"event": event})
+            if (kept_back := self._kept_back(event)) is not None:
+                line = describe(event) + again(kept_back)
+                log.log(logging.INFO if expected else logging.WARNING, "%s", line, extra={"event": event})
             match event:
                 case Turned(_, why):
                     self._refusal = why
@@ -228,6 +230,10 @@ class Hub:
                         self._failure = EnvironmentFailed(f"worker {worker} ({host}): {error}; {counted}", traceback)
                 case _:
                     pass
+
+    def _kept_back(self, event: Event) -> int | None:
+        """None: say nothing of it. What was said while nobody listened comes all at once; so does a stranger's flood."""
+        return self._lid.due(f"told {event.worker}", self._clock()) if isinstance(event, Told) else 0
 
     def _judge(self) -> None:
         """End the run when nobody has been there for too long."""

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from typing import cast
+
+import pytest
 
 from learner.hub import AWAY_S, POLL_S, Hub
 from learner.roster import Roster
@@ -87,3 +90,16 @@ def test_a_learner_that_was_stopped_judges_after_a_while() -> None:
     link.now += 2 * WORKER_TIMEOUT_S
     listen(hub, link, AWAY_S + 2 * POLL_S)
     assert not hub.roster.members
+
+
+def test_a_flood_of_an_ended_session_is_one_line(caplog: pytest.LogCaptureFixture) -> None:
+    """As after a restart of the learner, from every worker that went on saying Heartbeat."""
+    link, hub, _ = hub_with_a_worker()
+    caplog.set_level(logging.INFO)
+    link.inbox += [(b"w1", Heartbeat(7, number, -1, (), 0, {}, 0)) for number in range(100)]
+    hub.pulse()
+    assert [record.getMessage() for record in caplog.records] == ["worker w1 was told to join again: its session had ended"]
+    link.now += 100
+    link.inbox.append((b"w1", Heartbeat(7, 100, -1, (), 0, {}, 0)))
+    hub.pulse()
+    assert caplog.records[-1].getMessage().endswith("had ended (99 more like this since the last line)")
