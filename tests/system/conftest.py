@@ -1,0 +1,30 @@
+"""What the tests of real processes share: a stage and a network that are gone when the test is over."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.system.network import Network, why_not
+from tests.system.processes import Stage
+
+
+@pytest.fixture
+def network() -> Iterator[Network]:
+    if why := why_not():
+        pytest.skip(why)
+    with Network() as made:
+        yield made
+
+
+@pytest.fixture
+def stage(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Stage]:
+    if "network" in request.fixturenames:
+        request.getfixturevalue("network")  # first: it must outlive the processes on it
+    made = Stage(tmp_path)
+    try:
+        yield made
+    finally:
+        made.close()

@@ -1,0 +1,264 @@
+"""Learners and workers as real processes: started, watched, stopped, and none of them left behind.
+
+The law: every wait has a deadline, and says what it waited for and what was said instead; a process that a test started is
+dead when the test is over, whatever the test did to it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, TypeVar
+
+import psutil
+
+from learner.metrics import read_rows
+from protocol.key_folder import KeyFolder
+
+ROOT = Path(__file__).parents[2]
+T = TypeVar("T")
+LOOK_EVERY_S = 0.02
+START_S = 90.0  # torch takes seconds to import, and on a crowded machine many
+TOY = "workers.envs.toy:Slow-v0"
+WORKER_TIMEOUT_S = 1.5
+SMALL: dict[str, object] = {
+    "env-kwargs": "seconds 0.001",
+    "rollout-steps": 16,
+    "batch-size": 64,
+    "n-epochs": 1,
+    "eval-episodes": 1,
+    "steps": 1_000_000_000,  # the test says when it is over
+    "worker-timeout-s": WORKER_TIMEOUT_S,
+    "heartbeat-s": 0.3,
+    "no-workers-timeout-s": 60,
+}
+
+
+def wait_for(condition: Callable[[], T], within_s: float = 60.0, what: Callable[[], str] | str = "it") -> T:
+    """What `condition` gives, as soon as it is true. Fails after `within_s`."""
+    deadline = time.monotonic() + within_s
+    while not (found := condition()):
+        text = what if isinstance(what, str) else what()
+        assert time.monotonic() < deadline, f"{text} did not happen within {within_s:.1f} s"
+        time.sleep(LOOK_EVERY_S)
+    return found
+
+
+def crowding() -> float:
+    """How many processes want each core, at least 1: how much longer than on an idle machine a thing may take."""
+    return max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+
+
+def free_port() -> int:
+    """A TCP port of loopback that nobody has."""
+    with socket.create_server(("127.0.0.1", 0)) as found:
+        return int(found.getsockname()[1])
+
+
+class Running:
+    """A process that was started; all that it says goes to a file."""
+
+    def __init__(self, command: Sequence[str], said: Path, told: bool = False) -> None:
+        """`told`: it reads stdin; see `tell`."""
+        self.said_in = said
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+        with said.open("ab") as file:
+            self.process = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE if told else subprocess.DEVNULL,
+                stdout=file,
+                stderr=file,
+                cwd=ROOT,
+                env=environment,
+            )
+        self.pid = self.process.pid
+
+    def said(self) -> str:
+        """Everything so far."""
+        return self.said_in.read_text(errors="replace")
+
+    def hears(self, pattern: str, within_s: float = 30.0, times: int = 1) -> str:
+        """Wait until it has said this so many times; the last of them."""
+        found = wait_for(
+            lambda: len(said := re.findall(f".*{pattern}.*", self.said())) >= times and said,
+            within_s,
+            lambda: f"{pattern!r} in what {self.said_in.name} says:\n{self.said()}\n",
+        )
+        assert found
+        return str(found[-1])
+
+    def tell(self, line: str) -> None:
+        """A line for its stdin."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(f"{line}\n".encode())
+        self.process.stdin.flush()
+
+    def alive(self) -> bool:
+        """Whether it runs, or is stopped."""
+        return self.process.poll() is None
+
+    def signal(self, number: int) -> None:
+        """Send a signal."""
+        self.process.send_signal(number)
+
+    def kill(self) -> None:
+        """SIGKILL, and wait until it is dead."""
+        self.process.kill()
+        self.process.wait(10)
+
+    def pause(self) -> None:
+        """SIGSTOP, and wait until it stands."""
+        self.signal(signal.SIGSTOP)
+        stopped = psutil.STATUS_STOPPED
+        wait_for(lambda: psutil.Process(self.pid).status() == stopped, 10, "the process to stop")
+
+    def go_on(self) -> None:
+        """SIGCONT."""
+        self.signal(signal.SIGCONT)
+
+    def ends(self, within_s: float = 30.0) -> int:
+        """Wait until it has ended by itself; the exit code."""
+        wait_for(lambda: not self.alive(), within_s, lambda: f"the end of {self.said_in.name}, which says:\n{self.said()}\n")
+        return self.process.wait()
+
+    def memory_mb(self) -> float:
+        """Resident."""
+        return float(psutil.Process(self.pid).memory_info().rss) / 1e6
+
+    def descriptors(self) -> int:
+        """Open files and sockets."""
+        return int(psutil.Process(self.pid).num_fds())
+
+
+class Learner(Running):
+    """`python -m learner`, and the folder of its run."""
+
+    def __init__(self, command: Sequence[str], said: Path, runs: Path) -> None:
+        super().__init__(command, said)
+        self._runs = runs
+
+    @property
+    def folder(self) -> Path:
+        """The run folder, once it is there."""
+        (found,) = self._runs.iterdir()
+        return found
+
+    def is_open(self) -> str:
+        """Wait until the port is open."""
+        return self.hears("waiting for workers", START_S)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """The rows of metrics.jsonl so far."""
+        tables = list(self._runs.glob("*/metrics.jsonl"))
+        return read_rows(tables[0]) if tables else []
+
+    def updates(self) -> int:
+        """How many there were."""
+        rows = self.rows()
+        return int(rows[-1]["time/iterations"]) if rows else 0
+
+    def trains(self, more: int = 3, within_s: float = START_S) -> dict[str, Any]:
+        """Wait for so many updates from now on; the newest row."""
+        since = self.updates()
+        self.until(lambda row: row["time/iterations"] >= since + more, within_s, f"{more} updates after the first {since}")
+        return self.rows()[-1]
+
+    def until(self, reached: Callable[[dict[str, Any]], bool], within_s: float, what: str = "the row") -> float:
+        """Wait for an update whose row is so; how many seconds it took."""
+        began_s = time.monotonic()
+
+        def found() -> bool:
+            assert self.alive(), f"the learner ended while a test waited for {what}:\n{self.said()}"
+            rows = self.rows()
+            return bool(rows) and reached(rows[-1])
+
+        wait_for(found, within_s, lambda: f"{what}; the learner says:\n{self.said()}\n")
+        return time.monotonic() - began_s
+
+    def ledger(self) -> dict[str, int]:
+        """As of the newest row."""
+        prefix = "ledger/"
+        return {name.removeprefix(prefix): count for name, count in self.rows()[-1].items() if name.startswith(prefix)}
+
+    def summary(self) -> dict[str, Any]:
+        """summary.json."""
+        found: dict[str, Any] = json.loads((self.folder / "summary.json").read_text())
+        return found
+
+    def checkpoints(self) -> list[Path]:
+        """Oldest first."""
+        return sorted(self._runs.glob("*/checkpoints/*.pt"))
+
+
+class Stage:
+    """All processes of one test."""
+
+    def __init__(self, tmp_path: Path) -> None:
+        self.tmp_path = tmp_path
+        self.runs = tmp_path / "runs"
+        self.started: list[Running] = []
+        self._numbers = itertools.count()
+
+    def keys(self) -> tuple[Path, Path]:
+        """A key folder, and the token of a client that it allows."""
+        folder = self.tmp_path / "keys"
+        return folder, KeyFolder(folder).new("workers", datetime.now(UTC).replace(microsecond=0))
+
+    def learner(
+        self,
+        address: str,
+        settings: Mapping[str, object] = {},
+        *,
+        env: str = TOY,
+        before: Sequence[str] = (),
+        resume: Path | None = None,
+    ) -> Learner:
+        """`python -m learner` at this address. `settings` are flags over SMALL; `before` goes before the command."""
+        arguments = ["--resume", str(resume)]
+        if resume is None:
+            arguments = [env, "--bind", address, "--run-dir", str(self.runs)]
+            for name, value in {**SMALL, **settings}.items():
+                if value != "":
+                    arguments += [f"--{name}", *str(value).split()]
+        said = self.tmp_path / f"learner-{next(self._numbers)}.log"
+        learner = Learner([*before, sys.executable, "-m", "learner", *arguments], said, self.runs)
+        self.started.append(learner)
+        return learner
+
+    def worker(self, address: str, name: str, *flags: str, before: Sequence[str] = ()) -> Running:
+        """`python -m workers` for the learner at this address."""
+        return self.start([*before, sys.executable, "-m", "workers", address, "--name", name, *flags], name)
+
+    def start(self, command: Sequence[str], name: str, told: bool = False) -> Running:
+        """Any process; it is ended with the test."""
+        running = Running(command, self.tmp_path / f"{name}-{next(self._numbers)}.log", told)
+        self.started.append(running)
+        return running
+
+    def close(self) -> None:
+        """End all, also those that are stopped; fail if any of them started a process that is still there."""
+        families = []
+        for running in self.started:
+            if running.alive():
+                families += psutil.Process(running.pid).children(recursive=True)
+                running.process.kill()
+        for running in self.started:
+            running.process.wait(10)
+            if running.process.stdin is not None:
+                with suppress(BrokenPipeError):
+                    running.process.stdin.close()
+        _, left = psutil.wait_procs(families, timeout=5)
+        for process in left:
+            process.kill()
+        assert not left, f"processes were left behind: {left}"

@@ -1,0 +1,44 @@
+"""A peer that talks rubbish: bytes that are not ZeroMQ's, and ZeroMQ messages that are not ours. Also a process of its own.
+
+The law: what it says follows from the seed.
+"""
+
+from __future__ import annotations
+
+import random
+import socket
+import sys
+
+import zmq
+
+from protocol.codec import encode
+from protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello
+
+NAME = b"stranger"
+
+
+def talk_rubbish(host: str, port: int, seed: int, *, connections: int = 100, messages: int = 300) -> bool:
+    """Random bytes over so many connections, so many messages of random frames and one more; whether it was answered."""
+    noise = random.Random(seed)
+    for _ in range(connections):
+        with socket.create_connection((host, port), timeout=10) as raw:
+            raw.sendall(noise.randbytes(500))
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    try:
+        stranger = context.socket(zmq.DEALER)
+        stranger.linger, stranger.sndtimeo, stranger.routing_id = 0, 10_000, NAME
+        stranger.connect(f"tcp://{host}:{port}")
+        for number in range(messages):
+            stranger.send_multipart([noise.randbytes(noise.randrange(2000)) for _ in range(1 + number % 80)])
+        hello = Hello(PROTOCOL_VERSION, NAME.decode(), "host", 1, 1, "", 1)
+        stranger.send_multipart([*encode(hello), b"one frame too many"])
+        stranger.send_multipart(encode(Heartbeat(7, 0, 0, (), 0, {}, 0)))
+        return bool(stranger.poll(10_000))
+    except zmq.Again:  # it is not let in, and its queue is full
+        return False
+    finally:
+        context.destroy(linger=0)
+
+
+if __name__ == "__main__":
+    talk_rubbish(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))

@@ -1,0 +1,225 @@
+"""What must happen when the way between learner and workers is bad, cut, or used by strangers.
+
+Hosts are network namespaces (root, `ip`, `nft`); what needs none of them goes through a proxy on loopback.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import pytest
+
+from protocol.messages import PROTOCOL_VERSION
+from tests.system.network import Network
+from tests.system.processes import START_S, Stage, free_port, wait_for
+from tests.system.proxy import Proxy
+from tests.system.rubbish import talk_rubbish
+from tests.system.runs import NOTICED_S, dealt_again, far_apart, finish, play, within
+
+AGAIN_S = 5.0  # after a cut: at most 2 s until a connection in vain is given up, 2 s until the next is tried, and a Hello
+
+# ---------------------------------------------------------------- cut, and healed
+
+
+@pytest.mark.parametrize("cut_s", [4, pytest.param(30, marks=pytest.mark.soak)])
+def test_a_network_cut_and_healed(stage: Stage, network: Network, cut_s: float) -> None:
+    learner, workers, (_, far, _), _ = far_apart(stage, network)
+    far.cut()
+    began_s = time.monotonic()
+    within("a worker's network cut", dealt_again(learner), NOTICED_S)
+    learner.hears("worker w0 silent for 2 s")
+    time.sleep(cut_s - (time.monotonic() - began_s))  # long enough for TCP to wait for long between two tries
+    far.heal()
+    began_s = time.monotonic()
+    learner.hears(r"worker w0 \(.*\) joined", times=2)
+    within(f"healed after {cut_s} s, joined again", time.monotonic() - began_s, AGAIN_S)
+    learner.trains()
+    finish(learner, workers)
+
+
+@pytest.mark.soak
+def test_the_learners_network_cut_and_healed(stage: Stage, network: Network) -> None:
+    learner, workers, (here, *_), _ = far_apart(stage, network)
+    here.cut()
+    learner.hears("worker w[01] silent for 2 s", times=2)
+    time.sleep(4)
+    here.heal()
+    began_s = time.monotonic()
+    learner.trains(1)
+    within("the learner's network cut for 6 s and healed", time.monotonic() - began_s, AGAIN_S)
+    learner.trains()
+    finish(learner, workers)
+
+
+def test_a_host_that_vanished_and_came_back(stage: Stage, network: Network) -> None:
+    """The learner's connection to it is half-open; the worker that comes back has its name, and is not locked out."""
+    learner, (gone, other), (here, far, _), token = far_apart(stage, network, {"worker-timeout-s": 20})
+    far.cut()
+    gone.kill()
+    far.vanish()
+    far = network.host(2)
+    began_s = time.monotonic()
+    back = stage.worker(f"tcp://{here.address}:5555", "w0", *token, before=far.before)
+    dealt_again(learner)
+    within("its host vanished, the same name came back", time.monotonic() - began_s, 4.0)
+    learner.hears(r"worker w0 replaced by process \d+; \d of its tickets are dealt again")
+    learner.trains()
+    finish(learner, [back, other])
+
+
+@pytest.mark.soak
+def test_a_host_that_vanished_for_good(stage: Stage, network: Network) -> None:
+    """Nobody says goodbye, and the learner has nothing to say to it: its connection is closed nevertheless."""
+    learner, (gone, other), (_, far, _), _ = far_apart(stage, network)
+    far.cut()
+    gone.kill()
+    far.vanish()
+    within("its host vanished for good", dealt_again(learner), NOTICED_S)
+    before = learner.descriptors()
+    began_s = time.monotonic()
+    wait_for(lambda: learner.descriptors() < before, 60, "the end of its connection")
+    within("its connection closed", time.monotonic() - began_s, 30.0)
+    finish(learner, [other])
+
+
+@pytest.mark.soak
+def test_the_learners_host_vanished_and_came_back(stage: Stage, network: Network) -> None:
+    """The workers' connections are half-open: nobody tells them that they are."""
+    learner, workers, (here, *_), _ = far_apart(stage, network, {"checkpoint-every-s": 0.3})
+    wait_for(lambda: len(learner.checkpoints()) >= 2, START_S, "the second checkpoint")
+    here.cut()
+    learner.kill()
+    here.vanish()
+    saved = int(learner.checkpoints()[-1].stem)
+    time.sleep(3)
+    here = network.host(1)
+    again = stage.learner(f"tcp://{here.address}:5555", resume=learner.folder, before=here.before)
+    again.is_open()
+    seconds = again.until(lambda row: row["time/total_timesteps"] > saved, START_S, "an update after the checkpoint")
+    within("the learner's host vanished, resumed at its address", seconds, AGAIN_S)
+    finish(again, workers)
+
+
+# ---------------------------------------------------------------- bad
+
+
+@pytest.mark.parametrize(
+    ("percent", "bound_s"),
+    [(1, 4.0), pytest.param(10, 15.0, marks=pytest.mark.soak), pytest.param(30, 60.0, marks=pytest.mark.soak)],
+)
+def test_lost_packets(stage: Stage, network: Network, percent: int, bound_s: float) -> None:
+    learner, workers, (_, *far), _ = far_apart(stage, network)
+    for host in far:
+        host.lose(percent)
+    began_s = time.monotonic()
+    learner.trains(10)
+    within(f"ten updates while {percent} % of packets are lost, each way", time.monotonic() - began_s, bound_s)
+    for host in far:
+        host.lose(0)
+    learner.trains()
+    finish(learner, workers)
+
+
+@pytest.mark.soak
+def test_a_thin_line(stage: Stage, network: Network) -> None:
+    """Weights and rollouts take longer than the heartbeats between them."""
+    learner, workers, (_, *far), _ = far_apart(stage, network)
+    for host in far:
+        host.slow(32)
+    began_s = time.monotonic()
+    learner.trains(10)
+    seconds = time.monotonic() - began_s
+    within("ten updates over 32 kbit/s", seconds, 15.0)
+    assert seconds > 1.0, "the line is not thin"
+    for host in far:
+        host.slow(0)
+    learner.trains()
+    finish(learner, workers)
+
+
+def test_latency_and_small_pieces(stage: Stage) -> None:
+    port = free_port()
+    learner = stage.learner(f"tcp://127.0.0.1:{port}", {"min-workers": 2})
+    with Proxy(port) as far:
+        workers = [stage.worker(far.address, f"w{number}") for number in range(2)]
+        learner.trains(2)
+        far.latency_s, far.slice_bytes = 0.2, 100
+        learner.trains(2)
+        began_s = time.monotonic()
+        learner.trains(2)
+        within("two updates over 200 ms each way, in pieces of 100 bytes", time.monotonic() - began_s, 2.0)
+        assert learner.ledger()["lost"] == 0
+        assert "silent" not in learner.said()
+        far.latency_s, far.slice_bytes = 0.0, 0
+        finish(learner, workers)
+
+
+def test_connections_that_are_reset(stage: Stage) -> None:
+    """What was under way is lost; heartbeats repair it; nobody is given up and no ticket is lost."""
+    port = free_port()
+    learner = stage.learner(f"tcp://127.0.0.1:{port}", {"min-workers": 2})
+    with Proxy(port) as way:
+        workers = [stage.worker(way.address, f"w{number}") for number in range(2)]
+        learner.trains(2)
+        worst_s = 0.0
+        for _ in range(3):
+            way.reset()
+            began_s = time.monotonic()
+            learner.trains(2)
+            worst_s = max(worst_s, time.monotonic() - began_s)
+        within("all connections reset, two updates, the worst of three", worst_s, 2.0)
+        assert way.connections >= 8
+        assert learner.ledger()["lost"] == 0, "a cut connection cost a ticket"
+        finish(learner, workers)
+
+
+@pytest.mark.soak
+def test_a_way_that_swallows_everything(stage: Stage) -> None:
+    """Connections stay open and nothing comes: the worker is given up, and when it comes again it is told to rejoin."""
+    port = free_port()
+    learner = stage.learner(f"tcp://127.0.0.1:{port}", {"min-workers": 2})
+    with Proxy(port) as way:
+        near, far = stage.worker(f"tcp://127.0.0.1:{port}", "near"), stage.worker(way.address, "far")
+        learner.trains(2)
+        way.swallow()
+        within("a connection swallows everything", dealt_again(learner), NOTICED_S)
+        learner.hears("worker far silent for 2 s")
+        way.flow()
+        began_s = time.monotonic()
+        learner.hears(r"worker far \(.*\) joined", times=2)
+        within("it flows again, joined again", time.monotonic() - began_s, 2.0)
+        learner.trains()
+        finish(learner, [near, far])
+
+
+# ---------------------------------------------------------------- strangers
+
+
+def test_peers_that_talk_rubbish(stage: Stage) -> None:
+    learner, workers = play(stage)
+    before_mb = learner.memory_mb()
+    port = int(learner.hears("waiting for workers").rpartition(":")[2])
+    bad = learner.ledger()["messages_bad"]
+    assert talk_rubbish("127.0.0.1", port, seed=1), "it was not answered"
+    learner.until(lambda row: row["ledger/messages_bad"] >= bad + 301, START_S, "301 bad messages")
+    learner.hears("message from .*: ")
+    assert learner.said().count("message from") < 40, "strangers fill the log"
+    began_s = time.monotonic()
+    learner.trains(1)
+    within("rubbish from a hundred peers", time.monotonic() - began_s, 1.0)
+    assert learner.memory_mb() - before_mb < 30
+    assert learner.ledger()["lost"] == 0
+    finish(learner, workers)
+
+
+def test_a_worker_of_another_protocol_version(stage: Stage) -> None:
+    learner, workers = play(stage)
+    address = learner.hears("waiting for workers").split()[-1]
+    newer = "import sys, workers.session as s, workers.__main__ as m; s.PROTOCOL_VERSION = 999; sys.exit(m.main())"
+    stranger = stage.start([sys.executable, "-c", newer, address, "--name", "newer"], "newer")
+    assert stranger.ends() == 2
+    assert "got 999; install the learner's version of millrace" in stranger.said()
+    learner.hears(f"worker newer was refused: protocol expected {PROTOCOL_VERSION}, got 999")
+    learner.trains()
+    finish(learner, workers)
