@@ -1,10 +1,11 @@
 # `make train` and `make test` work on a fresh clone with python3 >= 3.11 and nothing else.
 PYTHON ?= python3
+MINUTES ?= 10
 BIN := .venv/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: train test lint type unit docs bench test-learning clean
+.PHONY: train test lint type unit docs bench test-learning soak clean
 
 train: .venv/installed  ## train CartPole-v1 on two worker processes until a greedy evaluation averages 475
 	$(BIN)/millrace train CartPole-v1 --workers 2 --target-return 475 --eval-episodes 20 --eval-every 5000
@@ -23,6 +24,10 @@ unit: .venv/installed-dev
 
 test-learning: .venv/installed-dev  ## published scores, three seeds each; forty minutes
 	$(BIN)/python -m pytest -m learning --timeout 3600 tests/learning
+
+soak: .venv/installed-dev  ## faults for ten minutes, every two seconds one; then the faults that take too long for `make test`. Needs root
+	$(BIN)/python -m tests.system.soak --minutes $(MINUTES)
+	$(BIN)/python -m pytest -m soak tests/system
 
 docs: .venv/installed-dev  ## write the generated parts of protocol/README.md
 	$(BIN)/python -m tests.test_wire_document

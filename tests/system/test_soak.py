@@ -1,0 +1,18 @@
+"""A minute of the soak: many faults at once, and all that must hold when they are over."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.system.network import why_not
+from tests.system.soak import soak
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(400)
+def test_a_minute_of_faults(tmp_path: Path) -> None:
+    if why := why_not():
+        pytest.skip(why)
+    assert soak(1.0, seed=1, folder=tmp_path) == []
