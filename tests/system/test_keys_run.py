@@ -76,7 +76,7 @@ def cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster
 
 def test_a_revoked_worker_leaves_with_the_reason_and_the_run_goes_on_without_it(cluster: Cluster) -> None:
     keys = cluster.folder / "keys"
-    address = cluster.learner("--keys", str(keys), "--steps", "40000", "--n-epochs", "2")
+    address = cluster.learner("--keys", str(keys), "--steps", "1000000000")  # the test says when it is over
     assert f"--token {keys}/default.token" in cluster.said("learner")
     made = subprocess.run(
         [sys.executable, "-m", "millrace", "keys", "new", "lab", "--keys", str(keys)],
@@ -106,11 +106,11 @@ def test_a_revoked_worker_leaves_with_the_reason_and_the_run_goes_on_without_it(
     cluster.until(lambda: "was not let in: its key lab" in cluster.said("learner"))
 
     cluster.until(lambda: cluster.updates() > before + 5)
-    assert cluster.running["learner"].wait(60) == 0, cluster.said("learner")
+    cluster.running["learner"].terminate()
+    assert cluster.running["learner"].wait(60) == 130, cluster.said("learner")
     assert steady.wait(20) == 0, cluster.said("steady")
     (run,) = (cluster.folder / "runs").iterdir()
     summary = json.loads((run / "summary.json").read_text())
-    assert summary["stop_reason"] == "all steps done"
     ledger = summary["ledger"]
     assert ledger["issued"] == ledger["used"] + ledger["outstanding"] + ledger["stale"] + ledger["lost"]
     for secret in (copy.read_text().strip(), (keys / "server.key").read_text().strip()):
