@@ -205,6 +205,7 @@ class Stage:
     """All processes of one test."""
 
     def __init__(self, tmp_path: Path) -> None:
+        tmp_path.mkdir(exist_ok=True)
         self.tmp_path = tmp_path
         self.runs = tmp_path / "runs"
         self.started: list[Running] = []

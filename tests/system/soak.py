@@ -28,7 +28,7 @@ from tests.system.runs import accounted
 PORT, PROXY_PORT = 5555, 5556
 WORKERS = 8
 FAULT_EVERY_S, HEALED_WITHIN_S = 2.0, (0.5, 4.0)
-STEPS_PER_MINUTE = 150_000  # what is learned with these faults on two cores, about
+STEPS_FIRST_MINUTE, STEPS_PER_MINUTE = 150_000, 270_000  # what is learned with these faults on two cores, about
 SETTINGS: dict[str, object] = {
     "env-kwargs": "",
     "rollout-steps": 32,
@@ -66,6 +66,9 @@ class Soak:
         self.memory: list[tuple[int, float, float]] = []  # pid of the learner, seconds, MB
         self.descriptors: dict[int, list[int]] = {}
         self.killed: set[int] = set()
+        self.longest_pause: tuple[float, str] = (0.0, "")
+        self._made: list[tuple[float, str]] = []
+        self._rows_bytes, self._row_s = 0, 0.0
         self._due: list[tuple[float, Undo]] = []
 
     def _worker(self, number: int) -> Running:
@@ -167,13 +170,16 @@ class Soak:
             undo()
 
     def _make(self, fault: Callable[[], Undo | None]) -> None:
-        self.faults[fault.__name__.replace("_", " ")] += 1
+        name = fault.__name__.replace("_", " ")
+        self.faults[name] += 1
+        self._made.append((time.monotonic(), name))
         undo = fault()
         if undo is not None:
             self._due.append((time.monotonic() + self.random.uniform(*HEALED_WITHIN_S), undo))
 
     def _look_after(self, now: float) -> None:
         """Start again the workers that were killed, note those that ended by themselves; measure."""
+        self._look_at_updates(now)
         for number, worker in self.workers.items():
             if not worker.alive() and self.learner.alive():
                 if worker.pid not in self.killed and worker.process.returncode != 0:
@@ -188,6 +194,18 @@ class Soak:
             self.descriptors.setdefault(running.pid, []).append(descriptors)
             if running is self.learner:
                 self.memory.append((running.pid, now, memory_mb))
+
+    def _look_at_updates(self, now: float) -> None:
+        """How long there was none, and what had gone wrong shortly before and meanwhile."""
+        rows_bytes = (self.learner.folder / "metrics.jsonl").stat().st_size
+        if rows_bytes == self._rows_bytes:
+            return
+        pause_s = now - self._row_s if self._row_s else 0.0
+        if pause_s > self.longest_pause[0]:
+            since = self._row_s - HEALED_WITHIN_S[1]
+            causes = [f"{at - self._row_s:+.1f} s {name}" for at, name in self._made if at >= since]
+            self.longest_pause = pause_s, ", ".join(causes)
+        self._rows_bytes, self._row_s = rows_bytes, now
 
     # ---------------------------------------------------------------- the account
 
@@ -220,11 +238,10 @@ def without_faults(stage: Stage, steps: int, seed: int) -> Learner:
 
 def soak(minutes: float, seed: int, folder: Path) -> list[str]:
     """Print the table; what falls short."""
-    steps = int(minutes * STEPS_PER_MINUTE)
+    steps = STEPS_FIRST_MINUTE + int((minutes - 1) * STEPS_PER_MINUTE)
     print(f"soak: seed {seed}, {steps:,} env steps, about {minutes:g} minutes", flush=True)
     short: list[str] = []
     calm_stage = Stage(folder / "calm")
-    calm_stage.tmp_path.mkdir()
     try:
         calm = without_faults(calm_stage, steps, seed).summary()
     finally:
@@ -268,12 +285,11 @@ def soak(minutes: float, seed: int, folder: Path) -> list[str]:
     if any("Traceback" in running.said() for running in stage.started if running not in scene.strangers):
         short.append("a traceback was said: " + next(r.said()[-3000:] for r in stage.started if "Traceback" in r.said()))
     short += scene.own_ends
-    elapsed = np.diff([row["time/time_elapsed"] for row in learner.rows()])
     rows = {
         **{f"fault: {name}": count for name, count in sorted(scene.faults.items())},
         "seconds": f"{took_s:.0f}",
         "updates, env steps": f"{summary['updates']:,}, {summary['env_steps']:,}",
-        "longest pause between updates": f"{max(elapsed):.1f} s" if len(elapsed) else "-",
+        "longest pause between updates": f"{scene.longest_pause[0]:.1f} s",
         "greedy return": f"{found['return_mean']:.1f} ± {found['return_std']:.1f}",
         "greedy return without faults": f"{wanted['return_mean']:.1f} ± {wanted['return_std']:.1f}",
         **{f"ledger: {name}": f"{count:,}" for name, count in ledger.items()},
@@ -284,6 +300,7 @@ def soak(minutes: float, seed: int, folder: Path) -> list[str]:
     }
     for name, value in rows.items():
         print(f"  {name:36} {value:>20}")
+    print(f"  in the longest pause: {scene.longest_pause[1]}")
     (folder / "soak.json").write_text(json.dumps(rows, indent=2))
     return short
 
