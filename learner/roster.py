@@ -36,7 +36,9 @@ from protocol.messages import (
     Refuse,
     Rejoin,
     Release,
+    Returned,
     Rollout,
+    Stepped,
     ToLearner,
     ToWorker,
     Weights,
@@ -131,6 +133,8 @@ class Roster:
                 return self._rollout(member, message)
             case Heartbeat():
                 return self._heartbeat(member, message)
+            case Stepped() | Returned():
+                return []  # nobody asked: a run collects rollouts
             case Goodbye(_, reason):
                 self._forget(member, Goodbye, f"left: {reason}")
                 return self._deal()

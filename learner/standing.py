@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import Enum
 
-from protocol.messages import Drain, Failure, Goodbye, Heartbeat, Hello, Rollout
+from protocol.messages import Drain, Failure, Goodbye, Heartbeat, Hello, Returned, Rollout, Stepped
 
 
 class Standing(Enum):
@@ -34,6 +34,8 @@ TABLE: dict[Standing, dict[type, Standing]] = {
         Hello: Standing.ACTIVE,
         Rollout: Standing.ACTIVE,
         Heartbeat: Standing.ACTIVE,
+        Stepped: Standing.ACTIVE,
+        Returned: Standing.ACTIVE,
         Goodbye: Standing.UNKNOWN,
         Failure: Standing.UNKNOWN,
         Silence: Standing.UNKNOWN,
@@ -44,6 +46,8 @@ TABLE: dict[Standing, dict[type, Standing]] = {
     Standing.DRAINING: {
         Rollout: Standing.DRAINING,
         Heartbeat: Standing.DRAINING,
+        Stepped: Standing.DRAINING,
+        Returned: Standing.DRAINING,
         Goodbye: Standing.UNKNOWN,
         Failure: Standing.UNKNOWN,
         Silence: Standing.UNKNOWN,

@@ -6,14 +6,18 @@ run = millrace.train("CartPole-v1", seed=1)
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
-    from learner.metrics import Progress
+    from gymnasium.vector import AutoresetMode
 
-__all__ = ["__version__", "train"]
+    from learner.metrics import Progress
+    from learner.vector_env import ZmqVectorEnv
+    from learner.vector_spec import Env
+
+__all__ = ["__version__", "make_vec", "train"]
 
 
 def train(
@@ -38,6 +42,53 @@ def train(
     file, run = (None if path is None else Path(path) for path in (config, resume))
     settings = resolve(name, file=file, resume=run, preset=preset, **keywords)
     return local.train(settings, run, watch or (lambda progress: None), factory=None if isinstance(env, str) else env)
+
+
+def make_vec(
+    env: Env | Sequence[Env],
+    num_envs: int | None = None,
+    *,
+    workers: int | None = None,
+    lanes: int | None = None,
+    bind: str | None = None,
+    transport: Literal["ipc", "tcp", "inproc"] = "ipc",
+    shared_memory: bool = True,
+    autoreset_mode: AutoresetMode | str = "NextStep",
+    on_worker_loss: Literal["truncate", "raise"] = "truncate",
+    timeout: float = 60.0,
+    copy: bool = True,
+    render_mode: str | None = None,
+    **kwargs: bool | int | float | str,
+) -> ZmqVectorEnv:
+    """A `gymnasium.vector.VectorEnv` whose copies live in worker processes.
+
+    `env` is anything `gymnasium.make` takes, a callable that returns an environment, or a list with one of these for each
+    copy; `kwargs` are passed on to it. The copies are shared evenly among `workers` processes of this machine (one for each
+    core), started and ended with the vector environment; with `workers=0` and a `bind` address, among `lanes` workers that
+    are started elsewhere (`python -m workers ADDRESS`). Observations and actions go through shared memory, unless that is
+    turned off, or a worker is elsewhere; what comes out is the same.
+
+    Whoever does not answer within `timeout` seconds is given up. The copies of a worker that is lost come back truncated, on
+    another or a new one, and the info says `worker_lost`; or, with `on_worker_loss="raise"`, `WorkerLost` is raised. What an
+    environment raises is raised here, with the worker's traceback. Raises `OurError`.
+    """
+    from millrace.launch import vector
+
+    return vector.make_vec(
+        env,
+        num_envs,
+        workers=workers,
+        lanes=lanes,
+        bind=bind,
+        transport=transport,
+        shared_memory=shared_memory,
+        autoreset_mode=autoreset_mode,
+        on_worker_loss=on_worker_loss,
+        timeout_s=timeout,
+        copy=copy,
+        render_mode=render_mode,
+        kwargs=kwargs,
+    )
 
 
 def __getattr__(name: str) -> str:

@@ -7,6 +7,7 @@
     │   └── RunError              1   the run cannot go on
     │       ├── CheckpointError   1   a checkpoint is missing, broken or of another format
     │       ├── NoWorkers         1   nobody is left (or came) to step the environment
+    │       ├── WorkerLost        1   a worker is gone, and env copies with it, where none may be lost
     │       ├── Stalled           1   a deadline passed; the text says what was waited for
     │       └── EnvironmentFailed 1   the environment raised too often; the text carries the worker's own traceback
     └── TheirError            counted and answered, never raised into the loop: a peer sent something wrong
@@ -54,6 +55,10 @@ class CheckpointError(RunError):
 
 class NoWorkers(RunError):
     """Nobody is left, or came, to step the environment."""
+
+
+class WorkerLost(RunError):
+    """A worker is gone, and env copies with it."""
 
 
 class Stalled(RunError):

@@ -11,7 +11,7 @@ import msgspec
 import numpy.typing as npt
 
 from protocol.rollout import Rollout
-from protocol.specs import RunSpec
+from protocol.specs import RunSpec, StepSpec
 
 PROTOCOL_VERSION = 1
 
@@ -38,12 +38,12 @@ class Hello(Message, frozen=True):
 
 
 class Welcome(Message, frozen=True):
-    """Join: the environment, the policy, T, N, the seed."""
+    """Join: what to do, collect rollouts or step copies; the environment, the policy, T, N, the seed."""
 
     session: int
     attempt: int
     """of the Hello that is answered"""
-    run: RunSpec
+    run: RunSpec | StepSpec
 
 
 class Refuse(Message, frozen=True):
@@ -159,6 +159,84 @@ class Failure(Message, frozen=True):
     lane: int | None
 
 
+class Reset(Message, frozen=True):
+    """Begin episodes in these copies of the lane; answered by `Stepped`. A new life of the lane begins on new copies."""
+
+    session: int
+    ticket: int
+    """rises with every order; each is obeyed once, and answered again if it is said again"""
+    lane: int
+    incarnation: int
+    copies: tuple[int, ...]
+    """which of the lane's copies, from 0"""
+    seeds: tuple[int | None, ...]
+    """one for each of them"""
+    options: Array
+    """[bytes] uint8, `protocol.plain`: the options of `Env.reset`, or None"""
+
+
+class Step(Message, frozen=True):
+    """Step every copy of the lane; answered by `Stepped`."""
+
+    session: int
+    ticket: int
+    lane: int
+    incarnation: int
+    actions: tuple[Array, ...]
+    """one array [N, *leaf] for each leaf of the action"""
+
+
+class Call(Message, frozen=True):
+    """Call, read or set an attribute of these copies of the lane; answered by `Returned`."""
+
+    session: int
+    ticket: int
+    lane: int
+    incarnation: int
+    copies: tuple[int, ...]
+    """which of the lane's copies, from 0"""
+    name: str
+    """of the attribute, wherever among the wrappers it is; what is not callable is read"""
+    assign: bool
+    """set it, instead"""
+    given: Array
+    """[bytes] uint8, `protocol.plain`: (arguments, keyword arguments), or one value for each of the copies"""
+
+
+class Stepped(Message, frozen=True):
+    """What a Reset or a Step gave, of every copy of the lane."""
+
+    session: int
+    ticket: int
+    lane: int
+    incarnation: int
+    obs: tuple[Array, ...]
+    """one array [N, *leaf] for each leaf of the observation"""
+    reward: Array
+    """[N] float64, raw"""
+    terminated: Array
+    """[N] bool"""
+    truncated: Array
+    """[N] bool"""
+    infos: Array
+    """[bytes] uint8, `protocol.plain`: a list of (copy, info), of the copies whose info is not empty; no bytes: of none"""
+
+
+class Returned(Message, frozen=True):
+    """What a Call gave."""
+
+    session: int
+    ticket: int
+    lane: int
+    incarnation: int
+    results: Array
+    """[bytes] uint8, `protocol.plain`: a list of what each copy gave"""
+    error: str
+    """the exception's type and text, in one line, if the call raised; else empty"""
+    traceback: str
+    """where it was raised, as text"""
+
+
 class Inquire(Message, frozen=True):
     """How is the run? From anybody who may connect; one who asks need not be a worker."""
 
@@ -214,12 +292,15 @@ class Status(Message, frozen=True):
     """what became of every ticket, transition and message"""
 
 
-ToLearner = Hello | Rollout | Heartbeat | Goodbye | Failure
-ToWorker = Welcome | Refuse | Rejoin | Weights | Collect | Release | HeartbeatReply | Drain
+ToLearner = Hello | Rollout | Heartbeat | Goodbye | Failure | Stepped | Returned
+ToWorker = Welcome | Refuse | Rejoin | Weights | Collect | Release | HeartbeatReply | Drain | Reset | Step | Call
+Order = Reset | Step | Call
+Answer = Stepped | Returned
 ToObserver = Status
 
 __all__ = [
-    "PROTOCOL_VERSION", "Array", "Collect", "Drain", "Failure", "Goodbye", "Heartbeat", "HeartbeatReply", "Hello",
-    "Inquire", "LaneLife", "Message", "Permit", "Received", "Refuse", "Rejoin", "Release", "Rollout", "Status",
-    "ToLearner", "ToObserver", "ToWorker", "Weights", "Welcome", "WorkerStatus",
+    "PROTOCOL_VERSION", "Answer", "Array", "Call", "Collect", "Drain", "Failure", "Goodbye", "Heartbeat", "HeartbeatReply",
+    "Hello", "Inquire", "LaneLife", "Message", "Order", "Permit", "Received", "Refuse", "Rejoin", "Release", "Reset",
+    "Returned", "Rollout", "Status", "Step", "Stepped", "ToLearner", "ToObserver", "ToWorker", "Weights", "Welcome",
+    "WorkerStatus",
 ]  # fmt: skip

@@ -6,10 +6,11 @@ only the policy turns them into features.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import gymnasium
+import msgspec
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
@@ -27,6 +28,30 @@ STORED_KINDS = "biuf"  # bool, integers, floats: what a frame may hold
 def observation_leaves(space: gymnasium.Space[Any]) -> tuple[Leaf, ...]:
     """Describe each array of an observation. Raises `UsageError` for a space that is not supported."""
     return tuple(_leaf("/".join(map(str, path)), leaf) for path, leaf in _walk(space, ()))
+
+
+def exact_leaves(space: gymnasium.Space[Any]) -> tuple[Leaf, ...]:
+    """The same of an observation or an action, each array in its space's own dtype. Raises `UsageError`."""
+    leaves = zip(observation_leaves(space), _walk(space, ()), strict=True)
+    return tuple(msgspec.structs.replace(leaf, dtype=np.dtype(inner.dtype).name) for leaf, (_, inner) in leaves)
+
+
+def nester(space: gymnasium.Space[Any]) -> Callable[[Sequence[Any]], Any]:
+    """The inverse of `reader`: a function from leaves, in order, to an observation or an action."""
+    paths = [path for path, _ in _walk(space, ())]
+    if paths == [()]:
+        return lambda leaves: leaves[0]
+
+    def nest(space: gymnasium.Space[Any], leaves: Iterator[Any]) -> Any:
+        match space:
+            case spaces.Dict():
+                return {key: nest(inner, leaves) for key, inner in space.spaces.items()}
+            case spaces.Tuple():
+                return tuple(nest(inner, leaves) for inner in space.spaces)
+            case _:
+                return next(leaves)
+
+    return lambda leaves: nest(space, iter(leaves))
 
 
 def _walk(space: gymnasium.Space[Any], path: tuple[str | int, ...]) -> Iterator[tuple[tuple[str | int, ...], Any]]:

@@ -204,8 +204,8 @@ class PolicySpec(msgspec.Struct, frozen=True):
         return self.encoder is not None or any(leaf.is_image for leaf in self.observation)
 
 
-class RunSpec(msgspec.Struct, frozen=True):
-    """Everything a worker needs to know of the run it joins."""
+class RunSpec(msgspec.Struct, frozen=True, tag=True):
+    """Everything a worker needs to know of the run it joins: it collects rollouts."""
 
     env: EnvSpec
     policy: PolicySpec
@@ -227,3 +227,32 @@ class RunSpec(msgspec.Struct, frozen=True):
                 "cannot be sure of; give it a token (and not --no-code)"
             )
         return self.env.why_not(code)
+
+
+class StepSpec(msgspec.Struct, frozen=True, tag=True):
+    """Everything a worker needs to know of the vector environment it joins: it steps copies when it is told to."""
+
+    envs: tuple[EnvSpec, ...]
+    """each of the different environments, once"""
+    copies: tuple[int, ...]
+    """which of `envs` each copy is, in the order of the whole vector environment"""
+    lanes: tuple[int, ...]
+    """how many copies each lane has; lane 0 has the first ones"""
+    observation: tuple[Leaf, ...]
+    action: tuple[Leaf, ...]
+    """the arrays of an action, described as those of an observation are"""
+    autoreset: Literal["NextStep", "SameStep", "Disabled"] = "NextStep"
+    """what follows an episode's end, as gymnasium's `AutoresetMode` names it"""
+    render_mode: str | None = None
+    """passed on to each copy"""
+    heartbeat_s: float = 1.0
+    learner_timeout_s: float = 600.0
+    """a worker that heard nothing of the learner for so long starts again with Hello; it may do much between two steps"""
+
+    def first(self, lane: int) -> int:
+        """Number of the lane's first copy."""
+        return sum(self.lanes[:lane])
+
+    def why_not(self, code: Code) -> str:
+        """Why a worker that runs so much code cannot take part; empty if it can."""
+        return next((why for env in self.envs if (why := env.why_not(code))), "")

@@ -191,7 +191,7 @@ class World:
         session = worker.session
         while worker.inbox:
             self.say(worker, session.handle(worker.inbox.pop(0), self.now))
-        if worker.task is not None and session.abandoned(worker.task):
+        if worker.task is not None and session.abandoned(worker.task.session):
             worker.task = None
             self.say(worker, session.finished([]))
         if worker.task is None and (task := session.next_task()) is not None:

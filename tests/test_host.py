@@ -23,6 +23,9 @@ class FakeRunning:
     def wait(self, timeout_s: float) -> None:
         self.asked.append("wait")
 
+    def kill(self) -> None:
+        self.asked.append("kill")
+
 
 class Machine:
     """Starts fakes and tells the time."""

@@ -28,7 +28,9 @@ from protocol.messages import (
     Refuse,
     Rejoin,
     Release,
+    Returned,
     Rollout,
+    Stepped,
     ToLearner,
     Weights,
     Welcome,
@@ -959,6 +961,8 @@ EVERY_MESSAGE: list[ToLearner] = [
     Heartbeat(100, 0, 0, (0,), 0, {}, 0),
     Goodbye(100, "bye", ()),
     Failure(100, "broke", "", None),
+    Stepped(100, 0, 0, 0, (), *(np.zeros(1) for _ in range(4))),
+    Returned(100, 0, 0, 0, np.zeros(0, np.uint8), "", ""),
 ]
 
 

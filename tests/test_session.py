@@ -12,6 +12,7 @@ import pytest
 
 from protocol.messages import (
     PROTOCOL_VERSION,
+    Call,
     Collect,
     Drain,
     Failure,
@@ -25,7 +26,9 @@ from protocol.messages import (
     Refuse,
     Rejoin,
     Release,
+    Reset,
     Rollout,
+    Step,
     ToLearner,
     ToWorker,
     Weights,
@@ -449,11 +452,11 @@ def test_nothing_of_a_session_outlives_it() -> None:
 def test_a_task_of_an_ended_session_is_abandoned_and_its_rollouts_are_not_said() -> None:
     session = ready(collect((0, 0)))
     task = task_of(session)
-    assert not session.abandoned(task)
+    assert not session.abandoned(task.session)
     session.handle(Rejoin(SESSION), 1.0)
-    assert session.abandoned(task)
+    assert session.abandoned(task.session)
     session.handle(Welcome(12, 2, RUN), 1.1)
-    assert session.abandoned(task)
+    assert session.abandoned(task.session)
     session.handle(msgspec.structs.replace(collect((0, 0)), session=12), 1.2)  # the same ticket number again
     assert session.finished(fake_rollouts(task)) == []
     assert session.in_memory() == 1
@@ -508,7 +511,7 @@ def test_sigterm_finishes_the_rollout_in_hand_and_hands_back_the_rest_in_goodbye
     task = task_of(session)  # tickets 0 and 2
     assert session.terminate() == []
     assert session.state is State.DRAINING
-    assert not session.abandoned(task)
+    assert not session.abandoned(task.session)
     *rollouts, goodbye, leave = session.finished(fake_rollouts(task))
     assert [rollout.ticket for rollout in said(rollouts, Rollout)] == [0, 2]
     assert goodbye == Say(Goodbye(SESSION, "told to stop", (1,)))
@@ -531,7 +534,7 @@ def test_sigterm_twice_leaves_at_once() -> None:
     task = task_of(session)
     session.terminate()
     assert session.terminate() == [Leave(0, "told to stop")]
-    assert session.abandoned(task)
+    assert session.abandoned(task.session)
     assert session.terminate() == []
 
 
@@ -651,6 +654,9 @@ EVERY_MESSAGE: list[ToWorker] = [
     Release(SESSION, (LaneLife(0, 0),)),
     HeartbeatReply(SESSION, 1, lanes(0)),
     Drain("finished"),
+    Reset(SESSION, 60, 0, 0, (0,), (None,), np.zeros(0, np.uint8)),
+    Step(SESSION, 61, 0, 0, (np.zeros(1),)),
+    Call(SESSION, 62, 0, 0, (0,), "render_mode", False, np.zeros(0, np.uint8)),
 ]
 
 

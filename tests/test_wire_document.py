@@ -34,6 +34,7 @@ RECORDS: tuple[type, ...] = (
     messages.WorkerStatus,
     rollout.Episode,
     specs.RunSpec,
+    specs.StepSpec,
     specs.EnvSpec,
     specs.PolicySpec,
     specs.EncoderSpec,

@@ -23,6 +23,7 @@ from protocol.errors import OurError, UsageError
 from protocol.key_folder import TOKEN_VARIABLE, read_token
 from protocol.keys import Token
 from protocol.link import WorkerLink
+from protocol.shared import Handed
 from protocol.specs import Code
 from workers.host import NOBODY, Host, Process
 from workers.session import NO_LEARNER, Session
@@ -62,6 +63,7 @@ def main(argv: list[str] | None = None) -> int:
         help="so many workers, each in a process of its own, restarted when it breaks",
     )
     parser.add_argument("--pin", action="store_true", help="with --processes: each keeps to one core")
+    parser.add_argument("--handed", default="", help=argparse.SUPPRESS)  # descriptors of shared memory, from its host
     options = parser.parse_args(argv)
     logging.basicConfig(level=logging.INFO, format=f"%(asctime)s worker {options.name}: %(message)s", stream=sys.stderr)
     try:
@@ -82,6 +84,7 @@ def main(argv: list[str] | None = None) -> int:
         session,
         told_to_stop=lambda: len(stops) or int(bool(options.parent) and parent_is_gone(options.parent)),
         alive=watchdog.feed if watchdog else lambda now: None,
+        handed=Handed(*map(int, options.handed.split(","))) if options.handed else None,
         code=Code.REGISTERED if options.no_code else trusted(options.address, token),
     )
     left = worker.run()

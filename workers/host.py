@@ -23,6 +23,7 @@ import zmq
 from protocol.key_folder import TOKEN_VARIABLE
 from protocol.keys import Token
 from protocol.link import WorkerLink
+from protocol.shared import Handed
 from protocol.specs import Code
 from workers.session import Leave, Session
 from workers.watchdog import where_it_hung
@@ -49,16 +50,30 @@ class Running(Protocol):
         """Wait until it has ended; a process that has not by then is killed."""
         ...
 
+    def kill(self) -> None:
+        """End it at once, if it is a process."""
+        ...
+
 
 class Process:
     """A worker process of its own; its stderr goes to a file."""
 
     def __init__(
-        self, address: str, name: str, log: Path | None, token: Token | None = None, flags: Sequence[str] = ()
+        self,
+        address: str,
+        name: str,
+        log: Path | None,
+        token: Token | None = None,
+        flags: Sequence[str] = (),
+        handed: Handed | None = None,
     ) -> None:
-        """`flags`: further ones of `python -m workers`."""
+        """`flags`: further ones of `python -m workers`; `handed`: descriptors that it inherits, to step a vector
+        environment through shared memory.
+        """
         self._log = log
         command = [sys.executable, "-P", "-m", "workers", address, "--name", name, "--parent", str(os.getpid()), *flags]
+        if handed is not None:
+            command += ["--handed", ",".join(map(str, handed))]
         # A child must find what its parent found: a user's environment may lie beside the user's script.
         path = os.pathsep.join(entry or os.getcwd() for entry in [*sys.path, str(Path(__file__).parents[1])])
         threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -71,6 +86,7 @@ class Process:
                 stderr=stderr if log else None,
                 start_new_session=True,  # Ctrl-C in the terminal is the learner's to answer
                 env={**os.environ, **threads, **secret, "PYTHONPATH": path},
+                pass_fds=handed or (),
             )
 
     @property
@@ -104,6 +120,11 @@ class Process:
             self._process.kill()
             self._process.wait()
 
+    def kill(self) -> None:
+        """SIGKILL: it hangs."""
+        if self._process.poll() is None:
+            self._process.kill()
+
 
 class Thread:
     """A worker in a thread of this process, over inproc: for debugging and for tests."""
@@ -132,6 +153,10 @@ class Thread:
     def wait(self, timeout_s: float) -> None:
         """Wait; a thread cannot be killed."""
         self._thread.join(timeout_s)
+
+    def kill(self) -> None:
+        """A thread cannot be killed."""
+        self._stops += 2
 
 
 @dataclass
@@ -191,6 +216,17 @@ class Host:
         for place in self.places:
             if place.running is not None:
                 place.running.stop()
+
+    def kill(self, name: str) -> bool:
+        """End the worker of this name at once; False if it is none of ours."""
+        running = [place.running for place in self.places if place.name == name and place.running is not None]
+        for worker in running:
+            worker.kill()
+        return bool(running)
+
+    def expected(self) -> bool:
+        """Whether a worker that ended is to be started again, or one was started and has not ended."""
+        return not self.empty
 
     def stop(self, timeout_s: float = 5.0) -> None:
         """Ask all to leave, wait at most `timeout_s` for all together, and kill who is left."""

@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 
 from protocol.messages import (
     PROTOCOL_VERSION,
+    Answer,
+    Call,
     Collect,
     Drain,
     Failure,
@@ -21,18 +23,22 @@ from protocol.messages import (
     HeartbeatReply,
     Hello,
     LaneLife,
+    Order,
     Permit,
     Received,
     Refuse,
     Rejoin,
     Release,
+    Reset,
     Rollout,
+    Step,
     ToLearner,
     ToWorker,
     Weights,
     Welcome,
 )
-from protocol.specs import RunSpec
+from protocol.specs import RunSpec, StepSpec
+from workers.orders import Orders
 from workers.states import TABLE, Broke, Emptied, Silence, State, Terminate
 
 HELLO_FIRST_S, HELLO_MOST_S = 0.25, 4.0
@@ -51,7 +57,7 @@ class Say:
 class Begin:
     """Effect: a new session; forget every env copy of the last one."""
 
-    run: RunSpec
+    run: RunSpec | StepSpec
 
 
 @dataclass(frozen=True)
@@ -118,6 +124,7 @@ class _Stay:
     """What is held within one session; nothing of it outlives the session."""
 
     lanes: dict[int, _Lane] = field(default_factory=dict)
+    orders: Orders = field(default_factory=Orders)
     weights: Weights | None = None
     in_hand: tuple[int, ...] = ()  # tickets being collected
     replies: int = 0
@@ -136,7 +143,7 @@ class Session:
     ) -> None:
         self.identity = identity
         self.state = State.JOINING
-        self.run: RunSpec | None = None
+        self.run: RunSpec | StepSpec | None = None
         self.session = 0
         self.steps = 0
         """env steps since the worker started; the shell keeps it"""
@@ -177,9 +184,11 @@ class Session:
             case Weights(version):
                 if version > self._stay.version:
                     self._stay.weights = message
-            case Collect(_, version, permits, received):
+            case Collect(_, version, permits, received) if isinstance(self.run, RunSpec):
                 closed = self._arrived(received)
                 return closed + [effect for permit in permits for effect in self._permit(permit, version)]
+            case Reset() | Step() | Call() if isinstance(self.run, StepSpec):
+                return [Say(answer) for answer in self._stay.orders.take(message)]
             case Release(_, lanes):
                 return self._release(lanes)
             case HeartbeatReply(_, number, received):
@@ -266,9 +275,25 @@ class Session:
             effects += self._goodbye()
         return effects
 
-    def abandoned(self, task: Task) -> bool:
-        """True when nobody wants this task any more."""
-        return self.state in (State.JOINING, State.LEFT) or task.session != self.session
+    # ---------------------------------------------------------------- stepping in lock-step
+
+    def next_order(self) -> Order | None:
+        """The oldest order that is not obeyed yet; it is in hand until `answered`."""
+        if self.state is not State.READY or self._stay.in_hand:
+            return None
+        order = self._stay.orders.next()
+        self._stay.in_hand = () if order is None else (order.ticket,)
+        return order
+
+    def answered(self, answer: Answer) -> list[Effect]:
+        """The order in hand is obeyed."""
+        self._stay.in_hand = ()
+        said: list[Effect] = [Say(answer)] if answer.session == self.session and self._stay.orders.obeyed(answer) else []
+        return said + (self._goodbye() if self.state is State.DRAINING else [])
+
+    def abandoned(self, session: int) -> bool:
+        """True when nobody wants any more what was asked for in this session."""
+        return self.state in (State.JOINING, State.LEFT) or session != self.session
 
     def in_memory(self) -> int:
         """How many tickets and rollouts are held: at most what the learner has outstanding, so memory is bounded."""
@@ -299,6 +324,7 @@ class Session:
         if self.state is State.LEFT:
             return [Leave(1, reason)]
         closing = tuple(LaneLife(number, lane.incarnation) for number, lane in self._stay.lanes.items())
+        closing += self._stay.orders.lives()
         self._join(now)
         return [Close(closing), *self.tick(now)]
 
@@ -324,8 +350,8 @@ class Session:
                     del lane.kept[ticket]
                     lane.done.append(ticket)
         mine = {theirs.lane for theirs in received}
-        foreign = [LaneLife(number, lane.incarnation) for number, lane in self._stay.lanes.items() if number not in mine]
-        return self._release(foreign)
+        here = [LaneLife(number, lane.incarnation) for number, lane in self._stay.lanes.items()]
+        return self._release([life for life in (*here, *self._stay.orders.lives()) if life.lane not in mine])
 
     def _release(self, lives: Sequence[LaneLife]) -> list[Effect]:
         gone = []
@@ -334,6 +360,7 @@ class Session:
             if lane is not None and lane.incarnation <= life.incarnation:
                 del self._stay.lanes[life.lane]
                 gone.append(LaneLife(life.lane, lane.incarnation))
+        gone += self._stay.orders.release(lives)
         return [Close(tuple(gone))] if gone else []
 
     def _heartbeat(self) -> Heartbeat:
@@ -341,7 +368,7 @@ class Session:
             session=self.session,
             replies=self._stay.replies,
             version=self._stay.version,
-            tickets=tuple(ticket for lane in self._stay.lanes.values() for ticket in lane.held),
+            tickets=self._unfinished(),
             steps=self.steps,
             stages=dict(self.stages),
             resident_bytes=self.resident_bytes,
@@ -355,8 +382,11 @@ class Session:
         return [] if self._stay.in_hand else self._goodbye()
 
     def _goodbye(self) -> list[Effect]:
-        unfinished = tuple(ticket for lane in self._stay.lanes.values() for ticket in lane.held)
-        return [Say(Goodbye(self.session, self._reason, unfinished)), *self._leave(Emptied(), 0, self._reason)]
+        said = Say(Goodbye(self.session, self._reason, self._unfinished()))
+        return [said, *self._leave(Emptied(), 0, self._reason)]
+
+    def _unfinished(self) -> tuple[int, ...]:
+        return (*(ticket for lane in self._stay.lanes.values() for ticket in lane.held), *self._stay.orders.held())
 
     def _leave(self, event: object, exit_code: int, reason: str) -> list[Effect]:
         self._become(event)

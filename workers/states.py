@@ -4,7 +4,19 @@ from __future__ import annotations
 
 from enum import Enum
 
-from protocol.messages import Collect, Drain, HeartbeatReply, Refuse, Rejoin, Release, Weights, Welcome
+from protocol.messages import (
+    Call,
+    Collect,
+    Drain,
+    HeartbeatReply,
+    Refuse,
+    Rejoin,
+    Release,
+    Reset,
+    Step,
+    Weights,
+    Welcome,
+)
 
 
 class State(Enum):
@@ -45,6 +57,9 @@ TABLE: dict[State, dict[type, State]] = {
     State.READY: {
         Weights: State.READY,
         Collect: State.READY,
+        Reset: State.READY,
+        Step: State.READY,
+        Call: State.READY,
         Release: State.READY,
         HeartbeatReply: State.READY,
         Welcome: State.READY,

@@ -1,4 +1,4 @@
-"""The shell round a session: link + session + collector + signals. All decisions are the session's.
+"""The shell round a session: link + session + collector or stepper + signals. All decisions are the session's.
 
 The law: the inbox is emptied before a rollout starts, and looked into between env steps, so a worker answers while it
 collects and acts under the newest weights it holds. Whatever the environment does, the learner is told.
@@ -19,12 +19,14 @@ from pathlib import Path
 from protocol.codec import encode
 from protocol.errors import BadMessage, OurError
 from protocol.link import WorkerLink
-from protocol.messages import Weights
+from protocol.messages import Order, Weights
 from protocol.policy import make_policy
-from protocol.specs import Code, RunSpec
+from protocol.shared import Handed
+from protocol.specs import Code, RunSpec, StepSpec
 from workers.collector import Collector
 from workers.lane import EnvironmentBroke
 from workers.session import Begin, Close, Effect, Identity, Leave, Say, Session, Task
+from workers.stepper import Stepper
 
 log = logging.getLogger("millrace.worker")
 
@@ -49,16 +51,20 @@ class Worker:
         told_to_stop: Callable[[], int] = lambda: 0,
         alive: Callable[[float], None] = lambda now: None,
         code: Code = Code.MODULES,
+        handed: Handed | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """`told_to_stop` counts the requests to leave; `alive` is called now and then, unless the environment hangs;
-        `code`: how much the learner may have it run.
+        `code`: how much the learner may have it run; `handed`: shared memory and bells, for a vector environment of this
+        machine.
         """
         self._link, self._session, self._clock = link, session, clock
         self._told_to_stop, self._code = told_to_stop, code
         self._alive = alive
         self._stops_heeded = 0
+        self._handed = handed
         self._collector: Collector | None = None
+        self._stepper: Stepper | None = None
         self._loaded: Weights | None = None
         self._pulse_due_s = 0.0
         self._left: Leave | None = None
@@ -70,13 +76,16 @@ class Worker:
             while self._left is None:
                 self._do(self._session.tick(self._clock()))
                 if self._left is None:
-                    self._listen(min(IDLE_S, max(0.0, self._session.next_due_s() - self._clock())))
+                    idle_s = min(IDLE_S, max(0.0, self._session.next_due_s() - self._clock()))
+                    self._listen(0.0 if self._serve(idle_s) else idle_s)
                 while self._left is None and (task := self._session.next_task()) is not None:
                     self._collect(task)
                     self._listen(0.0)
+                while self._left is None and (order := self._session.next_order()) is not None:
+                    self._obey(order)
+                    self._listen(0.0)
         finally:
-            if self._collector is not None:
-                self._collector.close_all()
+            self._close_all()
             self._link.close()
         return self._left
 
@@ -104,14 +113,7 @@ class Worker:
         assert collector is not None
 
         def pulse() -> None:
-            now = self._clock()
-            if now >= self._pulse_due_s:
-                self._pulse_due_s = now + PULSE_S
-                self._account()
-                self._listen(0.0)
-                self._do(self._session.tick(now))
-                if self._session.abandoned(task):
-                    raise _Abandoned
+            self._pulse(task.session)
 
         try:
             if self._loaded is not task.weights:
@@ -120,19 +122,64 @@ class Worker:
             rollouts = collector.collect(task.assignments, task.weights.version, task.session, pulse)
         except _Abandoned:
             rollouts = []
-        except Exception as error:  # the environment's code, or ours on its data: the learner must hear of either
-            detail = error.detail if isinstance(error, OurError) else traceback.format_exc()
-            lane = error.lane if isinstance(error, EnvironmentBroke) else None
-            log.error("%s\n%s", error, detail)
-            self._do(self._session.broke(_line(error), detail[-MAX_TRACEBACK:], lane))
+        except Exception as error:
+            self._broke(error)
             return
         self._account()
         self._do(self._session.finished(rollouts))
 
+    def _obey(self, order: Order) -> None:
+        stepper = self._stepper
+        assert stepper is not None
+        try:
+            answer = stepper.obey(order, lambda: self._pulse(order.session))
+        except _Abandoned:
+            return
+        except Exception as error:
+            self._broke(error)
+            return
+        self._do(self._session.answered(answer))
+
+    def _serve(self, timeout_s: float) -> bool:
+        """Step what shared memory asks for, until `timeout_s` have passed or there is a message; False if there is none."""
+        stepper, session = self._stepper, self._session.session
+        if stepper is None or not stepper.shares:
+            return False
+        began_s, stepped_s = self._clock(), stepper.stages["step"]
+        try:
+            stepper.serve(
+                min(timeout_s, PULSE_S), lambda: self._pulse(session), session, lambda answer: self._do([Say(answer)])
+            )
+        except _Abandoned:
+            pass
+        except Exception as error:
+            self._broke(error)
+        self._waited_s += self._clock() - began_s - (stepper.stages["step"] - stepped_s)
+        self._account()
+        return True
+
+    def _pulse(self, session: int) -> None:
+        """Show, now and then, that this worker is alive. Raises `_Abandoned` once nobody wants what it does."""
+        now = self._clock()
+        if now >= self._pulse_due_s:
+            self._pulse_due_s = now + PULSE_S
+            self._account()
+            self._listen(0.0)
+            self._do(self._session.tick(now))
+            if self._session.abandoned(session):
+                raise _Abandoned
+
+    def _broke(self, error: Exception) -> None:
+        """The environment's code raised, or ours on its data: the learner must hear of either."""
+        detail = error.detail if isinstance(error, OurError) else traceback.format_exc()
+        lane = error.lane if isinstance(error, EnvironmentBroke) else None
+        log.error("%s\n%s", error, detail)
+        self._do(self._session.broke(_line(error), detail[-MAX_TRACEBACK:], lane))
+
     def _account(self) -> None:
-        if self._collector is not None:
-            self._session.steps = self._collector.steps
-            self._session.stages = {**self._collector.stages, "wait": self._waited_s}
+        if (busy := self._collector or self._stepper) is not None:
+            self._session.steps = busy.steps
+            self._session.stages = {**busy.stages, "wait": self._waited_s}
             self._session.resident_bytes = _resident_bytes()
 
     def _do(self, effects: list[Effect]) -> None:
@@ -143,23 +190,31 @@ class Worker:
                 case Begin(run):
                     self._begin(run)
                 case Close(lanes):
-                    if self._collector is not None:
-                        self._collector.close(life.lane for life in lanes)
+                    if (busy := self._collector or self._stepper) is not None:
+                        busy.close([life.lane for life in lanes])
                 case Leave():
                     self._left = effect
 
-    def _begin(self, run: RunSpec) -> None:
-        """A new session: a new collector, and nothing of the old one."""
-        if self._collector is not None:
-            self._collector.close_all()
+    def _begin(self, run: RunSpec | StepSpec) -> None:
+        """A new session: a new collector or stepper, and nothing of the old one."""
+        self._close_all()
+        self._collector = self._stepper = None
         if why := run.why_not(self._code):
             self._do(self._session.decline(why))
             return
         try:
-            self._collector = Collector(run, make_policy(run.policy))
+            match run:
+                case RunSpec():
+                    self._collector = Collector(run, make_policy(run.policy))
+                case StepSpec():
+                    self._stepper = Stepper(run, self._handed)
             self._loaded = None
-        except (OurError, ImportError) as error:
+        except (OurError, ImportError, ValueError) as error:
             self._do(self._session.broke(_line(error), traceback.format_exc(), None))
+
+    def _close_all(self) -> None:
+        if (busy := self._collector or self._stepper) is not None:
+            busy.close_all()
 
 
 def _resident_bytes() -> int:

@@ -1,0 +1,327 @@
+"""The shell round the lock-step: link + lock-step + shared memory + clock. `hear` is the only place that waits.
+
+The law: every wait has a deadline; when it passes, whoever has not answered is given up (and killed, if it is a child of
+ours), so that a wait ends with every lane answered or lost, and nobody under way.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from learner.events import Broke, Joined, Left, Told, Turned
+from learner.lockstep import Lockstep, Make
+from learner.membership import Out
+from protocol.codec import encode
+from protocol.errors import BadMessage, EnvironmentFailed, NoWorkers
+from protocol.link import LearnerLink
+from protocol.messages import Answer, Inquire, Stepped
+from protocol.shared import Bell, Memory, spin
+from protocol.specs import StepSpec
+
+log = logging.getLogger("millrace.learner")
+
+POLL_S = 0.05  # between two looks at whether a child has ended
+LISTEN_EVERY_S = 0.5  # heartbeats are answered so often while steps go through shared memory
+PATIENCE_S = 10.0  # a lost lane waits so long for its worker's successor before it moves in with another lane
+LAST_WORDS_S = 0.1  # what a process said before it ended may still be on its way
+
+
+class Staff(Protocol):
+    """Worker processes of our own."""
+
+    def poll(self) -> Iterable[tuple[str, str]]:
+        """Those that have ended since the last call, and why; those that are due are started again."""
+        ...
+
+    def kill(self, name: str) -> bool:
+        """End one at once; False if it is none of ours."""
+        ...
+
+    def expected(self) -> bool:
+        """Whether one is to be started again, or has been started and has not ended."""
+        ...
+
+    def stop(self, timeout_s: float) -> None:
+        """End all."""
+        ...
+
+
+class Nobody:
+    """Staff of a learner whose workers are all started elsewhere."""
+
+    def poll(self) -> Iterable[tuple[str, str]]:
+        """None ended."""
+        return ()
+
+    def kill(self, name: str) -> bool:
+        """None of ours."""
+        return False
+
+    def expected(self) -> bool:
+        """No."""
+        return False
+
+    def stop(self, timeout_s: float) -> None:
+        """Nothing to do."""
+
+
+@dataclass(frozen=True)
+class Shared:
+    """Shared memory and the bells of each worker that was handed it."""
+
+    memory: Memory
+    bells: Mapping[str, tuple[Bell, Bell]]
+    """by name: rung for the worker, and by it"""
+
+    def close(self) -> None:
+        """Let go of all descriptors."""
+        self.memory.close()
+        for bell in (bell for pair in self.bells.values() for bell in pair):
+            bell.close()
+
+
+class LockstepHub:
+    """Everything the vector environment knows of workers."""
+
+    def __init__(
+        self,
+        link: LearnerLink,
+        spec: StepSpec,
+        *,
+        first_session: int,
+        staff: Staff | None = None,
+        shared: Shared | None = None,
+        spin_s: float = 0.0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """`spin_s`: how long to wait awake for a step through shared memory before sleeping."""
+        self.link, self.spec = link, spec
+        self.lockstep = Lockstep(spec, first_session)
+        self.staff: Staff = staff or Nobody()
+        self._shared, self._spin_s, self._clock = shared, spin_s, clock
+        self._wanted: dict[int, Make] = {}  # lane -> an order that is said as soon as the lane is placed
+        self._wanted_since_s = 0.0
+        self.stepped: set[int] = set()
+        """lanes whose last step, through shared memory, is done"""
+        self._under_way: dict[int, int] = {}  # lane -> number of its order through shared memory
+        self._waits: dict[int, tuple[Bell, Bell] | None] = {}  # lane -> its worker's bells, if it may use them
+        self._listen_due_s = 0.0
+        self._refusal = ""
+
+    # ---------------------------------------------------------------- saying
+
+    def say(self, makes: Mapping[int, Make]) -> None:
+        """Orders, one for each of these lanes; what has not been placed is placed while `hear` waits."""
+        self.lockstep.answers.clear()
+        self.stepped.clear()
+        self._wanted = dict(makes)
+        self._wanted_since_s = self._clock()
+        self._say_wanted()
+
+    def shares(self, lane: int) -> bool:
+        """Whether a step of this lane may go through shared memory: its copies live with a child that was handed it."""
+        if lane not in self._waits:
+            member = self.lockstep.owner(lane)
+            if member is None or not self.lockstep.seats[lane].living or self._shared is None:
+                return False
+            self._waits[lane] = self._shared.bells.get(member.hello.worker)
+        return self._waits[lane] is not None
+
+    def step_shared(self, lanes: Sequence[int]) -> None:
+        """The actions are laid in shared memory: step these lanes."""
+        self.lockstep.answers.clear()
+        self.stepped.clear()
+        assert self._shared is not None
+        memory = self._shared.memory
+        for lane in lanes:
+            self._under_way[lane] = number = memory.ordered(lane) + 1
+            memory.order(lane, number)
+            bells = self._waits[lane]
+            assert bells is not None
+            bells[0].ring()
+
+    # ---------------------------------------------------------------- waiting
+
+    def hear(self, timeout_s: float) -> dict[int, Answer]:
+        """Wait until every order is answered or its lane is lost; the answers that came as messages, by lane.
+
+        Raises `EnvironmentFailed` if an environment raised, `NoWorkers` if there was nobody to take a lane in time.
+        """
+        deadline_s = self._clock() + timeout_s
+        for lane in list(self._under_way):
+            self._hear_shared(lane, deadline_s)
+        while self._wanted or self.lockstep.orders:
+            self._turn(POLL_S)
+            if self._clock() > deadline_s:
+                self._give_up(timeout_s)
+        if self._clock() > self._listen_due_s:
+            self._turn(0.0)
+        if self.lockstep.broke:
+            self._raise_broken()
+        return dict(self.lockstep.answers)
+
+    def infos(self, lane: int, timeout_s: float) -> bytes:
+        """The packed infos of a lane that was stepped through shared memory."""
+        assert self._shared is not None
+        packed = self._shared.memory.infos(lane)
+        if packed is not None:
+            return packed
+        deadline_s = self._clock() + timeout_s
+        while True:
+            match self.lockstep.answers.get(lane):
+                case Stepped() as answer:
+                    return bytes(answer.infos.data)
+                case _ if lane in self.lockstep.lost or self._clock() > deadline_s:
+                    return b""
+                case _:
+                    self._turn(POLL_S)
+
+    def distrust(self, lane: int, why: str) -> None:
+        """What this lane's worker sent cannot be used: it is refused."""
+        if (member := self.lockstep.owner(lane)) is not None:
+            log.warning("worker %s: %s", member.hello.worker, why)
+            self._send(self.lockstep.reject(member.peer, why))
+            self._after()
+
+    def lost(self) -> dict[int, str]:
+        """Lanes whose copies are gone since this was last asked, and why."""
+        lost, self.lockstep.lost = self.lockstep.lost, {}
+        return lost
+
+    def renew(self) -> None:
+        """Every lane is about to begin anew: even out."""
+        self._turn(0.0)
+        self._waits.clear()
+        self._send(self.lockstep.rebalance())
+
+    def wait_for(self, workers: int, timeout_s: float) -> None:
+        """Wait until so many workers have joined."""
+        deadline_s = self._clock() + timeout_s
+        while len(self.lockstep.members) < workers:
+            if self._clock() > deadline_s:
+                raise self._nobody(timeout_s, workers)
+            self._turn(POLL_S)
+
+    def close(self, timeout_s: float) -> None:
+        """Ask everybody to leave, wait a moment for their Goodbye, and end those that are ours."""
+        deadline_s = self._clock() + timeout_s
+        busy = bool(self._under_way or self.lockstep.orders)
+        self._send(self.lockstep.membership.drain("the vector environment was closed"))
+        for bell, _ in self._shared.bells.values() if self._shared is not None else ():
+            bell.ring()
+        while self.lockstep.members and self._clock() < deadline_s and not busy:
+            self._receive(POLL_S)
+            for name, why in self.staff.poll():
+                self.lockstep.gone(name, why)
+        self.staff.stop(0.0 if busy else max(0.0, deadline_s - self._clock()))
+
+    # ---------------------------------------------------------------- inside
+
+    def _hear_shared(self, lane: int, deadline_s: float) -> None:
+        """Wait for one lane's step: awake for a moment, then asleep; it is done when the number is."""
+        assert self._shared is not None
+        memory, number, bells = self._shared.memory, self._under_way[lane], self._waits[lane]
+        assert bells is not None
+        for _ in spin(self._spin_s):
+            if memory.answered(lane) == number:
+                break
+        while memory.answered(lane) != number and lane in self._under_way:
+            if not bells[1].wait(POLL_S):
+                self._turn(0.0)
+                if self._clock() > deadline_s:
+                    self._give_up_lane(lane, "did not answer in time")
+            elif self._clock() > self._listen_due_s:
+                self._turn(0.0)
+        if memory.answered(lane) == number:
+            self.stepped.add(lane)
+        self._under_way.pop(lane, None)
+
+    def _turn(self, timeout_s: float) -> None:
+        """Listen; see who has ended; say what can be said."""
+        self._listen_due_s = self._clock() + LISTEN_EVERY_S
+        self._receive(timeout_s)
+        for name, why in self.staff.poll():
+            self._receive(LAST_WORDS_S)
+            self.lockstep.gone(name, why)
+            self._after()
+        self._say_wanted()
+
+    def _receive(self, timeout_s: float) -> None:
+        if self.link.poll(timeout_s):
+            for peer, message in self.link.receive():
+                match message:
+                    case BadMessage():
+                        log.warning("message from %s: %s", peer[:40], message)
+                        self._send(self.lockstep.reject(peer, str(message)))
+                    case Inquire():
+                        pass  # it asks how a run is: this is none
+                    case _:
+                        self._send(self.lockstep.receive(peer, message, self._clock()))
+        self._after()
+
+    def _after(self) -> None:
+        """Tell what has happened, and let go of what is lost."""
+        for event in self.lockstep.events():
+            match event:
+                case Turned(worker, why):
+                    self._refusal = why
+                    log.warning("worker %s was refused: %s", worker, why)
+                case Left(worker, why, _, on_purpose):
+                    self._waits.clear()
+                    log.log(logging.INFO if on_purpose else logging.WARNING, "worker %s %s", worker, why)
+                case Broke(worker, host, _, error, _):
+                    log.info("worker %s (%s): %s", worker, host, error)  # it is raised, with its traceback
+                case Joined(worker, host, pid):
+                    log.info("worker %s (%s, pid %d) joined", worker, host, pid)
+                case Told(worker):
+                    log.info("worker %s was told to join again: its session had ended", worker)
+                case _:
+                    pass
+        for lane in [lane for lane in self._under_way if self.lockstep.owner(lane) is None]:
+            del self._under_way[lane]
+
+    def _say_wanted(self) -> None:
+        for lane, make in list(self._wanted.items()):
+            waited_s = self._clock() - self._wanted_since_s
+            if self.lockstep.place(lane, patient=self.staff.expected() and waited_s < PATIENCE_S):
+                del self._wanted[lane]
+                self._send(self.lockstep.order(lane, make))
+
+    def _send(self, outs: Sequence[Out]) -> None:
+        for peer, message in outs:
+            if not self.link.send(peer, encode(message)):
+                continue  # it is gone, or does not read: its silence will tell
+            if self._shared is not None and (bells := self._shared.bells.get(peer.decode(errors="replace"))):
+                bells[0].ring()  # it may be asleep beside its shared memory
+
+    def _give_up(self, timeout_s: float) -> None:
+        """The deadline has passed: whoever holds an order has had it."""
+        if self._wanted and not self.lockstep.orders:
+            self._wanted.clear()
+            raise self._nobody(timeout_s, 1)
+        for order in list(self.lockstep.orders.values()):
+            self._give_up_lane(order.lane, f"did not answer within {timeout_s:g} s")
+
+    def _give_up_lane(self, lane: int, why: str) -> None:
+        member = self.lockstep.owner(lane)
+        if member is not None:
+            killed = self.staff.kill(member.hello.worker)
+            self.lockstep.gone(member.hello.worker, f"{why}, and was killed" if killed else why)
+        self._after()
+
+    def _raise_broken(self) -> None:
+        broke, self.lockstep.broke = self.lockstep.broke[0], []
+        error = EnvironmentFailed(f"worker {broke.worker} ({broke.host}): {broke.error}", broke.traceback)
+        error.add_note(broke.traceback)
+        raise error
+
+    def _nobody(self, timeout_s: float, workers: int) -> NoWorkers:
+        because = f" (the last one was refused: {self._refusal})" if self._refusal else ""
+        return NoWorkers(
+            f"waited {timeout_s:g} s for {workers} workers at {self.link.address}, {len(self.lockstep.members)} are there"
+            f"{because}; start one: python -m workers {self.link.address}"
+        )

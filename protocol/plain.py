@@ -1,0 +1,148 @@
+"""Plain values <-> bytes: what an `info` holds and what a call gives, with their types kept. Pure; no pickle.
+
+Plain is None, bool, int, float, complex, str, bytes, list, tuple, dict, and numpy's scalars and arrays (of these dtypes,
+and of objects that are plain). Anything else is refused by name, or, where the caller asks so, travels as its `repr`
+and arrives as `Shown`: it is not silently taken for a string.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from protocol.errors import BadMessage
+
+DTYPE_KINDS = "biufcSUmM"
+MAX_DEPTH = 32
+MAX_REPR = 1000  # characters
+
+_TUPLE, _PAIRS, _ARRAY, _SCALAR, _OBJECTS, _INT, _COMPLEX, _SHOWN = range(1, 9)
+
+
+class Shown(str):
+    """The `repr` of a value that is not plain."""
+
+    __slots__ = ()
+
+
+def pack(value: object, show: bool = False) -> bytes:
+    """Bytes of a plain value. Raises `TypeError`, naming where it stands, for what is not plain; or shows its `repr`."""
+    return _pack(_folded(value, "", show, 0))
+
+
+def unpack(data: bytes | memoryview) -> Any:
+    """The value. Raises `BadMessage`, whatever the bytes."""
+    try:
+        return _unpack(data, 0)
+    except BadMessage:
+        raise
+    except Exception as error:  # msgpack and numpy raise a dozen types on hostile bytes; to us they are one
+        raise BadMessage(f"not a plain value: {type(error).__name__}: {' '.join(str(error).split())[:200]}") from error
+
+
+def _pack(folded: object) -> bytes:
+    packed: bytes = msgpack.packb(folded)
+    return packed
+
+
+def _folded(value: Any, where: str, show: bool, depth: int) -> Any:
+    """The value in what msgpack knows: exact types only, so that nothing arrives as its base class."""
+    if depth > MAX_DEPTH:
+        raise TypeError(f"{where or 'value'}: expected at most {MAX_DEPTH} levels")
+    kind = type(value)
+    if value is None or kind in (bool, float, str, bytes):
+        return value
+    if kind is int:
+        return value if -(2**63) <= value < 2**64 else msgpack.ExtType(_INT, str(value).encode())
+    if kind is list:
+        return [_folded(inner, f"{where}[{i}]", show, depth + 1) for i, inner in enumerate(value)]
+    if kind is tuple:
+        inside = [_folded(inner, f"{where}[{i}]", show, depth + 1) for i, inner in enumerate(value)]
+        return msgpack.ExtType(_TUPLE, _pack(inside))
+    if kind is dict:
+        inside = [_folded(inner, f"{where}.{key}" if where else str(key), show, depth + 1) for key, inner in value.items()]
+        if all(type(key) is str for key in value):
+            return dict(zip(value, inside, strict=True))
+        keys = [_folded(key, f"{where} key", show, depth + 1) for key in value]
+        return msgpack.ExtType(_PAIRS, _pack([keys, inside]))
+    if kind is complex:
+        return msgpack.ExtType(_COMPLEX, _pack([value.real, value.imag]))
+    if isinstance(value, np.ndarray) and kind is np.ndarray:
+        if value.dtype.kind in DTYPE_KINDS:
+            return msgpack.ExtType(_ARRAY, _pack([value.dtype.str, list(value.shape), value.tobytes()]))
+        if value.dtype.kind == "O":
+            inside = [_folded(inner, f"{where}[{i}]", show, depth + 1) for i, inner in enumerate(value.ravel().tolist())]
+            return msgpack.ExtType(_OBJECTS, _pack([list(value.shape), inside]))
+    if isinstance(value, np.generic) and value.dtype.kind in DTYPE_KINDS:
+        return msgpack.ExtType(_SCALAR, _pack([value.dtype.str, value.tobytes()]))
+    if show:
+        return msgpack.ExtType(_SHOWN, repr(value)[:MAX_REPR].encode())
+    raise TypeError(f"{where or 'value'}: expected plain data (numbers, strings, lists, dicts, arrays), got {kind.__name__}")
+
+
+def _unpack(data: bytes | memoryview, depth: int) -> Any:
+    if depth > MAX_DEPTH:
+        raise BadMessage(f"plain value expected at most {MAX_DEPTH} levels")
+
+    def unfold(code: int, inside: bytes) -> Any:
+        return _unfold(code, inside, lambda inner: _unpack(inner, depth + 1))
+
+    return msgpack.unpackb(data, ext_hook=unfold, strict_map_key=True)
+
+
+def _unfold(code: int, data: bytes, inner: Callable[[bytes], Any]) -> Any:
+    match code:
+        case 1:
+            return tuple(inner(data))
+        case 2:
+            keys, values = inner(data)
+            return dict(zip(keys, values, strict=True))
+        case 3:
+            dtype, shape, raw = inner(data)
+            kind = _dtype(dtype)
+            if len(raw) != math.prod(shape) * kind.itemsize:
+                raise BadMessage(f"array {dtype}{shape} expected {math.prod(shape) * kind.itemsize} bytes, got {len(raw)}")
+            return np.frombuffer(raw, kind).reshape(shape).copy() if raw else np.zeros(shape, kind)
+        case 4:
+            dtype, raw = inner(data)
+            kind = _dtype(dtype)
+            return np.frombuffer(raw, kind)[0] if kind.itemsize else kind.type()
+        case 5:
+            shape, values = inner(data)
+            array = np.empty(len(values), object)
+            array[:] = values
+            return array.reshape(shape)
+        case 6:
+            return int(data)
+        case 7:
+            return complex(*inner(data))
+        case 8:
+            return Shown(data.decode())
+        case _:
+            raise BadMessage(f"plain value expected one of ours, got extension {code}")
+
+
+def _dtype(name: object) -> np.dtype[Any]:
+    kind = np.dtype(str(name))
+    if kind.kind not in DTYPE_KINDS:
+        raise BadMessage(f"array dtype expected one of plain data, got {str(name)[:20]!r}")
+    return kind
+
+
+def shown_keys(value: object, where: str = "") -> list[str]:
+    """Where in the value something stands as its `repr` only."""
+    match value:
+        case Shown():
+            return [where]
+        case dict():
+            return [at for key, inner in value.items() for at in shown_keys(inner, f"{where}.{key}" if where else str(key))]
+        case list() | tuple():
+            return [at for inner in value for at in shown_keys(inner, where)]
+        case np.ndarray() if value.dtype.kind == "O":
+            return [at for inner in value.ravel().tolist() for at in shown_keys(inner, where)]
+        case _:
+            return []
