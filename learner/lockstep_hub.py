@@ -19,7 +19,7 @@ from protocol.codec import encode
 from protocol.errors import BadMessage, EnvironmentFailed, NoWorkers
 from protocol.link import LearnerLink
 from protocol.messages import Answer, Inquire, Stepped
-from protocol.shared import Bell, Memory, spin
+from protocol.shared import MESSAGE, Bell, Memory, spin
 from protocol.specs import StepSpec
 
 log = logging.getLogger("millrace.learner")
@@ -212,7 +212,7 @@ class LockstepHub:
         busy = bool(self._under_way or self.lockstep.orders)
         self._send(self.lockstep.membership.drain("the vector environment was closed"))
         for bell, _ in self._shared.bells.values() if self._shared is not None else ():
-            bell.ring()
+            bell.ring(MESSAGE)
         while self.lockstep.members and self._clock() < deadline_s and not busy:
             self._receive(POLL_S)
             for name, why in self.staff.poll():
@@ -296,7 +296,7 @@ class LockstepHub:
             if not self.link.send(peer, encode(message)):
                 continue  # it is gone, or does not read: its silence will tell
             if self._shared is not None and (bells := self._shared.bells.get(peer.decode(errors="replace"))):
-                bells[0].ring()  # it may be asleep beside its shared memory
+                bells[0].ring(MESSAGE)  # it may be asleep beside its shared memory
 
     def _give_up(self, timeout_s: float) -> None:
         """The deadline has passed: whoever holds an order has had it."""

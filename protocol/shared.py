@@ -27,6 +27,7 @@ POSSIBLE = hasattr(os, "memfd_create") and hasattr(os, "eventfd")
 LINE = 64  # bytes of a cache line: each lane's words have lines of their own
 WORDS = LINE // 8
 INFO_BYTES = 1 << 20  # of a lane, at least; what is longer travels as a message
+MESSAGE = 1 << 32  # a bell that was rung by so much, or more, was rung for a message
 ELSEWHERE = -1  # in place of the number of bytes: the infos of this step travel as a message
 # x86 lets nobody see a later store before an earlier one. Elsewhere only a system call orders them: no spinning there.
 MAY_SPIN = platform.machine() in {"x86_64", "AMD64", "i686"}
@@ -137,19 +138,21 @@ class Bell:
         self._poll = select.poll()
         self._poll.register(self.fd, select.POLLIN)
 
-    def ring(self) -> None:
-        """Wake whoever waits, or will."""
-        os.eventfd_write(self.fd, 1)
+    def ring(self, by: int = 1) -> None:
+        """Wake whoever waits, or will: for a step, or by MESSAGE for a message."""
+        os.eventfd_write(self.fd, by)
 
-    def wait(self, timeout_s: float) -> bool:
-        """Sleep until it is rung, at most `timeout_s`."""
+    def wait(self, timeout_s: float) -> int:
+        """Sleep until it is rung, at most `timeout_s`: the sum of what it was rung by, 0 if it was not.
+
+        Rung for a step that was seen without sleeping, it wakes the next sleeper for nothing.
+        """
         if not self._poll.poll(timeout_s * 1000):
-            return False
+            return 0
         try:
-            os.eventfd_read(self.fd)
+            return os.eventfd_read(self.fd)
         except BlockingIOError:
-            return False
-        return True
+            return 0
 
     def close(self) -> None:
         """Let go of it."""

@@ -13,28 +13,7 @@ from hypothesis.extra import numpy as hnp
 
 from protocol.errors import BadMessage
 from protocol.plain import MAX_DEPTH, Shown, pack, shown_keys, unpack
-
-
-def same(a: Any, b: Any) -> bool:
-    """Equal in value, type and dtype, all the way down."""
-    if type(a) is not type(b):
-        return False
-    match a:
-        case dict():
-            return list(a) == list(b) and all(same(a[key], b[key]) for key in a)
-        case list() | tuple():
-            return len(a) == len(b) and all(map(same, a, b))
-        case np.ndarray() if a.dtype.kind == "O":
-            return bool(a.shape == b.shape and b.dtype.kind == "O") and all(
-                map(same, a.ravel().tolist(), b.ravel().tolist())
-            )
-        case np.ndarray() | np.generic():
-            return bool(a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes())
-        case float() | complex():
-            return bool(np.array_equal(a, b, equal_nan=True))
-        case _:
-            return bool(a == b)
-
+from tests.alike import alike
 
 scalars = hnp.arrays(
     st.one_of(hnp.scalar_dtypes(), hnp.byte_string_dtypes(), hnp.unicode_string_dtypes()).filter(
@@ -60,12 +39,12 @@ values = st.recursive(
 
 @given(values)
 def test_plain_values_come_back_with_their_types(value: Any) -> None:
-    assert same(unpack(pack(value)), value)
+    assert alike(unpack(pack(value)), value)
 
 
 def test_arrays_of_objects_come_back() -> None:
     array = np.array([None, "a", 3], dtype=object).reshape(3, 1)
-    assert same(unpack(pack(array)), array)
+    assert alike(unpack(pack(array)), array)
 
 
 class Odd:

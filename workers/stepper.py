@@ -17,7 +17,7 @@ import numpy.typing as npt
 from protocol.errors import OurError
 from protocol.messages import Answer, Array, Call, Order, Reset, Returned, Step, Stepped
 from protocol.plain import pack, unpack
-from protocol.shared import Bell, Handed, Memory, spin
+from protocol.shared import MESSAGE, Bell, Handed, Memory, spin
 from protocol.specs import StepSpec
 from workers.copies import CopyRaised, Pulse
 from workers.lane import environment_raised
@@ -63,8 +63,8 @@ class Stepper:
             raise
         return _stepped(order, lane.rows, pack_infos(infos))
 
-    def serve(self, timeout_s: float, pulse: Pulse, session: int, say: Callable[[Stepped], None]) -> None:
-        """Step whichever lanes shared memory asks for, until `timeout_s` have passed or the bell rings for a message."""
+    def serve(self, timeout_s: float, pulse: Pulse, session: int, say: Callable[[Stepped], None]) -> bool:
+        """Step whichever lanes shared memory asks for, until `timeout_s` have passed; True if it was rung for a message."""
         assert self._memory is not None
         assert self._called is not None
         until = perf_counter() + timeout_s
@@ -72,13 +72,14 @@ class Stepper:
             served = [self._serve_lane(lane, pulse, session, say) for lane in list(self._lanes)]
             if any(served):
                 if perf_counter() > until:
-                    return
+                    return False
                 for _ in spin(SPIN_S):
                     if self._asked():
                         break
                 continue
-            if not self._called.wait(max(0.0, until - perf_counter())) or not self._asked():
-                return
+            rung = self._called.wait(max(0.0, until - perf_counter()))
+            if not rung or rung >= MESSAGE:
+                return bool(rung)
 
     @property
     def shares(self) -> bool:

@@ -33,6 +33,7 @@ log = logging.getLogger("millrace.worker")
 PULSE_S = 0.05  # how often the inbox is looked into while collecting
 IDLE_S = 0.5  # longest sleep while idle, so that a signal or a dead parent is noticed
 MAX_TRACEBACK = 20_000  # characters
+ON_ITS_WAY_S = 0.02  # a message is announced by a bell, which is faster
 STATM = Path("/proc/self/statm")  # pages: all, resident, …
 
 
@@ -77,7 +78,7 @@ class Worker:
                 self._do(self._session.tick(self._clock()))
                 if self._left is None:
                     idle_s = min(IDLE_S, max(0.0, self._session.next_due_s() - self._clock()))
-                    self._listen(0.0 if self._serve(idle_s) else idle_s)
+                    self._listen(self._serve(idle_s))
                 while self._left is None and (task := self._session.next_task()) is not None:
                     self._collect(task)
                     self._listen(0.0)
@@ -140,14 +141,15 @@ class Worker:
             return
         self._do(self._session.answered(answer))
 
-    def _serve(self, timeout_s: float) -> bool:
-        """Step what shared memory asks for, until `timeout_s` have passed or there is a message; False if there is none."""
+    def _serve(self, timeout_s: float) -> float:
+        """Step what shared memory asks for, if there is any, until there may be a message: how long to wait for it."""
         stepper, session = self._stepper, self._session.session
         if stepper is None or not stepper.shares:
-            return False
+            return timeout_s
+        rung = False
         began_s, stepped_s = self._clock(), stepper.stages["step"]
         try:
-            stepper.serve(
+            rung = stepper.serve(
                 min(timeout_s, PULSE_S), lambda: self._pulse(session), session, lambda answer: self._do([Say(answer)])
             )
         except _Abandoned:
@@ -156,7 +158,7 @@ class Worker:
             self._broke(error)
         self._waited_s += self._clock() - began_s - (stepper.stages["step"] - stepped_s)
         self._account()
-        return True
+        return ON_ITS_WAY_S if rung else 0.0
 
     def _pulse(self, session: int) -> None:
         """Show, now and then, that this worker is alive. Raises `_Abandoned` once nobody wants what it does."""

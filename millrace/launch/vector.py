@@ -73,15 +73,18 @@ def make_vec(
                 "waiting for workers; start one with: python -m workers %s", link.address
             )
         hub.wait_for(count or 1, JOIN_S if host is not None else timeout_s)
-        return ZmqVectorEnv(
+        kept = ExitStack()
+        made = ZmqVectorEnv(
             described,
             hub,
             memory=None if shared is None else shared.memory,
             timeout_s=timeout_s,
             on_worker_loss=on_worker_loss,
             copy=copy,
-            shut=stack.pop_all().close,
+            shut=kept.close,
         )
+        kept.push(stack.pop_all())
+        return made
     raise AssertionError  # the block returns or raises
 
 

@@ -298,7 +298,60 @@ class Spaces(gymnasium.Env[Any, Any]):
         return self.observation_space.sample(), float(np.sum(action)), False, self._steps == 4, {}
 
 
+class Odd:
+    """No plain data; of a class that only this module knows."""
+
+    def __repr__(self) -> str:
+        return "<odd>"
+
+
+class Informs(gymnasium.Env[Any, Any]):
+    """Episodes of random length; a Dict observation, and infos of every kind: numbers, words, arrays, nested, rare ones.
+
+    With `odd`, one that is no plain data, too; words end in `wordy` letters more.
+    `level` is an attribute to get and set, `shout` a method to call.
+    """
+
+    def __init__(self, odd: bool = False, length: float = 6.0, wordy: int = 0) -> None:
+        self.observation_space = spaces.Dict({"arm": spaces.Tuple((_BOX, _DISCRETE)), "clock": spaces.Discrete(1000)})
+        self.action_space = spaces.Dict({"move": spaces.Box(-1, 1, (2,), np.float32), "pick": spaces.Discrete(3)})
+        self._odd, self._length, self._wordy, self._steps = odd, length, wordy, 0
+        self.level = 1
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
+        """Begin; the info says how."""
+        super().reset(seed=seed)
+        self._steps = 0
+        return self._show(), {"began": True, **(options or {})}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
+        """The reward depends on all of the action."""
+        self._steps += 1
+        draw = float(self.np_random.random())
+        info: Info = {
+            "step": self._steps,
+            "draw": draw,
+            "word": f"w{self._steps}" + self._wordy * "x",
+            "deep": {"array": np.arange(3) * draw},
+        }
+        if draw < 0.2:
+            info |= {"rare": np.float32(draw), "list": [1, "a", None], "pair": (1, 2.5), "nothing": None, "flag": draw < 0.1}
+        if self._odd:
+            info["odd"] = Odd()
+        reward = float(action["move"].sum()) + 10.0 * float(action["pick"]) + self.level
+        return self._show(), reward, draw < 1 / self._length, draw > 1 - 1 / self._length, info
+
+    def shout(self, word: str, times: int = 1) -> str:
+        """To be called."""
+        return word.upper() * times
+
+    def _show(self) -> Any:
+        box = self.np_random.uniform(-1, 1, 3).astype(np.float32)
+        return {"arm": (box, int(self.np_random.integers(-1, 3))), "clock": self._steps}
+
+
 for _toy in (
-    Scripted, OneStep, Both, Countdown, Identity, Recall, Slow, Raises, NaNReward, NaNObservation, Hangs, Dies, Spaces,
+    Informs, Scripted, OneStep, Both, Countdown, Identity, Recall, Slow, Raises, NaNReward, NaNObservation, Hangs, Dies,
+    Spaces,
 ):  # fmt: skip
     gymnasium.register(id=f"{_toy.__name__}-v0", entry_point=f"{__name__}:{_toy.__name__}")
