@@ -122,7 +122,7 @@ class Lockstep:
         """See that the lane lives with a worker; False if there is none, or (`patient`) only such as have lanes already."""
         seat = self.seats[lane]
         if seat.owner is None:
-            emptiest = min(self.membership.active(), key=lambda member: len(member.lanes), default=None)
+            emptiest = min(self.membership.active(), key=_by_lanes, default=None)
             if emptiest is None or (emptiest.lanes and patient):
                 return False
             seat.owner = emptiest.peer
@@ -135,7 +135,7 @@ class Lockstep:
         active = self.membership.active()
         while active:
             fullest = max(active, key=lambda member: len(member.lanes))
-            emptiest = min(active, key=lambda member: len(member.lanes))
+            emptiest = min(active, key=_by_lanes)
             if len(fullest.lanes) - len(emptiest.lanes) < 2:
                 break
             seat = self.seats[max(fullest.lanes)]
@@ -202,6 +202,11 @@ class Lockstep:
             if seat.living:
                 self.lost[lane] = f"worker {member.hello.worker} ({member.hello.host}) {why}"
             seat.owner, seat.living, seat.incarnation = None, False, seat.incarnation + 1
+
+
+def _by_lanes(member: Member) -> tuple[int, int, str]:
+    """Who has fewest comes first; among equals by name, not by who was faster to join."""
+    return len(member.lanes), len(member.hello.worker), member.hello.worker
 
 
 def check(answer: Answer, order: Order, spec: StepSpec) -> None:

@@ -153,7 +153,8 @@ class LockstepHub:
         """
         deadline_s = self._clock() + timeout_s
         for lane in list(self._under_way):
-            self._hear_shared(lane, deadline_s)
+            if lane in self._under_way:  # not lost while another was waited for
+                self._hear_shared(lane, deadline_s)
         while self._wanted or self.lockstep.orders:
             self._turn(POLL_S)
             if self._clock() > deadline_s:
@@ -236,9 +237,13 @@ class LockstepHub:
                     self._give_up_lane(lane, "did not answer in time")
             elif self._clock() > self._listen_due_s:
                 self._turn(0.0)
-        if memory.answered(lane) == number:
+        self._take(lane)
+
+    def _take(self, lane: int) -> None:
+        """Its step is done, or it is lost."""
+        number = self._under_way.pop(lane, None)
+        if number is not None and self._shared is not None and self._shared.memory.answered(lane) == number:
             self.stepped.add(lane)
-        self._under_way.pop(lane, None)
 
     def _turn(self, timeout_s: float) -> None:
         """Listen; see who has ended; say what can be said."""
@@ -271,7 +276,6 @@ class LockstepHub:
                     self._refusal = why
                     log.warning("worker %s was refused: %s", worker, why)
                 case Left(worker, why, _, on_purpose):
-                    self._waits.clear()
                     log.log(logging.INFO if on_purpose else logging.WARNING, "worker %s %s", worker, why)
                 case Broke(worker, host, _, error, _):
                     log.info("worker %s (%s): %s", worker, host, error)  # it is raised, with its traceback
@@ -281,8 +285,9 @@ class LockstepHub:
                     log.info("worker %s was told to join again: its session had ended", worker)
                 case _:
                     pass
-        for lane in [lane for lane in self._under_way if self.lockstep.owner(lane) is None]:
-            del self._under_way[lane]
+        for lane in [lane for lane in self._waits if self.lockstep.owner(lane) is None]:
+            del self._waits[lane]
+            self._take(lane)
 
     def _say_wanted(self) -> None:
         for lane, make in list(self._wanted.items()):

@@ -72,7 +72,7 @@ def make_vec(
             logging.getLogger("millrace.learner").warning(
                 "waiting for workers; start one with: python -m workers %s", link.address
             )
-        hub.wait_for(count or 1, JOIN_S if host is not None else timeout_s)
+        hub.wait_for(count or len(described.step.lanes), JOIN_S if host is not None else timeout_s)
         kept = ExitStack()
         made = ZmqVectorEnv(
             described,

@@ -1,0 +1,281 @@
+"""Workers killed, environments that raise, hang or die: the vector environment says so in time and leaves nothing behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import psutil
+import pytest
+from gymnasium.vector import AutoresetMode
+
+import millrace
+from learner.vector_env import ZmqVectorEnv
+from protocol.errors import EnvironmentFailed, NoWorkers, OurError, WorkerLost
+
+WAYS = {"shared": True, "messages": False}
+ZEROS = np.zeros(4, np.int64)
+CLOSES_WITHIN_S = 8.0
+
+
+@pytest.fixture(params=WAYS)
+def shared(request: pytest.FixtureRequest) -> bool:
+    return WAYS[request.param]
+
+
+def made(env: str = "CartPole-v1", **keywords: Any) -> ZmqVectorEnv:
+    return millrace.make_vec(env, 4, **{"workers": 2, "timeout": 20.0, **keywords})
+
+
+def workers_here() -> list[psutil.Process]:
+    """Our children that are worker processes, in the order of their names."""
+    found = [(child.cmdline(), child) for child in psutil.Process().children() if child.status() != psutil.STATUS_ZOMBIE]
+    named = [(line[line.index("--name") + 1], child) for line, child in found if "--name" in line]
+    return [child for _, child in sorted(named, key=lambda pair: pair[0])]
+
+
+def closed_cleanly(env: ZmqVectorEnv) -> None:
+    """Close it, twice; no child, descriptor or folder is left."""
+    began = time.monotonic()
+    env.close()
+    env.close()
+    assert time.monotonic() - began < CLOSES_WITHIN_S
+    assert workers_here() == []
+
+
+def descriptors() -> int:
+    return psutil.Process().num_fds()
+
+
+def test_a_worker_killed_between_steps_comes_back_truncated(shared: bool) -> None:
+    env = made(shared_memory=shared)
+    env.reset(seed=1)
+    before = env.step(ZEROS)[0]
+    workers_here()[1].kill()
+    obs, reward, terminated, truncated, infos = env.step(ZEROS)
+    assert truncated.tolist() == [False, False, True, True]
+    assert not terminated.any()
+    assert reward.tolist() == [1.0, 1.0, 0.0, 0.0]
+    assert (obs[2:] == before[2:]).all()
+    assert (obs[:2] != before[:2]).any()
+    assert infos["worker_lost"].tolist() == [False, False, True, True]
+    obs, reward, terminated, truncated, infos = env.step(ZEROS)  # as a reset would
+    assert reward.tolist() == [1.0, 1.0, 0.0, 0.0]
+    assert not truncated.any()
+    assert "worker_lost" not in infos
+    assert (np.abs(obs[2:]) <= 0.05).all()
+    assert env.step(ZEROS)[1].tolist() == [1.0] * 4
+    closed_cleanly(env)
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.DISABLED])
+def test_a_lost_worker_in_the_other_modes(mode: AutoresetMode) -> None:
+    env = made(autoreset_mode=mode)
+    env.reset(seed=1)
+    before = env.step(ZEROS)[0]
+    workers_here()[0].kill()
+    obs, _, _, truncated, infos = env.step(ZEROS)
+    assert truncated.tolist() == [True, True, False, False]
+    if mode is AutoresetMode.SAME_STEP:
+        assert (infos["final_obs"][0] == before[0]).all()
+        assert infos["final_info"]["worker_lost"].tolist() == [True, True, False, False]
+        assert (np.abs(obs[:2]) <= 0.05).all()
+    else:
+        assert (obs[:2] == before[:2]).all()
+        env.reset(options={"reset_mask": truncated})
+    assert env.step(ZEROS)[1].tolist() == [1.0] * 4
+    closed_cleanly(env)
+
+
+def test_a_worker_that_dies_in_mid_step_is_noticed_at_once(tmp_path: Path, shared: bool) -> None:
+    env = made("workers.envs.toy:Dies-v0", after=2, once=str(tmp_path / "once"), k=50, shared_memory=shared)
+    env.reset(seed=1)
+    began = time.monotonic()
+    truncated = [env.step(ZEROS)[3] for _ in range(4)]
+    assert time.monotonic() - began < 10.0
+    assert sum(int(row.any()) for row in truncated) == 1
+    assert truncated[2].sum() == 2
+    closed_cleanly(env)
+
+
+def test_a_loss_is_raised_where_that_is_asked_for(shared: bool) -> None:
+    env = made(on_worker_loss="raise", shared_memory=shared)
+    env.reset(seed=1)
+    workers_here()[1].kill()
+    with pytest.raises(WorkerLost, match=r"worker w1 \(.*\) was killed by SIGKILL: lane 1 \(copies 2 to 3\) is lost"):
+        env.step(ZEROS)
+    with pytest.raises(WorkerLost, match="call reset"):
+        env.step(ZEROS)
+    env.reset(seed=1)
+    assert env.step(ZEROS)[1].tolist() == [1.0] * 4
+    closed_cleanly(env)
+
+
+def test_an_environment_that_raises_shows_its_own_traceback() -> None:
+    env = made("workers.envs.toy:Raises-v0", after=2)
+    env.reset(seed=1)
+    with pytest.raises(EnvironmentFailed, match=r"lane \d, copy 0, step 2: its environment raised ValueError") as raised:
+        for _ in range(4):
+            env.step(ZEROS)
+    assert "the toy is broken, as it was asked to be" in raised.value.detail
+    assert "in fault" in "".join(raised.value.__notes__)
+    env.reset(seed=1)  # on new copies
+    assert env.step(ZEROS)[1].tolist() == [1.0] * 4
+    closed_cleanly(env)
+
+
+def test_an_environment_that_cannot_be_made_in_a_worker_says_why() -> None:
+    home = os.getpid()
+
+    def only_here() -> gymnasium.Env[Any, Any]:
+        if os.getpid() != home:
+            raise OSError("no licence on this machine")
+        return gymnasium.make("CartPole-v1")
+
+    env = made(only_here)  # type: ignore[arg-type]
+    with pytest.raises(EnvironmentFailed, match="no licence on this machine"):
+        env.reset(seed=1)
+    closed_cleanly(env)
+
+
+@pytest.mark.parametrize("loss", ["truncate", "raise"])
+def test_an_environment_that_hangs_is_given_up_at_the_deadline(tmp_path: Path, loss: str) -> None:
+    once = str(tmp_path / "once")
+    env = made("workers.envs.toy:Hangs-v0", after=1, once=once, timeout=1.5, on_worker_loss=loss)
+    env.reset(seed=1)
+    env.step(ZEROS)
+    began = time.monotonic()
+    if loss == "truncate":
+        truncated = env.step(ZEROS)[3]
+        assert truncated.sum() == 2
+        assert env.step(ZEROS)[1][~truncated].tolist() == [1.0, 1.0]
+    else:
+        with pytest.raises(WorkerLost, match="did not answer"):
+            env.step(ZEROS)
+    assert 1.0 < time.monotonic() - began < 8.0
+    closed_cleanly(env)
+
+
+def test_closing_while_an_environment_hangs() -> None:
+    env = made("workers.envs.toy:Hangs-v0", after=0)
+    env.reset(seed=1)
+    env.step_async(ZEROS)
+    closed_cleanly(env)
+
+
+def test_a_stopped_worker_is_given_up_at_the_deadline() -> None:
+    env = made(timeout=1.0)
+    env.reset(seed=1)
+    workers_here()[0].send_signal(signal.SIGSTOP)
+    assert env.step(ZEROS)[3].tolist() == [True, True, False, False]
+    env.timeout_s = 20.0
+    assert not env.step(ZEROS)[3].any()
+    closed_cleanly(env)
+
+
+def test_a_loss_during_reset_is_made_good() -> None:
+    env = made()
+    env.reset(seed=1)
+    for worker in workers_here():
+        worker.kill()
+    obs, _ = env.reset(seed=1)
+    theirs = gymnasium.make_vec("CartPole-v1", 4, vectorization_mode="sync")
+    assert (obs == theirs.reset(seed=1)[0]).all()
+    theirs.close()
+    assert env.step(ZEROS)[1].tolist() == [1.0] * 4
+    closed_cleanly(env)
+
+
+def test_nothing_is_left_open_after_many() -> None:
+    def one() -> None:
+        with made() as env:
+            env.reset(seed=1)
+            env.step(ZEROS)
+
+    one()
+    before, in_memory = descriptors(), set(os.listdir("/dev/shm"))
+    for _ in range(3):
+        one()
+    assert descriptors() <= before
+    assert set(os.listdir("/dev/shm")) <= in_memory
+
+
+def test_nobody_comes() -> None:
+    env: ZmqVectorEnv | None = None
+    with pytest.raises(NoWorkers, match=r"waited 0.5 s for 2 workers at tcp://127.0.0.1:\d+, 0 are there; start one"):
+        env = made(workers=0, lanes=2, bind="tcp://127.0.0.1:*", timeout=0.5)
+    assert env is None
+
+
+SCRIPT = """
+import os, sys, numpy as np, millrace
+if __name__ == "__main__":
+    env = millrace.make_vec("CartPole-v1", 4, workers=2)
+    env.reset(seed=1)
+    env.step(np.zeros(4, int))
+    print("ready", flush=True)
+    {end}
+"""
+ENDS = {
+    "at interpreter exit": "pass",
+    "after an exception": "raise SystemExit(3)",
+    "when it is forgotten": "del env",
+    "killed": "os.kill(os.getpid(), 9)",
+}
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_nothing_outlives_its_learner(end: str, tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT.format(end=ENDS[end]))
+    env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    before = set(os.listdir("/dev/shm"))
+    with subprocess.Popen([sys.executable, str(script)], env=env, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        with suppress(psutil.NoSuchProcess):
+            children = psutil.Process(process.pid).children() if end == "killed" else []
+        process.wait(15)
+    gone, alive = psutil.wait_procs(children, timeout=10)
+    assert not alive, gone
+    assert not list((tmp_path / "tmp").iterdir())
+    assert set(os.listdir("/dev/shm")) <= before
+
+
+def test_workers_elsewhere_join_by_tcp_and_come_back() -> None:
+    """Started by hand, over tcp; one is killed and another takes its place."""
+
+    def start(address: str, name: str) -> subprocess.Popen[bytes]:
+        root = Path(__file__).parents[2]
+        return subprocess.Popen([sys.executable, "-m", "workers", address, "--name", name], cwd=root)
+
+    import socket
+
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+    started = [start(address, "a"), start(address, "b")]
+    try:
+        env = made(workers=0, lanes=2, bind=address, timeout=3.0)
+        env.reset(seed=1)
+        assert env.step(ZEROS)[1].tolist() == [1.0] * 4
+        started.append(start(address, "c"))
+        started[0].kill()
+        rows = [env.step(ZEROS) for _ in range(3)]
+        assert [row[3].any() for row in rows] == [True, False, False]
+        assert rows[-1][1].tolist() == [1.0] * 4
+        env.close()
+        assert [process.wait(10) for process in started] == [-9, 0, 0]
+    finally:
+        for process in started:
+            with suppress(OurError):
+                process.kill()
+                process.wait()
