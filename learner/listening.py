@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import logging
 import socket
+from dataclasses import dataclass
 from datetime import datetime
+from typing import Protocol
 
-from learner.config import Config
 from protocol.address import advertised, is_local
 from protocol.errors import UsageError
 from protocol.key_folder import KeyFolder, Keyring, asked_folder
@@ -20,7 +21,36 @@ from protocol.keys import Allowed, Key, Token
 log = logging.getLogger("millrace.learner")
 
 
-def keyring_for(config: Config, now: datetime) -> Keyring | None:
+class Listens(Protocol):
+    """Whatever says where a learner listens: a run's `Config`, or a vector environment's `Bind`."""
+
+    @property
+    def bind(self) -> str:
+        """The address."""
+        ...
+
+    @property
+    def keys(self) -> str:
+        """The key folder that was named; empty if none was."""
+        ...
+
+    @property
+    def insecure(self) -> bool:
+        """Whether other machines may connect without keys."""
+        ...
+
+
+@dataclass(frozen=True)
+class Bind:
+    """Where a vector environment listens, named as in `Config`; without an address it meets workers of its own."""
+
+    bind: str = ""
+    keys: str = ""
+    insecure: bool = False
+    advertise: str = ""
+
+
+def keyring_for(config: Listens, now: datetime) -> Keyring | None:
     """Who may connect to `config.bind`; None where everybody may. Raises `UsageError`."""
     if config.insecure and config.keys:
         raise UsageError(f"keys {config.keys} or insecure: expected one, got both")

@@ -13,7 +13,8 @@ import numpy as np
 
 from learner.events import Broke, Event, Told
 from learner.membership import Member, Membership, Out
-from learner.standing import Rubbish, Silence, Standing
+from learner.standing import Revoked, Rubbish, Silence, Standing
+from protocol.address import name_of
 from protocol.errors import BadMessage
 from protocol.messages import (
     Answer,
@@ -87,7 +88,7 @@ class Lockstep:
         if member is None or member.session != message.session:
             if isinstance(message, Goodbye | Failure):
                 return []
-            self.membership.events.append(Told(peer.decode(errors="replace")[:40], message.session, 0))
+            self.membership.events.append(Told(name_of(peer).decode(errors="replace")[:40], message.session, 0))
             return [(peer, Rejoin(message.session))]
         member.heard_s = now
         match message:
@@ -110,6 +111,10 @@ class Lockstep:
         """A message that could not be read, or an answer that does not fit: its sender is refused."""
         member = self.members.get(peer)
         return [(peer, Refuse(f"not understood: {why}"))] if member is None else self.membership.refuse(member, Rubbish, why)
+
+    def revoke(self, peer: bytes, why: str) -> list[Out]:
+        """A member may speak no more: it is told so and forgotten at once, whatever it holds."""
+        return self.membership.refuse(self.members[peer], Revoked, why)
 
     def gone(self, worker: str, why: str) -> None:
         """A worker's process has ended, or it is given up."""

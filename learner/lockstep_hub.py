@@ -15,10 +15,12 @@ from typing import Protocol
 from learner.events import Broke, Joined, Left, Told, Turned
 from learner.lockstep import Lockstep, Make
 from learner.membership import Out
+from protocol.address import name_of
 from protocol.codec import encode
 from protocol.errors import BadMessage, EnvironmentFailed, NoWorkers
 from protocol.link import LearnerLink
 from protocol.messages import Answer, Inquire, Stepped
+from protocol.rarely import Rarely, again
 from protocol.shared import MESSAGE, Bell, Memory, spin
 from protocol.specs import StepSpec
 
@@ -41,8 +43,9 @@ class Staff(Protocol):
         """End one at once; False if it is none of ours."""
         ...
 
-    def expected(self) -> bool:
-        """Whether one is to be started again, or has been started and has not ended."""
+    @property
+    def empty(self) -> bool:
+        """Nobody is here, and nobody will come back."""
         ...
 
     def stop(self, timeout_s: float) -> None:
@@ -61,9 +64,10 @@ class Nobody:
         """None of ours."""
         return False
 
-    def expected(self) -> bool:
-        """No."""
-        return False
+    @property
+    def empty(self) -> bool:
+        """Nobody is."""
+        return True
 
     def stop(self, timeout_s: float) -> None:
         """Nothing to do."""
@@ -110,7 +114,9 @@ class LockstepHub:
         self._under_way: dict[int, int] = {}  # lane -> number of its order through shared memory
         self._waits: dict[int, tuple[Bell, Bell] | None] = {}  # lane -> its worker's bells, if it may use them
         self._listen_due_s = 0.0
-        self._refusal = ""
+        self._closing = False
+        self._turned_away = ""  # what became of the last one that did not stay
+        self._lid = Rarely()
 
     # ---------------------------------------------------------------- saying
 
@@ -209,6 +215,7 @@ class LockstepHub:
 
     def close(self, timeout_s: float) -> None:
         """Ask everybody to leave, wait a moment for their Goodbye, and end those that are ours."""
+        self._closing = True
         deadline_s = self._clock() + timeout_s
         busy = bool(self._under_way or self.lockstep.orders)
         self._send(self.lockstep.membership.drain("the vector environment was closed"))
@@ -249,6 +256,7 @@ class LockstepHub:
         """Listen; see who has ended; say what can be said."""
         self._listen_due_s = self._clock() + LISTEN_EVERY_S
         self._receive(timeout_s)
+        self._shut_out()
         for name, why in self.staff.poll():
             self._receive(LAST_WORDS_S)
             self.lockstep.gone(name, why)
@@ -260,7 +268,7 @@ class LockstepHub:
             for peer, message in self.link.receive():
                 match message:
                     case BadMessage():
-                        log.warning("message from %s: %s", peer[:40], message)
+                        self._complain(peer, f"message from {name_of(peer)[:40]!r}: {message}")
                         self._send(self.lockstep.reject(peer, str(message)))
                     case Inquire():
                         pass  # it asks how a run is: this is none
@@ -268,21 +276,36 @@ class LockstepHub:
                         self._send(self.lockstep.receive(peer, message, self._clock()))
         self._after()
 
+    def _complain(self, peer: bytes, line: str) -> None:
+        """A line about what a peer sent, unless there was one a short while ago."""
+        if (kept_back := self._lid.due(self.link.speaker(peer), self._clock())) is not None:
+            log.warning("%s%s", line, again(kept_back))
+
+    def _shut_out(self) -> None:
+        """Forget the members whose key was revoked: ZeroMQ asks about a key at the handshake alone."""
+        for peer in list(self.lockstep.members):
+            if why := self.link.why_not(peer):
+                self._send(self.lockstep.revoke(peer, why))
+                self._after()
+
     def _after(self) -> None:
         """Tell what has happened, and let go of what is lost."""
         for event in self.lockstep.events():
             match event:
                 case Turned(worker, why):
-                    self._refusal = why
+                    self._turned_away = f"was refused: {why}"
                     log.warning("worker %s was refused: %s", worker, why)
                 case Left(worker, why, _, on_purpose):
-                    log.log(logging.INFO if on_purpose else logging.WARNING, "worker %s %s", worker, why)
+                    if on_purpose and not self._closing:
+                        self._turned_away = why
+                    log.log(logging.INFO if on_purpose and self._closing else logging.WARNING, "worker %s %s", worker, why)
                 case Broke(worker, host, _, error, _):
                     log.info("worker %s (%s): %s", worker, host, error)  # it is raised, with its traceback
                 case Joined(worker, host, pid):
                     log.info("worker %s (%s, pid %d) joined", worker, host, pid)
                 case Told(worker):
-                    log.info("worker %s was told to join again: its session had ended", worker)
+                    if (kept_back := self._lid.due(f"told {worker}", self._clock())) is not None:
+                        log.info("worker %s was told to join again: its session had ended%s", worker, again(kept_back))
                 case _:
                     pass
         for lane in [lane for lane in self._waits if self.lockstep.owner(lane) is None]:
@@ -292,7 +315,7 @@ class LockstepHub:
     def _say_wanted(self) -> None:
         for lane, make in list(self._wanted.items()):
             waited_s = self._clock() - self._wanted_since_s
-            if self.lockstep.place(lane, patient=self.staff.expected() and waited_s < PATIENCE_S):
+            if self.lockstep.place(lane, patient=not self.staff.empty and waited_s < PATIENCE_S):
                 del self._wanted[lane]
                 self._send(self.lockstep.order(lane, make))
 
@@ -300,7 +323,7 @@ class LockstepHub:
         for peer, message in outs:
             if not self.link.send(peer, encode(message)):
                 continue  # it is gone, or does not read: its silence will tell
-            if self._shared is not None and (bells := self._shared.bells.get(peer.decode(errors="replace"))):
+            if self._shared is not None and (bells := self._shared.bells.get(name_of(peer).decode(errors="replace"))):
                 bells[0].ring(MESSAGE)  # it may be asleep beside its shared memory
 
     def _give_up(self, timeout_s: float) -> None:
@@ -325,8 +348,11 @@ class LockstepHub:
         raise error
 
     def _nobody(self, timeout_s: float, workers: int) -> NoWorkers:
-        because = f" (the last one was refused: {self._refusal})" if self._refusal else ""
+        because = f" ({self.link.refused} were not let in; the log says why)" if self.link.refused else ""
+        if self._turned_away:
+            because = f" (the last one {self._turned_away})"
+        token = "" if self.link.keyring is None else " --token FILE"
         return NoWorkers(
             f"waited {timeout_s:g} s for {workers} workers at {self.link.address}, {len(self.lockstep.members)} are there"
-            f"{because}; start one: python -m workers {self.link.address}"
+            f"{because}; start one: python -m workers {self.link.address}{token}"
         )

@@ -15,6 +15,8 @@ from protocol.address import name_of
 from protocol.messages import PROTOCOL_VERSION, Drain, Goodbye, Heartbeat, Hello, Refuse, ToWorker, Welcome
 from protocol.specs import RunSpec, StepSpec
 
+REMEMBERED_REFUSALS = 1000  # processes; who has many names must not fill the memory
+
 Out = tuple[bytes, ToWorker]
 
 
@@ -83,7 +85,7 @@ class Membership:
                 return [], None
             if not same:
                 why = f"another process, on {hello.host}, joined as {hello.worker}; give each worker a name of its own"
-                self._refused[peer] = (member.hello.life, why)
+                self._remember(member, why)
             self.forget(member, Silence, "began again" if same else f"replaced by process {hello.pid}")
         member = Member(peer, hello, self._next_session, self._joins, now)
         self._next_session += 1
@@ -94,10 +96,17 @@ class Membership:
 
     def refuse(self, member: Member, event: type, why: str) -> list[Out]:
         """Turn a member out for good."""
-        self._refused[member.peer] = (member.hello.life, why)
+        self._remember(member, why)
         self.events.append(Turned(member.hello.worker, why))
         self.forget(member, event, f"refused: {why}")
         return [(member.peer, Refuse(why))]
+
+    def _remember(self, member: Member, why: str) -> None:
+        """Remember that its process was refused: it must not come back."""
+        self._refused.pop(member.peer, None)
+        self._refused[member.peer] = (member.hello.life, why)
+        if len(self._refused) > REMEMBERED_REFUSALS:
+            del self._refused[next(iter(self._refused))]
 
     def forget(self, member: Member, event: type, why: str) -> None:
         """It is gone."""

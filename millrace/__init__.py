@@ -50,7 +50,10 @@ def make_vec(
     *,
     workers: int | None = None,
     lanes: int | None = None,
-    bind: str | None = None,
+    bind: str = "",
+    keys: str = "",
+    insecure: bool = False,
+    advertise: str = "",
     transport: Literal["ipc", "tcp", "inproc"] = "ipc",
     shared_memory: bool = True,
     autoreset_mode: AutoresetMode | str = "NextStep",
@@ -64,14 +67,17 @@ def make_vec(
 
     `env` is anything `gymnasium.make` takes, a callable that returns an environment, or a list with one of these for each
     copy; `kwargs` are passed on to it. The copies are shared evenly among `workers` processes of this machine (one for each
-    core), started and ended with the vector environment; with `workers=0` and a `bind` address, among `lanes` workers that
-    are started elsewhere (`python -m workers ADDRESS`). Observations and actions go through shared memory, unless that is
-    turned off, or a worker is elsewhere; what comes out is the same.
+    core), started and ended with the vector environment; with a `bind` address, among `lanes` workers that are started
+    elsewhere, as the line says that is printed (`millrace worker ADDRESS`). Observations and actions go through shared
+    memory, unless that is turned off, or a worker is elsewhere; what comes out is the same. `keys`, `insecure` and
+    `advertise` are as in `millrace learner`: an address that other machines can reach needs keys, which are made by
+    themselves, and a callable goes over TCP with keys only.
 
     Whoever does not answer within `timeout` seconds is given up. The copies of a worker that is lost come back truncated, on
     another or a new one, and the info says `worker_lost`; or, with `on_worker_loss="raise"`, `WorkerLost` is raised. What an
     environment raises is raised here, with the worker's traceback. Raises `OurError`.
     """
+    from learner.listening import Bind
     from millrace.launch import vector
 
     return vector.make_vec(
@@ -79,7 +85,7 @@ def make_vec(
         num_envs,
         workers=workers,
         lanes=lanes,
-        bind=bind,
+        where=Bind(bind, keys, insecure, advertise),
         transport=transport,
         shared_memory=shared_memory,
         autoreset_mode=autoreset_mode,

@@ -15,7 +15,7 @@ from protocol.address import advertised, check_address, is_local, needs_ipv6, re
 from protocol.errors import UsageError
 from protocol.key_folder import KeyFolder
 from protocol.keys import Allowed, Key, Token
-from protocol.specs import Code, EnvSpec
+from protocol.specs import Code, EnvSpec, StepSpec
 from workers.trust import entry, trusted
 
 NOW = datetime(2026, 11, 21, 10, tzinfo=UTC)
@@ -139,6 +139,11 @@ MODULE, CALLABLE = EnvSpec("os:Env-v0"), EnvSpec("mine", factory=b"pickle")
 REGISTERED = [EnvSpec("CartPole-v1"), EnvSpec("ALE/Pong-v5"), EnvSpec("millrace/CartDoublePendulum-v0")]
 
 
+def steps(*envs: EnvSpec) -> StepSpec:
+    """A vector environment with a copy of each, all in one lane."""
+    return StepSpec(envs, tuple(range(len(envs))), (len(envs),), (), ())
+
+
 def test_a_worker_runs_as_much_code_as_it_is_sure_of_its_learner() -> None:
     levels = {trusted("tcp://host:5555", None): (False, False), trusted("tcp://127.0.0.1:5555", None): (True, False)}
     levels |= {trusted(address, TOKEN): (True, True) for address in (*PUBLIC, *LOOPBACK)}
@@ -148,6 +153,9 @@ def test_a_worker_runs_as_much_code_as_it_is_sure_of_its_learner() -> None:
         assert (MODULE.why_not(code) == "") is modules
         assert (CALLABLE.why_not(code) == "") is callables
         assert not any(env.why_not(code) for env in REGISTERED)
+        assert not steps(*REGISTERED).why_not(code)
+        assert steps(*REGISTERED, MODULE).why_not(code) == MODULE.why_not(code)
+        assert steps(REGISTERED[0], CALLABLE).why_not(code) == CALLABLE.why_not(code)
 
 
 # ---------------------------------------------------------------- addresses

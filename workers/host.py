@@ -224,10 +224,6 @@ class Host:
             worker.kill()
         return bool(running)
 
-    def expected(self) -> bool:
-        """Whether a worker that ended is to be started again, or one was started and has not ended."""
-        return not self.empty
-
     def stop(self, timeout_s: float = 5.0) -> None:
         """Ask all to leave, wait at most `timeout_s` for all together, and kill who is left."""
         self.ask_to_leave()

@@ -6,21 +6,16 @@ The law: whatever happens, no worker, socket file or folder of ours is left behi
 from __future__ import annotations
 
 import os
-import shutil
-import tempfile
-import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from datetime import UTC, datetime
 from pathlib import Path
 
 import zmq
 
 from learner.config import Config
-from learner.listening import throwaway
 from learner.run import Run, Watch
+from millrace.launch.here import own_address, own_keys
 from protocol.errors import UsageError
-from protocol.key_folder import asked_folder
 from protocol.keys import Token
 from protocol.link import LearnerLink
 from protocol.specs import EnvSpec
@@ -32,14 +27,13 @@ def train(config: Config, resume: Path | None, watch: Watch, factory: Callable[.
 
     Raises `OurError`, or `Interrupted` when the user stopped it.
     """
-    sealed = config.transport == "tcp" and asked_folder(config.keys) is not None and not config.insecure
-    if factory is not None and config.transport == "tcp" and not sealed:
+    keyring, token = own_keys(config.transport, config.keys, insecure=config.insecure)
+    if factory is not None and config.transport == "tcp" and keyring is None:
         raise UsageError("an environment factory is code: it travels over ipc or inproc only, or over tcp with --keys")
     with ExitStack() as stack:
-        address = _address(config, stack)
+        address = own_address(config.transport, stack)
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         stack.callback(context.term)
-        keyring, token = throwaway("local", datetime.now(UTC)) if sealed else (None, None)
         link = LearnerLink(address, context, keyring)
         stack.callback(link.close, 0.5)
         env = EnvSpec.of(config.env if factory is None else factory, config.env_kwargs)
@@ -49,18 +43,6 @@ def train(config: Config, resume: Path | None, watch: Watch, factory: Callable[.
         run.journal.workers_expected = config.workers
         run.go(config.min_workers or config.workers, host.poll)
         return run.folder.path
-
-
-def _address(config: Config, stack: ExitStack) -> str:
-    match config.transport:
-        case "inproc":
-            return f"inproc://millrace-{os.getpid()}-{time.monotonic_ns()}"
-        case "tcp":
-            return "tcp://127.0.0.1:*"
-        case "ipc":
-            folder = tempfile.mkdtemp(prefix="millrace-")  # 0700: the operating system decides who may connect
-            stack.callback(shutil.rmtree, folder, ignore_errors=True)
-            return f"ipc://{folder}/learner"
 
 
 def _starter(

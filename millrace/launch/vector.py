@@ -7,27 +7,33 @@ from __future__ import annotations
 
 import logging
 import os
-import shutil
-import tempfile
-import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from datetime import UTC, datetime
 from typing import Literal
 
 import zmq
 from gymnasium.vector import AutoresetMode
 
+from learner.listening import Bind, join_lines, keyring_for
 from learner.lockstep_hub import LockstepHub, Shared
 from learner.vector_env import ZmqVectorEnv
 from learner.vector_spec import Env, describe
+from millrace.launch.here import own_address, own_keys
+from protocol.address import advertised, check_address
 from protocol.errors import UsageError
+from protocol.key_folder import Keyring
+from protocol.keys import Token
 from protocol.link import LearnerLink
 from protocol.shared import POSSIBLE, Bell, Handed, Memory
 from protocol.specs import Scalar
 from workers.host import Host, Process, Running, Thread
 
+log = logging.getLogger("millrace.learner")
+
 CLOSE_S = 5.0  # for workers to leave; then they are killed
 JOIN_S = 60.0
+STEP_TIMEOUT_LEAST_S, STEP_TIMEOUT_MOST_S = 60.0, 1e6
 
 
 def make_vec(
@@ -36,7 +42,7 @@ def make_vec(
     *,
     workers: int | None,
     lanes: int | None,
-    bind: str | None,
+    where: Bind,
     transport: Literal["ipc", "tcp", "inproc"],
     shared_memory: bool,
     autoreset_mode: AutoresetMode | str,
@@ -48,30 +54,32 @@ def make_vec(
 ) -> ZmqVectorEnv:
     """See `millrace.make_vec`."""
     copies = num_envs if num_envs is not None else (1 if isinstance(env, str) or callable(env) else len(env))
-    count = min(workers if workers is not None else (os.cpu_count() or 1), copies)
+    if where.bind and workers:
+        raise UsageError(f"workers expected 0 with a bind address, for they are started elsewhere, got {workers}")
+    count = 0 if where.bind else min(workers if workers is not None else (os.cpu_count() or 1), copies)
     described = describe(env, num_envs, lanes or max(count, 1), autoreset_mode, render_mode, kwargs)
-    remote = bind is not None or transport == "tcp"
-    if remote and any(one.factory is not None for one in described.step.envs):
-        raise UsageError("an environment factory is code: it travels over ipc or inproc only, not over tcp")
     with ExitStack() as stack:
-        address = bind or _address(transport, stack)
+        address = where.bind or own_address(transport, stack)
+        keyring, token = _keys(where, transport)
+        if address.startswith("tcp://") and keyring is None and any(one.factory is not None for one in described.step.envs):
+            raise UsageError("an environment factory is code: it travels over ipc or inproc only, or over tcp with keys")
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         stack.callback(context.term)
-        link = LearnerLink(address, context)
+        link = LearnerLink(address, context, keyring)
         stack.callback(link.close, 0.5)
         shared = None
         if shared_memory and POSSIBLE and count and transport != "inproc":
             shared = Shared(Memory(described.step), {f"w{n}": (Bell(), Bell()) for n in range(count)})
             stack.callback(shared.close)
-        host = Host(_starter(transport, link.address, context, shared), count) if count else None
+        start = _starter(transport, link.address, token, context, shared, _step_timeout_s(timeout_s))
+        host = Host(start, count) if count else None
         hub = LockstepHub(
             link, described.step, first_session=int.from_bytes(os.urandom(6), "little"), staff=host, shared=shared
         )
         stack.callback(hub.close, CLOSE_S)
         if host is None:
-            logging.getLogger("millrace.learner").warning(
-                "waiting for workers; start one with: python -m workers %s", link.address
-            )
+            for line in join_lines(link.address, where.advertise, keyring):
+                log.warning("%s", line)
         hub.wait_for(count or len(described.step.lanes), JOIN_S if host is not None else timeout_s)
         kept = ExitStack()
         made = ZmqVectorEnv(
@@ -88,27 +96,38 @@ def make_vec(
     raise AssertionError  # the block returns or raises
 
 
-def _address(transport: str, stack: ExitStack) -> str:
-    match transport:
-        case "inproc":
-            return f"inproc://millrace-{os.getpid()}-{time.monotonic_ns()}"
-        case "tcp":
-            return "tcp://127.0.0.1:*"
-        case "ipc":
-            folder = tempfile.mkdtemp(prefix="millrace-")  # 0700: the operating system decides who may connect
-            stack.callback(shutil.rmtree, folder, ignore_errors=True)
-            return f"ipc://{folder}/learner"
-        case _:
-            raise UsageError(f"transport expected ipc, tcp or inproc, got {transport!r}")
+def _keys(where: Bind, transport: str) -> tuple[Keyring | None, Token | None]:
+    """Who may connect, and with what workers of ours do."""
+    if not where.bind:
+        return own_keys(transport, where.keys, insecure=where.insecure)
+    check_address(advertised("tcp://*:1", where.advertise, "machine"))
+    return keyring_for(where, datetime.now(UTC).replace(microsecond=0)), None
 
 
 def _starter(
-    transport: str, address: str, context: zmq.Context[zmq.Socket[bytes]], shared: Shared | None
+    transport: str,
+    address: str,
+    token: Token | None,
+    context: zmq.Context[zmq.Socket[bytes]],
+    shared: Shared | None,
+    step_timeout_s: float,
 ) -> Callable[[str], Running]:
     if transport == "inproc":
         return lambda name: Thread(address, name, context)
-    if shared is None:
-        return lambda name: Process(address, name, None)
-    bells = shared.bells
-    fd = shared.memory.fd
-    return lambda name: Process(address, name, None, handed=Handed(fd, bells[name][0].fd, bells[name][1].fd))
+
+    def start(name: str) -> Process:
+        handed = None
+        if shared is not None:
+            to_worker, to_learner = shared.bells[name]
+            handed = Handed(shared.memory.fd, to_worker.fd, to_learner.fd)
+        return Process(address, name, None, token, ["--step-timeout-s", str(step_timeout_s)], handed)
+
+    return start
+
+
+def _step_timeout_s(timeout_s: float) -> float:
+    """When a worker of ours ends itself because a step hangs; 0: never.
+
+    Well after this process, which kills whoever has not answered within `timeout_s`: it is for when nobody waits any more.
+    """
+    return max(STEP_TIMEOUT_LEAST_S, 2 * timeout_s) if timeout_s < STEP_TIMEOUT_MOST_S else 0.0

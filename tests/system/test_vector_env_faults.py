@@ -7,7 +7,9 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from contextlib import suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,10 @@ from gymnasium.vector import AutoresetMode
 
 import millrace
 from learner.vector_env import ZmqVectorEnv
+from learner.vector_spec import Env
 from protocol.errors import EnvironmentFailed, NoWorkers, OurError, WorkerLost
+from protocol.key_folder import KeyFolder
+from tests.system.processes import free_port
 
 WAYS = {"shared": True, "messages": False}
 ZEROS = np.zeros(4, np.int64)
@@ -31,7 +36,7 @@ def shared(request: pytest.FixtureRequest) -> bool:
     return WAYS[request.param]
 
 
-def made(env: str = "CartPole-v1", **keywords: Any) -> ZmqVectorEnv:
+def made(env: Env = "CartPole-v1", **keywords: Any) -> ZmqVectorEnv:
     return millrace.make_vec(env, 4, **{"workers": 2, "timeout": 20.0, **keywords})
 
 
@@ -140,7 +145,7 @@ def test_an_environment_that_cannot_be_made_in_a_worker_says_why() -> None:
             raise OSError("no licence on this machine")
         return gymnasium.make("CartPole-v1")
 
-    env = made(only_here)  # type: ignore[arg-type]
+    env = made(only_here)
     with pytest.raises(EnvironmentFailed, match="no licence on this machine"):
         env.reset(seed=1)
     closed_cleanly(env)
@@ -257,11 +262,7 @@ def test_workers_elsewhere_join_by_tcp_and_come_back() -> None:
         root = Path(__file__).parents[2]
         return subprocess.Popen([sys.executable, "-m", "workers", address, "--name", name], cwd=root)
 
-    import socket
-
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+    address = f"tcp://127.0.0.1:{free_port()}"
     started = [start(address, "a"), start(address, "b")]
     try:
         env = made(workers=0, lanes=2, bind=address, timeout=3.0)
@@ -279,3 +280,94 @@ def test_workers_elsewhere_join_by_tcp_and_come_back() -> None:
             with suppress(OurError):
                 process.kill()
                 process.wait()
+
+
+# ---------------------------------------------------------------- keys, trust and hangs, of workers elsewhere
+
+
+class Elsewhere:
+    """Workers started by hand, which say what they have to say into a file."""
+
+    def __init__(self, folder: Path) -> None:
+        self.address = f"tcp://127.0.0.1:{free_port()}"
+        self.started: list[subprocess.Popen[bytes]] = []
+        self._said_in = folder / "said"
+
+    def start(self, name: str, *flags: str) -> None:
+        command = [sys.executable, "-m", "workers", self.address, "--name", name, *flags]
+        with self._said_in.open("ab") as said:
+            self.started.append(subprocess.Popen(command, cwd=Path(__file__).parents[2], stderr=said))
+
+    def said(self) -> str:
+        return self._said_in.read_text()
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Elsewhere]:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for variable in ("MILLRACE_KEYS", "MILLRACE_TOKEN"):
+        monkeypatch.delenv(variable, raising=False)
+    elsewhere = Elsewhere(tmp_path)
+    yield elsewhere
+    for process in elsewhere.started:
+        process.terminate()
+    for process in elsewhere.started:
+        process.wait(10)
+
+
+def test_under_keys_a_callable_travels_and_a_revoked_key_is_a_lost_worker(elsewhere: Elsewhere, tmp_path: Path) -> None:
+    folder = KeyFolder(tmp_path / "keys")
+    for name in ("a", "b"):
+        elsewhere.start(name, "--token", str(folder.new(name, datetime.now(UTC))))
+    with made(
+        lambda: gymnasium.make("CartPole-v1"),
+        workers=None,
+        lanes=2,
+        bind=elsewhere.address,
+        keys=str(folder.path),
+        timeout=60.0,
+    ) as env:
+        env.reset(seed=1)
+        assert env.step(ZEROS)[1].tolist() == [1.0] * 4
+        folder.revoke("b", datetime.now(UTC))
+        began = time.monotonic()
+        while not (row := env.step(ZEROS))[4].get("worker_lost", ZEROS).any():
+            time.sleep(0.05)
+        assert time.monotonic() - began < 15.0, "long before the deadline"
+        assert row[4]["worker_lost"].tolist() == [False, False, True, True]
+        assert not env.step(ZEROS)[3].any()
+    assert [process.wait(10) for process in elsewhere.started] == [0, 2]
+    assert "revoked" in elsewhere.said()
+
+
+def test_one_without_a_token_is_not_let_in(elsewhere: Elsewhere, tmp_path: Path) -> None:
+    elsewhere.start("a")
+    with pytest.raises(NoWorkers, match=r"0 are there \(\d+ were not let in.*start one: .* --token FILE"):
+        made(workers=None, bind=elsewhere.address, keys=str(tmp_path / "keys"), timeout=5.0)
+
+
+def test_what_other_machines_can_reach_has_keys_made_by_itself(elsewhere: Elsewhere, tmp_path: Path) -> None:
+    with pytest.raises(NoWorkers, match="--token FILE"):
+        made(workers=None, bind="tcp://0.0.0.0:*", timeout=0.2)
+    assert (tmp_path / ".config" / "millrace" / "keys" / "default.token").is_file()
+
+
+def test_a_worker_that_runs_no_code_declines_and_that_is_said(elsewhere: Elsewhere) -> None:
+    elsewhere.start("a", "--no-code")
+    with pytest.raises(OurError, match=r"workers\.envs\.toy:Countdown-v0 imports a module, which this worker does not do"):
+        made("workers.envs.toy:Countdown-v0", workers=None, bind=elsewhere.address, timeout=5.0).reset()
+    assert elsewhere.started[0].wait(10) == 2
+
+
+def test_a_worker_whose_step_hangs_ends_itself_and_another_takes_its_lane(elsewhere: Elsewhere, tmp_path: Path) -> None:
+    elsewhere.start("h", "--processes", "2", "--step-timeout-s", "3")
+    with made("workers.envs.toy:Hangs-v0", workers=None, lanes=2, bind=elsewhere.address, after=1, once=str(tmp_path / "o"),
+              timeout=60.0) as env:  # fmt: skip
+        env.reset(seed=1)
+        env.step(ZEROS)
+        began = time.monotonic()
+        truncated = env.step(ZEROS)[3]
+        assert truncated.sum() == 2
+        assert time.monotonic() - began < 30.0, "long before the deadline"
+        assert env.step(ZEROS)[1][~truncated].tolist() == [1.0, 1.0]
+    assert "Timeout (" in elsewhere.said()

@@ -1,0 +1,39 @@
+"""Where a learner meets workers that it starts on this machine, and whether they need keys for it. Shared by the launchers.
+
+The law: a socket file lies in a folder of its own that only this user can enter (0700), and goes with it.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import time
+from contextlib import ExitStack
+from datetime import UTC, datetime
+
+from learner.listening import throwaway
+from protocol.errors import UsageError
+from protocol.key_folder import Keyring, asked_folder
+from protocol.keys import Token
+
+
+def own_address(transport: str, stack: ExitStack) -> str:
+    """An address that nobody else has; `stack` tidies up after it."""
+    match transport:
+        case "inproc":
+            return f"inproc://millrace-{os.getpid()}-{time.monotonic_ns()}"
+        case "tcp":
+            return "tcp://127.0.0.1:*"
+        case "ipc":
+            folder = tempfile.mkdtemp(prefix="millrace-")  # 0700: the operating system decides who may connect
+            stack.callback(shutil.rmtree, folder, ignore_errors=True)
+            return f"ipc://{folder}/learner"
+        case _:
+            raise UsageError(f"transport expected ipc, tcp or inproc, got {transport!r}")
+
+
+def own_keys(transport: str, keys: str, *, insecure: bool) -> tuple[Keyring | None, Token | None]:
+    """Keys for this run alone, where loopback TCP is to have some: a key folder was named."""
+    sealed = transport == "tcp" and asked_folder(keys) is not None and not insecure
+    return throwaway("local", datetime.now(UTC)) if sealed else (None, None)
