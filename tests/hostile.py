@@ -10,7 +10,8 @@ import msgspec
 import numpy as np
 
 from protocol.codec import encode
-from protocol.messages import PROTOCOL_VERSION, Failure, Goodbye, Heartbeat, Hello, Inquire, Rollout
+from protocol.messages import PROTOCOL_VERSION, Failure, Goodbye, Heartbeat, Hello, Inquire, Returned, Rollout, Stepped
+from protocol.plain import pack
 
 Frames = list[bytes]
 
@@ -29,12 +30,15 @@ NONSENSE: list[Any] = [
 
 def real(rollout: Rollout) -> list[Any]:
     """One good message of each kind that a learner can be told."""
+    packed = np.frombuffer(pack([(0, {"key": [1.5, "text"]})]), np.uint8)
     return [
         Hello(PROTOCOL_VERSION, "mallory", "host", 1, 1, "fuzz", 1),
         rollout,
         Heartbeat(rollout.session, 0, 0, (1, 2), 5, {"act": 0.1}, 0),
         Goodbye(rollout.session, "bye", (1,)),
         Failure(rollout.session, "error", "traceback", 0),
+        Stepped(rollout.session, 1, 0, 0, (np.ones((2, 4)),), np.ones(2), np.zeros(2, bool), np.ones(2, bool), packed),
+        Returned(rollout.session, 1, 0, 0, packed, "", ""),
         Inquire(),
     ]
 

@@ -20,6 +20,7 @@ from protocol.errors import BadMessage, UsageError
 from protocol.link import COPY_BELOW_BYTES, LearnerLink, WorkerLink
 from protocol.messages import (
     PROTOCOL_VERSION,
+    Call,
     Collect,
     Drain,
     Failure,
@@ -34,12 +35,17 @@ from protocol.messages import (
     Refuse,
     Rejoin,
     Release,
+    Reset,
+    Returned,
     Rollout,
+    Step,
+    Stepped,
     ToLearner,
     ToWorker,
     Weights,
     Welcome,
 )
+from protocol.plain import pack
 from tests.fakes import fake_rollout, run_spec
 
 Context = zmq.Context[zmq.Socket[bytes]]
@@ -47,12 +53,16 @@ Context = zmq.Context[zmq.Socket[bytes]]
 DEADLINE_S = 10.0
 HELLO = Hello(PROTOCOL_VERSION, "w0", "host", 1, 1, "fake", 1)
 
+PACKED = np.frombuffer(pack([(0, {"ünï": 1.5})]), np.uint8)
+
 TO_LEARNER: list[ToLearner] = [
     HELLO,
     fake_rollout(1, 2, 3, 4, 5),
     Heartbeat(1, 2, 3, (4, 5), 6, {"env": 0.5}, 7),
     Goodbye(1, "told to stop", (4,)),
     Failure(1, "ValueError: ünïcode", "Traceback: …", None),
+    Stepped(1, 2, 0, 1, (np.ones((3, 4), np.float32),), np.ones(3), np.zeros(3, bool), np.ones(3, bool), PACKED),
+    Returned(1, 2, 0, 1, PACKED, "ValueError: ünïcode", "Traceback: …"),
 ]
 TO_WORKER: list[ToWorker] = [
     Welcome(1, 1, run_spec()),
@@ -63,6 +73,9 @@ TO_WORKER: list[ToWorker] = [
     Release(1, (LaneLife(0, 1),)),
     HeartbeatReply(1, 9, (Received(0, 1, 4, ()),)),
     Drain("finished"),
+    Reset(1, 2, 0, 1, (0, 2), (7, None), PACKED),
+    Step(1, 3, 0, 1, (np.ones((3, 2), np.int64),)),
+    Call(1, 4, 0, 1, (1,), "gravity", True, PACKED),
 ]
 
 
