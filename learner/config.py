@@ -89,6 +89,9 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     keep_checkpoints: Count = 3
     """how many of the newest checkpoints stay"""
 
+    metrics_bind: str = ""
+    """where Prometheus finds the metrics, as 127.0.0.1:9464; 0.0.0.0:9464 lets everybody read them; if not given, nowhere"""
+
     record: str = ""
     """id of a Minari dataset of every whole training episode, as cartpole/ppo-v0 (pip install 'millrace[record]')"""
 
@@ -226,6 +229,12 @@ def checked(config: Config, where: str = "") -> Config:
             f"{at}{config.envs} envs cannot be shared evenly among {config.lanes} lanes; take {near}, or {divisor} lanes"
         )
     check_address(config.bind)
+    if config.metrics_bind:
+        try:
+            check_address(f"tcp://{config.metrics_bind}")
+        except UsageError:
+            expected = "expected HOST:PORT, as in 127.0.0.1:9464"
+            raise UsageError(f"{at}metrics_bind {config.metrics_bind}: {expected}") from None
     try:
         check_address(advertised("tcp://*:1", config.advertise, "machine"))
     except UsageError:

@@ -43,9 +43,13 @@ class Hub:
         max_env_failures: int,
         dead_workers: Callable[[], Iterable[tuple[str, str]]] = lambda: (),
         watch: Callable[[], None] = lambda: None,
+        look: Callable[[Hub], None] = lambda hub: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`dead_workers` names local worker processes that have ended, and why; `watch` is called while waiting."""
+        """`dead_workers` names local worker processes that have ended, and why; `watch` is called while waiting.
+
+        `look` is called whenever this has listened.
+        """
         self.link, self.roster = link, roster
         self.no_workers_timeout_s = no_workers_timeout_s
         self.stall_timeout_s = stall_timeout_s
@@ -58,7 +62,7 @@ class Hub:
         """of the weights that rollouts were acted on under"""
         self.progress = Progress()
         """of the run, for whoever asks: the journal keeps it"""
-        self.dead_workers, self.watch, self._clock = dead_workers, watch, clock
+        self.dead_workers, self.watch, self.look, self._clock = dead_workers, watch, look, clock
         self._lid = Rarely()
         self._draining = False
         self._listened_s = self._judge_s = clock()
@@ -156,6 +160,7 @@ class Hub:
         self._listened_s = now
         if now >= self._judge_s:
             self._send(self.roster.tick(now))
+        self.look(self)
 
     def _receive(self, timeout_s: float) -> None:
         if not self.link.poll(timeout_s):

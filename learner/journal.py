@@ -7,11 +7,8 @@ on. A disk that is full costs a warning, never the run.
 from __future__ import annotations
 
 import logging
-import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from importlib import metadata
 from typing import Any
 
 import msgspec
@@ -27,6 +24,7 @@ from learner.ledger import Ledger
 from learner.metrics import EpisodeWindow, Evaluation, MetricsLog, Progress
 from learner.record import TrainingRecorder
 from learner.run_folder import Best, RunFolder, Summary
+from learner.versions import versions
 from protocol.errors import CheckpointError, RunError, UsageError
 from protocol.policy import make_policy
 from protocol.rollout import Batch, Rollout
@@ -69,15 +67,6 @@ def recall(folder: RunFolder, algorithm: Algorithm) -> Past:
     past.ledger.lost += past.ledger.outstanding
     past.ledger.transitions_late += past.ledger.transitions_waiting
     return past
-
-
-def versions() -> dict[str, str]:
-    """Of millrace, and of what decides its results."""
-    found = {"python": platform.python_version()}
-    for package in ("millrace", "torch", "gymnasium", "numpy"):
-        with suppress(metadata.PackageNotFoundError):
-            found[package] = metadata.version(package)
-    return found
 
 
 class Journal:

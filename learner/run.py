@@ -20,6 +20,7 @@ import zmq
 
 from learner.algorithms import ALGORITHMS, Algorithm
 from learner.config import Config
+from learner.exposition import Look, exposed
 from learner.hub import Hub
 from learner.journal import Journal, Past, recall
 from learner.listening import join_lines, keyring_for
@@ -41,8 +42,13 @@ DeadWorkers = Callable[[], Iterable[tuple[str, str]]]
 class Run:
     """A learner that listens, and has not begun."""
 
-    def __init__(self, config: Config, env: EnvSpec, link: LearnerLink, resume: Path | None, watch: Watch) -> None:
-        """`resume`: the folder of a run that goes on from its newest checkpoint. Raises `OurError` in one line."""
+    def __init__(
+        self, config: Config, env: EnvSpec, link: LearnerLink, resume: Path | None, watch: Watch, look: Look
+    ) -> None:
+        """`resume`: the folder of a run that goes on from its newest checkpoint. Raises `OurError` in one line.
+
+        `watch` is called after each update, `look` whenever the learner has listened to its workers.
+        """
         import torch
 
         torch.set_num_threads(config.torch_threads)
@@ -72,6 +78,7 @@ class Run:
             no_workers_timeout_s=config.no_workers_timeout_s,
             stall_timeout_s=config.stall_timeout_s,
             max_env_failures=config.max_env_failures,
+            look=look,
         )
         self.journal = Journal(config, self.folder, spec, self.algorithm, self.hub, past, watch)
 
@@ -104,7 +111,8 @@ def serve(config: Config, resume: Path | None, watch: Watch) -> Path:
         stack.callback(context.term)
         link = LearnerLink(config.bind, context, keyring)
         stack.callback(link.close)
-        run = Run(config, EnvSpec.of(config.env, config.env_kwargs), link, resume, watch)
+        look = stack.enter_context(exposed(config))
+        run = Run(config, EnvSpec.of(config.env, config.env_kwargs), link, resume, watch, look)
         for line in join_lines(link.address, config.advertise, keyring):
             log.warning("%s", line)
         run.go(config.min_workers or 1)

@@ -21,6 +21,7 @@ import struct
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import TypeVar
 
 import zmq
@@ -97,6 +98,19 @@ def _user(frame: zmq.Frame) -> str:
         return ""
 
 
+@dataclass
+class Traffic:
+    """What went one way. The bytes are those of the frames, before encryption; the worker's name is one of them."""
+
+    messages: int = 0
+    bytes: int = 0
+
+    def add(self, frames: Sequence[Buffer]) -> None:
+        """One message more."""
+        self.messages += 1
+        self.bytes += sum(map(len, frames))
+
+
 class LearnerLink:
     """The learner's end: many workers, one port."""
 
@@ -107,6 +121,7 @@ class LearnerLink:
         check_address(address)
         self.context = context or zmq.Context.instance()
         self.keyring = keyring
+        self.received, self.sent = Traffic(), Traffic()
         self.refused_messages = 0
         """messages under keys that may speak no more"""
         self._holders: dict[bytes, str] = {}  # routing id -> key under which it spoke last
@@ -149,6 +164,7 @@ class LearnerLink:
             frames = _receive(self._socket, said_by)
             if frames is None:
                 return
+            self.received.add(frames)
             peer = bytes(frames[0])
             if said_by is not None:
                 peer = self._held(peer, said_by[0])
@@ -194,12 +210,14 @@ class LearnerLink:
             if self._holders.get(routing_id) != key.decode():
                 return False  # another one speaks from there now
             peer = routing_id
+        whole = [peer, *frames]
         try:
-            self._socket.send_multipart([peer, *frames], zmq.NOBLOCK, copy=False)
+            self._socket.send_multipart(whole, zmq.NOBLOCK, copy=False)
         except zmq.ZMQError as error:
             if error.errno in (zmq.EHOSTUNREACH, zmq.EAGAIN):
                 return False
             raise
+        self.sent.add(whole)
         return True
 
     def close(self, linger_s: float = LINGER_MS / 1000) -> None:

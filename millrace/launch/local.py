@@ -13,6 +13,7 @@ from pathlib import Path
 import zmq
 
 from learner.config import Config
+from learner.exposition import exposed
 from learner.run import Run, Watch
 from millrace.launch.here import own_address, own_keys
 from protocol.errors import UsageError
@@ -37,7 +38,7 @@ def train(config: Config, resume: Path | None, watch: Watch, factory: Callable[.
         link = LearnerLink(address, context, keyring)
         stack.callback(link.close, 0.5)
         env = EnvSpec.of(config.env if factory is None else factory, config.env_kwargs)
-        run = Run(config, env, link, resume, watch)
+        run = Run(config, env, link, resume, watch, stack.enter_context(exposed(config)))
         host = Host(_starter(config, link.address, token, context, run.folder.path), config.workers)
         stack.callback(host.stop)
         run.journal.workers_expected = config.workers
