@@ -18,6 +18,7 @@ from tyro.conf import OmitArgPrefixes, PositionalMetavarFromFieldName
 from learner.config import Config, checked, lower_layers, over
 from learner.hyperparameters import elsewhere
 from learner.nearest import nearest
+from learner.resuming import AUTO, newest_run
 from protocol.errors import UsageError
 
 PLAINER = {
@@ -39,7 +40,7 @@ class RunFlags(Config, frozen=True, kw_only=True):
     preset: str = "auto"
     """a whole run by name (millrace presets lists them), the environment whose preset to take, or none"""
     resume: Path | None = None
-    """a run folder to go on with, from its newest checkpoint"""
+    """a run folder to go on with, from its newest checkpoint; auto: the newest of this ENV, algo and seed, or a new one"""
     log_json: bool = False
     """say what happens as JSON, one event a line, on stderr; and nothing else"""
     debug: bool = False
@@ -47,15 +48,24 @@ class RunFlags(Config, frozen=True, kw_only=True):
 
 
 def configuration(command: str, argv: list[str]) -> tuple[Config, Path | None]:
-    """The configuration from all its layers, and the run to resume.
+    """The configuration from all its layers, and the run to resume."""
+    config, resume = _layered(command, argv)
+    if resume != AUTO:
+        return config, resume
+    found = newest_run(config)
+    return (config, None) if found is None else (_layered(command, argv, found)[0], found)
+
+
+def _layered(command: str, argv: list[str], found: Path | None = None) -> tuple[Config, Path | None]:
+    """The configuration, and what --resume says. `found` is the run that it chose: its settings then lie below the flags.
 
     Flags are read more than once, because what lies below them depends on them.
     """
     asked = [flag for flag in argv if flag not in ("-h", "--help")]
     first = parse(RunFlags, asked, command, RunFlags(algo=""), lenient=True)
-    below = functools.partial(
-        lower_layers, algo=first.algo or None, file=first.config, resume=first.resume, preset=first.preset
-    )
+    resume = found if first.resume == AUTO else first.resume
+    file = None if found else first.config  # the run's own settings came from it
+    below = functools.partial(lower_layers, algo=first.algo or None, file=file, resume=resume, preset=first.preset)
     algorithm = below("").algorithm
     if type(algorithm) is not type(first.algorithm):  # its own flags were not known, and their values looked like ENV
         first = parse(RunFlags, asked, command, RunFlags(algo="", algorithm=algorithm), lenient=True)

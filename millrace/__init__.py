@@ -32,14 +32,19 @@ def train(
     """Train on this machine; the run folder.
 
     `env` is anything `gymnasium.make` takes, or a callable that returns an environment. `config` is a TOML file, `resume` a
-    run folder to go on with. Every flag of `millrace train` is a keyword argument of the same name: `learning_rate=1e-3`.
+    run folder to go on with, or "auto": the newest of this environment, algorithm and seed, or a new one. Every flag of
+    `millrace train` is a keyword argument of the same name: `learning_rate=1e-3`.
     `watch` is called after each update. Guard the call with `if __name__ == "__main__":` in a script. Raises `OurError`.
     """
     from learner.config import resolve
+    from learner.resuming import AUTO, newest_run
     from millrace.launch import local
 
     name = env if isinstance(env, str) else getattr(env, "__name__", type(env).__name__)
     file, run = (None if path is None else Path(path) for path in (config, resume))
+    if run == AUTO:
+        run = newest_run(resolve(name, file=file, preset=preset, **keywords))
+        file = None if run else file
     settings = resolve(name, file=file, resume=run, preset=preset, **keywords)
     return local.train(settings, run, watch or (lambda progress: None), factory=None if isinstance(env, str) else env)
 
