@@ -5,7 +5,7 @@ BIN := .venv/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: train test lint type unit docs bench test-learning soak clean
+.PHONY: train test lint type unit docs bench test-learning test-cluster soak clean
 
 train: .venv/installed  ## train CartPole-v1 on two worker processes until a greedy evaluation averages 475
 	$(BIN)/millrace train CartPole-v1 --workers 2 --target-return 475 --eval-episodes 20 --eval-every 5000
@@ -24,6 +24,9 @@ unit: .venv/installed-dev
 
 test-learning: .venv/installed-dev  ## published scores, three seeds each; forty minutes
 	$(BIN)/python -m pytest -m learning --timeout 3600 tests/learning
+
+test-cluster: .venv/installed-dev  ## containers on a real Docker Engine with a real Prometheus. Needs root and Debian's packages; says which
+	$(BIN)/python -m pytest -m cluster -rs -o log_cli=true -o log_cli_level=INFO tests/cluster
 
 soak: .venv/installed-dev  ## faults for ten minutes, every two seconds one; then the faults that take too long for `make test`. Needs root
 	$(BIN)/python -m tests.system.soak --minutes $(MINUTES)
@@ -48,4 +51,4 @@ bench: .venv/installed-dev
 	touch $@
 
 clean:
-	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv .cluster .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -45,13 +45,18 @@ SMALL: dict[str, object] = {
 }
 
 
-def wait_for(condition: Callable[[], T], within_s: float = 60.0, what: Callable[[], str] | str = "it") -> T:
-    """What `condition` gives, as soon as it is true. Fails after `within_s`."""
+def wait_for(
+    condition: Callable[[], T],
+    within_s: float = 60.0,
+    what: Callable[[], str] | str = "it",
+    every_s: float = LOOK_EVERY_S,
+) -> T:
+    """What `condition` gives, as soon as it is true; it is asked `every_s`. Fails after `within_s`."""
     deadline = time.monotonic() + within_s
     while not (found := condition()):
         text = what if isinstance(what, str) else what()
         assert time.monotonic() < deadline, f"{text} did not happen within {within_s:.1f} s"
-        time.sleep(LOOK_EVERY_S)
+        time.sleep(every_s)
     return found
 
 

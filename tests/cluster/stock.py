@@ -1,0 +1,51 @@
+"""What images are built from where no registry is reached: a small Debian with Python as their base, and a folder of wheels.
+
+The law: both are made once, by debootstrap and by pip as it is configured, and kept in `.cluster` beside the sources, or
+where MILLRACE_CLUSTER says.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import tempfile
+import tomllib
+from pathlib import Path
+
+from tests.cluster.engine import run
+from tests.system.processes import ROOT
+
+STOCK = Path(os.environ.get("MILLRACE_CLUSTER", ROOT / ".cluster"))
+SUITE, PYTHON = "bookworm", "3.11"
+NOT_NEEDED = ("var/cache/apt", "var/lib/apt/lists", "usr/share/doc", "usr/share/man", "usr/share/locale", "dev")
+"""neither has an image that is slim"""
+MAKE_WITHIN_S = 900.0
+
+
+def base() -> Path:
+    """A tar for `docker import`."""
+    made = STOCK / f"{SUITE}.tar"
+    if not made.exists():
+        STOCK.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=STOCK) as folder:
+            run(["debootstrap", "--variant=minbase", "--include=python3-venv", SUITE, folder], within_s=MAKE_WITHIN_S)
+            half = made.with_suffix(".half")
+            run(["tar", "-C", folder, "-cf", half, *(f"--exclude=./{path}" for path in NOT_NEEDED), "."])
+            half.rename(made)
+    return made
+
+
+def wheels() -> list[Path]:
+    """All that both images install. With PyTorch's CPU build within pip's reach that is 0.3 GB, else several."""
+    folder = STOCK / "wheels"
+    if not folder.exists():
+        STOCK.mkdir(parents=True, exist_ok=True)
+        wanted = tomllib.loads((ROOT / "pyproject.toml").read_text())
+        needs = [*wanted["project"]["dependencies"], *wanted["build-system"]["requires"]]
+        half = folder.with_suffix(".half")
+        shutil.rmtree(half, ignore_errors=True)
+        pip = [sys.executable, "-m", "pip", "download", "--quiet", "--only-binary=:all:", f"--python-version={PYTHON}"]
+        run([*pip, "--constraint", ROOT / "constraints.txt", "--dest", half, *needs], within_s=MAKE_WITHIN_S)
+        half.rename(folder)
+    return sorted(folder.glob("*.whl"))
