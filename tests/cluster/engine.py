@@ -7,6 +7,7 @@ and nothing can outlive it. Therefore it reaches no registry. Needs root; `why_n
 from __future__ import annotations
 
 import json
+import logging
 import os
 import shutil
 import subprocess
@@ -20,6 +21,8 @@ from typing import Any
 import psutil
 
 from tests.system.processes import wait_for
+
+log = logging.getLogger("millrace.cluster")
 
 START_S = 60.0
 STOP_S = 60.0
@@ -93,8 +96,11 @@ class Engine:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        for child in psutil.Process(self._process.pid).children():
-            child.terminate()
+        if self._process.poll() is None:
+            for child in psutil.Process(self._process.pid).children():
+                child.terminate()
+        else:
+            log.error("the engine ended by itself; its last words:\n%s", self.log.read_text()[-4_000:])
         try:
             self._process.wait(STOP_S)
         except subprocess.TimeoutExpired:
