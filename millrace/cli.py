@@ -225,6 +225,24 @@ def _keys(argv: list[str]) -> int:
     return 0
 
 
+def _launch(argv: list[str]) -> int:
+    from millrace.launch.placing import OURS, read
+
+    launcher, *rest = argv or [""]
+    match launcher:
+        case "kubernetes":
+            from datetime import UTC, datetime
+
+            from millrace.flags import KubernetesFlags
+            from millrace.launch.kubernetes import manifest
+
+            flags, learner = read(KubernetesFlags, rest, launcher, (*OURS, "metrics-bind"))
+            print(manifest(flags, learner, datetime.now(UTC).replace(microsecond=0)), end="")
+        case _:
+            raise UsageError(f"launch {launcher}: expected kubernetes; for containers on this machine see docs/docker.md")
+    return 0
+
+
 def _at_least(name: str, value: int, least: int) -> None:
     if value < least:
         raise UsageError(f"{name} expected int >= {least}, got {value}")
@@ -238,6 +256,9 @@ COMMANDS = {
     "worker": Command(_worker, "worker ADDRESS [--token FILE] [--processes N]", "workers here that join a learner"),
     "status": Command(_status, "status ADDRESS [--watch]", "how a run is: its workers, their speed, what was dropped"),
     "keys": Command(_keys, "keys new|show|allow|revoke [NAME]", "who may join learners of this machine from others"),
+    "launch": Command(
+        _launch, "launch kubernetes ENV [-- flags]", "the same on a cluster, placed by an engine that you have"
+    ),
     "evaluate": Command(_evaluate, "evaluate RUN [--video] [flags]", "greedy episodes of a run's newest policy"),
     "record": Command(_record, "record RUN --out DATASET [flags]", "episodes of a run's newest policy as a Minari dataset"),
     "plot": Command(_plot, "plot RUN [RUN ...] [--out FILE]", "learning curves as a PNG"),

@@ -125,3 +125,37 @@ class KeysRevokeFlags(KeysFlags, frozen=True, kw_only=True):
 
     name: Positional[str]
     """of the client"""
+
+
+class LaunchFlags(msgspec.Struct, frozen=True, kw_only=True):
+    """What every launcher takes. Flags of `millrace learner` stand behind `--`: millrace launch … -- --steps 1000000."""
+
+    env: Positional[str]
+    """anything gymnasium.make takes"""
+    workers: int = 4
+    """worker processes"""
+    name: str = "millrace"
+    """of all that belongs to this run: small letters, digits and dashes"""
+    debug: bool = False
+    """show the traceback of an error"""
+
+
+class KubernetesFlags(LaunchFlags, frozen=True, kw_only=True):
+    """A learner and workers as Kubernetes knows them, on stdout: millrace launch kubernetes ENV > k8s.yaml."""
+
+    keys: str = ""
+    """a key folder: its learner's key and join token become a Secret of the manifest, which is then itself secret"""
+    learner_image: str = "millrace-learner"
+    """docker/Dockerfile, target learner; where the cluster finds it"""
+    worker_image: str = "millrace-worker"
+    """docker/Dockerfile, target worker"""
+    storage: str = "10Gi"
+    """for run folders"""
+    learner_cpu: str = "2"
+    """cores"""
+    learner_memory: str = "4Gi"
+    """its bound"""
+    worker_cpu: str = "1"
+    """cores of each worker"""
+    worker_memory: str = "512Mi"
+    """of each worker, its bound"""

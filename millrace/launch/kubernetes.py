@@ -1,0 +1,222 @@
+"""`millrace launch kubernetes`: a learner and workers as a manifest. Pure but for reading a key folder; no scheduler logic.
+
+The learner is a Job: it ends, and if its pod is lost another goes on from the newest checkpoint. The workers are a
+Deployment: any number, at any time. Secrets are part of the manifest only where a key folder was named.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+
+from millrace.flags import KubernetesFlags
+from millrace.launch.placing import METRICS_PORT, learner_flags
+from protocol.key_folder import FIRST_CLIENT, KeyFolder
+
+PORT = 5555
+TOKEN = f"{FIRST_CLIENT}.token"
+
+
+def manifest(flags: KubernetesFlags, rest: Sequence[str], now: datetime) -> str:
+    """Documents of YAML. `rest` are the learner's own flags. Raises `UsageError`."""
+    keys = [_secret(flags.name, KeyFolder(Path(flags.keys).expanduser()), now)] if flags.keys else []
+    parts = [*keys, _service(flags), _storage(flags), _learner(flags, rest), _workers(flags), _budget(flags)]
+    return _head(flags) + "---\n" + "---\n".join(parts)
+
+
+def _head(flags: KubernetesFlags) -> str:
+    secret = f"kubectl create secret generic {flags.name}-keys --from-file=KEYS"
+    lines = [
+        f"A learner and {flags.workers} workers. docs/kubernetes.md tells more.",
+        *(
+            ["This file holds keys: keep it as secret as they are."]
+            if flags.keys
+            else ["millrace keys new default --keys KEYS", secret]
+        ),
+        "kubectl apply -f THIS_FILE",
+        f"kubectl logs -f job/{flags.name}-learner",
+        f"kubectl scale deployment/{flags.name}-worker --replicas=8",
+    ]
+    return "".join(f"# {line}\n" for line in lines)
+
+
+def _secret(name: str, folder: KeyFolder, now: datetime) -> str:
+    folder.server()
+    folder.first(now)
+    files = [folder.path / "server.key", folder.list_path, folder.token_path(FIRST_CLIENT)]
+    data = "".join(f"  {file.name}: {base64.b64encode(file.read_bytes()).decode()}\n" for file in files)
+    return f"""\
+apiVersion: v1
+kind: Secret
+metadata:
+  name: {name}-keys
+  labels: {{app.kubernetes.io/name: {name}}}
+type: Opaque
+data:
+{data}"""
+
+
+def _service(flags: KubernetesFlags) -> str:
+    return f"""\
+apiVersion: v1
+kind: Service
+metadata:
+  name: {flags.name}
+  labels: {{app.kubernetes.io/name: {flags.name}}}
+spec:
+  selector: {{app.kubernetes.io/name: {flags.name}, app.kubernetes.io/component: learner}}
+  ports:
+    - {{name: workers, port: {PORT}}}
+    - {{name: metrics, port: {METRICS_PORT}}}
+"""
+
+
+def _storage(flags: KubernetesFlags) -> str:
+    return f"""\
+apiVersion: v1
+kind: PersistentVolumeClaim
+metadata:
+  name: {flags.name}-runs
+  labels: {{app.kubernetes.io/name: {flags.name}}}
+spec:
+  accessModes: [ReadWriteOnce]
+  resources: {{requests: {{storage: {json.dumps(flags.storage)}}}}}
+"""
+
+
+def _learner(flags: KubernetesFlags, rest: Sequence[str]) -> str:
+    own = learner_flags(flags.env, rest, f"tcp://0.0.0.0:{PORT}", "/runs")
+    args = ["learner", *own, "--advertise", flags.name, "--metrics-bind", f"0.0.0.0:{METRICS_PORT}"]
+    image = json.dumps(flags.learner_image)
+    status = json.dumps(["millrace", "status", f"tcp://127.0.0.1:{PORT}", "--json"])
+    return f"""\
+apiVersion: batch/v1
+kind: Job
+metadata:
+  name: {flags.name}-learner
+  labels: {{app.kubernetes.io/name: {flags.name}}}
+spec:
+  backoffLimit: 10
+  podFailurePolicy:
+    rules:
+      - action: FailJob  # bad usage: it would fail again
+        onExitCodes: {{containerName: learner, operator: In, values: [2]}}
+      - action: Ignore  # its node was drained, or needed by others
+        onPodConditions: [{{type: DisruptionTarget, status: "True"}}]
+  template:
+    metadata:
+      labels: {{app.kubernetes.io/name: {flags.name}, app.kubernetes.io/component: learner}}
+      annotations: {{prometheus.io/scrape: "true", prometheus.io/port: "{METRICS_PORT}"}}
+    spec:
+      restartPolicy: Never
+      terminationGracePeriodSeconds: 60  # the update in hand, a checkpoint, the workers' last rollouts
+{_pod()}
+      initContainers:
+        - name: keys  # a key that others can read is refused: copies of its own, which nobody else can
+          image: {image}
+          imagePullPolicy: IfNotPresent
+          command: [sh, -c, "umask 077; mkdir -p /keys/own; cp /secret/* /keys/own"]
+{_container(cpu="100m", memory="64Mi")}
+          volumeMounts:
+            - {{name: secret, mountPath: /secret, readOnly: true}}
+            - {{name: keys, mountPath: /keys}}
+      containers:
+        - name: learner
+          image: {image}
+          imagePullPolicy: IfNotPresent
+          args: {_args(args)}
+          env:
+            - {{name: MILLRACE_KEYS, value: /keys/own}}
+            - {{name: MILLRACE_TOKEN, value: /keys/own/{TOKEN}}}  # for the probes, which ask like anybody else
+          ports:
+            - {{name: workers, containerPort: {PORT}}}
+            - {{name: metrics, containerPort: {METRICS_PORT}}}
+          startupProbe: {{exec: {{command: {status}}}, periodSeconds: 5, timeoutSeconds: 10, failureThreshold: 60}}
+          readinessProbe: {{httpGet: {{path: /metrics, port: metrics}}, periodSeconds: 10}}
+          livenessProbe: {{exec: {{command: {status}}}, periodSeconds: 60, timeoutSeconds: 20, failureThreshold: 3}}
+{_container(flags.learner_cpu, flags.learner_memory)}
+          volumeMounts:
+            - {{name: runs, mountPath: /runs}}
+            - {{name: keys, mountPath: /keys}}
+            - {{name: tmp, mountPath: /tmp}}
+      volumes:
+        - {{name: runs, persistentVolumeClaim: {{claimName: {flags.name}-runs}}}}
+        - {{name: secret, secret: {{secretName: {flags.name}-keys}}}}
+        - {{name: keys, emptyDir: {{medium: Memory}}}}
+        - {{name: tmp, emptyDir: {{}}}}
+"""
+
+
+def _workers(flags: KubernetesFlags) -> str:
+    args = [f"tcp://{flags.name}:{PORT}", "--join-timeout-s", "600"]
+    return f"""\
+apiVersion: apps/v1
+kind: Deployment
+metadata:
+  name: {flags.name}-worker
+  labels: {{app.kubernetes.io/name: {flags.name}}}
+spec:
+  replicas: {flags.workers}
+  selector:
+    matchLabels: {{app.kubernetes.io/name: {flags.name}, app.kubernetes.io/component: worker}}
+  template:
+    metadata:
+      labels: {{app.kubernetes.io/name: {flags.name}, app.kubernetes.io/component: worker}}
+    spec:
+      terminationGracePeriodSeconds: 30  # the rollout in hand
+{_pod()}
+      containers:
+        - name: worker  # no probe: it ends by itself when a step hangs, or nobody answers, and is started again
+          image: {json.dumps(flags.worker_image)}
+          imagePullPolicy: IfNotPresent
+          args: {_args(args)}
+          env:
+            - name: MILLRACE_TOKEN  # the text, not a file: a Secret's files can be read by the pod's group
+              valueFrom: {{secretKeyRef: {{name: {flags.name}-keys, key: {TOKEN}}}}}
+{_container(flags.worker_cpu, flags.worker_memory)}
+          volumeMounts:
+            - {{name: tmp, mountPath: /tmp}}
+      volumes:
+        - {{name: tmp, emptyDir: {{}}}}
+"""
+
+
+def _budget(flags: KubernetesFlags) -> str:
+    return f"""\
+apiVersion: policy/v1
+kind: PodDisruptionBudget
+metadata:
+  name: {flags.name}-worker
+  labels: {{app.kubernetes.io/name: {flags.name}}}
+spec:
+  maxUnavailable: 50%  # training goes on with the others
+  selector:
+    matchLabels: {{app.kubernetes.io/name: {flags.name}, app.kubernetes.io/component: worker}}
+"""
+
+
+def _pod() -> str:
+    """What every pod is not allowed to do."""
+    return """\
+      automountServiceAccountToken: false
+      enableServiceLinks: false
+      securityContext:
+        {runAsNonRoot: true, runAsUser: 1000, runAsGroup: 1000, fsGroup: 1000, seccompProfile: {type: RuntimeDefault}}"""
+
+
+def _container(cpu: str, memory: str) -> str:
+    """What a container gets, and is not allowed to do."""
+    return f"""\
+          resources:
+            requests: {{cpu: {json.dumps(cpu)}, memory: {json.dumps(memory)}}}
+            limits: {{memory: {json.dumps(memory)}}}
+          securityContext:
+            {{allowPrivilegeEscalation: false, readOnlyRootFilesystem: true, capabilities: {{drop: [ALL]}}}}"""
+
+
+def _args(args: Sequence[str]) -> str:
+    """A list in YAML; Kubernetes puts variables in place of $(NAME), and here is none."""
+    return json.dumps([arg.replace("$(", "$$(") for arg in args])
