@@ -238,8 +238,15 @@ def _launch(argv: list[str]) -> int:
 
             flags, learner = read(KubernetesFlags, rest, launcher, (*OURS, "metrics-bind"))
             print(manifest(flags, learner, datetime.now(UTC).replace(microsecond=0)), end="")
+        case "slurm":
+            from millrace.flags import SlurmFlags
+            from millrace.launch.slurm import script
+
+            print(script(*read(SlurmFlags, rest, launcher)), end="")
         case _:
-            raise UsageError(f"launch {launcher}: expected kubernetes; for containers on this machine see docs/docker.md")
+            raise UsageError(
+                f"launch {launcher}: expected kubernetes or slurm; for containers on this machine see docs/docker.md"
+            )
     return 0
 
 
@@ -257,7 +264,7 @@ COMMANDS = {
     "status": Command(_status, "status ADDRESS [--watch]", "how a run is: its workers, their speed, what was dropped"),
     "keys": Command(_keys, "keys new|show|allow|revoke [NAME]", "who may join learners of this machine from others"),
     "launch": Command(
-        _launch, "launch kubernetes ENV [-- flags]", "the same on a cluster, placed by an engine that you have"
+        _launch, "launch kubernetes|slurm ENV [-- flags]", "the same on a cluster, placed by an engine that you have"
     ),
     "evaluate": Command(_evaluate, "evaluate RUN [--video] [flags]", "greedy episodes of a run's newest policy"),
     "record": Command(_record, "record RUN --out DATASET [flags]", "episodes of a run's newest policy as a Minari dataset"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import msgspec
@@ -159,3 +160,20 @@ class KubernetesFlags(LaunchFlags, frozen=True, kw_only=True):
     """cores of each worker"""
     worker_memory: str = "512Mi"
     """of each worker, its bound"""
+
+
+class SlurmFlags(LaunchFlags, frozen=True, kw_only=True):
+    """A learner and workers as one Slurm job, on stdout: millrace launch slurm ENV > run.sbatch; sbatch run.sbatch."""
+
+    folder: Path = Path()
+    """a folder that all nodes share: runs, keys and logs go there; the current one if not given"""
+    time: str = "24:00:00"
+    """the job's time limit"""
+    save_s: int = 120
+    """so long before the time limit the run is saved, and the job queued again to go on"""
+    cpus: int = 1
+    """cores of each worker, and of the learner"""
+    partition: str = ""
+    """of the cluster; its own default if not given"""
+    python: Path = Path(sys.executable)
+    """the Python that has millrace, on every node"""

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import base64
+import os
 import re
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +31,15 @@ def launched(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
 @pytest.mark.parametrize(
     ("argv", "says"),
     [
-        ([""], "expected kubernetes"),
+        ([""], "expected kubernetes or slurm"),
         (["kubernetes"], "missing"),
         (["kubernetes", "CartPole-v1", "--workers", "0"], "workers expected int >= 1, got 0"),
         (["kubernetes", "CartPole-v1", "--name", "My_Run"], "expected small letters, digits and dashes"),
         (["kubernetes", "CartPole-v1", "--", "--lerning-rate", "1"], "unknown flag --lerning-rate"),
         (["kubernetes", "CartPole-v1", "--", "--bind=tcp://*:1"], "--bind=tcp://*:1 is the launcher's to set"),
         (["kubernetes", "CartPole-v1", "--", "--metrics-bind", "*:1"], "--metrics-bind is the launcher's to set"),
+        (["slurm", "CartPole-v1", "--folder", "/a folder"], "sbatch takes no spaces, quotes or %"),
+        (["slurm", "CartPole-v1", "--cpus", "0"], "cpus expected int >= 1, got 0"),
     ],
 )
 def test_what_a_cluster_would_refuse_later_is_refused_at_once(
@@ -155,3 +161,34 @@ def test_the_page_shows_what_kubernetes_knows() -> None:
     for text in shown:
         for document in yaml.safe_load_all(text):
             kubernetes_validate.validate(document, KUBERNETES[-1], strict=True)
+
+
+# -------------------------------------------------------------------------------------------------------------- Slurm
+
+
+def test_the_script_is_one_that_a_shell_and_sbatch_know(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    text = launched(capsys, "slurm", "CartPole-v1", "--workers", "3", "--folder", str(tmp_path), "--partition", "short")
+    checker = shutil.which("shellcheck", path=f"{Path(sys.executable).parent}:{os.defpath}")
+    assert checker is not None
+    done = subprocess.run(
+        [checker, "--severity=warning", "-"], input=text, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, done.stdout
+    asked = dict(re.findall(r"^#SBATCH --([-a-z]+)=(.*)$", text, re.MULTILINE))
+    assert (asked["ntasks"], asked["signal"], asked["partition"]) == ("4", "B:USR1@120", "short")
+    assert asked["output"].startswith(str(tmp_path))
+    assert "#SBATCH --requeue\n" in text
+
+
+def test_what_is_odd_in_a_flag_reaches_the_learner_as_it_is(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    odd = "a 'b' $HOME `id` \\"
+    flags = ("--env-kwargs", "render_mode", odd)
+    text = launched(capsys, "slurm", "CartPole-v1", "--folder", str(tmp_path), "--", *flags, "--seed", "7")
+    (line,) = re.findall(r"^.*\[@\]\}\" learner (.* \\\n.*) &$", text, re.MULTILINE)
+    said = subprocess.run(
+        ["bash", "-c", f"port=5; folder=f; printf '%s\\0' learner {line}"], capture_output=True, timeout=10, check=True
+    ).stdout
+    command, *argv = said.decode().split("\0")[:-1]
+    config, _ = configuration(command, [*argv, "--run-dir", str(tmp_path)])
+    assert (config.env, config.seed, config.env_kwargs) == ("CartPole-v1", 7, {"render_mode": odd})
+    assert (config.bind, config.keys) == ("tcp://0.0.0.0:5", "f/keys")
