@@ -243,11 +243,29 @@ def _launch(argv: list[str]) -> int:
             from millrace.launch.slurm import script
 
             print(script(*read(SlurmFlags, rest, launcher)), end="")
+        case "ray":
+            return _launch_ray(rest)
         case _:
-            raise UsageError(
-                f"launch {launcher}: expected kubernetes or slurm; for containers on this machine see docs/docker.md"
-            )
+            raise UsageError(f"launch {launcher}: expected kubernetes, slurm or ray; for containers here see docs/docker.md")
     return 0
+
+
+def _launch_ray(argv: list[str]) -> int:
+    from millrace.flags import RayFlags
+    from millrace.launch.placing import read
+
+    flags, learner = read(RayFlags, argv, "ray", ("bind", "advertise", "insecure"))
+    try:
+        from millrace.launch.ray import launch
+    except ModuleNotFoundError as error:
+        if error.name != "ray":
+            raise
+        raise UsageError("launch ray: Ray is not installed; pip install 'millrace[ray]'") from None
+    from millrace.terminal import watching
+
+    with watching("--log-json" in argv) as watch:
+        run = launch(flags, learner, watch)
+    return _told(run)
 
 
 def _at_least(name: str, value: int, least: int) -> None:
@@ -264,7 +282,7 @@ COMMANDS = {
     "status": Command(_status, "status ADDRESS [--watch]", "how a run is: its workers, their speed, what was dropped"),
     "keys": Command(_keys, "keys new|show|allow|revoke [NAME]", "who may join learners of this machine from others"),
     "launch": Command(
-        _launch, "launch kubernetes|slurm ENV [-- flags]", "the same on a cluster, placed by an engine that you have"
+        _launch, "launch kubernetes|slurm|ray ENV [-- flags]", "the same on a cluster, placed by an engine that you have"
     ),
     "evaluate": Command(_evaluate, "evaluate RUN [--video] [flags]", "greedy episodes of a run's newest policy"),
     "record": Command(_record, "record RUN --out DATASET [flags]", "episodes of a run's newest policy as a Minari dataset"),

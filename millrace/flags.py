@@ -134,7 +134,7 @@ class LaunchFlags(msgspec.Struct, frozen=True, kw_only=True):
     env: Positional[str]
     """anything gymnasium.make takes"""
     workers: int = 4
-    """worker processes"""
+    """worker processes; of Ray, actors"""
     name: str = "millrace"
     """of all that belongs to this run: small letters, digits and dashes"""
     debug: bool = False
@@ -177,3 +177,14 @@ class SlurmFlags(LaunchFlags, frozen=True, kw_only=True):
     """of the cluster; its own default if not given"""
     python: Path = Path(sys.executable)
     """the Python that has millrace, on every node"""
+
+
+class RayFlags(LaunchFlags, frozen=True, kw_only=True):
+    """The learner here, its workers as actors of the Ray cluster of this machine (pip install 'millrace[ray]')."""
+
+    address: str = "auto"
+    """of the cluster, as HOST:PORT; if not given, RAY_ADDRESS or the one that runs here"""
+    processes: int = 1
+    """worker processes of each actor, which takes so many of Ray's cores"""
+    port: int = 5555
+    """where the learner listens, on the address of this node"""
