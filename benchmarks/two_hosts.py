@@ -1,0 +1,96 @@
+"""Workers on another host behind a 5 ms link, beside the same ones on loopback: `python -m benchmarks.two_hosts`.
+
+The learner is on one host, `millrace worker --processes 4` on the other. The hosts are network namespaces of this machine
+(root, iproute2, nftables); the link's delay is a TCP proxy's, 5 ms in either direction. All share this machine's cores: the
+figures tell what the way costs, and nothing else. Each run is one of PPO, with keys and the same settings; env steps/s from
+its fifth update on. Two environments: CartPole-v1, where the way is much, and one whose step sleeps for a millisecond.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+import tempfile
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from tests.system.network import Network, why_not
+from tests.system.processes import START_S, TOY, Stage, free_port
+
+RESULTS = Path(__file__).parent / "results"
+PROCESSES = 4
+DELAY_S = 0.005  # one way
+ENVS: dict[str, dict[str, object]] = {
+    "CartPole-v1": {"env-kwargs": "", "rollout-steps": 128, "envs": 32, "batch-size": 1024, "n-epochs": 1},
+    TOY: {"env-kwargs": "seconds 0.001", "rollout-steps": 128, "envs": 8, "batch-size": 256, "n-epochs": 1},
+}
+WAYS = ("loopback", "two hosts", "two hosts, 5 ms")
+
+
+def rate(env: str, way: str, max_lag: int, seconds: float) -> float:
+    """Env steps/s of one run."""
+    with tempfile.TemporaryDirectory() as folder, Network() as network:
+        stage = Stage(Path(folder))
+        try:
+            return _rate(stage, network, env, way, max_lag, seconds)
+        finally:
+            stage.close()
+
+
+def _rate(stage: Stage, network: Network, env: str, way: str, max_lag: int, seconds: float) -> float:
+    there, here = network.host(1), network.host(2)
+    keys, token = stage.keys()
+    port = free_port()
+    host, before = ("127.0.0.1", ()) if way == "loopback" else (there.address, there.before)
+    settings = ENVS[env] | {"keys": keys, "min-workers": PROCESSES, "max-lag": max_lag, "worker-timeout-s": 10}
+    learner = stage.learner(f"tcp://{host}:{port}", settings, env=env, before=before)
+    learner.is_open()
+    to = port
+    if way.endswith("ms"):
+        to = free_port()
+        proxy = [sys.executable, "-m", "tests.system.proxy", str(port), host, str(to)]
+        stage.start([*before, *proxy], "proxy", told=True).tell(f"delay {DELAY_S}")
+    command = [sys.executable, "-m", "millrace", "worker", f"tcp://{host}:{to}", "--token", str(token)]
+    stage.start([*(here.before if before else ()), *command, "--processes", str(PROCESSES)], "workers")
+    learner.trains(5)  # warm
+    first = learner.rows()[-1]
+    learner.until(lambda row: row["time/time_elapsed"] >= first["time/time_elapsed"] + seconds, START_S + seconds)
+    last = learner.rows()[-1]
+    steps = last["time/total_timesteps"] - first["time/total_timesteps"]
+    return float(steps / (last["time/time_elapsed"] - first["time/time_elapsed"]))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="two hosts with a 5 ms link beside loopback")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--seconds", type=float, default=8.0, help="of each run")
+    parser.add_argument("--max-lag", type=int, nargs="+", default=[0, 1])
+    arguments = parser.parse_args()
+    if why := why_not():
+        sys.exit(why)
+    cases = [(env, lag) for env in ENVS for lag in arguments.max_lag]
+    turns = [
+        {(env, lag, way): rate(env, way, lag, arguments.seconds) for env, lag in cases for way in WAYS}
+        for _ in range(arguments.rounds)
+    ]
+    table = Table("", "max lag", *WAYS, title=f"env steps/s of {PROCESSES} workers, medians of {arguments.rounds}")
+    rows = []
+    for env, lag in cases:
+        found = {way: statistics.median(turn[env, lag, way] for turn in turns) for way in WAYS}
+        shares = {way: statistics.median(turn[env, lag, way] / turn[env, lag, WAYS[0]] for turn in turns) for way in WAYS}
+        table.add_row(env, str(lag), *(f"{found[way]:,.0f} ({shares[way]:.2f})" for way in WAYS))
+        rows += [
+            {"env": env, "max_lag": lag, "way": way, "env_steps_per_s": round(found[way]), "share_of_loopback": shares[way]}
+            for way in WAYS
+        ]
+    Console().print(table)
+    RESULTS.mkdir(exist_ok=True)
+    (RESULTS / "two_hosts.json").write_text(json.dumps({"two_hosts": rows}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
