@@ -25,7 +25,7 @@ unit: .venv/installed-dev
 test-learning: .venv/installed-dev  ## published scores, three seeds each; forty minutes
 	$(BIN)/python -m pytest -m learning --timeout 3600 tests/learning
 
-test-cluster: .venv/installed-dev  ## containers on a real Docker Engine with a real Prometheus. Needs root and Debian's packages; says which
+test-cluster: .venv/installed-dev  ## Docker, Prometheus, Slurm and Ray, for real. Needs root, Debian's packages, the extra `ray`; says which
 	$(BIN)/python -m pytest -m cluster -rs -o log_cli=true -o log_cli_level=INFO tests/cluster
 
 soak: .venv/installed-dev  ## faults for ten minutes, every two seconds one; then the faults that take too long for `make test`. Needs root
