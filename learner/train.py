@@ -23,8 +23,9 @@ def train(algorithm: Algorithm, hub: Hub, journal: Journal, workers: int) -> str
     whole update is saved, then the error goes on.
     """
     journal.save()
-    hub.wait_for(workers)
-    hub.publish(journal.version, *algorithm.weights())
+    if journal.stop_reason() is None:
+        hub.wait_for(workers)
+        hub.publish(journal.version, *algorithm.weights())
     while (reason := journal.stop_reason()) is None:
         try:
             rollouts = hub.gather()

@@ -238,7 +238,12 @@ def test_learner_and_workers_as_processes_of_their_own(tmp_path: Path) -> None:
     for worker in workers:
         _, said = worker.communicate(timeout=20)
         assert worker.returncode == 0, said
-    assert [summary(folder)["stop_reason"] for folder in (tmp_path / "runs").iterdir()] == ["all steps done"]
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert summary(folder)["stop_reason"] == "all steps done"
+    again = subprocess.run(
+        [sys.executable, "-m", "learner", "--resume", str(folder)], capture_output=True, timeout=60, check=False
+    )
+    assert again.returncode == 0, "a run that is done waits for workers"
 
 
 def test_a_worker_says_that_nobody_answers(tmp_path: Path) -> None:
