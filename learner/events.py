@@ -62,3 +62,21 @@ class Stale:
 
 
 Event = Joined | Left | Turned | Broke | Told | Stale
+
+
+def describe(event: Event) -> str:
+    """One line for the log."""
+    match event:
+        case Joined(worker, host, pid):
+            return f"worker {worker} ({host}, pid {pid}) joined"
+        case Left(worker, why, tickets):
+            return f"worker {worker} {why}" + (f"; {tickets} of its tickets are dealt again" if tickets else "")
+        case Turned(worker, why):
+            return f"worker {worker} was refused: {why}"
+        case Broke(worker, host, lane, error, traceback):
+            return f"worker {worker} ({host}): lane {lane}: {error}\n{traceback}"
+        case Told(worker, _, late):
+            counted = f"; {late} transitions that it sent are counted, not used" if late else ""
+            return f"worker {worker} was told to join again: its session had ended{counted}"
+        case Stale(lane, lag, transitions):
+            return f"a rollout of lane {lane} was dropped: {lag} versions old, {transitions} transitions"

@@ -10,17 +10,18 @@ import logging
 import time
 from collections.abc import Callable, Iterable, Sequence
 
-from learner.events import Broke, Event, Joined, Left, Stale, Told, Turned
+from learner.events import Broke, Joined, Left, Stale, Told, Turned, describe
 from learner.freshness import Freshness
+from learner.lid import Lid, shut_out
+from learner.membership import Out
 from learner.metrics import Progress
-from learner.roster import Out, Roster
+from learner.roster import Roster
 from learner.status import status
 from protocol.address import name_of
 from protocol.codec import Buffer, encode
 from protocol.errors import BadMessage, BadRollout, EnvironmentFailed, NoWorkers, Stalled
 from protocol.link import LearnerLink
 from protocol.messages import Array, Inquire, Rollout, ToWorker, Weights
-from protocol.rarely import Rarely, again
 from protocol.rollout import validate
 
 log = logging.getLogger("millrace.learner")
@@ -63,7 +64,7 @@ class Hub:
         self.progress = Progress()
         """of the run, for whoever asks: the journal keeps it"""
         self.dead_workers, self.watch, self.look, self._clock = dead_workers, watch, look, clock
-        self._lid = Rarely()
+        self._lid = Lid(link, clock)
         self._draining = False
         self._listened_s = self._judge_s = clock()
         self._env_failures = 0
@@ -169,7 +170,7 @@ class Hub:
             now = self._clock()
             match message:
                 case BadMessage():
-                    self._complain(peer, f"message from {name_of(peer)[:40]!r}: {message}", now)
+                    self._lid.complain(peer, f"message from {name_of(peer)[:40]!r}: {message}")
                     self._send(self.roster.reject(peer, None, str(message), now))
                 case Rollout():
                     self._rollout(peer, message, now)
@@ -183,22 +184,15 @@ class Hub:
             validate(rollout, self.roster.run)
         except BadRollout as error:
             why = f"worker {name_of(peer).decode(errors='replace')}: rollout of ticket {rollout.ticket}: {error}"
-            self._complain(peer, why, now)
+            self._lid.complain(peer, why)
             self._send(self.roster.reject(peer, rollout, why, now))
         else:
             self.freshness.arrived(name_of(peer).decode(errors="replace"), rollout.version, now)
             self._send(self.roster.receive(peer, rollout, now))
 
-    def _complain(self, peer: bytes, line: str, now: float) -> None:
-        """A line about what a peer sent, unless there was one a short while ago."""
-        if (kept_back := self._lid.due(self.link.speaker(peer), now)) is not None:
-            log.warning("%s%s", line, again(kept_back))
-
     def _shut_out(self) -> None:
-        """Forget the members whose key was revoked: ZeroMQ asks about a key at the handshake alone."""
-        for peer in list(self.roster.members):
-            if why := self.link.why_not(peer):
-                self._send(self.roster.revoke(peer, why))
+        for peer, why in shut_out(self.link, self.roster.members):
+            self._send(self.roster.revoke(peer, why))
 
     def _gone(self) -> None:
         for worker, why in self.dead_workers():
@@ -218,13 +212,10 @@ class Hub:
         return self._encoded[1]
 
     def _events(self) -> None:
-        events, self.roster.events = self.roster.events, []
-        for event in events:
+        for event in self.roster.membership.happened():
             leaving = isinstance(event, Left) and event.on_purpose and self._draining
             expected = leaving or isinstance(event, Joined | Told | Stale)
-            if (kept_back := self._kept_back(event)) is not None:
-                line = describe(event) + again(kept_back)
-                log.log(logging.INFO if expected else logging.WARNING, "%s", line, extra={"event": event})
+            self._lid.tell(logging.INFO if expected else logging.WARNING, event, describe(event))
             match event:
                 case Turned(_, why):
                     self._refusal = why
@@ -235,10 +226,6 @@ class Hub:
                         self._failure = EnvironmentFailed(f"worker {worker} ({host}): {error}; {counted}", traceback)
                 case _:
                     pass
-
-    def _kept_back(self, event: Event) -> int | None:
-        """None: say nothing of it. What was said while nobody listened comes all at once; so does a stranger's flood."""
-        return self._lid.due(f"told {event.worker}", self._clock()) if isinstance(event, Told) else 0
 
     def _judge(self) -> None:
         """End the run when nobody has been there for too long."""
@@ -255,21 +242,3 @@ class Hub:
         if self._refusal:
             return f" (the last one was refused: {self._refusal})"
         return f" ({self.link.refused} were not let in; the log says why)" if self.link.refused else ""
-
-
-def describe(event: Event) -> str:
-    """One line for the log."""
-    match event:
-        case Joined(worker, host, pid):
-            return f"worker {worker} ({host}, pid {pid}) joined"
-        case Left(worker, why, tickets):
-            return f"worker {worker} {why}" + (f"; {tickets} of its tickets are dealt again" if tickets else "")
-        case Turned(worker, why):
-            return f"worker {worker} was refused: {why}"
-        case Broke(worker, host, lane, error, traceback):
-            return f"worker {worker} ({host}): lane {lane}: {error}\n{traceback}"
-        case Told(worker, _, late):
-            counted = f"; {late} transitions that it sent are counted, not used" if late else ""
-            return f"worker {worker} was told to join again: its session had ended{counted}"
-        case Stale(lane, lag, transitions):
-            return f"a rollout of lane {lane} was dropped: {lag} versions old, {transitions} transitions"

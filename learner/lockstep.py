@@ -1,20 +1,21 @@
 """The learner's half of a vector environment. Pure: messages and `now` in, messages out; no socket, clock or environment.
 
 The law: an order goes to one lane, which has one at a time; it is answered, or its lane is lost with its worker. A lost lane
-lives again, on new env copies, in its next life. What a Heartbeat shows to be lost on the way is said again.
+lives again, on new env copies, in its next life. What a Heartbeat shows to be lost on the way is said again. Steps through
+shared memory are counted elsewhere; of these only infos that are too long to be laid there come as messages.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from learner.events import Broke, Event, Told
+from learner.events import Broke, Event
 from learner.membership import Member, Membership, Out
-from learner.standing import Revoked, Rubbish, Silence, Standing
-from protocol.address import name_of
+from learner.standing import Rubbish, Standing
 from protocol.errors import BadMessage
 from protocol.messages import (
     Answer,
@@ -28,7 +29,6 @@ from protocol.messages import (
     Order,
     Received,
     Refuse,
-    Rejoin,
     Release,
     Returned,
     Rollout,
@@ -54,14 +54,19 @@ class Seat:
 class Lockstep:
     """Members, lanes, orders and their answers."""
 
-    def __init__(self, spec: StepSpec, first_session: int) -> None:
+    def __init__(self, spec: StepSpec, first_session: int, worker_timeout_s: float = math.inf) -> None:
         self.spec = spec
-        self.membership = Membership(spec, first_session, self._lost)
+        self.worker_timeout_s = worker_timeout_s
+        self.membership = Membership(spec, Member, self._lost, first_session)
         self.seats = [Seat(lane) for lane in range(len(spec.lanes))]
         self.orders: dict[int, Order] = {}
         """said and not answered, by ticket"""
         self.answers: dict[int, Answer] = {}
         """by lane; whoever gave the order takes it"""
+        self.in_memory: dict[int, int] = {}
+        """lane -> number of its newest order, of those that went through shared memory"""
+        self.infos: dict[int, bytes] = {}
+        """by lane: the packed infos of such an order, where they came as a message"""
         self.lost: dict[int, str] = {}
         """lanes whose copies are gone, and why; whoever steps them takes note of it"""
         self.broke: list[Broke] = []
@@ -75,8 +80,7 @@ class Lockstep:
 
     def events(self) -> list[Event]:
         """What has happened since it was last asked."""
-        events, self.membership.events = self.membership.events, []
-        return events
+        return self.membership.happened()
 
     # ---------------------------------------------------------------- in
 
@@ -84,13 +88,9 @@ class Lockstep:
         """What a worker said."""
         if isinstance(message, Hello):
             return self.membership.hello(peer, message, now)[0]
-        member = self.members.get(peer)
-        if member is None or member.session != message.session:
-            if isinstance(message, Goodbye | Failure):
-                return []
-            self.membership.events.append(Told(name_of(peer).decode(errors="replace")[:40], message.session, 0))
-            return [(peer, Rejoin(message.session))]
-        member.heard_s = now
+        member = self.membership.speaker(peer, message, now)
+        if member is None:
+            return self.membership.stranger(peer, message)
         match message:
             case Stepped() | Returned():
                 return self._answer(member, message)
@@ -114,14 +114,23 @@ class Lockstep:
 
     def revoke(self, peer: bytes, why: str) -> list[Out]:
         """A member may speak no more: it is told so and forgotten at once, whatever it holds."""
-        return self.membership.refuse(self.members[peer], Revoked, why)
+        return self.membership.revoke(peer, why)
 
     def gone(self, worker: str, why: str) -> None:
         """A worker's process has ended, or it is given up."""
-        for member in [member for member in self.members.values() if member.hello.worker == worker]:
-            self.membership.forget(member, Silence, why)
+        self.membership.gone(worker, why)
+
+    def tick(self, now: float, listening_since_s: float) -> None:
+        """Judge silence. Call it only when every message that has arrived was given to `receive`."""
+        self.membership.silence(now, self.worker_timeout_s, listening_since_s)
 
     # ---------------------------------------------------------------- the vector environment's side
+
+    def begin(self) -> None:
+        """What the last orders gave has been taken."""
+        self.answers.clear()
+        self.in_memory.clear()
+        self.infos.clear()
 
     def place(self, lane: int, patient: bool) -> bool:
         """See that the lane lives with a worker; False if there is none, or (`patient`) only such as have lanes already."""
@@ -170,9 +179,8 @@ class Lockstep:
     # ---------------------------------------------------------------- inside
 
     def _answer(self, member: Member, answer: Answer) -> list[Out]:
-        if answer.ticket < 0 and answer.lane in member.lanes:  # to an order through shared memory
-            self.answers[answer.lane] = answer
-            return []
+        if answer.ticket < 0:
+            return self._long_infos(member, answer)
         order = self.orders.get(answer.ticket)
         if order is None or answer.ticket not in member.tickets:
             return []  # a repeat
@@ -184,17 +192,24 @@ class Lockstep:
         self.answers[answer.lane] = answer
         return []
 
+    def _long_infos(self, member: Member, answer: Answer) -> list[Out]:
+        """To an order through shared memory; it counts only while that lane's newest order is this one."""
+        if not isinstance(answer, Stepped):
+            return self.reject(member.peer, "an answer to an order through shared memory expected Stepped, got Returned")
+        mine = answer.lane in member.lanes and self.seats[answer.lane].incarnation == answer.incarnation
+        if mine and self.in_memory.get(answer.lane) == -answer.ticket:
+            self.infos[answer.lane] = bytes(answer.infos.data)
+        return []
+
     def _heartbeat(self, member: Member, heartbeat: Heartbeat) -> list[Out]:
-        """Say again what this account shows to be lost: said before a reply that the worker has seen, yet not held."""
-        member.heartbeat = heartbeat
+        """Say again what this account shows to be lost."""
+        missing = member.account(heartbeat)
         if member.standing is Standing.DRAINING:
             return [(member.peer, Drain(self.membership.draining or ""))]
-        seen = min(heartbeat.replies, member.replies)
         out: list[Out] = []
-        for ticket, said_at in member.tickets.items():
-            if ticket not in heartbeat.tickets and seen > said_at:
-                member.tickets[ticket] = member.replies
-                out.append((member.peer, self.orders[ticket]))
+        for ticket in missing:
+            member.tickets[ticket] = member.replies
+            out.append((member.peer, self.orders[ticket]))
         member.replies += 1
         lanes = tuple(Received(lane, self.seats[lane].incarnation, 0) for lane in sorted(member.lanes))
         return [*out, (member.peer, HeartbeatReply(member.session, member.replies, lanes))]
@@ -203,6 +218,7 @@ class Lockstep:
         for ticket in member.tickets:
             del self.orders[ticket]
         for lane in member.lanes:
+            self.in_memory.pop(lane, None)
             seat = self.seats[lane]
             if seat.living:
                 self.lost[lane] = f"worker {member.hello.worker} ({member.hello.host}) {why}"

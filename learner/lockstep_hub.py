@@ -1,26 +1,29 @@
 """The shell round the lock-step: link + lock-step + shared memory + clock. `hear` is the only place that waits.
 
 The law: every wait has a deadline; when it passes, whoever has not answered is given up (and killed, if it is a child of
-ours), so that a wait ends with every lane answered or lost, and nobody under way.
+ours), so that a wait ends with every lane answered or lost, and nobody under way. Nobody is silent whom nobody listens to:
+the caller may think as long as it likes between two waits.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from learner.events import Broke, Joined, Left, Told, Turned
+from learner.events import Broke, Left, Turned, describe
+from learner.lid import Lid, shut_out
 from learner.lockstep import Lockstep, Make
 from learner.membership import Out
+from learner.status import stepping_status
 from protocol.address import name_of
 from protocol.codec import encode
 from protocol.errors import BadMessage, EnvironmentFailed, NoWorkers
 from protocol.link import LearnerLink
-from protocol.messages import Answer, Inquire, Stepped
-from protocol.rarely import Rarely, again
+from protocol.messages import Answer, Inquire
 from protocol.shared import MESSAGE, Bell, Memory, spin
 from protocol.specs import StepSpec
 
@@ -28,7 +31,9 @@ log = logging.getLogger("millrace.learner")
 
 POLL_S = 0.05  # between two looks at whether a child has ended
 LISTEN_EVERY_S = 0.5  # heartbeats are answered so often while steps go through shared memory
-PATIENCE_S = 10.0  # a lost lane waits so long for its worker's successor before it moves in with another lane
+AWAY_S = 1.0  # a caller that has not listened for longer was busy: what was said meanwhile may still be on its way
+PATIENCE_S = 10.0  # a lost lane waits so long for its worker's successor, and no longer than half its time: then it moves in
+# with another lane
 LAST_WORDS_S = 0.1  # what a process said before it ended may still be on its way
 
 
@@ -100,15 +105,19 @@ class LockstepHub:
         staff: Staff | None = None,
         shared: Shared | None = None,
         spin_s: float = 0.0,
+        worker_timeout_s: float = math.inf,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`spin_s`: how long to wait awake for a step through shared memory before sleeping."""
+        """`spin_s`: how long to wait awake for a step through shared memory before sleeping. `worker_timeout_s`: whoever is
+        silent for so long while it is listened to is given up; never, where the end of a process is known otherwise.
+        """
         self.link, self.spec = link, spec
-        self.lockstep = Lockstep(spec, first_session)
+        self.lockstep = Lockstep(spec, first_session, worker_timeout_s)
         self.staff: Staff = staff or Nobody()
         self._shared, self._spin_s, self._clock = shared, spin_s, clock
         self._wanted: dict[int, Make] = {}  # lane -> an order that is said as soon as the lane is placed
         self._wanted_since_s = 0.0
+        self._patience_s = PATIENCE_S
         self.stepped: set[int] = set()
         """lanes whose last step, through shared memory, is done"""
         self._under_way: dict[int, int] = {}  # lane -> number of its order through shared memory
@@ -116,13 +125,14 @@ class LockstepHub:
         self._listen_due_s = 0.0
         self._closing = False
         self._turned_away = ""  # what became of the last one that did not stay
-        self._lid = Rarely()
+        self._lid = Lid(link, clock)
+        self._listened_s = self._listening_since_s = clock()
 
     # ---------------------------------------------------------------- saying
 
     def say(self, makes: Mapping[int, Make]) -> None:
         """Orders, one for each of these lanes; what has not been placed is placed while `hear` waits."""
-        self.lockstep.answers.clear()
+        self.lockstep.begin()
         self.stepped.clear()
         self._wanted = dict(makes)
         self._wanted_since_s = self._clock()
@@ -139,12 +149,12 @@ class LockstepHub:
 
     def step_shared(self, lanes: Sequence[int]) -> None:
         """The actions are laid in shared memory: step these lanes."""
-        self.lockstep.answers.clear()
+        self.lockstep.begin()
         self.stepped.clear()
         assert self._shared is not None
         memory = self._shared.memory
         for lane in lanes:
-            self._under_way[lane] = number = memory.ordered(lane) + 1
+            self._under_way[lane] = self.lockstep.in_memory[lane] = number = memory.ordered(lane) + 1
             memory.order(lane, number)
             bells = self._waits[lane]
             assert bells is not None
@@ -158,6 +168,7 @@ class LockstepHub:
         Raises `EnvironmentFailed` if an environment raised, `NoWorkers` if there was nobody to take a lane in time.
         """
         deadline_s = self._clock() + timeout_s
+        self._patience_s = min(PATIENCE_S, timeout_s / 2)
         for lane in list(self._under_way):
             if lane in self._under_way:  # not lost while another was waited for
                 self._hear_shared(lane, deadline_s)
@@ -179,13 +190,14 @@ class LockstepHub:
             return packed
         deadline_s = self._clock() + timeout_s
         while True:
-            match self.lockstep.answers.get(lane):
-                case Stepped() as answer:
-                    return bytes(answer.infos.data)
-                case _ if lane in self.lockstep.lost or self._clock() > deadline_s:
-                    return b""
-                case _:
-                    self._turn(POLL_S)
+            if (said := self.lockstep.infos.get(lane)) is not None:
+                return said
+            if lane not in self.lockstep.in_memory:
+                return b""  # its worker is gone, and that is told
+            if self._clock() > deadline_s:
+                self._give_up_lane(lane, "did not send its infos in time")
+            else:
+                self._turn(POLL_S)
 
     def distrust(self, lane: int, why: str) -> None:
         """What this lane's worker sent cannot be used: it is refused."""
@@ -255,8 +267,14 @@ class LockstepHub:
     def _turn(self, timeout_s: float) -> None:
         """Listen; see who has ended; say what can be said."""
         self._listen_due_s = self._clock() + LISTEN_EVERY_S
+        now = self._clock()
+        if now - self._listened_s > AWAY_S:
+            self._listening_since_s = now
         self._receive(timeout_s)
         self._shut_out()
+        self._listened_s = self._clock()
+        self.lockstep.tick(self._listened_s, self._listening_since_s)
+        self._after()
         for name, why in self.staff.poll():
             self._receive(LAST_WORDS_S)
             self.lockstep.gone(name, why)
@@ -268,46 +286,35 @@ class LockstepHub:
             for peer, message in self.link.receive():
                 match message:
                     case BadMessage():
-                        self._complain(peer, f"message from {name_of(peer)[:40]!r}: {message}")
+                        self._lid.complain(peer, f"message from {name_of(peer)[:40]!r}: {message}")
                         self._send(self.lockstep.reject(peer, str(message)))
                     case Inquire():
-                        pass  # it asks how a run is: this is none
+                        self.link.send(peer, encode(stepping_status(self.lockstep, self._clock())))
                     case _:
                         self._send(self.lockstep.receive(peer, message, self._clock()))
         self._after()
 
-    def _complain(self, peer: bytes, line: str) -> None:
-        """A line about what a peer sent, unless there was one a short while ago."""
-        if (kept_back := self._lid.due(self.link.speaker(peer), self._clock())) is not None:
-            log.warning("%s%s", line, again(kept_back))
-
     def _shut_out(self) -> None:
-        """Forget the members whose key was revoked: ZeroMQ asks about a key at the handshake alone."""
-        for peer in list(self.lockstep.members):
-            if why := self.link.why_not(peer):
-                self._send(self.lockstep.revoke(peer, why))
-                self._after()
+        for peer, why in shut_out(self.link, self.lockstep.members):
+            self._send(self.lockstep.revoke(peer, why))
+            self._after()
 
     def _after(self) -> None:
         """Tell what has happened, and let go of what is lost."""
         for event in self.lockstep.events():
             match event:
-                case Turned(worker, why):
+                case Turned(_, why):
                     self._turned_away = f"was refused: {why}"
-                    log.warning("worker %s was refused: %s", worker, why)
-                case Left(worker, why, _, on_purpose):
+                    self._lid.tell(logging.WARNING, event, describe(event))
+                case Left(_, why, _, on_purpose):
                     if on_purpose and not self._closing:
                         self._turned_away = why
-                    log.log(logging.INFO if on_purpose and self._closing else logging.WARNING, "worker %s %s", worker, why)
-                case Broke(worker, host, _, error, _):
-                    log.info("worker %s (%s): %s", worker, host, error)  # it is raised, with its traceback
-                case Joined(worker, host, pid):
-                    log.info("worker %s (%s, pid %d) joined", worker, host, pid)
-                case Told(worker):
-                    if (kept_back := self._lid.due(f"told {worker}", self._clock())) is not None:
-                        log.info("worker %s was told to join again: its session had ended%s", worker, again(kept_back))
+                    expected = on_purpose and self._closing
+                    self._lid.tell(logging.INFO if expected else logging.WARNING, event, describe(event))
+                case Broke(worker, host, _, error, _):  # it is raised, with its traceback
+                    self._lid.tell(logging.INFO, event, f"worker {worker} ({host}): {error}")
                 case _:
-                    pass
+                    self._lid.tell(logging.INFO, event, describe(event))
         for lane in [lane for lane in self._waits if self.lockstep.owner(lane) is None]:
             del self._waits[lane]
             self._take(lane)
@@ -315,7 +322,7 @@ class LockstepHub:
     def _say_wanted(self) -> None:
         for lane, make in list(self._wanted.items()):
             waited_s = self._clock() - self._wanted_since_s
-            if self.lockstep.place(lane, patient=not self.staff.empty and waited_s < PATIENCE_S):
+            if self.lockstep.place(lane, patient=not self.staff.empty and waited_s < self._patience_s):
                 del self._wanted[lane]
                 self._send(self.lockstep.order(lane, make))
 

@@ -13,15 +13,14 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from learner.events import Broke, Event, Joined, Left, Stale, Told, Turned
+from learner.events import Broke, Event, Stale
 from learner.lanes import Lane, Ticket
 from learner.ledger import Ledger
-from learner.standing import TABLE, Revoked, Rubbish, Silence, Standing
-from protocol.address import name_of
+from learner.membership import Member, Membership, Out
+from learner.standing import Rubbish, Standing
 from protocol.messages import (
-    PROTOCOL_VERSION,
     Array,
     Collect,
     Drain,
@@ -40,39 +39,23 @@ from protocol.messages import (
     Rollout,
     Stepped,
     ToLearner,
-    ToWorker,
     Weights,
-    Welcome,
 )
 from protocol.specs import RunSpec
 
-MEASURE_S = 0.5  # at least, between two accounts that a worker's speed is measured by
-STRIKES = 3  # rollouts or messages that could not be used, after which a worker is refused
-REMEMBERED_REFUSALS = 1000  # processes; who has many names must not fill the memory
+__all__ = ["STRIKES", "CollectingMember", "Out", "Roster"]
 
-Out = tuple[bytes, ToWorker]
+STRIKES = 3  # rollouts or messages that could not be used, after which a worker is refused
 
 
 @dataclass
-class Member:
-    """A worker as the learner sees it."""
+class CollectingMember(Member):
+    """A worker as the learner of a run sees it."""
 
-    peer: bytes
-    hello: Hello
-    session: int
-    order: int
-    heard_s: float
-    standing: Standing = Standing.ACTIVE
-    lanes: set[int] = field(default_factory=set)
-    tickets: dict[int, int] = field(default_factory=dict)  # ticket -> replies said when it was last said
-    replies: int = 0
     acknowledged: int = -1
     under_way: int | None = None  # version of the Weights sent and not acknowledged
     said_at: int = 0  # replies said when it was sent
     strikes: int = 0
-    heartbeat: Heartbeat | None = None
-    steps_per_s: float = 0.0
-    counted: tuple[int, float] = (0, 0.0)  # env steps that its last measured account told of, and when
 
 
 class Roster:
@@ -94,22 +77,26 @@ class Roster:
         self.run = run
         self.rollouts_per_update = rollouts_per_update
         self.max_lag = max_lag
-        self.worker_timeout_s = worker_timeout_s
         self.ledger = ledger or Ledger()
         self.version = version
-        self.members: dict[bytes, Member] = {}
+        self.worker_timeout_s = worker_timeout_s
+        self.membership = Membership(run, CollectingMember, self._lost, first_session)
         self.lanes = [Lane(n, incarnations[n] if incarnations else 0) for n in range(run.lanes)]
         self.tickets: dict[int, Ticket] = {}
         self.ready: list[Rollout] = []
         self.lives: dict[int, int] = {}
         """incarnation of the lane in which each rollout that is ready, or was taken last, was collected, by its ticket"""
-        self.events: list[Event] = []
         self._weights: Weights | None = None
-        self._next_session = first_session
-        self._joins = 0
-        self._draining: str | None = None
-        self._silent: set[str] = set()  # names of those given up for their silence, until they join again
-        self._refused: dict[bytes, tuple[int, str]] = {}  # the life that was refused, and why
+
+    @property
+    def members(self) -> dict[bytes, CollectingMember]:
+        """By routing id."""
+        return self.membership.members
+
+    @property
+    def events(self) -> list[Event]:
+        """What has happened, and nobody has taken note of."""
+        return self.membership.events
 
     # ---------------------------------------------------------------- in
 
@@ -119,15 +106,11 @@ class Roster:
             return self._hello(peer, message, now)
         if isinstance(message, Rollout):
             self.ledger.transitions_received += message.env_steps
-        member = self.members.get(peer)
-        if member is None or member.session != message.session:
+        member = self.membership.speaker(peer, message, now)
+        if member is None:
             if isinstance(message, Rollout):
                 self.ledger.transitions_late += message.env_steps
-            if not isinstance(message, Goodbye | Failure):
-                late = message.env_steps if isinstance(message, Rollout) else 0
-                self.events.append(Told(name_of(peer).decode(errors="replace")[:40], message.session, late))
-            return [(peer, Rejoin(message.session))] if not isinstance(message, Goodbye | Failure) else []
-        member.heard_s = now
+            return self.membership.stranger(peer, message)
         match message:
             case Rollout():
                 return self._rollout(member, message)
@@ -136,12 +119,12 @@ class Roster:
             case Stepped() | Returned():
                 return []  # nobody asked: a run collects rollouts
             case Goodbye(_, reason):
-                self._forget(member, Goodbye, f"left: {reason}")
+                self.membership.forget(member, Goodbye, f"left: {reason}")
                 return self._deal()
             case Failure(_, error, traceback, lane):
                 hello = member.hello
                 self.events.append(Broke(hello.worker, hello.host, lane, error, traceback))
-                self._forget(member, Failure, f"broke: {error}")
+                self.membership.forget(member, Failure, f"broke: {error}")
                 return self._deal()
 
     def reject(self, peer: bytes, rollout: Rollout | None, why: str, now: float) -> list[Out]:
@@ -160,10 +143,7 @@ class Roster:
         member.heard_s = now
         member.strikes += 1
         if member.strikes >= STRIKES:
-            self._refuse(member, why)
-            self.events.append(Turned(member.hello.worker, why))
-            self._forget(member, Rubbish, f"refused: {why}")
-            return [(peer, Refuse(why)), *self._deal()]
+            return self.membership.refuse(member, Rubbish, why) + self._deal()
         if rollout is not None and rollout.ticket in member.tickets:
             lane = self.lanes[self.tickets[rollout.ticket].lane]
             if lane.awaits(rollout.sequence):
@@ -173,30 +153,15 @@ class Roster:
 
     def gone(self, worker: str, why: str) -> list[Out]:
         """A worker's process is known to be dead: do not wait for its silence."""
-        member = next((member for member in self.members.values() if member.hello.worker == worker), None)
-        if member is None:
-            if worker in self._silent:  # given up already, and now it is known why
-                self._silent.discard(worker)
-                self.events.append(Left(worker, why, 0, False))
-            return []
-        self._forget(member, Silence, why)
-        return self._deal()
+        return self._deal() if self.membership.gone(worker, why) else []
 
     def revoke(self, peer: bytes, why: str) -> list[Out]:
         """A member may speak no more: it is told so and forgotten at once, whatever it holds."""
-        member = self.members[peer]
-        self.events.append(Turned(member.hello.worker, why))
-        self._forget(member, Revoked, f"was shut out: {why}")
-        return [(peer, Refuse(why)), *self._deal()]
+        return self.membership.revoke(peer, why) + self._deal()
 
     def tick(self, now: float) -> list[Out]:
         """Judge silence. Call it only when every message that has arrived was given to `receive`."""
-        silent = [member for member in self.members.values() if now - member.heard_s > self.worker_timeout_s]
-        why = f"silent for {self.worker_timeout_s:.0f} s"
-        for member in silent:
-            self._silent.add(member.hello.worker)
-            self._forget(member, Silence, why)
-        return self._deal() if silent else []
+        return self._deal() if self.membership.silence(now, self.worker_timeout_s) else []
 
     # ---------------------------------------------------------------- the learner's side
 
@@ -204,7 +169,7 @@ class Roster:
         """New weights: offer them to every worker, and deal the tickets that they allow."""
         self.version = version
         self._weights = Weights(version, parameters, buffers)
-        out = [out for member in self._active() for out in self._offer(member)]
+        out = [out for member in self.membership.active() for out in self._offer(member)]
         return out + self._deal()
 
     def take(self) -> list[Rollout] | None:
@@ -230,12 +195,7 @@ class Roster:
 
     def drain(self, reason: str) -> list[Out]:
         """Ask everybody to leave; no more tickets."""
-        self._draining = reason
-        out: list[Out] = []
-        for member in self._active():
-            member.standing = TABLE[member.standing][Drain]
-            out.append((member.peer, Drain(reason)))
-        return out
+        return self.membership.drain(reason)
 
     def incarnations(self) -> list[int]:
         """The next life of each lane, for a checkpoint: one that was dealt a ticket is not lived again."""
@@ -243,52 +203,11 @@ class Roster:
 
     # ---------------------------------------------------------------- inside
 
-    def _active(self) -> list[Member]:
-        return [member for member in self.members.values() if member.standing is Standing.ACTIVE]
-
     def _hello(self, peer: bytes, hello: Hello, now: float) -> list[Out]:
-        why = ""
-        if hello.protocol != PROTOCOL_VERSION:
-            why = f"protocol expected {PROTOCOL_VERSION}, got {hello.protocol}; install the learner's version of millrace"
-        elif hello.worker.encode() != name_of(peer):
-            why = f"name expected {name_of(peer)[:40]!r}, as in its routing id, got {hello.worker[:40]!r}"
-        if why:
-            self.events.append(Turned(hello.worker, why))
-            return [(peer, Refuse(why))]
-        life, why = self._refused.get(peer, (-1, ""))
-        if life == hello.life:
-            return [(peer, Refuse(why))]
-        if self._draining is not None:
-            return [(peer, Drain(self._draining))]
-        member = self.members.get(peer)
-        if member is not None:
-            same = member.hello.life == hello.life
-            if same and hello.attempt == member.hello.attempt:
-                member.heard_s = now
-                return [(peer, Welcome(member.session, hello.attempt, self.run))]
-            if same and hello.attempt < member.hello.attempt:
-                return []
-            if not same:
-                why = f"another process, on {hello.host}, joined as {hello.worker}; give each worker a name of its own"
-                self._refuse(member, why)
-            self._forget(member, Silence, "began again" if same else f"replaced by process {hello.pid}")
-        member = Member(peer, hello, self._next_session, self._joins, now)
-        self._next_session += 1
-        self._joins += 1
-        self.members[peer] = member
-        self._silent.discard(hello.worker)
-        self.events.append(Joined(hello.worker, hello.host, hello.pid))
-        welcome: list[Out] = [(peer, Welcome(member.session, hello.attempt, self.run))]
-        return welcome + self._offer(member) + self._deal()
+        welcome, member = self.membership.hello(peer, hello, now)
+        return welcome if member is None else welcome + self._offer(member) + self._deal()
 
-    def _refuse(self, member: Member, why: str) -> None:
-        """Remember that this process was refused: it must not come back."""
-        self._refused.pop(member.peer, None)
-        self._refused[member.peer] = (member.hello.life, why)
-        if len(self._refused) > REMEMBERED_REFUSALS:
-            del self._refused[next(iter(self._refused))]
-
-    def _rollout(self, member: Member, rollout: Rollout) -> list[Out]:
+    def _rollout(self, member: CollectingMember, rollout: Rollout) -> list[Out]:
         self._acknowledge(member, min(rollout.version, self.version))
         ticket = self.tickets.get(rollout.ticket)
         if ticket is None:
@@ -312,34 +231,28 @@ class Roster:
         self.lives[ticket.number] = ticket.incarnation
         return self._offer(member) + self._deal()
 
-    def _heartbeat(self, member: Member, heartbeat: Heartbeat) -> list[Out]:
+    def _heartbeat(self, member: CollectingMember, heartbeat: Heartbeat) -> list[Out]:
         """Say again what this account shows to be lost: said before a reply that the worker has seen, yet not held."""
-        member.heartbeat = heartbeat
-        steps, since_s = member.counted
-        if member.heard_s - since_s >= MEASURE_S:  # new weights make an account come early: too short a time to measure
-            member.steps_per_s = (heartbeat.steps - steps) / (member.heard_s - since_s) if since_s else 0.0
-            member.counted = heartbeat.steps, member.heard_s
+        missing = member.account(heartbeat)
         peer = member.peer
         if member.standing is Standing.DRAINING:
-            return [(peer, Drain(self._draining or ""))]
+            return [(peer, Drain(self.membership.draining or ""))]
         self._acknowledge(member, min(heartbeat.version, self.version))
         seen = min(heartbeat.replies, member.replies)
         if member.under_way is not None and seen > member.said_at:
             member.under_way = None
         out = self._offer(member)
-        held = set(heartbeat.tickets)
-        missing = [t for t, said_at in member.tickets.items() if t not in held and seen > said_at]
         out += self._collect(member, missing)
         member.replies += 1
         out.append((peer, HeartbeatReply(member.session, member.replies, self._received(member.lanes))))
         return out + self._deal()
 
-    def _acknowledge(self, member: Member, version: int) -> None:
+    def _acknowledge(self, member: CollectingMember, version: int) -> None:
         member.acknowledged = max(member.acknowledged, version)
         if member.under_way is not None and version >= member.under_way:
             member.under_way = None
 
-    def _offer(self, member: Member) -> list[Out]:
+    def _offer(self, member: CollectingMember) -> list[Out]:
         """The newest weights, unless the worker has them or older ones are still on their way."""
         newest = self._weights
         if newest is None or member.under_way is not None or member.acknowledged >= newest.version:
@@ -353,7 +266,7 @@ class Roster:
         mine = [self.lanes[number] for number in lanes]
         return tuple(Received(lane.number, lane.incarnation, lane.below, tuple(lane.ahead)) for lane in mine)
 
-    def _collect(self, member: Member, tickets: Sequence[int]) -> list[Out]:
+    def _collect(self, member: CollectingMember, tickets: Sequence[int]) -> list[Out]:
         """Collect messages for these outstanding tickets: one for each version that they were dealt under."""
         out: list[Out] = []
         for version in sorted({self.tickets[number].version for number in tickets}):
@@ -363,17 +276,14 @@ class Roster:
             out.append((member.peer, Collect(member.session, version, permits, self._received(member.lanes))))
         return out
 
-    def _forget(self, member: Member, event: type, why: str) -> None:
+    def _lost(self, member: CollectingMember, why: str) -> None:
         """The worker is gone: its tickets are lost, its lanes have no owner. `_deal` gives both to the living."""
-        member.standing = TABLE[member.standing][event]
-        del self.members[member.peer]
-        self.events.append(Left(member.hello.worker, why, len(member.tickets), event is Goodbye))
         for number in list(member.tickets):
             self._lose(member, number)
         for number in member.lanes:
             self.lanes[number].restart()
 
-    def _lose(self, member: Member, number: int) -> None:
+    def _lose(self, member: CollectingMember, number: int) -> None:
         ticket = self.tickets.pop(number)
         del member.tickets[number]
         lane = self.lanes[ticket.lane]
@@ -383,7 +293,7 @@ class Roster:
 
     def _deal(self) -> list[Out]:
         """Place lanes that have no owner, even out, and deal tickets to the least advanced lanes."""
-        if self._weights is None or self._draining is not None or not self._active():
+        if self._weights is None or self.membership.draining is not None or not self.membership.active():
             return []
         out = self._place_lanes()
         room = self.rollouts_per_update * (self.version + 1 + self.max_lag) - self.ledger.used - self.ledger.outstanding
@@ -408,7 +318,7 @@ class Roster:
         return out
 
     def _place_lanes(self) -> list[Out]:
-        active = sorted(self._active(), key=lambda member: member.order)
+        active = sorted(self.membership.active(), key=lambda member: member.order)
         for lane in self.lanes:
             lane.moving = False
             if lane.owner is None:
@@ -428,6 +338,6 @@ class Roster:
             lane.restart()
             self._give(lane, emptiest)
 
-    def _give(self, lane: Lane, member: Member) -> None:
+    def _give(self, lane: Lane, member: CollectingMember) -> None:
         lane.owner = member.peer
         member.lanes.add(lane.number)

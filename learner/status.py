@@ -1,15 +1,18 @@
-"""How the run is, for whoever asks (`millrace status`). Pure: a roster, the run's progress and `now` in, a message out."""
+"""How the run, or the vector environment, is, for whoever asks (`millrace status`). Pure: what is known in, words out."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
+from learner.lockstep import Lockstep
+from learner.membership import Member
 from learner.metrics import Progress
-from learner.roster import Member, Roster
+from learner.roster import CollectingMember, Roster
 from protocol.messages import Status, WorkerStatus
 
 
 def status(roster: Roster, progress: Progress, now: float) -> Status:
     """What the learner knows now; `progress` is that of the last update."""
-    members = sorted(roster.members.values(), key=lambda member: member.order)
     return Status(
         env=roster.run.env.id,
         version=roster.version,
@@ -19,9 +22,30 @@ def status(roster: Roster, progress: Progress, now: float) -> Status:
         return_mean=progress.return_mean,
         lag_mean=progress.lag_mean,
         lag_max=progress.lag_max,
-        workers=tuple(_worker(member, now) for member in members),
+        workers=_workers(roster.members.values(), now),
         ledger=roster.ledger.counts(),
     )
+
+
+def stepping_status(lockstep: Lockstep, now: float) -> Status:
+    """What a vector environment knows now."""
+    members = lockstep.members.values()
+    return Status(
+        env=", ".join(dict.fromkeys(env.id for env in lockstep.spec.envs)),
+        version=-1,
+        env_steps=sum(member.heartbeat.steps for member in members if member.heartbeat is not None),
+        total_steps=0,
+        steps_per_s=sum(member.steps_per_s for member in members),
+        return_mean=None,
+        lag_mean=0.0,
+        lag_max=0,
+        workers=_workers(members, now),
+        ledger={},
+    )
+
+
+def _workers(members: Iterable[Member], now: float) -> tuple[WorkerStatus, ...]:
+    return tuple(_worker(member, now) for member in sorted(members, key=lambda member: member.order))
 
 
 def _worker(member: Member, now: float) -> WorkerStatus:
@@ -35,8 +59,8 @@ def _worker(member: Member, now: float) -> WorkerStatus:
         tickets=len(member.tickets),
         steps=said.steps if said else 0,
         steps_per_s=member.steps_per_s,
-        version=member.acknowledged,
+        version=member.acknowledged if isinstance(member, CollectingMember) else -1,
         silent_s=max(0.0, now - member.heard_s),
         resident_bytes=said.resident_bytes if said else 0,
-        strikes=member.strikes,
+        strikes=member.strikes if isinstance(member, CollectingMember) else 0,
     )

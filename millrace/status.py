@@ -80,6 +80,8 @@ def shown(status: Status) -> RenderableType:
     score = "none yet" if status.return_mean is None else f"{status.return_mean:,.1f}"
     lag = f"lag {status.lag_mean:.1f} (max {status.lag_max})"
     run = f"{status.env}: {done}, {status.steps_per_s:,.0f} steps/s, return {score}, update {max(status.version, 0)}, {lag}"
+    if not status.total_steps:
+        run = f"{status.env}, a vector environment: {status.env_steps:,} env steps, {status.steps_per_s:,.0f} steps/s"
     table = Table(box=None, pad_edge=False, header_style="dim")
     rows = [_cells(worker, status.version) for worker in status.workers]
     for name in rows[0] if rows else ():

@@ -238,7 +238,7 @@ class Returned(Message, frozen=True):
 
 
 class Inquire(Message, frozen=True):
-    """How is the run? From anybody who may connect; one who asks need not be a worker."""
+    """How is the run, or the vector environment? From anybody who may connect; one who asks need not be a worker."""
 
 
 class WorkerStatus(msgspec.Struct, frozen=True):
@@ -277,7 +277,7 @@ class Status(Message, frozen=True):
     env_steps: int
     """used by updates, since the run began"""
     total_steps: int
-    """when it ends"""
+    """when it ends; 0: it is no run but a vector environment, and has neither updates nor an end"""
     steps_per_s: float
     """env steps used per second, since this learner started"""
     return_mean: float | None

@@ -15,7 +15,8 @@ import pytest
 import zmq
 
 from learner.hub import Hub
-from learner.roster import REMEMBERED_REFUSALS, Roster
+from learner.membership import REMEMBERED_REFUSALS
+from learner.roster import Roster
 from protocol.address import name_of
 from protocol.codec import encode
 from protocol.errors import BadMessage, RunError, UsageError
@@ -650,7 +651,7 @@ def test_who_comes_under_ever_new_names_does_not_fill_the_memory() -> None:
             learner.reject(peer, None, "rubbish", 0.0)
     logging.disable(logging.NOTSET)
     assert not learner.members
-    assert len(learner._refused) == REMEMBERED_REFUSALS
+    assert len(learner.membership._refused) == REMEMBERED_REFUSALS
     assert isinstance(learner.receive(peer, hello(f"w{number}", number), 0.0)[0][1], Refuse), "it came back"
 
 

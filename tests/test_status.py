@@ -15,8 +15,8 @@ import zmq
 from rich.console import Console
 
 from learner.event_log import JsonLines, progress_line
-from learner.events import Event, Left, Stale, Told
-from learner.hub import Hub, describe
+from learner.events import Event, Left, Stale, Told, describe
+from learner.hub import Hub
 from learner.metrics import Progress
 from learner.status import status
 from millrace.status import ask, observer_name, shown

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import logging
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
@@ -14,10 +16,13 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.wrappers import vector as wrappers
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rich.console import Console
 
 import millrace
 from learner.vector_env import ZmqVectorEnv
+from millrace.status import ask, observer_name, shown
 from protocol.errors import EnvironmentFailed, UsageError
+from protocol.link import WorkerLink
 from tests.alike import alike
 
 MODES = tuple(AutoresetMode)
@@ -197,6 +202,26 @@ def test_infos_too_long_for_shared_memory_travel_as_a_message() -> None:
     with both("workers.envs.toy:Informs-v0", 2, AutoresetMode.NEXT_STEP, "shared", wordy=1_000_000) as (ours, theirs):
         play(ours, theirs, 5, AutoresetMode.NEXT_STEP)
         assert len(ours.step(ours.action_space.sample())[4]["word"][0]) > 1_000_000
+
+
+def test_whoever_asks_how_it_is_is_answered_while_it_steps() -> None:
+    zeros = np.zeros(3, np.int64)
+    with millrace.make_vec("CartPole-v1", 3, workers=2) as env, ThreadPoolExecutor(1) as pool:
+        env.reset(seed=1)
+        link = WorkerLink(env._hub.link.address, observer_name())
+        asked = pool.submit(ask, link, 20.0)
+        while not asked.done():
+            env.step(zeros)
+        link.close(0)
+        status = asked.result()
+    assert (status.env, status.total_steps) == ("CartPole-v1", 0)
+    assert [(worker.worker, worker.lanes) for worker in sorted(status.workers, key=lambda one: one.worker)] == [
+        ("w0", (0,)),
+        ("w1", (1,)),
+    ]
+    console = Console(width=120, file=io.StringIO(), record=True)
+    console.print(shown(status))
+    assert "CartPole-v1, a vector environment: " in console.export_text()
 
 
 @pytest.mark.parametrize(

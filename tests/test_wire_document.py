@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from learner import roster, standing
+from learner import membership, roster, standing
 from protocol import codec, handshake, link, messages, rollout, specs
 from protocol.messages import PROTOCOL_VERSION, Collect, Permit, Received, Rollout, ToLearner, ToWorker, Weights
 from workers import session, states
@@ -87,7 +87,7 @@ LIMITS: Mapping[tuple[ModuleType, str], str] = {
     (session, "HELLO_MOST_S"): "seconds between two Hello at most",
     (session, "REMEMBERED_TICKETS"): "finished tickets of a lane that a worker remembers, to know a late repeat",
     (roster, "STRIKES"): "messages or rollouts that cannot be used, after which a worker is refused",
-    (roster, "REMEMBERED_REFUSALS"): "refused processes that the learner remembers, so that they do not come back",
+    (membership, "REMEMBERED_REFUSALS"): "refused processes that the learner remembers, so that they do not come back",
     (handshake, "HANDSHAKE_MS"): "milliseconds that a connection may take to say who it is",
     (link, "LINGER_MS"): "milliseconds for which a closing side still sends what is queued",
 }
