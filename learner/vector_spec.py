@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -36,6 +37,7 @@ def describe(
     autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
     render_mode: str | None = None,
     kwargs: dict[str, Scalar] | None = None,
+    learner_timeout_s: float = math.inf,
 ) -> Described:
     """From one environment and how many copies, or a list with one for each copy. Raises `UsageError` in one line."""
     listed = [env] * (1 if num_envs is None else num_envs) if isinstance(env, str) or callable(env) else list(env)
@@ -57,6 +59,7 @@ def describe(
             action=_actions(copy.action_space),
             autoreset=_mode(autoreset_mode),
             render_mode=render_mode,
+            learner_timeout_s=learner_timeout_s,
         )
         metadata = {**copy.metadata, "autoreset_mode": AutoresetMode(step.autoreset)}
         spec = copy.spec if len(different) == 1 and different[0].factory is None else None

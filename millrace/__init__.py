@@ -78,9 +78,12 @@ def make_vec(
     `advertise` are as in `millrace learner`: an address that other machines can reach needs keys, which are made by
     themselves, and a callable goes over TCP with keys only.
 
-    Whoever does not answer within `timeout` seconds is given up. The copies of a worker that is lost come back truncated, on
-    another or a new one, and the info says `worker_lost`; or, with `on_worker_loss="raise"`, `WorkerLost` is raised. What an
-    environment raises is raised here, with the worker's traceback. Raises `OurError`.
+    Whoever does not answer within `timeout` seconds is given up; a worker elsewhere that gives no sign of life for 5 s while
+    it is waited for, at once (a long step is no silence, unless it keeps Python's lock all the while). Between two calls you
+    may think as long as you like: workers of this machine wait as long as this process lives, those elsewhere for ten
+    minutes, after which they join anew, and their copies are lost. The copies of a worker that is lost come back truncated,
+    on another or a new one, and the info says `worker_lost`; or, with `on_worker_loss="raise"`, `WorkerLost` is raised. What
+    an environment raises is raised here, with the worker's traceback. Raises `OurError`.
     """
     from learner.listening import Bind
     from millrace.launch import vector

@@ -24,7 +24,9 @@ class Code(Enum):
     """How much code a learner may have a worker run, by how sure the worker is of who the learner is."""
 
     REGISTERED = 0
-    """environments that are registered where the worker runs, by their ids alone: anybody may have answered"""
+    """environments that are registered where the worker runs, by their ids alone, and of their attributes those whose names
+    do not begin with an underscore: anybody may have answered
+    """
     MODULES = 1
     """also `module:EnvId`, which imports the module: somebody on this machine has answered"""
     CALLABLES = 2
@@ -247,7 +249,9 @@ class StepSpec(msgspec.Struct, frozen=True, tag=True):
     """passed on to each copy"""
     heartbeat_s: float = 1.0
     learner_timeout_s: float = 600.0
-    """a worker that heard nothing of the learner for so long starts again with Hello; it may do much between two steps"""
+    """a worker that heard nothing of the learner for so long starts again with Hello. The caller may do much between two
+    steps, and nobody listens then; workers that end with the learner's process wait for ever (infinity)
+    """
 
     def first(self, lane: int) -> int:
         """Number of the lane's first copy."""

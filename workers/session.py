@@ -213,6 +213,12 @@ class Session:
         assert self.run is not None
         if now - self._heard_s > self.run.learner_timeout_s:
             return self._rejoin(Silence(), f"the learner was silent for {self.run.learner_timeout_s:.0f} s", now)
+        return self.breathe(now)
+
+    def breathe(self, now: float) -> list[Effect]:
+        """A Heartbeat, if one is due; nothing else comes of it, so that it may be said in the middle of anything."""
+        if self.run is None or self.state not in (State.READY, State.DRAINING):
+            return []
         if now < self._due_s and self._stay.said_version == self._stay.version:
             return []
         self._due_s = now + self.run.heartbeat_s

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from protocol.errors import OurError
+from protocol.errors import OurError, UsageError
 from protocol.messages import Answer, Array, Call, Order, Reset, Returned, Step, Stepped
 from protocol.plain import pack, unpack
 from protocol.shared import MESSAGE, Bell, Handed, Memory, spin
@@ -30,12 +30,13 @@ MAX_TRACEBACK = 20_000  # characters
 class Stepper:
     """Env copies, lane by lane, made when their first order comes."""
 
-    def __init__(self, spec: StepSpec, handed: Handed | None = None) -> None:
+    def __init__(self, spec: StepSpec, handed: Handed | None = None, *, private: bool = True) -> None:
+        """`handed`: shared memory and bells; `private`: a Call may reach names that begin with an underscore."""
         self.steps = 0
         """env steps made"""
         self.stages = {"open": 0.0, "step": 0.0}
         """seconds spent making and resetting copies, and stepping them"""
-        self._spec = spec
+        self._spec, self._private = spec, private
         self._lanes: dict[int, SteppedLane] = {}
         self._seen: dict[int, int] = {}  # lane -> the newest order through shared memory that is obeyed
         self._memory = None if handed is None else Memory(spec, handed.memory)
@@ -54,7 +55,7 @@ class Stepper:
                 case Step():
                     infos = self._step(lane, order.actions, pulse)
                 case Call():
-                    return _call(order, lane)
+                    return _call(order, lane, self._private)
         except CopyRaised as error:
             self.close([order.lane])
             raise environment_raised(order.lane, error.doing, error) from error
@@ -173,11 +174,16 @@ def _stepped(order: Reset | Step, rows: Rows, infos: bytes) -> Stepped:
     )
 
 
-def _call(order: Call, lane: SteppedLane) -> Returned:
+def _call(order: Call, lane: SteppedLane, private: bool) -> Returned:
     """What the attribute gave, or the exception that it raised: that is an answer, too."""
     results: list[Any] = []
     error = detail = ""
     try:
+        if order.name.startswith("_") and not private:
+            raise UsageError(
+                f"{order.name[:40]!r} begins with an underscore: this worker opens nothing private to a learner that it "
+                "cannot be sure of; give it a token (and not --no-code)"
+            )
         given = unpack(order.given.data)
         if order.assign:
             lane.assign(order.copies, order.name, given)

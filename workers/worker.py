@@ -1,7 +1,8 @@
 """The shell round a session: link + session + collector or stepper + signals. All decisions are the session's.
 
 The law: the inbox is emptied before a rollout starts, and looked into between env steps, so a worker answers while it
-collects and acts under the newest weights it holds. Whatever the environment does, the learner is told.
+collects and acts under the newest weights it holds. Whatever the environment does, the learner is told. In the lock-step of
+a vector environment, whose steps may take as long as the caller allows, a second thread says that this worker lives.
 """
 
 from __future__ import annotations
@@ -19,10 +20,11 @@ from pathlib import Path
 from protocol.codec import encode
 from protocol.errors import BadMessage, OurError
 from protocol.link import WorkerLink
-from protocol.messages import Order, Weights
+from protocol.messages import Order, Stepped, Weights
 from protocol.policy import make_policy
 from protocol.shared import Handed
 from protocol.specs import Code, RunSpec, StepSpec
+from workers.breath import Breath
 from workers.collector import Collector
 from workers.lane import EnvironmentBroke
 from workers.session import Begin, Close, Effect, Identity, Leave, Say, Session, Task
@@ -69,6 +71,7 @@ class Worker:
         self._loaded: Weights | None = None
         self._pulse_due_s = 0.0
         self._left: Leave | None = None
+        self._breath = Breath(lambda: self._do(self._session.breathe(self._clock())))
         self._waited_s = 0.0
 
     def run(self) -> Leave:
@@ -86,6 +89,7 @@ class Worker:
                     self._obey(order)
                     self._listen(0.0)
         finally:
+            self._breath.stop()
             self._close_all()
             self._link.close()
         return self._left
@@ -133,7 +137,8 @@ class Worker:
         stepper = self._stepper
         assert stepper is not None
         try:
-            answer = stepper.obey(order, lambda: self._pulse(order.session))
+            with self._breath.away():
+                answer = stepper.obey(order, lambda: self._pulse_back(order.session))
         except _Abandoned:
             return
         except Exception as error:
@@ -149,9 +154,8 @@ class Worker:
         rung = False
         began_s, stepped_s = self._clock(), stepper.stages["step"]
         try:
-            rung = stepper.serve(
-                min(timeout_s, PULSE_S), lambda: self._pulse(session), session, lambda answer: self._do([Say(answer)])
-            )
+            with self._breath.away():
+                rung = stepper.serve(min(timeout_s, PULSE_S), lambda: self._pulse_back(session), session, self._say_back)
         except _Abandoned:
             pass
         except Exception as error:
@@ -170,6 +174,16 @@ class Worker:
             self._do(self._session.tick(now))
             if self._session.abandoned(session):
                 raise _Abandoned
+
+    def _pulse_back(self, session: int) -> None:
+        """The same, out of the midst of orders."""
+        if self._clock() >= self._pulse_due_s:
+            with self._breath.back():
+                self._pulse(session)
+
+    def _say_back(self, answer: Stepped) -> None:
+        with self._breath.back():
+            self._do([Say(answer)])
 
     def _broke(self, error: Exception) -> None:
         """The environment's code raised, or ours on its data: the learner must hear of either."""
@@ -209,7 +223,8 @@ class Worker:
                 case RunSpec():
                     self._collector = Collector(run, make_policy(run.policy))
                 case StepSpec():
-                    self._stepper = Stepper(run, self._handed)
+                    self._stepper = Stepper(run, self._handed, private=self._code is not Code.REGISTERED)
+                    self._breath.start()
             self._loaded = None
         except (OurError, ImportError, ValueError) as error:
             self._do(self._session.broke(_line(error), traceback.format_exc(), None))

@@ -6,6 +6,7 @@ The law: whatever happens, no worker, socket file or folder of ours is left behi
 from __future__ import annotations
 
 import logging
+import math
 import os
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -33,6 +34,8 @@ log = logging.getLogger("millrace.learner")
 
 CLOSE_S = 5.0  # for workers to leave; then they are killed
 JOIN_S = 60.0
+WORKER_TIMEOUT_S = 5.0  # a worker elsewhere that is silent for so long, while it is listened to, is given up
+THINK_S = 600.0  # between two steps, at most: then workers elsewhere take it that the learner is gone
 STEP_TIMEOUT_LEAST_S, STEP_TIMEOUT_MOST_S = 60.0, 1e6
 
 
@@ -57,7 +60,9 @@ def make_vec(
     if where.bind and workers:
         raise UsageError(f"workers expected 0 with a bind address, for they are started elsewhere, got {workers}")
     count = 0 if where.bind else min(workers if workers is not None else (os.cpu_count() or 1), copies)
-    described = describe(env, num_envs, lanes or max(count, 1), autoreset_mode, render_mode, kwargs)
+    # Workers of ours end with this process, and their ends are known at once: neither side judges the other's silence.
+    think_s, worker_timeout_s = (THINK_S, WORKER_TIMEOUT_S) if where.bind else (math.inf, math.inf)
+    described = describe(env, num_envs, lanes or max(count, 1), autoreset_mode, render_mode, kwargs, think_s)
     with ExitStack() as stack:
         address = where.bind or own_address(transport, stack)
         keyring, token = _keys(where, transport)
@@ -74,7 +79,12 @@ def make_vec(
         start = _starter(transport, link.address, token, context, shared, _step_timeout_s(timeout_s))
         host = Host(start, count) if count else None
         hub = LockstepHub(
-            link, described.step, first_session=int.from_bytes(os.urandom(6), "little"), staff=host, shared=shared
+            link,
+            described.step,
+            first_session=int.from_bytes(os.urandom(6), "little"),
+            staff=host,
+            shared=shared,
+            worker_timeout_s=worker_timeout_s,
         )
         stack.callback(hub.close, CLOSE_S)
         if host is None:

@@ -22,6 +22,7 @@ from gymnasium.vector import AutoresetMode
 import millrace
 from learner.vector_env import ZmqVectorEnv
 from learner.vector_spec import Env
+from millrace.launch import vector
 from protocol.errors import EnvironmentFailed, NoWorkers, OurError, WorkerLost
 from protocol.key_folder import KeyFolder
 from tests.system.processes import free_port
@@ -78,6 +79,19 @@ def test_a_worker_killed_between_steps_comes_back_truncated(shared: bool) -> Non
     assert "worker_lost" not in infos
     assert (np.abs(obs[2:]) <= 0.05).all()
     assert env.step(ZEROS)[1].tolist() == [1.0] * 4
+    closed_cleanly(env)
+
+
+def test_infos_too_long_for_shared_memory_do_not_hide_a_lost_lane() -> None:
+    env = made("workers.envs.toy:Informs-v0", wordy=1_000_000)
+    env.reset(seed=1)
+    action = env.action_space.sample()
+    assert "worker_lost" not in env.step(action)[4]
+    workers_here()[1].kill()
+    infos = env.step(action)[4]
+    assert infos["worker_lost"].tolist() == [False, False, True, True]
+    assert [len(word or "") > 1_000_000 for word in infos["word"]] == [True, True, False, False]
+    assert "worker_lost" not in env.step(action)[4]
     closed_cleanly(env)
 
 
@@ -338,6 +352,34 @@ def test_under_keys_a_callable_travels_and_a_revoked_key_is_a_lost_worker(elsewh
         assert not env.step(ZEROS)[3].any()
     assert [process.wait(10) for process in elsewhere.started] == [0, 2]
     assert "revoked" in elsewhere.said()
+
+
+def test_a_worker_elsewhere_that_falls_silent_is_given_up_long_before_the_deadline(elsewhere: Elsewhere) -> None:
+    for name in ("a", "b"):
+        elsewhere.start(name)
+    with made(workers=None, lanes=2, bind=elsewhere.address, timeout=60.0) as env:
+        env.reset(seed=1)
+        assert env.step(ZEROS)[1].tolist() == [1.0] * 4
+        elsewhere.started[1].send_signal(signal.SIGSTOP)
+        began = time.monotonic()
+        row = env.step(ZEROS)
+        assert 4.0 < time.monotonic() - began < 15.0
+        assert row[4]["worker_lost"].tolist() == [False, False, True, True]
+        assert not env.step(ZEROS)[3].any()
+        elsewhere.started[1].send_signal(signal.SIGCONT)
+        assert env.reset(seed=1)[0].shape == (4, 4)
+
+
+def test_a_slow_step_is_no_silence(elsewhere: Elsewhere, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor is a caller that thinks for longer than a worker may be silent."""
+    monkeypatch.setattr(vector, "WORKER_TIMEOUT_S", 2.0)
+    elsewhere.start("a")
+    with millrace.make_vec("workers.envs.toy:Slow-v0", 1, bind=elsewhere.address, seconds=5.0, timeout=60.0) as env:
+        env.reset(seed=1)
+        assert "worker_lost" not in env.step(np.zeros(1, np.int64))[4]
+        time.sleep(4.0)
+        assert env.call("has_wrapper_attr", "step") == (True,)
+        assert "worker_lost" not in env.step(np.zeros(1, np.int64))[4]
 
 
 def test_one_without_a_token_is_not_let_in(elsewhere: Elsewhere, tmp_path: Path) -> None:
