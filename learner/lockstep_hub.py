@@ -34,6 +34,7 @@ LISTEN_EVERY_S = 0.5  # heartbeats are answered so often while steps go through 
 AWAY_S = 1.0  # a caller that has not listened for longer was busy: what was said meanwhile may still be on its way
 PATIENCE_S = 10.0  # a lost lane waits so long for its worker's successor, and no longer than half its time: then it moves in
 # with another lane
+BUSY_S = 1.0  # of closing, for a step under way: it may hang, and nobody waits for what it gives
 LAST_WORDS_S = 0.1  # what a process said before it ended may still be on its way
 
 
@@ -228,16 +229,16 @@ class LockstepHub:
     def close(self, timeout_s: float) -> None:
         """Ask everybody to leave, wait a moment for their Goodbye, and end those that are ours."""
         self._closing = True
-        deadline_s = self._clock() + timeout_s
         busy = bool(self._under_way or self.lockstep.orders)
+        deadline_s = self._clock() + (min(BUSY_S, timeout_s) if busy else timeout_s)
         self._send(self.lockstep.membership.drain("the vector environment was closed"))
         for bell, _ in self._shared.bells.values() if self._shared is not None else ():
             bell.ring(MESSAGE)
-        while self.lockstep.members and self._clock() < deadline_s and not busy:
+        while self.lockstep.members and self._clock() < deadline_s:
             self._receive(POLL_S)
             for name, why in self.staff.poll():
                 self.lockstep.gone(name, why)
-        self.staff.stop(0.0 if busy else max(0.0, deadline_s - self._clock()))
+        self.staff.stop(max(0.0, deadline_s - self._clock()))
 
     # ---------------------------------------------------------------- inside
 

@@ -93,6 +93,8 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._check_idle("reset")
         seeds = self._seeds_of(seed)
         mask, options = self._mask_of(options)
+        if not self._began and not mask.all():
+            raise UsageError("reset of some copies before the first reset of all: call reset() without reset_mask first")
         chosen = {lane: [n for n in range(self._spec.lanes[lane]) if mask[self._firsts[lane] + n]] for lane in self._lanes}
         if mask.all():
             self._hub.renew()

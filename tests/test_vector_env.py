@@ -7,6 +7,7 @@ import logging
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
+from copy import deepcopy
 from typing import Any
 
 import gymnasium
@@ -274,30 +275,37 @@ def test_the_order_of_calls_is_gymnasiums() -> None:
         env.reset()
 
 
+seeds = st.none() | st.integers(0, 9) | st.lists(st.none() | st.integers(0, 9), min_size=3, max_size=3)
+options = st.none() | st.dictionaries(st.sampled_from(["why", "how"]), st.text(max_size=3) | st.integers(-3, 3), max_size=2)
+masks = st.lists(st.booleans(), min_size=3, max_size=3).filter(any)
 calls = st.lists(
     st.one_of(
         st.tuples(st.just("step"), st.integers(1, 4)),
-        st.tuples(st.just("reset"), st.none() | st.integers(0, 9)),
-        st.tuples(st.just("mask"), st.integers(1, 7)),
-        st.tuples(st.just("call"), st.text(max_size=3)),
-        st.tuples(st.just("set"), st.integers(-3, 3)),
+        st.tuples(st.just("step_async"), st.none()),
+        st.tuples(st.just("reset"), st.tuples(seeds, options)),
+        st.tuples(st.just("mask"), st.tuples(seeds, options, masks)),
+        st.tuples(st.just("call"), st.tuples(st.text(max_size=3), st.integers(0, 2))),
+        st.tuples(st.just("set_attr"), st.integers(-3, 3) | st.lists(st.integers(-3, 3), min_size=3, max_size=3)),
+        st.tuples(st.just("get_attr"), st.sampled_from(["level", "np_random_seed", "metadata"])),
+        st.tuples(st.just("render"), st.none()),
     ),
-    max_size=12,
+    max_size=15,
 )
 
 
 def test_any_sequence_of_calls_gives_the_same() -> None:
+    """Through shared memory and by messages, in each mode: whatever comes back is compared, after every call."""
     with ExitStack() as stack:
-        ways = ("shared", "ipc", "shared")
         pairs = {
-            mode: stack.enter_context(both("workers.envs.toy:Informs-v0", 3, mode, way))
-            for mode, way in zip(MODES, ways, strict=True)
+            (mode, way): stack.enter_context(both("workers.envs.toy:Informs-v0", 3, mode, way))
+            for mode in MODES
+            for way in ("shared", "inproc")
         }
 
-        @settings(max_examples=40, deadline=None)
-        @given(st.sampled_from(MODES), st.integers(0, 1000), calls)
-        def any_sequence(mode: AutoresetMode, seed: int, sequence: list[tuple[str, Any]]) -> None:
-            play_sequence(*pairs[mode], mode, seed, sequence)
+        @settings(max_examples=120, deadline=None)
+        @given(st.sampled_from(sorted(pairs, key=str)), st.integers(0, 1000), calls)
+        def any_sequence(pair: tuple[AutoresetMode, str], seed: int, sequence: list[tuple[str, Any]]) -> None:
+            play_sequence(*pairs[pair], pair[0], seed, sequence)
 
         any_sequence()
 
@@ -305,33 +313,41 @@ def test_any_sequence_of_calls_gives_the_same() -> None:
 def play_sequence(
     ours: ZmqVectorEnv, theirs: SyncVectorEnv[Any, Any], mode: AutoresetMode, seed: int, sequence: list[tuple[str, Any]]
 ) -> None:
+    def same(name: str, *args: Any, **keywords: Any) -> Any:
+        mine, wanted = (getattr(env, name)(*args, **deepcopy(keywords)) for env in (ours, theirs))
+        assert alike(mine, wanted), f"{name}: {mine} is not {wanted}"
+        return wanted
+
     theirs.action_space.seed(seed)
-    assert alike(ours.reset(seed=seed), theirs.reset(seed=seed))
+    same("reset", seed=seed)
+    same("set_attr", "level", 1)
     ended = np.zeros(3, bool)
     for kind, value in sequence:
         match kind:
-            case "step":
-                for _ in range(value):
+            case "step" | "step_async":
+                for _ in range(value or 1):
                     if mode is AutoresetMode.DISABLED and ended.any():
-                        options = [{"reset_mask": ended.copy(), "why": "ended"} for _ in range(2)]
-                        assert alike(ours.reset(options=options[0]), theirs.reset(options=options[1]))
+                        same("reset", options={"reset_mask": ended, "why": "ended"})
                     action = theirs.action_space.sample()
-                    mine, wanted = ours.step(action), theirs.step(action)
-                    assert alike(mine, wanted)
+                    if kind == "step_async":
+                        ours.step_async(action)
+                        mine, wanted = ours.step_wait(), theirs.step(action)
+                        assert alike(mine, wanted), f"{mine} is not {wanted}"
+                    else:
+                        wanted = same("step", action)
                     ended = wanted[2] | wanted[3]
             case "reset":
-                seeds = None if value is None else [value, None, value + 1]
-                if seeds is None or None not in seeds:
-                    assert alike(ours.reset(seed=seeds), theirs.reset(seed=seeds))
-                    ended[:] = False
+                same("reset", seed=value[0], options=value[1])
+                ended[:] = False
             case "mask":
-                mask = np.array([value & 1, value & 2, value & 4], bool)
-                options = [{"reset_mask": mask.copy()} for _ in range(2)]
-                assert alike(ours.reset(seed=value, options=options[0]), theirs.reset(seed=value, options=options[1]))
-                ended &= ~mask
+                given, told, chosen = value
+                same("reset", seed=given, options={"reset_mask": np.array(chosen), **(told or {})})
+                ended &= ~np.array(chosen)
             case "call":
-                assert ours.call("shout", value) == theirs.call("shout", value)
-            case "set":
-                ours.set_attr("level", value)
-                theirs.set_attr("level", value)
-                assert ours.get_attr("level") == theirs.get_attr("level")
+                same("call", "shout", value[0], times=value[1])
+            case "set_attr":
+                same("set_attr", "level", value)
+            case "get_attr":
+                same("get_attr", value)
+            case "render":
+                same("render")

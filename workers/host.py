@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -138,7 +139,8 @@ class Thread:
     def _run(self, address: str, name: str, context: zmq.Context[Any]) -> None:
         session = Session(identity(name), time.monotonic())
         link = WorkerLink(address, name, context)
-        self._left = Worker(link, session, told_to_stop=lambda: self._stops, code=Code.CALLABLES).run()
+        with suppress(zmq.ContextTerminated):  # it could not be killed when all others were
+            self._left = Worker(link, session, told_to_stop=lambda: self._stops, code=Code.CALLABLES).run()
 
     def ended(self) -> tuple[int, str] | None:
         """Exit code and reason, as a process would have."""

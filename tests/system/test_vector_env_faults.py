@@ -374,10 +374,10 @@ def test_a_slow_step_is_no_silence(elsewhere: Elsewhere, monkeypatch: pytest.Mon
     """Nor is a caller that thinks for longer than a worker may be silent."""
     monkeypatch.setattr(vector, "WORKER_TIMEOUT_S", 2.0)
     elsewhere.start("a")
-    with millrace.make_vec("workers.envs.toy:Slow-v0", 1, bind=elsewhere.address, seconds=5.0, timeout=60.0) as env:
+    with millrace.make_vec("workers.envs.toy:Slow-v0", 1, bind=elsewhere.address, seconds=3.0, timeout=60.0) as env:
         env.reset(seed=1)
         assert "worker_lost" not in env.step(np.zeros(1, np.int64))[4]
-        time.sleep(4.0)
+        time.sleep(3.0)
         assert env.call("has_wrapper_attr", "step") == (True,)
         assert "worker_lost" not in env.step(np.zeros(1, np.int64))[4]
 
