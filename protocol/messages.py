@@ -208,6 +208,7 @@ class Stepped(Message, frozen=True):
 
     session: int
     ticket: int
+    """of the order; below 0: a step through shared memory, whose infos were too long to be laid there"""
     lane: int
     incarnation: int
     obs: tuple[Array, ...]
