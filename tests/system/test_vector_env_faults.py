@@ -324,6 +324,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Elsew
     elsewhere = Elsewhere(tmp_path)
     yield elsewhere
     for process in elsewhere.started:
+        process.send_signal(signal.SIGCONT)  # one that a failed test left stopped
         process.terminate()
     for process in elsewhere.started:
         process.wait(10)
