@@ -29,8 +29,8 @@ from prometheus_client.registry import Collector
 
 from learner.config import Config
 from learner.hub import Hub
+from learner.membership import Member
 from learner.metrics import Progress
-from learner.roster import Member
 from learner.standing import Standing
 from learner.versions import versions
 from protocol.address import WILDCARDS, is_local
