@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import Any
+from unittest.mock import patch
 
 import msgspec
 import numpy as np
@@ -13,7 +14,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from learner.algorithms import ALGORITHMS
+from learner.algorithms import ALGORITHMS, layers
 from learner.algorithms.actor_critic import Minibatch
 from learner.algorithms.fused import FusedActorCritic, applies
 from learner.algorithms.ppo import PPO
@@ -55,14 +56,26 @@ def make(spec: PolicySpec, seed: int) -> tuple[ActorCritic, FusedActorCritic]:
     st.lists(st.integers(1, 9), max_size=3),
     st.booleans(),
     st.integers(1, 40),
+    st.sampled_from([512, 7, 1]),
+    st.booleans(),
     st.integers(0, 2**32),
 )
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=300, deadline=None)
 def test_outputs_and_gradients_are_autograds(
-    action: str, activation: Any, net: list[int], shared_net: bool, rows: int, seed: int
+    action: str, activation: Any, net: list[int], shared_net: bool, rows: int, piece: int, by_torch: bool, seed: int
 ) -> None:
+    with patch.multiple(layers, PIECE=piece, LARGE=0 if by_torch else layers.LARGE):
+        outputs_and_gradients(PolicySpec(BOX, ACTIONS[action], tuple(net), activation, shared_net=shared_net), rows, seed)
+
+
+@pytest.mark.parametrize("rows", [64, 129, 513, 2048])
+@pytest.mark.parametrize("shared_net", [False, True])
+def test_so_they_are_at_the_sizes_that_are_used(rows: int, shared_net: bool) -> None:
+    outputs_and_gradients(PolicySpec(BOX, ACTIONS["discrete"], (64, 64), shared_net=shared_net), rows, 0)
+
+
+def outputs_and_gradients(spec: PolicySpec, rows: int, seed: int) -> None:
     generator = np.random.default_rng(seed)
-    spec = PolicySpec(BOX, ACTIONS[action], tuple(net), activation, shared_net=shared_net)
     with_graph, fused = make(spec, seed)
     x, taken = generator.normal(size=(rows, 4)).astype(np.float32), some_actions(spec.action, rows, generator)
     params, value = with_graph.forward(torch.tensor(x))
@@ -84,8 +97,13 @@ def test_outputs_and_gradients_are_autograds(
 @pytest.mark.parametrize("action", sorted(ACTIONS))
 @pytest.mark.parametrize("activation", ["tanh", "relu"])
 @pytest.mark.parametrize("shared_net", [False, True])
-def test_the_gradient_is_the_slope_in_float64(action: str, activation: Any, shared_net: bool) -> None:
+@pytest.mark.parametrize(("piece", "large"), [(512, layers.LARGE), (4, 0)])
+def test_the_gradient_is_the_slope_in_float64(
+    action: str, activation: Any, shared_net: bool, piece: int, large: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Central differences of a weighted sum of all outputs, by every parameter."""
+    monkeypatch.setattr(layers, "PIECE", piece)
+    monkeypatch.setattr(layers, "LARGE", large)
     generator = np.random.default_rng(3)
     spec = PolicySpec(BOX, ACTIONS[action], (5, 3), activation, shared_net=shared_net)
     flat = generator.normal(0, 0.5, sum(map(size, layout(spec))))
@@ -163,10 +181,12 @@ def test_a_thousand_steps_stay_together() -> None:
         (shared(GAUSSIAN), True),
         (IMAGE, False),
         (recurrent(DISCRETE, "gru"), False),
-        (msgspec.structs.replace(DISCRETE, head="q"), False),
+        (msgspec.structs.replace(DISCRETE, head="q"), True),
+        (msgspec.structs.replace(DISCRETE, net=(64, 256)), True),
+        (msgspec.structs.replace(DISCRETE, net=(64, 257)), False),
     ],
 )
-def test_it_is_for_layers_and_nothing_else(spec: PolicySpec, expected: bool) -> None:
+def test_it_is_for_small_layers_and_nothing_else(spec: PolicySpec, expected: bool) -> None:
     assert applies(spec) == expected
 
 

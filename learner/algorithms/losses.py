@@ -24,6 +24,16 @@ def _of(array: object) -> Any:
     return np if isinstance(array, np.ndarray) else torch
 
 
+def _mean(array: A) -> Any:
+    """Of [B]; numpy's own is several times slower where there are few."""
+    return array.sum() / len(array)
+
+
+def _clip(array: A, low: float, high: float) -> A:
+    found: A = np.minimum(np.maximum(array, low), high) if isinstance(array, np.ndarray) else array.clamp(low, high)
+    return found
+
+
 def ratio(log_prob: A, before: A) -> tuple[A, A]:
     """Log ρ and ρ = π(a) / π_old(a), [B] each."""
     log_ratio = log_prob - before
@@ -34,8 +44,9 @@ def standardized(advantage: A) -> A:
     """Advantages [B] less their mean, over their standard deviation; a single row has none and stays as it is."""
     if len(advantage) < 2:
         return advantage
-    std = advantage.std(ddof=1) if isinstance(advantage, np.ndarray) else advantage.std()
-    found: A = (advantage - advantage.mean()) / (std + 1e-8)
+    centred = advantage - _mean(advantage)
+    std = ((centred @ centred) / (len(centred) - 1)) ** 0.5
+    found: A = centred / (std + 1e-8)
     return found
 
 
@@ -44,20 +55,19 @@ def clipped_surrogate(ratio: A, advantage: A, clip_range: float) -> tuple[A, A]:
 
     L = −E[min(ρ A, clip(ρ, 1−ε, 1+ε) A)],  ρ = π(a) / π_old(a);    ∂L/∂log π(a) = −ρ A / B where ρ A is the lesser
     """
-    xp = _of(ratio)
-    plain, clipped = ratio * advantage, xp.clip(ratio, 1 - clip_range, 1 + clip_range) * advantage
-    return -xp.minimum(plain, clipped).mean(), plain * (plain <= clipped) / -len(ratio)
+    plain, clipped = ratio * advantage, _clip(ratio, 1 - clip_range, 1 + clip_range) * advantage
+    return -_mean(_of(ratio).minimum(plain, clipped)), plain * (plain <= clipped) / -len(ratio)
 
 
 def policy_gradient(log_prob: A, advantage: A) -> tuple[A, A]:
     """L = −E[A log π(a)] (Sutton et al. 1999), and its gradient [B] by log π(a)."""
-    return -(log_prob * advantage).mean(), advantage / -len(advantage)
+    return (log_prob @ advantage) / -len(advantage), advantage / -len(advantage)
 
 
 def value_loss(value: A, target: A) -> tuple[A, A]:
     """Mean squared error (as Stable-Baselines3 has it, without the half that others put before it), and its gradient [B]."""
     error = value - target
-    return (error * error).mean(), error * (2 / len(error))
+    return (error @ error) / len(error), error * (2 / len(error))
 
 
 def clipped_value_loss(value: A, target: A, before: A, clip_range: float) -> tuple[A, A]:
@@ -68,25 +78,25 @@ def clipped_value_loss(value: A, target: A, before: A, clip_range: float) -> tup
     """
     moved, error = value - before, value - target
     xp = _of(value)
-    held = xp.where(abs(moved) <= clip_range, value, before + xp.clip(moved, -clip_range, clip_range)) - target
+    held = xp.where(abs(moved) <= clip_range, value, before + _clip(moved, -clip_range, clip_range)) - target
     plain, clipped = error * error, held * held
-    return xp.maximum(plain, clipped).mean(), error * (plain >= clipped) * (2 / len(error))
+    return _mean(xp.maximum(plain, clipped)), error * (plain >= clipped) * (2 / len(error))
 
 
 def entropy_loss(entropy: A) -> tuple[A, A]:
     """Minus the mean entropy, and its gradient [B]."""
-    return -entropy.mean(), _of(entropy).full_like(entropy, -1 / len(entropy))
+    return -_mean(entropy), _of(entropy).full_like(entropy, -1 / len(entropy))
 
 
 def approx_kl(log_ratio: A, ratio: A) -> A:
     """KL(π_old ‖ π) estimated by E[(ρ − 1) − log ρ]: unbiased, never negative (Schulman 2020, "Approximating KL")."""
-    found: A = (ratio - 1 - log_ratio).mean()
+    found: A = _mean(ratio - 1 - log_ratio)
     return found
 
 
 def clip_fraction(ratio: A, clip_range: float) -> A:
     """The share of rows whose ratio left [1−ε, 1+ε]."""
-    found: A = ((abs(ratio - 1) > clip_range) * 1.0).mean()
+    found: A = _of(ratio).count_nonzero(abs(ratio - 1) > clip_range) / len(ratio)
     return found
 
 
