@@ -19,6 +19,7 @@ from msgspec.structs import replace
 from torch import Tensor
 
 from learner.algorithms import losses
+from learner.algorithms.flat_step import take_step
 from learner.algorithms.fused import MOST_ROWS, FusedActorCritic, applies
 from learner.algorithms.normalise import ObservationNormaliser, RewardScaler
 from learner.hyperparameters import ActorCriticHyperparameters, RecurrentHyperparameters
@@ -301,7 +302,7 @@ class Parts:
             by_value *= self.config.vf_coef if critic else 0.0
         numbers = {"policy_gradient_loss": policy_loss, "value_loss": value_loss, "entropy_loss": entropy_loss}
         measured = self.backward((log_prob, entropy, value), (by_log_prob, by_entropy, by_value), numbers)
-        self.optimizer.step()
+        take_step(self.optimizer)
         return measured
 
     def used(self, batch: Batch, seen: Seen) -> None:

@@ -19,6 +19,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from learner.algorithms.flat_step import take_step
 from learner.algorithms.normalise import ObservationNormaliser
 from learner.algorithms.replay import Replay, Sample
 from learner.hyperparameters import DQNConfig
@@ -151,7 +152,7 @@ class DQN:
             measured = Measured(*torch.stack((loss, chosen.mean(), net.flat_grad.norm())).tolist())
             self._check(measured)
             self._bound_gradient(measured.grad_norm)
-        self._optimizer.step()
+        take_step(self._optimizer)
         self.gradient_steps += 1
         self._follow()
         self.replay.reprioritise(sample.slots, error.cpu().numpy())

@@ -16,6 +16,7 @@ import torch
 
 from learner.algorithms import actor_critic, losses
 from learner.algorithms.actor_critic import Minibatch, Parts
+from learner.algorithms.flat_step import take_step
 from learner.algorithms.returns import gae
 from learner.hyperparameters import PPOConfig
 from protocol.rollout import Batch
@@ -117,7 +118,7 @@ class PPO:
         outputs, gradients = (log_prob, entropy, value), (by_log_prob, by_entropy, by_value)
         measured = Measured(**self.parts.backward(outputs, gradients, numbers))
         if measured.approx_kl <= self._kl_limit:
-            self.parts.optimizer.step()
+            take_step(self.parts.optimizer)
         return measured
 
     def _metrics(self, epochs: list[list[Measured]]) -> dict[str, float]:

@@ -1,0 +1,47 @@
+"""A step without the ceremony has the bits of the optimiser's own, and leaves a state that the optimiser goes on from."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+from torch.optim import SGD, Adam, AdamW, Optimizer, RMSprop
+
+from learner.algorithms.flat_step import take_step
+
+KINDS: dict[str, Callable[[list[Tensor]], Optimizer]] = {
+    "adam": lambda flat: Adam(flat, lr=1e-2, eps=1e-5, fused=True),
+    "amsgrad": lambda flat: Adam(flat, lr=1e-2, amsgrad=True, fused=True),
+    "adamw": lambda flat: AdamW(flat, lr=1e-2, fused=True),
+    "adamw amsgrad": lambda flat: AdamW(flat, lr=1e-2, amsgrad=True, fused=True),
+    "rmsprop": lambda flat: RMSprop(flat, lr=1e-2, alpha=0.99, eps=1e-5),
+    "any other": lambda flat: SGD(flat, lr=1e-2),
+}
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_bits_are_the_optimisers(kind: str) -> None:
+    generator = torch.Generator().manual_seed(0)
+    start = torch.randn(1001, generator=generator)
+    flats = [start.clone() for _ in range(2)]
+    optimizers = [KINDS[kind]([flat]) for flat in flats]
+    for step in range(30):
+        gradient = torch.randn(1001, generator=generator)
+        for flat in flats:
+            flat.grad = gradient.clone()
+        for optimizer in optimizers:
+            optimizer.param_groups[0]["lr"] = 1e-2 / (1 + step)
+        optimizers[0].step()
+        take_step(optimizers[1])
+        assert torch.equal(*flats)
+    ours, theirs = (optimizer.state_dict() for optimizer in reversed(optimizers))
+    torch.testing.assert_close(ours["state"], theirs["state"], rtol=0, atol=0)
+    assert not torch.equal(flats[0], start)
+    resumed = KINDS[kind]([flats[1]])
+    resumed.load_state_dict(copy.deepcopy(ours))
+    optimizers[0].step()
+    take_step(resumed)
+    assert torch.equal(*flats)
