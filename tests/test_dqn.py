@@ -163,7 +163,7 @@ def test_targets_on_a_chain_by_hand(double: bool, n_step: int, end: str, from_0:
     drawn = made.replay.sample(50)
     expected = np.where(drawn.leaves[0][:, 0] == 1, from_0, from_1)
     assert len(set(expected)) == 2
-    np.testing.assert_allclose(made.targets(drawn).numpy(), expected, rtol=1e-6)
+    np.testing.assert_allclose(made.targets(drawn), expected, rtol=1e-6)
 
 
 def test_a_step_moves_the_value_of_the_action_taken_towards_its_target() -> None:
@@ -293,7 +293,7 @@ def test_the_next_action_is_chosen_by_the_network_if_double_and_by_the_target_if
             values, best = made.target.params(following), made.net.params(following).argmax(1)
         value = values[torch.arange(64), best] if double else values.amax(1)
         expected = torch.from_numpy(drawn.reward) + torch.from_numpy(drawn.discount) * value
-        torch.testing.assert_close(made.targets(drawn), expected)
+        torch.testing.assert_close(torch.from_numpy(made.targets(drawn)), expected)
         assert (value < values.amax(1)).any() == double
 
 
@@ -360,7 +360,7 @@ def test_what_is_published_acts_as_the_network_and_explores_by_epsilon() -> None
     assert made.weights()[1][:4] == pytest.approx([2] * 4, abs=1)
     assert made.weights()[1][4:8] == pytest.approx([3] * 4, abs=1)
     with torch.no_grad():
-        values = made.net.params(made._inputs([obs[0]])[0]).numpy()
+        values = made.net.params(torch.from_numpy(made._inputs([obs[0]])[0])).numpy()
     np.testing.assert_allclose(params[0, :, :-1], values, atol=1e-5)
     assert (distribution(made.policy).mode(params) == values.argmax(-1)).all()  # greedy: ε plays no part
 

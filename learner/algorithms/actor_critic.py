@@ -288,6 +288,7 @@ class Parts:
                 gradient.mul_(self.config.max_grad_norm / measured["grad_norm"])
         return measured
 
+    @np.errstate(all="ignore")  # what is not finite is found and named
     def policy_gradient_step(self, rows: Minibatch, critic: bool = True) -> dict[str, float]:
         """One step of the optimiser on valid rows, by the plain policy gradient; `critic`: the values are fitted too.
 

@@ -17,8 +17,9 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor
 
+from learner.algorithms import losses
+from learner.algorithms.action_values import action_values
 from learner.algorithms.flat_step import take_step
 from learner.algorithms.normalise import ObservationNormaliser
 from learner.algorithms.replay import Replay, Sample
@@ -41,18 +42,7 @@ class Measured(NamedTuple):
     grad_norm: float  # before it was cut or shortened
 
 
-def huber_loss(error: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """E[w (½ e² where |e| ≤ 1, else |e| − ½)] of errors [B] and weights [B], and its gradient [B] by the errors."""
-    held = error.clamp(-1, 1)
-    return (weight * held * (error - 0.5 * held)).mean(), weight * held / len(error)
-
-
-def squared_loss(error: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """E[w e²] of errors [B] and weights [B], and its gradient [B] by the errors."""
-    return (weight * error * error).mean(), weight * error * (2 / len(error))
-
-
-LOSSES = {"huber": huber_loss, "squared": squared_loss}
+LOSSES = {"huber": losses.huber_loss, "squared": losses.squared_loss}
 
 
 def exploration_rate(config: DQNConfig, env_steps: int) -> float:
@@ -93,6 +83,7 @@ class DQN:
         )
         self.net = QNetwork(policy, device, seed=seed)
         self.target = QNetwork(policy, device, seed=seed)
+        self._values, self._target_values = (action_values(net, config.batch_size) for net in (self.net, self.target))
         self.env_steps = 0  # transitions used so far: where the schedules are
         self.version = 0  # updates made
         self.gradient_steps = 0  # what Stable-Baselines3 calls n_updates
@@ -136,52 +127,42 @@ class DQN:
             metrics["replay/env_steps_per_gradient_step"] = batch.env_steps / len(measured)
         return metrics
 
+    @np.errstate(all="ignore")  # what is not finite is found and named
     def step(self, sample: Sample) -> Measured:
         """One gradient step on a minibatch, and what follows it: the target, the priorities."""
-        config, net = self.config, self.net
-        action, weight = self._tensor(sample.action)[:, None], self._tensor(sample.weight)
-        target = self.targets(sample)
-        values = net.params(*self._inputs(sample.leaves))
-        with torch.no_grad():
-            chosen = values.gather(1, action)[:, 0]
-            error = chosen - target
-            loss, by_chosen = LOSSES[config.loss](error, weight)
-            net.flat_grad.zero_()
-        torch.autograd.backward(values, torch.zeros_like(values).scatter_(1, action, by_chosen[:, None]))
-        with torch.no_grad():
-            measured = Measured(*torch.stack((loss, chosen.mean(), net.flat_grad.norm())).tolist())
-            self._check(measured)
-            self._bound_gradient(measured.grad_norm)
+        values, target = self._values, self.targets(sample)
+        chosen = values.of(*self._inputs(sample.leaves), values.array(sample.action))
+        error = chosen - target
+        loss, by_chosen = LOSSES[self.config.loss](error, values.array(sample.weight))
+        values.backward(by_chosen)
+        measured = Measured(*values.read(loss, chosen.sum() / len(chosen)))
+        self._check(measured)
+        self._bound_gradient(measured.grad_norm)
         take_step(self._optimizer)
         self.gradient_steps += 1
         self._follow()
-        self.replay.reprioritise(sample.slots, error.cpu().numpy())
+        self.replay.reprioritise(sample.slots, error if isinstance(error, np.ndarray) else error.cpu().numpy())
         return measured
 
-    def targets(self, sample: Sample) -> Tensor:
+    def targets(self, sample: Sample) -> Any:
         """What action values should be [B]:  Σ γⁱ r + γᵏ Q′(s′, a′), where the task has not terminated (there γᵏ is 0).
 
         a′ = argmax Q′(s′, ·), or argmax Q(s′, ·) if double (van Hasselt et al. 2016), with Q′ the target network.
         """
-        inputs = self._inputs(sample.next_leaves)
-        with torch.no_grad():
-            values = self.target.params(*inputs)
-            if self.config.double:
-                value = values.gather(1, self.net.params(*inputs).argmax(1, keepdim=True))[:, 0]
-            else:
-                value = values.amax(1)
-            return self._tensor(sample.reward) + self._tensor(sample.discount) * value
+        inputs, values = self._inputs(sample.next_leaves), self._target_values
+        if self.config.double:
+            with torch.no_grad():
+                value = values.of(*inputs, self._values.best(*inputs))
+        else:
+            value = values.highest(*inputs)
+        return values.array(sample.reward) + values.array(sample.discount) * value
 
-    def _inputs(self, leaves: Sequence[Array]) -> tuple[Tensor, list[Tensor]]:
+    def _inputs(self, leaves: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Features [B, D], normalised by the present statistics, and images [B, *leaf] uint8."""
         x = features(self.policy, leaves)
         if self.policy.normalize_observations:
             x = normalized(x, *np.split(self._statistics, 2))
-        images = [self._tensor(array) for leaf, array in zip(self.policy.observation, leaves, strict=True) if leaf.is_image]
-        return self._tensor(x), images
-
-    def _tensor(self, array: Array) -> Tensor:
-        return torch.from_numpy(array).to(self.net.flat.device)
+        return x, [array for leaf, array in zip(self.policy.observation, leaves, strict=True) if leaf.is_image]
 
     def _check(self, measured: Measured) -> None:
         for name, number in measured._asdict().items():

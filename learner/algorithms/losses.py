@@ -83,6 +83,19 @@ def clipped_value_loss(value: A, target: A, before: A, clip_range: float) -> tup
     return _mean(xp.maximum(plain, clipped)), error * (plain >= clipped) * (2 / len(error))
 
 
+def huber_loss(error: A, weight: A) -> tuple[Any, A]:
+    """E[w (½ e² where |e| ≤ 1, else |e| − ½)] of errors [B] and weights [B], and its gradient [B] by the errors."""
+    held = _clip(error, -1, 1)
+    weighted = weight * held
+    return weighted @ (error - 0.5 * held) / len(error), weighted / len(error)
+
+
+def squared_loss(error: A, weight: A) -> tuple[Any, A]:
+    """E[w e²] of errors [B] and weights [B], and its gradient [B] by the errors."""
+    weighted = weight * error
+    return weighted @ error / len(error), weighted * (2 / len(error))
+
+
 def entropy_loss(entropy: A) -> tuple[A, A]:
     """Minus the mean entropy, and its gradient [B]."""
     return -_mean(entropy), _of(entropy).full_like(entropy, -1 / len(entropy))

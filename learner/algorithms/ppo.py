@@ -92,6 +92,7 @@ class PPO:
     def _too_far(self, epochs: list[list[Measured]]) -> bool:
         return bool(epochs) and epochs[-1][-1].approx_kl > self._kl_limit
 
+    @np.errstate(all="ignore")  # what is not finite is found and named
     def step(self, rows: Minibatch, clip_range: float) -> Measured:
         """One step of Adam on a minibatch of valid rows; none if the policy moved too far already."""
         config = self.config
