@@ -416,7 +416,7 @@ def test_observations_stay_as_they_are(dtype: str) -> None:
 def test_the_memory_that_is_foretold_is_what_it_takes(alpha: float | None) -> None:
     observation = (Leaf("", "box", (84, 84, 4), "uint8"), Leaf("n", "discrete", (), "int64", (3,), (0,)))
     kept = Replay(observation, size=50, n_step=1, gamma=GAMMA, seed=0, alpha=alpha)
-    arrays = sum(array.nbytes for array in kept._arrays().values() if array.base is None)
+    arrays = kept._row.nbytes + sum(leaf.nbytes for leaf in kept._obs)
     tree = 0 if kept._tree is None else kept._tree._nodes.nbytes
     assert kept.bytes == memory_bytes(observation, 50, alpha is not None) == arrays + tree
 

@@ -32,6 +32,9 @@ Ints = npt.NDArray[np.int64]
 
 TINY = 1e-6  # added to errors, so that no transition is never drawn again
 NOWHERE = -1
+ROW = np.dtype(  # one record, so that drawing is one copy
+    [("action", "i8"), ("follows", "i8"), ("reward", "f4"), ("terminated", "?"), ("is_row", "?")], align=True
+)
 
 
 class Sample(NamedTuple):
@@ -49,8 +52,7 @@ class Sample(NamedTuple):
 def memory_bytes(observation: Sequence[Leaf], size: int, prioritized: bool) -> int:
     """What a replay of so many slots takes, when it is full."""
     row = sum(int(np.prod(leaf.shape)) * np.dtype(leaf.dtype).itemsize for leaf in observation)
-    row += sum(np.dtype(kind).itemsize for kind in (np.int64, np.float32, np.bool_, np.int64, np.bool_))
-    return size * row + (SumTree.memory_bytes(size) if prioritized else 0)
+    return size * (row + ROW.itemsize) + (SumTree.memory_bytes(size) if prioritized else 0)
 
 
 def refuse_what_does_not_fit(observation: Sequence[Leaf], size: int, prioritized: bool) -> None:
@@ -86,11 +88,12 @@ class Replay:
         self._n_step, self._gamma, self._alpha = n_step, gamma, alpha
         self._generator = np.random.default_rng(seed)
         self._obs = tuple(np.zeros((size, *leaf.shape), leaf.dtype) for leaf in observation)
-        self._action: Ints = np.zeros(size, np.int64)
-        self._reward: Floats = np.zeros(size, np.float32)
-        self._terminated: Bools = np.zeros(size, bool)
-        self._follows: Ints = np.zeros(size, np.int64)  # slot of the next observation; itself if terminated
-        self._is_row: Bools = np.zeros(size, bool)
+        self._row = np.zeros(size, ROW)
+        self._action: Ints = self._row["action"]  # and so on: views
+        self._reward: Floats = self._row["reward"]
+        self._terminated: Bools = self._row["terminated"]
+        self._follows: Ints = self._row["follows"]  # slot of the next observation; itself if terminated
+        self._is_row: Bools = self._row["is_row"]
         self._tree = None if alpha is None else SumTree(size)
         self._highest = 1.0  # error ever seen: what is new gets it
         self._written = 0  # slots ever written; the next one is this, modulo the size
@@ -164,11 +167,12 @@ class Replay:
     def sample(self, count: int, beta: float = 1.0) -> Sample:
         """Draw transitions, with replacement; `beta` is how far the weights undo the drawing by priority."""
         slots, weight = self._uniform(count) if self._tree is None else self._by_priority(self._tree, count, beta)
-        reward, discount, last = self._follow(slots)
+        row = self._row[slots]
+        reward, discount, last = self._follow(row)
         return Sample(
             slots=slots,
             leaves=tuple(leaf[slots] for leaf in self._obs),
-            action=self._action[slots],
+            action=row["action"],
             reward=reward.astype(np.float32),
             discount=discount.astype(np.float32),
             next_leaves=tuple(leaf[last] for leaf in self._obs),
@@ -189,16 +193,16 @@ class Replay:
         weight = (self._rows * chance) ** -beta
         return slots, (weight / weight.max()).astype(np.float32)
 
-    def _follow(self, slots: Ints) -> tuple[Doubles, Doubles, Ints]:
-        """From each slot, up to n steps on: the discounted rewards, γᵏ (0 if the task ended), and where that leads."""
-        reward, discount, at = np.zeros(len(slots)), np.ones(len(slots)), slots
-        going = np.ones(len(slots), bool)
-        for _ in range(self._n_step):
-            terminated = self._terminated[at]
-            reward += np.where(going, discount * self._reward[at], 0)
-            discount = np.where(going, discount * self._gamma * ~terminated, discount)
-            at = np.where(going, self._follows[at], at)
-            going &= self._is_row[at]  # a row that terminated leads to itself, worth nothing more
+    def _follow(self, row: Array) -> tuple[Doubles, Doubles, Ints]:
+        """From each row, up to n steps on: the discounted rewards, γᵏ (0 if the task ended), and where that leads."""
+        reward, discount, at = row["reward"].astype(np.float64), self._gamma * ~row["terminated"], row["follows"]
+        going = row["is_row"]
+        for _ in range(self._n_step - 1):
+            row = self._row[at]
+            going = going & row["is_row"]  # a row that terminated leads to itself, worth nothing more
+            reward += np.where(going, discount * row["reward"], 0)
+            discount = np.where(going, discount * self._gamma * ~row["terminated"], discount)
+            at = np.where(going, row["follows"], at)
         return reward, discount, at
 
     def reprioritise(self, slots: Ints, error: Floats) -> None:
