@@ -82,6 +82,7 @@ def outputs_and_gradients(spec: PolicySpec, rows: int, seed: int) -> None:
     params, value = with_graph.forward(torch.tensor(x))
     expected = (*log_prob_and_entropy(spec.action, params, torch.tensor(taken)), value)
     found = fused.forward(x, taken)
+    np.testing.assert_allclose(fused.value(x), found[2], rtol=1e-4, atol=1e-4)
     for ours, theirs in zip(found, expected, strict=True):
         np.testing.assert_allclose(ours, theirs.detach().numpy(), rtol=1e-4, atol=1e-4)
     given_back = [generator.normal(size=rows).astype(np.float32) for _ in range(3)]

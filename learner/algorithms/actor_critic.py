@@ -162,7 +162,12 @@ class Parts:
 
     def values(self, seen: Seen, pulse: Pulse) -> Floats:
         """V(obs) [T+1, ΣN], a piece at a time."""
-        return self._looked(seen, len(seen.raw), lambda view, _: self.net.value(*view), pulse)
+        fused = self._fused
+
+        def look(view: View, _: Rows) -> Tensor:
+            return self.net.value(*view) if fused is None else torch.from_numpy(fused.value(view[0].numpy()))
+
+        return self._looked(seen, len(seen.raw), look, pulse)
 
     def log_probs(self, seen: Seen, batch: Batch, pulse: Pulse) -> Floats:
         """Log π(action) [T, ΣN] under the newest weights, a piece at a time."""
@@ -318,7 +323,7 @@ class Parts:
 
     def metrics(self, measured: Sequence[Mapping[str, float]]) -> dict[str, float]:
         """Means of what steps measured, by Stable-Baselines3's names, and what is true of any update."""
-        found = {f"train/{name}": float(np.mean([each[name] for each in measured])) for name in (measured or [{}])[0]}
+        found = {f"train/{name}": sum(each[name] for each in measured) / len(measured) for name in (measured or [{}])[0]}
         found["train/learning_rate"] = self.optimizer.param_groups[0]["lr"]
         found["train/n_updates"] = float(self.version)
         log_std = self.net.parameters.get("actor.log_std")

@@ -41,6 +41,8 @@ class FusedActorCritic:
             Head(Linear.of([name], values, grads), at) for name, at in (("actor.out", 0), ("critic.out", len(trunks) - 1))
         ]
         self._layers = Layers(hidden, heads, spec.activation == "relu")
+        critic = [Linear.of([name], values, grads) for name in trunks[-1]]
+        self._critic = Layers(critic, [Head(heads[1].layer, 0)], spec.activation == "relu")
         self._actions: Actions = actions(spec.action, values.get("actor.log_std"), grads.get("actor.log_std"))
 
     def forward(self, x: Array, action: Array) -> tuple[Array, Array, Array]:
@@ -54,8 +56,9 @@ class FusedActorCritic:
         self._layers.backward((self._actions.backward(by_log_prob, by_entropy), by_value[None]))
 
     def value(self, x: Array) -> Array:
-        """V [B] of features [B, D]; good until the next forward pass."""
-        found: Array = self._layers.forward(x)[1][0]
+        """V [B] of features [B, D], alone; good until the next time."""
+        (value,) = self._critic.forward(x)
+        found: Array = value[0]
         return found
 
 

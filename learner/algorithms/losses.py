@@ -115,5 +115,10 @@ def clip_fraction(ratio: A, clip_range: float) -> A:
 
 def explained_variance(value: Floats, target: Floats) -> float:
     """1 − Var(target − value) / Var(target): 1 is perfect, 0 no better than a constant; NaN where targets do not vary."""
-    variance = float(np.var(target))
-    return 1 - float(np.var(target - value)) / variance if variance > 0 else math.nan
+    variance = _variance(target)
+    return 1 - _variance(target - value) / variance if variance > 0 else math.nan
+
+
+def _variance(array: Floats) -> float:
+    centred = array - _mean(array)
+    return float(centred @ centred) / len(array)
