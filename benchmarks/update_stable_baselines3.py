@@ -1,0 +1,121 @@
+"""A gradient step of DQN, and an update of A2C, against Stable-Baselines3's, with the same settings and shapes.
+
+DQN: draw 64 transitions, targets by the target network, Huber loss, gradient clipped by its norm, Adam. A2C: 8 env copies;
+theirs is given the values that it keeps from acting, ours computes them anew, and both compute advantages, losses, one
+step of RMSProp and what they log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from stable_baselines3 import A2C as TheirA2C
+from stable_baselines3 import DQN as TheirDQN
+from stable_baselines3.common.env_util import make_vec_env
+
+from benchmarks.contest import Contest, repeated
+from learner.algorithms.a2c import A2C
+from learner.algorithms.action_values import WithGraph
+from learner.algorithms.dqn import DQN
+from learner.hyperparameters import A2CConfig, DQNConfig
+from protocol.rollout import Batch
+from protocol.specs import ActionSpec, Leaf
+
+OBSERVATION = (Leaf("", "box", (4,), "float32"),)
+ACTION = ActionSpec("discrete", (), "int64", (2,), (0,))
+COPIES, NEVER = 8, 10**9
+STEPS = 8  # gradient steps, or updates, that are timed together
+
+
+def some_batch(steps: int, seed: int) -> Batch:
+    """Noise of the shapes of CartPole, with ends now and then."""
+    generator = np.random.default_rng(seed)
+    ends = generator.random((steps, COPIES)) < 0.02
+    valid = np.ones((steps, COPIES), bool)
+    valid[1:] = ~ends[:-1]
+    return Batch(
+        obs=(generator.normal(size=(steps + 1, COPIES, 4)).astype(np.float32),),
+        action=generator.integers(0, 2, (steps, COPIES)),
+        log_prob=np.full((steps, COPIES), -0.693, np.float32),
+        reward=np.ones((steps, COPIES), np.float32),
+        terminated=ends & valid,
+        truncated=np.zeros((steps, COPIES), bool),
+        valid=valid,
+        state=np.zeros((COPIES, 0), np.float32),
+        lane=np.repeat(np.arange(4), 2),
+        fresh=np.zeros(COPIES, bool),
+        copies=2,
+        episodes=(),
+    )
+
+
+def dqn(width: int, target: float) -> Contest:
+    """A gradient step on 64 transitions."""
+    rows, size = 64, 10_000
+    config = DQNConfig(
+        net=(width, width), double=False, batch_size=rows, replay_size=size, target_every=NEVER, max_grad_norm=10
+    )
+
+    def ours(graph: bool) -> Callable[[], float]:
+        made = DQN(config, DQN.policy_spec(config, OBSERVATION, ACTION), total_steps=NEVER, seed=0)
+        if graph:
+            made._values, made._target_values = WithGraph(made.net), WithGraph(made.target)
+        for seed in range(20):
+            made.replay.add(some_batch(32, seed))
+        return lambda: repeated(lambda: made.step(made.replay.sample(rows)), STEPS)
+
+    theirs = TheirDQN(
+        "MlpPolicy",
+        gymnasium.make("CartPole-v1"),
+        batch_size=rows,
+        buffer_size=size,
+        learning_starts=0,
+        max_grad_norm=10,
+        policy_kwargs={"net_arch": [width, width]},
+        target_update_interval=NEVER,
+        device="cpu",
+    )
+    theirs.learn(500)
+    runs = {
+        "peer": lambda: repeated(lambda: theirs.train(STEPS, rows), 1) / STEPS,
+        "graph": ours(True),
+        "ours": ours(False),
+    }
+    return Contest(f"DQN, {width} units", rows, "SB3", target, runs)
+
+
+def a2c(steps: int, target: float) -> Contest:
+    """An update on so many steps of 8 copies."""
+    batch = some_batch(steps, 0)
+    config = A2CConfig(rollout_steps=steps)
+
+    def ours(graph: bool) -> Callable[[], float]:
+        made = A2C(config, A2C.policy_spec(config, OBSERVATION, ACTION), total_steps=NEVER, seed=0)
+        if graph:
+            made.parts._fused = None
+        return lambda: repeated(lambda: made.update(batch, lambda: None), STEPS)
+
+    theirs = TheirA2C("MlpPolicy", make_vec_env("CartPole-v1", COPIES), n_steps=steps, device="cpu")
+    theirs.learn(steps * COPIES)
+    buffer: Any = theirs.rollout_buffer
+    nothing, starts = torch.zeros(COPIES), np.zeros(COPIES)
+
+    def update() -> None:
+        buffer.compute_returns_and_advantage(nothing, starts)
+        theirs.train()
+
+    def run() -> float:
+        taken = 0.0
+        for _ in range(STEPS):
+            buffer.reset()
+            for obs, action, reward in zip(batch.obs[0], batch.action, batch.reward, strict=False):
+                buffer.add(obs, action[:, None], reward, starts, nothing, nothing - 0.693)
+            taken += repeated(update, 1)
+        return taken / STEPS
+
+    runs = {"peer": run, "graph": ours(True), "ours": ours(False)}
+    return Contest("A2C, 64 units", steps * COPIES, "SB3", target, runs)
