@@ -257,6 +257,17 @@ def test_it_is_for_small_layers_and_nothing_else(spec: PolicySpec, expected: boo
     assert applies(spec) == expected
 
 
+def test_sizes_of_minibatches_come_and_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(layers, "KEPT", 100)
+    _, fused = make(PolicySpec(BOX, ACTIONS["discrete"], (5,)), 0)
+    x = np.random.default_rng(0).normal(size=(99, 4)).astype(np.float32)
+    whole = fused.value(x).copy()
+    for rows in (*range(1, 99), 40, 2):
+        np.testing.assert_allclose(fused.value(x[:rows]), whole[:rows], atol=1e-6)
+        assert sum(fused._critic._passes) <= 100
+    assert {40, 2} <= set(fused._critic._passes)
+
+
 def test_large_minibatches_keep_the_graph(monkeypatch: pytest.MonkeyPatch) -> None:
     kinds: list[type] = []
     for most in (30, 29):

@@ -24,7 +24,7 @@ Call = Callable[[], object]
 
 PIECE = 512  # rows, at most
 LARGE = 64 * 64 * 128  # multiplications of one product: from here torch's are faster than numpy's
-KEPT = 8  # sizes of minibatch: two are usual, and the last rollouts of a run perhaps give others
+KEPT = 16_384  # rows of all sizes of minibatch together: rows that are not valid make the sizes change
 
 
 class Linear(NamedTuple):
@@ -62,7 +62,7 @@ class Layers:
         """Features [B, D] -> what each head says, [out, B]; good until the next forward pass of as many rows."""
         made = self._passes.get(len(x))
         if made is None:
-            if len(self._passes) == KEPT:
+            if sum(self._passes) + len(x) > KEPT:
                 self._passes.clear()
             made = self._passes[len(x)] = _Pass(len(x), self._hidden, self._heads, self._relu)
         self._last = made
@@ -88,12 +88,12 @@ class _Pass:
 
     def __init__(self, rows: int, hidden: Sequence[Linear], heads: Sequence[Head], relu: bool) -> None:
         count = -(-rows // PIECE)
-        self.said = [_zeros(head.layer, rows) for head in heads]
-        self.by_said = [_zeros(head.layer, rows) for head in heads]
+        self.said = [_outputs(head.layer, rows) for head in heads]
+        self.by_said = [_outputs(head.layer, rows) for head in heads]
         self.gather: list[Call] = []
         trunk = [self._for_each(layer, count) for layer in hidden]
         tops = [self._for_each(head.layer, count) for head in heads]
-        gradients = [_zeros(layer, -(-rows // count)) for layer in hidden]  # one for all pieces, to stay in the cache
+        gradients = [_outputs(layer, -(-rows // count)) for layer in hidden]  # one for all pieces, to stay in the cache
         self.pieces: list[_Piece] = []
         for i in range(count):
             its = slice(rows * i // count, rows * (i + 1) // count)
@@ -108,7 +108,7 @@ class _Pass:
         """The same layer for each piece, each with a gradient of its own."""
         if count == 1:
             return [layer]
-        weight, bias = (np.zeros((count, *grad.shape), grad.dtype) for grad in (layer.weight_grad, layer.bias_grad))
+        weight, bias = (_zeros((count, *grad.shape), grad) for grad in (layer.weight_grad, layer.bias_grad))
         self.gather += [partial(np.add.reduce, weight, 0, out=layer.weight_grad)]
         self.gather += [partial(np.add.reduce, bias, 0, out=layer.bias_grad)]
         return [layer._replace(weight_grad=weight[i], bias_grad=bias[i]) for i in range(count)]
@@ -119,7 +119,7 @@ class _Piece:
 
     def __init__(self, rows: slice, first: Linear) -> None:
         self.rows = rows
-        self.x = self._h = _zeros(first, rows.stop - rows.start, of_inputs=True)
+        self.x = self._h = _zeros((1, first.weight.shape[2], rows.stop - rows.start), first.weight)
         self._dh: Array | None = None  # the gradient by the last hidden layers
         self._given: set[int] = set()  # networks that have one from a head
         self._ones = np.ones(rows.stop - rows.start, first.weight.dtype)
@@ -129,7 +129,7 @@ class _Piece:
 
     def hide(self, layer: Linear, dy: Array, relu: bool) -> None:
         """One more hidden layer; `dy`: where the gradient by what it says will be."""
-        y = _zeros(layer, len(self._ones))
+        y = _outputs(layer, len(self._ones))
         self.forward += [*_linear(layer, self._h, y), _activation(y, relu)]
         self.back_through_hidden[:0] = [_slope(dy, y, relu), *self._back(layer, self._h, dy, self._dh)]
         self._h, self._dh = y, dy
@@ -142,7 +142,7 @@ class _Piece:
         if dh is None or network not in self._given:
             self.back_from_heads += self._back(layer, self._h[its], dy, dh)
         else:
-            more = np.zeros_like(dh)
+            more = _zeros(dh.shape, dh)
             self.back_from_heads += [*self._back(layer, self._h[its], dy, more), partial(np.add, dh, more, out=dh)]
         self._given.add(network)
 
@@ -155,15 +155,15 @@ class _Piece:
         return calls if dx is None else [*calls, _product(layer.weight.swapaxes(1, 2), dy, dx)]
 
 
-def _zeros(layer: Linear, rows: int, of_inputs: bool = False) -> Array:
-    """[S, out, B] for what a layer says, or [1, in, B] for what it sees.
-
-    By torch, which aligns arrays always alike: its products could give other bits where they are not.
-    """
-    networks, outputs, inputs = layer.weight.shape
-    shape = (1, inputs, rows) if of_inputs else (networks, outputs, rows)
-    found: Array = torch.zeros(shape, dtype=torch.from_numpy(layer.weight).dtype).numpy()
+def _zeros(shape: tuple[int, ...], like: Array) -> Array:
+    """By torch, which aligns arrays always alike: its products could give other bits where they are not."""
+    found: Array = torch.zeros(shape, dtype=torch.from_numpy(like).dtype).numpy()
     return found
+
+
+def _outputs(layer: Linear, rows: int) -> Array:
+    """[S, out, B]."""
+    return _zeros((*layer.bias_grad.shape, rows), layer.weight)
 
 
 def _linear(layer: Linear, x: Array, y: Array) -> list[Call]:
