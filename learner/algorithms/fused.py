@@ -20,7 +20,7 @@ from protocol.specs import PolicySpec
 
 Array = npt.NDArray[Any]
 
-MOST_ROWS = 4096  # of a minibatch
+MOST_ROWS = 16_384  # of a minibatch: what is kept of one takes memory
 MOST_UNITS = 256  # of a layer: above, the products are all that counts (`python -m benchmarks.update`)
 
 
