@@ -196,10 +196,9 @@ class Replay:
     def _follow(self, row: Array) -> tuple[Doubles, Doubles, Ints]:
         """From each row, up to n steps on: the discounted rewards, γᵏ (0 if the task ended), and where that leads."""
         reward, discount, at = row["reward"].astype(np.float64), self._gamma * ~row["terminated"], row["follows"]
-        going = row["is_row"]
         for _ in range(self._n_step - 1):
             row = self._row[at]
-            going = going & row["is_row"]  # a row that terminated leads to itself, worth nothing more
+            going = row["is_row"]  # else it stays there; a row that terminated leads to itself, worth nothing more
             reward += np.where(going, discount * row["reward"], 0)
             discount = np.where(going, discount * self._gamma * ~row["terminated"], discount)
             at = np.where(going, row["follows"], at)
