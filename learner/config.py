@@ -55,6 +55,9 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     max_lag: Natural = 0
     """how many versions old the weights behind a rollout may be; 0 is synchronous"""
 
+    inference: Literal["workers", "learner"] = "workers"
+    """where the policy acts: in each worker, or beside the learner, for all env copies at once, so that workers only step"""
+
     transport: Literal["inproc", "ipc", "tcp"] = "ipc"
     """how local workers are reached: threads of this process, local sockets, or loopback TCP"""
     bind: str = "tcp://127.0.0.1:5555"
@@ -227,6 +230,10 @@ def checked(config: Config, where: str = "") -> Config:
         divisor = max(n for n in range(1, min(config.lanes, config.envs) + 1) if config.envs % n == 0)
         raise UsageError(
             f"{at}{config.envs} envs cannot be shared evenly among {config.lanes} lanes; take {near}, or {divisor} lanes"
+        )
+    if config.inference == "learner" and config.max_lag:
+        raise UsageError(
+            f"{at}inference learner: max_lag expected 0, got {config.max_lag}; the policy acts under the newest weights"
         )
     check_address(config.bind)
     if config.metrics_bind:

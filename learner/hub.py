@@ -64,6 +64,8 @@ class Hub:
         self.progress = Progress()
         """of the run, for whoever asks: the journal keeps it"""
         self.dead_workers, self.watch, self.look, self._clock = dead_workers, watch, look, clock
+        self.workers_alive: Callable[[], int] = lambda: len(roster.members)
+        """how many processes step the environment"""
         self._lid = Lid(link, clock)
         self._draining = False
         self._listened_s = self._judge_s = clock()

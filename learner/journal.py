@@ -132,7 +132,7 @@ class Journal:
         began_s = time.monotonic()
         self.version += 1
         self.env_steps += batch.env_steps
-        self._workers_alive = len(self.hub.roster.members)
+        self._workers_alive = self.hub.workers_alive()
         self.stages["update"] += update_s
         self._window.extend(batch.episodes)
         extra: dict[str, float] = {}

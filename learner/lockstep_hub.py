@@ -50,8 +50,8 @@ class Staff(Protocol):
         ...
 
     @property
-    def empty(self) -> bool:
-        """Nobody is here, and nobody will come back."""
+    def count(self) -> int:
+        """How many are here, or will come back."""
         ...
 
     def stop(self, timeout_s: float) -> None:
@@ -71,9 +71,9 @@ class Nobody:
         return False
 
     @property
-    def empty(self) -> bool:
+    def count(self) -> int:
         """Nobody is."""
-        return True
+        return 0
 
     def stop(self, timeout_s: float) -> None:
         """Nothing to do."""
@@ -119,6 +119,8 @@ class LockstepHub:
         self._wanted: dict[int, Make] = {}  # lane -> an order that is said as soon as the lane is placed
         self._wanted_since_s = 0.0
         self._patience_s = PATIENCE_S
+        self.watch: Callable[[], None] = lambda: None
+        """called while waiting; what it raises ends the wait"""
         self.stepped: set[int] = set()
         """lanes whose last step, through shared memory, is done"""
         self._under_way: dict[int, int] = {}  # lane -> number of its order through shared memory
@@ -268,6 +270,7 @@ class LockstepHub:
     def _turn(self, timeout_s: float) -> None:
         """Listen; see who has ended; say what can be said."""
         self._listen_due_s = self._clock() + LISTEN_EVERY_S
+        self.watch()
         now = self._clock()
         if now - self._listened_s > AWAY_S:
             self._listening_since_s = now
@@ -321,9 +324,10 @@ class LockstepHub:
             self._take(lane)
 
     def _say_wanted(self) -> None:
+        awaited = len(self.lockstep.membership.active()) < self.staff.count  # somebody of ours has yet to join
+        patient = awaited and self._clock() - self._wanted_since_s < self._patience_s
         for lane, make in list(self._wanted.items()):
-            waited_s = self._clock() - self._wanted_since_s
-            if self.lockstep.place(lane, patient=not self.staff.empty and waited_s < self._patience_s):
+            if self.lockstep.place(lane, patient):
                 del self._wanted[lane]
                 self._send(self.lockstep.order(lane, make))
 

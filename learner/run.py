@@ -53,9 +53,10 @@ class Run:
 
         torch.set_num_threads(config.torch_threads)
         spec = run_spec(config, env)
+        self.device = _device(config)
         make = ALGORITHMS[config.algo]
         self.algorithm: Algorithm = make(
-            config.algorithm, spec.policy, total_steps=config.steps, seed=config.seed, device=_device(config)
+            config.algorithm, spec.policy, total_steps=config.steps, seed=config.seed, device=self.device
         )
         if resume is None:
             self.folder, past = RunFolder.create(config), Past()
@@ -105,6 +106,8 @@ class Run:
 
 def serve(config: Config, resume: Path | None, watch: Watch) -> Path:
     """The learner alone, at `config.bind`: workers are started elsewhere. Its run folder."""
+    if config.inference == "learner":
+        raise UsageError("inference learner: python -m learner has no part that steps lanes; start it as millrace learner")
     keyring = keyring_for(config, datetime.now(UTC).replace(microsecond=0))
     with ExitStack() as stack:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()

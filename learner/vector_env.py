@@ -340,6 +340,21 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
             results += unpack(answer.results.data) if not assign else []
         return tuple(results)
 
+    # ---------------------------------------------------------------- the workers
+
+    @property
+    def workers(self) -> int:
+        """How many are here."""
+        return len(self._hub.lockstep.members)
+
+    def wait_for(self, workers: int, timeout_s: float) -> None:
+        """Wait until so many have joined. Raises `NoWorkers`."""
+        self._hub.wait_for(workers, timeout_s)
+
+    def watch(self, look: Callable[[], None]) -> None:
+        """Call this now and then while waiting; what it raises ends the wait."""
+        self._hub.watch = look
+
     # ---------------------------------------------------------------- the end
 
     def close_extras(self, **kwargs: Any) -> None:

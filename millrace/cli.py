@@ -100,10 +100,14 @@ def _learner(argv: list[str]) -> int:
 
     config, resume = configuration("learner", argv)
     from learner.run import serve
+    from millrace.launch import inference
     from millrace.terminal import watching
 
     with watching("--log-json" in argv) as watch:
-        run = serve(config, resume, watch)
+        if config.inference == "learner":
+            run = inference.train(config, resume, watch, elsewhere=True)
+        else:
+            run = serve(config, resume, watch)
     return _told(run)
 
 

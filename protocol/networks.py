@@ -217,7 +217,7 @@ class ActorCritic(FlatNetwork):
         """Distribution params [B, P] of one step of B copies, and the core's state after it [B, S]."""
         h = self.inputs(x, images)
         if self.spec.core is not None:
-            h, state = self.core(h, Memory(state, torch.ones(1, len(x))))
+            h, state = self.core(h, Memory(state, x.new_ones(1, len(x))))
         return self._params(self.hidden(h, self._trunk)), state
 
 
@@ -277,9 +277,11 @@ def _categorical(logits: Tensor, choice: Tensor) -> tuple[Tensor, Tensor]:
 class TorchPolicy:
     """Acts as `NumpyPolicy` does, with images. Lanes go one at a time, so each gets the bits it would get alone."""
 
-    def __init__(self, spec: PolicySpec) -> None:
+    def __init__(self, spec: PolicySpec, device: str = "cpu", *, together: bool = False) -> None:
+        """`together`: all lanes in one pass, for whoever always has all of them."""
         self.spec = spec
-        self._net = QNetwork(spec) if spec.head == "q" else ActorCritic(spec)
+        self._device, self._together = device, together
+        self._net = QNetwork(spec, device) if spec.head == "q" else ActorCritic(spec, device)
         self._buffers: dict[str, Floats] = {}
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
@@ -290,7 +292,7 @@ class TorchPolicy:
                 f"weights expected {count} parameters and {buffer_size(self.spec)} buffers, "
                 f"got {parameters.shape} and {buffers.shape}"
             )
-        np.copyto(self._net.flat.numpy()[:count], parameters)
+        self._net.flat[:count].copy_(torch.tensor(parameters))
         self._buffers = views(buffers, buffer_fields(self.spec))
 
     def __call__(self, leaves: Sequence[Array], state: Floats | None = None) -> Floats:
@@ -300,17 +302,23 @@ class TorchPolicy:
             x = normalized(x, self._buffers["observation_mean"], self._buffers["observation_std"])
         images = [array for leaf, array in zip(self.spec.observation, leaves, strict=True) if leaf.is_image]
         state = zero_state(self.spec, *x.shape[:-1]) if state is None else state
-        out = np.stack([self._lane(x[lane], [image[lane] for image in images], state[lane]) for lane in range(len(x))])
+        if self._together:
+            L, N = x.shape[:2]
+            remembered = state.reshape(L * N, -1)
+            flat = self._lane(x.reshape(L * N, -1), [image.reshape(L * N, *image.shape[2:]) for image in images], remembered)
+            out, state[...] = flat.reshape(L, N, -1), remembered.reshape(state.shape)
+        else:
+            out = np.stack([self._lane(x[lane], [image[lane] for image in images], state[lane]) for lane in range(len(x))])
         if self.spec.head != "q":
             return out
         return np.concatenate([out, np.broadcast_to(self._buffers["epsilon"], (*out.shape[:-1], 1))], -1)
 
     def _lane(self, x: Floats, images: Sequence[Array], state: Floats) -> Floats:
         """Of one lane: [N, D], [N, *leaf] each, [N, S], which is moved on -> [N, P]."""
-        inputs = torch.tensor(x), [torch.tensor(image) for image in images]
+        inputs = torch.tensor(x, device=self._device), [torch.tensor(image, device=self._device) for image in images]
         with torch.no_grad():
             if isinstance(self._net, QNetwork):
-                return np.asarray(self._net.params(*inputs).numpy())
-            params, after = self._net.act(*inputs, torch.tensor(state))
-        state[:] = after.numpy()
-        return np.asarray(params.numpy())
+                return np.asarray(self._net.params(*inputs).cpu().numpy())
+            params, after = self._net.act(*inputs, torch.tensor(state, device=self._device))
+        state[:] = after.cpu().numpy()
+        return np.asarray(params.cpu().numpy())

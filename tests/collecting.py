@@ -62,12 +62,12 @@ def a_collector(run: RunSpec, open_copies: OpenCopies = loop_over_copies) -> Col
 
 def over_copies_of(makes: Sequence[Callable[[], gymnasium.Env[Any, Any]]]) -> OpenCopies:
     """A loop over these copies, one of each."""
-    return lambda run, pulse: CopyLoop(iter([make() for make in makes]).__next__, len(makes), pulse)
+    return lambda run, lane, pulse: CopyLoop(iter([make() for make in makes]).__next__, len(makes), pulse)
 
 
 def over_sync(makes: Sequence[Callable[[], gymnasium.Env[Any, Any]]]) -> OpenCopies:
     """A SyncVectorEnv over these copies, one of each."""
-    return lambda run, pulse: VectorCopies(SyncVectorEnv(makes))
+    return lambda run, lane, pulse: VectorCopies(SyncVectorEnv(makes))
 
 
 def collect(

@@ -59,7 +59,7 @@ def test_an_environment_that_cannot_be_made_is_named() -> None:
 
     run = run_of(f"{TOY}Countdown-v0")
     with pytest.raises(EnvironmentBroke, match=r"lane 0, copy 0, made: .* RuntimeError: no licence$"):
-        collect(a_collector(run, lambda r, pulse: CopyLoop(make, 2, pulse)), run)
+        collect(a_collector(run, lambda r, lane, pulse: CopyLoop(make, 2, pulse)), run)
 
 
 def test_a_vector_environment_that_raises_is_named() -> None:

@@ -190,7 +190,7 @@ def closable(T: int = 4) -> tuple[RunSpec, Collector, list[str]]:
     said: list[str] = []
     names = iter("abcdefgh")
     run = run_of(f"{TOY}Scripted-v0", T=T, N=1)
-    return run, a_collector(run, lambda r, p: over_copies_of([partial(Closable, said, next(names))])(r, p)), said
+    return run, a_collector(run, lambda r, n, p: over_copies_of([partial(Closable, said, next(names))])(r, n, p)), said
 
 
 def test_lanes_are_closed_when_released_or_begun_afresh() -> None:

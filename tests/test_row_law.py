@@ -147,7 +147,7 @@ class EndsAgain(VectorEnv[Any, Any, Any]):
 
 def test_a_vector_environment_that_ends_on_the_reset_step() -> None:
     run = run_of(f"{TOY}Countdown-v0", T=5, N=2)  # it has the same spaces
-    collector = a_collector(run, lambda run, pulse: VectorCopies(EndsAgain(2)))
+    collector = a_collector(run, lambda run, lane, pulse: VectorCopies(EndsAgain(2)))
     (rollout,) = collect(collector, run)
     assert rollout.terminated.T.tolist() == [[True] * 5, [False, True, False, True, False]]
     assert rollout.valid.T.tolist() == [[True, False, False, False, False], [True, True, False, True, False]]
@@ -176,7 +176,7 @@ def test_gymnasiums_vectorised_cartpole_collects_lawfully() -> None:
     assert 0 < lengths <= collector.steps < 2 * 3 * 100 * 4
 
 
-def native_cartpole(run: RunSpec, pulse: object) -> VectorCopies:
+def native_cartpole(run: RunSpec, lane: int, pulse: object) -> VectorCopies:
     return VectorCopies(gymnasium.make_vec("CartPole-v1", run.copies))
 
 

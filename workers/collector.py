@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from protocol.distributions import distribution
+from protocol.errors import EnvironmentFailed
 from protocol.policy import Policy
 from protocol.rollout import Rollout
 from protocol.spaces import writer
@@ -25,12 +26,19 @@ from workers.session import Assignment
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
-OpenCopies = Callable[[RunSpec, Pulse], Copies]
+OpenCopies = Callable[[RunSpec, int, Pulse], Copies]
+"""The copies of the lane of this number."""
+Begin = Callable[[Sequence[int], Array, Pulse], None]
+"""Told the numbers of L lanes and their actions [L, N, *action], before the first of them is stepped."""
 
 
-def loop_over_copies(run: RunSpec, pulse: Pulse) -> Copies:
+def loop_over_copies(run: RunSpec, lane: int, pulse: Pulse) -> Copies:
     """The copies of one lane as a loop: what a worker opens unless it is told otherwise."""
     return CopyLoop(run.env.make, run.copies, pulse)
+
+
+def each_by_itself(lanes: Sequence[int], actions: Array, pulse: Pulse) -> None:
+    """Nothing begins before a lane is stepped."""
 
 
 class _Rows(NamedTuple):
@@ -50,14 +58,21 @@ class _Rows(NamedTuple):
 class Collector:
     """Collects rollouts on lanes that it opens as they are asked for."""
 
-    def __init__(self, run: RunSpec, policy: Policy, open_copies: OpenCopies = loop_over_copies) -> None:
+    def __init__(
+        self,
+        run: RunSpec,
+        policy: Policy,
+        open_copies: OpenCopies = loop_over_copies,
+        begin: Begin = each_by_itself,
+    ) -> None:
+        """`begin`: for copies that are stepped all at once, whichever lane they are of."""
         self.steps = 0
         """env steps collected: valid rows"""
         self.stages = {"open": 0.0, "act": 0.0, "step": 0.0}
         """seconds spent making and first resetting copies, choosing actions, stepping copies"""
         self._run = run
         self._policy = policy
-        self._open_copies = open_copies
+        self._open_copies, self._begin = open_copies, begin
         self._distribution = distribution(run.policy)
         self._write = writer(run.policy.action)
         self._lanes: dict[int, Lane] = {}
@@ -82,7 +97,7 @@ class Collector:
             rows = self._new_rows(lanes)
             try:
                 self._fill(rows, lanes, pulse)
-            except (EnvironmentBroke, IndexError):  # a nonsensical row explains what came of it
+            except (EnvironmentBroke, EnvironmentFailed, IndexError):  # a nonsensical row explains what came of it
                 done = len(rows.clock)
                 for i, lane in enumerate(lanes):
                     lane.check_sense([array[i, : done + 1] for array in rows.obs], rows.reward[i, :done])
@@ -116,7 +131,7 @@ class Collector:
         began = perf_counter()
         self.close([assignment.lane])
         try:
-            copies = self._open_copies(self._run, pulse)
+            copies = self._open_copies(self._run, assignment.lane, pulse)
         except CopyRaised as error:
             raise environment_raised(assignment.lane, "made", error) from error
         lane = self._lanes[assignment.lane] = Lane(self._run, assignment.lane, assignment.incarnation, copies)
@@ -146,6 +161,7 @@ class Collector:
     def _fill(self, rows: _Rows, lanes: Sequence[Lane], pulse: Pulse) -> None:
         """Step all lanes T times."""
         resets = np.stack([lane.ended for lane in lanes])  # [L, N] row t is not valid
+        numbers = [lane.number for lane in lanes]
         for t in range(self._run.rollout_steps):
             pulse()
             began = perf_counter()
@@ -157,6 +173,7 @@ class Collector:
             rows.params[:, t] = params
             rows.action[:, t] = action
             acted = perf_counter()
+            self._begin(numbers, taken, pulse)
             for i, lane in enumerate(lanes):
                 row = lane.step(taken[i], t, pulse)
                 try:

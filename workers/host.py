@@ -28,7 +28,7 @@ from protocol.shared import Handed
 from protocol.specs import Code
 from workers.session import Leave, Session
 from workers.watchdog import where_it_hung
-from workers.worker import Worker, identity
+from workers.worker import MakeCollector, Worker, acting_by_itself, identity
 
 BACKOFF_FIRST_S, BACKOFF_MOST_S, HEALTHY_S = 0.5, 30.0, 30.0
 POLL_S = 0.1
@@ -128,19 +128,25 @@ class Process:
 
 
 class Thread:
-    """A worker in a thread of this process, over inproc: for debugging and for tests."""
+    """A worker in a thread of this process, over inproc: for debugging, for tests, and to act on the learner's side."""
 
-    def __init__(self, address: str, name: str, context: zmq.Context[Any]) -> None:
+    def __init__(
+        self, address: str, name: str, context: zmq.Context[Any], make_collector: MakeCollector = acting_by_itself
+    ) -> None:
         self._stops = 0
         self._left: Leave | None = None
+        self._make_collector = make_collector
         self._thread = threading.Thread(target=self._run, args=(address, name, context), name=name, daemon=True)
         self._thread.start()
 
     def _run(self, address: str, name: str, context: zmq.Context[Any]) -> None:
         session = Session(identity(name), time.monotonic())
         link = WorkerLink(address, name, context)
+        worker = Worker(
+            link, session, told_to_stop=lambda: self._stops, code=Code.CALLABLES, make_collector=self._make_collector
+        )
         with suppress(zmq.ContextTerminated):  # it could not be killed when all others were
-            self._left = Worker(link, session, told_to_stop=lambda: self._stops, code=Code.CALLABLES).run()
+            self._left = worker.run()
 
     def ended(self) -> tuple[int, str] | None:
         """Exit code and reason, as a process would have."""
@@ -176,11 +182,18 @@ class _Place:
 class Host:
     """N workers, w0 to wN-1."""
 
-    def __init__(self, start: Callable[[str], Running], count: int, clock: Callable[[], float] = time.monotonic) -> None:
-        """`start` starts the worker of that name."""
+    def __init__(
+        self,
+        start: Callable[[str], Running],
+        count: int,
+        clock: Callable[[], float] = time.monotonic,
+        *,
+        called: str = "w",
+    ) -> None:
+        """`start` starts the worker of that name, which is `called` so and has a number."""
         self._start, self._clock = start, clock
         self._stopping = False
-        self.places = [_Place(f"w{number}", start(f"w{number}"), clock()) for number in range(count)]
+        self.places = [_Place(name, start(name), clock()) for name in (f"{called}{number}" for number in range(count))]
 
     def poll(self) -> list[tuple[str, str]]:
         """The workers that have ended since the last call, and why; those that are due are started again."""
@@ -202,9 +215,11 @@ class Host:
         return ended
 
     @property
-    def empty(self) -> bool:
-        """Nobody is here, and nobody will come back."""
-        return all(place.running is None and (place.restart_s is None or self._stopping) for place in self.places)
+    def count(self) -> int:
+        """How many are here, or will come back."""
+        return sum(
+            place.running is not None or (place.restart_s is not None and not self._stopping) for place in self.places
+        )
 
     @property
     def exit_code(self) -> int:
@@ -240,7 +255,7 @@ class Host:
         while True:
             for name, why in self.poll():
                 say(f"{name} {why}")
-            if self.empty:
+            if not self.count:
                 return self.exit_code
             if heeded < told_to_stop():
                 heeded += 1

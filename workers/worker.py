@@ -39,6 +39,14 @@ ON_ITS_WAY_S = 0.02  # a message is announced by a bell, which is faster
 STATM = Path("/proc/self/statm")  # pages: all, resident, …
 
 
+MakeCollector = Callable[[RunSpec], Collector]
+
+
+def acting_by_itself(run: RunSpec) -> Collector:
+    """Copies of its own, one lane after another, and a policy of its own."""
+    return Collector(run, make_policy(run.policy))
+
+
 class _Abandoned(Exception):
     """Nobody wants the rollouts in hand any more."""
 
@@ -55,17 +63,18 @@ class Worker:
         alive: Callable[[float], None] = lambda now: None,
         code: Code = Code.MODULES,
         handed: Handed | None = None,
+        make_collector: MakeCollector = acting_by_itself,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """`told_to_stop` counts the requests to leave; `alive` is called now and then, unless the environment hangs;
         `code`: how much the learner may have it run; `handed`: shared memory and bells, for a vector environment of this
-        machine.
+        machine; `make_collector`: what collects in a run, and how it acts.
         """
         self._link, self._session, self._clock = link, session, clock
         self._told_to_stop, self._code = told_to_stop, code
         self._alive = alive
         self._stops_heeded = 0
-        self._handed = handed
+        self._handed, self._make_collector = handed, make_collector
         self._collector: Collector | None = None
         self._stepper: Stepper | None = None
         self._loaded: Weights | None = None
@@ -221,7 +230,7 @@ class Worker:
         try:
             match run:
                 case RunSpec():
-                    self._collector = Collector(run, make_policy(run.policy))
+                    self._collector = self._make_collector(run)
                 case StepSpec():
                     self._stepper = Stepper(run, self._handed, private=self._code is not Code.REGISTERED)
                     self._breath.start()

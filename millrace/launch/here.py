@@ -9,13 +9,19 @@ import os
 import shutil
 import tempfile
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from datetime import UTC, datetime
+from pathlib import Path
 
+from learner.config import Config
 from learner.listening import throwaway
 from protocol.errors import UsageError
 from protocol.key_folder import Keyring, asked_folder
 from protocol.keys import Token
+
+StartFlags = Callable[[str], tuple[list[str], Path | None]]
+"""By a worker's name: the flags that its process is started with, and the file that its stderr goes to."""
 
 
 def own_address(transport: str, stack: ExitStack) -> str:
@@ -37,3 +43,18 @@ def own_keys(transport: str, keys: str, *, insecure: bool) -> tuple[Keyring | No
     """Keys for this run alone, where loopback TCP is to have some: a key folder was named."""
     sealed = transport == "tcp" and asked_folder(keys) is not None and not insecure
     return throwaway("local", datetime.now(UTC)) if sealed else (None, None)
+
+
+def flags_of(config: Config, run: Path) -> StartFlags:
+    """Those of a run's workers; their logs lie in the run folder."""
+    logs = run / "workers"
+    logs.mkdir(exist_ok=True)
+    if config.pin_workers and not hasattr(os, "sched_setaffinity"):
+        raise UsageError("pin_workers: this system does not let a process keep to one core")
+    cores = sorted(os.sched_getaffinity(0)) if config.pin_workers else []
+
+    def flags(name: str) -> tuple[list[str], Path]:
+        pinned = ["--core", str(cores[int(name.removeprefix("w")) % len(cores)])] if cores else []
+        return ["--step-timeout-s", str(config.step_timeout_s), *pinned], logs / f"{name}.log"
+
+    return flags

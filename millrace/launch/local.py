@@ -5,7 +5,6 @@ The law: whatever happens, no worker, socket file or folder of ours is left behi
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -15,7 +14,8 @@ import zmq
 from learner.config import Config
 from learner.exposition import exposed
 from learner.run import Run, Watch
-from millrace.launch.here import own_address, own_keys
+from millrace.launch import inference
+from millrace.launch.here import flags_of, own_address, own_keys
 from protocol.errors import UsageError
 from protocol.keys import Token
 from protocol.link import LearnerLink
@@ -28,6 +28,8 @@ def train(config: Config, resume: Path | None, watch: Watch, factory: Callable[.
 
     Raises `OurError`, or `Interrupted` when the user stopped it.
     """
+    if config.inference == "learner":
+        return inference.train(config, resume, watch, factory)
     keyring, token = own_keys(config.transport, config.keys, insecure=config.insecure)
     if factory is not None and config.transport == "tcp" and keyring is None:
         raise UsageError("an environment factory is code: it travels over ipc or inproc only, or over tcp with --keys")
@@ -51,16 +53,10 @@ def _starter(
 ) -> Callable[[str], Running]:
     if config.transport == "inproc":
         return lambda name: Thread(address, name, context)
-    logs = run / "workers"
-    logs.mkdir(exist_ok=True)
-    if config.pin_workers and not hasattr(os, "sched_setaffinity"):
-        raise UsageError("pin_workers: this system does not let a process keep to one core")
-    cores = sorted(os.sched_getaffinity(0)) if config.pin_workers else []
+    flags = flags_of(config, run)
 
     def start(name: str) -> Process:
-        flags = ["--step-timeout-s", str(config.step_timeout_s)]
-        if cores:
-            flags += ["--core", str(cores[int(name.removeprefix("w")) % len(cores)])]
-        return Process(address, name, logs / f"{name}.log", token, flags)
+        own, log = flags(name)
+        return Process(address, name, log, token, own)
 
     return start

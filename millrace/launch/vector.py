@@ -20,7 +20,7 @@ from learner.listening import Bind, join_lines, keyring_for
 from learner.lockstep_hub import LockstepHub, Shared
 from learner.vector_env import ZmqVectorEnv
 from learner.vector_spec import Env, describe
-from millrace.launch.here import own_address, own_keys
+from millrace.launch.here import StartFlags, own_address, own_keys
 from protocol.address import advertised, check_address
 from protocol.errors import UsageError
 from protocol.key_folder import Keyring
@@ -54,8 +54,11 @@ def make_vec(
     copy: bool,
     render_mode: str | None,
     kwargs: dict[str, Scalar],
+    begin: Callable[[], StartFlags] | None = None,
 ) -> ZmqVectorEnv:
-    """See `millrace.make_vec`."""
+    """See `millrace.make_vec`. `begin`: called once the address is bound; then the workers are started with these flags, and
+    whoever called waits for them.
+    """
     copies = num_envs if num_envs is not None else (1 if isinstance(env, str) or callable(env) else len(env))
     if where.bind and workers:
         raise UsageError(f"workers expected 0 with a bind address, for they are started elsewhere, got {workers}")
@@ -76,7 +79,8 @@ def make_vec(
         if shared_memory and POSSIBLE and count and transport != "inproc":
             shared = Shared(Memory(described.step), {f"w{n}": (Bell(), Bell()) for n in range(count)})
             stack.callback(shared.close)
-        start = _starter(transport, link.address, token, context, shared, _step_timeout_s(timeout_s))
+        flags = begin() if begin is not None else lambda name: (["--step-timeout-s", str(_step_timeout_s(timeout_s))], None)
+        start = _starter(transport, link.address, token, context, shared, flags)
         host = Host(start, count) if count else None
         hub = LockstepHub(
             link,
@@ -90,7 +94,8 @@ def make_vec(
         if host is None:
             for line in join_lines(link.address, where.advertise, keyring):
                 log.warning("%s", line)
-        hub.wait_for(count or len(described.step.lanes), JOIN_S if host is not None else timeout_s)
+        if begin is None:
+            hub.wait_for(count or len(described.step.lanes), JOIN_S if host is not None else timeout_s)
         kept = ExitStack()
         made = ZmqVectorEnv(
             described,
@@ -120,7 +125,7 @@ def _starter(
     token: Token | None,
     context: zmq.Context[zmq.Socket[bytes]],
     shared: Shared | None,
-    step_timeout_s: float,
+    flags: StartFlags,
 ) -> Callable[[str], Running]:
     if transport == "inproc":
         return lambda name: Thread(address, name, context)
@@ -130,7 +135,8 @@ def _starter(
         if shared is not None:
             to_worker, to_learner = shared.bells[name]
             handed = Handed(shared.memory.fd, to_worker.fd, to_learner.fd)
-        return Process(address, name, None, token, ["--step-timeout-s", str(step_timeout_s)], handed)
+        own, log_file = flags(name)
+        return Process(address, name, log_file, token, own, handed)
 
     return start
 
