@@ -103,6 +103,7 @@ class EpisodeAssembler:
         valid, ended = rollout.valid[:, n], rollout.terminated[:, n] | rollout.truncated[:, n]
         for t in np.flatnonzero(ended | ~valid).tolist():
             if not valid[t]:  # a reset: the next row begins an episode
+                self.left_out += sum(len(piece.reward) for piece in lane.open[n] or ())  # its copy was lost before it ended
                 lane.open[n], start = [], t + 1
                 continue
             pieces = lane.open[n]

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv
 
+from learner.episodes import EpisodeAssembler
 from protocol.errors import NoWorkers
 from protocol.networks import TorchPolicy
 from protocol.policy import buffer_size, layout, size
@@ -85,6 +86,53 @@ def test_that_nobody_steps_is_remembered() -> None:
     with pytest.raises(NoWorkers):
         collect(Collector(run, random_policy(run.policy), parts.open, parts.begin), run, lanes=range(LANES))
     assert str(parts.nobody) == "waited 1 s for 1 workers"
+    env.close()
+
+
+class Loses(SyncVectorEnv[Any, Any]):
+    """Loses the first two copies in its step number `at`, as a vector environment over worker processes would."""
+
+    def __init__(self, makes: Any, at: int) -> None:
+        super().__init__(makes)
+        self.at, self.made = at, 0
+
+    def step(self, actions: Any) -> Any:
+        self.made += 1
+        if self.made - 1 != self.at:
+            return super().step(actions)
+        before = np.array(self._observations)
+        obs, reward, terminated, truncated, _ = super().step(actions)
+        lost = np.arange(self.num_envs) < 2
+        obs[lost], reward[lost], terminated[lost], truncated[lost] = before[lost], 0.0, False, True
+        self._autoreset_envs = terminated | truncated
+        return obs, reward, terminated, truncated, {"worker_lost": lost, "_worker_lost": lost}
+
+
+@pytest.mark.parametrize("at", range(9))
+def test_a_step_that_was_lost_is_in_no_valid_row(at: int) -> None:
+    """Wherever it falls: amid an episode, on its end (5 steps) or its reset, on the first or last row of a rollout (3)."""
+    run = run_of(f"{TOY}Countdown-v0", T=3)
+    env = Loses([run.env.make] * (LANES * run.copies), at)
+    env.reset()
+    parts = SideBySide(env, LANES)
+    collector = Collector(run, random_policy(run.policy), parts.open, parts.begin)
+    by_lane = zip(*(collect(collector, run, k, lanes=range(LANES)) for k in range(4)), strict=True)
+    assembler = EpisodeAssembler(lambda actions: actions)
+    whole = []
+    for lane, rollouts in enumerate(by_lane):
+        valid = np.concatenate([rollout.valid for rollout in rollouts])  # [12, N]
+        left = np.concatenate([rollout.obs[0][:-1, :, 0] for rollout in rollouts])  # [12, N] of 1.0, in fifths
+        reward = np.concatenate([rollout.reward for rollout in rollouts])
+        assert valid[at].any() == (lane > 0 and at != 5), "row 5 is every other copy's reset"
+        np.testing.assert_array_equal(reward, valid)
+        np.testing.assert_allclose(np.diff(left, axis=0)[valid[:-1] & valid[1:]], -0.2, atol=1e-6)
+        assert (left[1:][~valid[:-1] & valid[1:]] == 1.0).all(), "an episode began amid another"
+        whole += [episode for rollout in rollouts for episode in assembler.add(rollout, 0)]
+    assert {episode.length for episode in whole if episode.terminated[-1]} == {5}
+    cut = [episode.length for episode in whole if episode.truncated[-1]]
+    assert cut == [] if at in (0, 3, 5, 6) else cut == [at if at < 5 else at - 6] * 2
+    assert assembler.left_out == (6 if at == 3 else 0), "three steps of two copies, delivered before the loss"
+    assert collector.steps == assembler.waiting + assembler.left_out + sum(episode.length for episode in whole)
     env.close()
 
 

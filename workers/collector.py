@@ -177,13 +177,15 @@ class Collector:
             for i, lane in enumerate(lanes):
                 row = lane.step(taken[i], t, pulse)
                 try:
-                    leaves, rows.reward[i, t], rows.terminated[i, t], rows.truncated[i, t] = row
+                    leaves, rows.reward[i, t], rows.terminated[i, t], rows.truncated[i, t], lost = row
                     for array, leaf in zip(rows.obs, leaves, strict=True):
                         array[i, t + 1] = leaf
                 except (TypeError, ValueError) as error:
                     raise EnvironmentBroke(
                         lane.number, f"step {t}: its environment gave what cannot be kept: {error}"
                     ) from error
+                if lost is not None:
+                    _cut_short(rows, i, lane, t, lost)
             resets = rows.terminated[:, t] | rows.truncated[:, t]
             rows.clock.append(perf_counter())
             self.stages["act"] += acted - began
@@ -215,3 +217,15 @@ class Collector:
             state=before,
             episodes=episodes,
         )
+
+
+def _cut_short(rows: _Rows, i: int, lane: Lane, t: int, lost: npt.NDArray[np.bool_]) -> None:
+    """Lane `i` lost these copies [N] in step `t`: their episodes end, truncated, with the last step that was made.
+
+    Rows `t` and `t + 1` are then not valid: nothing is made up for the step that was not.
+    """
+    rows.truncated[i, t] |= lost
+    if t:
+        rows.truncated[i, t - 1] |= lost & ~rows.terminated[i, t - 1]
+    else:
+        lane.ended |= lost  # the last rollout is delivered: the episode's end is in none

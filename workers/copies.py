@@ -33,6 +33,8 @@ class Row(NamedTuple):
     reward: Any
     terminated: Any
     truncated: Any
+    lost: Array | None = None
+    """[N] bool, copies that are gone: their step was not made, the next one begins an episode on new ones"""
 
 
 class CopyRaised(Exception):

@@ -45,14 +45,15 @@ class SideBySide:
         if [lanes[i] for i in order] != list(range(self._lanes)):
             raise ValueError(f"lanes expected all {self._lanes} of the vector environment at once, got {sorted(lanes)}")
         each = actions[order].reshape(-1, *actions.shape[2:])  # [L · N, *action]
-        observation, reward, terminated, truncated, _ = self.wait(lambda: self.env.step(each), pulse)
-        self._row = Row(self._read(observation), reward, terminated, truncated)
+        observation, reward, terminated, truncated, infos = self.wait(lambda: self.env.step(each), pulse)
+        self._row = Row(self._read(observation), reward, terminated, truncated, infos.get("worker_lost"))
 
     def row(self, copies: slice) -> Row:
         """What these copies gave in the last step."""
         assert self._row is not None
-        leaves, reward, terminated, truncated = self._row
-        return Row([leaf[copies] for leaf in leaves], reward[copies], terminated[copies], truncated[copies])
+        leaves, reward, terminated, truncated, lost = self._row
+        lost = None if lost is None else lost[copies]
+        return Row([leaf[copies] for leaf in leaves], reward[copies], terminated[copies], truncated[copies], lost)
 
     def reset(self, copies: slice, seeds: Sequence[int], pulse: Pulse) -> Leaves:
         """Begin episodes in these copies."""
