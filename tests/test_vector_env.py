@@ -351,3 +351,12 @@ def play_sequence(
                 same("get_attr", value)
             case "render":
                 same("render")
+
+
+def test_lanes_that_are_more_than_workers_move_in_at_once() -> None:
+    """Nobody waits for a worker that is not to come: only a lane whose worker died waits for its successor."""
+    env = millrace.make_vec("CartPole-v1", 4, workers=1, lanes=4, timeout=5)
+    env.reset(seed=1)  # within the deadline, which is shorter than a lane's patience
+    assert env.step(np.zeros(4, np.int64))[1].tolist() == [1.0] * 4
+    assert env.workers == 1
+    env.close()

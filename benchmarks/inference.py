@@ -1,0 +1,112 @@
+"""Where the policy acts: `python -m benchmarks.inference`. Runs of PPO with --inference workers and learner, in turn.
+
+Env steps/s while collecting (the learner's waiting alone, updates left out), on two workers, and what a worker keeps in
+memory. The machine need not be idle: compare within a round.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")  # before numpy
+
+import argparse
+import json
+import statistics
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import psutil
+from rich.console import Console
+from rich.table import Table
+
+from learner.config import resolve
+from learner.metrics import Progress
+from millrace.launch.local import train
+
+RESULTS = Path(__file__).parent / "results"
+WARM_UP = 2  # updates that do not count: copies are opened, torch is imported
+MODES = ("workers", "learner")
+
+
+class Frames(gymnasium.Env[Any, Any]):
+    """84×84×4 bytes, which change with every step and cost next to nothing."""
+
+    def __init__(self) -> None:
+        self.observation_space = gymnasium.spaces.Box(0, 255, (84, 84, 4), np.uint8)
+        self.action_space = gymnasium.spaces.Discrete(6)
+        self._frame, self._steps = np.zeros((84, 84, 4), np.uint8), 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._steps = 0
+        return self._frame.copy(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self._steps += 1
+        self._frame[self._steps % 84] += 1
+        return self._frame.copy(), 1.0, self._steps == 500, False, {}
+
+
+CASES: dict[str, tuple[Callable[..., object] | None, dict[str, Any]]] = {
+    "CartPole-v1, 8 copies": (None, {"envs": 8, "rollout_steps": 256, "n_epochs": 1, "steps": 40_000}),
+    "CartPole-v1, 64 copies": (
+        None,
+        {"envs": 64, "rollout_steps": 256, "n_epochs": 1, "batch_size": 2048, "steps": 300_000},
+    ),
+    "84×84×4, 16 copies": (Frames, {"envs": 16, "rollout_steps": 16, "n_epochs": 1, "batch_size": 256, "steps": 2_600}),
+}
+
+
+def measure(case: str, mode: str, threads: int) -> tuple[float, float]:
+    """Env steps/s while collecting, and MB of one worker."""
+    factory, settings = CASES[case]
+    seen: list[tuple[int, float]] = []
+    memory: list[float] = []
+
+    def watch(progress: Progress) -> None:
+        seen.append((progress.env_steps, progress.stages["learner_wait"]))
+        workers = [child for child in psutil.Process().children() if "workers" in child.cmdline()]
+        memory.extend(worker.memory_info().rss / 1e6 for worker in workers)
+
+    with tempfile.TemporaryDirectory() as folder:
+        config = resolve(
+            "CartPole-v1" if factory is None else "Frames",
+            inference=mode,
+            torch_threads=threads,
+            eval_episodes=1,
+            run_dir=folder,
+            **settings,
+        )
+        train(config, None, watch, factory)
+    (steps, wait_s), (last_steps, last_wait_s) = seen[WARM_UP], seen[-1]
+    return (last_steps - steps) / (last_wait_s - wait_s), statistics.median(memory)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="where the policy acts")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--torch-threads", type=int, default=2, help="of the learner; workers have one each")
+    arguments = parser.parse_args()
+    rows: list[dict[str, object]] = []
+    for case in CASES:
+        turns = [{mode: measure(case, mode, arguments.torch_threads) for mode in MODES} for _ in range(arguments.rounds)]
+        for mode in MODES:
+            rate, memory = (statistics.median(turn[mode][i] for turn in turns) for i in range(2))
+            rows.append({"case": case, "inference": mode, "env_steps_per_s": round(rate), "worker_mb": round(memory)})
+    table = Table(title=f"PPO on two workers, collecting, medians of {arguments.rounds}")
+    for column in rows[0]:
+        table.add_column(column)
+    for row in rows:
+        table.add_row(*map(str, row.values()))
+    Console().print(table)
+    RESULTS.mkdir(exist_ok=True)
+    (RESULTS / "inference.json").write_text(json.dumps({"inference": rows}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
