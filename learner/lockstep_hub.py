@@ -214,6 +214,10 @@ class LockstepHub:
         lost, self.lockstep.lost = self.lockstep.lost, {}
         return lost
 
+    def lives(self, lane: int) -> bool:
+        """Whether its copies are with a worker."""
+        return self.lockstep.seats[lane].living
+
     def renew(self) -> None:
         """Every lane is about to begin anew: even out."""
         self._turn(0.0)

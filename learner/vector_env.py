@@ -125,7 +125,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
             wanted = {lane: copies for lane, copies in wanted.items() if lane not in answers}
             self._unborn -= answers.keys()
             lost = self._hub.lost()
-            self._lost |= {lane: why for lane, why in lost.items() if lane not in wanted and lane not in chosen}
+            self._lost |= {lane: why for lane, why in lost.items() if lane not in wanted and not self._hub.lives(lane)}
             if not wanted:
                 return infos
             if self.on_worker_loss == "raise" or attempt == ATTEMPTS - 1:
@@ -233,7 +233,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
 
     def _with_losses(self, infos: dict[int, bytes], answered: set[int]) -> StepResult:
         """The step's result where some lanes have none: their copies are truncated at their newest observation."""
-        self._lost |= {lane: why for lane, why in self._hub.lost().items() if lane not in answered}
+        self._lost |= self._hub.lost()  # whoever answered and was lost then is told of in the next step
         lost = {lane: self._lost.pop(lane) for lane in self._lanes if lane in self._lost and lane not in answered}
         for lane in self._lanes:
             if lane not in answered:

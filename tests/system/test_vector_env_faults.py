@@ -125,6 +125,21 @@ def test_a_worker_that_dies_in_mid_step_is_noticed_at_once(tmp_path: Path, share
     closed_cleanly(env)
 
 
+def test_a_lane_that_had_answered_before_its_worker_died_is_told_of_in_the_next_step(tmp_path: Path) -> None:
+    once = str(tmp_path / "once")
+    env = made("workers.envs.toy:Dies-v0", after=2, once=once, k=50, only_seed=3, workers=1, lanes=2)
+    env.reset(seed=1)  # copy 2 has seed 3: the second lane dies when the first one has stepped
+    told = [env.step(ZEROS) for _ in range(6)]
+    assert [step[3].tolist() for step in told[:3]] == [[False] * 4, [False] * 4, [False, False, True, True]]
+    assert [step[3][:2].all() for step in told] == [False, False, False, True, False, False]
+    left = np.array([step[0][:, 0] for step in told])  # counts down by 1/50, unless an end was told one or two steps before
+    for n in range(4):
+        for t in range(1, 6):
+            if not any(step[3][n] for step in told[max(0, t - 1) : t + 1]):
+                assert left[t, n] == pytest.approx(left[t - 1, n] - 0.02), "an episode began that nobody was told of"
+    closed_cleanly(env)
+
+
 def test_a_loss_is_raised_where_that_is_asked_for(shared: bool) -> None:
     env = made(on_worker_loss="raise", shared_memory=shared)
     env.reset(seed=1)
