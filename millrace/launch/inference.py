@@ -16,6 +16,7 @@ from pathlib import Path
 import zmq
 
 from learner.config import Config
+from learner.exposition import exposed
 from learner.listening import Bind
 from learner.run import Run, Watch
 from learner.vector_env import ZmqVectorEnv
@@ -51,7 +52,7 @@ def train(
 
         def begin() -> StartFlags:
             env = EnvSpec.of(config.env if factory is None else factory, config.env_kwargs)
-            made.append(Run(config, env, link, resume, watch))
+            made.append(Run(config, env, link, resume, watch, stack.enter_context(exposed(config))))
             return flags_of(config, made[0].folder.path)
 
         env = _vector_env(config, factory, elsewhere, begin)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from contextlib import closing
+import time
+from contextlib import closing, suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import zmq
 
+from protocol.codec import decode_to_observer, encode
+from protocol.errors import BadMessage
+from protocol.messages import Inquire, Status
 from tests.fakes import fake_rollout
 from tests.hostile import hostile, real
 from tests.system.processes import START_S, Learner, Stage, free_port
@@ -16,13 +20,24 @@ from tests.system.runs import accounted
 from workers.copies import copy_seeds
 
 MESSAGES, STRANGERS = 30_000, 5
-GROWTH_MB = 30  # in the second half: in the first the sockets' queues fill, which are bounded
+GROWTH_MB = 30  # in the second half
 
 
 def result(learner: Learner) -> tuple[bytes, dict[str, Any], list[dict[str, Any]]]:
     """Wait for the end; the policy, the summary and the rows of metrics."""
     assert learner.ends(START_S) == 0, learner.said()[-5_000:]
     return (learner.folder / "policy.safetensors").read_bytes(), learner.summary(), learner.rows()
+
+
+def answered(stranger: zmq.Socket[bytes]) -> None:
+    """Wait until the learner has read all that this stranger has sent: what is on its way is no growth of the learner."""
+    stranger.send_multipart([bytes(frame) for frame in encode(Inquire())])
+    deadline_s = time.monotonic() + START_S
+    while True:
+        assert stranger.poll(max(0, int(1000 * (deadline_s - time.monotonic())))), "a stranger's question was not answered"
+        with suppress(BadMessage):  # what it was told of its rubbish
+            if isinstance(decode_to_observer(stranger.recv_multipart()), Status):
+                return
 
 
 def pester(learner: Learner, address: str) -> float:
@@ -39,7 +54,9 @@ def pester(learner: Learner, address: str) -> float:
     try:
         for number, frames in enumerate(islice(hostile(3, real(fake_rollout(7, 0, 1, 0, 0))), MESSAGES)):
             strangers[number % STRANGERS].send_multipart(frames)
-            if number % 1_000 == 0:
+            if number % 1_000 == 999:
+                for stranger in strangers:
+                    answered(stranger)
                 sizes.append(learner.memory_mb())
     finally:
         for stranger in strangers:
