@@ -24,7 +24,7 @@ from protocol.codec import encode
 from protocol.errors import BadMessage, EnvironmentFailed, NoWorkers
 from protocol.link import LearnerLink
 from protocol.messages import Answer, Inquire
-from protocol.shared import MESSAGE, Bell, Memory, spin
+from protocol.shared import Bell, Memory, Rung, spin
 from protocol.specs import StepSpec
 
 log = logging.getLogger("millrace.learner")
@@ -159,6 +159,7 @@ class LockstepHub:
         for lane in lanes:
             self._under_way[lane] = self.lockstep.in_memory[lane] = number = memory.ordered(lane) + 1
             memory.order(lane, number)
+        for lane in lanes:
             bells = self._waits[lane]
             assert bells is not None
             bells[0].ring()
@@ -239,7 +240,7 @@ class LockstepHub:
         deadline_s = self._clock() + (min(BUSY_S, timeout_s) if busy else timeout_s)
         self._send(self.lockstep.membership.drain("the vector environment was closed"))
         for bell, _ in self._shared.bells.values() if self._shared is not None else ():
-            bell.ring(MESSAGE)
+            bell.ring(Rung.MESSAGE)
         while self.lockstep.members and self._clock() < deadline_s:
             self._receive(POLL_S)
             for name, why in self.staff.poll():
@@ -340,7 +341,7 @@ class LockstepHub:
             if not self.link.send(peer, encode(message)):
                 continue  # it is gone, or does not read: its silence will tell
             if self._shared is not None and (bells := self._shared.bells.get(name_of(peer).decode(errors="replace"))):
-                bells[0].ring(MESSAGE)  # it may be asleep beside its shared memory
+                bells[0].ring(Rung.MESSAGE)  # it may be asleep beside its shared memory
 
     def _give_up(self, timeout_s: float) -> None:
         """The deadline has passed: whoever holds an order has had it."""

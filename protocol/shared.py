@@ -2,7 +2,7 @@
 
 The law: a lane's words are written by one side each. The learner lays the actions and then raises `ordered`; the worker
 lays what the step gave and then raises `answered` to the same number; only then does the other side look. Nothing of it has
-a name in any file system: the memory is an unlinked file and the bells are eventfds, handed to the children at their start,
+a name in any file system: the memory is an unlinked file and the bells are pipes, handed to the children at their start,
 so nothing can be left behind, whoever dies. Linux only; elsewhere everything travels as messages.
 """
 
@@ -12,7 +12,10 @@ import mmap
 import os
 import platform
 import select
+import threading
 from collections.abc import Iterator
+from contextlib import suppress
+from enum import IntEnum
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -23,14 +26,15 @@ from protocol.specs import StepSpec
 
 Array = npt.NDArray[Any]
 
-POSSIBLE = hasattr(os, "memfd_create") and hasattr(os, "eventfd")
+POSSIBLE = hasattr(os, "memfd_create") and hasattr(os, "pipe2")
 LINE = 64  # bytes of a cache line: each lane's words have lines of their own
 WORDS = LINE // 8
 INFO_BYTES = 1 << 20  # of a lane, at least; what is longer travels as a message
-MESSAGE = 1 << 32  # a bell that was rung by so much, or more, was rung for a message
 ELSEWHERE = -1  # in place of the number of bytes: the infos of this step travel as a message
 # x86 lets nobody see a later store before an earlier one. Elsewhere only a system call orders them: no spinning there.
 MAY_SPIN = platform.machine() in {"x86_64", "AMD64", "i686"}
+SPIN_S = 0.0002  # a learner that only looks into its next step is back by then; sleeping and waking costs 50 µs
+WANTED_S = 0.00005  # of one turn of waiting awake: somebody else ran meanwhile, who wants this core
 
 
 class Handed(NamedTuple):
@@ -38,9 +42,9 @@ class Handed(NamedTuple):
 
     memory: int
     to_worker: int
-    """eventfd, rung by the learner"""
+    """the end of a pipe where the learner's ringing is heard"""
     to_learner: int
-    """eventfd, rung by the worker"""
+    """the end of a pipe where the worker rings"""
 
 
 class LaneMemory(NamedTuple):
@@ -74,6 +78,9 @@ class Memory:
             raise ValueError(f"shared memory expected {size} bytes, got {os.fstat(fd).st_size}")
         memory = mmap.mmap(self.fd, size)
         self._words = memoryview(memory)[: 2 * LINE * lanes].cast("q")
+        numbers = np.frombuffer(memory, np.int64, 2 * WORDS * lanes).reshape(lanes, 2, WORDS)[:, :, 0]
+        self._ordered, self._answered = numbers[:, 0], numbers[:, 1]
+        self._fence = threading.Lock()
         arrays = [
             np.frombuffer(memory, dtype, N * int(np.prod(shape)), at).reshape(N, *shape)
             for at, shape, dtype in (*places, *flags)
@@ -117,6 +124,15 @@ class Memory:
         self._words[2 * WORDS * lane + WORDS] = number
         return fits
 
+    def under_way(self) -> int:
+        """How many lanes have an order that is not done, as whoever has just done one sees it.
+
+        Of workers that end at the same moment at least one sees none: taking the lock is what makes one's own answer seen
+        before the others' are looked at. Not on every machine: see `MAY_SPIN`.
+        """
+        with self._fence:
+            return int(np.count_nonzero(self._ordered != self._answered))
+
     def infos(self, lane: int) -> bytes | None:
         """The packed infos of the newest answer; None if they travel as a message."""
         size = self._words[2 * WORDS * lane + WORDS + 1]
@@ -129,43 +145,73 @@ class Memory:
             self.fd = -1
 
 
+class Rung(IntEnum):
+    """What a bell was rung for."""
+
+    NOT = 0
+    STEP = 1
+    MESSAGE = 2
+
+
 class Bell:
-    """An eventfd: rung by one process, waited for by another."""
+    """A pipe: rung by one side, which writes, and heard by the other, which reads.
 
-    def __init__(self, fd: int | None = None) -> None:
-        """A new one, or one that was handed over."""
-        self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC) if fd is None else fd
+    A pipe, for Linux takes it that who writes to one is about to wait: whom it wakes begins on the same core as soon as the
+    other sleeps. Whom an eventfd or a semaphore wakes may be made to wait for a core where a third one spins.
+    """
+
+    def __init__(self, *, hears: int = -1, rings: int = -1) -> None:
+        """A new one; or one of the ends, which was handed over."""
+        self.hears, self.rings = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC) if hears == rings == -1 else (hears, rings)
         self._poll = select.poll()
-        self._poll.register(self.fd, select.POLLIN)
+        if self.hears != -1:
+            self._poll.register(self.hears, select.POLLIN)
 
-    def ring(self, by: int = 1) -> None:
-        """Wake whoever waits, or will: for a step, or by MESSAGE for a message."""
-        os.eventfd_write(self.fd, by)
+    def ring(self, rung: Rung = Rung.STEP) -> None:
+        """Wake whoever waits, or will."""
+        with suppress(BlockingIOError, BrokenPipeError):  # full: it will wake; broken: nobody is left to
+            os.write(self.rings, _STROKES[rung])
 
-    def wait(self, timeout_s: float) -> int:
-        """Sleep until it is rung, at most `timeout_s`: the sum of what it was rung by, 0 if it was not.
+    def wait(self, timeout_s: float) -> Rung:
+        """Sleep until it is rung, at most `timeout_s`; of all that it was rung for, a message counts most.
 
         Rung for a step that was seen without sleeping, it wakes the next sleeper for nothing.
         """
         if not self._poll.poll(timeout_s * 1000):
-            return 0
+            return Rung.NOT
         try:
-            return os.eventfd_read(self.fd)
+            strokes = os.read(self.hears, 4096)
         except BlockingIOError:
-            return 0
+            return Rung.NOT
+        return Rung(max(strokes, default=0))
 
     def close(self) -> None:
         """Let go of it."""
-        if self.fd >= 0:
-            os.close(self.fd)
-            self.fd = -1
+        for fd in {self.hears, self.rings} - {-1}:
+            os.close(fd)
+        self.hears = self.rings = -1
+
+
+_STROKES = {rung: bytes([rung]) for rung in Rung}
 
 
 def spin(seconds: float) -> Iterator[None]:
-    """Turns of waiting awake, each of which lets others run first."""
+    """Turns of waiting awake, each of which lets others run first; none after somebody else wanted this core.
+
+    Yielding is a request that Linux may decline for a while: only who sleeps surely makes room.
+    """
     if not MAY_SPIN or seconds <= 0:
         return
-    until = perf_counter() + seconds
-    while perf_counter() < until:
+    now = perf_counter()
+    until = now + seconds
+    while now < until:
         yield
         os.sched_yield()
+        before, now = now, perf_counter()
+        if now - before > WANTED_S:
+            return
+
+
+def cores() -> int:
+    """How many of this machine's cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -17,13 +17,12 @@ import numpy.typing as npt
 from protocol.errors import OurError, UsageError
 from protocol.messages import Answer, Array, Call, Order, Reset, Returned, Step, Stepped
 from protocol.plain import pack, unpack
-from protocol.shared import MESSAGE, Bell, Handed, Memory, spin
+from protocol.shared import MAY_SPIN, SPIN_S, Bell, Handed, Memory, Rung, cores, spin
 from protocol.specs import StepSpec
 from workers.copies import CopyRaised, Pulse
 from workers.lane import environment_raised
 from workers.stepping import Infos, Rows, SteppedLane, new_rows
 
-SPIN_S = 0.0002  # a learner that only looks into its next step is back by then; sleeping and waking costs 50 µs
 MAX_TRACEBACK = 20_000  # characters
 
 
@@ -40,8 +39,10 @@ class Stepper:
         self._lanes: dict[int, SteppedLane] = {}
         self._seen: dict[int, int] = {}  # lane -> the newest order through shared memory that is obeyed
         self._memory = None if handed is None else Memory(spec, handed.memory)
-        self._called = None if handed is None else Bell(handed.to_worker)
-        self._calls = None if handed is None else Bell(handed.to_learner)
+        self._called = None if handed is None else Bell(hears=handed.to_worker)
+        self._calls = None if handed is None else Bell(rings=handed.to_learner)
+        self._cores = cores()
+        self._spin_s = 0.0  # how long to wait awake for the next order
 
     def obey(self, order: Order, pulse: Pulse) -> Answer:
         """What comes of it. Raises `EnvironmentBroke`, and what `pulse` raises: then the lane is closed."""
@@ -65,7 +66,11 @@ class Stepper:
         return _stepped(order, lane.rows, pack_infos(infos))
 
     def serve(self, timeout_s: float, pulse: Pulse, session: int, say: Callable[[Stepped], None]) -> bool:
-        """Step whichever lanes shared memory asks for, until `timeout_s` have passed; True if it was rung for a message."""
+        """Step whichever lanes shared memory asks for, until `timeout_s` have passed; True if it was rung for a message.
+
+        Waiting awake is quicker, but of all workers only so many may that the learner has a core for itself. They are those
+        that were done first: so the last one's core is free, and awake, when the learner is rung for.
+        """
         assert self._memory is not None
         assert self._called is not None
         until = perf_counter() + timeout_s
@@ -74,13 +79,13 @@ class Stepper:
             if any(served):
                 if perf_counter() > until:
                     return False
-                for _ in spin(SPIN_S):
+                for _ in spin(self._spin_s):
                     if self._asked():
                         break
                 continue
             rung = self._called.wait(max(0.0, until - perf_counter()))
-            if not rung or rung >= MESSAGE:
-                return bool(rung)
+            if rung is not Rung.STEP:
+                return rung is Rung.MESSAGE
 
     @property
     def shares(self) -> bool:
@@ -108,7 +113,11 @@ class Stepper:
         if not memory.answer(number, order, infos):
             step = Step(session, -order, number, lane.incarnation, ())
             say(_stepped(step, lane.rows, infos))
-        self._calls.ring()
+        left = memory.under_way()
+        if not left or not MAY_SPIN:
+            self._calls.ring()
+        done_before = len(memory.lanes) - len(self._lanes) - left
+        self._spin_s = SPIN_S if done_before < self._cores - 1 else 0.0
         return True
 
     def _step(self, lane: SteppedLane, actions: Iterable[Array], pulse: Pulse) -> Infos:

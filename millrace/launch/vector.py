@@ -26,7 +26,7 @@ from protocol.errors import UsageError
 from protocol.key_folder import Keyring
 from protocol.keys import Token
 from protocol.link import LearnerLink
-from protocol.shared import POSSIBLE, Bell, Handed, Memory
+from protocol.shared import POSSIBLE, SPIN_S, Bell, Handed, Memory, cores
 from protocol.specs import Scalar
 from workers.host import Host, Process, Running, Thread
 
@@ -77,7 +77,8 @@ def make_vec(
         stack.callback(link.close, 0.5)
         shared = None
         if shared_memory and POSSIBLE and count and transport != "inproc":
-            shared = Shared(Memory(described.step), {f"w{n}": (Bell(), Bell()) for n in range(count)})
+            for_us = Bell()  # rung once a step, by the worker that is done last
+            shared = Shared(Memory(described.step), {f"w{n}": (Bell(), for_us) for n in range(count)})
             stack.callback(shared.close)
         flags = begin() if begin is not None else lambda name: (["--step-timeout-s", str(_step_timeout_s(timeout_s))], None)
         start = _starter(transport, link.address, token, context, shared, flags)
@@ -89,6 +90,7 @@ def make_vec(
             staff=host,
             shared=shared,
             worker_timeout_s=worker_timeout_s,
+            spin_s=SPIN_S if count < cores() else 0.0,  # there is a core that no worker needs
         )
         stack.callback(hub.close, CLOSE_S)
         if host is None:
@@ -134,7 +136,7 @@ def _starter(
         handed = None
         if shared is not None:
             to_worker, to_learner = shared.bells[name]
-            handed = Handed(shared.memory.fd, to_worker.fd, to_learner.fd)
+            handed = Handed(shared.memory.fd, to_worker.hears, to_learner.rings)
         own, log_file = flags(name)
         return Process(address, name, log_file, token, own, handed)
 
