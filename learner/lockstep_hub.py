@@ -24,7 +24,7 @@ from protocol.codec import encode
 from protocol.errors import BadMessage, EnvironmentFailed, NoWorkers
 from protocol.link import LearnerLink
 from protocol.messages import Answer, Inquire
-from protocol.shared import Bell, Memory, Rung, spin
+from protocol.shared import Awake, Bell, Memory, Rung
 from protocol.specs import StepSpec
 
 log = logging.getLogger("millrace.learner")
@@ -116,6 +116,7 @@ class LockstepHub:
         self.lockstep = Lockstep(spec, first_session, worker_timeout_s)
         self.staff: Staff = staff or Nobody()
         self._shared, self._spin_s, self._clock = shared, spin_s, clock
+        self._awake = Awake()
         self._wanted: dict[int, Make] = {}  # lane -> an order that is said as soon as the lane is placed
         self._wanted_since_s = 0.0
         self._patience_s = PATIENCE_S
@@ -254,9 +255,7 @@ class LockstepHub:
         assert self._shared is not None
         memory, number, bells = self._shared.memory, self._under_way[lane], self._waits[lane]
         assert bells is not None
-        for _ in spin(self._spin_s):
-            if memory.answered(lane) == number:
-                break
+        self._awake.wait(lambda: memory.answered(lane) == number, self._spin_s)
         while memory.answered(lane) != number and lane in self._under_way:
             if not bells[1].wait(POLL_S):
                 self._turn(0.0)

@@ -13,7 +13,7 @@ import os
 import platform
 import select
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from enum import IntEnum
 from time import perf_counter
@@ -35,6 +35,7 @@ ELSEWHERE = -1  # in place of the number of bytes: the infos of this step travel
 MAY_SPIN = platform.machine() in {"x86_64", "AMD64", "i686"}
 SPIN_S = 0.0002  # a learner that only looks into its next step is back by then; sleeping and waking costs 50 µs
 WANTED_S = 0.00005  # of one turn of waiting awake: somebody else ran meanwhile, who wants this core
+MOST_LEFT_OUT = 63  # waits between two tries to wait awake
 
 
 class Handed(NamedTuple):
@@ -195,21 +196,37 @@ class Bell:
 _STROKES = {rung: bytes([rung]) for rung in Rung}
 
 
-def spin(seconds: float) -> Iterator[None]:
-    """Turns of waiting awake, each of which lets others run first; none after somebody else wanted this core.
+class Awake:
+    """Waiting awake for what is expected at once. While it does not come at once, this is tried less and less often.
 
-    Yielding is a request that Linux may decline for a while: only who sleeps surely makes room.
+    Yielding is a request that Linux may decline for a while: only who sleeps surely makes room. So the first turn that takes
+    long, because somebody else wanted this core, ends it.
     """
-    if not MAY_SPIN or seconds <= 0:
-        return
-    now = perf_counter()
-    until = now + seconds
-    while now < until:
-        yield
-        os.sched_yield()
-        before, now = now, perf_counter()
-        if now - before > WANTED_S:
-            return
+
+    def __init__(self) -> None:
+        self._left_out = self._to_leave_out = 0
+
+    def wait(self, seen: Callable[[], bool], seconds: float) -> bool:
+        """Whether it was seen within `seconds`."""
+        if seen():
+            return True
+        if not MAY_SPIN or seconds <= 0:
+            return False
+        if self._to_leave_out:
+            self._to_leave_out -= 1
+            return False
+        now = perf_counter()
+        until = now + seconds
+        while now < until:
+            os.sched_yield()
+            before, now = now, perf_counter()
+            if seen():
+                self._left_out = 0
+                return True
+            if now - before > WANTED_S:
+                break
+        self._left_out = self._to_leave_out = min(2 * self._left_out + 1, MOST_LEFT_OUT)
+        return False
 
 
 def cores() -> int:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from protocol.errors import OurError, UsageError
 from protocol.messages import Answer, Array, Call, Order, Reset, Returned, Step, Stepped
 from protocol.plain import pack, unpack
-from protocol.shared import MAY_SPIN, SPIN_S, Bell, Handed, Memory, Rung, cores, spin
+from protocol.shared import MAY_SPIN, SPIN_S, Awake, Bell, Handed, Memory, Rung, cores
 from protocol.specs import StepSpec
 from workers.copies import CopyRaised, Pulse
 from workers.lane import environment_raised
@@ -42,6 +42,7 @@ class Stepper:
         self._called = None if handed is None else Bell(hears=handed.to_worker)
         self._calls = None if handed is None else Bell(rings=handed.to_learner)
         self._cores = cores()
+        self._awake = Awake()
         self._spin_s = 0.0  # how long to wait awake for the next order
 
     def obey(self, order: Order, pulse: Pulse) -> Answer:
@@ -79,9 +80,7 @@ class Stepper:
             if any(served):
                 if perf_counter() > until:
                     return False
-                for _ in spin(self._spin_s):
-                    if self._asked():
-                        break
+                self._awake.wait(self._asked, self._spin_s)
                 continue
             rung = self._called.wait(max(0.0, until - perf_counter()))
             if rung is not Rung.STEP:
