@@ -39,6 +39,7 @@ bench: .venv/installed-dev
 	$(BIN)/python -m benchmarks.collect
 	$(BIN)/python -m benchmarks.update
 	$(BIN)/python -m benchmarks.worker
+	$(BIN)/python -m benchmarks.vector_env
 
 .venv/installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit("millrace needs Python 3.11 or newer; set PYTHON=") if sys.version_info < (3, 11) else None'

@@ -1,8 +1,10 @@
-"""Vector environments of CartPole-v1 under random actions, env steps/s: `python -m benchmarks.vector_env`.
+"""Vector environments under random actions, env steps/s, and their memory: `python -m benchmarks.vector_env`.
 
-gymnasium's Sync and Async (shared memory), Stable-Baselines3's Dummy and Subproc, ours on two workers (through shared
-memory, and by messages over ipc and tcp), and the limit: two processes that each step half of the copies in a bare loop and
-answer nobody. All actions are drawn beforehand. All take turns; medians of rounds, ratios within each round.
+gymnasium's Sync and Async (shared memory), Stable-Baselines3's Dummy and Subproc, tianshou and TorchRL where they are
+installed, ours (through shared memory, and by messages over ipc and tcp), and the limit: two processes that each step half
+of the copies in a bare loop and answer nobody. On CartPole-v1 with two workers; on an environment that sleeps, with as many
+workers as the peers have processes; on frames. All take turns, and the order changes from round to round; medians of
+rounds, ratios within each round.
 """
 
 from __future__ import annotations
@@ -14,106 +16,89 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM
 import argparse
 import json
 import statistics
-import time
-import warnings
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import gymnasium
-import numpy as np
-from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from rich.console import Console
 from rich.table import Table
 
-import millrace
-from benchmarks.collect import Pair
+from benchmarks.vector_contenders import ASYNC, LIMIT, OURS, Contender, Task, make, memory_mb
 
 RESULTS = Path(__file__).parent / "results"
-ENV = "CartPole-v1"
-COPIES = (8, 16, 64)
-WORKERS = 2
-OURS: dict[str, dict[str, Any]] = {
-    "millrace": {},
-    "millrace, messages, ipc": {"shared_memory": False},
-    "millrace, messages, tcp": {"transport": "tcp", "shared_memory": False},
-}
-CONTENDERS = (
-    "gymnasium Sync", "gymnasium Async", "SB3 DummyVecEnv", "SB3 SubprocVecEnv", *OURS, "bare loop, 2 processes",
-)  # fmt: skip
+PEERS = ("SB3 SubprocVecEnv", "tianshou Shmem", "TorchRL ParallelEnv")
+ALL = ("gymnasium Sync", ASYNC, "SB3 DummyVecEnv", *PEERS, *OURS, LIMIT)
+FEW = ("gymnasium Sync", ASYNC, *PEERS, "millrace")
+TASKS: tuple[tuple[Task, tuple[str, ...]], ...] = (
+    *((Task("CartPole-v1", "CartPole-v1", copies, 2), ALL) for copies in (8, 16, 64)),
+    (Task("sleeps 1 ms a step", "workers.envs.toy:Slow-v0", 8, 8, {"seconds": 0.001, "k": 100}), FEW),
+    (Task("84 × 84 × 4 uint8", "workers.envs.toy:Frames-v0", 8, 2), FEW),
+    (Task("84 × 84 × 4 uint8", "workers.envs.toy:Frames-v0", 8, 8), FEW),
+)
+Rows = list[dict[str, object]]
 
 
-class Contender:
-    """A vector environment that goes on stepping."""
-
-    def __init__(self, env: Any, copies: int) -> None:
-        self._env, self._copies = env, copies
-        self._actions = np.random.default_rng(copies).integers(2, size=(1000, copies))
-        if hasattr(env, "seed"):  # SB3
-            env.seed(1)
-            env.reset()
-        else:
-            env.reset(seed=1)
-        self.close: Callable[[], None] = env.close
-
-    def rate(self, seconds: float) -> float:
-        """Env steps/s."""
-        steps, start = 0, time.perf_counter()
-        while (now := time.perf_counter()) - start < seconds:
-            self._env.step(self._actions[steps % len(self._actions)])
-            steps += 1
-        return steps * self._copies / (now - start)
-
-
-def make(name: str, copies: int) -> Contender | Pair:
-    def one() -> gymnasium.Env[Any, Any]:
-        return gymnasium.make(ENV)
-
-    match name:
-        case "gymnasium Sync":
-            return Contender(SyncVectorEnv([one] * copies), copies)
-        case "gymnasium Async":
-            return Contender(AsyncVectorEnv([one] * copies), copies)
-        case "SB3 DummyVecEnv" | "SB3 SubprocVecEnv":
-            from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
-
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                kind = DummyVecEnv if name == "SB3 DummyVecEnv" else SubprocVecEnv
-                return Contender(kind([one] * copies), copies)
-        case "bare loop, 2 processes":
-            return Pair("bare, drawn", copies // 2)
-        case _:
-            return Contender(millrace.make_vec(ENV, copies, workers=WORKERS, **OURS[name]), copies)
-
-
-def stepping(copies: int, rounds: int, seconds: float) -> list[dict[str, object]]:
+def stepping(task: Task, names: tuple[str, ...], rounds: int, seconds: float) -> Rows:
     """A row for each contender: its rate and, by rounds, its share of gymnasium's Async and of the limit."""
-    contenders = {name: make(name, copies) for name in CONTENDERS}
+    contenders: dict[str, Contender] = {}
+    absent = []
+    for name in names:
+        try:
+            contenders[name] = make(name, task)
+        except ImportError:
+            absent.append(name)
     for contender in contenders.values():
         contender.rate(0.2)  # warm up
-    turns = [{name: contender.rate(seconds) for name, contender in contenders.items()} for _ in range(rounds)]
+    turns = []
+    for number in range(rounds):
+        first = number % len(contenders)
+        order = [*contenders.items()]
+        turns.append({name: contender.rate(seconds) for name, contender in order[first:] + order[:first]})
     for contender in contenders.values():
         contender.close()
-    return [
-        {
-            "copies": copies,
-            "contender": name,
-            "env_steps_per_s": round(statistics.median(turn[name] for turn in turns)),
-            "of_async": statistics.median(turn[name] / turn["gymnasium Async"] for turn in turns),
-            "of_limit": statistics.median(turn[name] / turn["bare loop, 2 processes"] for turn in turns),
-        }
-        for name in CONTENDERS
-    ]
+    about = {"task": task.title, "copies": task.copies, "workers": task.workers}
+    rows: Rows = [about | {"contender": name, "env_steps_per_s": None} for name in absent]
+    for name in contenders:
+        rows.append(
+            about
+            | {
+                "contender": name,
+                "env_steps_per_s": round(statistics.median(turn[name] for turn in turns)),
+                "of_async": statistics.median(turn[name] / turn[ASYNC] for turn in turns),
+                "of_limit": statistics.median(turn[name] / turn[LIMIT] for turn in turns) if LIMIT in names else None,
+            }
+        )
+    return rows
 
 
-def show(rows: list[dict[str, object]], rounds: int) -> Table:
-    table = Table(title=f"{ENV}, random actions, {WORKERS} workers, medians of {rounds}")
-    for column in ("copies", "", "env steps/s", "× gymnasium Async", "of the limit"):
+def memory() -> Rows:
+    """What 64 copies of CartPole-v1 take, beside this process."""
+    task = Task("CartPole-v1", "CartPole-v1", 64, 2)
+    rows: Rows = []
+    for name in (ASYNC, "SB3 SubprocVecEnv", "millrace"):
+        processes, megabytes = memory_mb(name, task)
+        rows.append({"copies": task.copies, "contender": name, "processes": processes, "pss_mb": round(megabytes)})
+    return rows
+
+
+def show(rows: Rows, rounds: int) -> Table:
+    table = Table(title=f"random actions, medians of {rounds}")
+    for column in ("task", "copies", "our workers", "", "env steps/s", "× gymnasium Async", "of the limit"):
+        table.add_column(column, justify="left" if column in ("", "task") else "right", no_wrap=column == "")
+    for row in rows:
+        about = str(row["task"]), str(row["copies"]), str(row["workers"]), str(row["contender"])
+        if row["env_steps_per_s"] is None:
+            table.add_row(*about, "not installed", "", "")
+            continue
+        limit = "" if row["of_limit"] is None else f"{row['of_limit']:.2f}"
+        table.add_row(*about, f"{row['env_steps_per_s']:,}", f"{row['of_async']:.1f}", limit)
+    return table
+
+
+def show_memory(rows: Rows) -> Table:
+    table = Table(title="CartPole-v1, 64 copies: memory of the processes started, PSS")
+    for column in ("", "processes", "MB"):
         table.add_column(column, justify="left" if column == "" else "right")
     for row in rows:
-        ratios = f"{row['of_async']:.1f}", f"{row['of_limit']:.2f}"
-        table.add_row(str(row["copies"]), str(row["contender"]), f"{row['env_steps_per_s']:,}", *ratios)
+        table.add_row(str(row["contender"]), str(row["processes"]), str(row["pss_mb"]))
     return table
 
 
@@ -122,10 +107,12 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--seconds", type=float, default=1.0, help="of each turn")
     arguments = parser.parse_args()
-    rows = [row for copies in COPIES for row in stepping(copies, arguments.rounds, arguments.seconds)]
+    taken = memory()
+    rows = [row for task, names in TASKS for row in stepping(task, names, arguments.rounds, arguments.seconds)]
     Console().print(show(rows, arguments.rounds))
+    Console().print(show_memory(taken))
     RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "vector_env.json").write_text(json.dumps({"vector_env": rows}, indent=2) + "\n")
+    (RESULTS / "vector_env.json").write_text(json.dumps({"vector_env": rows, "memory": taken}, indent=2) + "\n")
 
 
 if __name__ == "__main__":

@@ -152,6 +152,27 @@ class Slow(Countdown):
         return super().step(action)
 
 
+class Frames(gymnasium.Env[npt.NDArray[np.uint8], Any]):
+    """Frames 84 x 84 x 4 such as Atari games give, drawn at the start; an episode has 100 steps."""
+
+    def __init__(self) -> None:
+        self.observation_space = spaces.Box(0, 255, (84, 84, 4), np.uint8)
+        self.action_space = spaces.Discrete(6)
+        self._frames = np.random.default_rng(0).integers(0, 256, (8, 84, 84, 4), np.uint8)
+        self._steps = 0
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[npt.NDArray[np.uint8], Info]:
+        """Begin at the first frame."""
+        super().reset(seed=seed)
+        self._steps = 0
+        return self._frames[0], {}
+
+    def step(self, action: Any) -> tuple[npt.NDArray[np.uint8], float, bool, bool, Info]:
+        """Show the next frame."""
+        self._steps += 1
+        return self._frames[self._steps % 8], 0.0, False, self._steps >= 100, {}
+
+
 class Faulty(Countdown):
     """A countdown that goes wrong at its step number `after` (from 0) and at all later ones; says how in `fault`.
 
@@ -355,7 +376,7 @@ class Informs(gymnasium.Env[Any, Any]):
 
 
 for _toy in (
-    Informs, Scripted, OneStep, Both, Countdown, Identity, Recall, Slow, Raises, NaNReward, NaNObservation, Hangs, Dies,
-    Spaces,
+    Informs, Scripted, OneStep, Both, Countdown, Identity, Recall, Slow, Frames, Raises, NaNReward, NaNObservation, Hangs,
+    Dies, Spaces,
 ):  # fmt: skip
     gymnasium.register(id=f"{_toy.__name__}-v0", entry_point=f"{__name__}:{_toy.__name__}")
