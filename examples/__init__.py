@@ -1,0 +1,1 @@
+"""Programs that use millrace as anybody would."""

@@ -1,0 +1,16 @@
+"""The example's PPO loop over our vector environment solves CartPole-v1."""
+
+from __future__ import annotations
+
+import pytest
+
+from examples.ppo_vector_env import Settings, greedy, train
+
+
+@pytest.mark.learning
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_it_solves_cartpole(seed: int) -> None:
+    settings = Settings(seed=seed)
+    agent, _ = train(settings, quiet=True)
+    assert greedy(agent, settings) >= 475
