@@ -79,7 +79,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._asked: Sequence[int] = ()  # lanes that the pending step was asked of
         self._lost: dict[int, str] = {}  # lanes that are gone, which nobody has been told of
         self._unborn: set[int] = set()  # lanes that live again, with copies that were never reset
-        self._began = False
+        self._begun = np.zeros(N, bool)  # copies that were reset, ever
         self._seeds: list[int | None] = [None] * N
         self._shown: set[str] = set()  # keys of infos that arrived as their repr
         self._finalizer = weakref.finalize(self, _shut_once, os.getpid(), shut)
@@ -93,15 +93,13 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._check_idle("reset")
         seeds = self._seeds_of(seed)
         mask, options = self._mask_of(options)
-        if not self._began and not mask.all():
-            raise UsageError("reset of some copies before the first reset of all: call reset() without reset_mask first")
         chosen = {lane: [n for n in range(self._spec.lanes[lane]) if mask[self._firsts[lane] + n]] for lane in self._lanes}
         if mask.all():
             self._hub.renew()
             self._lost.clear()
             self._hub.lost()
         infos = self._reset({lane: copies for lane, copies in chosen.items() if copies}, seeds, options)
-        self._began = True
+        self._begun |= mask
         return self._observations(), self._merged(infos)
 
     def _reset(self, chosen: Mapping[int, list[int]], seeds: Sequence[int | None], options: Any) -> dict[int, bytes]:
@@ -166,8 +164,8 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         """Tell every copy to step; `step_wait` has what came of it."""
         self._check_idle("step_async")
         leaves, fit = self._action_leaves(actions)
-        if not self._began:
-            raise UsageError("step before reset: call reset() first")
+        if not self._begun.all():
+            raise UsageError(f"step before reset of copies {np.flatnonzero(~self._begun).tolist()}: call reset() first")
         if self._spec.autoreset == "Disabled" and (ended := self._terminated | self._truncated).any():
             raise UsageError(
                 f"copies {np.flatnonzero(ended).tolist()} have ended: autoreset_mode is Disabled, expected "

@@ -135,8 +135,9 @@ def test_the_seeds_of_the_copies_differ_and_stay() -> None:
 
 def test_some_copies_are_reset_and_the_others_stay_where_they_are() -> None:
     with inproc("CartPole-v1", autoreset_mode="Disabled") as env:
-        with pytest.raises(UsageError, match="before the first reset of all"):
-            env.reset(options={"reset_mask": np.array([True, True, False])})
+        env.reset(options={"reset_mask": np.array([True, False, True])})
+        with pytest.raises(UsageError, match=r"step before reset of copies \[1\]"):
+            env.step(np.zeros(3, np.int64))
         first, _ = env.reset(seed=[0, 1, 2], options={"reset_mask": np.array([True, True, True])})
         for _ in range(3):
             stepped = env.step(np.zeros(3, np.int64))[0]
