@@ -263,7 +263,9 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         for leaf, given in zip(self._spec.action, self._read(actions), strict=True):
             array = np.asarray(given)
             if array.ndim == 0 or len(array) != self.num_envs:
-                raise ValueError(f"actions expected one for each of {self.num_envs} copies, got shape {list(array.shape)}")
+                raise (ValueError if array.ndim else TypeError)(
+                    f"actions expected one for each of {self.num_envs} copies, got shape {list(array.shape)}"
+                )
             if array.dtype.kind not in "biuf":
                 raise TypeError(f"actions expected numbers, got {array.dtype}")
             fit = (

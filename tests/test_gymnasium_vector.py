@@ -157,6 +157,9 @@ def test_some_copies_are_reset_and_the_others_stay_where_they_are() -> None:
             with pytest.raises(error, match="reset_mask"):
                 env.reset(options={"reset_mask": wrong})
         assert env.step(np.zeros(3, np.int64))[1].tolist() == [1.0] * 3
+        for actions, error in (np.zeros(2, np.int64), ValueError), (np.zeros(4, np.int64), ValueError), (0, TypeError):
+            with pytest.raises(error, match="actions expected one for each of 3 copies"):
+                env.step(actions)
 
 
 @pytest.mark.parametrize("mode", AutoresetMode, ids=lambda mode: mode.value)
