@@ -222,6 +222,9 @@ class NumpyPolicy:
         self._fields, _ = layout(spec)
         self._parameters: dict[str, Floats] = {}
         self._buffers: dict[str, Floats] = {}
+        leaf, *more = spec.observation
+        self._as_they_are = not more and (leaf.kind, leaf.dtype, len(leaf.shape)) == ("box", "float32", 1)
+        self._between: list[Floats] = []  # [L, N, width] what each hidden layer gives, overwritten in each pass
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
         """Act with these from now on: views, no copies. Raises ValueError when the sizes do not fit the spec."""
@@ -241,19 +244,22 @@ class NumpyPolicy:
 
     def __call__(self, leaves: Sequence[Array], state: Floats | None = None) -> Floats:
         """Distribution parameters [L, N, P] of the actions in these observations [L, N, *leaf]; see `Policy`."""
-        x = features(self.spec, leaves)
+        x = leaves[0] if self._as_they_are else features(self.spec, leaves)
         if self.spec.normalize_observations:
             x = normalized(x, self._buffers["observation_mean"], self._buffers["observation_std"])
         if self.spec.core is not None:
             x = advance(self.spec, self._parameters, x, zero_state(self.spec, *x.shape[:-1]) if state is None else state)
+        if not self._between or self._between[0].shape[:-1] != x.shape[:-1]:
+            self._between = [np.empty((*x.shape[:-1], width), np.float32) for width in self.spec.net]
         relu = self.spec.activation == "relu"
-        for w, b in self._hidden:
-            x = np.matmul(x, w)
-            x += b
+        for (weight, bias), out in zip(self._hidden, self._between, strict=True):
+            np.matmul(x, weight, out=out)
+            np.add(out, bias, out=out)
             if relu:
-                np.maximum(x, 0, out=x)
+                np.maximum(out, 0, out=out)
             else:
-                np.tanh(x, out=x)
+                np.tanh(out, out=out)
+            x = out
         weight, bias = self._out
         out = np.asarray(np.matmul(x, weight))
         out += bias

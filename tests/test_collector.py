@@ -6,11 +6,13 @@ import subprocess
 import sys
 from functools import partial
 from typing import Any
+from unittest.mock import Mock
 
 import gymnasium
 import msgspec
 import numpy as np
 import pytest
+from gymnasium.wrappers import OrderEnforcing, TimeLimit
 
 from protocol.distributions import distribution
 from protocol.rollout import Array
@@ -68,6 +70,14 @@ def test_any_lanes_of_any_size_act_the_same_alone_and_beside_others(run: RunSpec
             alone = policy([leaf[lane : lane + 1] for leaf in leaves])
             assert alone.tobytes() == params[lane].tobytes()
             assert chosen.sample(alone, noise[lane : lane + 1]).tobytes() == action[lane].tobytes()
+
+
+def test_a_policy_acts_alike_whatever_it_acted_on_before_and_keeps_what_it_gave() -> None:
+    generator = np.random.default_rng(0)
+    given = [generator.normal(size=(L, N, 4)).astype(np.float32) for L, N in ((1, 3), (2, 3), (2, 8), (1, 3))]
+    policy = random_policy(DISCRETE.policy)
+    in_turn = [policy([obs]) for obs in given]
+    assert [params.tobytes() for params in in_turn] == [random_policy(DISCRETE.policy)([obs]).tobytes() for obs in given]
 
 
 def test_a_lane_does_not_depend_on_how_many_the_run_has() -> None:
@@ -191,6 +201,30 @@ def closable(T: int = 4) -> tuple[RunSpec, Collector, list[str]]:
     names = iter("abcdefgh")
     run = run_of(f"{TOY}Scripted-v0", T=T, N=1)
     return run, a_collector(run, lambda r, n, p: over_copies_of([partial(Closable, said, next(names))])(r, n, p)), said
+
+
+class Doubled(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """A wrapper that does something."""
+
+    def step(self, action: Any) -> Any:
+        obs, reward, terminated, truncated, info = super().step(action)
+        return obs, 2 * float(reward), terminated, truncated, info
+
+
+def test_copies_are_stepped_past_the_guard_of_the_first_reset_and_past_no_other_wrapper(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    guard = Mock()
+    monkeypatch.setattr(OrderEnforcing, "step", guard)
+    made = [
+        lambda: TimeLimit(Doubled(OrderEnforcing(Doubled(Countdown()))), 3),
+        lambda: OrderEnforcing(Doubled(Countdown())),
+    ]
+    run = run_of(f"{TOY}Countdown-v0", T=3, N=2)
+    (rollout,) = collect(a_collector(run, over_copies_of(made)), run)
+    assert rollout.reward.tolist() == [[4, 2]] * 3
+    assert rollout.truncated.tolist() == [[False, False]] * 2 + [[True, False]]
+    assert not guard.called
 
 
 def test_lanes_are_closed_when_released_or_begun_afresh() -> None:

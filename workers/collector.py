@@ -160,14 +160,15 @@ class Collector:
 
     def _fill(self, rows: _Rows, lanes: Sequence[Lane], pulse: Pulse) -> None:
         """Step all lanes T times."""
+        remembers = rows.state.size > 0
         resets = np.stack([lane.ended for lane in lanes])  # [L, N] row t is not valid
         numbers = [lane.number for lane in lanes]
+        stages = self.stages
         for t in range(self._run.rollout_steps):
             pulse()
             began = perf_counter()
             with np.errstate(all="ignore"):  # a NaN is named once the rows are full
                 params = self._policy([leaf[:, t] for leaf in rows.obs], rows.state)
-                rows.state[resets] = 0.0
                 action = self._distribution.sample(params, rows.noise[:, t])
                 taken = self._write(action)
             rows.params[:, t] = params
@@ -186,10 +187,13 @@ class Collector:
                     ) from error
                 if lost is not None:
                     _cut_short(rows, i, lane, t, lost)
-            resets = rows.terminated[:, t] | rows.truncated[:, t]
-            rows.clock.append(perf_counter())
-            self.stages["act"] += acted - began
-            self.stages["step"] += rows.clock[-1] - acted
+            if remembers:
+                rows.state[resets] = 0.0
+                resets = rows.terminated[:, t] | rows.truncated[:, t]
+            over = perf_counter()
+            rows.clock.append(over)
+            stages["act"] += acted - began
+            stages["step"] += over - acted
 
     def _rollout(self, rows: _Rows, i: int, lane: Lane, about: Assignment, version: int, session: int) -> Rollout:
         """Lane `i` of the rows, as views."""

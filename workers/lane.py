@@ -138,14 +138,14 @@ class Lane:
         valid = ~np.concatenate([self.ended[None], done[:-1]])
         reward[~valid] = 0.0
         self.ended = done[-1].copy()
-        rewards, valids = reward.T.tolist(), valid.T.tolist()  # by copy
-        first = [0] * len(rewards)
+        rewards = reward.T.tolist()  # by copy
+        first, resets = [0] * len(rewards), (~valid[0]).tolist()  # where its next account begins, with a reset or not
         episodes = []
 
         def add(n: int, end: int) -> None:
             self._return[n] += sum(rewards[n][first[n] : end])
-            self._length[n] += sum(valids[n][first[n] : end])
-            first[n] = end
+            self._length[n] += end - first[n] - resets[n]  # only the first row of an account can be one that resets
+            first[n], resets[n] = end, True
 
         for t, n in np.argwhere(done).tolist():
             add(n, t + 1)
@@ -153,7 +153,8 @@ class Lane:
                 episodes.append(Episode(self._return[n], self._length[n], clock[t] - self._began[n]))
             self._return[n], self._length[n], self._began[n] = 0.0, 0, clock[t]
         for n in range(len(rewards)):
-            add(n, len(clock))
+            if first[n] < len(clock):
+                add(n, len(clock))
         return valid, tuple(episodes)
 
 
