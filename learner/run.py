@@ -30,6 +30,7 @@ from learner.run_folder import Interrupted, RunFolder
 from learner.train import train
 from protocol.errors import UsageError
 from protocol.link import LearnerLink
+from protocol.native import check_native
 from protocol.spaces import action_spec, observation_leaves
 from protocol.specs import EnvSpec, RunSpec
 
@@ -137,6 +138,8 @@ def run_spec(config: Config, env: EnvSpec) -> RunSpec:
             _check_whole_episodes(config, copy.spec.max_episode_steps if copy.spec else None)
     finally:
         copy.close()
+    if config.vector == "native":
+        check_native(env, observation, action)
     return RunSpec(
         env=env,
         policy=policy,
@@ -144,6 +147,7 @@ def run_spec(config: Config, env: EnvSpec) -> RunSpec:
         copies=config.envs // config.lanes,
         lanes=config.lanes,
         seed=config.seed,
+        vector="native" if config.vector == "native" else "loop",
         heartbeat_s=config.heartbeat_s,
     )
 

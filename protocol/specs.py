@@ -9,15 +9,18 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable
 from enum import Enum
-from typing import Literal
+from typing import Any, Literal, TypeVar
 
 import gymnasium
 import msgspec
+from gymnasium.envs.registration import VectorizeMode
+from gymnasium.vector import VectorEnv
 
 from protocol.errors import UsageError
 
 OWN_ENVS = "workers.envs"  # the module that registers millrace/…: gymnasium imports it, as it would a user's own
 Scalar = bool | int | float | str
+_Made = TypeVar("_Made")
 
 
 class Code(Enum):
@@ -76,10 +79,18 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             if not isinstance(env, gymnasium.Env):
                 raise UsageError(f"env factory {self.id}: expected it to return a gymnasium.Env, got {type(env).__name__}")
             return env
+        # The checker is left out: it costs a tenth of a CartPole step, and `Rollout.validate` checks every row.
+        return self._made(lambda env_id: gymnasium.make(env_id, disable_env_checker=True, **self.kwargs, **extra))  # type: ignore[arg-type]
+
+    def make_vectorised(self, copies: int) -> VectorEnv[Any, Any, Any]:
+        """So many copies as the environment's own vectorised form; `protocol.native` says which can serve."""
+        own, kwargs = VectorizeMode.VECTOR_ENTRY_POINT, dict[str, Any](self.kwargs)
+        return self._made(lambda env_id: gymnasium.make_vec(env_id, copies, own, **kwargs))
+
+    def _made(self, make: Callable[[str], _Made]) -> _Made:
+        """What `make` makes of the id. Raises `UsageError`."""
         try:
-            env_id = f"{OWN_ENVS}:{self.id}" if self.id.startswith("millrace/") else self.id
-            # The checker is left out: it costs a tenth of a CartPole step, and `Rollout.validate` checks every row.
-            return gymnasium.make(env_id, disable_env_checker=True, **self.kwargs, **extra)  # type: ignore[arg-type]
+            return make(f"{OWN_ENVS}:{self.id}" if self.id.startswith("millrace/") else self.id)
         except (gymnasium.error.Error, ImportError, TypeError) as error:  # TypeError: keyword arguments it does not take
             raise UsageError(_why_not_made(self.id, error)) from error
         except Exception as error:  # its own constructor raised, whatever that may be
@@ -100,6 +111,10 @@ def _why_not_made(env_id: str, error: Exception) -> str:
             return f"environment {env_id}: no module named {module}; is it installed, or its folder on PYTHONPATH?"
         case ImportError():
             return f"environment {env_id}: a package it needs is missing ({says}); pip install it, then try again"
+        case gymnasium.error.Error() if "vector entry point" in says:
+            return (
+                f"environment {env_id} has no vectorised form of its own (gymnasium's vector_entry_point); use --vector loop"
+            )
         case gymnasium.error.UnregisteredEnv() if not colon:
             return f"environment {env_id} is not registered: {says} One of your own is given as my_module:MyEnv-v0"
         case _:
@@ -217,6 +232,8 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
     """N, env copies in a lane"""
     lanes: int
     seed: int
+    vector: Literal["loop", "native"] = "loop"
+    """how the copies of a lane are stepped: one after another, or at once, by the environment's own vectorised form"""
     heartbeat_s: float = 1.0
     learner_timeout_s: float = 30.0
     """a worker that heard nothing of the learner for so long starts again with Hello"""

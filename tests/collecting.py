@@ -14,7 +14,7 @@ from protocol.policy import Policy, buffer_size, layout, make_policy, size
 from protocol.rollout import Rollout, validate
 from protocol.spaces import action_spec, observation_leaves
 from protocol.specs import EnvSpec, PolicySpec, RunSpec
-from workers.collector import Collector, OpenCopies, loop_over_copies
+from workers.collector import Collector, OpenCopies, copies_of
 from workers.copies import CopyLoop, VectorCopies
 from workers.session import Assignment
 
@@ -55,7 +55,7 @@ def random_policy(spec: PolicySpec) -> Policy:
     return policy
 
 
-def a_collector(run: RunSpec, open_copies: OpenCopies = loop_over_copies) -> Collector:
+def a_collector(run: RunSpec, open_copies: OpenCopies = copies_of) -> Collector:
     """A collector that acts with random weights."""
     return Collector(run, random_policy(run.policy), open_copies)
 

@@ -16,11 +16,12 @@ import numpy.typing as npt
 
 from protocol.distributions import distribution
 from protocol.errors import EnvironmentFailed
+from protocol.native import make_native
 from protocol.policy import Policy
 from protocol.rollout import Rollout
 from protocol.spaces import writer
 from protocol.specs import RunSpec
-from workers.copies import Copies, CopyLoop, CopyRaised, Pulse
+from workers.copies import Copies, CopyLoop, CopyRaised, Pulse, VectorCopies
 from workers.lane import EnvironmentBroke, Lane, environment_raised
 from workers.session import Assignment
 
@@ -32,8 +33,10 @@ Begin = Callable[[Sequence[int], Array, Pulse], None]
 """Told the numbers of L lanes and their actions [L, N, *action], before the first of them is stepped."""
 
 
-def loop_over_copies(run: RunSpec, lane: int, pulse: Pulse) -> Copies:
-    """The copies of one lane as a loop: what a worker opens unless it is told otherwise."""
+def copies_of(run: RunSpec, lane: int, pulse: Pulse) -> Copies:
+    """The copies of one lane, as the run says: what a worker opens unless it is told otherwise."""
+    if run.vector == "native":
+        return VectorCopies(make_native(run.env, run.copies))
     return CopyLoop(run.env.make, run.copies, pulse)
 
 
@@ -62,7 +65,7 @@ class Collector:
         self,
         run: RunSpec,
         policy: Policy,
-        open_copies: OpenCopies = loop_over_copies,
+        open_copies: OpenCopies = copies_of,
         begin: Begin = each_by_itself,
     ) -> None:
         """`begin`: for copies that are stepped all at once, whichever lane they are of."""

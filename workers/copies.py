@@ -14,10 +14,11 @@ from typing import Any, NamedTuple, Protocol
 import gymnasium
 import numpy as np
 import numpy.typing as npt
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import VectorEnv
 from gymnasium.wrappers import OrderEnforcing
 
 from protocol.errors import UsageError
+from protocol.native import check_resets_next_step
 from protocol.spaces import reader
 
 Array = npt.NDArray[Any]
@@ -157,13 +158,8 @@ class VectorCopies:
     """Any `gymnasium.vector.VectorEnv` that resets in the step after an episode's end."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
-        """Raises `UsageError` for another way of resetting: its last observations could not be told from first ones."""
-        mode = env.metadata.get("autoreset_mode")
-        if mode not in {AutoresetMode.NEXT_STEP, AutoresetMode.NEXT_STEP.value}:
-            raise UsageError(
-                f"vector environment {env}: metadata['autoreset_mode'] expected {AutoresetMode.NEXT_STEP}, got {mode}; "
-                "make it with autoreset_mode=AutoresetMode.NEXT_STEP"
-            )
+        """Raises `UsageError` for another way of resetting."""
+        check_resets_next_step(env)
         self._env = env
         self.observation_space = env.single_observation_space
         self.action_space = env.single_action_space
