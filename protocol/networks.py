@@ -153,9 +153,9 @@ class FlatNetwork:
             return out
         parts = [x]
         for (channels_last, convs, (weight, bias)), image in zip(self._images, images, strict=True):
-            h = (image.permute(0, 3, 1, 2) if channels_last else image).float() * (1 / 255)
+            h = (image.permute(0, 3, 1, 2) if channels_last else image).to(torch.float32, copy=True).mul_(1 / 255)
             for w, b, stride in convs:
-                h = F.relu(F.conv2d(h, w, b, stride))
+                h = F.relu(F.conv2d(h, w, b, stride), inplace=True)
             parts.append(F.relu(F.linear(h.flatten(1), weight, bias)))
         return torch.cat(parts, -1) if images else x
 
