@@ -1,12 +1,14 @@
-"""Collecting CartPole-v1 in two processes, ours against the bare loop over the same copies: `python -m benchmarks.collect`.
+"""Collecting in two processes, ours against the bare loop over the same copies: `python -m benchmarks.collect`.
 
-Ours is `workers.collector.Collector`, as a worker runs it: a policy 4-64-64-2 acts in numpy, rows of T = 128 steps are
-stored with their log-probabilities, episodes are counted. The bare loop takes random actions, keeps nothing and resets at
-an episode's end. It comes in two kinds: `sampled`, the one that counts, is `gymnasium.make` as it comes and
-`action_space.sample()`, as the field measures it (about 265k steps/s on two cores); `drawn` is the fastest that a loop
-over these copies can be: gymnasium's checker left out, as we leave it out, and all actions drawn beforehand.
+Ours is `workers.collector.Collector`, as a worker runs it: a policy acts (64-64 in numpy, or convolutions in torch), rows of
+T = 128 steps are stored with their log-probabilities, episodes are counted. The bare loop takes random actions, keeps
+nothing and resets at an episode's end. It comes in two kinds. `sampled`, the one that counts, is `gymnasium.make` as it
+comes and `action_space.sample()`, as the field measures it. `drawn` is the fastest that a loop over these copies can be:
+gymnasium's checker left out, as we leave it out, and all actions drawn beforehand. `native` is an environment's own
+vectorised form, bare and as a lane; `no network` is ours with a policy that does not look: storing and stepping alone.
 
-All take turns, one pair of processes at a time, one thread each; medians of rounds.
+All contenders of a case take turns, one pair of processes at a time, one thread each; medians of rounds. On a machine that
+does other work too, `--cpu` counts seconds of CPU, which that work does not take away.
 """
 
 from __future__ import annotations
@@ -16,127 +18,202 @@ import os
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")  # before numpy
 
 import argparse
+import itertools
 import json
 import multiprocessing
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
+import numpy.typing as npt
 from rich.console import Console
 from rich.table import Table
 
-from protocol.policy import NumpyPolicy, buffer_size, layout, size
-from protocol.specs import ActionSpec, EnvSpec, Leaf, PolicySpec, RunSpec
+from protocol.distributions import distribution
+from protocol.errors import UsageError
+from protocol.native import make_native
+from protocol.policy import Policy, buffer_size, layout, make_policy, size
+from protocol.spaces import action_spec, observation_leaves
+from protocol.specs import EnvSpec, PolicySpec, RunSpec
 from workers.collector import Collector
 from workers.session import Assignment
 
 RESULTS = Path(__file__).parent / "results"
-TARGETS = {64: 0.75, 8: 0.6}  # copies in each process -> what our share of the bare loop must be
 PROCESSES = 2
 STEPS = 128  # T
-ENV = EnvSpec("CartPole-v1")
-POLICY = PolicySpec((Leaf("", "box", (4,), "float32"),), ActionSpec("discrete", (), "int64", (2,), (0,)))
+CARTPOLE, FRAMES = EnvSpec("CartPole-v1"), EnvSpec("benchmarks.frames:Frames-v0")
+BARE = ("bare, sampled", "bare, drawn")
+OURS = ("ours, 2 lanes", "ours, 1 lane")
 
-Loop = Callable[[float], float]  # seconds to go on for -> env steps/s
+
+class Case(NamedTuple):
+    """What is collected, and what must come of it."""
+
+    env: EnvSpec
+    copies: int
+    """in each process"""
+    contenders: tuple[str, ...]
+    share: float | None = None
+    """what ours must be of `bare, sampled`"""
+    rate: int | None = None
+    """env steps/s that ours must reach"""
 
 
-def bare_sampled(copies: int, number: int) -> Loop:
+CASES = (
+    Case(CARTPOLE, 64, (*BARE, *OURS), share=0.85),
+    Case(CARTPOLE, 8, (*BARE, *OURS), share=0.75),
+    Case(EnvSpec("HalfCheetah-v5"), 8, (*BARE, *OURS), share=0.92),
+    Case(FRAMES, 16, (*BARE, *OURS, "no network, 1 lane"), share=0.9),
+    Case(CARTPOLE, 64, ("bare, native", "native, 1 lane"), rate=1_500_000),
+    Case(CARTPOLE, 512, ("bare, native", "native, 4 lanes", "native, 1 lane"), rate=1_500_000),
+)
+
+Turn = Callable[[], int]  # steps copies once or a few times -> env steps
+
+
+def bare_sampled(spec: EnvSpec, copies: int, number: int) -> Turn:
     """Random actions as the field takes them."""
-    envs = [gymnasium.make(ENV.id) for _ in range(copies)]
+    envs = [gymnasium.make(spec.id) for _ in range(copies)]
     for seed, env in enumerate(envs, start=number * copies):
         env.reset(seed=seed)
         env.action_space.seed(seed)
 
-    def loop(seconds: float) -> float:
-        steps, start = 0, time.perf_counter()
-        while (now := time.perf_counter()) - start < seconds:
-            for env in envs:
-                _, _, terminated, truncated, _ = env.step(env.action_space.sample())
-                if terminated or truncated:
-                    env.reset()
-            steps += copies
-        return steps / (now - start)
+    def turn() -> int:
+        for env in envs:
+            _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+            if terminated or truncated:
+                env.reset()
+        return copies
 
-    return loop
+    return turn
 
 
-def bare_drawn(copies: int, number: int) -> Loop:
+def bare_drawn(spec: EnvSpec, copies: int, number: int) -> Turn:
     """The fastest bare loop: no checker, actions drawn beforehand."""
-    envs = [ENV.make() for _ in range(copies)]
+    envs = [spec.make() for _ in range(copies)]
     for seed, env in enumerate(envs, start=number * copies):
         env.reset(seed=seed)
-    rows = np.random.default_rng(number).integers(2, size=(1000, copies))
+    rows = _drawn(envs[0].action_space, copies, number)
 
-    def loop(seconds: float) -> float:
-        steps, start = 0, time.perf_counter()
-        while (now := time.perf_counter()) - start < seconds:
-            for env, action in zip(envs, rows[steps // copies % len(rows)], strict=True):
-                _, _, terminated, truncated, _ = env.step(action)
-                if terminated or truncated:
-                    env.reset()
-            steps += copies
-        return steps / (now - start)
+    def turn() -> int:
+        for env, action in zip(envs, next(rows), strict=True):
+            _, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                env.reset()
+        return copies
 
-    return loop
+    return turn
 
 
-def ours(lanes: int, copies: int, number: int) -> Loop:
+def bare_native(spec: EnvSpec, copies: int, number: int) -> Turn:
+    """The environment's own vectorised form, with actions drawn beforehand; a step in which a copy only resets is none."""
+    env = make_native(spec, copies)
+    env.reset(seed=number)
+    rows = _drawn(env.single_action_space, copies, number)
+
+    def turn() -> int:
+        _, _, terminated, truncated, _ = env.step(next(rows))
+        return copies - int(np.count_nonzero(terminated | truncated))
+
+    return turn
+
+
+def _drawn(space: gymnasium.Space[Any], copies: int, number: int) -> Iterator[npt.NDArray[Any]]:
+    """Rows of actions [copies, *action], drawn beforehand, again and again."""
+    space.seed(number)
+    return itertools.cycle([np.array([space.sample() for _ in range(copies)]) for _ in range(500)])
+
+
+class Blind:
+    """A policy that does not look: its params are zeros."""
+
+    def __init__(self, spec: PolicySpec) -> None:
+        self._params = distribution(spec).params_size
+
+    def load(self, parameters: object, buffers: object) -> None:
+        """It has no weights."""
+
+    def __call__(self, leaves: Sequence[npt.NDArray[Any]], state: object = None) -> npt.NDArray[np.float32]:
+        """Zeros [L, N, P]."""
+        return np.zeros((*leaves[0].shape[:2], self._params), np.float32)
+
+
+def ours(kind: str, lanes: int, spec: EnvSpec, copies: int, number: int) -> Turn:
     """The collector over `lanes` lanes that share the copies."""
-    run = RunSpec(ENV, POLICY, rollout_steps=STEPS, copies=copies // lanes, lanes=PROCESSES * lanes, seed=1)
-    collector = Collector(run, NumpyPolicy(POLICY))
-    parameters = 0.01 * np.random.default_rng(0).standard_normal(size(layout(POLICY)[0]), np.float32)
-    collector.load(parameters, np.zeros(buffer_size(POLICY), np.float32))
+    made = spec.make()
+    about = PolicySpec(observation_leaves(made.observation_space), action_spec(made.action_space))
+    run = RunSpec(
+        spec,
+        about,
+        rollout_steps=STEPS,
+        copies=copies // lanes,
+        lanes=PROCESSES * lanes,
+        seed=1,
+        vector="native" if kind == "native" else "loop",
+    )
+    policy: Policy = Blind(about) if kind == "no network" else make_policy(about)
+    if about.needs_torch:
+        import torch
+
+        torch.set_num_threads(1)
+    collector = Collector(run, policy)
+    parameters = 0.01 * np.random.default_rng(0).standard_normal(size(layout(about)[0]), np.float32)
+    collector.load(parameters, np.zeros(buffer_size(about), np.float32))
     mine = range(number * lanes, (number + 1) * lanes)
     sequence = 0
 
-    def loop(seconds: float) -> float:
+    def turn() -> int:
         nonlocal sequence
-        steps, start = collector.steps, time.perf_counter()
-        while (now := time.perf_counter()) - start < seconds:
-            collector.collect([Assignment(0, lane, 0, sequence) for lane in mine], 0, 0, _no_pulse)
-            sequence += 1
-        return (collector.steps - steps) / (now - start)
+        before = collector.steps
+        collector.collect([Assignment(0, lane, 0, sequence) for lane in mine], 0, 0, _no_pulse)
+        sequence += 1
+        return collector.steps - before
 
-    return loop
+    return turn
 
 
 def _no_pulse() -> None: ...
 
 
-CONTENDERS = ("bare, sampled", "bare, drawn", "ours, 2 lanes", "ours, 1 lane")
+def _make(name: str, env: EnvSpec, copies: int, number: int) -> Turn:
+    match name.split(", "):
+        case "bare", "sampled":
+            return bare_sampled(env, copies, number)
+        case "bare", "drawn":
+            return bare_drawn(env, copies, number)
+        case "bare", "native":
+            return bare_native(env, copies, number)
+        case kind, lanes:
+            return ours(kind, int(lanes.split()[0]), env, copies, number)
+    raise ValueError(name)
 
 
-def _make(name: str, copies: int, number: int) -> Loop:
-    match name:
-        case "bare, sampled":
-            return bare_sampled(copies, number)
-        case "bare, drawn":
-            return bare_drawn(copies, number)
-        case _:
-            return ours(int(name.split()[1]), copies, number)
-
-
-def _process(name: str, copies: int, number: int, pipe: Connection) -> None:
+def _process(name: str, env: EnvSpec, copies: int, number: int, cpu: bool, pipe: Connection) -> None:
     """Step for as long as is asked, each time it is asked."""
-    loop = _make(name, copies, number)
+    turn = _make(name, env, copies, number)
+    clock = time.process_time if cpu else time.perf_counter
     while (seconds := pipe.recv()) is not None:
-        pipe.send(loop(seconds))
+        steps, start = 0, clock()
+        while (now := clock()) - start < seconds:
+            steps += turn()
+        pipe.send(steps / (now - start))
 
 
 class Pair:
     """Two processes that do the same at the same time."""
 
-    def __init__(self, name: str, copies: int) -> None:
+    def __init__(self, name: str, copies: int, env: EnvSpec = CARTPOLE, *, cpu: bool = False) -> None:
         context = multiprocessing.get_context("spawn")
         self._pipes = []
         self._processes = []
         for number in range(PROCESSES):
             here, there = context.Pipe()
-            process = context.Process(target=_process, args=(name, copies, number, there), daemon=True)
+            process = context.Process(target=_process, args=(name, env, copies, number, cpu, there), daemon=True)
             process.start()
             self._pipes.append(here)
             self._processes.append(process)
@@ -154,35 +231,45 @@ class Pair:
             process.join()
 
 
-def collecting(copies: int, rounds: int, seconds: float) -> list[dict[str, object]]:
-    """A row for each contender, with `copies` in each process: its rate and its share of the sampled bare loop."""
-    pairs = {name: Pair(name, copies) for name in CONTENDERS}
+def collecting(case: Case, rounds: int, seconds: float, *, cpu: bool) -> list[dict[str, object]]:
+    """A row for each contender: its rate and its share of the bare loops that take part."""
+    pairs = {name: Pair(name, case.copies, case.env, cpu=cpu) for name in case.contenders}
     for pair in pairs.values():
         pair.rate(0.2)  # warm up
     turns = [{name: pair.rate(seconds) for name, pair in pairs.items()} for _ in range(rounds)]
     for pair in pairs.values():
         pair.close()
+
+    def share(name: str, of: str) -> float | None:
+        return statistics.median(turn[name] / turn[of] for turn in turns) if of in pairs else None
+
     return [
         {
-            "copies_each": copies,
+            "env": case.env.id,
+            "copies_each": case.copies,
             "contender": name,
             "env_steps_per_s": round(statistics.median(turn[name] for turn in turns)),
-            "share_of_sampled": statistics.median(turn[name] / turn["bare, sampled"] for turn in turns),
-            "share_of_drawn": statistics.median(turn[name] / turn["bare, drawn"] for turn in turns),
-            "target": TARGETS[copies] if name.startswith("ours") else None,
+            "share_of_sampled": share(name, "bare, sampled"),
+            "share_of_drawn": share(name, "bare, drawn"),
+            "share_of_native": share(name, "bare, native"),
+            "target_share": case.share if name.startswith("ours") else None,
+            "target_rate": case.rate if name.startswith("native") else None,
         }
-        for name in CONTENDERS
+        for name in case.contenders
     ]
 
 
-def show(rows: list[dict[str, object]]) -> Table:
-    table = Table(title=f"Collecting {ENV.id}, {PROCESSES} processes, T = {STEPS}")
-    for column in ("copies each", "", "env steps/s", "of sampled", "of drawn", "target"):
+def show(rows: list[dict[str, object]], second: str) -> Table:
+    table = Table(title=f"Collecting, {PROCESSES} processes, T = {STEPS}")
+    shares = ("share_of_sampled", "share_of_drawn", "share_of_native")
+    for column in ("", "copies each", "", f"env steps/{second}", "of sampled", "of drawn", "of native", "target"):
         table.add_column(column, justify="left" if column == "" else "right")
     for row in rows:
-        shares = [f"{row[name]:.2f}" for name in ("share_of_sampled", "share_of_drawn")]
-        target = f"≥ {row['target']}" if row["target"] else ""
-        table.add_row(str(row["copies_each"]), str(row["contender"]), f"{row['env_steps_per_s']:,}", *shares, target)
+        target = f"≥ {row['target_share'] or row['target_rate']:,}" if row["target_share"] or row["target_rate"] else ""
+        found = ["" if row[name] is None else f"{row[name]:.2f}" for name in shares]
+        env = str(row["env"]).rpartition(":")[2]
+        about = (env, str(row["copies_each"]), str(row["contender"]))
+        table.add_row(*about, f"{row['env_steps_per_s']:,}", *found, target)
     return table
 
 
@@ -190,12 +277,25 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="collecting in two processes against the bare loop")
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--seconds", type=float, default=1.0, help="of each turn")
+    parser.add_argument("--cpu", action="store_true", help="count seconds of CPU")
+    parser.add_argument("--env", default="", help="only the cases whose environment has this in its id")
     arguments = parser.parse_args()
-    rows = [row for copies in TARGETS for row in collecting(copies, arguments.rounds, arguments.seconds)]
-    Console().print(show(rows))
+    rows: list[dict[str, object]] = []
+    for case in CASES:
+        if arguments.env not in case.env.id:
+            continue
+        try:
+            case.env.make().close()
+        except UsageError as error:
+            Console().print(f"left out: {error}")
+            continue
+        rows += collecting(case, arguments.rounds, arguments.seconds, cpu=arguments.cpu)
+    Console(width=120).print(show(rows, "CPU second" if arguments.cpu else "s"))
     # What belongs to a real worker process (resident memory, time from exec to first rollout) is another section here.
     RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "collect.json").write_text(json.dumps({"collecting": rows}, indent=2) + "\n")
+    (RESULTS / "collect.json").write_text(
+        json.dumps({"collecting": rows, "seconds": "CPU" if arguments.cpu else "wall"}, indent=2) + "\n"
+    )
 
 
 if __name__ == "__main__":
