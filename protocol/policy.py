@@ -268,8 +268,10 @@ class NumpyPolicy:
             out += np.matmul(x, weight) + bias - out.mean(-1, keepdims=True)
         if self._beside is None:
             return out
-        beside = np.broadcast_to(self._beside, (*out.shape[:-1], len(self._beside)))
-        return np.concatenate([out, beside], -1)
+        width = out.shape[-1]
+        params = np.empty((*out.shape[:-1], width + len(self._beside)), np.float32)
+        params[..., :width], params[..., width:] = out, self._beside
+        return params
 
 
 def make_policy(spec: PolicySpec) -> Policy:
