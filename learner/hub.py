@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 from learner.events import Broke, Joined, Left, Stale, Told, Turned, describe
 from learner.freshness import Freshness
-from learner.lid import Lid, shut_out
+from learner.lid import Doorkeeper, Lid
 from learner.membership import Out
 from learner.metrics import Progress
 from learner.roster import Roster
@@ -67,6 +67,7 @@ class Hub:
         self.workers_alive: Callable[[], int] = lambda: len(roster.members)
         """how many processes step the environment"""
         self._lid = Lid(link, clock)
+        self._doorkeeper = Doorkeeper(link)
         self._draining = False
         self._listened_s = self._judge_s = clock()
         self._env_failures = 0
@@ -193,7 +194,7 @@ class Hub:
             self._send(self.roster.receive(peer, rollout, now))
 
     def _shut_out(self) -> None:
-        for peer, why in shut_out(self.link, self.roster.members):
+        for peer, why in self._doorkeeper.shut_out(self.roster.members):
             self._send(self.roster.revoke(peer, why))
 
     def _gone(self) -> None:

@@ -1,4 +1,4 @@
-"""A lane, and a ticket, as the learner sees them. No clock, no messages.
+"""A lane, and a ticket, as the learner sees them, and whose turn it is. No clock, no messages.
 
 The law: a lane has one owner at a time; whoever gets it starts it afresh: its incarnation rises, its rollouts are counted
 from 0 again.
@@ -6,6 +6,8 @@ from 0 again.
 
 from __future__ import annotations
 
+import heapq
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 
@@ -51,3 +53,35 @@ class Ticket:
     incarnation: int
     version: int
     peer: bytes
+
+
+class Turns:
+    """Whose turn it is: the least advanced lane's; of equals, that of the lowest number.
+
+    What an entry of the heap says of its lane may be out of date; then there is another one that is not.
+    """
+
+    def __init__(self, lanes: Sequence[Lane]) -> None:
+        self._lanes = lanes
+        self._heap = [(lane.progress, lane.number) for lane in lanes]
+        heapq.heapify(self._heap)
+
+    def first(self) -> Lane:
+        """The least advanced lane."""
+        while True:
+            progress, number = self._heap[0]
+            if self._lanes[number].progress == progress:
+                return self._lanes[number]
+            heapq.heappop(self._heap)
+
+    def forward(self, lane: Lane) -> None:
+        """It was dealt a ticket."""
+        self._moved(lane, 1)
+
+    def back(self, lane: Lane) -> None:
+        """One of its tickets came to nothing."""
+        self._moved(lane, -1)
+
+    def _moved(self, lane: Lane, by: int) -> None:
+        lane.progress += by
+        heapq.heappush(self._heap, (lane.progress, lane.number))

@@ -8,6 +8,7 @@ import logging
 from collections.abc import Callable, Iterable
 
 from learner.events import Event, Told
+from protocol.keys import Allowed
 from protocol.link import LearnerLink
 from protocol.rarely import Rarely, again
 
@@ -36,6 +37,17 @@ class Lid:
             log.log(level, "%s%s", line, again(kept_back), extra={"event": event})
 
 
-def shut_out(link: LearnerLink, members: Iterable[bytes]) -> list[tuple[bytes, str]]:
-    """Those whose key was revoked, and why: ZeroMQ asks about a key at the handshake alone."""
-    return [(peer, why) for peer in members if (why := link.why_not(peer))]
+class Doorkeeper:
+    """Who was let in and may stay no more: ZeroMQ asks about a key at the handshake alone."""
+
+    def __init__(self, link: LearnerLink) -> None:
+        self._link = link
+        self._judged_by: Allowed | None = None
+
+    def shut_out(self, members: Iterable[bytes]) -> list[tuple[bytes, str]]:
+        """Those whose key was revoked, and why. Everybody is looked at once for each state of the list, not each time."""
+        keyring = self._link.keyring
+        if keyring is None or keyring.allowed is self._judged_by:
+            return []
+        self._judged_by = keyring.allowed  # before anybody is judged: the list may be replaced meanwhile
+        return [(peer, why) for peer in members if (why := self._link.why_not(peer))]

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from learner.events import Broke, Left, Turned, describe
-from learner.lid import Lid, shut_out
+from learner.lid import Doorkeeper, Lid
 from learner.lockstep import Lockstep, Make
 from learner.membership import Out
 from learner.status import stepping_status
@@ -130,6 +130,7 @@ class LockstepHub:
         self._closing = False
         self._turned_away = ""  # what became of the last one that did not stay
         self._lid = Lid(link, clock)
+        self._doorkeeper = Doorkeeper(link)
         self._listened_s = self._listening_since_s = clock()
 
     # ---------------------------------------------------------------- saying
@@ -303,7 +304,7 @@ class LockstepHub:
         self._after()
 
     def _shut_out(self) -> None:
-        for peer, why in shut_out(self.link, self.lockstep.members):
+        for peer, why in self._doorkeeper.shut_out(self.lockstep.members):
             self._send(self.lockstep.revoke(peer, why))
             self._after()
 

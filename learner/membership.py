@@ -81,6 +81,7 @@ class Membership(Generic[M]):
         self._run, self._kind, self._lost = run, kind, lost
         self._next_session = first_session
         self._joins = 0
+        self._silent_from_s = -math.inf  # before then nobody can have been silent for too long
         self._silent: set[str] = set()  # names of those given up for their silence, until they join again
         self._refused: dict[bytes, tuple[int, str]] = {}  # the life that was refused, and why
 
@@ -165,11 +166,15 @@ class Membership(Generic[M]):
 
     def silence(self, now: float, timeout_s: float, listening_since_s: float = -math.inf) -> list[M]:
         """Forget who has been silent for too long, and too long in the hearing of the learner; those that were."""
+        if now < self._silent_from_s:
+            return []
         members = self.members.values()
         silent = [member for member in members if now - max(member.heard_s, listening_since_s) > timeout_s]
         for member in silent:
             self._silent.add(member.hello.worker)
             self.forget(member, Silence, f"silent for {timeout_s:.0f} s")
+        heard_s = min((member.heard_s for member in self.members.values()), default=now)
+        self._silent_from_s = max(heard_s, listening_since_s) + timeout_s
         return silent
 
     def forget(self, member: M, event: type, why: str) -> None:

@@ -11,14 +11,14 @@ Heartbeat shows to be lost on the way is said again. Every ticket and every tran
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from learner.events import Broke, Event, Stale
-from learner.lanes import Lane, Ticket
+from learner.lanes import Lane, Ticket, Turns
 from learner.ledger import Ledger
 from learner.membership import Member, Membership, Out
+from learner.placing import Placing
 from learner.standing import Rubbish, Standing
 from protocol.messages import (
     Array,
@@ -29,12 +29,10 @@ from protocol.messages import (
     Heartbeat,
     HeartbeatReply,
     Hello,
-    LaneLife,
     Permit,
     Received,
     Refuse,
     Rejoin,
-    Release,
     Returned,
     Rollout,
     Stepped,
@@ -84,6 +82,8 @@ class Roster:
         self.lanes = [Lane(n, incarnations[n] if incarnations else 0) for n in range(run.lanes)]
         self.tickets: dict[int, Ticket] = {}
         self.ready: list[Rollout] = []
+        self._placing, self._turns = Placing(self.lanes), Turns(self.lanes)
+        self._oldest = version  # no rollout that is ready is older
         self.lives: dict[int, int] = {}
         """incarnation of the lane in which each rollout that is ready, or was taken last, was collected, by its ticket"""
         self._weights: Weights | None = None
@@ -174,13 +174,8 @@ class Roster:
 
     def take(self) -> list[Rollout] | None:
         """The rollouts of the next update, or None while there are too few. What is too stale is dropped and counted."""
-        stale = [rollout for rollout in self.ready if self.version - rollout.version > self.max_lag]
-        self.ready = [rollout for rollout in self.ready if self.version - rollout.version <= self.max_lag]
-        for rollout in stale:
-            self.ledger.stale += 1
-            self.ledger.transitions_stale += rollout.env_steps
-            self.lanes[rollout.lane].progress -= 1
-            self.events.append(Stale(rollout.lane, self.version - rollout.version, rollout.env_steps))
+        if self.version - self._oldest > self.max_lag:
+            self._drop_stale()
         if len(self.ready) < self.rollouts_per_update:
             return None
         self.lives = {rollout.ticket: self.lives[rollout.ticket] for rollout in self.ready}
@@ -205,7 +200,20 @@ class Roster:
 
     def _hello(self, peer: bytes, hello: Hello, now: float) -> list[Out]:
         welcome, member = self.membership.hello(peer, hello, now)
-        return welcome if member is None else welcome + self._offer(member) + self._deal()
+        if member is None:
+            return welcome
+        self._placing.joined()
+        return welcome + self._offer(member) + self._deal()
+
+    def _drop_stale(self) -> None:
+        stale = [rollout for rollout in self.ready if self.version - rollout.version > self.max_lag]
+        self.ready = [rollout for rollout in self.ready if self.version - rollout.version <= self.max_lag]
+        self._oldest = min((rollout.version for rollout in self.ready), default=self.version)
+        for rollout in stale:
+            self.ledger.stale += 1
+            self.ledger.transitions_stale += rollout.env_steps
+            self._turns.back(self.lanes[rollout.lane])
+            self.events.append(Stale(rollout.lane, self.version - rollout.version, rollout.env_steps))
 
     def _rollout(self, member: CollectingMember, rollout: Rollout) -> list[Out]:
         self._acknowledge(member, min(rollout.version, self.version))
@@ -227,7 +235,9 @@ class Roster:
         lane = self.lanes[ticket.lane]
         lane.outstanding.remove(ticket.number)
         lane.arrived(rollout.sequence)
+        self._placing.ended(member)
         self.ready.append(rollout)
+        self._oldest = min(self._oldest, rollout.version)
         self.lives[ticket.number] = ticket.incarnation
         return self._offer(member) + self._deal()
 
@@ -280,64 +290,36 @@ class Roster:
         """The worker is gone: its tickets are lost, its lanes have no owner. `_deal` gives both to the living."""
         for number in list(member.tickets):
             self._lose(member, number)
-        for number in member.lanes:
-            self.lanes[number].restart()
+        self._placing.lost(member)
 
     def _lose(self, member: CollectingMember, number: int) -> None:
         ticket = self.tickets.pop(number)
         del member.tickets[number]
         lane = self.lanes[ticket.lane]
         lane.outstanding.remove(number)
-        lane.progress -= 1
+        self._turns.back(lane)
+        self._placing.ended(member)
         self.ledger.lost += 1
 
     def _deal(self) -> list[Out]:
         """Place lanes that have no owner, even out, and deal tickets to the least advanced lanes."""
-        if self._weights is None or self.membership.draining is not None or not self.membership.active():
+        if self._weights is None or self.membership.draining is not None or not self.members:
             return []
-        out = self._place_lanes()
+        out = self._placing.place(self.members.values())
         room = self.rollouts_per_update * (self.version + 1 + self.max_lag) - self.ledger.used - self.ledger.outstanding
-        queue = [(lane.progress, lane.number) for lane in self.lanes] if room > 0 else []
-        heapq.heapify(queue)
         dealt: dict[bytes, list[int]] = {}
         while room > 0:
-            lane = self.lanes[queue[0][1]]
+            lane = self._turns.first()
             if lane.owner is None or lane.moving:
                 break  # the least advanced lane comes first: in a synchronous run no other may take its place
             number = self.ledger.issued
             self.tickets[number] = Ticket(number, lane.number, lane.incarnation, self.version, lane.owner)
             lane.outstanding.add(number)
-            lane.progress += 1
+            self._turns.forward(lane)
             lane.started = True
-            heapq.heapreplace(queue, (lane.progress, lane.number))
             dealt.setdefault(lane.owner, []).append(number)
             self.ledger.issued += 1
             room -= 1
         for peer, numbers in dealt.items():
             out += self._collect(self.members[peer], numbers)
         return out
-
-    def _place_lanes(self) -> list[Out]:
-        active = sorted(self.membership.active(), key=lambda member: member.order)
-        for lane in self.lanes:
-            lane.moving = False
-            if lane.owner is None:
-                self._give(lane, min(active, key=lambda member: len(member.lanes)))
-        out: list[Out] = []
-        while True:
-            fullest = max(active, key=lambda member: len(member.lanes))
-            emptiest = min(active, key=lambda member: len(member.lanes))
-            if len(fullest.lanes) - len(emptiest.lanes) < 2:
-                return out
-            lane = min((self.lanes[n] for n in fullest.lanes), key=lambda lane: (len(lane.outstanding), -lane.number))
-            if lane.outstanding:
-                lane.moving = True
-                return out
-            fullest.lanes.remove(lane.number)
-            out.append((fullest.peer, Release(fullest.session, (LaneLife(lane.number, lane.incarnation),))))
-            lane.restart()
-            self._give(lane, emptiest)
-
-    def _give(self, lane: Lane, member: CollectingMember) -> None:
-        lane.owner = member.peer
-        member.lanes.add(lane.number)

@@ -1,0 +1,206 @@
+"""One learner before 10, 100 and 1,000 simulated workers: `python -m benchmarks.scale`.
+
+The learner's side is the real one (link, roster, hub, stacking into a batch); its update does nothing. The workers are
+`simulated.py`: real sockets over loopback TCP, real messages, rollouts of 9 KB, answered at once. One lane for each worker,
+one rollout of every lane for each update. CPU is that of the learner's whole process, ZeroMQ's thread included.
+
+The law: not one rollout may be lost, and the CPU that a rollout costs must not grow with the number of workers.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")  # before numpy
+
+import argparse
+import json
+import multiprocessing
+import statistics
+import tempfile
+import time
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import psutil
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.simulated import POLICY, VERSIONS, run_spec, simulate, table
+from learner.hub import Hub
+from learner.roster import Roster
+from protocol.link import LearnerLink
+from protocol.policy import buffer_size, layout, size
+from protocol.rollout import stack
+
+RESULTS = Path(__file__).parent / "results"
+WORKERS = (10, 100, 1000)
+PROCESSES = 2
+WARM_UP = 5  # updates that do not count
+FLAT = 1.2  # what a rollout may cost with the most workers, as a multiple of what it costs with the fewest
+
+
+class Measured(msgspec.Struct, frozen=True, kw_only=True):
+    """What one learner did."""
+
+    workers: int
+    join_s: float
+    """from the first worker's start until the last has joined"""
+    updates: int
+    rollouts_per_s: float
+    mb_per_s: float
+    """received"""
+    cpu_us: float
+    """CPU time of the learner's process for each rollout: all it does, weights and heartbeats included"""
+    python_us: float
+    """of that, in the thread that runs Python"""
+    spread_ms: float
+    """from publishing weights until the last worker acts on them, median"""
+    start_mb: float
+    """resident, before the first worker"""
+    worker_kb: float
+    """resident, what each worker added once all had joined and sent some rollouts"""
+    growth_mb: float
+    """resident, added while it was measured"""
+    lost: int
+    """rollouts and tickets that were not used and should have been"""
+
+
+def learn(workers: int, seconds: float, transport: str, folder: Path, told: Connection) -> None:
+    """The learner's process: tells its address, measures, tells what it measured."""
+    me = psutil.Process()
+    run = run_spec(workers)
+    link = LearnerLink(f"ipc://{folder}/learner" if transport == "ipc" else "tcp://127.0.0.1:*")
+    roster = Roster(run, rollouts_per_update=workers, max_lag=0, worker_timeout_s=10, first_session=1)
+    hub = Hub(link, roster, no_workers_timeout_s=60, stall_timeout_s=30, max_env_failures=0)
+    parameters = np.zeros(size(layout(POLICY)[0]), np.float32)
+    buffers = np.zeros(buffer_size(POLICY), np.float32)
+    published_s: list[float] = []
+
+    def publish() -> None:
+        published_s.append(time.monotonic())
+        hub.publish(len(published_s) - 1, parameters.copy(), buffers)
+
+    start_mb = _resident_mb(me)
+    told.send(link.address)
+    began_s = time.monotonic()
+    hub.wait_for(workers)
+    join_s = time.monotonic() - began_s
+    publish()
+    for _ in range(WARM_UP):
+        stack(hub.gather())
+        publish()
+    warm_mb = _resident_mb(me)
+    first, bytes_before, used_before = len(published_s), link.received.bytes, roster.ledger.used
+    cpu_s, python_s, began_s = time.process_time(), time.thread_time(), time.monotonic()
+    while time.monotonic() - began_s < seconds and len(published_s) < VERSIONS:
+        stack(hub.gather())
+        publish()
+    took_s = time.monotonic() - began_s
+    cpu_s, python_s = time.process_time() - cpu_s, time.thread_time() - python_s
+    used = roster.ledger.used - used_before
+    received_bytes = link.received.bytes - bytes_before
+    growth_mb = _resident_mb(me) - warm_mb
+    counts = roster.ledger.counts()
+    lost = counts["lost"] + counts["stale"] + sum(counts[f"transitions_{why}"] for why in ("duplicate", "late", "invalid"))
+    lost += counts["messages_bad"] + abs(counts["issued"] - counts["used"] - counts["outstanding"])
+    for _ in range(2):  # so that the weights measured last arrive
+        hub.gather()
+        publish()
+    hub.drain("measured", 10)
+    link.close(0)
+    arrived_s = np.array(table(folder, workers)[first : len(published_s) - 2])
+    spread_s = (arrived_s.max(1) - published_s[first : len(published_s) - 2])[(arrived_s > 0).all(1)]
+    told.send(
+        Measured(
+            workers=workers,
+            join_s=join_s,
+            updates=used // workers,
+            rollouts_per_s=used / took_s,
+            mb_per_s=received_bytes / took_s / 1e6,
+            cpu_us=cpu_s / used * 1e6,
+            python_us=python_s / used * 1e6,
+            spread_ms=float(np.median(spread_s)) * 1e3 if len(spread_s) else float("nan"),
+            start_mb=start_mb,
+            worker_kb=(warm_mb - start_mb) / workers * 1e3,
+            growth_mb=growth_mb,
+            lost=lost,
+        )
+    )
+
+
+def _resident_mb(process: psutil.Process) -> float:
+    return float(process.memory_info().rss / 1e6)
+
+
+def measure(workers: int, seconds: float, transport: str) -> Measured:
+    """A learner of its own, and its workers in few processes."""
+    context = multiprocessing.get_context("spawn")
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        table(folder, workers, "w+")
+        here, there = context.Pipe()
+        learner = context.Process(target=learn, args=(workers, seconds, transport, folder, there))
+        learner.start()
+        there.close()
+        address = here.recv()
+        share = -(-workers // PROCESSES)
+        shares = [range(first, min(first + share, workers)) for first in range(0, workers, share)]
+        crowd = [context.Process(target=simulate, args=(address, numbers, workers, folder)) for numbers in shares]
+        for process in crowd:
+            process.start()
+        try:
+            found: Measured = here.recv()
+        finally:
+            for process in (learner, *crowd):
+                process.join(20)
+                process.kill()
+    return found
+
+
+def show(rows: list[Measured], rounds: int) -> Table:
+    shown = Table(title=f"One learner, simulated workers, medians of {rounds}")
+    for column in ("workers", "joined in s", "rollouts/s", "MB/s", "CPU µs a rollout", "in Python", "publish to last, ms",
+                   "MB at start", "KB a worker", "MB grown", "lost"):  # fmt: skip
+        shown.add_column(column, justify="right")
+    for row in rows:
+        shown.add_row(
+            *(str(row.workers), f"{row.join_s:.1f}", f"{row.rollouts_per_s:,.0f}", f"{row.mb_per_s:.0f}"),
+            *(f"{row.cpu_us:.0f}", f"{row.python_us:.0f}", f"{row.spread_ms:.0f}", f"{row.start_mb:.0f}"),
+            *(f"{row.worker_kb:.0f}", f"{row.growth_mb:.1f}", str(row.lost)),
+        )
+    return shown
+
+
+def medians(turns: list[Measured]) -> Measured:
+    """Of each figure; but all that was lost, in any turn, is told."""
+    fields = {name: statistics.median(getattr(turn, name) for turn in turns) for name in Measured.__struct_fields__}
+    fields |= {name: int(fields[name]) for name in ("workers", "updates")}
+    return Measured(**fields | {"lost": sum(turn.lost for turn in turns)})  # type: ignore[arg-type]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="one learner before many simulated workers")
+    parser.add_argument("--workers", type=int, nargs="+", default=WORKERS)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--seconds", type=float, default=4.0, help="of each turn")
+    parser.add_argument("--transport", choices=("tcp", "ipc"), default="tcp")
+    arguments = parser.parse_args()
+    turns = [
+        [measure(workers, arguments.seconds, arguments.transport) for workers in arguments.workers]
+        for _ in range(arguments.rounds)
+    ]
+    rows = [medians(list(column)) for column in zip(*turns, strict=True)]
+    console = Console(width=140)
+    console.print(show(rows, arguments.rounds))
+    growth = statistics.median(turn[-1].cpu_us / turn[0].cpu_us for turn in turns)
+    console.print(f"CPU a rollout, {rows[-1].workers} workers against {rows[0].workers}: {growth:.2f} (target ≤ {FLAT})")
+    RESULTS.mkdir(exist_ok=True)
+    record = {"scale": msgspec.to_builtins(rows), "transport": arguments.transport, "cpu_growth": growth}
+    (RESULTS / "scale.json").write_text(json.dumps(record, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
