@@ -178,7 +178,7 @@ def medians(turns: list[Measured]) -> Measured:
     """Of each figure; but all that was lost, in any turn, is told."""
     fields = {name: statistics.median(getattr(turn, name) for turn in turns) for name in Measured.__struct_fields__}
     fields |= {name: int(fields[name]) for name in ("workers", "updates")}
-    return Measured(**fields | {"lost": sum(turn.lost for turn in turns)})  # type: ignore[arg-type]
+    return Measured(**fields | {"lost": sum(turn.lost for turn in turns)})
 
 
 def main() -> None:

@@ -8,7 +8,6 @@ array that arrives is a read-only view on the received frame: no copy.
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -29,7 +28,9 @@ MAX_HEAD_BYTES = 1 << 20  # Welcome carries a pickled factory at most this large
 MAX_FRAME_BYTES = 1 << 30
 MAX_ITEMS = 1 << 16
 MAX_DIMENSIONS = 8
-DTYPES = frozenset(["|b1", "|i1", "|u1", "<i2", "<u2", "<i4", "<u4", "<i8", "<u8", "<f2", "<f4", "<f8"])
+DTYPES = {
+    name: np.dtype(name) for name in ("|b1", "|i1", "|u1", "<i2", "<u2", "<i4", "<u4", "<i8", "<u8", "<f2", "<f4", "<f8")
+}
 
 assert sys.byteorder == "little", "millrace sends arrays as they lie in memory and knows little-endian machines only"
 
@@ -43,7 +44,7 @@ def encode(message: ToLearner | Inquire | ToWorker | ToObserver) -> list[Buffer]
             raise TypeError(f"{type(message).__name__} cannot carry a {type(value).__name__}")
         if value.dtype.str not in DTYPES:
             raise TypeError(f"{type(message).__name__} cannot carry an array of {value.dtype}")
-        frames.append(np.ascontiguousarray(value).reshape(-1).view(np.uint8).data)
+        frames.append(value.ravel().view(np.uint8).data)
         return [value.dtype.str, list(value.shape), len(frames) - 1]
 
     head = msgpack.packb(msgspec.to_builtins(message, enc_hook=hook, builtin_types=(bytes,)))
@@ -104,20 +105,22 @@ def _decode(frames: Sequence[Buffer], kind: Any) -> Any:
 
 def _array(frames: Sequence[Buffer], value: object) -> tuple[int, Array]:
     """The array that `[dtype, shape, index]` stands for: a read-only view on its frame."""
-    match value:
-        case [str(dtype), list(shape), int(index)]:
-            pass
-        case _:
-            raise BadMessage(f"array expected [dtype, shape, index], got {str(value)[:80]}")
-    if dtype not in DTYPES:
-        raise BadMessage(f"array dtype expected one of ours, got {dtype[:20]!r}")
-    if len(shape) > MAX_DIMENSIONS or not all(type(side) is int and 0 <= side <= MAX_FRAME_BYTES for side in shape):
-        raise BadMessage(f"array shape expected at most {MAX_DIMENSIONS} whole numbers, got {str(shape)[:80]}")
-    if isinstance(index, bool) or not 1 <= index < len(frames):
+    if not (type(value) is list and len(value) == 3):
+        raise BadMessage(f"array expected [dtype, shape, index], got {str(value)[:80]}")
+    name, shape, index = value
+    if not (type(name) is str and type(shape) is list and isinstance(index, int)):
+        raise BadMessage(f"array expected [dtype, shape, index], got {str(value)[:80]}")
+    dtype = DTYPES.get(name)
+    if dtype is None:
+        raise BadMessage(f"array dtype expected one of ours, got {name[:20]!r}")
+    expected = dtype.itemsize
+    for side in shape:
+        if not (type(side) is int and 0 <= side <= MAX_FRAME_BYTES and len(shape) <= MAX_DIMENSIONS):
+            raise BadMessage(f"array shape expected at most {MAX_DIMENSIONS} whole numbers, got {str(shape)[:80]}")
+        expected *= side
+    if type(index) is bool or not 1 <= index < len(frames):
         raise BadMessage(f"array frame expected 1 to {len(frames) - 1}, got {index}")
-    frame = memoryview(frames[index]).toreadonly()
-    if math.prod(shape) * np.dtype(dtype).itemsize != len(frame):
-        raise BadMessage(
-            f"array {dtype}{shape} expected {math.prod(shape) * np.dtype(dtype).itemsize} bytes, got {len(frame)}"
-        )
-    return index, np.frombuffer(frame, dtype).reshape(shape)
+    frame = frames[index]
+    if expected != len(frame):
+        raise BadMessage(f"array {name}{shape} expected {expected} bytes, got {len(frame)}")
+    return index, np.ndarray(shape, dtype, frame if type(frame) is bytes else memoryview(frame).toreadonly())

@@ -1,0 +1,197 @@
+"""The way of a rollout from one process to another: `python -m benchmarks.wire`.
+
+Large (14.6 MB, Atari): seconds from before `encode` in the sender until after decoding in the receiver, one rollout under
+way at a time, against plain ROUTER and DEALER sockets that carry the same frames; in turns. Small (9 KB, CartPole): CPU µs
+of the Python thread at each end. Both: bytes of the frames and of ZeroMQ's framing against those of the arrays.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")  # before numpy
+
+import argparse
+import json
+import multiprocessing
+import statistics
+import tempfile
+import time
+from collections.abc import Sequence
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import zmq
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.simulated import canned, run_spec
+from protocol.codec import Buffer, encode
+from protocol.link import LearnerLink, WorkerLink
+from protocol.rollout import Rollout, validate
+from protocol.specs import ActionSpec, EnvSpec, Leaf, PolicySpec, RunSpec
+
+RESULTS = Path(__file__).parent / "results"
+TRANSPORTS = ("ipc", "tcp")
+SHARE, PYTHON_US, OVERHEAD = 0.8, 40, 1.02  # targets
+ATARI = RunSpec(
+    EnvSpec("ALE/Pong-v5"),
+    PolicySpec((Leaf("", "box", (84, 84, 4), "uint8"),), ActionSpec("discrete", (), "int64", (6,), (0,))),
+    rollout_steps=128,
+    copies=4,
+    lanes=2,
+    seed=1,
+)
+CARTPOLE = run_spec(4)
+BURST = 200  # small rollouts that are sent together
+
+
+def _send(addresses: dict[str, str], told: Connection) -> None:
+    """The sender's process: one rollout by one way, each time it is asked; seconds by the clock that both share."""
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    rollout = canned(ATARI)
+    frames = encode(rollout)
+    links = {way: WorkerLink(address, "w", context) for way, address in addresses.items() if way.startswith("ours")}
+    sockets = {}
+    for way, address in addresses.items():
+        if way.startswith("raw"):
+            sockets[way] = context.socket(zmq.DEALER)
+            sockets[way].routing_id = b"w"
+            sockets[way].connect(address)
+    told.send(None)
+    while (way := told.recv()) is not None:
+        began_s = time.monotonic()
+        if way in links:
+            links[way].send(encode(rollout))
+        else:
+            sockets[way].send_multipart(frames, copy=False)
+        told.send(began_s)
+    for link in links.values():
+        link.close(0)
+    context.destroy(linger=0)
+
+
+def large(rounds: int) -> list[dict[str, object]]:
+    """A row for each transport."""
+    context = multiprocessing.get_context("spawn")
+    zmq_context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    times: dict[str, list[float]] = {f"{kind} {transport}": [] for kind in ("raw", "ours") for transport in TRANSPORTS}
+    with tempfile.TemporaryDirectory() as folder:
+        links, sockets, addresses = {}, {}, {}
+        for way in times:
+            address = f"ipc://{folder}/{way.replace(' ', '-')}" if way.endswith("ipc") else "tcp://127.0.0.1:*"
+            if way.startswith("ours"):
+                links[way] = LearnerLink(address, zmq_context)
+                addresses[way] = links[way].address
+            else:
+                sockets[way] = zmq_context.socket(zmq.ROUTER)
+                sockets[way].bind(address)
+                addresses[way] = bytes(sockets[way].get(zmq.LAST_ENDPOINT)).decode().rstrip("\0")
+        here, there = context.Pipe()
+        sender = context.Process(target=_send, args=(addresses, there))
+        sender.start()
+        here.recv()
+        for turn in range(-3, rounds):  # those before 0 warm up
+            for way in list(times)[:: 1 if turn % 2 else -1]:
+                here.send(way)
+                if way in links:
+                    assert links[way].poll(10)
+                    ((_, message),) = links[way].receive()
+                    assert isinstance(message, Rollout)
+                else:
+                    assert sockets[way].poll(10_000)
+                    sockets[way].recv_multipart(copy=False)
+                now = time.monotonic()
+                if (began_s := here.recv()) and turn >= 0:
+                    times[way].append(now - began_s)
+        here.send(None)
+        sender.join()
+        for link in links.values():
+            link.close(0)
+        zmq_context.destroy(linger=0)
+    payload, _ = on_the_wire(encode(canned(ATARI)))
+    return [
+        {
+            "transport": transport,
+            "raw_ms": statistics.median(times[f"raw {transport}"]) * 1e3,
+            "ours_ms": statistics.median(times[f"ours {transport}"]) * 1e3,
+            "gb_per_s": payload / statistics.median(times[f"ours {transport}"]) / 1e9,
+            "share": statistics.median(
+                raw / ours for raw, ours in zip(times[f"raw {transport}"], times[f"ours {transport}"], strict=True)
+            ),
+        }
+        for transport in TRANSPORTS
+    ]
+
+
+def small(rounds: int) -> dict[str, float]:
+    """CPU µs of the Python thread for a rollout of 9 KB, and in which part; medians."""
+    rollout = canned(CARTPOLE)
+    parts: dict[str, list[float]] = {"encode": [], "send": [], "receive and decode": [], "validate": []}
+    with tempfile.TemporaryDirectory() as folder:
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        learner = LearnerLink(f"ipc://{folder}/learner", context)
+        worker = WorkerLink(learner.address, "w", context)
+        for turn in range(-2, rounds):
+            marks = [time.thread_time()]
+            messages = [encode(rollout) for _ in range(BURST)]
+            marks.append(time.thread_time())
+            for frames in messages:
+                worker.send(frames)
+            marks.append(time.thread_time())
+            time.sleep(0.05)  # all have arrived: what is timed is no waiting
+            assert learner.poll(10)
+            before_s = time.thread_time()
+            received = [message for _, message in learner.receive()]
+            marks.append(marks[-1] + time.thread_time() - before_s)
+            assert len(received) == BURST
+            before_s = time.thread_time()
+            for message in received:
+                assert isinstance(message, Rollout)
+                validate(message, CARTPOLE)
+            marks.append(marks[-1] + time.thread_time() - before_s)
+            if turn >= 0:
+                for part, taken in zip(parts.values(), np.diff(marks), strict=True):
+                    part.append(taken / BURST * 1e6)
+        worker.close(0)
+        learner.close(0)
+        context.term()
+    return {part: statistics.median(found) for part, found in parts.items()}
+
+
+def on_the_wire(frames: Sequence[Buffer]) -> tuple[int, int]:
+    """Bytes of the arrays, and of all that a connection carries: each frame has a head of 2 bytes, or 9 if it is long."""
+    return sum(map(len, frames[1:])), sum(len(frame) + (2 if len(frame) < 256 else 9) for frame in frames)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="the way of a rollout")
+    parser.add_argument("--rounds", type=int, default=40)
+    rounds = parser.parse_args().rounds
+    console = Console(width=110)
+    rows = large(rounds)
+    first = Table(title=f"A rollout of {on_the_wire(encode(canned(ATARI)))[0] / 1e6:.1f} MB, medians of {rounds}")
+    for column in ("", "raw ZeroMQ, ms", "ours, ms", "GB/s", "share", "target"):
+        first.add_column(column, justify="right")
+    for row in rows:
+        numbers = (f"{row[key]:.2f}" for key in ("raw_ms", "ours_ms", "gb_per_s", "share"))
+        first.add_row(str(row["transport"]), *numbers, f"≥ {SHARE}")
+    console.print(first)
+    parts = small(rounds)
+    second = Table(*parts, "worker", "learner", "target", title="A rollout of 9 KB, µs of Python")
+    ends = {"worker": parts["encode"] + parts["send"], "learner": parts["receive and decode"]}
+    second.add_row(*(f"{us:.1f}" for us in (*parts.values(), *ends.values())), f"≤ {PYTHON_US}")
+    console.print(second)
+    overhead = {name: on_the_wire(encode(canned(run))) for name, run in (("Atari", ATARI), ("CartPole", CARTPOLE))}
+    for name, (payload, wire) in overhead.items():
+        ratio = f"{wire / payload:.4f} (target ≤ {OVERHEAD})"
+        console.print(f"{name}: {wire:,} bytes on the wire for {payload:,} of arrays: {ratio}")
+    RESULTS.mkdir(exist_ok=True)
+    record = {"large": rows, "small_us": parts | ends, "bytes": overhead}
+    (RESULTS / "wire.json").write_text(msgspec.json.format(json.dumps(record)) + "\n")
+
+
+if __name__ == "__main__":
+    main()
