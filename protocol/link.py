@@ -56,6 +56,7 @@ COPY_BELOW_BYTES = 65536  # smaller frames are copied: cheaper than keeping trac
 CURVE_BYTES = 33  # what encryption adds to a frame
 HOLDERS = 10_000  # routing ids whose last speaker is remembered
 TAG_CHARACTERS = 32
+NOT_WAITING, AND_MORE = int(zmq.NOBLOCK), int(zmq.NOBLOCK | zmq.SNDMORE)
 
 
 def _options(socket: zmq.Socket[bytes], address: str, curve: bool) -> None:
@@ -80,7 +81,7 @@ def _receive(socket: zmq.Socket[bytes], said_by: list[str] | None = None) -> lis
     try:
         more = True
         while more:
-            frame = socket.recv(zmq.NOBLOCK, copy=False)
+            frame = socket.recv(NOT_WAITING, copy=False)
             if said_by is not None and not frames:
                 said_by[:] = [_user(frame)]
             more = frame.more
@@ -89,6 +90,13 @@ def _receive(socket: zmq.Socket[bytes], said_by: list[str] | None = None) -> lis
     except zmq.Again:
         return None
     return frames
+
+
+def _send(socket: zmq.Socket[bytes], frames: Sequence[Buffer]) -> None:
+    """What `send_multipart` does, which reckons flags and checks types anew for each frame: half of what sending costs."""
+    for frame in frames[:-1]:
+        socket.send(frame, AND_MORE, copy=False)
+    socket.send(frames[-1], NOT_WAITING, copy=False)
 
 
 def _user(frame: zmq.Frame) -> str:
@@ -212,7 +220,7 @@ class LearnerLink:
             peer = routing_id
         whole = [peer, *frames]
         try:
-            self._socket.send_multipart(whole, zmq.NOBLOCK, copy=False)
+            _send(self._socket, whole)
         except zmq.ZMQError as error:
             if error.errno in (zmq.EHOSTUNREACH, zmq.EAGAIN):
                 return False
@@ -328,7 +336,7 @@ class WorkerLink:
     def send(self, frames: Sequence[Buffer]) -> None:
         """Send, or queue while the learner is out of reach (the conversation repairs what is lost)."""
         with suppress(zmq.Again):
-            self._socket.send_multipart(frames, zmq.NOBLOCK, copy=False)
+            _send(self._socket, frames)
 
     def close(self, linger_s: float = LINGER_MS / 1000) -> None:
         """Send what is queued, at most `linger_s`, and close."""
