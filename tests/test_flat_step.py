@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import copy
+import subprocess
+import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
@@ -45,3 +48,16 @@ def test_bits_are_the_optimisers(kind: str) -> None:
     optimizers[0].step()
     take_step(resumed)
     assert torch.equal(*flats)
+
+
+@pytest.mark.parametrize("algo", ["ppo", "a2c", "dqn"])
+def test_a_run_that_compiles_nothing_does_not_import_the_compiler(algo: str, tmp_path: Path) -> None:
+    program = f"""
+import sys, millrace
+run = millrace.train("CartPole-v1", algo="{algo}", steps=2000, run_dir={str(tmp_path)!r}, transport="inproc")
+assert "torch" in sys.modules
+assert "torch._dynamo" not in sys.modules
+"""
+    root = Path(__file__).parents[1]
+    done = subprocess.run([sys.executable, "-c", program], cwd=root, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr

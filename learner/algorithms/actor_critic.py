@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from torch import Tensor
 
 from learner.algorithms import losses
-from learner.algorithms.flat_step import take_step
+from learner.algorithms.flat_step import spare_the_compiler, take_step
 from learner.algorithms.fused import MOST_ROWS, FusedActorCritic, applies
 from learner.algorithms.normalise import ObservationNormaliser, RewardScaler
 from learner.hyperparameters import ActorCriticHyperparameters, RecurrentHyperparameters
@@ -110,6 +110,7 @@ def policy_spec(config: ActorCriticHyperparameters, observation: tuple[Leaf, ...
 
 def make_optimizer(kind: Literal["adam", "rmsprop"], net: ActorCritic, learning_rate: float) -> torch.optim.Optimizer:
     """Over the flat parameters. 1e-5 stands outside the square root, as in Stable-Baselines3."""
+    spare_the_compiler()
     if kind == "adam":
         return torch.optim.Adam([net.flat], lr=learning_rate, eps=1e-5, fused=True)
     return torch.optim.RMSprop([net.flat], lr=learning_rate, alpha=0.99, eps=1e-5)

@@ -20,7 +20,7 @@ import torch
 
 from learner.algorithms import losses
 from learner.algorithms.action_values import action_values
-from learner.algorithms.flat_step import take_step
+from learner.algorithms.flat_step import spare_the_compiler, take_step
 from learner.algorithms.normalise import ObservationNormaliser
 from learner.algorithms.replay import Replay, Sample
 from learner.hyperparameters import DQNConfig
@@ -88,6 +88,7 @@ class DQN:
         self.version = 0  # updates made
         self.gradient_steps = 0  # what Stable-Baselines3 calls n_updates
         self._total_steps = total_steps
+        spare_the_compiler()
         optimizer = torch.optim.Adam if config.optimizer == "adam" else torch.optim.AdamW
         self._optimizer = optimizer([self.net.flat], lr=config.learning_rate, amsgrad=config.amsgrad, fused=True)
         # The normaliser asks for the measured features alone, whichever head acts on them.
