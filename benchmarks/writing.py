@@ -1,0 +1,68 @@
+"""What a benchmark leaves behind: JSON, with the machine, the versions, the commit and the load; and a picture of bars."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from learner.report import COLOURS, DPI, GREY
+from learner.versions import versions
+
+RESULTS = Path(__file__).parent / "results"
+Bars = tuple[str, Mapping[str, float]]
+"""a title, and the length of each bar by its name"""
+
+
+def circumstances() -> dict[str, object]:
+    """Where and under what these figures came about."""
+    return {
+        "at": datetime.now(UTC).isoformat(timespec="seconds"),
+        "commit": _commit(),
+        "machine": platform.platform(),
+        "cores": os.cpu_count(),
+        "load": [round(load, 1) for load in os.getloadavg()],
+        "versions": versions(),
+    }
+
+
+def _commit() -> str:
+    command = ["git", "describe", "--always", "--dirty"]
+    try:
+        return subprocess.run(command, cwd=RESULTS.parent, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+def write(name: str, record: Mapping[str, Any], charts: Sequence[Bars] = ()) -> None:
+    """The record as results/NAME.json; the charts, if there are any, as results/NAME.png."""
+    RESULTS.mkdir(exist_ok=True)
+    (RESULTS / f"{name}.json").write_text(json.dumps({"circumstances": circumstances(), **record}, indent=2) + "\n")
+    if charts:
+        _draw(charts, RESULTS / f"{name}.png")
+
+
+def _draw(charts: Sequence[Bars], out: Path) -> None:
+    from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    heights = [len(bars) + 1 for _, bars in charts]
+    figure = Figure(figsize=(8.0, 0.8 + 0.32 * sum(heights)), layout=ConstrainedLayoutEngine())
+    panels = figure.subplots(len(charts), 1, squeeze=False, height_ratios=heights)[:, 0]
+    for panel, (title, bars) in zip(panels, charts, strict=True):
+        colours = [COLOURS[0] if label.startswith(("millrace", "ours")) else "#bbbbbb" for label in bars]
+        drawn = panel.barh(list(bars), list(bars.values()), color=colours)
+        panel.bar_label(drawn, fmt="{:,.4g}", padding=3, fontsize=8, color=GREY)
+        panel.set_title(title, fontsize=10, fontweight="bold", loc="left")
+        panel.invert_yaxis()
+        panel.margins(x=0.12)
+        panel.tick_params(labelsize=8, colors=GREY, length=0)
+        panel.xaxis.set_visible(False)
+        for spine in panel.spines.values():
+            spine.set_visible(False)
+    figure.savefig(out, dpi=DPI)
