@@ -35,11 +35,8 @@ soak: .venv/installed-dev  ## faults for ten minutes, every two seconds one; the
 docs: .venv/installed-dev  ## write the generated parts of protocol/README.md
 	$(BIN)/python -m tests.test_wire_document
 
-bench: .venv/installed-dev
-	$(BIN)/python -m benchmarks.collect
-	$(BIN)/python -m benchmarks.update
-	$(BIN)/python -m benchmarks.worker
-	$(BIN)/python -m benchmarks.vector_env
+bench: .venv/installed-dev  ## all benchmarks, a quarter of an hour: tables here, JSON and pictures in benchmarks/results
+	$(BIN)/millrace bench
 
 .venv/installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit("millrace needs Python 3.11 or newer; set PYTHON=") if sys.version_info < (3, 11) else None'

@@ -19,14 +19,11 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM
 
 import argparse
 import itertools
-import json
 import multiprocessing
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection
-from pathlib import Path
-from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -34,6 +31,7 @@ import numpy.typing as npt
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.writing import bars, write
 from protocol.distributions import distribution
 from protocol.errors import UsageError
 from protocol.native import make_native
@@ -43,7 +41,6 @@ from protocol.specs import EnvSpec, PolicySpec, RunSpec
 from workers.collector import Collector
 from workers.session import Assignment
 
-RESULTS = Path(__file__).parent / "results"
 PROCESSES = 2
 STEPS = 128  # T
 CARTPOLE, FRAMES = EnvSpec("CartPole-v1"), EnvSpec("benchmarks.frames:Frames-v0")
@@ -281,6 +278,7 @@ def main() -> None:
     parser.add_argument("--env", default="", help="only the cases whose environment has this in its id")
     arguments = parser.parse_args()
     rows: list[dict[str, object]] = []
+    charts = []
     for case in CASES:
         if arguments.env not in case.env.id:
             continue
@@ -289,13 +287,12 @@ def main() -> None:
         except UsageError as error:
             Console().print(f"left out: {error}")
             continue
-        rows += collecting(case, arguments.rounds, arguments.seconds, cpu=arguments.cpu)
+        found = collecting(case, arguments.rounds, arguments.seconds, cpu=arguments.cpu)
+        rows += found
+        title = f"{case.env.id.rpartition(':')[2]}, env steps/s, {case.copies} copies in each of {PROCESSES} processes"
+        charts.append((title, bars(found, "contender", "env_steps_per_s")))
     Console(width=120).print(show(rows, "CPU second" if arguments.cpu else "s"))
-    # What belongs to a real worker process (resident memory, time from exec to first rollout) is another section here.
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "collect.json").write_text(
-        json.dumps({"collecting": rows, "seconds": "CPU" if arguments.cpu else "wall"}, indent=2) + "\n"
-    )
+    write("collect", {"collecting": rows, "seconds": "CPU" if arguments.cpu else "wall"}, charts)
 
 
 if __name__ == "__main__":

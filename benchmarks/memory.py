@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.programs import OURS, ZOO, contenders, run
-from benchmarks.writing import write
+from benchmarks.writing import bars, write
 
 STEPS = 20_000
 TARGET_WORKER_MB = 70
@@ -92,11 +92,7 @@ def main() -> None:
         target = f"a worker ≤ {TARGET_WORKER_MB}" if row["contender"] == OURS else ""
         table.add_row(str(row["contender"]), str(row["processes"]), *figures, target)
     Console(width=120).print(table)
-    write(
-        "memory",
-        {"memory": rows},
-        [("memory of all processes, MB", {str(r["contender"]): float(str(r["own_mb"])) for r in rows})],
-    )
+    write("memory", {"memory": rows}, [("memory of all processes, MB", bars(rows, "contender", "own_mb"))])
 
 
 if __name__ == "__main__":

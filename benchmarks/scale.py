@@ -14,7 +14,6 @@ import os
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")  # before numpy
 
 import argparse
-import json
 import multiprocessing
 import statistics
 import tempfile
@@ -29,13 +28,13 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.simulated import POLICY, VERSIONS, run_spec, simulate, table
+from benchmarks.writing import write
 from learner.hub import Hub
 from learner.roster import Roster
 from protocol.link import LearnerLink
 from protocol.policy import buffer_size, layout, size
 from protocol.rollout import stack
 
-RESULTS = Path(__file__).parent / "results"
 WORKERS = (10, 100, 1000)
 PROCESSES = 2
 WARM_UP = 5  # updates that do not count
@@ -197,9 +196,16 @@ def main() -> None:
     console.print(show(rows, arguments.rounds))
     growth = statistics.median(turn[-1].cpu_us / turn[0].cpu_us for turn in turns)
     console.print(f"CPU a rollout, {rows[-1].workers} workers against {rows[0].workers}: {growth:.2f} (target ≤ {FLAT})")
-    RESULTS.mkdir(exist_ok=True)
-    record = {"scale": msgspec.to_builtins(rows), "transport": arguments.transport, "cpu_growth": growth}
-    (RESULTS / "scale.json").write_text(json.dumps(record, indent=2) + "\n")
+    found = msgspec.to_builtins(rows)
+    charts = [
+        (title, {f"{row['workers']:,} workers": float(row[name]) for row in found})
+        for title, name in (
+            ("CPU µs a rollout", "cpu_us"),
+            ("rollouts/s", "rollouts_per_s"),
+            ("publish to last, ms", "spread_ms"),
+        )
+    ]
+    write("scale", {"scale": found, "transport": arguments.transport, "cpu_growth": growth}, charts)
 
 
 if __name__ == "__main__":

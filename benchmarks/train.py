@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.programs import SETTINGS, SUBPROC, ZOO, contenders, run
-from benchmarks.writing import write
+from benchmarks.writing import bars, write
 
 WARM_UP = 2  # updates
 TARGET = 5.0  # times the env steps/s of Stable-Baselines3's best
@@ -96,12 +96,8 @@ def main() -> None:
         spread = f"{row['least']:.1f} to {row['most']:.1f}"
         table.add_row(str(row["contender"]), f"{row['seconds']:.1f}", spread, f"{row['env_steps']:,}")
     console.print(table)
-    bars = {
-        name: {str(row["contender"]): float(str(row["env_steps_per_s"])) for row in rows if row["settings"] == name}
-        for name in SETTINGS
-    }
-    charts = [(f"env steps/s, {name}", found) for name, found in bars.items()]
-    charts.append(("seconds to a solved CartPole", {str(row["contender"]): float(str(row["seconds"])) for row in solved}))
+    charts = [(f"env steps/s, {name}", bars(rows, "contender", "env_steps_per_s", name)) for name in SETTINGS]
+    charts.append(("seconds to a solved CartPole", bars(solved, "contender", "seconds")))
     write("train", {"speeds": rows, "solving": solved}, charts)
 
 

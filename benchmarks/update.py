@@ -12,8 +12,6 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM
 
 import argparse
 import importlib.util
-import json
-from pathlib import Path
 
 import torch
 from rich.console import Console
@@ -21,8 +19,8 @@ from rich.table import Table
 
 from benchmarks import update_ppo
 from benchmarks.contest import Contest, measure
+from benchmarks.writing import write
 
-RESULTS = Path(__file__).parent / "results"
 COLUMNS = ("update", "rows", "peer", "its ms", "graph ms", "ours ms", "ratio", "target", "to graph")
 
 
@@ -53,9 +51,9 @@ def main() -> None:
         target = "" if r["target"] is None else f"≤ {r['target']}"
         table.add_row(str(r["update"]), str(r["rows"]), str(r["peer"]), *numbers, target, f"{r['ratio_to_graph']:.3f}")
     console.print(table)
-    RESULTS.mkdir(exist_ok=True)
-    record = {"benchmark": "update", "torch": torch.__version__, "threads": 1, "rounds": rounds, "load": load}
-    (RESULTS / "update.json").write_text(json.dumps(record | {"results": results}, indent=2) + "\n")
+    ratios = {f"{r['update']}, {r['rows']} rows, against {r['peer']}": float(str(r["ratio"])) for r in results}
+    record = {"threads": 1, "rounds": rounds, "results": results}
+    write("update", record, [("time of our update, as a share of the other's", ratios)])
 
 
 if __name__ == "__main__":

@@ -14,16 +14,14 @@ import os
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")  # before numpy
 
 import argparse
-import json
 import statistics
-from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
 from benchmarks.vector_contenders import ASYNC, LIMIT, OURS, Contender, Task, make, memory_mb
+from benchmarks.writing import bars, write
 
-RESULTS = Path(__file__).parent / "results"
 PEERS = ("SB3 SubprocVecEnv", "tianshou Shmem", "TorchRL ParallelEnv")
 ALL = ("gymnasium Sync", ASYNC, "SB3 DummyVecEnv", *PEERS, *OURS, LIMIT)
 FEW = ("gymnasium Sync", ASYNC, *PEERS, "millrace")
@@ -108,11 +106,17 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=1.0, help="of each turn")
     arguments = parser.parse_args()
     taken = memory()
-    rows = [row for task, names in TASKS for row in stepping(task, names, arguments.rounds, arguments.seconds)]
+    rows: Rows = []
+    charts = []
+    for task, names in TASKS:
+        found = stepping(task, names, arguments.rounds, arguments.seconds)
+        rows += found
+        title = f"{task.title}, env steps/s, {task.copies} copies, {task.workers} workers"
+        charts.append((title, bars([row for row in found if row["env_steps_per_s"]], "contender", "env_steps_per_s")))
+    charts.append(("64 copies: MB, PSS", bars(taken, "contender", "pss_mb")))
     Console().print(show(rows, arguments.rounds))
     Console().print(show_memory(taken))
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "vector_env.json").write_text(json.dumps({"vector_env": rows, "memory": taken}, indent=2) + "\n")
+    write("vector_env", {"vector_env": rows, "memory": taken}, charts)
 
 
 if __name__ == "__main__":

@@ -12,28 +12,25 @@ import os
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")  # before numpy
 
 import argparse
-import json
 import multiprocessing
 import statistics
 import tempfile
 import time
 from collections.abc import Sequence
 from multiprocessing.connection import Connection
-from pathlib import Path
 
-import msgspec
 import numpy as np
 import zmq
 from rich.console import Console
 from rich.table import Table
 
 from benchmarks.simulated import canned, run_spec
+from benchmarks.writing import write
 from protocol.codec import Buffer, encode
 from protocol.link import LearnerLink, WorkerLink
 from protocol.rollout import Rollout, validate
 from protocol.specs import ActionSpec, EnvSpec, Leaf, PolicySpec, RunSpec
 
-RESULTS = Path(__file__).parent / "results"
 TRANSPORTS = ("ipc", "tcp")
 SHARE, PYTHON_US, OVERHEAD = 0.8, 40, 1.02  # targets
 ATARI = RunSpec(
@@ -188,9 +185,13 @@ def main() -> None:
     for name, (payload, wire) in overhead.items():
         ratio = f"{wire / payload:.4f} (target ≤ {OVERHEAD})"
         console.print(f"{name}: {wire:,} bytes on the wire for {payload:,} of arrays: {ratio}")
-    RESULTS.mkdir(exist_ok=True)
-    record = {"large": rows, "small_us": parts | ends, "bytes": overhead}
-    (RESULTS / "wire.json").write_text(msgspec.json.format(json.dumps(record)) + "\n")
+    times = {
+        f"{who}, {row['transport']}": float(str(row[f"{who.split()[0]}_ms"]))
+        for row in rows
+        for who in ("raw ZeroMQ", "ours")
+    }
+    charts = [("a rollout of 14.6 MB, ms", times), ("a rollout of 9 KB, µs of Python", parts)]
+    write("wire", {"large": rows, "small_us": parts | ends, "bytes": overhead}, charts)
 
 
 if __name__ == "__main__":

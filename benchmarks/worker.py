@@ -7,7 +7,6 @@ image policy, which needs it.
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import tempfile
 import time
@@ -18,6 +17,7 @@ import psutil
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.writing import write
 from learner.config import resolve
 from learner.hub import Hub
 from learner.roster import Roster
@@ -27,7 +27,6 @@ from protocol.policy import buffer_size, layout, size
 from protocol.specs import EnvSpec
 from workers.host import Process
 
-RESULTS = Path(__file__).parent / "results"
 CASES = {
     "MLP, CartPole-v1": EnvSpec("CartPole-v1"),
     "image, 12 x 12 x 3": EnvSpec("workers.envs.toy:Spaces-v0", {"observation": "image"}),
@@ -64,8 +63,9 @@ def main() -> None:
     for name, (seconds, megabytes) in found.items():
         table.add_row(name, f"{seconds:.2f}", f"{megabytes:.0f}")
     Console().print(table)
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "worker.json").write_text(json.dumps(found, indent=2) + "\n")
+    write(
+        "worker", {"seconds to first rollout, MB": found}, [("resident, MB", {name: mb for name, (_, mb) in found.items()})]
+    )
 
 
 if __name__ == "__main__":

@@ -47,6 +47,12 @@ def write(name: str, record: Mapping[str, Any], charts: Sequence[Bars] = ()) -> 
         _draw(charts, RESULTS / f"{name}.png")
 
 
+def bars(rows: Sequence[Mapping[str, object]], label: str, length: str, first: object = None) -> dict[str, float]:
+    """A bar for each row, or for each whose first field is `first`: `label` and `length` are names of fields."""
+    chosen = [row for row in rows if first is None or next(iter(row.values())) == first]
+    return {str(row[label]): float(str(row[length])) for row in chosen}
+
+
 def _draw(charts: Sequence[Bars], out: Path) -> None:
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine

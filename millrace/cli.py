@@ -272,6 +272,18 @@ def _launch_ray(argv: list[str]) -> int:
     return _told(run)
 
 
+def _bench(argv: list[str]) -> int:
+    import importlib.util
+
+    if importlib.util.find_spec("benchmarks") is None or importlib.util.find_spec("benchmarks.program") is None:
+        raise UsageError(
+            "bench: the benchmarks are no part of the installed package; run it in a clone of the repository (make bench)"
+        )
+    from benchmarks.program import main as run
+
+    return run([flag for flag in argv if flag != "--debug"])
+
+
 def _at_least(name: str, value: int, least: int) -> None:
     if value < least:
         raise UsageError(f"{name} expected int >= {least}, got {value}")
@@ -292,6 +304,7 @@ COMMANDS = {
     "record": Command(_record, "record RUN --out DATASET [flags]", "episodes of a run's newest policy as a Minari dataset"),
     "plot": Command(_plot, "plot RUN [RUN ...] [--out FILE]", "learning curves as a PNG"),
     "presets": Command(_presets, "presets", "settings that are known to work, by environment and by name"),
+    "bench": Command(_bench, "bench [NAME] [flags]", "benchmarks: tables, JSON and pictures (in a clone of the repository)"),
     "report": Command(_report, "report RUN [RUN ...] [--out FILE]", "runs side by side as one HTML page"),
 }
 

@@ -1,0 +1,80 @@
+"""`millrace bench [NAME [flags]]`, or `python -m benchmarks.program`: one benchmark, or all of them in turn.
+
+The law: each is a module with a main of its own and runs in a process of its own, so that none inherits another's threads,
+imports or memory. What it finds it prints, and leaves in `benchmarks/results`.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+from protocol.errors import UsageError
+
+ROOT = Path(__file__).parents[1]
+
+
+class Benchmark(NamedTuple):
+    """One of them."""
+
+    module: str
+    about: str
+    peers: bool = False
+    """worth nothing without Stable-Baselines3"""
+
+
+BENCHMARKS = {
+    "collect": Benchmark("collect", "collecting in two processes against the bare loop"),
+    "vector": Benchmark("vector_env", "vector environments beside gymnasium's and Stable-Baselines3's", peers=True),
+    "update": Benchmark("update", "updates against the usual style and Stable-Baselines3's"),
+    "train": Benchmark("train", "PPO on CartPole-v1 beside Stable-Baselines3, from the command to solved"),
+    "wire": Benchmark("wire", "the way of a rollout beside raw ZeroMQ"),
+    "scale": Benchmark("scale", "one learner before 10, 100 and 1,000 simulated workers"),
+    "memory": Benchmark("memory", "memory of all processes of a run, beside Stable-Baselines3"),
+    "worker": Benchmark("worker", "what a worker process costs: seconds to its first rollout, memory"),
+}
+
+
+def overview() -> str:
+    """What there is."""
+    lines = [f"  millrace bench {name:8}  {each.about}" for name, each in BENCHMARKS.items()]
+    return "\n".join([*lines, "", "Without a name: all of them, about a quarter of an hour. NAME --help tells its flags."])
+
+
+def main(argv: list[str]) -> int:
+    """Run what is asked for; the exit code. Raises `UsageError`."""
+    if argv and argv[0] in ("-h", "--help"):
+        print(overview())
+        return 0
+    name, *flags = argv or [""]
+    if name and name not in BENCHMARKS:
+        raise UsageError(f"bench {name}: expected one of {', '.join(BENCHMARKS)}, or nothing, which is all of them")
+    failed = []
+    for each in [name] if name else BENCHMARKS:
+        if not name and BENCHMARKS[each].peers and importlib.util.find_spec("stable_baselines3") is None:
+            print(f"{each}: left out, Stable-Baselines3 is not installed (pip install 'millrace[peers]')", flush=True)
+            continue
+        began_s = time.monotonic()
+        command = [sys.executable, "-m", f"benchmarks.{BENCHMARKS[each].module}", *flags]
+        path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+        if subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, check=False).returncode:
+            failed.append(each)
+        elif not name:
+            print(f"{each}: {time.monotonic() - began_s:.0f} s\n", flush=True)
+    if failed:
+        print(f"failed: {', '.join(failed)}", file=sys.stderr)
+    elif "--help" not in flags and "-h" not in flags:
+        print(f"JSON and pictures: {ROOT / 'benchmarks' / 'results'}")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main(sys.argv[1:]))
+    except UsageError as error:
+        sys.exit(f"bench: {error}")
