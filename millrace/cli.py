@@ -276,9 +276,7 @@ def _bench(argv: list[str]) -> int:
     import importlib.util
 
     if importlib.util.find_spec("benchmarks") is None or importlib.util.find_spec("benchmarks.program") is None:
-        raise UsageError(
-            "bench: the benchmarks are no part of the installed package; run it in a clone of the repository (make bench)"
-        )
+        raise UsageError("bench: not part of the installed package; run it in a clone of the repository (make bench)")
     from benchmarks.program import main as run
 
     return run([flag for flag in argv if flag != "--debug"])
