@@ -26,12 +26,19 @@ class Benchmark(NamedTuple):
     about: str
     peers: bool = False
     """worth nothing without Stable-Baselines3"""
+    brief: tuple[str, ...] = ()
+    """its flags when all are run"""
 
 
 BENCHMARKS = {
     "collect": Benchmark("collect", "collecting in two processes against the bare loop"),
-    "vector": Benchmark("vector_env", "vector environments beside gymnasium's and Stable-Baselines3's", peers=True),
-    "update": Benchmark("update", "updates against the usual style and Stable-Baselines3's"),
+    "vector": Benchmark(
+        "vector_env",
+        "vector environments beside gymnasium's and Stable-Baselines3's",
+        True,
+        ("--rounds", "3", "--seconds", "0.5"),
+    ),
+    "update": Benchmark("update", "updates against the usual style and Stable-Baselines3's", brief=("--rounds", "40")),
     "train": Benchmark("train", "PPO on CartPole-v1 beside Stable-Baselines3, from the command to solved"),
     "wire": Benchmark("wire", "the way of a rollout beside raw ZeroMQ"),
     "scale": Benchmark("scale", "one learner before 10, 100 and 1,000 simulated workers"),
@@ -54,18 +61,25 @@ def main(argv: list[str]) -> int:
     name, *flags = argv or [""]
     if name and name not in BENCHMARKS:
         raise UsageError(f"bench {name}: expected one of {', '.join(BENCHMARKS)}, or nothing, which is all of them")
-    failed = []
+    failed, all_began_s = [], time.monotonic()
     for each in [name] if name else BENCHMARKS:
         if not name and BENCHMARKS[each].peers and importlib.util.find_spec("stable_baselines3") is None:
             print(f"{each}: left out, Stable-Baselines3 is not installed (pip install 'millrace[peers]')", flush=True)
             continue
         began_s = time.monotonic()
-        command = [sys.executable, "-m", f"benchmarks.{BENCHMARKS[each].module}", *flags]
+        command = [
+            sys.executable,
+            "-m",
+            f"benchmarks.{BENCHMARKS[each].module}",
+            *(flags if name else BENCHMARKS[each].brief),
+        ]
         path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
         if subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, check=False).returncode:
             failed.append(each)
         elif not name:
             print(f"{each}: {time.monotonic() - began_s:.0f} s\n", flush=True)
+    if not name:
+        print(f"all: {(time.monotonic() - all_began_s) / 60:.0f} minutes")
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)
     elif "--help" not in flags and "-h" not in flags:
