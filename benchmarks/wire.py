@@ -97,6 +97,7 @@ def large(rounds: int) -> list[dict[str, object]]:
                     assert links[way].poll(10)
                     ((_, message),) = links[way].receive()
                     assert isinstance(message, Rollout)
+                    del message  # as that of the others: what is kept takes other memory the next time
                 else:
                     assert sockets[way].poll(10_000)
                     sockets[way].recv_multipart(copy=False)
