@@ -39,10 +39,12 @@ BENCHMARKS = {
         ("--rounds", "3", "--seconds", "0.5"),
     ),
     "update": Benchmark("update", "updates against the usual style and Stable-Baselines3's", brief=("--rounds", "40")),
-    "train": Benchmark("train", "PPO on CartPole-v1 beside Stable-Baselines3, from the command to solved"),
+    "train": Benchmark(
+        "train", "PPO on CartPole-v1 beside Stable-Baselines3, from the command to solved", brief=("--rounds", "2")
+    ),
     "wire": Benchmark("wire", "the way of a rollout beside raw ZeroMQ"),
     "scale": Benchmark("scale", "one learner before 10, 100 and 1,000 simulated workers"),
-    "memory": Benchmark("memory", "memory of all processes of a run, beside Stable-Baselines3"),
+    "memory": Benchmark("memory", "memory of all processes of a run, beside Stable-Baselines3", brief=("--rounds", "1")),
     "worker": Benchmark("worker", "what a worker process costs: seconds to its first rollout, memory"),
 }
 

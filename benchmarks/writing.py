@@ -61,7 +61,8 @@ def _draw(charts: Sequence[Bars], out: Path) -> None:
     figure = Figure(figsize=(8.0, 0.8 + 0.32 * sum(heights)), layout=ConstrainedLayoutEngine())
     panels = figure.subplots(len(charts), 1, squeeze=False, height_ratios=heights)[:, 0]
     for panel, (title, bars) in zip(panels, charts, strict=True):
-        colours = [COLOURS[0] if label.startswith(("millrace", "ours")) else "#bbbbbb" for label in bars]
+        ours = [label for label in bars if label.startswith(("millrace", "ours"))] or list(bars)
+        colours = [COLOURS[0] if label in ours else "#bbbbbb" for label in bars]
         drawn = panel.barh(list(bars), list(bars.values()), color=colours)
         panel.bar_label(drawn, fmt="{:,.4g}", padding=3, fontsize=8, color=GREY)
         panel.set_title(title, fontsize=10, fontweight="bold", loc="left")
