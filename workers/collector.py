@@ -167,6 +167,10 @@ class Collector:
         resets = np.stack([lane.ended for lane in lanes])  # [L, N] row t is not valid
         numbers = [lane.number for lane in lanes]
         stages = self.stages
+        each = [  # the parts of every lane
+            (i, lane, rows.reward[i], rows.terminated[i], rows.truncated[i], [array[i] for array in rows.obs])
+            for i, lane in enumerate(lanes)
+        ]
         for t in range(self._run.rollout_steps):
             pulse()
             began = perf_counter()
@@ -178,12 +182,12 @@ class Collector:
             rows.action[:, t] = action
             acted = perf_counter()
             self._begin(numbers, taken, pulse)
-            for i, lane in enumerate(lanes):
+            for i, lane, reward, terminated, truncated, obs in each:
                 row = lane.step(taken[i], t, pulse)
                 try:
-                    leaves, rows.reward[i, t], rows.terminated[i, t], rows.truncated[i, t], lost = row
-                    for array, leaf in zip(rows.obs, leaves, strict=True):
-                        array[i, t + 1] = leaf
+                    leaves, reward[t], terminated[t], truncated[t], lost = row
+                    for array, leaf in zip(obs, leaves, strict=True):
+                        array[t + 1] = leaf
                 except (TypeError, ValueError) as error:
                     raise EnvironmentBroke(
                         lane.number, f"step {t}: its environment gave what cannot be kept: {error}"
