@@ -24,6 +24,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
