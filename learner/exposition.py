@@ -28,7 +28,7 @@ from prometheus_client.metrics_core import (
 from prometheus_client.registry import Collector
 
 from learner.config import Config
-from learner.hub import Hub
+from learner.hub import Hub, Look
 from learner.membership import Member
 from learner.metrics import Progress
 from learner.standing import Standing
@@ -37,8 +37,6 @@ from protocol.address import WILDCARDS, is_local
 from protocol.errors import UsageError
 
 log = logging.getLogger("millrace.learner")
-
-Look = Callable[[Hub], None]
 
 EVERY_S = 0.5  # between snapshots
 SILENT_SCRAPER_S = 5.0  # then its connection is closed, and its thread ends
@@ -201,13 +199,10 @@ def _by_reason(name: str, text: str, counts: Mapping[str, int]) -> CounterMetric
 
 @contextmanager
 def exposed(config: Config) -> Iterator[Look]:
-    """Serve while it is entered, if `metrics_bind` says where; what it gives is to be called by the loop.
+    """Serve at `metrics_bind` while it is entered; what it gives is to be called by the loop.
 
     Raises `UsageError` in one line if the port is in use.
     """
-    if not config.metrics_bind:
-        yield lambda hub: None
-        return
     exposition = Exposition(config)
     registry = CollectorRegistry()
     registry.register(exposition)

@@ -28,6 +28,9 @@ log = logging.getLogger("millrace.learner")
 
 POLL_S = 0.1
 SAY_WAITING_EVERY_S = 10.0
+Look = Callable[["Hub"], None]
+"""Told of the hub whenever it has listened."""
+
 AWAY_S = 0.5  # a learner that has not listened for longer was busy, or stopped
 
 
@@ -44,7 +47,7 @@ class Hub:
         max_env_failures: int,
         dead_workers: Callable[[], Iterable[tuple[str, str]]] = lambda: (),
         watch: Callable[[], None] = lambda: None,
-        look: Callable[[Hub], None] = lambda hub: None,
+        look: Look = lambda hub: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """`dead_workers` names local worker processes that have ended, and why; `watch` is called while waiting.

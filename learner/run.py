@@ -9,30 +9,29 @@ import logging
 import os
 import signal
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 import zmq
 
-from learner.algorithms import ALGORITHMS, Algorithm
 from learner.config import Config
-from learner.exposition import Look, exposed
-from learner.hub import Hub
-from learner.journal import Journal, Past, recall
+from learner.hub import Hub, Look
 from learner.listening import join_lines, keyring_for
 from learner.metrics import Progress
 from learner.roster import Roster
 from learner.run_folder import Interrupted, RunFolder
-from learner.train import train
 from protocol.errors import UsageError
 from protocol.link import LearnerLink
 from protocol.native import check_native
 from protocol.spaces import action_spec, observation_leaves
-from protocol.specs import EnvSpec, RunSpec
+from protocol.specs import ActionSpec, EnvSpec, Leaf, RunSpec
+
+if TYPE_CHECKING:  # they bring torch along
+    from learner.algorithms import Algorithm
 
 log = logging.getLogger("millrace.learner")
 
@@ -44,25 +43,46 @@ class Run:
     """A learner that listens, and has not begun."""
 
     def __init__(
-        self, config: Config, env: EnvSpec, link: LearnerLink, resume: Path | None, watch: Watch, look: Look
+        self,
+        config: Config,
+        env: EnvSpec,
+        link: LearnerLink,
+        resume: Path | None,
+        watch: Watch,
+        look: Look,
+        begin: Callable[[Path], None] = lambda folder: None,
     ) -> None:
         """`resume`: the folder of a run that goes on from its newest checkpoint. Raises `OurError` in one line.
 
-        `watch` is called after each update, `look` whenever the learner has listened to its workers.
+        `watch` is called after each update, `look` whenever the learner has listened to its workers. `begin` is told the
+        run folder before torch is imported: workers that are started there are ready when the learner is.
         """
+        seen = look_at(env)
+        self.folder = RunFolder.create(config) if resume is None else RunFolder.open(resume)
+        try:
+            begin(self.folder.path)
+            self._make(config, env, seen, link, resume is not None, watch, look)
+        except BaseException:
+            self.folder.remove()
+            raise
+
+    def _make(
+        self, config: Config, env: EnvSpec, seen: Spaces, link: LearnerLink, resumed: bool, watch: Watch, look: Look
+    ) -> None:
         import torch
 
+        from learner.algorithms import ALGORITHMS
+        from learner.journal import Journal, Past, recall
+
         torch.set_num_threads(config.torch_threads)
-        spec = run_spec(config, env)
+        spec = run_spec(config, env, seen)
         self.device = _device(config)
         make = ALGORITHMS[config.algo]
         self.algorithm: Algorithm = make(
             config.algorithm, spec.policy, total_steps=config.steps, seed=config.seed, device=self.device
         )
-        if resume is None:
-            self.folder, past = RunFolder.create(config), Past()
-        else:
-            self.folder = RunFolder.open(resume)
+        past = Past()
+        if resumed:
             past = recall(self.folder, self.algorithm)
             self.folder.write_config(config)
         roster = Roster(
@@ -86,6 +106,8 @@ class Run:
 
     def go(self, workers: int, dead_workers: DeadWorkers = lambda: ()) -> None:
         """Train until done. `workers`: how many to wait for; `dead_workers` names those known to have ended, and why."""
+        from learner.train import train
+
         signals: list[int] = []
 
         def check() -> None:
@@ -115,7 +137,7 @@ def serve(config: Config, resume: Path | None, watch: Watch) -> Path:
         stack.callback(context.term)
         link = LearnerLink(config.bind, context, keyring)
         stack.callback(link.close)
-        look = stack.enter_context(exposed(config))
+        look = stack.enter_context(looking(config))
         run = Run(config, EnvSpec.of(config.env, config.env_kwargs), link, resume, watch, look)
         for line in join_lines(link.address, config.advertise, keyring):
             log.warning("%s", line)
@@ -123,21 +145,47 @@ def serve(config: Config, resume: Path | None, watch: Watch) -> Path:
         return run.folder.path
 
 
-def run_spec(config: Config, env: EnvSpec) -> RunSpec:
-    """What the workers are told. Makes one env copy to learn its spaces; raises `UsageError` if it cannot."""
+def looking(config: Config) -> AbstractContextManager[Look]:
+    """What `--metrics-bind` asks for, while it is entered; without it nothing, and no HTTP server is imported."""
+    if not config.metrics_bind:
+        return nullcontext(lambda hub: None)
+    from learner.exposition import exposed
+
+    return exposed(config)
+
+
+class Spaces(NamedTuple):
+    """What an environment says of itself."""
+
+    observation: tuple[Leaf, ...]
+    action: ActionSpec
+    longest: int | None
+    """env steps after which the clock ends an episode"""
+
+
+def look_at(env: EnvSpec) -> Spaces:
+    """Make one env copy to learn its spaces. Raises `UsageError` if it cannot be made, or used."""
     copy = env.make()
     try:
-        observation, action = observation_leaves(copy.observation_space), action_spec(copy.action_space)
-        policy = ALGORITHMS[config.algo].policy_spec(config.algorithm, observation, action)
-        if config.algorithm.encoder is not None:
-            from protocol.encoder import describe_encoder
-
-            encoder = describe_encoder(config.algorithm.encoder, observation, action)
-            policy = msgspec.structs.replace(policy, encoder=encoder)
-        if getattr(ALGORITHMS[config.algo], "whole_episodes", False):
-            _check_whole_episodes(config, copy.spec.max_episode_steps if copy.spec else None)
+        longest = copy.spec.max_episode_steps if copy.spec else None
+        return Spaces(observation_leaves(copy.observation_space), action_spec(copy.action_space), longest)
     finally:
         copy.close()
+
+
+def run_spec(config: Config, env: EnvSpec, seen: Spaces | None = None) -> RunSpec:
+    """What the workers are told; `seen`: of this environment. Raises `UsageError` if it is not for this algorithm."""
+    from learner.algorithms import ALGORITHMS
+
+    observation, action, longest = look_at(env) if seen is None else seen
+    policy = ALGORITHMS[config.algo].policy_spec(config.algorithm, observation, action)
+    if config.algorithm.encoder is not None:
+        from protocol.encoder import describe_encoder
+
+        encoder = describe_encoder(config.algorithm.encoder, observation, action)
+        policy = msgspec.structs.replace(policy, encoder=encoder)
+    if getattr(ALGORITHMS[config.algo], "whole_episodes", False):
+        _check_whole_episodes(config, longest)
     if config.vector == "native":
         check_native(env, observation, action)
     return RunSpec(

@@ -16,6 +16,7 @@ The law: a file here is whole or not there. Nothing is pickled.
 from __future__ import annotations
 
 import re
+import shutil
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -109,21 +110,23 @@ class PolicyCard(msgspec.Struct, frozen=True, kw_only=True):
 class RunFolder:
     """The folder of one run."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, made: Path | None = None) -> None:
+        """`made`: the topmost folder that was made for it, if it is new."""
+        self.path, self._made = path, made
 
     @staticmethod
     def create(config: Config, started_s: float | None = None) -> RunFolder:
         """A new folder with its config.toml. Raises `UsageError` if it exists. `started_s` is wall-clock time."""
         stamp = time.strftime("%Y%m%d-%H%M%S", time.localtime(started_s))
         path = Path(config.run_dir) / f"{sanitised(config.env)}-{config.algo}-s{config.seed}-{stamp}"
+        made = [folder for folder in (path, *path.parents) if not folder.exists()]
         try:
             path.mkdir(parents=True)
         except FileExistsError as error:
             raise UsageError(f"run folder {path} exists; wait a second, or choose another --run-dir or --seed") from error
         except OSError as error:
             raise UsageError(f"run folder {path} cannot be made: {error.strerror}; choose another --run-dir") from error
-        folder = RunFolder(path)
+        folder = RunFolder(path, made[-1])
         folder.write_config(config)
         return folder
 
@@ -135,6 +138,11 @@ class RunFolder:
         if not (path / "config.toml").is_file():
             raise UsageError(f"run {path}: expected a run folder, got one without config.toml")
         return RunFolder(path)
+
+    def remove(self) -> None:
+        """As if it had not been made; nothing, if it was there before."""
+        if self._made is not None:
+            shutil.rmtree(self._made, ignore_errors=True)
 
     def write_config(self, config: Config) -> None:
         """config.toml: at the start, and again when a run is resumed with other settings."""

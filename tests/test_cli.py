@@ -164,6 +164,14 @@ def test_an_environment_that_cannot_be_made_leaves_no_folder(
     assert not (tmp_path / "runs").exists()
 
 
+def test_an_environment_that_is_not_for_the_algorithm_leaves_no_folder_and_no_worker(
+    tmp_path: Path, capsys: Captured
+) -> None:
+    line = refusal(capsys, "train", "Pendulum-v1", "--algo", "dqn", "--run-dir", str(tmp_path / "mine" / "runs"))
+    assert "dqn" in line.lower()
+    assert not (tmp_path / "mine").exists()  # the workers were started before this was known: see conftest.py
+
+
 def test_a_run_folder_that_exists_is_left_alone(tmp_path: Path, capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("learner.run_folder.time.strftime", lambda *_: "now")
     (tmp_path / "CartPole-v1-ppo-s1-now").mkdir()

@@ -23,6 +23,7 @@ from learner.config import Config, resolve
 from learner.exposition import EVERY_S, STAGES, Exposition, exposed
 from learner.hub import Hub
 from learner.metrics import Progress
+from learner.run import looking
 from millrace.launch import local
 from protocol.codec import encode
 from protocol.errors import UsageError
@@ -239,7 +240,7 @@ def test_it_is_scraped_while_a_run_goes_on_and_is_gone_with_it(
 
 def test_it_is_off_unless_asked_for(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "millrace.learner")
-    with exposed(Config(env="CartPole-v1")):
+    with looking(Config(env="CartPole-v1")):
         assert not [thread for thread in threading.enumerate() if thread.name == "metrics"]
     assert not caplog.messages
 

@@ -16,9 +16,8 @@ from pathlib import Path
 import zmq
 
 from learner.config import Config
-from learner.exposition import exposed
 from learner.listening import Bind
-from learner.run import Run, Watch
+from learner.run import Run, Watch, looking
 from learner.vector_env import ZmqVectorEnv
 from millrace.launch.here import StartFlags, flags_of, own_address
 from millrace.launch.vector import make_vec
@@ -52,7 +51,7 @@ def train(
 
         def begin() -> StartFlags:
             env = EnvSpec.of(config.env if factory is None else factory, config.env_kwargs)
-            made.append(Run(config, env, link, resume, watch, stack.enter_context(exposed(config))))
+            made.append(Run(config, env, link, resume, watch, stack.enter_context(looking(config))))
             return flags_of(config, made[0].folder.path)
 
         env = _vector_env(config, factory, elsewhere, begin)

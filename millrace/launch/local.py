@@ -12,9 +12,7 @@ from pathlib import Path
 import zmq
 
 from learner.config import Config
-from learner.exposition import exposed
-from learner.run import Run, Watch
-from millrace.launch import inference
+from learner.run import Run, Watch, looking
 from millrace.launch.here import flags_of, own_address, own_keys
 from protocol.errors import UsageError
 from protocol.keys import Token
@@ -29,6 +27,8 @@ def train(config: Config, resume: Path | None, watch: Watch, factory: Callable[.
     Raises `OurError`, or `Interrupted` when the user stopped it.
     """
     if config.inference == "learner":
+        from millrace.launch import inference
+
         return inference.train(config, resume, watch, factory)
     keyring, token = own_keys(config.transport, config.keys, insecure=config.insecure)
     if factory is not None and config.transport == "tcp" and keyring is None:
@@ -40,11 +40,15 @@ def train(config: Config, resume: Path | None, watch: Watch, factory: Callable[.
         link = LearnerLink(address, context, keyring)
         stack.callback(link.close, 0.5)
         env = EnvSpec.of(config.env if factory is None else factory, config.env_kwargs)
-        run = Run(config, env, link, resume, watch, stack.enter_context(exposed(config)))
-        host = Host(_starter(config, link.address, token, context, run.folder.path), config.workers)
-        stack.callback(host.stop)
+        hosts: list[Host] = []
+
+        def begin(folder: Path) -> None:
+            hosts.append(Host(_starter(config, link.address, token, context, folder), config.workers))
+            stack.callback(hosts[0].stop)
+
+        run = Run(config, env, link, resume, watch, stack.enter_context(looking(config)), begin)
         run.journal.workers_expected = config.workers
-        run.go(config.min_workers or config.workers, host.poll)
+        run.go(config.min_workers or config.workers, hosts[0].poll)
         return run.folder.path
 
 
