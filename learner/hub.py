@@ -27,6 +27,7 @@ from protocol.rollout import validate
 log = logging.getLogger("millrace.learner")
 
 POLL_S = 0.1
+PULSE_S = 0.003  # a minibatch may take a tenth of it, and listening as long as a minibatch
 SAY_WAITING_EVERY_S = 10.0
 Look = Callable[["Hub"], None]
 """Told of the hub whenever it has listened."""
@@ -122,8 +123,12 @@ class Hub:
                 log.warning("%s", self.waiting_for())
 
     def pulse(self) -> None:
-        """Empty the inbox, then judge silence. Called between minibatches: never waits, never ends the run."""
-        self._listen(0.0)
+        """Empty the inbox, then judge silence, unless that was just done. Called between minibatches.
+
+        Never waits, never ends the run.
+        """
+        if self._clock() - self._listened_s >= PULSE_S:
+            self._listen(0.0)
 
     def drain(self, reason: str, timeout_s: float = 5.0) -> None:
         """Ask every worker to leave and wait for their Goodbye, at most `timeout_s`; what they still send is counted."""

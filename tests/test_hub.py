@@ -8,7 +8,7 @@ from typing import cast
 
 import pytest
 
-from learner.hub import AWAY_S, POLL_S, Hub
+from learner.hub import AWAY_S, POLL_S, PULSE_S, Hub
 from learner.roster import Roster
 from protocol.codec import Buffer
 from protocol.link import LearnerLink
@@ -97,9 +97,24 @@ def test_a_flood_of_an_ended_session_is_one_line(caplog: pytest.LogCaptureFixtur
     link, hub, _ = hub_with_a_worker()
     caplog.set_level(logging.INFO)
     link.inbox += [(b"w1", Heartbeat(7, number, -1, (), 0, {}, 0)) for number in range(100)]
+    link.now += PULSE_S
     hub.pulse()
     assert [record.getMessage() for record in caplog.records] == ["worker w1 was told to join again: its session had ended"]
     link.now += 100
     link.inbox.append((b"w1", Heartbeat(7, 100, -1, (), 0, {}, 0)))
     hub.pulse()
     assert caplog.records[-1].getMessage().endswith("had ended (99 more like this since the last line)")
+
+
+def test_between_short_minibatches_it_listens_now_and_then() -> None:
+    link, hub, heartbeat = hub_with_a_worker()
+    link.now += PULSE_S
+    hub.pulse()
+    link.inbox.append((b"w0", heartbeat))
+    for _ in range(8):
+        link.now += PULSE_S / 10
+        hub.pulse()
+    assert link.inbox, "it listened as often as it was asked"
+    link.now += PULSE_S / 2
+    hub.pulse()
+    assert not link.inbox

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from millrace.sb3 import make_vec_env
@@ -24,5 +25,4 @@ def test_stable_baselines3_ppo_solves_cartpole(seed: int) -> None:
     test = make_vec_env("CartPole-v1", 4, seed=100_000, workers=1)
     mean, _ = evaluate_policy(model, test, n_eval_episodes=20)
     test.close()
-    assert isinstance(mean, float)
-    assert mean >= 475
+    assert np.mean(mean) >= 475
