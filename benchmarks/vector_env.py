@@ -114,7 +114,7 @@ def main() -> None:
         title = f"{task.title}, env steps/s, {task.copies} copies, {task.workers} workers"
         charts.append((title, bars([row for row in found if row["env_steps_per_s"]], "contender", "env_steps_per_s")))
     charts.append(("64 copies: MB, PSS", bars(taken, "contender", "pss_mb")))
-    Console().print(show(rows, arguments.rounds))
+    Console(width=120).print(show(rows, arguments.rounds))
     Console().print(show_memory(taken))
     write("vector_env", {"vector_env": rows, "memory": taken}, charts)
 

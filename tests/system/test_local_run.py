@@ -78,6 +78,15 @@ def test_lag_never_exceeds_its_bound(tmp_path: Path, max_lag: int) -> None:
     assert_balanced(summary(folder)["ledger"])
 
 
+@pytest.mark.parametrize("max_lag", [0, 1])
+def test_the_learners_stages_are_all_of_its_time(tmp_path: Path, max_lag: int) -> None:
+    folder = run(tmp_path, "CartPole-v1", max_lag=max_lag, steps=12_000, **SMALL)
+    first, *_, last = read_rows(folder / "metrics.jsonl")
+    names = ("learner_wait", "learner_update", "learner_other")
+    told = sum(last[f"stage/{name}"] - first[f"stage/{name}"] for name in names)
+    assert told == pytest.approx(last["time/time_elapsed"] - first["time/time_elapsed"], rel=0.03)
+
+
 def test_the_best_policy_by_the_runs_own_evaluations_is_kept_and_tried_again(tmp_path: Path) -> None:
     """The greedy return of CartPole rises and falls; what is kept is the highest point, not the last."""
     settings: dict[str, Any] = {"steps": 12_000, "eval_every": 1_000, "eval_episodes": 20, "learning_rate": 0.01}
