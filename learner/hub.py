@@ -22,7 +22,7 @@ from protocol.codec import Buffer, encode
 from protocol.errors import BadMessage, BadRollout, EnvironmentFailed, NoWorkers, Stalled
 from protocol.link import LearnerLink
 from protocol.messages import Array, Inquire, Rollout, ToWorker, Weights
-from protocol.rollout import validate
+from protocol.rollout import rollout_bytes, validate
 
 log = logging.getLogger("millrace.learner")
 
@@ -52,6 +52,7 @@ class Hub:
         `look` is called whenever this has listened.
         """
         self.link, self.roster = link, roster
+        link.room = rollout_bytes(roster.run)
         self.no_workers_timeout_s = no_workers_timeout_s
         self.stall_timeout_s = stall_timeout_s
         self.max_env_failures = max_env_failures

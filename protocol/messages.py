@@ -13,7 +13,7 @@ import numpy.typing as npt
 from protocol.rollout import Rollout
 from protocol.specs import RunSpec, StepSpec
 
-PROTOCOL_VERSION = 1
+PROTOCOL_VERSION = 2
 
 Array = npt.NDArray[Any]
 

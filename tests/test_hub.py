@@ -13,6 +13,7 @@ from learner.roster import Roster
 from protocol.codec import Buffer
 from protocol.link import LearnerLink
 from protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello, ToLearner
+from protocol.rollout import rollout_bytes
 from tests.fakes import run_spec
 
 WORKER_TIMEOUT_S = 3.0
@@ -25,6 +26,7 @@ class FakeLink:
 
     def __init__(self) -> None:
         self.now = 100.0
+        self.room = 0
         self.inbox: list[tuple[bytes, ToLearner]] = []
 
     def poll(self, timeout_s: float) -> bool:
@@ -64,6 +66,11 @@ def listen(hub: Hub, link: FakeLink, seconds: float) -> None:
     while link.now < until_s:
         hub.pulse()
         link.now += POLL_S
+
+
+def test_a_message_may_unpack_to_a_rollout_of_the_run_and_no_more() -> None:
+    link, hub, _ = hub_with_a_worker()
+    assert link.room == rollout_bytes(hub.roster.run) > 0
 
 
 def test_a_silent_worker_is_given_up_while_the_learner_listens() -> None:

@@ -211,7 +211,7 @@ class Worker:
         for effect in effects:
             match effect:
                 case Say(message):
-                    self._link.send(encode(message))
+                    self._link.send(encode(message, self._link.packing))
                 case Begin(run):
                     self._begin(run)
                 case Close(lanes):
