@@ -3,7 +3,7 @@
 Large (14.6 MB, Atari): seconds from before `encode` in the sender until after decoding in the receiver, one rollout under
 way at a time, against plain ROUTER and DEALER sockets that carry the same arrays as they lie; in turns. Once of noise, and
 once of frame stacks, which travel packed. Small (9 KB, CartPole): CPU µs of the Python thread at each end. All: bytes of the
-frames and of ZeroMQ's framing against those of the arrays.
+frames and of ZeroMQ's framing against those of the arrays. Then what packing saves and takes (`benchmarks/packing.py`).
 """
 
 from __future__ import annotations
@@ -21,47 +21,32 @@ import time
 from collections.abc import Sequence
 from multiprocessing.connection import Connection
 
-import msgspec
 import numpy as np
 import zmq
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.packing import ATARI, STACKS, atari, packing
 from benchmarks.simulated import canned, run_spec
 from benchmarks.writing import write
 from protocol.codec import Buffer, encode
 from protocol.link import LearnerLink, WorkerLink
 from protocol.packing import Packing
 from protocol.rollout import Rollout, rollout_bytes, validate
-from protocol.specs import ActionSpec, EnvSpec, Leaf, PolicySpec, RunSpec
+from protocol.specs import RunSpec
 
 TRANSPORTS = ("ipc", "tcp")
 SHARE, PYTHON_US, OVERHEAD, FRAME = 0.8, 40, 1.02, 1.05  # targets
-ATARI = RunSpec(
-    EnvSpec("ALE/Pong-v5"),
-    PolicySpec((Leaf("", "box", (84, 84, 4), "uint8"),), ActionSpec("discrete", (), "int64", (6,), (0,))),
-    rollout_steps=128,
-    copies=4,
-    lanes=2,
-    seed=1,
-)
-STACKS = msgspec.structs.replace(ATARI, policy=PolicySpec((Leaf("", "box", (4, 84, 84), "uint8"),), ATARI.policy.action))
 CARTPOLE = run_spec(4)
+PACKING = {
+    "bytes": "bytes",
+    "packed": "packed",
+    "pack, ms": "pack_ms",
+    "MB/s": "pack_mb_per_s",
+    "unpack, ms": "unpack_ms",
+    "pays below, Gbit/s": "pays_below_gbit_per_s",
+}
 BURST = 200  # small rollouts that are sent together
-
-
-def atari(run: RunSpec) -> Rollout:
-    """A rollout of noise, or, where the run's observations are frame stacks, of stacks; one episode ends in it."""
-    rollout = canned(run)
-    if run != STACKS:  # not `is`: it may come from another process
-        return rollout
-    (noise,) = rollout.obs
-    obs, ends = noise.copy(), len(noise) // 2
-    for t in range(1, len(obs)):
-        obs[t, :, :-1] = obs[t - 1, :, 1:]
-        if t == ends:
-            obs[t, 0] = noise[t, 0]
-    return msgspec.structs.replace(rollout, obs=(obs,))
 
 
 def _send(run: RunSpec, addresses: dict[str, str], told: Connection) -> None:
@@ -194,7 +179,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="the way of a rollout")
     parser.add_argument("--rounds", type=int, default=40)
     rounds = parser.parse_args().rounds
-    console = Console(width=110)
+    console = Console(width=130)
     found = {"of noise": large(ATARI, rounds), "of frame stacks": large(STACKS, rounds)}
     first = Table(title=f"A rollout of {rollout_bytes(ATARI) / 1e6:.1f} MB, medians of {rounds}")
     for column in ("", "", "raw ZeroMQ, ms", "ours, ms", "GB/s", "share", "target"):
@@ -202,13 +187,18 @@ def main() -> None:
     for kind, rows in found.items():
         for row in rows:
             numbers = (f"{row[key]:.2f}" for key in ("raw_ms", "ours_ms", "gb_per_s", "share"))
-            first.add_row(kind, str(row["transport"]), *numbers, f"≥ {SHARE}")
+            first.add_row(kind, str(row["transport"]), *numbers, f"≥ {SHARE}" if kind == "of noise" else "–")
     console.print(first)
     parts = small(rounds)
     second = Table(*parts, "worker", "learner", "target", title="A rollout of 9 KB, µs of Python")
     ends = {"worker": parts["encode"] + parts["send"], "learner": parts["receive and decode"]}
     second.add_row(*(f"{us:.1f}" for us in (*parts.values(), *ends.values())), f"≤ {PYTHON_US}")
     console.print(second)
+    ways = packing(rounds)
+    third = Table("rollout", "packing", *PACKING, title="Packing, CPU of one thread")
+    for row in ways:
+        third.add_row(str(row["rollout"]), str(row["packing"]), *(f"{row[key]:,.4g}" for key in PACKING.values()))
+    console.print(third)
     overhead = {name: on_the_wire(encode(canned(run))) for name, run in (("Atari", ATARI), ("CartPole", CARTPOLE))}
     for name, (payload, wire) in overhead.items():
         ratio = f"{wire / payload:.4f} (target ≤ {OVERHEAD})"
@@ -229,7 +219,7 @@ def main() -> None:
     ]
     charts.append(("a rollout of 9 KB, µs of Python", parts))
     record = {"large": found["of noise"], "stacks": found["of frame stacks"], "small_us": parts | ends}
-    write("wire", {**record, "bytes": overhead, "stack_bytes": stack_bytes}, charts)
+    write("wire", {**record, "packing": ways, "bytes": overhead, "stack_bytes": stack_bytes}, charts)
 
 
 if __name__ == "__main__":

@@ -31,6 +31,7 @@ from learner.train import train
 from protocol.errors import UsageError
 from protocol.link import LearnerLink
 from protocol.native import check_native
+from protocol.packing import why_no_zstd
 from protocol.spaces import action_spec, observation_leaves
 from protocol.specs import EnvSpec, RunSpec
 
@@ -125,6 +126,8 @@ def serve(config: Config, resume: Path | None, watch: Watch) -> Path:
 
 def run_spec(config: Config, env: EnvSpec) -> RunSpec:
     """What the workers are told. Makes one env copy to learn its spaces; raises `UsageError` if it cannot."""
+    if config.compress == "zstd" and (why := why_no_zstd()):
+        raise UsageError(why)
     copy = env.make()
     try:
         observation, action = observation_leaves(copy.observation_space), action_spec(copy.action_space)
@@ -148,6 +151,7 @@ def run_spec(config: Config, env: EnvSpec) -> RunSpec:
         lanes=config.lanes,
         seed=config.seed,
         vector="native" if config.vector == "native" else "loop",
+        compress=config.compress,
         heartbeat_s=config.heartbeat_s,
     )
 

@@ -1,14 +1,16 @@
 """How an array of a rollout travels when it is not as it lies. Pure: bytes in, bytes out; it comes back bit for bit.
 
-A packing has a name; the head lists those of an array in the order in which they were done. `stack` is for frame stacks as
-gymnasium's FrameStackObservation makes them, uint8 [T+1, N, k, H, W, …]: what step t+1 shows is mostly what step t showed,
-moved on by a frame, of which only the newest is new. The payload is
+A packing has a name; the head lists those of an array in the order in which they were done. `zstd` is a Zstandard frame (RFC
+8878) that says how much it holds. `stack` is for frame stacks as gymnasium's FrameStackObservation makes them, uint8
+[T+1, N, k, H, W, …]: what step t+1 shows is mostly what step t showed, moved on by a frame, of which only the newest is new.
+Its payload is
 
     bits     [N, T]        1: step t+1 of copy n is step t moved on by a frame; lowest bit first, zeros up to a whole byte
     frames   [M, H, W, …]  copy by copy and step by step: the newest of a step that is moved on, all k of every other
 
-so that a step shows the last k frames up to its own, whether sent for it or before. Whatever a peer says is checked
-before anything is set aside for it; an array is at most k times as large as the frames it is made from.
+so that a step shows the last k frames up to its own, whether sent for it or before. Whatever a peer says is checked before
+anything is set aside for it: a stack is at most k times as large as its payload, and what a Zstandard frame holds must be
+as much as the array needs.
 """
 
 from __future__ import annotations
@@ -30,7 +32,10 @@ Frame = bytes | memoryview
 
 MAX_STACK = 16
 LEAST_FRAME_BYTES = 64  # below, an index of the frames would be larger than they are
-WORTH = 0.25  # of an array's bytes must be saved
+WORTH = 0.25  # of a stack's bytes must be saved
+ZSTD_LEVEL = -1  # of images it saves as much as higher levels do; of what cannot be compressed it lets go at once
+ZSTD_FROM_BYTES = 1024  # what is smaller costs more than it saves
+ZSTD_WORTH = 0.1  # of an array's bytes must be saved
 PROBES = 8  # steps that are looked at before all are
 COMPARED_WORDS = 1 << 15  # at once: what is compared should be in the cache still
 
@@ -41,12 +46,18 @@ class Packing:
 
     stack: bool = False
     """frames that are seen several times are sent once"""
+    zstd: bool = False
+    """what is worth it is compressed"""
 
     def of(self, array: Array) -> tuple[Frame, list[str]]:
         """The array's frame and the names of its packings: none, if it goes as it lies."""
+        frame: Frame = as_it_lies(array)
+        packings: list[str] = []
         if self.stack and (payload := stacked(array)) is not None:
-            return payload.data, ["stack"]
-        return as_it_lies(array), []
+            frame, packings = payload.data, ["stack"]
+        if self.zstd and (compressed := _compressed(frame)) is not None:
+            frame, packings = compressed, [*packings, "zstd"]
+        return frame, packings
 
 
 def as_it_lies(array: Array) -> memoryview:
@@ -56,11 +67,50 @@ def as_it_lies(array: Array) -> memoryview:
 
 def unpacked(frame: Frame, packings: Sequence[object], dtype: np.dtype[Any], shape: Sequence[int]) -> Array:
     """The array, read-only, that this frame stands for; it may be as large as it says. Raises `BadMessage`."""
+    size = dtype.itemsize * math.prod(shape)
     match packings:
         case ["stack"]:
             return unstacked(frame, dtype, shape)
+        case ["zstd"]:
+            return np.ndarray(shape, dtype, _decompressed(frame, size, size))
+        case ["stack", "zstd"]:
+            return unstacked(_decompressed(frame, 0, size + size // LEAST_FRAME_BYTES), dtype, shape)
         case _:
-            raise BadMessage(f"packings expected stack, got {str(packings)[:80]}")
+            raise BadMessage(f"packings expected stack, zstd or both in this order, got {str(packings)[:80]}")
+
+
+def why_no_zstd() -> str:
+    """Why nothing can be compressed or decompressed here; empty if it can."""
+    try:
+        import zstandard  # noqa: F401  (an extra)
+    except ImportError:
+        return "compress zstd needs the package zstandard, which is an extra; pip install 'millrace[compress]'"
+    return ""
+
+
+def _compressed(frame: Frame) -> bytes | None:
+    """A Zstandard frame; None where too little would be saved."""
+    if len(frame) < ZSTD_FROM_BYTES:
+        return None
+    import zstandard
+
+    found = zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(frame)
+    return found if len(found) <= (1 - ZSTD_WORTH) * len(frame) else None
+
+
+def _decompressed(frame: Frame, least: int, most: int) -> bytes:
+    """What a Zstandard frame holds, if it says that it is between `least` and `most` bytes. Raises `BadMessage`."""
+    try:
+        import zstandard
+    except ImportError:
+        raise BadMessage("zstd was not asked for, and cannot be read here") from None
+    try:
+        held = zstandard.frame_content_size(frame)  # -1: it does not say
+        if not least <= held <= most:
+            raise BadMessage(f"zstd expected a frame that says it holds {least} to {most} bytes, got {held}")
+        return zstandard.ZstdDecompressor().decompress(frame, allow_extra_data=False)
+    except zstandard.ZstdError as error:
+        raise BadMessage(f"zstd: {' '.join(str(error).split())[:200]}") from error
 
 
 def stacked(array: Array) -> Bytes | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import tracemalloc
 from contextlib import suppress
 from typing import Any
@@ -11,6 +12,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 import pytest
+import zstandard
 from gymnasium import spaces
 from gymnasium.wrappers import FrameStackObservation
 from hypothesis import given, settings
@@ -18,7 +20,7 @@ from hypothesis import strategies as st
 
 from protocol.codec import decode_to_learner, decode_to_worker, encode
 from protocol.errors import BadMessage
-from protocol.packing import Packing, stacked, unpacked, unstacked
+from protocol.packing import Packing, stacked, unpacked, unstacked, why_no_zstd
 from protocol.rollout import Rollout, rollout_bytes
 from protocol.specs import ActionSpec, EnvSpec, Leaf, PolicySpec, RunSpec
 from tests.collecting import a_collector, collect, over_copies_of, run_around, run_of
@@ -256,12 +258,12 @@ def test_the_hand_made_stack_is_a_good_one() -> None:
         (payload_of(), ["stack"], U1, [17, 0, 4, 8, 8], "stack expected uint8"),
         (payload_of(), ["stack"], U1, [17, 2, 4, 8, 0], "stack expected uint8"),
         (payload_of(), ["stack"], U1, [2**10, 2**10, 2, 8, 8], "expected at least"),
-        (payload_of(), [], U1, SHAPE, "packings expected stack"),
-        (payload_of(), ["stack", "stack"], U1, SHAPE, "packings expected stack"),
-        (payload_of(), ["pickle"], U1, SHAPE, "packings expected stack"),
-        (payload_of(), [b"stack"], U1, SHAPE, "packings expected stack"),
-        (payload_of(), [["stack"]], U1, SHAPE, "packings expected stack"),
-        (payload_of(), ["x" * 100_000], U1, SHAPE, "packings expected stack"),
+        (payload_of(), [], U1, SHAPE, "packings expected"),
+        (payload_of(), ["stack", "stack"], U1, SHAPE, "packings expected"),
+        (payload_of(), ["pickle"], U1, SHAPE, "packings expected"),
+        (payload_of(), [b"stack"], U1, SHAPE, "packings expected"),
+        (payload_of(), [["stack"]], U1, SHAPE, "packings expected"),
+        (payload_of(), ["x" * 100_000], U1, SHAPE, "packings expected"),
     ],
 )
 def test_what_is_not_quite_a_packed_array_is_refused(
@@ -293,11 +295,131 @@ def test_nothing_is_set_aside_for_a_promise() -> None:
     assert most < 100_000
 
 
+# ------------------------------------------------------------------------------------------------ compressed
+
+
+def pictures(steps: int, copies: int, moving: bool = True) -> Bytes:
+    """Stacks [steps, copies, 4, 20, 20] of frames in which little is to be seen."""
+    obs = np.zeros((steps, copies, 4, 20, 20), np.uint8)
+    for t, n, j in np.ndindex(*obs.shape[:3]):
+        obs[t, n, j, (t + j) % 20, (7 * n + (t + j if moving else 31 * t + 57 * j)) % 20] = 255
+    return obs
+
+
+@pytest.mark.parametrize(
+    ("obs", "stack", "names"),
+    [
+        (pictures(17, 2), True, ["stack", "zstd"]),
+        (pictures(17, 2), False, ["zstd"]),
+        (pictures(17, 2, moving=False), True, ["zstd"]),
+        (frame_stacks(17, 2, 4, (8, 8)), True, ["stack"]),
+        (frame_stacks(17, 2, 4, (8, 8), resets=1.0), True, []),
+    ],
+    ids=["both", "not stacked", "no stack", "stacked noise", "noise"],
+)
+def test_what_is_worth_it_is_compressed(obs: Bytes, stack: bool, names: list[str]) -> None:
+    frame, packings = Packing(stack=stack, zstd=True).of(obs)
+    assert packings == names
+    if names:
+        assert len(frame) < obs.nbytes * (0.1 if "zstd" in names else 0.4)
+        back = unpacked(frame, packings, obs.dtype, obs.shape)
+        assert back.tobytes() == obs.tobytes()
+        assert not back.flags.writeable
+
+
+@pytest.mark.parametrize("dtype", ["<i8", "<f4", "|b1", "<u2"])
+def test_arrays_of_any_kind_are_compressed_from_a_kilobyte_on(dtype: str) -> None:
+    few, many = np.zeros(1023 // np.dtype(dtype).itemsize, dtype), np.ones((64, 32, 2), dtype)
+    assert Packing(zstd=True).of(few)[1] == []
+    frame, packings = Packing(zstd=True).of(many)
+    assert packings == ["zstd"]
+    back = unpacked(frame, packings, many.dtype, many.shape)
+    assert (back.dtype, back.shape) == (many.dtype, many.shape)
+    assert (back == many).all()
+
+
+def test_a_compressed_rollout_comes_back_as_it_went() -> None:
+    rollout = a_rollout((np.tile(pictures(17, 2), (1, 1, 1, 4, 4)),))
+    frames = [bytes(frame) for frame in encode(rollout, Packing(stack=True, zstd=True))]
+    assert sum(map(len, frames)) < 0.02 * rollout.obs[0].nbytes
+    assert encode(decode_to_learner(frames, rollout.obs[0].nbytes)) == encode(rollout)
+
+
+def runs_of_zeros(says: int, holds: int) -> bytes:
+    """A Zstandard frame by hand: it says that it holds so many bytes, and holds so many, in blocks of one repeated byte."""
+    sizes = [1 << 17] * (holds >> 17) + [holds % (1 << 17)]
+    blocks = b"".join(
+        ((size << 3) | 2 | (i == len(sizes) - 1)).to_bytes(3, "little") + b"\0" for i, size in enumerate(sizes)
+    )
+    return b"\x28\xb5\x2f\xfd\xe0" + says.to_bytes(8, "little") + blocks
+
+
+GIGABYTE = 1 << 30
+ZEROS = zstandard.ZstdCompressor().compress(bytes(8704))
+
+
+def test_the_frame_made_by_hand_is_a_good_one() -> None:
+    for frame in (runs_of_zeros(8704, 8704), ZEROS):
+        assert not unpacked(frame, ["zstd"], U1, SHAPE).any()
+    payload = zstandard.ZstdCompressor().compress(payload_of())
+    assert not unpacked(payload, ["stack", "zstd"], U1, SHAPE).any()
+
+
+@pytest.mark.parametrize(
+    ("frame", "says"),
+    [
+        (b"", "zstd"),
+        (b"\0" * 100, "zstd"),
+        (runs_of_zeros(GIGABYTE, GIGABYTE), "got 1073741824"),
+        (runs_of_zeros(2**62, 8704), "got 4611686018427387904"),
+        (runs_of_zeros(8704, GIGABYTE), "zstd: "),
+        (runs_of_zeros(8704, 8703), "zstd: "),
+        (runs_of_zeros(8703, 8703), "got 8703"),
+        (runs_of_zeros(8705, 8705), "got 8705"),
+        (runs_of_zeros(0, 0), "got 0"),
+        (zstandard.ZstdCompressor(write_content_size=False).compress(bytes(8704)), "got -1"),
+        (b"\x50\x2a\x4d\x18\x04\0\0\0zero", "zstd"),  # a frame to be skipped
+        (ZEROS + b"\0", "zstd"),
+        (ZEROS + ZEROS, "zstd"),
+        (ZEROS[:-1], "zstd: "),
+    ],
+    ids=lambda value: value if isinstance(value, str) else f"{len(value)} bytes",
+)
+def test_bombs_and_other_broken_frames_are_refused_before_memory_is_taken_for_them(frame: bytes, says: str) -> None:
+    tracemalloc.start()
+    with pytest.raises(BadMessage) as caught:
+        unpacked(frame, ["zstd"], U1, SHAPE)
+    if says.startswith("got"):  # told by its own words; as a stack it may be smaller than the array
+        with pytest.raises(BadMessage):
+            unpacked(frame, ["stack", "zstd"], U1, SHAPE)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert says in str(caught.value)
+    assert most < 500_000
+
+
+def test_packings_are_undone_in_one_order_only() -> None:
+    for packings in (["zstd", "stack"], ["zstd", "zstd"], ["stack", "zstd", "zstd"], []):
+        with pytest.raises(BadMessage, match="packings expected"):
+            unpacked(ZEROS, packings, U1, SHAPE)
+
+
+def test_a_learner_that_cannot_decompress_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "zstandard", None)
+    assert "pip install 'millrace[compress]'" in why_no_zstd()
+    with pytest.raises(BadMessage, match="zstd was not asked for"):
+        unpacked(ZEROS, ["zstd"], U1, SHAPE)
+
+
+@pytest.mark.parametrize("zstd", [False, True])
 @settings(max_examples=300, deadline=None)
 @given(st.data())
-def test_damaged_packed_rollouts(data: st.DataObject) -> None:
+def test_damaged_packed_rollouts(zstd: bool, data: st.DataObject) -> None:
     """Each is taken for a rollout, of what its bits say, or refused; nothing else is raised."""
-    frames = sent(a_rollout((frame_stacks(17, 2, 4, (8, 8)), frame_stacks(6, 1, 2, (8, 9), 0.2))))
+    obs = frame_stacks(17, 2, 4, (8, 8)), frame_stacks(6, 1, 2, (8, 9), 0.2)
+    if zstd:
+        obs = pictures(17, 2), pictures(6, 1, moving=False)
+    frames = [bytes(frame) for frame in encode(a_rollout(obs), Packing(stack=True, zstd=zstd))]
     which = data.draw(st.sampled_from([0, 1, 1, 2, 2, 3]))
     damaged = bytearray(frames[which])
     for _ in range(data.draw(st.integers(1, 3))):
@@ -307,6 +429,6 @@ def test_damaged_packed_rollouts(data: st.DataObject) -> None:
         del damaged[data.draw(st.integers(0, len(damaged))) :]
     frames[which] = bytes(damaged)
     with suppress(BadMessage):
-        message = decode_to_learner(frames, 2 * ROOM)
+        message = decode_to_learner(frames, 100_000)
         assert isinstance(message, Rollout)
         assert not any(array.flags.writeable for array in message.obs)

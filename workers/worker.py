@@ -14,6 +14,7 @@ import socket
 import time
 import traceback
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -78,6 +79,7 @@ class Worker:
         self._collector: Collector | None = None
         self._stepper: Stepper | None = None
         self._loaded: Weights | None = None
+        self._packing = link.packing
         self._pulse_due_s = 0.0
         self._left: Leave | None = None
         self._breath = Breath(lambda: self._do(self._session.breathe(self._clock())))
@@ -211,7 +213,7 @@ class Worker:
         for effect in effects:
             match effect:
                 case Say(message):
-                    self._link.send(encode(message, self._link.packing))
+                    self._link.send(encode(message, self._packing))
                 case Begin(run):
                     self._begin(run)
                 case Close(lanes):
@@ -231,6 +233,7 @@ class Worker:
             match run:
                 case RunSpec():
                     self._collector = self._make_collector(run)
+                    self._packing = replace(self._link.packing, zstd=run.compress == "zstd")
                 case StepSpec():
                     self._stepper = Stepper(run, self._handed, private=self._code is not Code.REGISTERED)
                     self._breath.start()

@@ -69,6 +69,20 @@ def test_the_same_curve_whatever_the_number_of_workers(tmp_path: Path, env: str,
     assert (other / "policy.safetensors").read_bytes() != policies[1, "inproc"], "the seed changes nothing"
 
 
+def test_compressed_rollouts_change_nothing_but_their_bytes(tmp_path: Path) -> None:
+    settings: dict[str, Any] = {"steps": 2_000, "rollout_steps": 64, "seed": 3, "eval_episodes": 1}
+    plain, compressed = (run(tmp_path, "CartPole-v1", compress=compress, **settings) for compress in ("none", "zstd"))
+    assert (plain / "policy.safetensors").read_bytes() == (compressed / "policy.safetensors").read_bytes()
+    assert Config.from_toml((compressed / "config.toml").read_text()).compress == "zstd"
+
+
+def test_a_learner_that_cannot_decompress_does_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "zstandard", None)
+    with pytest.raises(UsageError, match=r"needs the package zstandard, .* pip install 'millrace\[compress\]'"):
+        run(tmp_path, "CartPole-v1", compress="zstd", steps=1_000)
+    assert not list(tmp_path.glob("runs*"))
+
+
 @pytest.mark.parametrize("max_lag", [0, 1, 4])
 def test_lag_never_exceeds_its_bound(tmp_path: Path, max_lag: int) -> None:
     folder = run(tmp_path, "CartPole-v1", max_lag=max_lag, steps=8_000, **SMALL)
