@@ -1,23 +1,33 @@
 """What packing saves of a rollout and what it takes: rollouts as large as Atari's, and CartPole's, packed every way.
 
 CPU seconds of one thread at each end, less those of the same rollout as it lies; from them the speed of a network below
-which packing pays.
+which packing pays. And from end to end over an encrypted connection, where every byte costs. And what rounding weights
+takes.
 """
 
 from __future__ import annotations
 
+import multiprocessing
+import statistics
 import time
+from datetime import UTC, datetime
+from multiprocessing.connection import Connection
 
 import gymnasium
 import msgspec
 import numpy as np
+import zmq
 from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation
 
 from benchmarks.simulated import canned, run_spec
 from protocol.codec import MAX_FRAME_BYTES, decode_to_learner, encode
+from protocol.key_folder import Keyring
+from protocol.keys import Allowed, Key, Token
+from protocol.link import LearnerLink, WorkerLink
 from protocol.packing import Packing
 from protocol.policy import layout, make_policy, size
-from protocol.rollout import Rollout
+from protocol.precision import WeightsDtype, narrowed, widened
+from protocol.rollout import Rollout, rollout_bytes
 from protocol.specs import ActionSpec, EnvSpec, Leaf, PolicySpec, RunSpec
 from workers.collector import Collector
 from workers.session import Assignment
@@ -31,6 +41,14 @@ ATARI = RunSpec(
     seed=1,
 )
 STACKS = msgspec.structs.replace(ATARI, policy=PolicySpec((Leaf("", "box", (4, 84, 84), "uint8"),), ATARI.policy.action))
+
+WAYS = {
+    "as they lie": Packing(),
+    "stack": Packing(stack=True),
+    "zstd": Packing(zstd=True),
+    "stack + zstd": Packing(stack=True, zstd=True),
+}
+MNIH = 1_687_206  # parameters of the network of Mnih et al. 2015, with six actions
 
 
 def atari(run: RunSpec) -> Rollout:
@@ -77,13 +95,13 @@ def cartpole(copies: int, steps: int) -> Rollout:
 def packing(rounds: int) -> list[dict[str, object]]:
     """A row for each rollout and way of packing it; medians of the CPU seconds of one thread."""
     stacks = {"frame stacks of noise": atari(STACKS)} | ({"frame stacks of Pong": game} if (game := pong()) else {})
-    stack, zstd, both = Packing(stack=True), Packing(zstd=True), Packing(stack=True, zstd=True)
-    rows: list[tuple[str, Rollout, Packing]] = [(name, each, stack) for name, each in stacks.items()]
-    rows += [(name, each, way) for name, each in stacks.items() if each is game for way in (zstd, both)]
-    rows += [(f"CartPole, {n} × {t}", cartpole(n, t), zstd) for n, t in ((8, 32), (64, 128))]
+    rows = [(name, each, "stack") for name, each in stacks.items()]
+    rows += [(name, each, way) for name, each in stacks.items() if each is game for way in ("zstd", "stack + zstd")]
+    rows += [(f"CartPole, {n} × {t}", cartpole(n, t), "zstd") for n, t in ((8, 32), (64, 128))]
     found: list[dict[str, object]] = []
-    for name, rollout, way in rows:
-        (plain, saved), taken = (sum(map(len, encode(rollout, each))) for each in (None, way)), np.zeros((4, rounds))
+    for name, rollout, packed_by in rows:
+        way, taken = WAYS[packed_by], np.zeros((4, rounds))
+        plain, saved = (sum(map(len, encode(rollout, each))) for each in (None, way))
         for turn in range(rounds):
             for i, each in enumerate((None, way)):
                 began_s = time.thread_time()
@@ -96,7 +114,7 @@ def packing(rounds: int) -> list[dict[str, object]]:
         found.append(
             {
                 "rollout": name,
-                "packing": " + ".join(kind for kind, done in (("stack", way.stack), ("zstd", way.zstd)) if done),
+                "packing": packed_by,
                 "bytes": plain,
                 "packed": saved,
                 "pack_ms": pack_s * 1e3,
@@ -105,4 +123,62 @@ def packing(rounds: int) -> list[dict[str, object]]:
                 "pays_below_gbit_per_s": 8e-9 * (plain - saved) / (pack_s + unpack_s),
             }
         )
+    return found
+
+
+def _send(address: str, token: Token, told: Connection) -> None:
+    """The sender's process: one rollout of frame stacks, packed as it is told to."""
+    link, rollout = WorkerLink(address, "w", zmq.Context(), token), pong() or atari(STACKS)
+    told.send(None)
+    while (way := told.recv()) is not None:
+        began_s = time.monotonic()
+        link.send(encode(rollout, WAYS[way]))
+        told.send(began_s)
+    link.close(0)
+
+
+def encrypted(rounds: int) -> dict[str, float]:
+    """Milliseconds of a rollout of frame stacks from before `encode` until after decoding, over CURVE and loopback TCP."""
+    server, client = Key.new(), Key.new()
+    keyring = Keyring(server, Allowed().adding("w", client.public, datetime.now(UTC)))
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    link = LearnerLink("tcp://127.0.0.1:*", context, keyring)
+    link.room = rollout_bytes(STACKS)
+    spawn = multiprocessing.get_context("spawn")
+    here, there = spawn.Pipe()
+    sender = spawn.Process(target=_send, args=(link.address, Token(server.public, client), there))
+    sender.start()
+    here.recv()
+    times: dict[str, list[float]] = {way: [] for way in WAYS}
+    for turn in range(-2, rounds):  # those before 0 warm up
+        for way, taken in times.items():
+            here.send(way)
+            assert link.poll(10)
+            ((_, message),) = link.receive()
+            assert isinstance(message, Rollout)
+            now = time.monotonic()
+            if (began_s := here.recv()) and turn >= 0:
+                taken.append((now - began_s) * 1e3)
+    here.send(None)
+    sender.join()
+    link.close(0)
+    context.term()
+    return {way: statistics.median(taken) for way, taken in times.items()}
+
+
+def rounding(rounds: int) -> list[dict[str, object]]:
+    """A row for each dtype in which the weights of an image network may travel: MB, and CPU ms at each end; medians."""
+    parameters = np.random.default_rng(0).normal(0, 0.1, MNIH).astype(np.float32)
+    found: list[dict[str, object]] = []
+    dtypes: list[WeightsDtype] = ["float32", "bfloat16", "float16"]
+    for dtype in dtypes:
+        times = []
+        for _ in range(rounds):
+            began_s = time.thread_time()
+            travelling = narrowed(parameters, dtype)
+            rounded_s = time.thread_time()
+            widened(travelling)
+            times.append((rounded_s - began_s, time.thread_time() - rounded_s))
+        learner_ms, worker_ms = (np.median(times, axis=0) * 1e3).tolist()
+        found.append({"dtype": dtype, "mb": travelling.nbytes / 1e6, "learner_ms": learner_ms, "worker_ms": worker_ms})
     return found

@@ -3,7 +3,7 @@
 Large (14.6 MB, Atari): seconds from before `encode` in the sender until after decoding in the receiver, one rollout under
 way at a time, against plain ROUTER and DEALER sockets that carry the same arrays as they lie; in turns. Once of noise, and
 once of frame stacks, which travel packed. Small (9 KB, CartPole): CPU µs of the Python thread at each end. All: bytes of the
-frames and of ZeroMQ's framing against those of the arrays. Then what packing saves and takes (`benchmarks/packing.py`).
+frames and of ZeroMQ's framing against those of the arrays. Then what packing rollouts and rounding weights saves and takes.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import zmq
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.packing import ATARI, STACKS, atari, packing
+from benchmarks.packing import ATARI, STACKS, atari, encrypted, packing, rounding
 from benchmarks.simulated import canned, run_spec
 from benchmarks.writing import write
 from protocol.codec import Buffer, encode
@@ -194,11 +194,20 @@ def main() -> None:
     ends = {"worker": parts["encode"] + parts["send"], "learner": parts["receive and decode"]}
     second.add_row(*(f"{us:.1f}" for us in (*parts.values(), *ends.values())), f"≤ {PYTHON_US}")
     console.print(second)
-    ways = packing(rounds)
+    ways = packing(rounds)  # from here on `benchmarks/packing.py`
     third = Table("rollout", "packing", *PACKING, title="Packing, CPU of one thread")
     for row in ways:
         third.add_row(str(row["rollout"]), str(row["packing"]), *(f"{row[key]:,.4g}" for key in PACKING.values()))
     console.print(third)
+    keyed = encrypted(rounds)
+    fourth = Table(*keyed, title="Frame stacks, encrypted, ms")
+    fourth.add_row(*(f"{ms:.1f}" for ms in keyed.values()))
+    console.print(fourth)
+    weights = rounding(rounds)
+    fifth = Table("weights", "MB", "learner, ms", "worker, ms", title="Rounding the weights of an image network")
+    for row in weights:
+        fifth.add_row(str(row["dtype"]), *(f"{row[key]:.2f}" for key in ("mb", "learner_ms", "worker_ms")))
+    console.print(fifth)
     overhead = {name: on_the_wire(encode(canned(run))) for name, run in (("Atari", ATARI), ("CartPole", CARTPOLE))}
     for name, (payload, wire) in overhead.items():
         ratio = f"{wire / payload:.4f} (target ≤ {OVERHEAD})"
@@ -218,8 +227,9 @@ def main() -> None:
         for kind, rows in found.items()
     ]
     charts.append(("a rollout of 9 KB, µs of Python", parts))
-    record = {"large": found["of noise"], "stacks": found["of frame stacks"], "small_us": parts | ends}
-    write("wire", {**record, "packing": ways, "bytes": overhead, "stack_bytes": stack_bytes}, charts)
+    record: dict[str, object] = {"large": found["of noise"], "stacks": found["of frame stacks"], "small_us": parts | ends}
+    record |= {"packing": ways, "encrypted_ms": keyed, "weights": weights, "bytes": overhead, "stack_bytes": stack_bytes}
+    write("wire", record, charts)
 
 
 if __name__ == "__main__":

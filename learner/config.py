@@ -22,6 +22,7 @@ from learner.hyperparameters import HYPERPARAMETERS, Hyperparameters, PPOConfig,
 from learner.nearest import nearest
 from protocol.address import advertised, check_address
 from protocol.errors import UsageError
+from protocol.precision import WeightsDtype
 
 PRESETS = Path(__file__).with_name("presets.toml")
 Scalar = bool | int | float | str
@@ -67,6 +68,10 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     compress: Literal["none", "zstd"] = "none"
     """how workers compress their rollouts: not at all, or by Zstandard, which pays for images, on almost any network
     (pip install 'millrace[compress]', here and with every worker)
+    """
+    weights_dtype: WeightsDtype = "float32"
+    """as what weights travel to workers: rounded, as bfloat16 or float16, they are half as many bytes. Workers act under the
+    rounded ones, of which their log-probabilities are; the learner's own stay float32
     """
     bind: str = "tcp://127.0.0.1:5555"
     """where `millrace learner` listens for workers; tcp://0.0.0.0:5555 is for other machines, and needs keys"""

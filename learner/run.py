@@ -81,6 +81,7 @@ class Run:
             no_workers_timeout_s=config.no_workers_timeout_s,
             stall_timeout_s=config.stall_timeout_s,
             max_env_failures=config.max_env_failures,
+            weights_dtype=config.weights_dtype,
             look=look,
         )
         self.journal = Journal(config, self.folder, spec, self.algorithm, self.hub, past, watch)

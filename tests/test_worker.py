@@ -1,4 +1,4 @@
-"""The shell round a session, over a link that is not real: which runs it takes part in, and how it packs what it sends."""
+"""The shell round a session, over a link that is not real: which runs it takes part in, how it packs, what it acts under."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from protocol.codec import Buffer, decode_to_learner, encode
+from protocol.codec import Buffer, decode_to_learner, decode_to_worker, encode
 from protocol.link import WorkerLink
 from protocol.messages import (
     Collect,
@@ -27,9 +27,10 @@ from protocol.messages import (
 )
 from protocol.packing import Packing
 from protocol.policy import buffer_size, layout, size
-from protocol.rollout import rollout_bytes
+from protocol.precision import WeightsDtype, narrowed, widened
+from protocol.rollout import Array, rollout_bytes
 from protocol.specs import RunSpec
-from tests.collecting import run_of
+from tests.collecting import a_collector, bits, collect, run_of
 from workers.session import Leave, Session
 from workers.worker import Worker, identity
 
@@ -66,11 +67,14 @@ def work(link: FakeLink) -> Leave:
     return Worker(cast(WorkerLink, link), Session(identity("w0"), 0.0), clock=lambda: 0.0).run()
 
 
-def said_to_a_worker(run: RunSpec) -> list[ToWorker]:
+PARAMETERS = np.random.default_rng(0).normal(0, 0.1, size(layout(RUN.policy)[0])).astype(np.float32)
+BUFFERS = np.ones(buffer_size(RUN.policy), np.float32)
+
+
+def said_to_a_worker(run: RunSpec, parameters: Array = PARAMETERS) -> list[ToWorker]:
     """To join, collect one rollout and leave."""
-    parameters = np.random.default_rng(0).normal(0, 0.1, size(layout(run.policy)[0])).astype(np.float32)
-    weights = Weights(0, parameters, np.ones(buffer_size(run.policy), np.float32))
-    return [Welcome(1, 1, run), weights, Collect(1, 0, (Permit(0, 0, 0),), (Received(0, 0, 0),)), Drain("done")]
+    permits, received = (Permit(0, 0, 0),), (Received(0, 0, 0),)
+    return [Welcome(1, 1, run), Weights(0, parameters, BUFFERS), Collect(1, 0, permits, received), Drain("done")]
 
 
 def test_a_worker_compresses_when_the_run_says_so() -> None:
@@ -91,3 +95,19 @@ def test_a_worker_that_cannot_compress_leaves_at_once_and_says_why(monkeypatch: 
     why = "compress zstd needs the package zstandard, which is an extra; pip install 'millrace[compress]'"
     assert work(link) == Leave(2, why)
     assert link.heard()[-1] == Goodbye(1, why, ())
+
+
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16", "float16"])
+def test_a_worker_acts_under_the_weights_that_travelled(dtype: WeightsDtype) -> None:
+    travelling = narrowed(PARAMETERS, dtype)
+    (welcome, weights, *rest) = said_to_a_worker(RUN, travelling)
+    link = FakeLink([welcome, decode_to_worker(encode(weights)), *rest])
+    assert work(link).exit_code == 0
+    (rollout,) = (message for message in link.heard() if isinstance(message, Rollout))
+    found = []
+    for parameters in (widened(travelling), PARAMETERS):
+        collector = a_collector(RUN)
+        collector.load(parameters, BUFFERS)
+        found.append(bits(collect(collector, RUN)[0])["log_prob"])
+    assert rollout.log_prob.tobytes() == found[0]
+    assert (found[0] == found[1]) == (dtype == "float32")

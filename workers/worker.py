@@ -23,6 +23,7 @@ from protocol.errors import BadMessage, OurError
 from protocol.link import WorkerLink
 from protocol.messages import Order, Stepped, Weights
 from protocol.policy import make_policy
+from protocol.precision import widened
 from protocol.shared import Handed
 from protocol.specs import Code, RunSpec, StepSpec
 from workers.breath import Breath
@@ -133,7 +134,7 @@ class Worker:
 
         try:
             if self._loaded is not task.weights:
-                collector.load(task.weights.parameters, task.weights.buffers)
+                collector.load(widened(task.weights.parameters), task.weights.buffers)
                 self._loaded = task.weights
             rollouts = collector.collect(task.assignments, task.weights.version, task.session, pulse)
         except _Abandoned:
