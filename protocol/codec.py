@@ -102,7 +102,7 @@ def _decode(frames: Sequence[Buffer], kind: Any, room: int = 0) -> Any:
         frame = frames[index]
         if packings is not None:
             taken += size
-            if taken > min(room, MAX_FRAME_BYTES):
+            if taken > min(room, MAX_FRAME_BYTES) or not room:
                 raise BadMessage(f"packed arrays expected at most {min(room, MAX_FRAME_BYTES)} bytes together, got {taken}")
             return unpacked(frame, packings, dtype, shape)
         if size != len(frame):

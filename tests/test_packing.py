@@ -203,6 +203,11 @@ def test_who_gives_no_room_takes_no_packed_array() -> None:
         decode_to_learner(frames)
     with pytest.raises(BadMessage):
         decode_to_worker(frames)
+    empty = [bytes(frame) for frame in encode(a_rollout((np.zeros(0, np.uint8),)))]
+    head = msgspec.msgpack.decode(empty[0])
+    head["obs"][0].append(["zstd"])
+    with pytest.raises(BadMessage, match="packed arrays expected at most 0 bytes together, got 0"):
+        decode_to_learner([msgspec.msgpack.encode(head), *empty[1:]])
     assert decode_to_learner(frames, 8704)
     with pytest.raises(BadMessage, match="packed arrays expected at most 8703 bytes together, got 8704"):
         decode_to_learner(frames, 8703)
@@ -322,9 +327,10 @@ def test_what_is_worth_it_is_compressed(obs: Bytes, stack: bool, names: list[str
     assert packings == names
     if names:
         assert len(frame) < obs.nbytes * (0.1 if "zstd" in names else 0.4)
-        back = unpacked(frame, packings, obs.dtype, obs.shape)
-        assert back.tobytes() == obs.tobytes()
-        assert not back.flags.writeable
+        for received in (bytes(frame), memoryview(bytearray(frame))):
+            back = unpacked(received, packings, obs.dtype, obs.shape)
+            assert back.tobytes() == obs.tobytes()
+            assert not back.flags.writeable
 
 
 @pytest.mark.parametrize("dtype", ["<i8", "<f4", "|b1", "<u2"])
