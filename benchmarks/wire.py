@@ -1,8 +1,9 @@
 """The way of a rollout from one process to another: `python -m benchmarks.wire`.
 
 Large (14.6 MB, Atari): seconds from before `encode` in the sender until after decoding in the receiver, one rollout under
-way at a time, against plain ROUTER and DEALER sockets that carry the same frames; in turns. Small (9 KB, CartPole): CPU µs
-of the Python thread at each end. Both: bytes of the frames and of ZeroMQ's framing against those of the arrays.
+way at a time, against plain ROUTER and DEALER sockets that carry the same arrays as they lie; in turns. Once of noise, and
+once of frame stacks, which travel packed. Small (9 KB, CartPole): CPU µs of the Python thread at each end. All: bytes of the
+frames and of ZeroMQ's framing against those of the arrays. Then what packing rollouts and rounding weights saves and takes.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import os
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")  # before numpy
 
 import argparse
+import math
 import multiprocessing
 import statistics
 import tempfile
@@ -24,31 +26,33 @@ import zmq
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.packing import ATARI, STACKS, atari, encrypted, packing, rounding
 from benchmarks.simulated import canned, run_spec
 from benchmarks.writing import write
 from protocol.codec import Buffer, encode
 from protocol.link import LearnerLink, WorkerLink
-from protocol.rollout import Rollout, validate
-from protocol.specs import ActionSpec, EnvSpec, Leaf, PolicySpec, RunSpec
+from protocol.packing import Packing
+from protocol.rollout import Rollout, rollout_bytes, validate
+from protocol.specs import RunSpec
 
 TRANSPORTS = ("ipc", "tcp")
-SHARE, PYTHON_US, OVERHEAD = 0.8, 40, 1.02  # targets
-ATARI = RunSpec(
-    EnvSpec("ALE/Pong-v5"),
-    PolicySpec((Leaf("", "box", (84, 84, 4), "uint8"),), ActionSpec("discrete", (), "int64", (6,), (0,))),
-    rollout_steps=128,
-    copies=4,
-    lanes=2,
-    seed=1,
-)
+SHARE, PYTHON_US, OVERHEAD, FRAME = 0.8, 40, 1.02, 1.05  # targets
 CARTPOLE = run_spec(4)
+PACKING = {
+    "bytes": "bytes",
+    "packed": "packed",
+    "pack, ms": "pack_ms",
+    "MB/s": "pack_mb_per_s",
+    "unpack, ms": "unpack_ms",
+    "pays below, Gbit/s": "pays_below_gbit_per_s",
+}
 BURST = 200  # small rollouts that are sent together
 
 
-def _send(addresses: dict[str, str], told: Connection) -> None:
+def _send(run: RunSpec, addresses: dict[str, str], told: Connection) -> None:
     """The sender's process: one rollout by one way, each time it is asked; seconds by the clock that both share."""
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    rollout = canned(ATARI)
+    rollout = atari(run)
     frames = encode(rollout)
     links = {way: WorkerLink(address, "w", context) for way, address in addresses.items() if way.startswith("ours")}
     sockets = {}
@@ -61,7 +65,7 @@ def _send(addresses: dict[str, str], told: Connection) -> None:
     while (way := told.recv()) is not None:
         began_s = time.monotonic()
         if way in links:
-            links[way].send(encode(rollout))
+            links[way].send(encode(rollout, Packing(stack=True)))
         else:
             sockets[way].send_multipart(frames, copy=False)
         told.send(began_s)
@@ -70,7 +74,7 @@ def _send(addresses: dict[str, str], told: Connection) -> None:
     context.destroy(linger=0)
 
 
-def large(rounds: int) -> list[dict[str, object]]:
+def large(run: RunSpec, rounds: int) -> list[dict[str, object]]:
     """A row for each transport."""
     context = multiprocessing.get_context("spawn")
     zmq_context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
@@ -81,13 +85,14 @@ def large(rounds: int) -> list[dict[str, object]]:
             address = f"ipc://{folder}/{way.replace(' ', '-')}" if way.endswith("ipc") else "tcp://127.0.0.1:*"
             if way.startswith("ours"):
                 links[way] = LearnerLink(address, zmq_context)
+                links[way].room = rollout_bytes(run)
                 addresses[way] = links[way].address
             else:
                 sockets[way] = zmq_context.socket(zmq.ROUTER)
                 sockets[way].bind(address)
                 addresses[way] = bytes(sockets[way].get(zmq.LAST_ENDPOINT)).decode().rstrip("\0")
         here, there = context.Pipe()
-        sender = context.Process(target=_send, args=(addresses, there))
+        sender = context.Process(target=_send, args=(run, addresses, there))
         sender.start()
         here.recv()
         for turn in range(-3, rounds):  # those before 0 warm up
@@ -109,7 +114,7 @@ def large(rounds: int) -> list[dict[str, object]]:
         for link in links.values():
             link.close(0)
         zmq_context.destroy(linger=0)
-    payload, _ = on_the_wire(encode(canned(ATARI)))
+    payload = rollout_bytes(run)
     return [
         {
             "transport": transport,
@@ -164,35 +169,67 @@ def on_the_wire(frames: Sequence[Buffer]) -> tuple[int, int]:
     return sum(map(len, frames[1:])), sum(len(frame) + (2 if len(frame) < 256 else 9) for frame in frames)
 
 
+def stack_sizes() -> tuple[int, int]:
+    """Bytes of a frame, and of a rollout of frame stacks on the wire."""
+    (leaf,) = STACKS.policy.observation
+    return math.prod(leaf.shape[1:]), on_the_wire(encode(atari(STACKS), Packing(stack=True)))[1]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="the way of a rollout")
     parser.add_argument("--rounds", type=int, default=40)
     rounds = parser.parse_args().rounds
-    console = Console(width=110)
-    rows = large(rounds)
-    first = Table(title=f"A rollout of {on_the_wire(encode(canned(ATARI)))[0] / 1e6:.1f} MB, medians of {rounds}")
-    for column in ("", "raw ZeroMQ, ms", "ours, ms", "GB/s", "share", "target"):
+    console = Console(width=130)
+    found = {"of noise": large(ATARI, rounds), "of frame stacks": large(STACKS, rounds)}
+    first = Table(title=f"A rollout of {rollout_bytes(ATARI) / 1e6:.1f} MB, medians of {rounds}")
+    for column in ("", "", "raw ZeroMQ, ms", "ours, ms", "GB/s", "share", "target"):
         first.add_column(column, justify="right")
-    for row in rows:
-        numbers = (f"{row[key]:.2f}" for key in ("raw_ms", "ours_ms", "gb_per_s", "share"))
-        first.add_row(str(row["transport"]), *numbers, f"≥ {SHARE}")
+    for kind, rows in found.items():
+        for row in rows:
+            numbers = (f"{row[key]:.2f}" for key in ("raw_ms", "ours_ms", "gb_per_s", "share"))
+            first.add_row(kind, str(row["transport"]), *numbers, f"≥ {SHARE}" if kind == "of noise" else "–")
     console.print(first)
     parts = small(rounds)
     second = Table(*parts, "worker", "learner", "target", title="A rollout of 9 KB, µs of Python")
     ends = {"worker": parts["encode"] + parts["send"], "learner": parts["receive and decode"]}
     second.add_row(*(f"{us:.1f}" for us in (*parts.values(), *ends.values())), f"≤ {PYTHON_US}")
     console.print(second)
+    ways = packing(rounds)  # from here on `benchmarks/packing.py`
+    third = Table("rollout", "packing", *PACKING, title="Packing, CPU of one thread")
+    for row in ways:
+        third.add_row(str(row["rollout"]), str(row["packing"]), *(f"{row[key]:,.4g}" for key in PACKING.values()))
+    console.print(third)
+    keyed = encrypted(rounds)
+    fourth = Table(*keyed, title="Frame stacks, encrypted, ms")
+    fourth.add_row(*(f"{ms:.1f}" for ms in keyed.values()))
+    console.print(fourth)
+    weights = rounding(rounds)
+    fifth = Table("weights", "MB", "learner, ms", "worker, ms", title="Rounding the weights of an image network")
+    for row in weights:
+        fifth.add_row(str(row["dtype"]), *(f"{row[key]:.2f}" for key in ("mb", "learner_ms", "worker_ms")))
+    console.print(fifth)
     overhead = {name: on_the_wire(encode(canned(run))) for name, run in (("Atari", ATARI), ("CartPole", CARTPOLE))}
     for name, (payload, wire) in overhead.items():
         ratio = f"{wire / payload:.4f} (target ≤ {OVERHEAD})"
         console.print(f"{name}: {wire:,} bytes on the wire for {payload:,} of arrays: {ratio}")
-    times = {
-        f"{who}, {row['transport']}": float(str(row[f"{who.split()[0]}_ms"]))
-        for row in rows
-        for who in ("raw ZeroMQ", "ours")
-    }
-    charts = [("a rollout of 14.6 MB, ms", times), ("a rollout of 9 KB, µs of Python", parts)]
-    write("wire", {"large": rows, "small_us": parts | ends, "bytes": overhead}, charts)
+    transitions, (frame_bytes, stack_bytes) = STACKS.rollout_steps * STACKS.copies, stack_sizes()
+    ratio = f"{stack_bytes / transitions / frame_bytes:.3f} of one frame (target ≤ {FRAME})"
+    console.print(f"frame stacks: {stack_bytes:,} bytes on the wire, {stack_bytes / transitions:,.0f} a transition: {ratio}")
+    charts = [
+        (
+            f"a rollout of 14.6 MB {kind}, ms",
+            {
+                f"{who}, {row['transport']}": float(str(row[f"{who.split()[0]}_ms"]))
+                for row in rows
+                for who in ("raw ZeroMQ", "ours")
+            },
+        )
+        for kind, rows in found.items()
+    ]
+    charts.append(("a rollout of 9 KB, µs of Python", parts))
+    record: dict[str, object] = {"large": found["of noise"], "stacks": found["of frame stacks"], "small_us": parts | ends}
+    record |= {"packing": ways, "encrypted_ms": keyed, "weights": weights, "bytes": overhead, "stack_bytes": stack_bytes}
+    write("wire", record, charts)
 
 
 if __name__ == "__main__":

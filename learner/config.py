@@ -22,6 +22,7 @@ from learner.hyperparameters import HYPERPARAMETERS, Hyperparameters, PPOConfig,
 from learner.nearest import nearest
 from protocol.address import advertised, check_address
 from protocol.errors import UsageError
+from protocol.precision import WeightsDtype
 
 PRESETS = Path(__file__).with_name("presets.toml")
 Scalar = bool | int | float | str
@@ -64,6 +65,14 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     transport: Literal["inproc", "ipc", "tcp"] = "ipc"
     """how local workers are reached: threads of this process, local sockets, or loopback TCP"""
+    compress: Literal["none", "zstd"] = "none"
+    """how workers compress their rollouts: not at all, or by Zstandard, which pays for images, on almost any network
+    (pip install 'millrace[compress]', here and with every worker)
+    """
+    weights_dtype: WeightsDtype = "float32"
+    """as what weights travel to workers: rounded, as bfloat16 or float16, they are half as many bytes. Workers act under the
+    rounded ones, of which their log-probabilities are; the learner's own stay float32
+    """
     bind: str = "tcp://127.0.0.1:5555"
     """where `millrace learner` listens for workers; tcp://0.0.0.0:5555 is for other machines, and needs keys"""
     advertise: str = ""
@@ -234,6 +243,10 @@ def checked(config: Config, where: str = "") -> Config:
         divisor = max(n for n in range(1, min(config.lanes, config.envs) + 1) if config.envs % n == 0)
         raise UsageError(
             f"{at}{config.envs} envs cannot be shared evenly among {config.lanes} lanes; take {near}, or {divisor} lanes"
+        )
+    if config.inference == "learner" and config.compress != "none":
+        raise UsageError(
+            f"{at}inference learner: compress expected none, got {config.compress}; rollouts are made beside the learner"
         )
     if config.inference == "learner" and config.max_lag:
         raise UsageError(

@@ -22,7 +22,8 @@ from protocol.codec import Buffer, encode
 from protocol.errors import BadMessage, BadRollout, EnvironmentFailed, NoWorkers, Stalled
 from protocol.link import LearnerLink
 from protocol.messages import Array, Inquire, Rollout, ToWorker, Weights
-from protocol.rollout import validate
+from protocol.precision import WeightsDtype, narrowed
+from protocol.rollout import rollout_bytes, validate
 
 log = logging.getLogger("millrace.learner")
 
@@ -46,19 +47,22 @@ class Hub:
         no_workers_timeout_s: float,
         stall_timeout_s: float,
         max_env_failures: int,
+        weights_dtype: WeightsDtype = "float32",
         dead_workers: Callable[[], Iterable[tuple[str, str]]] = lambda: (),
         watch: Callable[[], None] = lambda: None,
         look: Look = lambda hub: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`dead_workers` names local worker processes that have ended, and why; `watch` is called while waiting.
+        """`weights_dtype`: as what parameters travel. `dead_workers` names local worker processes that have ended, and why.
 
-        `look` is called whenever this has listened.
+        `watch` is called while waiting, `look` whenever this has listened.
         """
         self.link, self.roster = link, roster
+        link.room = rollout_bytes(roster.run)
         self.no_workers_timeout_s = no_workers_timeout_s
         self.stall_timeout_s = stall_timeout_s
         self.max_env_failures = max_env_failures
+        self.weights_dtype: WeightsDtype = weights_dtype
         self.wait_s = 0.0
         """seconds spent waiting for rollouts since the run began"""
         self.lags: list[int] = []
@@ -95,9 +99,13 @@ class Hub:
             self._turn(POLL_S)
 
     def publish(self, version: int, parameters: Array, buffers: Array) -> None:
-        """Broadcast new weights and deal the tickets that they allow. The arrays must not change afterwards."""
+        """Broadcast new weights and deal the tickets that they allow. The arrays must not change afterwards.
+
+        Raises `RunError` if a parameter is too large for `weights_dtype`.
+        """
+        travelling = narrowed(parameters, self.weights_dtype)
         self.freshness.published(version, self._clock())
-        self._send(self.roster.publish(version, parameters, buffers))
+        self._send(self.roster.publish(version, travelling, buffers))
 
     def gather(self) -> list[Rollout]:
         """The rollouts of the next update. Raises `NoWorkers`, `Stalled` or `EnvironmentFailed`."""

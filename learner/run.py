@@ -27,6 +27,7 @@ from learner.run_folder import Interrupted, RunFolder
 from protocol.errors import UsageError
 from protocol.link import LearnerLink
 from protocol.native import check_native
+from protocol.packing import why_no_zstd
 from protocol.spaces import action_spec, observation_leaves
 from protocol.specs import ActionSpec, EnvSpec, Leaf, RunSpec
 
@@ -100,6 +101,7 @@ class Run:
             no_workers_timeout_s=config.no_workers_timeout_s,
             stall_timeout_s=config.stall_timeout_s,
             max_env_failures=config.max_env_failures,
+            weights_dtype=config.weights_dtype,
             look=look,
         )
         self.journal = Journal(config, self.folder, spec, self.algorithm, self.hub, past, watch)
@@ -177,6 +179,9 @@ def run_spec(config: Config, env: EnvSpec, seen: Spaces | None = None) -> RunSpe
     """What the workers are told; `seen`: of this environment. Raises `UsageError` if it is not for this algorithm."""
     from learner.algorithms import ALGORITHMS
 
+    if config.compress == "zstd" and (why := why_no_zstd()):
+        raise UsageError(why)
+
     observation, action, longest = look_at(env) if seen is None else seen
     policy = ALGORITHMS[config.algo].policy_spec(config.algorithm, observation, action)
     if config.algorithm.encoder is not None:
@@ -196,6 +201,7 @@ def run_spec(config: Config, env: EnvSpec, seen: Spaces | None = None) -> RunSpe
         lanes=config.lanes,
         seed=config.seed,
         vector="native" if config.vector == "native" else "loop",
+        compress=config.compress,
         heartbeat_s=config.heartbeat_s,
     )
 

@@ -4,6 +4,9 @@ Frame 0 is the head, msgpack: the message's fields under its type's name, each a
 [dtype, shape, index of its frame]. Frames 1… are the arrays' raw bytes, C-ordered, little-endian. Everything a peer says
 is checked before it is used: the number of frames and bytes, the head's size and nesting, every type, every shape. An
 array that arrives is a read-only view on the received frame: no copy.
+
+Arrays of a rollout may come packed (`packing.py`), as [dtype, shape, index, packings]; what a message's packed arrays come
+to together is bounded by the receiver.
 """
 
 from __future__ import annotations
@@ -18,7 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from protocol.errors import BadMessage
-from protocol.messages import Inquire, ToLearner, ToObserver, ToWorker
+from protocol.messages import Inquire, Rollout, ToLearner, ToObserver, ToWorker
+from protocol.packing import Packing, as_it_lies, unpacked
 
 Array = npt.NDArray[Any]
 Buffer = bytes | memoryview
@@ -35,17 +39,23 @@ DTYPES = {
 assert sys.byteorder == "little", "millrace sends arrays as they lie in memory and knows little-endian machines only"
 
 
-def encode(message: ToLearner | Inquire | ToWorker | ToObserver) -> list[Buffer]:
-    """Frames of a message. Arrays are not copied: do not change them afterwards."""
+def encode(message: ToLearner | Inquire | ToWorker | ToObserver, packing: Packing | None = None) -> list[Buffer]:
+    """Frames of a message. Arrays are not copied: do not change them afterwards. `packing`: for those of a rollout."""
     frames: list[Buffer] = [b""]
+    packs = packing is not None and isinstance(message, Rollout)
 
     def hook(value: object) -> object:
         if not isinstance(value, np.ndarray):
             raise TypeError(f"{type(message).__name__} cannot carry a {type(value).__name__}")
         if value.dtype.str not in DTYPES:
             raise TypeError(f"{type(message).__name__} cannot carry an array of {value.dtype}")
-        frames.append(value.ravel().view(np.uint8).data)
-        return [value.dtype.str, list(value.shape), len(frames) - 1]
+        described: list[object] = [value.dtype.str, list(value.shape), len(frames)]
+        if packs and packing is not None:
+            frame, packings = packing.of(value)
+            frames.append(frame)
+            return [*described, packings] if packings else described
+        frames.append(as_it_lies(value))
+        return described
 
     head = msgpack.packb(msgspec.to_builtins(message, enc_hook=hook, builtin_types=(bytes,)))
     if len(head) > MAX_HEAD_BYTES:
@@ -54,9 +64,12 @@ def encode(message: ToLearner | Inquire | ToWorker | ToObserver) -> list[Buffer]
     return frames
 
 
-def decode_to_learner(frames: Sequence[Buffer]) -> ToLearner | Inquire:
-    """What a worker said, or an observer. Raises `BadMessage`, whatever the bytes."""
-    message: ToLearner | Inquire = _decode(frames, ToLearner | Inquire)
+def decode_to_learner(frames: Sequence[Buffer], room: int = 0) -> ToLearner | Inquire:
+    """What a worker said, or an observer. Raises `BadMessage`, whatever the bytes.
+
+    `room`: bytes to which its packed arrays may come, all together; 0: none may come packed.
+    """
+    message: ToLearner | Inquire = _decode(frames, ToLearner | Inquire, room)
     return message
 
 
@@ -72,17 +85,29 @@ def decode_to_observer(frames: Sequence[Buffer]) -> ToObserver:
     return message
 
 
-def _decode(frames: Sequence[Buffer], kind: Any) -> Any:
+def _decode(frames: Sequence[Buffer], kind: Any, room: int = 0) -> Any:
     if not 1 <= len(frames) <= MAX_FRAMES:
         raise BadMessage(f"message expected 1 to {MAX_FRAMES} frames, got {len(frames)}")
     if len(frames[0]) > MAX_HEAD_BYTES:
         raise BadMessage(f"head expected at most {MAX_HEAD_BYTES} bytes, got {len(frames[0])}")
     used: set[int] = set()
+    taken = 0
 
     def hook(wanted: type, value: object) -> object:
-        index, array = _array(frames, value)
+        nonlocal taken
+        dtype, shape, index, size, packings = _described(frames, value)
+        if index in used:
+            raise BadMessage(f"array frame {index} expected one array, got two")
         used.add(index)
-        return array
+        frame = frames[index]
+        if packings is not None:
+            taken += size
+            if taken > min(room, MAX_FRAME_BYTES) or not room:
+                raise BadMessage(f"packed arrays expected at most {min(room, MAX_FRAME_BYTES)} bytes together, got {taken}")
+            return unpacked(frame, packings, dtype, shape)
+        if size != len(frame):
+            raise BadMessage(f"array {dtype.str}{shape} expected {size} bytes, got {len(frame)}")
+        return np.ndarray(shape, dtype, frame if type(frame) is bytes else memoryview(frame).toreadonly())
 
     try:
         head = msgpack.unpackb(
@@ -103,24 +128,24 @@ def _decode(frames: Sequence[Buffer], kind: Any) -> Any:
     return message
 
 
-def _array(frames: Sequence[Buffer], value: object) -> tuple[int, Array]:
-    """The array that `[dtype, shape, index]` stands for: a read-only view on its frame."""
-    if not (type(value) is list and len(value) == 3):
+def _described(frames: Sequence[Buffer], value: object) -> tuple[np.dtype[Any], list[int], int, int, list[object] | None]:
+    """Dtype, shape, frame, bytes and packings of the array that `[dtype, shape, index]`, or one more, stands for."""
+    if not (type(value) is list and 3 <= len(value) <= 4):
         raise BadMessage(f"array expected [dtype, shape, index], got {str(value)[:80]}")
-    name, shape, index = value
+    name, shape, index = value[:3]
     if not (type(name) is str and type(shape) is list and isinstance(index, int)):
         raise BadMessage(f"array expected [dtype, shape, index], got {str(value)[:80]}")
     dtype = DTYPES.get(name)
     if dtype is None:
         raise BadMessage(f"array dtype expected one of ours, got {name[:20]!r}")
-    expected = dtype.itemsize
+    size = dtype.itemsize
     for side in shape:
         if not (type(side) is int and 0 <= side <= MAX_FRAME_BYTES and len(shape) <= MAX_DIMENSIONS):
             raise BadMessage(f"array shape expected at most {MAX_DIMENSIONS} whole numbers, got {str(shape)[:80]}")
-        expected *= side
+        size *= side
     if type(index) is bool or not 1 <= index < len(frames):
         raise BadMessage(f"array frame expected 1 to {len(frames) - 1}, got {index}")
-    frame = frames[index]
-    if expected != len(frame):
-        raise BadMessage(f"array {name}{shape} expected {expected} bytes, got {len(frame)}")
-    return index, np.ndarray(shape, dtype, frame if type(frame) is bytes else memoryview(frame).toreadonly())
+    packings = value[3] if len(value) == 4 else None
+    if packings is not None and type(packings) is not list:
+        raise BadMessage(f"array packings expected a list of names, got {str(packings)[:80]}")
+    return dtype, shape, index, size, packings

@@ -26,7 +26,7 @@ from typing import TypeVar
 
 import zmq
 
-from protocol.address import check_address, name_of, needs_ipv6, resolves
+from protocol.address import check_address, is_local, name_of, needs_ipv6, resolves
 from protocol.codec import (
     MAX_FRAME_BYTES,
     MAX_FRAMES,
@@ -41,6 +41,7 @@ from protocol.handshake import HANDSHAKE_MS, WATCHED_BY_WORKER, Trouble, trouble
 from protocol.key_folder import Keyring
 from protocol.keys import Token
 from protocol.messages import Inquire, Refuse, ToLearner, ToObserver, ToWorker
+from protocol.packing import Packing
 from protocol.rarely import Rarely, again
 from protocol.security import Door, connect_with
 
@@ -132,6 +133,8 @@ class LearnerLink:
         self.received, self.sent = Traffic(), Traffic()
         self.refused_messages = 0
         """messages under keys that may speak no more"""
+        self.room = 0
+        """bytes to which the packed arrays of one message may come; 0: none may come packed"""
         self._holders: dict[bytes, str] = {}  # routing id -> key under which it spoke last
         self._lid = Rarely()
         self._socket = self.context.socket(zmq.ROUTER)
@@ -179,7 +182,7 @@ class LearnerLink:
                 if self._turned_away(peer):
                     continue
             try:
-                yield peer, decode_to_learner(frames[1:])
+                yield peer, decode_to_learner(frames[1:], self.room)
             except BadMessage as error:
                 yield peer, error
 
@@ -255,6 +258,8 @@ class WorkerLink:
         self.address, self.token = address, token
         self.trouble: Trouble | None = None
         """why there is no connection, as far as that is known"""
+        self.packing = Packing(stack=token is not None or not is_local(address))
+        """of the rollouts that go over it: what is encrypted, or leaves this machine, is worth looking at first"""
         self._connected = False
         self._lid = Rarely()
         self.context = context or zmq.Context.instance()

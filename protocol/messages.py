@@ -13,7 +13,7 @@ import numpy.typing as npt
 from protocol.rollout import Rollout
 from protocol.specs import RunSpec, StepSpec
 
-PROTOCOL_VERSION = 1
+PROTOCOL_VERSION = 2
 
 Array = npt.NDArray[Any]
 
@@ -63,7 +63,7 @@ class Weights(Message, frozen=True):
 
     version: int
     parameters: Array
-    """[P] float32, the acting part of the flat parameter buffer"""
+    """[P] float32, the acting part of the flat parameter buffer; or rounded, float16 or bfloat16, the latter as uint16"""
     buffers: Array
     """[B] float32, what the learner keeps for the policy: observation mean and standard deviation"""
 

@@ -69,6 +69,15 @@ class Rollout(msgspec.Struct, frozen=True, tag=True, forbid_unknown_fields=True)
         return int(np.count_nonzero(self.valid))
 
 
+def rollout_bytes(run: RunSpec) -> int:
+    """Bytes of all arrays of a rollout of this run."""
+    T, N = run.rollout_steps, run.copies
+    leaves = [(T + 1, leaf.shape, leaf.dtype) for leaf in run.policy.observation]
+    steps = [*leaves, (T, run.policy.action.shape, run.policy.action.stored_dtype), (1, (run.policy.state_size,), "float32")]
+    flags = T * N * (2 * np.dtype(np.float32).itemsize + 3)  # log_prob, reward; terminated, truncated, valid
+    return flags + sum(rows * N * math.prod(shape) * np.dtype(dtype).itemsize for rows, shape, dtype in steps)
+
+
 def validate(rollout: Rollout, run: RunSpec) -> None:
     """Raise `BadRollout`, in one line, if the rollout does not fit the run or breaks the law of a row."""
     T, N = run.rollout_steps, run.copies

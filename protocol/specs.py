@@ -17,6 +17,7 @@ from gymnasium.envs.registration import VectorizeMode
 from gymnasium.vector import VectorEnv
 
 from protocol.errors import UsageError
+from protocol.packing import why_no_zstd
 
 OWN_ENVS = "workers.envs"  # the module that registers millrace/…: gymnasium imports it, as it would a user's own
 Scalar = bool | int | float | str
@@ -234,12 +235,16 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
     seed: int
     vector: Literal["loop", "native"] = "loop"
     """how the copies of a lane are stepped: one after another, or at once, by the environment's own vectorised form"""
+    compress: Literal["none", "zstd"] = "none"
+    """what workers do with the larger arrays of their rollouts, besides what they do anyway"""
     heartbeat_s: float = 1.0
     learner_timeout_s: float = 30.0
     """a worker that heard nothing of the learner for so long starts again with Hello"""
 
     def why_not(self, code: Code) -> str:
         """Why a worker that runs so much code cannot take part; empty if it can."""
+        if self.compress == "zstd" and (why := why_no_zstd()):
+            return why
         if self.policy.encoder is not None and code is Code.REGISTERED:
             return (
                 f"encoder {self.policy.encoder.factory} imports a module, which this worker does not do for a learner it "

@@ -11,6 +11,7 @@ import numpy as np
 
 from protocol.codec import encode
 from protocol.messages import PROTOCOL_VERSION, Failure, Goodbye, Heartbeat, Hello, Inquire, Returned, Rollout, Stepped
+from protocol.packing import Packing
 from protocol.plain import pack
 
 Frames = list[bytes]
@@ -24,16 +25,19 @@ NONSENSE: list[Any] = [
     None, True, -1, 2**63, -(2**63), 1e308, float("nan"), "", "x" * 10_000, b"\x00" * 100, [], {}, [[[[[[]]]]]],
     {"type": "Hello"}, ["|O", [1], 1], ["O", [1], 1], ["|V16", [1], 1], ["|S5", [1], 1], ["<M8[s]", [1], 1], [">f4", [1], 1],
     ["<f4", [-1], 1], ["<f4", [-2, -2], 1], ["<f4", [2**31, 2**31], 1], ["<f4", [0, 2**40], 1], ["<f4", [1] * 40, 1],
+    ["|u1", [17, 1, 4, 8, 8], 1, ["stack"]], ["|u1", [2**9, 2, 16, 8, 8], 1, ["stack"]], ["<f4", [1], 1, []], ["stack"],
     ["<f4", [1], 0], ["<f4", [1], -1], ["<f4", [1], 99], ["<f4", [True], 1], ["<f8", [1.5], 1], ["<f4", "12", 1],
 ]  # fmt: skip
 
 
 def real(rollout: Rollout) -> list[Any]:
-    """One good message of each kind that a learner can be told."""
+    """One good message of each kind that a learner can be told; the rollout also with frame stacks, which go packed."""
+    frames = np.lib.stride_tricks.sliding_window_view(np.arange(16 + 4, dtype=np.uint8), 4)[:, None, :, None, None]
     packed = np.frombuffer(pack([(0, {"key": [1.5, "text"]})]), np.uint8)
     return [
         Hello(PROTOCOL_VERSION, "mallory", "host", 1, 1, "fuzz", 1),
         rollout,
+        msgspec.structs.replace(rollout, obs=(np.tile(frames, (8, 8)),)),
         Heartbeat(rollout.session, 0, 0, (1, 2), 5, {"act": 0.1}, 0),
         Goodbye(rollout.session, "bye", (1,)),
         Failure(rollout.session, "error", "traceback", 0),
@@ -46,7 +50,7 @@ def real(rollout: Rollout) -> list[Any]:
 def hostile(seed: int, messages: Sequence[Any]) -> Iterator[Frames]:
     """Without end."""
     rng = np.random.default_rng(seed)
-    frames = [[bytes(frame) for frame in encode(message)] for message in messages]
+    frames = [[bytes(frame) for frame in encode(message, Packing(stack=True))] for message in messages]
     kinds: list[Callable[[np.random.Generator, Frames], Frames]] = [
         _random, _flipped, _cut, _doubled, _twisted, _twisted, _lying, _as_it_is,
     ]  # fmt: skip

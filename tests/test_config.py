@@ -199,3 +199,9 @@ def test_no_setting_of_an_algorithm_hides_one_of_the_run() -> None:
     own = {field.name for field in msgspec.structs.fields(Config)}
     for kind in HYPERPARAMETERS.values():
         assert not own & {field.name for field in msgspec.structs.fields(kind)}
+
+
+def test_rollouts_that_do_not_travel_are_not_compressed() -> None:
+    assert "compress expected none, got zstd" in refusal(inference="learner", compress="zstd")
+    assert "compress expected one of none, zstd, got 'gzip'" in refusal(compress="gzip")
+    assert resolve("CartPole-v1", compress="none").compress == "none"

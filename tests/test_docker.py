@@ -25,7 +25,8 @@ from tests.test_architecture import imported, sources
 
 ROOT = Path(__file__).parent.parent
 DOCKER = ROOT / "docker"
-NOT_FOR_WORKERS = {"torch", "tomli_w"}  # imported where they are used: for policies that look at images; for key lists
+# Imported where they are used: for policies that look at images; for key lists; for --compress.
+NOT_FOR_WORKERS = {"torch", "tomli_w", "zstandard"}
 
 
 def names(file: Path) -> set[str]:
@@ -61,7 +62,17 @@ sys.exit(main(["worker", "tcp://127.0.0.1:1", "--join-timeout-s", "0.01"]))
 
 
 def test_a_worker_starts_where_nothing_else_is_installed() -> None:
-    missing = {"matplotlib", "prometheus_client", "rich", "safetensors", "tensorboard", "tomli_w", "torch", "tyro"}
+    missing = {
+        "matplotlib",
+        "prometheus_client",
+        "rich",
+        "safetensors",
+        "tensorboard",
+        "tomli_w",
+        "torch",
+        "tyro",
+        "zstandard",
+    }
     done = subprocess.run(
         [sys.executable, "-c", IN_A_WORKER_IMAGE.format(missing=missing)],
         cwd=ROOT, capture_output=True, text=True, timeout=60, check=False,

@@ -12,13 +12,14 @@ from tests.fakes import fake_rollout
 from tests.hostile import Frames, hostile, real
 
 MESSAGES = 100_000
+ROOM = 100_000
 GROWTH_MB = 20
 
 
 def _refusal(frames: Frames) -> str | None:
     """What is said of these frames; None if they are a message. Whatever else is raised fails the test."""
     try:
-        decode_to_learner(frames)
+        decode_to_learner(frames, ROOM)
     except BadMessage as error:
         return str(error)
     return None

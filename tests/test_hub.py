@@ -1,4 +1,4 @@
-"""The shell round the roster, over a link and a clock that are not real: when silence counts."""
+"""The shell round the roster, over a link and a clock that are not real: when silence counts, and what is sent."""
 
 from __future__ import annotations
 
@@ -6,13 +6,17 @@ import logging
 from collections.abc import Iterator, Sequence
 from typing import cast
 
+import numpy as np
 import pytest
 
 from learner.hub import AWAY_S, POLL_S, PULSE_S, Hub
 from learner.roster import Roster
-from protocol.codec import Buffer
+from protocol.codec import Buffer, decode_to_worker
+from protocol.errors import RunError
 from protocol.link import LearnerLink
-from protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello, ToLearner
+from protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello, ToLearner, Weights
+from protocol.precision import WeightsDtype, widened
+from protocol.rollout import rollout_bytes
 from tests.fakes import run_spec
 
 WORKER_TIMEOUT_S = 3.0
@@ -25,6 +29,8 @@ class FakeLink:
 
     def __init__(self) -> None:
         self.now = 100.0
+        self.room = 0
+        self.sent: list[Sequence[Buffer]] = []
         self.inbox: list[tuple[bytes, ToLearner]] = []
 
     def poll(self, timeout_s: float) -> bool:
@@ -37,13 +43,14 @@ class FakeLink:
             yield self.inbox.pop(0)
 
     def send(self, peer: bytes, frames: Sequence[Buffer]) -> bool:
+        self.sent.append(frames)
         return True
 
     def why_not(self, peer: bytes) -> str:
         return ""
 
 
-def hub_with_a_worker() -> tuple[FakeLink, Hub, Heartbeat]:
+def hub_with_a_worker(weights_dtype: WeightsDtype = "float32") -> tuple[FakeLink, Hub, Heartbeat]:
     link = FakeLink()
     roster = Roster(run_spec(lanes=1), rollouts_per_update=1, max_lag=0, worker_timeout_s=WORKER_TIMEOUT_S, first_session=1)
     hub = Hub(
@@ -52,6 +59,7 @@ def hub_with_a_worker() -> tuple[FakeLink, Hub, Heartbeat]:
         no_workers_timeout_s=60.0,
         stall_timeout_s=600.0,
         max_env_failures=0,
+        weights_dtype=weights_dtype,
         clock=lambda: link.now,
     )
     link.inbox.append((b"w0", Hello(PROTOCOL_VERSION, "w0", "host", 1, 1, "fake", 1)))
@@ -64,6 +72,37 @@ def listen(hub: Hub, link: FakeLink, seconds: float) -> None:
     while link.now < until_s:
         hub.pulse()
         link.now += POLL_S
+
+
+def test_a_message_may_unpack_to_a_rollout_of_the_run_and_no_more() -> None:
+    link, hub, _ = hub_with_a_worker()
+    assert link.room == rollout_bytes(hub.roster.run) > 0
+
+
+@pytest.mark.parametrize(("dtype", "sent"), [("float32", "<f4"), ("bfloat16", "<u2"), ("float16", "<f2")])
+def test_weights_are_rounded_and_encoded_once_for_all_workers(dtype: WeightsDtype, sent: str) -> None:
+    link, hub, _ = hub_with_a_worker(dtype)
+    link.inbox.append((b"w1", Hello(PROTOCOL_VERSION, "w1", "host", 2, 2, "fake", 1)))
+    hub.wait_for(2)
+    parameters = np.array([1.00001, -2.0], np.float32)
+    link.sent.clear()
+    hub.publish(0, parameters, np.zeros(0, np.float32))
+    first, second = (frames for frames in link.sent if len(frames) > 1)
+    assert first is second
+    weights = decode_to_worker(first)
+    assert isinstance(weights, Weights)
+    assert weights.parameters.dtype.str == sent
+    assert (
+        widened(weights.parameters).tobytes() == (parameters if sent == "<f4" else np.array([1, -2], np.float32)).tobytes()
+    )
+
+
+def test_weights_that_do_not_fit_are_not_published() -> None:
+    link, hub, _ = hub_with_a_worker("float16")
+    link.sent.clear()
+    with pytest.raises(RunError, match="weights_dtype float16: parameter 1 expected less than 65520"):
+        hub.publish(0, np.array([1, -70_000], np.float32), np.zeros(0, np.float32))
+    assert (hub.roster.version, link.sent) == (-1, [])
 
 
 def test_a_silent_worker_is_given_up_while_the_learner_listens() -> None:

@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import zmq
@@ -45,6 +46,7 @@ from protocol.messages import (
     Weights,
     Welcome,
 )
+from protocol.packing import Packing
 from protocol.plain import pack
 from tests.fakes import fake_rollout, run_spec
 
@@ -162,6 +164,34 @@ def joined(learner: LearnerLink, worker: WorkerLink) -> None:
 
 
 # -------------------------------------------------------------------- both directions
+
+
+def frame_stacks() -> Rollout:
+    """A rollout whose observations are frame stacks [33, 1, 4, 50, 50], larger than what is copied when it is received."""
+    frames = np.random.default_rng(0).integers(0, 256, (36, 50, 50), dtype=np.uint8)
+    obs = np.stack([frames[t : t + 4] for t in range(33)])[:, None]
+    return msgspec.structs.replace(fake_rollout(1, 2, 3, 4, 5), obs=(obs,))
+
+
+def test_a_packed_rollout_arrives_whole_where_there_is_room_for_it(ends: Ends) -> None:
+    learner, rollout = ends.learner(), frame_stacks()
+    worker = ends.worker(learner)
+    frames = encode(rollout, Packing(stack=True))
+    worker.send(frames)
+    ((_, error),) = heard(learner)
+    assert isinstance(error, BadMessage)
+    learner.room = rollout.obs[0].nbytes
+    before = learner.received.bytes
+    worker.send(frames)
+    ((_, back),) = heard(learner)
+    assert same(back, rollout)
+    assert COPY_BELOW_BYTES < learner.received.bytes - before < 0.3 * rollout.obs[0].nbytes
+
+
+def test_what_leaves_the_machine_or_is_encrypted_is_packed(ends: Ends) -> None:
+    assert ends.worker(ends.learner()).packing == Packing(stack=False)
+    assert ends.worker("tcp://192.0.2.1:5555", "w1").packing == Packing(stack=True)
+    assert ends.worker("tcp://localhost:9", "w2").packing == Packing(stack=False)
 
 
 def test_every_message_to_a_learner_arrives_in_order_with_its_sender(ends: Ends) -> None:

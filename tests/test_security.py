@@ -243,6 +243,12 @@ def test_a_refused_key_is_counted_once_by_zap_alone() -> None:
 # ---------------------------------------------------------------- the handshake
 
 
+def test_what_is_encrypted_is_packed_even_on_this_machine(net: Net) -> None:
+    learner = net.keyed()
+    assert net.worker(learner, token()).packing.stack
+    assert not net.worker(learner, None, "w1").packing.stack
+
+
 def test_who_has_a_token_is_heard_and_answered(net: Net) -> None:
     learner = net.keyed()
     worker = net.worker(learner, token(), "wörker")

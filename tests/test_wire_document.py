@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from learner import membership, roster, standing
-from protocol import codec, handshake, link, messages, rollout, specs
+from protocol import codec, handshake, link, messages, packing, rollout, specs
 from protocol.messages import PROTOCOL_VERSION, Collect, Permit, Received, Rollout, ToLearner, ToWorker, Weights
 from workers import session, states
 
@@ -83,6 +83,8 @@ LIMITS: Mapping[tuple[ModuleType, str], str] = {
     (codec, "MAX_FRAME_BYTES"): "bytes of any one frame: the connection is closed before more is read",
     (codec, "MAX_ITEMS"): "items of any list or map in the head",
     (codec, "MAX_DIMENSIONS"): "dimensions of an array",
+    (packing, "MAX_STACK"): "frames of a stack that travels packed",
+    (packing, "LEAST_FRAME_BYTES"): "bytes of a frame of such a stack, at least",
     (session, "HELLO_FIRST_S"): "seconds from the first Hello to the second; each wait is twice the last",
     (session, "HELLO_MOST_S"): "seconds between two Hello at most",
     (session, "REMEMBERED_TICKETS"): "finished tickets of a lane that a worker remembers, to know a late repeat",
@@ -261,7 +263,7 @@ def test_every_record_that_travels_is_described() -> None:
 
 
 def test_every_limit_is_in_the_document() -> None:
-    for module in (codec, link, session, roster, messages, rollout, specs):
+    for module in (codec, link, packing, session, roster, messages, rollout, specs):
         for name in re.findall(r"^(MAX_\w+) = ", inspect.getsource(module), re.MULTILINE):
             assert (module, name) in LIMITS, f"say in LIMITS what {name} bounds"
 

@@ -14,6 +14,7 @@ import socket
 import time
 import traceback
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from protocol.errors import BadMessage, OurError
 from protocol.link import WorkerLink
 from protocol.messages import Order, Stepped, Weights
 from protocol.policy import make_policy
+from protocol.precision import widened
 from protocol.shared import Handed
 from protocol.specs import Code, RunSpec, StepSpec
 from workers.breath import Breath
@@ -78,6 +80,7 @@ class Worker:
         self._collector: Collector | None = None
         self._stepper: Stepper | None = None
         self._loaded: Weights | None = None
+        self._packing = link.packing
         self._pulse_due_s = 0.0
         self._left: Leave | None = None
         self._breath = Breath(lambda: self._do(self._session.breathe(self._clock())))
@@ -131,7 +134,7 @@ class Worker:
 
         try:
             if self._loaded is not task.weights:
-                collector.load(task.weights.parameters, task.weights.buffers)
+                collector.load(widened(task.weights.parameters), task.weights.buffers)
                 self._loaded = task.weights
             rollouts = collector.collect(task.assignments, task.weights.version, task.session, pulse)
         except _Abandoned:
@@ -211,7 +214,7 @@ class Worker:
         for effect in effects:
             match effect:
                 case Say(message):
-                    self._link.send(encode(message))
+                    self._link.send(encode(message, self._packing))
                 case Begin(run):
                     self._begin(run)
                 case Close(lanes):
@@ -231,6 +234,7 @@ class Worker:
             match run:
                 case RunSpec():
                     self._collector = self._make_collector(run)
+                    self._packing = replace(self._link.packing, zstd=run.compress == "zstd")
                 case StepSpec():
                     self._stepper = Stepper(run, self._handed, private=self._code is not Code.REGISTERED)
                     self._breath.start()

@@ -8,10 +8,16 @@ import time
 from pathlib import Path
 from typing import Any
 
+import gymnasium
+import numpy as np
 import pytest
+from gymnasium import spaces
+from gymnasium.wrappers import FrameStackObservation, TransformObservation
 
+import millrace
 from learner.config import resolve
 from millrace.launch.local import train
+from protocol import packing
 from tests.system.processes import START_S, Learner, Stage, crowding
 from tests.system.runs import accounted
 
@@ -110,3 +116,29 @@ def test_a_run_on_this_machine_over_sealed_tcp_learns_the_same(tmp_path: Path) -
         policies.append((train(config, None, lambda progress: None) / "policy.safetensors").read_bytes())
     assert policies[0] == policies[1]
     assert not (tmp_path / "keys").exists()
+
+
+def test_frame_stacks_that_travel_packed_teach_what_those_do_that_lie_as_they_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Over an encrypted connection they are packed, between processes of this machine not; the weights are the same bits."""
+
+    def stacks() -> gymnasium.Env[Any, Any]:
+        frames = gymnasium.make("workers.envs.toy:Frames-v0")
+        small = TransformObservation(frames, lambda frame: frame[:40, :40, 0], spaces.Box(0, 255, (40, 40), np.uint8))
+        return FrameStackObservation(small, 4)
+
+    settings: dict[str, Any] = {"workers": 1, "lanes": 2, "envs": 4, "rollout_steps": 60, "steps": 480, "n_epochs": 1}
+    over: list[dict[str, Any]] = [{"transport": "ipc"}, {"transport": "tcp", "keys": str(tmp_path / "keys")}]
+    policies, unpacked, unstacked = [], list[object](), packing.unstacked
+
+    def unstacking(payload: Any, dtype: Any, shape: Any) -> Any:
+        unpacked.append(shape)
+        return unstacked(payload, dtype, shape)
+
+    monkeypatch.setattr(packing, "unstacked", unstacking)
+    for number, way in enumerate(over):
+        folder = millrace.train(stacks, run_dir=str(tmp_path / f"runs{number}"), eval_episodes=1, **settings, **way)
+        policies.append((folder / "policy.safetensors").read_bytes())
+        assert unpacked == [[61, 2, 4, 40, 40]] * 6 * number
+    assert policies[0] == policies[1]

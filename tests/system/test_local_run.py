@@ -22,7 +22,7 @@ from learner.config import Config, resolve
 from learner.evaluate import load_policy
 from learner.metrics import Progress, read_rows
 from millrace.launch.local import train
-from protocol.errors import EnvironmentFailed, NoWorkers, Stalled, UsageError
+from protocol.errors import EnvironmentFailed, NoWorkers, RunError, Stalled, UsageError
 
 SMALL: dict[str, Any] = {"n_epochs": 2, "eval_episodes": 2}  # what is shown here does not hang on learning much
 
@@ -67,6 +67,39 @@ def test_the_same_curve_whatever_the_number_of_workers(tmp_path: Path, env: str,
     assert not different
     other = run(tmp_path, env, seed=4, workers=2, eval_episodes=1, **settings)
     assert (other / "policy.safetensors").read_bytes() != policies[1, "inproc"], "the seed changes nothing"
+
+
+def test_compressed_rollouts_change_nothing_but_their_bytes(tmp_path: Path) -> None:
+    settings: dict[str, Any] = {"steps": 2_000, "rollout_steps": 64, "seed": 3, "eval_episodes": 1}
+    plain, compressed = (run(tmp_path, "CartPole-v1", compress=compress, **settings) for compress in ("none", "zstd"))
+    assert (plain / "policy.safetensors").read_bytes() == (compressed / "policy.safetensors").read_bytes()
+    assert Config.from_toml((compressed / "config.toml").read_text()).compress == "zstd"
+
+
+def test_a_learner_that_cannot_decompress_does_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "zstandard", None)
+    with pytest.raises(UsageError, match=r"needs the package zstandard, .* pip install 'millrace\[compress\]'"):
+        run(tmp_path, "CartPole-v1", compress="zstd", steps=1_000)
+    assert not list(tmp_path.glob("runs*"))
+
+
+def test_a_run_whose_weights_travel_rounded_learns(tmp_path: Path) -> None:
+    """It learns what it learns from exact weights, of which it is not: another run."""
+    settings: dict[str, Any] = {"steps": 12_000, "seed": 3, "eval_episodes": 5, "learning_rate": 0.003, "rollout_steps": 64}
+    env = "workers.envs.toy:Identity-v0"
+    folders = {dtype: run(tmp_path, env, weights_dtype=dtype, **settings) for dtype in ("float32", "bfloat16", "float16")}
+    for folder in folders.values():
+        assert summary(folder)["evaluation"]["return_mean"] == 10
+        assert summary(folder)["return_mean_100"] > 8  # 2.5 at random
+    assert len({(folder / "policy.safetensors").read_bytes() for folder in folders.values()}) == 3
+
+
+def test_a_run_ends_when_its_weights_do_not_fit(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="weights_dtype float16: parameter"):
+        run(tmp_path, "CartPole-v1", weights_dtype="float16", steps=5_000, learning_rate=1e6, max_grad_norm=1e9)
+    (folder,) = tmp_path.glob("runs*/*")
+    assert "weights_dtype float16" in summary(folder)["stop_reason"]
+    assert list((folder / "checkpoints").iterdir())
 
 
 @pytest.mark.parametrize("max_lag", [0, 1, 4])
