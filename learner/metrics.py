@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import errno
 import io
+import math
 import os
 import socket
 import time
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,8 @@ from protocol.rollout import Episode
 
 WINDOW = 100
 X = "time/total_timesteps"
+EVENTS_EVERY_S = 0.2  # a fast run makes a hundred updates in that time, and an event takes as long as a small minibatch
+Row = Mapping[str, float | None]
 
 
 class Progress(msgspec.Struct, frozen=True, kw_only=True):
@@ -127,9 +130,10 @@ class EpisodeWindow:
 
 
 class MetricsLog:
-    """The two files that rows go to. `from_env_steps`: rows beyond it, of a run that is resumed, are taken back."""
+    """The two files that rows go to: all to the table; to TensorBoard's those a while apart, evaluations, and the last."""
 
-    def __init__(self, folder: Path, from_env_steps: int = 0) -> None:
+    def __init__(self, folder: Path, from_env_steps: int = 0, clock: Callable[[], float] = time.monotonic) -> None:
+        """`from_env_steps`: rows beyond it, of a run that is resumed, are taken back."""
         table = folder / "metrics.jsonl"
         if table.exists():
             kept = [row for row in read_rows(table) if (row.get(X) or 0) <= from_env_steps]
@@ -138,15 +142,27 @@ class MetricsLog:
         events.parent.mkdir(exist_ok=True)
         self._table, self._events = _Appender(table), _Appender(events)
         self._events.append(_first_event(from_env_steps))
+        self._clock, self._told_s = clock, -math.inf
+        self._untold: tuple[Row, int] | None = None
 
     def write(self, progress: Progress, train: Mapping[str, float]) -> None:
         """Add a row. Raises `RunError` in one line when the disk does not take it; what is there stays readable."""
         row = progress.row(train)
         self._table.append(_line(row))
-        self._events.append(_event(row, progress.env_steps))
+        self._untold = row, progress.env_steps
+        if self._clock() - self._told_s >= EVENTS_EVERY_S or any(name.startswith("eval/") for name in row):
+            self._tell()
+
+    def _tell(self) -> None:
+        if self._untold is not None:
+            untold, self._untold = self._untold, None
+            self._told_s = self._clock()
+            self._events.append(_event(*untold))
 
     def close(self) -> None:
         """Close both."""
+        with suppress(RunError):  # the table has it
+            self._tell()
         self._table.close()
         self._events.close()
 
@@ -179,11 +195,11 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     return [msgspec.json.decode(line, type=dict[str, Any]) for line in lines if line.endswith(b"\n")]
 
 
-def _line(row: Mapping[str, float | None]) -> bytes:
+def _line(row: Row) -> bytes:
     return msgspec.json.encode(row) + b"\n"
 
 
-def _event(row: Mapping[str, float | None], env_steps: int) -> bytes:
+def _event(row: Row, env_steps: int) -> bytes:
     from tensorboard.compat.proto.event_pb2 import Event
     from tensorboard.compat.proto.summary_pb2 import Summary
 

@@ -1,6 +1,7 @@
 """The run folder and what stands in it: whole files, the same bytes for the same policy, curves that never go back."""
 
 import errno
+import itertools
 import json
 import os
 from pathlib import Path
@@ -10,7 +11,7 @@ import pytest
 from gymnasium import spaces
 
 from learner.config import Config, resolve
-from learner.metrics import EpisodeWindow, Evaluation, MetricsLog, Progress, read_rows
+from learner.metrics import EVENTS_EVERY_S, EpisodeWindow, Evaluation, MetricsLog, Progress, read_rows
 from learner.run_folder import RunFolder, Summary, sanitised
 from protocol.errors import RunError, UsageError
 from protocol.policy import buffer_size, layout, size
@@ -180,14 +181,26 @@ def scalars(folder: Path, name: str) -> list[tuple[int, float]]:
     return [(event.step, event.value) for event in events.Scalars(name)]
 
 
+def test_tensorboard_gets_rows_a_while_apart_and_evaluations_and_the_last(tmp_path: Path) -> None:
+    now = 0.0
+    log = MetricsLog(tmp_path, clock=lambda: now)
+    for number in range(1, 26):
+        log.write(Progress(env_steps=number, return_mean=1.0), {"eval/mean_reward": 9.0} if number == 7 else {})
+        now += EVENTS_EVERY_S / 10
+    log.close()
+    assert [row["time/total_timesteps"] for row in read_rows(tmp_path / "metrics.jsonl")] == list(range(1, 26))
+    assert scalars(tmp_path, "rollout/ep_rew_mean") == [(number, 1.0) for number in (1, 7, 17, 25)]
+
+
 def test_a_resumed_run_takes_back_what_its_checkpoint_does_not_know(tmp_path: Path) -> None:
-    log = MetricsLog(tmp_path)
+    seconds = itertools.count()
+    log = MetricsLog(tmp_path, clock=lambda: next(seconds))
     for steps in (100, 200, 300, 400):
         log.write(Progress(env_steps=steps, return_mean=1.0), {})
     log.close()
     with (tmp_path / "metrics.jsonl").open("ab") as file:
         file.write(b'{"time/total_timesteps": 50')  # killed in mid-row
-    log = MetricsLog(tmp_path, from_env_steps=200)
+    log = MetricsLog(tmp_path, from_env_steps=200, clock=lambda: next(seconds))
     for steps in (250, 350):
         log.write(Progress(env_steps=steps, return_mean=2.0), {})
     log.close()
