@@ -42,7 +42,7 @@ assert sys.byteorder == "little", "millrace sends arrays as they lie in memory a
 def encode(message: ToLearner | Inquire | ToWorker | ToObserver, packing: Packing | None = None) -> list[Buffer]:
     """Frames of a message. Arrays are not copied: do not change them afterwards. `packing`: for those of a rollout."""
     frames: list[Buffer] = [b""]
-    packs = packing is not None and isinstance(message, Rollout)
+    packing = packing if isinstance(message, Rollout) else None
 
     def hook(value: object) -> object:
         if not isinstance(value, np.ndarray):
@@ -50,12 +50,12 @@ def encode(message: ToLearner | Inquire | ToWorker | ToObserver, packing: Packin
         if value.dtype.str not in DTYPES:
             raise TypeError(f"{type(message).__name__} cannot carry an array of {value.dtype}")
         described: list[object] = [value.dtype.str, list(value.shape), len(frames)]
-        if packs and packing is not None:
-            frame, packings = packing.of(value)
-            frames.append(frame)
-            return [*described, packings] if packings else described
-        frames.append(as_it_lies(value))
-        return described
+        if packing is None:
+            frames.append(as_it_lies(value))
+            return described
+        frame, packings = packing.of(value)
+        frames.append(frame)
+        return [*described, packings] if packings else described
 
     head = msgpack.packb(msgspec.to_builtins(message, enc_hook=hook, builtin_types=(bytes,)))
     if len(head) > MAX_HEAD_BYTES:
@@ -102,8 +102,10 @@ def _decode(frames: Sequence[Buffer], kind: Any, room: int = 0) -> Any:
         frame = frames[index]
         if packings is not None:
             taken += size
-            if taken > min(room, MAX_FRAME_BYTES) or not room:
-                raise BadMessage(f"packed arrays expected at most {min(room, MAX_FRAME_BYTES)} bytes together, got {taken}")
+            if taken > room or not room:
+                raise BadMessage(f"packed arrays expected at most {room} bytes together, got {taken}")
+            if size > MAX_FRAME_BYTES:
+                raise BadMessage(f"packed array expected at most {MAX_FRAME_BYTES} bytes, got {size}")
             return unpacked(frame, packings, dtype, shape)
         if size != len(frame):
             raise BadMessage(f"array {dtype.str}{shape} expected {size} bytes, got {len(frame)}")

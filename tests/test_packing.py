@@ -18,7 +18,7 @@ from gymnasium.wrappers import FrameStackObservation
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.codec import decode_to_learner, decode_to_worker, encode
+from protocol.codec import MAX_FRAME_BYTES, decode_to_learner, decode_to_worker, encode
 from protocol.errors import BadMessage
 from protocol.packing import Packing, stacked, unpacked, unstacked, why_no_zstd
 from protocol.rollout import Rollout, rollout_bytes
@@ -219,6 +219,14 @@ def test_packed_arrays_share_the_room() -> None:
     assert decode_to_learner(frames, 2 * 8704)
     with pytest.raises(BadMessage, match="packed arrays expected at most 17407 bytes together, got 17408"):
         decode_to_learner(frames, 2 * 8704 - 1)
+
+
+def test_a_packed_array_is_no_larger_than_a_frame_may_be() -> None:
+    frames = sent(a_rollout())
+    head = msgspec.msgpack.decode(frames[0])
+    head["obs"][0][1] = [2**16, 2**4, 16, 8, 9]
+    with pytest.raises(BadMessage, match=f"packed array expected at most {MAX_FRAME_BYTES} bytes, got {2**27 * 9}"):
+        decode_to_learner([msgspec.msgpack.encode(head), *frames[1:]], 2**40)
 
 
 def test_a_frame_is_not_unpacked_twice() -> None:
