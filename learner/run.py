@@ -31,6 +31,7 @@ from learner.train import train
 from protocol.errors import UsageError
 from protocol.link import LearnerLink
 from protocol.native import check_native
+from protocol.pool import check_pool
 from protocol.spaces import action_spec, observation_leaves
 from protocol.specs import EnvSpec, RunSpec
 
@@ -138,8 +139,11 @@ def run_spec(config: Config, env: EnvSpec) -> RunSpec:
             _check_whole_episodes(config, copy.spec.max_episode_steps if copy.spec else None)
     finally:
         copy.close()
-    if config.vector == "native":
-        check_native(env, observation, action)
+    match vector := "loop" if config.vector == "auto" else config.vector:
+        case "native":
+            check_native(env, observation, action)
+        case "envpool":
+            check_pool(env, observation, action)
     return RunSpec(
         env=env,
         policy=policy,
@@ -147,7 +151,7 @@ def run_spec(config: Config, env: EnvSpec) -> RunSpec:
         copies=config.envs // config.lanes,
         lanes=config.lanes,
         seed=config.seed,
-        vector="native" if config.vector == "native" else "loop",
+        vector=vector,
         heartbeat_s=config.heartbeat_s,
     )
 
