@@ -70,11 +70,11 @@ class Case(NamedTuple):
 CASES = (
     Case(CARTPOLE, 64, (*BARE, *OURS), share=0.85),
     Case(CARTPOLE, 8, (*BARE, *OURS), share=0.75),
-    Case(EnvSpec("HalfCheetah-v5"), 8, (*BARE, *OURS), share=0.92),
+    Case(EnvSpec("HalfCheetah-v5"), 8, (*BARE, *OURS, *POOL), share=0.92),
     Case(FRAMES, 16, (*BARE, *OURS, "no network, 1 lane"), share=0.9),
     Case(PONG, 16, (*BARE, *OURS, "no network, 1 lane", *NATIVE, *POOL), share=0.9),
     Case(CARTPOLE, 64, (*NATIVE, *POOL), rate=1_500_000),
-    Case(CARTPOLE, 512, ("bare, native", "native, 4 lanes", "native, 1 lane"), rate=1_500_000),
+    Case(CARTPOLE, 512, ("bare, native", "native, 4 lanes", "native, 1 lane", *POOL), rate=1_500_000),
 )
 
 Turn = Callable[[], int]  # steps copies once or a few times -> env steps

@@ -1,7 +1,8 @@
 """Atari games as Mnih et al. (2015) show them to a network: each fourth screen, grey, 84 × 84, the last four of them.
 
-The law: one screen stack [4, 84, 84], whoever steps the game; a game alone, the emulator's own vectorised form and envpool
-differ in nothing but their random numbers. Up to 30 steps without an action begin an episode; rewards are the game's own.
+The law: one stack of screens [4, 84, 84], whoever steps the game. A game alone, the emulator's vectorised form and envpool
+differ in nothing but their random numbers, and in what stands before an episode's first screen (nothing; envpool repeats
+it). Up to 30 screens without an action begin an episode; rewards are the game's own.
 """
 
 from __future__ import annotations
