@@ -5,7 +5,8 @@ T = 128 steps are stored with their log-probabilities, episodes are counted. The
 nothing and resets at an episode's end. It comes in two kinds. `sampled`, the one that counts, is `gymnasium.make` as it
 comes and `action_space.sample()`, as the field measures it. `drawn` is the fastest that a loop over these copies can be:
 gymnasium's checker left out, as we leave it out, and all actions drawn beforehand. `native` is an environment's own
-vectorised form, bare and as a lane; `no network` is ours with a policy that does not look: storing and stepping alone.
+vectorised form, `envpool` envpool's, bare and as a lane; `no network` is ours with a policy that does not look: storing and
+stepping alone. What is not installed is left out.
 
 All contenders of a case take turns, one pair of processes at a time, one thread each; medians of rounds. On a machine that
 does other work too, `--cpu` counts seconds of CPU, which that work does not take away.
@@ -23,8 +24,9 @@ import multiprocessing
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
+from importlib.util import find_spec
 from multiprocessing.connection import Connection
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -37,6 +39,7 @@ from protocol.distributions import distribution
 from protocol.errors import UsageError
 from protocol.native import make_native
 from protocol.policy import Policy, buffer_size, layout, make_policy, size
+from protocol.pool import pool_of
 from protocol.spaces import action_spec, observation_leaves
 from protocol.specs import EnvSpec, PolicySpec, RunSpec
 from workers.collector import Collector
@@ -45,8 +48,10 @@ from workers.session import Assignment
 PROCESSES = 2
 STEPS = 128  # T
 CARTPOLE, FRAMES = EnvSpec("CartPole-v1"), EnvSpec("benchmarks.frames:Frames-v0")
+PONG = EnvSpec("workers.envs:millrace/Atari-v0")  # the module, because the bare loop asks gymnasium alone
 BARE = ("bare, sampled", "bare, drawn")
 OURS = ("ours, 2 lanes", "ours, 1 lane")
+NATIVE, POOL = ("bare, native", "native, 1 lane"), ("bare, envpool", "envpool, 1 lane")
 
 
 class Case(NamedTuple):
@@ -65,10 +70,11 @@ class Case(NamedTuple):
 CASES = (
     Case(CARTPOLE, 64, (*BARE, *OURS), share=0.85),
     Case(CARTPOLE, 8, (*BARE, *OURS), share=0.75),
-    Case(EnvSpec("HalfCheetah-v5"), 8, (*BARE, *OURS), share=0.92),
+    Case(EnvSpec("HalfCheetah-v5"), 8, (*BARE, *OURS, *POOL), share=0.92),
     Case(FRAMES, 16, (*BARE, *OURS, "no network, 1 lane"), share=0.9),
-    Case(CARTPOLE, 64, ("bare, native", "native, 1 lane"), rate=1_500_000),
-    Case(CARTPOLE, 512, ("bare, native", "native, 4 lanes", "native, 1 lane"), rate=1_500_000),
+    Case(PONG, 16, (*BARE, *OURS, "no network, 1 lane", *NATIVE, *POOL), share=0.9),
+    Case(CARTPOLE, 64, (*NATIVE, *POOL), rate=1_500_000),
+    Case(CARTPOLE, 512, ("bare, native", "native, 4 lanes", "native, 1 lane", *POOL), rate=1_500_000),
 )
 
 Turn = Callable[[], int]  # steps copies once or a few times -> env steps
@@ -108,10 +114,14 @@ def bare_drawn(spec: EnvSpec, copies: int, number: int) -> Turn:
     return turn
 
 
-def bare_native(spec: EnvSpec, copies: int, number: int) -> Turn:
-    """The environment's own vectorised form, with actions drawn beforehand; a step in which a copy only resets is none."""
-    env = make_native(spec, copies)
-    env.reset(seed=number)
+def bare_vector(kind: str, spec: EnvSpec, copies: int, number: int) -> Turn:
+    """A vectorised form, with actions drawn beforehand; a step in which a copy only resets is none."""
+    if kind == "native":
+        env = make_native(spec, copies)
+        env.reset(seed=number)
+    else:
+        env = pool_of(spec).make(range(number * copies, (number + 1) * copies))
+        env.reset()
     rows = _drawn(env.single_action_space, copies, number)
 
     def turn() -> int:
@@ -145,15 +155,11 @@ def ours(kind: str, lanes: int, spec: EnvSpec, copies: int, number: int) -> Turn
     """The collector over `lanes` lanes that share the copies."""
     made = spec.make()
     about = PolicySpec(observation_leaves(made.observation_space), action_spec(made.action_space))
-    run = RunSpec(
-        spec,
-        about,
-        rollout_steps=STEPS,
-        copies=copies // lanes,
-        lanes=PROCESSES * lanes,
-        seed=1,
-        vector="native" if kind == "native" else "loop",
-    )
+    vector: Literal["loop", "native", "envpool"] = "loop"
+    match kind:
+        case "native" | "envpool":
+            vector = kind
+    run = RunSpec(spec, about, rollout_steps=STEPS, copies=copies // lanes, lanes=PROCESSES * lanes, seed=1, vector=vector)
     policy: Policy = Blind(about) if kind == "no network" else make_policy(about)
     if about.needs_torch:
         import torch
@@ -184,8 +190,8 @@ def _make(name: str, env: EnvSpec, copies: int, number: int) -> Turn:
             return bare_sampled(env, copies, number)
         case "bare", "drawn":
             return bare_drawn(env, copies, number)
-        case "bare", "native":
-            return bare_native(env, copies, number)
+        case "bare", kind:
+            return bare_vector(kind, env, copies, number)
         case kind, lanes:
             return ours(kind, int(lanes.split()[0]), env, copies, number)
     raise ValueError(name)
@@ -231,7 +237,8 @@ class Pair:
 
 def collecting(case: Case, rounds: int, seconds: float, *, cpu: bool) -> list[dict[str, object]]:
     """A row for each contender: its rate and its share of the bare loops that take part."""
-    pairs = {name: Pair(name, case.copies, case.env, cpu=cpu) for name in case.contenders}
+    here = [name for name in case.contenders if "envpool" not in name or find_spec("envpool")]
+    pairs = {name: Pair(name, case.copies, case.env, cpu=cpu) for name in here}
     for pair in pairs.values():
         pair.rate(0.2)  # warm up
     turns = [{name: pair.rate(seconds) for name, pair in pairs.items()} for _ in range(rounds)]
@@ -250,22 +257,33 @@ def collecting(case: Case, rounds: int, seconds: float, *, cpu: bool) -> list[di
             "share_of_sampled": share(name, "bare, sampled"),
             "share_of_drawn": share(name, "bare, drawn"),
             "share_of_native": share(name, "bare, native"),
+            "share_of_envpool": share(name, "bare, envpool"),
             "target_share": case.share if name.startswith("ours") else None,
             "target_rate": case.rate if name.startswith("native") else None,
         }
-        for name in case.contenders
+        for name in here
     ]
 
 
 def show(rows: list[dict[str, object]], second: str) -> Table:
     table = Table(title=f"Collecting, {PROCESSES} processes, T = {STEPS}")
-    shares = ("share_of_sampled", "share_of_drawn", "share_of_native")
-    for column in ("", "copies each", "", f"env steps/{second}", "of sampled", "of drawn", "of native", "target"):
+    shares = ("share_of_sampled", "share_of_drawn", "share_of_native", "share_of_envpool")
+    for column in (
+        "",
+        "copies each",
+        "",
+        f"env steps/{second}",
+        "of sampled",
+        "of drawn",
+        "of native",
+        "of envpool",
+        "target",
+    ):
         table.add_column(column, justify="left" if column == "" else "right")
     for row in rows:
         target = f"≥ {row['target_share'] or row['target_rate']:,}" if row["target_share"] or row["target_rate"] else ""
         found = ["" if row[name] is None else f"{row[name]:.2f}" for name in shares]
-        env = str(row["env"]).rpartition(":")[2]
+        env = str(row["env"]).rpartition(":")[2].rpartition("/")[2]
         about = (env, str(row["copies_each"]), str(row["contender"]))
         table.add_row(*about, f"{row['env_steps_per_s']:,}", *found, target)
     return table

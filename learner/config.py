@@ -55,9 +55,9 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """groups into which the env copies are divided; workers share out the lanes, and results do not depend on the workers"""
     max_lag: Natural = 0
     """how many versions old the weights behind a rollout may be; 0 is synchronous"""
-    vector: Literal["auto", "loop", "native"] = "auto"
+    vector: Literal["auto", "loop", "native", "envpool"] = "auto"
     """how a lane's env copies are stepped: one after another (loop), or at once by the environment's own vectorised form
-    (native), with other random numbers; auto is loop, with which the presets' results were made
+    (native) or by envpool's (pip install 'millrace[envpool]'), with other random numbers; auto is loop, wherever it runs
     """
 
     inference: Literal["workers", "learner"] = "workers"
@@ -252,9 +252,9 @@ def checked(config: Config, where: str = "") -> Config:
         raise UsageError(
             f"{at}inference learner: max_lag expected 0, got {config.max_lag}; the policy acts under the newest weights"
         )
-    if config.inference == "learner" and config.vector == "native":
+    if config.inference == "learner" and config.vector not in {"auto", "loop"}:
         raise UsageError(
-            f"{at}inference learner: vector expected auto or loop, got native; its workers step copies one by one"
+            f"{at}inference learner: vector expected auto or loop, got {config.vector}; its workers step copies one by one"
         )
     check_address(config.bind)
     if config.metrics_bind:

@@ -28,6 +28,7 @@ from protocol.errors import UsageError
 from protocol.link import LearnerLink
 from protocol.native import check_native
 from protocol.packing import why_no_zstd
+from protocol.pool import check_pool
 from protocol.spaces import action_spec, observation_leaves
 from protocol.specs import ActionSpec, EnvSpec, Leaf, RunSpec
 
@@ -181,7 +182,6 @@ def run_spec(config: Config, env: EnvSpec, seen: Spaces | None = None) -> RunSpe
 
     if config.compress == "zstd" and (why := why_no_zstd()):
         raise UsageError(why)
-
     observation, action, longest = look_at(env) if seen is None else seen
     policy = ALGORITHMS[config.algo].policy_spec(config.algorithm, observation, action)
     if config.algorithm.encoder is not None:
@@ -191,8 +191,11 @@ def run_spec(config: Config, env: EnvSpec, seen: Spaces | None = None) -> RunSpe
         policy = msgspec.structs.replace(policy, encoder=encoder)
     if getattr(ALGORITHMS[config.algo], "whole_episodes", False):
         _check_whole_episodes(config, longest)
-    if config.vector == "native":
-        check_native(env, observation, action)
+    match vector := "loop" if config.vector == "auto" else config.vector:
+        case "native":
+            check_native(env, observation, action)
+        case "envpool":
+            check_pool(env, observation, action)
     return RunSpec(
         env=env,
         policy=policy,
@@ -200,7 +203,7 @@ def run_spec(config: Config, env: EnvSpec, seen: Spaces | None = None) -> RunSpe
         copies=config.envs // config.lanes,
         lanes=config.lanes,
         seed=config.seed,
-        vector="native" if config.vector == "native" else "loop",
+        vector=vector,
         compress=config.compress,
         heartbeat_s=config.heartbeat_s,
     )

@@ -43,11 +43,29 @@ def check_native(env: EnvSpec, observation: tuple[Leaf, ...], action: ActionSpec
     """Raises `UsageError` unless its vectorised form can stand for copies with these spaces."""
     made = make_native(env, 1)
     try:
-        spaces: tuple[gymnasium.Space[Any], gymnasium.Space[Any]] = made.single_observation_space, made.single_action_space
-        if (observation_leaves(spaces[0]), action_spec(spaces[1])) != (observation, action):
-            raise UsageError(
-                f"environment {env.id}: its vectorised form has other spaces than itself, {spaces[0]} and {spaces[1]}; "
-                "use --vector loop"
-            )
+        check_spaces(
+            env, "its vectorised form", made.single_observation_space, made.single_action_space, observation, action
+        )
     finally:
         made.close()
+
+
+def check_spaces(
+    env: EnvSpec,
+    whose: str,
+    observed: gymnasium.Space[Any],
+    acted: gymnasium.Space[Any],
+    observation: tuple[Leaf, ...],
+    action: ActionSpec,
+) -> None:
+    """Raises `UsageError` unless these spaces of a vectorised form say what one copy says."""
+    if (observation_leaves(observed), action_spec(acted)) != (observation, action):
+        line = f"environment {env.id}: {whose} has other spaces than itself, {observed} and {acted}; {instead_of(env)}"
+        raise UsageError(line)
+
+
+def instead_of(env: EnvSpec) -> str:
+    """What to do where the vectorised form of this id cannot serve."""
+    if env.id.startswith("ALE/"):
+        return f"take millrace/Atari-v0 --env-kwargs game {env.id[4:].partition('-')[0]}, or use --vector loop"
+    return "use --vector loop"

@@ -21,6 +21,7 @@ from torch.nn import functional as F
 from protocol.core import zero_state
 from protocol.distributions import LOG_SQRT_2PI
 from protocol.encoder import make_encoder
+from protocol.heap import keep_freed
 from protocol.policy import (
     Field,
     buffer_fields,
@@ -108,6 +109,8 @@ class FlatNetwork:
         self._encoder = None if spec.encoder is None else self._own(make_encoder(spec, seed).to(device))
         images = [i for i, leaf in enumerate(spec.observation) if leaf.is_image]
         self._images = [] if self._encoder else [self._image(i) for i in images]
+        if spec.needs_torch:
+            keep_freed()
 
     def _own(self, encoder: torch.nn.Module) -> torch.nn.Module:
         """Let the encoder's parameters live where all others do; they keep their first values."""

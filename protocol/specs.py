@@ -6,9 +6,11 @@ agreed to run code (`Code`). Nothing that a worker sends is ever unpickled.
 
 from __future__ import annotations
 
+import importlib
 import traceback
 from collections.abc import Callable
 from enum import Enum
+from importlib.util import find_spec
 from typing import Any, Literal, TypeVar
 
 import gymnasium
@@ -19,7 +21,7 @@ from gymnasium.vector import VectorEnv
 from protocol.errors import UsageError
 from protocol.packing import why_no_zstd
 
-OWN_ENVS = "workers.envs"  # the module that registers millrace/…: gymnasium imports it, as it would a user's own
+REGISTRARS = {"millrace": "workers.envs", "ALE": "ale_py"}  # of a namespace: gymnasium imports them as it would a user's own
 Scalar = bool | int | float | str
 _Made = TypeVar("_Made")
 
@@ -88,10 +90,22 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         own, kwargs = VectorizeMode.VECTOR_ENTRY_POINT, dict[str, Any](self.kwargs)
         return self._made(lambda env_id: gymnasium.make_vec(env_id, copies, own, **kwargs))
 
+    def registered(self) -> gymnasium.envs.registration.EnvSpec:
+        """What gymnasium knows of the id. Raises `UsageError`."""
+
+        def look_up(env_id: str) -> gymnasium.envs.registration.EnvSpec:
+            module, colon, name = env_id.partition(":")
+            if colon:
+                importlib.import_module(module)
+            return gymnasium.spec(name if colon else env_id)
+
+        return self._made(look_up)
+
     def _made(self, make: Callable[[str], _Made]) -> _Made:
         """What `make` makes of the id. Raises `UsageError`."""
+        registrar = REGISTRARS.get(self.id.partition("/")[0])
         try:
-            return make(f"{OWN_ENVS}:{self.id}" if self.id.startswith("millrace/") else self.id)
+            return make(f"{registrar}:{self.id}" if registrar and find_spec(registrar) else self.id)
         except (gymnasium.error.Error, ImportError, TypeError) as error:  # TypeError: keyword arguments it does not take
             raise UsageError(_why_not_made(self.id, error)) from error
         except Exception as error:  # its own constructor raised, whatever that may be
@@ -233,8 +247,10 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
     """N, env copies in a lane"""
     lanes: int
     seed: int
-    vector: Literal["loop", "native"] = "loop"
-    """how the copies of a lane are stepped: one after another, or at once, by the environment's own vectorised form"""
+    vector: Literal["loop", "native", "envpool"] = "loop"
+    """how the copies of a lane are stepped: one after another, or at once, by the environment's own vectorised form or by
+    envpool's
+    """
     compress: Literal["none", "zstd"] = "none"
     """what workers do with the larger arrays of their rollouts, besides what they do anyway"""
     heartbeat_s: float = 1.0

@@ -25,8 +25,8 @@ from tests.test_architecture import imported, sources
 
 ROOT = Path(__file__).parent.parent
 DOCKER = ROOT / "docker"
-# Imported where they are used: for policies that look at images; for key lists; for --compress.
-NOT_FOR_WORKERS = {"torch", "tomli_w", "zstandard"}
+# Imported where they are used: for policies that look at images; for key lists; for --compress; for --vector envpool.
+NOT_FOR_WORKERS = {"torch", "tomli_w", "zstandard", "envpool"}
 
 
 def names(file: Path) -> set[str]:

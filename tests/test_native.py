@@ -163,5 +163,5 @@ def test_what_cannot_be_stepped_at_once_is_refused_in_one_line(env: EnvSpec, why
 def test_where_the_policy_acts_beside_the_learner_copies_are_stepped_one_by_one() -> None:
     with pytest.raises(UsageError, match="inference learner: vector expected auto or loop, got native"):
         resolve("CartPole-v1", vector="native", inference="learner")
-    with pytest.raises(UsageError, match="vector expected one of auto, loop, native, got 'envpool'"):
-        resolve("CartPole-v1", vector="envpool")
+    with pytest.raises(UsageError, match="vector expected one of auto, loop, native, envpool, got 'sync'"):
+        resolve("CartPole-v1", vector="sync")

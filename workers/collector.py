@@ -18,11 +18,13 @@ from protocol.distributions import distribution
 from protocol.errors import EnvironmentFailed
 from protocol.native import make_native
 from protocol.policy import Policy
+from protocol.pool import pool_of
 from protocol.rollout import Rollout
 from protocol.spaces import writer
 from protocol.specs import RunSpec
 from workers.copies import Copies, CopyLoop, CopyRaised, Pulse, VectorCopies
 from workers.lane import EnvironmentBroke, Lane, environment_raised
+from workers.pool import PoolCopies
 from workers.session import Assignment
 
 Array = npt.NDArray[Any]
@@ -35,9 +37,13 @@ Begin = Callable[[Sequence[int], Array, Pulse], None]
 
 def copies_of(run: RunSpec, lane: int, pulse: Pulse) -> Copies:
     """The copies of one lane, as the run says: what a worker opens unless it is told otherwise."""
-    if run.vector == "native":
-        return VectorCopies(make_native(run.env, run.copies))
-    return CopyLoop(run.env.make, run.copies, pulse)
+    match run.vector:
+        case "native":
+            return VectorCopies(make_native(run.env, run.copies))
+        case "envpool":
+            return PoolCopies(pool_of(run.env), run.copies)
+        case "loop":
+            return CopyLoop(run.env.make, run.copies, pulse)
 
 
 def each_by_itself(lanes: Sequence[int], actions: Array, pulse: Pulse) -> None:

@@ -171,13 +171,16 @@ class VectorCopies:
         if len(seeds) != self._env.num_envs:
             raise UsageError(f"vector environment {self._env}: expected {len(seeds)} copies, got {self._env.num_envs}")
         try:
-            try:
-                observation, _ = self._env.reset(seed=list(seeds))  # type: ignore[arg-type]  # most take a list
-            except (gymnasium.error.Error, TypeError):
-                observation, _ = self._env.reset(seed=seeds[0])
+            return self._read(self._first(seeds))
         except Exception as error:
             raise CopyRaised(None, "reset") from error
-        return self._read(observation)
+
+    def _first(self, seeds: Sequence[int]) -> Any:
+        """First observations. Most take a list of seeds, Atari's an array, some one number."""
+        for given in (list(seeds), np.array(seeds)):
+            with suppress(gymnasium.error.Error, TypeError):
+                return self._env.reset(seed=given)[0]  # type: ignore[arg-type]
+        return self._env.reset(seed=seeds[0])[0]
 
     def step(self, actions: Array, pulse: Pulse) -> Row:
         """Step all copies at once."""

@@ -7,3 +7,8 @@ gymnasium.register(
     entry_point="workers.envs.double_pendulum:CartDoublePendulum",
     max_episode_steps=500,
 )
+gymnasium.register(
+    id="millrace/Atari-v0",
+    entry_point="workers.envs.atari:make_game",
+    vector_entry_point="workers.envs.atari:make_games",
+)
