@@ -37,13 +37,13 @@ PEERS = {
     # Declares Python < 3.11 and pins a torch of 2022; its PPO, one file, runs on this Python with this gymnasium.
     "cleanrl": Peer(
         (
-            ("gymnasium==0.29.1", "numpy<2", "tensorboard"),
+            ("gym==0.23.1", "gymnasium==0.29.1", "numpy<2", "pygame-ce", "setuptools<80", "tensorboard"),
             ("--no-deps", "--ignore-requires-python", "cleanrl==1.2.0"),
         )
     ),
     "sample_factory": Peer((("sample-factory==2.1.1", "gymnasium<1.0", "numpy<2"),)),
-    # A source package whose build needs a C++ compiler. NO_OCEAN: without its own environments, whose parts it would fetch from
-    # elsewhere; its setup.py then lacks a name, which the line of Python supplies while it builds.
+    # A source package whose build needs a C++ compiler. NO_OCEAN: without its own environments, whose parts it would fetch
+    # from elsewhere; its setup.py then lacks a name, which the line of Python supplies while it builds.
     "pufferlib": Peer(
         (
             ("numpy<2", "Cython", "setuptools<80", "wheel"),
