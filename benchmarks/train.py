@@ -181,7 +181,7 @@ def main() -> None:
         turns.append(take_turns(names, again, turn + 1))
         rows = summary(names, turns)
         charts = [(column, _bars(rows, column)) for column in (SMALL_RATE, LARGE_RATE, SECONDS)]
-        write("train", {"rows": rows}, charts)  # after each, should a later one not come to its end
+        write("train", {"rows": _plain(rows)}, charts)  # after each, should a later one not come to its end
     console = Console(width=140)
     console.print(table(rows, f"PPO, CartPole-v1, medians of {arguments.rounds} (least to most)"))
     if arguments.peers:
@@ -190,6 +190,19 @@ def main() -> None:
     for said in against(rows):
         console.print(f"{OURS}: {said}")
     console.print(f"aim: {TARGET:g} × the env steps/s of Stable-Baselines3, half of its seconds")
+
+
+def _plain(data: Any) -> Any:
+    """JSON has no NaN."""
+    match data:
+        case dict():
+            return {key: _plain(value) for key, value in data.items()}
+        case list():
+            return [_plain(value) for value in data]
+        case float() if math.isnan(data):
+            return None
+        case _:
+            return data
 
 
 def _bars(rows: list[dict[str, Any]], column: str) -> dict[str, float]:
