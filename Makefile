@@ -5,7 +5,7 @@ BIN := .venv/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: train test lint type unit docs bench test-learning test-cluster soak clean
+.PHONY: train test lint type unit docs bench bench-peers test-learning test-cluster soak clean
 
 train: .venv/installed  ## train CartPole-v1 on two worker processes until a greedy evaluation averages 475
 	$(BIN)/millrace train CartPole-v1 --workers 2 --target-return 475 --eval-episodes 20 --eval-every 5000
@@ -38,6 +38,10 @@ docs: .venv/installed-dev  ## write the generated parts of protocol/README.md
 bench: .venv/installed-dev  ## all benchmarks, a quarter of an hour: tables here, JSON and pictures in benchmarks/results
 	$(BIN)/millrace bench
 
+bench-peers: .venv/installed-dev  ## training beside seven other systems, each in an environment of its own (3 GB); forty minutes
+	$(BIN)/python -m benchmarks.peers.install || true  # what cannot be installed is left out
+	$(BIN)/millrace bench train --peers
+
 .venv/installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit("millrace needs Python 3.11 or newer; set PYTHON=") if sys.version_info < (3, 11) else None'
 	$(PYTHON) -m venv .venv
@@ -49,4 +53,4 @@ bench: .venv/installed-dev  ## all benchmarks, a quarter of an hour: tables here
 	touch $@
 
 clean:
-	rm -rf .venv .cluster .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv .cluster benchmarks/peers/envs .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -16,7 +16,7 @@ import psutil
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.programs import OURS, ZOO, contenders, run
+from benchmarks.programs import CONTENDERS, OURS, ZOO, contenders, run
 from benchmarks.writing import bars, write
 
 STEPS = 20_000
@@ -72,7 +72,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="memory of all processes of a CartPole run")
     parser.add_argument("--rounds", type=int, default=2)
     rounds = parser.parse_args().rounds
-    names = contenders()
+    names = [name for name in contenders() if not CONTENDERS[name].own]
     turns = [{name: measure(name) for name in names} for _ in range(rounds)]
     rows = [
         {

@@ -40,7 +40,9 @@ BENCHMARKS = {
     ),
     "update": Benchmark("update", "updates against the usual style and Stable-Baselines3's", brief=("--rounds", "40")),
     "train": Benchmark(
-        "train", "PPO on CartPole-v1 beside Stable-Baselines3, from the command to solved", brief=("--rounds", "2")
+        "train",
+        "PPO on CartPole-v1 beside Stable-Baselines3, from the command to solved; --peers: beside six systems more",
+        brief=("--rounds", "2"),
     ),
     "wire": Benchmark("wire", "the way of a rollout beside raw ZeroMQ"),
     "scale": Benchmark("scale", "one learner before 10, 100 and 1,000 simulated workers"),

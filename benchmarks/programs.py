@@ -1,13 +1,17 @@
-"""PPO on CartPole-v1 as programs of their own, alike in settings: ours, as the command line makes it, and a peer's.
+"""Training CartPole-v1 as programs of their own, alike in settings: ours, as the command line makes it, and its peers'.
 
 The law: whoever is compared gets the same hyperparameters, one torch thread, and its own process tree from a cold start.
+What a peer cannot be told stands in the first lines of its program, in `benchmarks/peers`.
 """
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import json
+import math
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -16,43 +20,102 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from benchmarks.peers import install
 from learner.metrics import read_rows
+from learner.run_folder import RunFolder
 
 ROOT = Path(__file__).parents[1]
-OURS, DUMMY, SUBPROC = "millrace, 2 workers", "SB3, one process", "SB3, SubprocVecEnv"
-COMMON: dict[str, Any] = {
-    "env": "CartPole-v1",
-    "vf_coef": 0.5,
-    "max_grad_norm": 0.5,
-    "eval_every": 5000,
-    "eval_episodes": 20,
-}
+COMMON: dict[str, Any] = {"env": "CartPole-v1", "eval_every": 5000, "eval_episodes": 20}
+ACTOR_CRITIC = COMMON | {"vf_coef": 0.5, "max_grad_norm": 0.5}
 # RL Zoo's for CartPole-v1, and a large batch. Names are those of our flags.
-ZOO = COMMON | {
-    "envs": 8, "rollout_steps": 32, "batch_size": 256, "n_epochs": 20, "gamma": 0.98, "gae_lambda": 0.8, "ent_coef": 0.0,
-    "learning_rate": 1e-3, "learning_rate_schedule": "linear", "clip_range": 0.2, "clip_range_schedule": "linear",
+ZOO = ACTOR_CRITIC | {
+    "algo": "ppo", "envs": 8, "rollout_steps": 32, "batch_size": 256, "n_epochs": 20, "gamma": 0.98, "gae_lambda": 0.8,
+    "ent_coef": 0.0, "learning_rate": 1e-3, "learning_rate_schedule": "linear", "clip_range": 0.2,
+    "clip_range_schedule": "linear",
 }  # fmt: skip
-LARGE = COMMON | {
-    "envs": 64, "rollout_steps": 128, "batch_size": 2048, "n_epochs": 4, "gamma": 0.99, "gae_lambda": 0.95, "ent_coef": 0.0,
-    "learning_rate": 3e-4, "learning_rate_schedule": "constant", "clip_range": 0.2, "clip_range_schedule": "constant",
+LARGE = ACTOR_CRITIC | {
+    "algo": "ppo", "envs": 64, "rollout_steps": 128, "batch_size": 2048, "n_epochs": 4, "gamma": 0.99, "gae_lambda": 0.95,
+    "ent_coef": 0.0, "learning_rate": 3e-4, "learning_rate_schedule": "constant", "clip_range": 0.2,
+    "clip_range_schedule": "constant",
 }  # fmt: skip
 SETTINGS = {"8 × 32, batch 256, 20 epochs": ZOO, "64 × 128, 4 minibatches, 4 epochs": LARGE}
+# RL Zoo's, too. Its DQN has one copy, trains after 256 steps, and makes a target anew every 10 steps: before each update, in
+# effect, that is, after 128 gradient steps.
+A2C = ACTOR_CRITIC | {
+    "algo": "a2c", "envs": 8, "rollout_steps": 5, "gamma": 0.99, "gae_lambda": 1.0, "ent_coef": 0.0, "learning_rate": 7e-4,
+}  # fmt: skip
+DQN = COMMON | {
+    "algo": "dqn", "envs": 8, "rollout_steps": 32, "gamma": 0.99, "learning_rate": 2.3e-3, "batch_size": 64,
+    "gradient_steps": 128, "learning_starts": 1000, "replay_size": 100_000, "net": [256, 256], "target": "hard",
+    "target_every": 128, "double": False, "epsilon_steps": 8000, "epsilon_end": 0.04, "max_grad_norm": 10.0,
+}  # fmt: skip
 LEAST_S = 0.05  # between two looks at a program that runs
 LONGEST_S = 300.0
+
+
+class Contender(NamedTuple):
+    """A program that is compared."""
+
+    module: str
+    how: str = ""
+    """which of its ways"""
+    peer: str = ""
+    """whose environment it needs; none: this Python's"""
+    most_envs: int = 64
+    """copies that this machine has room for"""
+    own: bool = False
+    """settings of its own instead of those that all have"""
+    flags: tuple[str, ...] = ()
+    """of ours, besides the settings"""
+
+    @property
+    def ours(self) -> bool:
+        """Not a peer."""
+        return self.module == "millrace"
+
+
+OURS, OURS_OWN = "millrace, 2 workers", "millrace, own preset"
+OVERLAPPED, NATIVE = "millrace, --max-lag 1", "millrace, --vector native"
+DUMMY, SUBPROC = "SB3, one process", "SB3, SubprocVecEnv"
+_SB3, _PEERS = "benchmarks.train_stable_baselines3", "benchmarks.peers"
+CONTENDERS = {
+    OURS: Contender("millrace", flags=("--lanes", "2")),
+    OVERLAPPED: Contender("millrace", flags=("--lanes", "2", "--max-lag", "1")),
+    NATIVE: Contender("millrace", flags=("--lanes", "2", "--vector", "native")),
+    OURS_OWN: Contender("millrace", own=True),
+    DUMMY: Contender(_SB3, "one"),
+    SUBPROC: Contender(_SB3, "subproc", most_envs=8),  # a process for each copy
+    "CleanRL": Contender(f"{_PEERS}.cleanrl_ppo", "", "cleanrl"),
+    "Sample Factory, one process": Contender(f"{_PEERS}.sample_factory_ppo", "serial", "sample_factory"),
+    "Sample Factory, 2 workers": Contender(f"{_PEERS}.sample_factory_ppo", "async", "sample_factory"),
+    "Sample Factory, own settings": Contender(f"{_PEERS}.sample_factory_ppo", "own", "sample_factory", own=True),
+    "PufferLib": Contender(f"{_PEERS}.pufferlib_ppo", "", "pufferlib"),
+    "PufferLib, own settings": Contender(f"{_PEERS}.pufferlib_ppo", "own", "pufferlib", own=True),
+    "TorchRL, 2 workers": Contender(f"{_PEERS}.torchrl_ppo", "sync", "torchrl"),
+    "Tianshou": Contender(f"{_PEERS}.tianshou_ppo", "", "tianshou"),
+    "RLlib, 2 runners": Contender(f"{_PEERS}.rllib_ppo", "", "rllib"),
+}
 
 
 class Ran(NamedTuple):
     """What a program did."""
 
-    wall_s: float
-    """from the command to its end"""
+    solved_s: float
+    """from the command until it was known to be solved (ours: until the program's end); NaN if it was not"""
     updates: list[tuple[int, float]]
     """env steps, and seconds by some clock, at the end of each update"""
 
 
-def contenders() -> list[str]:
-    """Those that can be run here."""
-    return [OURS, DUMMY, SUBPROC] if importlib.util.find_spec("stable_baselines3") else [OURS]
+def contenders(peers: bool = False) -> list[str]:
+    """Those that can be run here; of other systems only Stable-Baselines3, unless all `peers` are asked for."""
+    here = ["", *install.installed()] if peers else [""]
+    sb3 = importlib.util.find_spec("stable_baselines3") is not None
+    return [name for name, each in CONTENDERS.items() if each.peer in here and (each.module != _SB3 or sb3)]
+
+
+def missing() -> list[str]:
+    """The peers whose environments are not there."""
+    return [name for name in install.PEERS if name not in install.installed()]
 
 
 def run(
@@ -62,20 +125,21 @@ def run(
     look: Callable[[int], None] = lambda pid: None,
 ) -> Ran:
     """Run it to its end; `look` is called now and then with its pid. With a target it ends as soon as that is reached."""
-    with tempfile.TemporaryDirectory() as folder:
-        ours = contender == OURS
-        command = _ours(settings, target, folder) if ours else _theirs(contender, settings, target)
+    each = CONTENDERS[contender]
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        command = _ours(each, settings, target, folder) if each.ours else _theirs(each, settings, target)
         threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
         path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
         out = Path(folder) / "out"
         with out.open("w") as file:
             began_s = time.monotonic()
             process = subprocess.Popen(
-                [sys.executable, "-m", *command],
+                [str(install.python(each.peer)) if each.peer else sys.executable, "-m", each.module, *command],
                 stdout=file,
                 stderr=subprocess.STDOUT,
                 env=os.environ | threads | {"PYTHONPATH": path},
                 cwd=folder,
+                start_new_session=True,  # so that whatever it leaves can be ended with it
             )
             try:
                 while process.poll() is None and time.monotonic() - began_s < LONGEST_S:
@@ -86,27 +150,51 @@ def run(
                         continue
                 wall_s = time.monotonic() - began_s
             finally:
-                process.kill()
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
         if process.returncode:
             raise RuntimeError(f"{contender} ended with {process.returncode}: {out.read_text()[-500:]}")
-        if ours:
+        if each.ours:
             (table,) = Path(folder).rglob("metrics.jsonl")
-            return Ran(wall_s, [(row["time/total_timesteps"], row["time/time_elapsed"]) for row in read_rows(table)])
-        lines = [json.loads(line) for line in out.read_text().splitlines() if line.startswith('{"env_steps"')]
-        return Ran(wall_s, [(line["env_steps"], line["at_s"]) for line in lines])
+            config = RunFolder.open(table.parent).config()
+            updates = [(int(row["time/total_timesteps"]), row["time/time_elapsed"]) for row in read_rows(table)]
+            early = config.steps - updates[-1][0] > 2 * config.envs * config.algorithm.rollout_steps
+            return Ran(wall_s if early else math.nan, updates)
+        lines = [json.loads(line) for line in out.read_text().splitlines() if line.startswith(('{"env_steps"', '{"solved"'))]
+        solved = [line["at_s"] - began_s for line in lines if "solved" in line]  # one clock for all processes
+        return Ran(
+            solved[0] if solved else math.nan, [(line["env_steps"], line["at_s"]) for line in lines if "env_steps" in line]
+        )
 
 
-def _ours(settings: dict[str, Any], target: float | None, folder: str) -> list[str]:
+def _ours(contender: Contender, settings: dict[str, Any], target: float | None, folder: str) -> list[str]:
     named = {name: value for name, value in settings.items() if name != "env"}
     if target is None:
         named |= {"eval_every": 0, "eval_episodes": 1}
-    flags = [word for name, value in named.items() for word in (f"--{name.replace('_', '-')}", str(value))]
-    until = [] if target is None else ["--target-return", str(target)]
-    return ["millrace", "train", settings["env"], "--preset", "none", "--run-dir", folder, *flags, *until]
+    else:
+        named |= {"target_return": target}
+    if contender.own:
+        named = {
+            name: named[name] for name in ("algo", "seed", "eval_every", "eval_episodes", "target_return") if name in named
+        }
+    else:
+        named |= {"preset": "none"}
+    flags = [word for name, value in named.items() for word in _flag(name, value)]
+    return ["train", settings["env"], "--run-dir", folder, *flags, *contender.flags]
 
 
-def _theirs(contender: str, settings: dict[str, Any], target: float | None) -> list[str]:
+def _flag(name: str, value: Any) -> list[str]:
+    flag = name.replace("_", "-")
+    match value:
+        case bool():
+            return [f"--{flag}" if value else f"--no-{flag}"]
+        case list():
+            return [f"--{flag}", *map(str, value)]
+        case _:
+            return [f"--{flag}", str(value)]
+
+
+def _theirs(contender: Contender, settings: dict[str, Any], target: float | None) -> list[str]:
     until = [] if target is None else ["--target", str(target)]
-    subproc = ["--subproc"] if contender == SUBPROC else []
-    return ["benchmarks.ppo_stable_baselines3", json.dumps(settings), *subproc, *until]
+    return [json.dumps(settings), *(["--how", contender.how] if contender.how else []), *until]

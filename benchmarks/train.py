@@ -1,104 +1,210 @@
-"""PPO on CartPole-v1 beside Stable-Baselines3, with the same hyperparameters: `python -m benchmarks.train`.
+"""CartPole-v1 beside Stable-Baselines3, with the same hyperparameters: `python -m benchmarks.train`.
 
-Env steps/s from the third update on; and seconds from the command (imports, start and evaluations included) until a greedy
-evaluation of 20 episodes, one every 5,000 env steps, averages 475 and the program has ended. Each is a process tree of its
-own, started cold; all take turns. A subprocess for each of 64 copies is more than this machine holds: left out.
+With `--peers` beside all other systems that `python -m benchmarks.peers.install` has installed, with memory, and A2C and DQN
+beside Stable-Baselines3's. Env steps/s are from the third update on. Solved: from the command (imports, start, evaluations)
+until a greedy evaluation of 20 episodes, one every 5,000 env steps, averages 475; for ours until the program has ended,
+too. Each is a process tree of its own, started cold; all take turns. What fails is said and left out.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import statistics
-from typing import Any
+import sys
+from typing import Any, NamedTuple
 
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.programs import SETTINGS, SUBPROC, ZOO, contenders, run
+from benchmarks.memory import Tree
+from benchmarks.programs import A2C, CONTENDERS, DQN, DUMMY, LARGE, OURS, OURS_OWN, SUBPROC, ZOO, contenders, missing, run
 from benchmarks.writing import bars, write
 
 WARM_UP = 2  # updates
 TARGET = 5.0  # times the env steps/s of Stable-Baselines3's best
-SOLVED, MOST_STEPS = 475.0, 150_000
+SOLVED = 475.0
+NAN = math.nan
 
 
-def rate(contender: str, settings: dict[str, Any]) -> float:
+class Measure(NamedTuple):
+    """What is asked of a contender in one turn."""
+
+    column: str
+    settings: dict[str, Any]
+    steps: int
+    kind: str
+    """rate, solved or memory"""
+
+    def fits(self, contender: str) -> bool:
+        """Whether it is asked of this one."""
+        each = CONTENDERS[contender]
+        if self.settings["algo"] != "ppo":
+            among = (OURS, DUMMY, SUBPROC) if self.settings["algo"] == "a2c" else (OURS, DUMMY)
+            return contender in among or (contender == OURS_OWN and self.kind == "solved")
+        if contender == OURS_OWN:
+            return False  # the preset of PPO has the same settings
+        return self.settings["envs"] <= each.most_envs and not (each.own and self.settings is LARGE)
+
+    def of(self, contender: str, seed: int) -> dict[str, float]:
+        """One figure or two. Raises `RuntimeError`."""
+        settings = self.settings | {"steps": self.steps, "seed": seed}
+        match self.kind:
+            case "rate":
+                return {self.column: _rate(run(contender, settings).updates)}
+            case "memory":
+                tree = Tree()
+                run(contender, settings, look=tree.look)
+                return {self.column: tree.own}
+            case _:
+                ran = run(contender, settings, SOLVED)
+                steps = NAN if math.isnan(ran.solved_s) else ran.updates[-1][0]
+                return {self.column: ran.solved_s, f"{self.column}, env steps": steps}
+
+
+def _rate(updates: list[tuple[int, float]]) -> float:
     """Env steps/s."""
-    updates = run(contender, settings).updates
     (first, began_s), (last, ended_s) = updates[WARM_UP], updates[-1]
     return (last - first) / (ended_s - began_s)
 
 
-def speeds(name: str, steps: int, rounds: int) -> list[dict[str, object]]:
-    """A row for each contender with these settings."""
-    settings = SETTINGS[name]
-    names = [one for one in contenders() if one != SUBPROC or settings["envs"] <= 8]
-    turns = [{one: rate(one, settings | {"steps": steps, "seed": turn + 1}) for one in names} for turn in range(rounds)]
+SMALL_RATE, LARGE_RATE = "env steps/s, 8 × 32", "env steps/s, 64 × 128"
+SECONDS, MEMORY = "solved, s", "memory, MB"
+PPO_MEASURES = [
+    Measure(SMALL_RATE, ZOO, 16_000, "rate"),
+    Measure(LARGE_RATE, LARGE, 66_000, "rate"),
+    Measure(SECONDS, ZOO, 150_000, "solved"),
+]
+PEERS_MEASURES = [
+    Measure(MEMORY, ZOO, 6_000, "memory"),
+    Measure("A2C, env steps/s", A2C, 30_000, "rate"),
+    Measure("A2C solved, s", A2C, 300_000, "solved"),
+    Measure("DQN, env steps/s", DQN, 8_000, "rate"),
+    Measure("DQN solved, s", DQN, 50_000, "solved"),
+]
+Turn = dict[str, dict[str, float]]
+"""of each contender, a figure for each column"""
 
-    def against_best(one: str, turn: dict[str, float]) -> float:
-        return turn[one] / max((speed for peer, speed in turn.items() if peer != names[0]), default=float("nan"))
 
-    return [
-        {
-            "settings": name,
-            "contender": one,
-            "env_steps_per_s": round(statistics.median(turn[one] for turn in turns)),
-            "least": round(min(turn[one] for turn in turns)),
-            "most": round(max(turn[one] for turn in turns)),
-            "of_best_peer": statistics.median(against_best(one, turn) for turn in turns),
-        }
-        for one in names
+def take_turns(names: list[str], measures: list[Measure], seed: int) -> Turn:
+    """Each measure of each contender, once."""
+    turn: Turn = {name: {} for name in names}
+    for measure in measures:
+        for name in filter(measure.fits, names):
+            try:
+                turn[name] |= measure.of(name, seed)
+            except RuntimeError as error:
+                print(f"left out: {measure.column}: {error}", file=sys.stderr)
+    return turn
+
+
+def summary(names: list[str], turns: list[Turn]) -> list[dict[str, object]]:
+    """A row for each contender: medians, and what they are of."""
+    rows: list[dict[str, object]] = []
+    for name in names:
+        asked = dict.fromkeys(column for turn in turns for column in turn[name])
+        columns = {column: [turn[name][column] for turn in turns if column in turn[name]] for column in asked}
+        rows.append(
+            {"contender": name, "median": {column: _median(found) for column, found in columns.items()}, "of": columns}
+        )
+    return rows
+
+
+def _median(found: list[float]) -> float:
+    """NaN, a task that was not solved, is longer than all."""
+    return statistics.median_low(sorted(found, key=lambda x: (math.isnan(x), x))) if len(found) % 2 else _middle(found)
+
+
+def _middle(found: list[float]) -> float:
+    ordered = sorted(math.inf if math.isnan(x) else x for x in found)
+    return statistics.median(ordered) if ordered and math.isfinite(statistics.median(ordered)) else NAN
+
+
+def table(rows: list[dict[str, Any]], title: str, algo: str = "") -> Table:
+    """Medians, from least to most; of PPO, or of another algorithm."""
+    columns = [
+        c for c in dict.fromkeys(c for row in rows for c in row["of"]) if c.startswith(algo or ("env", "solved", "mem"))
     ]
+    shown = Table(title=title)
+    shown.add_column("")
+    for column in columns:
+        shown.add_column(column.removeprefix(f"{algo} ").removeprefix(f"{algo}, "), justify="right")
+    for row in rows:
+        if set(columns) & set(row["of"]):
+            shown.add_row(row["contender"], *(_cell(row["median"].get(c), row["of"].get(c, [])) for c in columns))
+    return shown
 
 
-def solving(rounds: int) -> list[dict[str, object]]:
-    """A row for each contender: seconds from the command to a solved CartPole, and how many env steps that took."""
-    found: dict[str, list[tuple[float, int]]] = {one: [] for one in contenders()}
-    for turn in range(rounds):
-        for one, runs in found.items():
-            ran = run(one, ZOO | {"steps": MOST_STEPS, "seed": turn + 1}, SOLVED)
-            runs.append((ran.wall_s, ran.updates[-1][0]))
-    return [
-        {
-            "contender": one,
-            "seconds": statistics.median(seconds for seconds, _ in runs),
-            "least": min(seconds for seconds, _ in runs),
-            "most": max(seconds for seconds, _ in runs),
-            "env_steps": round(statistics.median(steps for _, steps in runs)),
-        }
-        for one, runs in found.items()
-    ]
+def _cell(median: float | None, found: list[float]) -> str:
+    if median is None or not found:
+        return "–"
+    places = 1 if max((x for x in found if not math.isnan(x)), default=0) < 1000 else 0
+    reached = [x for x in found if not math.isnan(x)]
+    if not reached:
+        return "not solved"
+    unsolved = "" if len(reached) == len(found) else f", {len(found) - len(reached)} not solved"
+    middle = "–" if math.isnan(median) else f"{median:,.{places}f}"
+    return f"{middle} ({min(reached):,.{places}f} to {max(reached):,.{places}f}{unsolved})" if len(found) > 1 else middle
+
+
+def against(rows: list[dict[str, Any]]) -> list[str]:
+    """Ours against the best peer, in words. Settings of their own count for the seconds, which is what those are for."""
+    said = []
+    for column in (SMALL_RATE, LARGE_RATE, SECONDS):
+        fast = max if column != SECONDS else min
+        found = [(row["median"].get(column, NAN), row["contender"]) for row in rows]
+        known = [(figure, who) for figure, who in found if math.isfinite(figure)]
+        alike = [(figure, who) for figure, who in known if column == SECONDS or not CONTENDERS[who].own]
+        peers = [(figure, who) for figure, who in alike if not CONTENDERS[who].ours]
+        if peers:
+            best, peer = fast(peers)
+            each = [f"{who} {figure / best:.2f} ×" for figure, who in alike if CONTENDERS[who].ours]
+            said.append(f"{column}, against the best peer, {peer}: {', '.join(each)}")
+    return said
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="PPO on CartPole-v1 beside Stable-Baselines3")
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--steps", type=int, nargs=2, default=(16_000, 66_000), help="env steps of a turn, by settings")
+    parser = argparse.ArgumentParser(description="CartPole-v1 beside other systems, with the same hyperparameters")
+    parser.add_argument("--rounds", type=int, default=3, help="turns, each of another seed")
+    parser.add_argument("--peers", action="store_true", help="beside all that are installed; memory; A2C and DQN")
     arguments = parser.parse_args()
-    console = Console(width=120)
-    rows = [
-        row for name, steps in zip(SETTINGS, arguments.steps, strict=True) for row in speeds(name, steps, arguments.rounds)
-    ]
-    table = Table(title=f"PPO, CartPole-v1, medians of {arguments.rounds}")
-    for column in ("settings", "", "env steps/s", "least to most", "× best peer", "target"):
-        table.add_column(column, justify="left" if column in ("settings", "") else "right")
-    for row in rows:
-        ours = str(row["contender"]).startswith("millrace")
-        speed = f"{row['env_steps_per_s']:,}", f"{row['least']:,} to {row['most']:,}"
-        target = f"≥ {TARGET:g}" if ours else ""
-        table.add_row(str(row["settings"]), str(row["contender"]), *speed, f"{row['of_best_peer']:.2f}", target)
-    console.print(table)
-    solved = solving(arguments.rounds)
-    table = Table(title=f"From the command to a greedy mean of {SOLVED:g}, 8 × 32, medians of {arguments.rounds} seeds")
-    for column in ("", "seconds", "least to most", "env steps"):
-        table.add_column(column, justify="left" if column == "" else "right")
-    for row in solved:
-        spread = f"{row['least']:.1f} to {row['most']:.1f}"
-        table.add_row(str(row["contender"]), f"{row['seconds']:.1f}", spread, f"{row['env_steps']:,}")
-    console.print(table)
-    charts = [(f"env steps/s, {name}", bars(rows, "contender", "env_steps_per_s", name)) for name in SETTINGS]
-    charts.append(("seconds to a solved CartPole", bars(solved, "contender", "seconds")))
-    write("train", {"speeds": rows, "solving": solved}, charts)
+    names = [name for name in contenders(arguments.peers) if arguments.peers or not CONTENDERS[name].own]
+    for name in missing() if arguments.peers else []:
+        print(f"left out: {name} is not installed (python -m benchmarks.peers.install {name})", file=sys.stderr)
+    measures = PPO_MEASURES + (PEERS_MEASURES if arguments.peers else [])
+    turns: list[Turn] = []
+    for turn in range(arguments.rounds):
+        again = [measure for measure in measures if measure.kind != "memory" or not turns]  # which hardly differs
+        turns.append(take_turns(names, again, turn + 1))
+        rows = summary(names, turns)
+        charts = [(column, _bars(rows, column)) for column in (SMALL_RATE, LARGE_RATE, SECONDS)]
+        write("train", {"rows": _plain(rows)}, charts)  # after each, should a later one not come to its end
+    console = Console(width=140)
+    console.print(table(rows, f"PPO, CartPole-v1, medians of {arguments.rounds} (least to most)"))
+    if arguments.peers:
+        for algo in ("A2C", "DQN"):
+            console.print(table(rows, f"{algo}, CartPole-v1, RL Zoo's settings", algo))
+    for said in against(rows):
+        console.print(said)
+    console.print(f"aim: {TARGET:g} × the env steps/s of Stable-Baselines3, half of its seconds")
+
+
+def _plain(data: Any) -> Any:
+    """JSON has no NaN."""
+    match data:
+        case dict():
+            return {key: _plain(value) for key, value in data.items()}
+        case list():
+            return [_plain(value) for value in data]
+        case float() if math.isnan(data):
+            return None
+        case _:
+            return data
+
+
+def _bars(rows: list[dict[str, Any]], column: str) -> dict[str, float]:
+    found = [{"who": row["contender"], "value": row["median"].get(column, NAN)} for row in rows]
+    return bars([row for row in found if math.isfinite(row["value"])], "who", "value")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,109 @@
+"""PufferLib's PPO over its serial vector environment, the fastest of its own on two cores; `--how own` for its own settings.
+
+Cannot be said to it: minibatches of single rows (they are whole segments), a clip range that falls (stays 0.2), a learning
+rate that falls in a line (falls as a cosine), a network for the value alone within its own policy class: the one below is
+ours. Values move within an update and its advantages with them, as V-trace's. Rewards are clipped to [-1, 1].
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import pufferlib.emulation
+import pufferlib.models
+import pufferlib.pytorch
+import pufferlib.vector
+import torch
+
+from benchmarks.peers.told import Told
+
+OWN_COPIES = 16
+OWN_STEPS = 500_000  # its classic_control.ini's: what its learning rate falls over, and what it may take to solve the task
+
+
+class Policy(torch.nn.Module):
+    """64-64 tanh for the actor, and for the critic."""
+
+    def __init__(self, env: Any) -> None:
+        super().__init__()
+        inputs = env.single_observation_space.shape[0]
+        self.actor = self._net(inputs, env.single_action_space.n, 0.01)
+        self.critic = self._net(inputs, 1, 1.0)
+        self.hidden_size = 64
+
+    @staticmethod
+    def _net(inputs: int, outputs: int, last: float) -> torch.nn.Sequential:
+        init: Any = pufferlib.pytorch.layer_init
+        hidden = [init(torch.nn.Linear(inputs, 64)), torch.nn.Tanh(), init(torch.nn.Linear(64, 64)), torch.nn.Tanh()]
+        return torch.nn.Sequential(*hidden, init(torch.nn.Linear(64, outputs), std=last))
+
+    def forward(self, obs: Any, state: Any = None) -> Any:
+        return self.actor(obs), self.critic(obs)
+
+    forward_eval = forward
+
+
+def make(env: str, **kwargs: Any) -> Any:
+    """One copy."""
+    return pufferlib.emulation.GymnasiumPufferEnv(gymnasium.make(env), **kwargs)
+
+
+def config(s: dict[str, Any], own: bool) -> dict[str, Any]:
+    """Its default.ini; with the common settings in it unless its own are asked for."""
+    from pufferlib.pufferl import load_config
+
+    argv, sys.argv = sys.argv, sys.argv[:1]
+    found: dict[str, Any] = load_config("default")["train"]
+    sys.argv = argv
+    found |= {
+        "device": "cpu", "seed": s["seed"], "total_timesteps": s["steps"], "env": s["env"], "use_rnn": False,
+        "data_dir": str(Path.cwd()), "checkpoint_interval": 10**9,
+    }  # fmt: skip
+    if own:
+        # Its minibatch of 8,192 rows needs 128 copies: the whole batch of 16 instead.
+        return found | {"minibatch_size": OWN_COPIES * found["bptt_horizon"], "total_timesteps": OWN_STEPS}
+    return found | {
+        "optimizer": "adam", "adam_beta1": 0.9, "adam_beta2": 0.999, "adam_eps": 1e-5,
+        "learning_rate": s["learning_rate"], "anneal_lr": s["learning_rate_schedule"] == "linear",
+        "gamma": s["gamma"], "gae_lambda": s["gae_lambda"], "update_epochs": s["n_epochs"],
+        "bptt_horizon": s["rollout_steps"], "minibatch_size": s["batch_size"], "clip_coef": s["clip_range"],
+        "vf_coef": 2.0 * s["vf_coef"],  # it halves the squared error
+        "vf_clip_coef": 1e9, "max_grad_norm": s["max_grad_norm"], "ent_coef": s["ent_coef"],
+        "prio_alpha": 0.0, "prio_beta0": 1.0,
+    }  # fmt: skip
+
+
+def main() -> None:
+    from pufferlib.pufferl import PuffeRL
+
+    torch.set_num_threads(1)
+    told = Told()
+    s, own = told.settings, told.how == "own"
+    if own:
+        s["steps"] = max(s["steps"], OWN_STEPS) if told.until_solved else s["steps"]
+    torch.manual_seed(s["seed"])
+    copies = OWN_COPIES if own else s["envs"]
+    envs = pufferlib.vector.make(
+        make, env_kwargs={"env": s["env"]}, backend=pufferlib.vector.Serial, num_envs=copies, seed=s["seed"]
+    )
+    policy: Any = pufferlib.models.Default(envs.driver_env, hidden_size=64) if own else Policy(envs.driver_env)
+    trainer = PuffeRL(config(s, own), envs, policy)
+    trainer.print_dashboard = lambda *_, **__: None
+
+    def greedy(obs: Any) -> Any:
+        with torch.no_grad():
+            return policy(torch.from_numpy(obs))[0].argmax(-1).numpy()
+
+    ended = False
+    while not ended:
+        trainer.evaluate()
+        trainer.train()
+        ended = told.update(trainer.global_step, greedy)
+    trainer.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,108 @@
+"""PPO, A2C and DQN of Stable-Baselines3 as a program of its own, with our names for their settings: a peer of `train.py`.
+
+One torch thread, which is its fastest here. Each update is a line of JSON: env steps, and when by the monotonic clock. Two
+things are worded otherwise: a DQN of ours counts a hard target's age in gradient steps, and has as many copies as it likes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from typing import Any
+
+import torch
+from stable_baselines3 import A2C, DQN, PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, StopTrainingOnRewardThreshold
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+
+
+class Told(BaseCallback):
+    """A line for each update."""
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        print(json.dumps({"env_steps": self.num_timesteps, "at_s": time.monotonic()}), flush=True)
+
+
+def make(s: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+    """The algorithm that the settings ask for."""
+    linear = s.get("learning_rate_schedule") == "linear"
+    rate, seed = s["learning_rate"], {"seed": s["seed"], "device": "cpu", "gamma": s["gamma"]}
+    match s["algo"]:
+        case "dqn":
+            return DQN(
+                "MlpPolicy",
+                env,
+                learning_rate=rate,
+                batch_size=s["batch_size"],
+                buffer_size=s["replay_size"],
+                learning_starts=s["learning_starts"],
+                train_freq=s["envs"] * s["rollout_steps"],  # its one copy's
+                gradient_steps=s["gradient_steps"],
+                target_update_interval=10,  # env steps: before each update, in effect
+                exploration_fraction=s["epsilon_steps"] / s["steps"],
+                exploration_final_eps=s["epsilon_end"],
+                max_grad_norm=s["max_grad_norm"],
+                policy_kwargs={"net_arch": s["net"]},
+                **seed,
+            )
+        case "a2c":
+            names = ("gae_lambda", "ent_coef", "vf_coef", "max_grad_norm")
+            return A2C(
+                "MlpPolicy",
+                env,
+                learning_rate=rate,
+                n_steps=s["rollout_steps"],
+                **seed,
+                **{name: s[name] for name in names},
+            )
+        case _:
+            clip = s["clip_range"]
+            return PPO(
+                "MlpPolicy",
+                env,
+                n_steps=s["rollout_steps"],
+                batch_size=s["batch_size"],
+                n_epochs=s["n_epochs"],
+                gae_lambda=s["gae_lambda"],
+                ent_coef=s["ent_coef"],
+                vf_coef=s["vf_coef"],
+                max_grad_norm=s["max_grad_norm"],
+                learning_rate=(lambda left: left * rate) if linear else rate,
+                clip_range=(lambda left: left * clip) if linear else clip,
+                **seed,
+            )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("settings", type=json.loads)
+    parser.add_argument("--how", choices=("one", "subproc"), default="one")
+    parser.add_argument("--target", type=float, help="stop as soon as a greedy evaluation averages at least this")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    s: dict[str, Any] = arguments.settings
+    copies = 1 if s["algo"] == "dqn" else s["envs"]
+    env = make_vec_env(s["env"], copies, s["seed"], vec_env_cls=SubprocVecEnv if arguments.how == "subproc" else DummyVecEnv)
+    evaluate: EvalCallback | None = None
+    if arguments.target is not None:
+        evaluate = EvalCallback(
+            make_vec_env(s["env"], 8, 1000),
+            callback_on_new_best=StopTrainingOnRewardThreshold(arguments.target),
+            n_eval_episodes=s["eval_episodes"],
+            eval_freq=max(1, s["eval_every"] // copies),
+            verbose=0,
+        )
+    make(s, env).learn(s["steps"], CallbackList([Told(), *([evaluate] if evaluate else [])]))
+    if evaluate and evaluate.best_mean_reward >= arguments.target:
+        print(json.dumps({"solved": float(evaluate.best_mean_reward), "at_s": time.monotonic()}), flush=True)
+    env.close()
+
+
+if __name__ == "__main__":
+    main()
