@@ -258,14 +258,37 @@ def test_it_is_for_small_layers_and_nothing_else(spec: PolicySpec, expected: boo
 
 
 def test_sizes_of_minibatches_come_and_go(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(layers, "KEPT", 100)
+    monkeypatch.setattr(layers, "KEPT", 30)
     _, fused = make(PolicySpec(BOX, ACTIONS["discrete"], (5,)), 0)
     x = np.random.default_rng(0).normal(size=(99, 4)).astype(np.float32)
     whole = fused.value(x).copy()
     for rows in (*range(1, 99), 40, 2):
         np.testing.assert_allclose(fused.value(x[:rows]), whole[:rows], atol=1e-6)
-        assert sum(fused._critic._passes) <= 100
+        assert len(fused._critic._passes) <= 30
     assert {40, 2} <= set(fused._critic._passes)
+
+
+def test_sizes_of_minibatches_share_their_memory() -> None:
+    """And give the bits that they would give alone, whichever came before."""
+    spec = PolicySpec(BOX, ACTIONS["discrete"], (32,))
+    _, fused = make(spec, 0)
+    x = np.random.default_rng(0).normal(size=(2 * layers.PIECE, 4)).astype(np.float32)
+    action = np.zeros((len(x), 1), np.int64)
+    for rows in (200, 256, 255, 2 * layers.PIECE, 256, 1, 255):
+        _, alone = make(spec, 0)
+        for found in (alone, fused):
+            found.forward(x[:rows], action[:rows])
+        ones = np.ones(rows, np.float32)
+        gradients = []
+        for found in (alone, fused):
+            said = [each.copy() for each in found.forward(x[:rows], action[:rows])]
+            found.backward(ones, ones, ones)
+            gradients.append([*said, *(layer.weight_grad.copy() for layer in found._layers._hidden)])
+        for one, other in zip(*gradients, strict=True):
+            np.testing.assert_array_equal(one, other)
+    passes = fused._layers._passes
+    assert np.shares_memory(passes[256].said[0], passes[255].said[0])
+    assert sum(array.nbytes for array in fused._layers._memory._arrays) < 3 * 4 * 2 * layers.PIECE * (4 + 4 * 32 * 2)
 
 
 def test_large_minibatches_keep_the_graph(monkeypatch: pytest.MonkeyPatch) -> None:

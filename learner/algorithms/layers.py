@@ -10,6 +10,7 @@ of the rows goes all the way forward, or back, while it is in the cache. With g 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -24,7 +25,7 @@ Call = Callable[[], object]
 
 PIECE = 512  # rows, at most
 LARGE = 64 * 64 * 128  # multiplications of one product: from here torch's are faster than numpy's
-KEPT = 16_384  # rows of all sizes of minibatch together: rows that are not valid make the sizes change
+KEPT = 256  # sizes of minibatch: rows that are not valid make them change
 
 
 class Linear(NamedTuple):
@@ -56,15 +57,17 @@ class Layers:
 
     def __init__(self, hidden: Sequence[Linear], heads: Sequence[Head], relu: bool) -> None:
         self._hidden, self._heads, self._relu = hidden, heads, relu
+        self._memory = _Memory(heads[0].layer.weight)
         self._passes: dict[int, _Pass] = {}
 
     def forward(self, x: Array) -> list[Array]:
-        """Features [B, D] -> what each head says, [out, B]; good until the next forward pass of as many rows."""
+        """Features [B, D] -> what each head says, [out, B]; good until the next forward pass."""
         made = self._passes.get(len(x))
         if made is None:
-            if sum(self._passes) + len(x) > KEPT:
+            if len(self._passes) == KEPT:
                 self._passes.clear()
-            made = self._passes[len(x)] = _Pass(len(x), self._hidden, self._heads, self._relu)
+            self._memory.begin_again()
+            made = self._passes[len(x)] = _Pass(len(x), self._hidden, self._heads, self._relu, self._memory)
         self._last = made
         for piece in made.pieces:
             piece.x[0] = x[piece.rows].T
@@ -83,21 +86,53 @@ class Layers:
             call()
 
 
+class _Memory:
+    """Arrays that passes of all sizes share, for there is one pass at a time: each takes the same ones in the same order."""
+
+    def __init__(self, like: Array) -> None:
+        self._like = like
+        self._arrays: list[Array] = []
+        self._taken = 0
+
+    def begin_again(self) -> None:
+        """The next array is the first."""
+        self._taken = 0
+
+    def take(self, *shape: int) -> Array:
+        """The next array, C-ordered, whatever is in it."""
+        size, number = math.prod(shape), self._taken
+        self._taken += 1
+        if number == len(self._arrays):
+            self._arrays.append(np.empty(0, self._like.dtype))
+        if self._arrays[number].size < size:
+            # By torch, which aligns arrays always alike: its products could give other bits where they are not. To a power
+            # of two, lest every size that is a little larger takes memory of its own.
+            room = 1 << (size - 1).bit_length()
+            self._arrays[number] = torch.zeros(room, dtype=torch.from_numpy(self._like).dtype).numpy()
+        return self._arrays[number][:size].reshape(shape)
+
+    def outputs(self, layer: Linear, rows: int) -> Array:
+        """For what a layer says, [S, out, B]."""
+        return self.take(*layer.bias_grad.shape, rows)
+
+
 class _Pass:
     """What is done with so many rows: pieces of them, one after another, then one gradient of those of the pieces."""
 
-    def __init__(self, rows: int, hidden: Sequence[Linear], heads: Sequence[Head], relu: bool) -> None:
+    def __init__(self, rows: int, hidden: Sequence[Linear], heads: Sequence[Head], relu: bool, memory: _Memory) -> None:
         count = -(-rows // PIECE)
-        self.said = [_outputs(head.layer, rows) for head in heads]
-        self.by_said = [_outputs(head.layer, rows) for head in heads]
+        self._memory = memory
+        self.said = [memory.outputs(head.layer, rows) for head in heads]
+        self.by_said = [memory.outputs(head.layer, rows) for head in heads]
         self.gather: list[Call] = []
         trunk = [self._for_each(layer, count) for layer in hidden]
         tops = [self._for_each(head.layer, count) for head in heads]
-        gradients = [_outputs(layer, -(-rows // count)) for layer in hidden]  # one for all pieces, to stay in the cache
+        # One for all pieces, to stay in the cache.
+        gradients = [memory.outputs(layer, -(-rows // count)) for layer in hidden]
         self.pieces: list[_Piece] = []
         for i in range(count):
             its = slice(rows * i // count, rows * (i + 1) // count)
-            piece = _Piece(its, (trunk or tops)[0][i])
+            piece = _Piece(its, (trunk or tops)[0][i], memory)
             for layer, dy in zip(trunk, gradients, strict=True):
                 piece.hide(layer[i], dy[..., : its.stop - its.start], relu)
             for layer, head, said, by_said in zip(tops, heads, self.said, self.by_said, strict=True):
@@ -108,7 +143,7 @@ class _Pass:
         """The same layer for each piece, each with a gradient of its own."""
         if count == 1:
             return [layer]
-        weight, bias = (_zeros((count, *grad.shape), grad) for grad in (layer.weight_grad, layer.bias_grad))
+        weight, bias = (self._memory.take(count, *grad.shape) for grad in (layer.weight_grad, layer.bias_grad))
         self.gather += [partial(np.add.reduce, weight, 0, out=layer.weight_grad)]
         self.gather += [partial(np.add.reduce, bias, 0, out=layer.bias_grad)]
         return [layer._replace(weight_grad=weight[i], bias_grad=bias[i]) for i in range(count)]
@@ -117,9 +152,10 @@ class _Pass:
 class _Piece:
     """Some of the rows: what they are, and the calls, made ready in their order."""
 
-    def __init__(self, rows: slice, first: Linear) -> None:
+    def __init__(self, rows: slice, first: Linear, memory: _Memory) -> None:
         self.rows = rows
-        self.x = self._h = _zeros((1, first.weight.shape[2], rows.stop - rows.start), first.weight)
+        self._memory = memory
+        self.x = self._h = memory.take(1, first.weight.shape[2], rows.stop - rows.start)
         self._dh: Array | None = None  # the gradient by the last hidden layers
         self._given: set[int] = set()  # networks that have one from a head
         self._ones = np.ones(rows.stop - rows.start, first.weight.dtype)
@@ -129,7 +165,7 @@ class _Piece:
 
     def hide(self, layer: Linear, dy: Array, relu: bool) -> None:
         """One more hidden layer; `dy`: where the gradient by what it says will be."""
-        y = _outputs(layer, len(self._ones))
+        y = self._memory.outputs(layer, len(self._ones))
         self.forward += [*_linear(layer, self._h, y), _activation(y, relu)]
         self.back_through_hidden[:0] = [_slope(dy, y, relu), *self._back(layer, self._h, dy, self._dh)]
         self._h, self._dh = y, dy
@@ -142,7 +178,7 @@ class _Piece:
         if dh is None or network not in self._given:
             self.back_from_heads += self._back(layer, self._h[its], dy, dh)
         else:
-            more = _zeros(dh.shape, dh)
+            more = self._memory.take(*dh.shape)
             self.back_from_heads += [*self._back(layer, self._h[its], dy, more), partial(np.add, dh, more, out=dh)]
         self._given.add(network)
 
@@ -153,17 +189,6 @@ class _Piece:
             partial(np.matmul, dy, self._ones, out=layer.bias_grad),
         ]
         return calls if dx is None else [*calls, _product(layer.weight.swapaxes(1, 2), dy, dx)]
-
-
-def _zeros(shape: tuple[int, ...], like: Array) -> Array:
-    """By torch, which aligns arrays always alike: its products could give other bits where they are not."""
-    found: Array = torch.zeros(shape, dtype=torch.from_numpy(like).dtype).numpy()
-    return found
-
-
-def _outputs(layer: Linear, rows: int) -> Array:
-    """[S, out, B]."""
-    return _zeros((*layer.bias_grad.shape, rows), layer.weight)
 
 
 def _linear(layer: Linear, x: Array, y: Array) -> list[Call]:
