@@ -161,7 +161,8 @@ def run(
             updates = [(int(row["time/total_timesteps"]), row["time/time_elapsed"]) for row in read_rows(table)]
             early = config.steps - updates[-1][0] > 2 * config.envs * config.algorithm.rollout_steps
             return Ran(wall_s if early else math.nan, updates)
-        lines = [json.loads(line) for line in out.read_text().splitlines() if line.startswith(('{"env_steps"', '{"solved"'))]
+        told = [line for line in out.read_text().splitlines() if line.startswith(('{"env_steps"', '{"solved"'))]
+        lines = [json.JSONDecoder().raw_decode(line)[0] for line in told]  # a peer's own words may follow on the same line
         solved = [line["at_s"] - began_s for line in lines if "solved" in line]  # one clock for all processes
         return Ran(
             solved[0] if solved else math.nan, [(line["env_steps"], line["at_s"]) for line in lines if "env_steps" in line]

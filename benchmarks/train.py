@@ -71,8 +71,8 @@ def _rate(updates: list[tuple[int, float]]) -> float:
 SMALL_RATE, LARGE_RATE = "env steps/s, 8 × 32", "env steps/s, 64 × 128"
 SECONDS, MEMORY = "solved, s", "memory, MB"
 PPO_MEASURES = [
-    Measure(SMALL_RATE, ZOO, 16_000, "rate"),
-    Measure(LARGE_RATE, LARGE, 66_000, "rate"),
+    Measure(SMALL_RATE, ZOO, 30_000, "rate"),
+    Measure(LARGE_RATE, LARGE, 150_000, "rate"),
     Measure(SECONDS, ZOO, 150_000, "solved"),
 ]
 PEERS_MEASURES = [

@@ -116,5 +116,5 @@ def test_a_task_that_was_not_solved_is_longer_than_any_and_said() -> None:
     turns = [{OURS: {SECONDS: 2.0}, peer: {SECONDS: 8.0}}, {OURS: {SECONDS: 4.0}, peer: {SECONDS: math.nan}}]
     rows = summary([OURS, peer], [*turns, {OURS: {SECONDS: 3.0}, peer: {SECONDS: 6.0}}])
     assert [row["median"] for row in rows] == [{SECONDS: 3.0}, {SECONDS: 8.0}]
-    assert against(rows) == [f"{SECONDS}: 0.38 × that of the best, {peer}"]
+    assert against(rows) == [f"{SECONDS}, against the best peer, {peer}: {OURS} 0.38 ×"]
     assert [*table(rows, "").columns[1].cells] == ["3.0 (2.0 to 4.0)", "8.0 (6.0 to 8.0, 1 not solved)"]
