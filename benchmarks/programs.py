@@ -78,10 +78,22 @@ OURS, OURS_OWN = "millrace, 2 workers", "millrace, own preset"
 OVERLAPPED, NATIVE = "millrace, --max-lag 1", "millrace, --vector native"
 DUMMY, SUBPROC = "SB3, one process", "SB3, SubprocVecEnv"
 _SB3, _PEERS = "benchmarks.train_stable_baselines3", "benchmarks.peers"
+AS_PUFFERLIB, AS_SAMPLE_FACTORY = "millrace, as PufferLib's own", "millrace, as Sample Factory's own"
+
+
+def _flags(sizes: str, more: str) -> tuple[str, ...]:
+    """Copies, steps and minibatch of a peer's own settings, one epoch; and its network."""
+    copies, steps, minibatch = sizes.split()
+    given = f"--preset none --envs {copies} --lanes 2 --rollout-steps {steps} --batch-size {minibatch} --n-epochs 1 {more}"
+    return tuple(given.split())
+
+
 CONTENDERS = {
     OURS: Contender("millrace", flags=("--lanes", "2")),
     OVERLAPPED: Contender("millrace", flags=("--lanes", "2", "--max-lag", "1")),
     NATIVE: Contender("millrace", flags=("--lanes", "2", "--vector", "native")),
+    AS_PUFFERLIB: Contender("millrace", own=True, flags=_flags("16 64 256", "--net 64 --shared-net")),
+    AS_SAMPLE_FACTORY: Contender("millrace", own=True, flags=_flags("40 32 512", "--net 512 512 --shared-net --max-lag 1")),
     OURS_OWN: Contender("millrace", own=True),
     DUMMY: Contender(_SB3, "one"),
     SUBPROC: Contender(_SB3, "subproc", most_envs=8),  # a process for each copy

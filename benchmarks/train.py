@@ -44,6 +44,8 @@ class Measure(NamedTuple):
             return contender in among or (contender == OURS_OWN and self.kind == "solved")
         if contender == OURS_OWN:
             return False  # the preset of PPO has the same settings
+        if each.ours and each.own and self.kind != "rate":
+            return False  # what they learn with is not alike: their env steps/s are asked for
         return self.settings["envs"] <= each.most_envs and not (each.own and self.settings is LARGE)
 
     def of(self, contender: str, seed: int) -> dict[str, float]:

@@ -53,6 +53,10 @@ def bars(rows: Sequence[Mapping[str, object]], label: str, length: str, first: o
     return {str(row[label]): float(str(row[length])) for row in chosen}
 
 
+def _figure(number: float) -> str:
+    return f"{number:,.0f}" if number >= 100 else f"{number:.3g}"
+
+
 def _draw(charts: Sequence[Bars], out: Path) -> None:
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -64,7 +68,7 @@ def _draw(charts: Sequence[Bars], out: Path) -> None:
         ours = [label for label in bars if label.startswith(("millrace", "ours"))] or list(bars)
         colours = [COLOURS[0] if label in ours else "#bbbbbb" for label in bars]
         drawn = panel.barh(list(bars), list(bars.values()), color=colours)
-        panel.bar_label(drawn, fmt="{:,.4g}", padding=3, fontsize=8, color=GREY)
+        panel.bar_label(drawn, [_figure(length) for length in bars.values()], padding=3, fontsize=8, color=GREY)
         panel.set_title(title, fontsize=10, fontweight="bold", loc="left")
         panel.invert_yaxis()
         panel.margins(x=0.12)
