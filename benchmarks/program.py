@@ -31,7 +31,9 @@ class Benchmark(NamedTuple):
 
 
 BENCHMARKS = {
-    "collect": Benchmark("collect", "collecting in two processes against the bare loop"),
+    "collect": Benchmark(
+        "collect", "collecting in two processes against the bare loop", brief=("--rounds", "3", "--seconds", "0.5")
+    ),
     "vector": Benchmark(
         "vector_env",
         "vector environments beside gymnasium's and Stable-Baselines3's",
