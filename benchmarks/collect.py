@@ -310,7 +310,7 @@ def main() -> None:
         rows += found
         title = f"{case.env.id.rpartition(':')[2]}, env steps/s, {case.copies} copies in each of {PROCESSES} processes"
         charts.append((title, bars(found, "contender", "env_steps_per_s")))
-    Console(width=120).print(show(rows, "CPU second" if arguments.cpu else "s"))
+    Console(width=150).print(show(rows, "CPU second" if arguments.cpu else "s"))
     write("collect", {"collecting": rows, "seconds": "CPU" if arguments.cpu else "wall"}, charts)
 
 
