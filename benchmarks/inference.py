@@ -11,11 +11,9 @@ import os
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")  # before numpy
 
 import argparse
-import json
 import statistics
 import tempfile
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -24,11 +22,11 @@ import psutil
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.writing import write
 from learner.config import resolve
 from learner.metrics import Progress
 from millrace.launch.local import train
 
-RESULTS = Path(__file__).parent / "results"
 WARM_UP = 2  # updates that do not count: copies are opened, torch is imported
 MODES = ("workers", "learner")
 
@@ -104,8 +102,7 @@ def main() -> None:
     for row in rows:
         table.add_row(*map(str, row.values()))
     Console().print(table)
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "inference.json").write_text(json.dumps({"inference": rows}, indent=2) + "\n")
+    write("inference", {"inference": rows})
 
 
 if __name__ == "__main__":

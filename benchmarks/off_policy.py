@@ -12,7 +12,6 @@ import os
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")  # before numpy
 
 import argparse
-import json
 import statistics
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,6 +23,7 @@ from rich.progress import track
 from rich.table import Table
 
 import millrace
+from benchmarks.writing import RESULTS, write
 from learner.metrics import read_rows
 from learner.report import COLOURS, DPI, GREY, Curve, common_grid, read_curve
 from learner.run_folder import RunFolder
@@ -31,7 +31,6 @@ from learner.run_folder import RunFolder
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-RESULTS = Path(__file__).parent / "results"
 PNG = Path(__file__).parents[1] / "docs" / "off_policy.png"
 ALGORITHMS = {"a2c": COLOURS[1], "impala": COLOURS[0]}
 LAGS = (0, 8)
@@ -138,9 +137,8 @@ def main() -> None:
     plan = [(algo, max_lag, seed) for max_lag in LAGS for algo in ALGORITHMS for seed in seeds]
     runs = [train(*each) for each in track(plan, "training")]
     Console().print(show(runs))
-    RESULTS.mkdir(exist_ok=True)
     rows = [{name: value for name, value in run._asdict().items() if name != "curve"} for run in runs]
-    (RESULTS / "off_policy.json").write_text(json.dumps({"settings": SETTINGS, "runs": rows}, indent=2) + "\n")
+    write("off_policy", {"settings": SETTINGS, "runs": rows})
     draw(runs, PNG)
     Console().print(f"drawn: {PNG}")
 

@@ -38,7 +38,6 @@ LARGE = ACTOR_CRITIC | {
     "ent_coef": 0.0, "learning_rate": 3e-4, "learning_rate_schedule": "constant", "clip_range": 0.2,
     "clip_range_schedule": "constant",
 }  # fmt: skip
-SETTINGS = {"8 × 32, batch 256, 20 epochs": ZOO, "64 × 128, 4 minibatches, 4 epochs": LARGE}
 # RL Zoo's, too. Its DQN has one copy, trains after 256 steps, and makes a target anew every 10 steps: before each update, in
 # effect, that is, after 128 gradient steps.
 A2C = ACTOR_CRITIC | {

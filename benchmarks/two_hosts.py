@@ -9,7 +9,6 @@ its fifth update on. Two environments: CartPole-v1, where the way is much, and o
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import sys
 import tempfile
@@ -18,10 +17,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.writing import write
 from tests.system.network import Network, why_not
 from tests.system.processes import START_S, TOY, Stage, free_port
 
-RESULTS = Path(__file__).parent / "results"
 PROCESSES = 4
 DELAY_S = 0.005  # one way
 ENVS: dict[str, dict[str, object]] = {
@@ -88,8 +87,7 @@ def main() -> None:
             for way in WAYS
         ]
     Console().print(table)
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "two_hosts.json").write_text(json.dumps({"two_hosts": rows}, indent=2) + "\n")
+    write("two_hosts", {"two_hosts": rows})
 
 
 if __name__ == "__main__":

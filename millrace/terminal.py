@@ -25,7 +25,6 @@ from learner.metrics import Progress
 
 REDRAW_EVERY_S = 0.2
 LINE_EVERY_S = 5.0
-WIDTH = 100
 
 
 class Screen(Protocol):

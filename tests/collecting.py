@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import gymnasium
 import msgspec
 import numpy as np
 from gymnasium.vector import SyncVectorEnv
 
+from learner.config import resolve
+from millrace.launch.local import train
 from protocol.policy import Policy, buffer_size, layout, make_policy, size
 from protocol.rollout import Rollout, validate
 from protocol.spaces import action_spec, observation_leaves
@@ -90,3 +93,12 @@ def bits(rollout: Rollout) -> dict[str, object]:
     found["obs"] = [leaf.tobytes() for leaf in rollout.obs]
     found["episodes"] = [(episode.reward, episode.length) for episode in rollout.episodes]
     return found
+
+
+def trained(folder: Path, vector: Literal["native", "envpool"], workers: int) -> bytes:
+    """The policy of a short run on CartPole-v1, whose lanes are stepped like that."""
+    config = resolve(
+        "CartPole-v1", vector=vector, steps=1_500, workers=workers, transport="inproc", eval_episodes=1,
+        run_dir=str(folder / str(workers)),
+    )  # fmt: skip
+    return (train(config, None, lambda progress: None) / "policy.safetensors").read_bytes()

@@ -24,6 +24,7 @@ from protocol.networks import ActorCritic, log_prob_and_entropy
 from protocol.policy import layout, size
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 from tests.batches import DISCRETE, GAUSSIAN, IMAGE, batch, no_pulse, normal, recurrent, shared
+from tests.slopes import is_the_slope
 from tests.test_networks import ACTIONS
 
 Array = npt.NDArray[Any]
@@ -119,15 +120,7 @@ def test_the_gradient_is_the_slope_in_float64(
 
     total()
     fused.backward(*weights.copy())
-    step = 1e-6
-    for i in range(len(flat)):
-        middle = flat[i]
-        flat[i] = middle + step
-        above = total()
-        flat[i] = middle - step
-        below = total()
-        flat[i] = middle
-        assert abs((above - below) / (2 * step) - grad[i]) < 1e-6 * max(1, abs(grad[i])), i
+    is_the_slope(grad, total, flat, 1e-6)
 
 
 PPO_LOSSES = ("clipped surrogate", "policy gradient"), ("squared", "clipped"), (0.0, 0.02)
@@ -158,15 +151,7 @@ def test_the_gradient_of_every_loss_is_its_slope_in_float64(policy_loss: str, va
         return float(first + 0.5 * second + ent_coef * third), (by_log_prob, ent_coef * by_entropy, 0.5 * by_value)
 
     fused.backward(*loss_and_gradients()[1])
-    step = 1e-6
-    for i in range(len(flat)):
-        middle = flat[i]
-        flat[i] = middle + step
-        above, _ = loss_and_gradients()
-        flat[i] = middle - step
-        below, _ = loss_and_gradients()
-        flat[i] = middle
-        assert abs((above - below) / (2 * step) - grad[i]) < 1e-7 * max(1, abs(grad[i])), i
+    is_the_slope(grad, lambda: loss_and_gradients()[0], flat, 1e-7)
 
 
 @pytest.mark.parametrize("action", sorted(ACTIONS))

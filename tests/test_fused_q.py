@@ -24,6 +24,7 @@ from protocol.networks import QNetwork
 from protocol.policy import layout, size
 from protocol.specs import PolicySpec
 from tests.batches import BOX, DISCRETE, IMAGE, no_pulse
+from tests.slopes import is_the_slope
 from tests.test_dqn import batch
 
 Array = npt.NDArray[Any]
@@ -107,15 +108,7 @@ def test_the_gradient_is_the_slope_of_the_loss_in_float64(
     by_value = np.zeros((4, rows))
     by_value[action, np.arange(rows)] = loss_and_gradient()[1]
     without.backward(by_value)
-    step = 1e-6
-    for i in range(len(flat)):
-        middle = flat[i]
-        flat[i] = middle + step
-        above, _ = loss_and_gradient()
-        flat[i] = middle - step
-        below, _ = loss_and_gradient()
-        flat[i] = middle
-        assert abs((above - below) / (2 * step) - grad[i]) < 1e-7 * max(1, abs(grad[i])) + 1e-8, i
+    is_the_slope(grad, lambda: loss_and_gradient()[0], flat, 1e-7, 1e-8)
 
 
 OPTIONS: list[dict[str, Any]] = [

@@ -14,11 +14,10 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 from learner.config import Config, resolve
 from learner.run import run_spec
-from millrace.launch.local import train
 from protocol.errors import UsageError
 from protocol.native import make_native
 from protocol.specs import EnvSpec, RunSpec
-from tests.collecting import TOY, a_collector, bits, collect, no_pulse, run_of
+from tests.collecting import TOY, a_collector, bits, collect, no_pulse, run_of, trained
 from workers.copies import CopyLoop, VectorCopies, copy_seeds
 from workers.envs.toy import Countdown
 
@@ -97,14 +96,8 @@ def test_a_lane_gets_the_same_bits_alone_and_beside_others_and_others_by_its_see
 
 
 def test_a_run_is_the_same_whatever_the_number_of_workers(tmp_path: Path) -> None:
-    policies = []
-    for workers in (1, 2):
-        config = resolve(
-            "CartPole-v1", vector="native", steps=1_500, workers=workers, transport="inproc", eval_episodes=1,
-            run_dir=str(tmp_path / str(workers)),
-        )  # fmt: skip
-        policies.append((train(config, None, lambda progress: None) / "policy.safetensors").read_bytes())
-    assert policies[0] == policies[1]
+    one, two = (trained(tmp_path, "native", workers) for workers in (1, 2))
+    assert one == two
 
 
 def test_auto_is_the_loop() -> None:

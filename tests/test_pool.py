@@ -16,11 +16,10 @@ from hypothesis import strategies as st
 
 from learner.config import Config, resolve
 from learner.run import run_spec
-from millrace.launch.local import train
 from protocol.errors import UsageError
 from protocol.pool import pool_of
 from protocol.specs import EnvSpec, RunSpec
-from tests.collecting import TOY, a_collector, bits, collect, no_pulse, run_of
+from tests.collecting import TOY, a_collector, bits, collect, no_pulse, run_of, trained
 from workers.copies import CopyLoop, Row, copy_seeds
 from workers.envs.toy import Countdown
 from workers.pool import PoolCopies
@@ -139,14 +138,8 @@ def test_a_lane_gets_the_same_bits_alone_and_beside_others_and_others_by_its_see
 
 @here
 def test_a_run_is_the_same_whatever_the_number_of_workers(tmp_path: Path) -> None:
-    policies = []
-    for workers in (1, 2):
-        config = resolve(
-            "CartPole-v1", vector="envpool", steps=1_500, workers=workers, transport="inproc", eval_episodes=1,
-            run_dir=str(tmp_path / str(workers)),
-        )  # fmt: skip
-        policies.append((train(config, None, lambda progress: None) / "policy.safetensors").read_bytes())
-    assert policies[0] == policies[1]
+    one, two = (trained(tmp_path, "envpool", workers) for workers in (1, 2))
+    assert one == two
 
 
 # ------------------------------------------------------------------------------------------------ refusals
