@@ -121,8 +121,9 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """end the run, after a checkpoint, when no worker has been here for so many seconds"""
     step_timeout_s: Seconds = 120.0
     """a local worker process that takes so many seconds for a step of one env copy is ended, and started again"""
-    pin_workers: bool = False
-    """each local worker process keeps to one core"""
+    pin_workers: bool | None = None
+    """each local worker process keeps to one core; none: it does where workers and learner take turns (max_lag 0) and there
+    are as many workers as cores, or twice as many, ..."""
     stall_timeout_s: Seconds = 600.0
     """end the run, after a checkpoint, when nothing has arrived for so many seconds"""
     max_env_failures: Natural = 3

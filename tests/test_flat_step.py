@@ -50,6 +50,22 @@ def test_bits_are_the_optimisers(kind: str) -> None:
     assert torch.equal(*flats)
 
 
+@pytest.mark.parametrize("kind", ["adam", "amsgrad", "adamw", "rmsprop"])
+def test_moments_that_fade_are_zero_before_they_are_denormal_and_only_they(kind: str) -> None:
+    flat = torch.zeros(100)
+    optimizer = KINDS[kind]([flat])
+    flat.grad = torch.full((100,), 1e-20)
+    take_step(optimizer)
+    flat.grad.zero_()
+    for _ in range(1500):
+        take_step(optimizer)
+    smallest = torch.finfo(torch.float32).tiny
+    for moment in optimizer.state[flat].values():
+        assert not ((moment > 0) & (moment < smallest)).any()
+    denormal = torch.tensor(smallest) / 2
+    assert 0 < denormal * 1 < smallest  # to whatever runs in this thread afterwards
+
+
 @pytest.mark.parametrize("algo", ["ppo", "a2c", "dqn"])
 def test_a_run_that_compiles_nothing_does_not_import_the_compiler(algo: str, tmp_path: Path) -> None:
     program = f"""

@@ -49,12 +49,26 @@ def flags_of(config: Config, run: Path) -> StartFlags:
     """Those of a run's workers; their logs lie in the run folder."""
     logs = run / "workers"
     logs.mkdir(exist_ok=True)
-    if config.pin_workers and not hasattr(os, "sched_setaffinity"):
-        raise UsageError("pin_workers: this system does not let a process keep to one core")
-    cores = sorted(os.sched_getaffinity(0)) if config.pin_workers else []
+    cores = cores_for(config)
 
     def flags(name: str) -> tuple[list[str], Path]:
         pinned = ["--core", str(cores[int(name.removeprefix("w")) % len(cores)])] if cores else []
         return ["--step-timeout-s", str(config.step_timeout_s), *pinned], logs / f"{name}.log"
 
     return flags
+
+
+def cores_for(config: Config) -> list[int]:
+    """The cores that local workers keep to, in turn; none if they go where they are put. Raises `UsageError`.
+
+    New weights wake all workers at once, while the learner still runs: left to itself, Linux then often puts two on one core
+    and lets another one idle, for so short a time that it never moves them. Fewer workers than cores find a free one by
+    themselves, and would meet those of another run on theirs.
+    """
+    if not hasattr(os, "sched_setaffinity"):
+        if config.pin_workers:
+            raise UsageError("pin_workers: this system does not let a process keep to one core")
+        return []
+    cores = sorted(os.sched_getaffinity(0))
+    take_turns = config.max_lag == 0 and config.workers % len(cores) == 0
+    return cores if config.pin_workers or (config.pin_workers is None and take_turns) else []
