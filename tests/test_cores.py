@@ -1,4 +1,4 @@
-"""Local workers keep to cores where they take turns with the learner and share the cores out evenly; nowhere else by themselves."""
+"""Local workers keep to cores where they take turns with the learner and share the cores out evenly, or are told to."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -209,6 +209,12 @@ class Parts:
             index = np.flatnonzero(mask)
             return rows.in_numpy().rows(index) if self._small(len(index)) else rows.rows(self._to_device(index))
         return rows.columns(self._to_device(np.arange(mask.shape[1])), self._to_device(mask))
+
+    def epochs(self, rows: Minibatch, mask: Bools, parts: int) -> Iterator[Iterable[Minibatch]]:
+        """Epochs without end, each of so many minibatches; a single one is made once: the order of rows is nothing to it."""
+        whole = (self.only(rows, mask),) if parts == 1 else ()
+        while True:
+            yield whole or self.minibatches(rows, mask, parts)
 
     def minibatches(self, rows: Minibatch, mask: Bools, parts: int) -> Iterator[Minibatch]:
         """Each of all rows where `mask` [T, ΣN] is True once, at random, in so many parts of nearly equal size.

@@ -7,7 +7,7 @@ thread on a CPU the same batches give the same bits, also after `load_state_dict
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -68,9 +68,12 @@ class PPO:
         advantage = gae(parts.rewards(batch), values, *ends, config.gamma, config.gae_lambda)
         target = advantage + values[:-1]
         rows = parts.rows(batch, seen, advantage, target)
+        number = math.ceil(np.count_nonzero(batch.valid) / config.batch_size)
         epochs: list[list[Measured]] = []
-        while len(epochs) < config.n_epochs and not self._too_far(epochs):
-            epochs.append(self._epoch(rows, batch.valid, clip_range, pulse))
+        for minibatches in parts.epochs(rows, batch.valid, number):
+            epochs.append(self._epoch(minibatches, clip_range, pulse))
+            if len(epochs) == config.n_epochs or self._too_far(epochs):
+                break
         parts.used(batch, seen)
         self.epochs += len(epochs)
         return self._metrics(epochs) | {
@@ -78,11 +81,10 @@ class PPO:
             "train/clip_range": clip_range,
         }
 
-    def _epoch(self, rows: Minibatch, valid: Bools, clip_range: float, pulse: Callable[[], None]) -> list[Measured]:
+    def _epoch(self, minibatches: Iterable[Minibatch], clip_range: float, pulse: Callable[[], None]) -> list[Measured]:
         """Use each valid row once, in minibatches of nearly equal size."""
         found: list[Measured] = []
-        parts = math.ceil(np.count_nonzero(valid) / self.config.batch_size)
-        for minibatch in self.parts.minibatches(rows, valid, parts):
+        for minibatch in minibatches:
             found.append(self.step(minibatch, clip_range))
             pulse()
             if self._too_far([found]):
