@@ -5,8 +5,8 @@ T = 128 steps are stored with their log-probabilities, episodes are counted. The
 nothing and resets at an episode's end. It comes in two kinds. `sampled`, the one that counts, is `gymnasium.make` as it
 comes and `action_space.sample()`, as the field measures it. `drawn` is the fastest that a loop over these copies can be:
 gymnasium's checker left out, as we leave it out, and all actions drawn beforehand. `native` is an environment's own
-vectorised form, `envpool` envpool's, bare and as a lane; `no network` is ours with a policy that does not look: storing and
-stepping alone. What is not installed is left out.
+vectorised form, `envpool` envpool's, bare and as a lane; `bfloat16` is ours that looks at images in it; `no network` is ours
+with a policy that does not look: storing and stepping alone. What is not installed is left out.
 
 All contenders of a case take turns, one pair of processes at a time, one thread each; medians of rounds. On a machine that
 does other work too, `--cpu` counts seconds of CPU, which that work does not take away.
@@ -41,7 +41,7 @@ from protocol.native import make_native
 from protocol.policy import Policy, buffer_size, layout, make_policy, size
 from protocol.pool import pool_of
 from protocol.spaces import action_spec, observation_leaves
-from protocol.specs import EnvSpec, PolicySpec, RunSpec
+from protocol.specs import EnvSpec, ImagesDtype, PolicySpec, RunSpec
 from workers.collector import Collector
 from workers.session import Assignment
 
@@ -51,6 +51,7 @@ CARTPOLE, FRAMES = EnvSpec("CartPole-v1"), EnvSpec("benchmarks.frames:Frames-v0"
 PONG = EnvSpec("workers.envs:millrace/Atari-v0")  # the module, because the bare loop asks gymnasium alone
 BARE = ("bare, sampled", "bare, drawn")
 OURS = ("ours, 2 lanes", "ours, 1 lane")
+NARROW = ("ours, 1 lane, bfloat16", "native, 1 lane, bfloat16")
 NATIVE, POOL = ("bare, native", "native, 1 lane"), ("bare, envpool", "envpool, 1 lane")
 
 
@@ -72,7 +73,7 @@ CASES = (
     Case(CARTPOLE, 8, (*BARE, *OURS), share=0.75),
     Case(EnvSpec("HalfCheetah-v5"), 8, (*BARE, *OURS, *POOL), share=0.92),
     Case(FRAMES, 16, (*BARE, *OURS, "no network, 1 lane"), share=0.9),
-    Case(PONG, 16, (*BARE, *OURS, "no network, 1 lane", *NATIVE, *POOL), share=0.9),
+    Case(PONG, 16, (*BARE, *OURS, "no network, 1 lane", *NATIVE, *POOL, *NARROW), share=0.9),
     Case(CARTPOLE, 64, (*NATIVE, *POOL), rate=1_500_000),
     Case(CARTPOLE, 512, ("bare, native", "native, 4 lanes", "native, 1 lane", *POOL), rate=1_500_000),
 )
@@ -151,8 +152,8 @@ class Blind:
         return np.zeros((*leaves[0].shape[:2], self._params), np.float32)
 
 
-def ours(kind: str, lanes: int, spec: EnvSpec, copies: int, number: int) -> Turn:
-    """The collector over `lanes` lanes that share the copies."""
+def ours(kind: str, lanes: int, images: ImagesDtype, spec: EnvSpec, copies: int, number: int) -> Turn:
+    """The collector over `lanes` lanes that share the copies; `images`: as what it looks at them."""
     made = spec.make()
     about = PolicySpec(observation_leaves(made.observation_space), action_spec(made.action_space))
     vector: Literal["loop", "native", "envpool"] = "loop"
@@ -160,7 +161,7 @@ def ours(kind: str, lanes: int, spec: EnvSpec, copies: int, number: int) -> Turn
         case "native" | "envpool":
             vector = kind
     run = RunSpec(spec, about, rollout_steps=STEPS, copies=copies // lanes, lanes=PROCESSES * lanes, seed=1, vector=vector)
-    policy: Policy = Blind(about) if kind == "no network" else make_policy(about)
+    policy: Policy = Blind(about) if kind == "no network" else make_policy(about, images)
     if about.needs_torch:
         import torch
 
@@ -192,8 +193,8 @@ def _make(name: str, env: EnvSpec, copies: int, number: int) -> Turn:
             return bare_drawn(env, copies, number)
         case "bare", kind:
             return bare_vector(kind, env, copies, number)
-        case kind, lanes:
-            return ours(kind, int(lanes.split()[0]), env, copies, number)
+        case kind, lanes, *narrow:
+            return ours(kind, int(lanes.split()[0]), "bfloat16" if narrow else "float32", env, copies, number)
     raise ValueError(name)
 
 

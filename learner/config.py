@@ -23,6 +23,7 @@ from learner.nearest import nearest
 from protocol.address import advertised, check_address
 from protocol.errors import UsageError
 from protocol.precision import WeightsDtype
+from protocol.specs import ImagesDtype
 
 PRESETS = Path(__file__).with_name("presets.toml")
 Scalar = bool | int | float | str
@@ -72,6 +73,10 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     weights_dtype: WeightsDtype = "float32"
     """as what weights travel to workers: rounded, as bfloat16 or float16, they are half as many bytes. Workers act under the
     rounded ones, of which their log-probabilities are; the learner's own stay float32
+    """
+    images_dtype: ImagesDtype = "float32"
+    """as what the acting policy looks at images; in bfloat16 half the work on a CPU with matrix units (AMX), more on one
+    without. Log-probabilities are those of the actions as they were drawn; the learner's own stay float32
     """
     bind: str = "tcp://127.0.0.1:5555"
     """where `millrace learner` listens for workers; tcp://0.0.0.0:5555 is for other machines, and needs keys"""

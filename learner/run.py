@@ -189,6 +189,10 @@ def run_spec(config: Config, env: EnvSpec, seen: Spaces | None = None) -> RunSpe
 
         encoder = describe_encoder(config.algorithm.encoder, observation, action)
         policy = msgspec.structs.replace(policy, encoder=encoder)
+    if config.images_dtype != "float32" and not policy.convolves:
+        raise UsageError(
+            f"images_dtype {config.images_dtype}: expected float32, for this policy has no convolutions of ours"
+        )
     if getattr(ALGORITHMS[config.algo], "whole_episodes", False):
         _check_whole_episodes(config, longest)
     match vector := "loop" if config.vector == "auto" else config.vector:
@@ -205,6 +209,7 @@ def run_spec(config: Config, env: EnvSpec, seen: Spaces | None = None) -> RunSpe
         seed=config.seed,
         vector=vector,
         compress=config.compress,
+        images_dtype=config.images_dtype,
         heartbeat_s=config.heartbeat_s,
     )
 

@@ -34,7 +34,7 @@ from protocol.policy import (
     size,
     views,
 )
-from protocol.specs import ActionSpec, PolicySpec
+from protocol.specs import ActionSpec, ImagesDtype, PolicySpec
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
@@ -85,6 +85,31 @@ class MLP(torch.autograd.Function):
         return tuple(reversed(found))
 
 
+class Convolutions(NamedTuple):
+    """What an image goes through first, and the layer after it."""
+
+    channels_last: bool
+    parameters: list[tuple[Tensor, Tensor]]  # weight and bias of each convolution, then of the layer
+    strides: list[int]
+    narrow: bool = False  # parameters are bfloat16, the first ones divided by 255
+
+    def narrowed(self) -> Convolutions:
+        """With copies of the parameters, in bfloat16, and laid as it is fastest with: half the time of any other way."""
+        (first, bias), *others = ((weight.to(torch.bfloat16), bias.to(torch.bfloat16)) for weight, bias in self.parameters)
+        *convs, out = [(first / 255, bias), *others]
+        laid = [(weight.contiguous(memory_format=torch.channels_last), bias) for weight, bias in convs]
+        return self._replace(parameters=[*laid, out], narrow=True)
+
+    def __call__(self, image: Tensor) -> Tensor:
+        """Images [B, *leaf] uint8 -> features [B, IMAGE_FEATURES] float32, computed in the dtype of the parameters."""
+        *convs, (weight, bias) = self.parameters
+        h = (image.permute(0, 3, 1, 2) if self.channels_last else image).to(weight.dtype, copy=True)
+        h = h.contiguous(memory_format=torch.channels_last) if self.narrow else h.mul_(1 / 255)
+        for (w, b), stride in zip(convs, self.strides, strict=True):
+            h = F.relu(F.conv2d(h, w, b, stride), inplace=True)
+        return F.relu(F.linear(h.flatten(1), weight, bias)).float()
+
+
 class FlatNetwork:
     """Named parameters that are views into one flat tensor, and the convolutions that images go through first."""
 
@@ -108,7 +133,7 @@ class FlatNetwork:
         self._relu = spec.activation == "relu"
         self._encoder = None if spec.encoder is None else self._own(make_encoder(spec, seed).to(device))
         images = [i for i, leaf in enumerate(spec.observation) if leaf.is_image]
-        self._images = [] if self._encoder else [self._image(i) for i in images]
+        self._images = self._own_images = [] if self._encoder else [self._image(i) for i in images]
         if spec.needs_torch:
             keep_freed()
 
@@ -138,13 +163,17 @@ class FlatNetwork:
         out = self.mlp(x, layers)
         return torch.relu(out) if self._relu else torch.tanh(out)
 
-    def _image(self, i: int) -> tuple[bool, list[tuple[Tensor, Tensor, int]], tuple[Tensor, Tensor]]:
+    def narrow_convolutions(self) -> None:
+        """From now on look at images in bfloat16, under the parameters as they are now; without gradient."""
+        with torch.no_grad():
+            self._images = [image.narrowed() for image in self._own_images]
+
+    def _image(self, i: int) -> Convolutions:
         leaf = self.spec.observation[i]
         stack, (channels, _, _), _ = convolutions(leaf)
         names = [f"image{i}.{j}" for j in range(len(stack))] + [f"image{i}.out"]
-        *convs, out = [(self.parameters[f"{name}.weight"], self.parameters[f"{name}.bias"]) for name in names]
-        last = leaf.shape != (channels, *leaf.shape[1:])
-        return last, [(w, b, conv.stride) for (w, b), conv in zip(convs, stack, strict=True)], out
+        parameters = [(self.parameters[f"{name}.weight"], self.parameters[f"{name}.bias"]) for name in names]
+        return Convolutions(leaf.shape != (channels, *leaf.shape[1:]), parameters, [conv.stride for conv in stack])
 
     def inputs(self, x: Tensor, images: Sequence[Tensor]) -> Tensor:
         """Features [B, D] and images [B, *leaf] uint8 -> what the MLPs take [B, D + IMAGE_FEATURES per image].
@@ -155,11 +184,7 @@ class FlatNetwork:
             out: Tensor = self._encoder(x, *images)
             return out
         parts = [x]
-        for (channels_last, convs, (weight, bias)), image in zip(self._images, images, strict=True):
-            h = (image.permute(0, 3, 1, 2) if channels_last else image).to(torch.float32, copy=True).mul_(1 / 255)
-            for w, b, stride in convs:
-                h = F.relu(F.conv2d(h, w, b, stride), inplace=True)
-            parts.append(F.relu(F.linear(h.flatten(1), weight, bias)))
+        parts += [convolutions(image) for convolutions, image in zip(self._images, images, strict=True)]
         return torch.cat(parts, -1) if images else x
 
     def core(self, x: Tensor, memory: Memory) -> tuple[Tensor, Tensor]:
@@ -280,9 +305,12 @@ def _categorical(logits: Tensor, choice: Tensor) -> tuple[Tensor, Tensor]:
 class TorchPolicy:
     """Acts as `NumpyPolicy` does, with images. Lanes go one at a time, so each gets the bits it would get alone."""
 
-    def __init__(self, spec: PolicySpec, device: str = "cpu", *, together: bool = False) -> None:
-        """`together`: all lanes in one pass, for whoever always has all of them."""
+    def __init__(
+        self, spec: PolicySpec, device: str = "cpu", *, together: bool = False, images: ImagesDtype = "float32"
+    ) -> None:
+        """`together`: all lanes in one pass, for whoever always has all of them. `images`: as what it looks at them."""
         self.spec = spec
+        self._images = images
         self._device, self._together = device, together
         self._net = QNetwork(spec, device) if spec.head == "q" else ActorCritic(spec, device)
         self._buffers: dict[str, Floats] = {}
@@ -296,6 +324,8 @@ class TorchPolicy:
                 f"got {parameters.shape} and {buffers.shape}"
             )
         self._net.flat[:count].copy_(torch.tensor(parameters))
+        if self._images == "bfloat16":
+            self._net.narrow_convolutions()
         self._buffers = views(buffers, buffer_fields(self.spec))
 
     def __call__(self, leaves: Sequence[Array], state: Floats | None = None) -> Floats:

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from protocol.core import advance, core_shapes, zero_state
 from protocol.distributions import distribution
-from protocol.specs import Leaf, PolicySpec
+from protocol.specs import ImagesDtype, Leaf, PolicySpec
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
@@ -274,10 +274,13 @@ class NumpyPolicy:
         return params
 
 
-def make_policy(spec: PolicySpec) -> Policy:
-    """What acts for this spec: numpy for an MLP; torch, imported only then, where there are images."""
+def make_policy(spec: PolicySpec, images: ImagesDtype = "float32") -> Policy:
+    """What acts for this spec: numpy for an MLP; torch, imported only then, where there are images.
+
+    `images`: as what it looks at them.
+    """
     if not spec.needs_torch:
         return NumpyPolicy(spec)
     from protocol.networks import TorchPolicy
 
-    return TorchPolicy(spec)
+    return TorchPolicy(spec, images=images)

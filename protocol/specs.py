@@ -202,6 +202,9 @@ class EncoderSpec(msgspec.Struct, frozen=True):
     """how many features it gives"""
 
 
+ImagesDtype = Literal["float32", "bfloat16"]
+
+
 class PolicySpec(msgspec.Struct, frozen=True):
     """A policy as plain data: enough to act in numpy (workers) and to learn in torch (learner)."""
 
@@ -233,7 +236,12 @@ class PolicySpec(msgspec.Struct, frozen=True):
     @property
     def needs_torch(self) -> bool:
         """Images need convolutions, which numpy has not, and modules are torch's; every other policy acts without it."""
-        return self.encoder is not None or any(leaf.is_image for leaf in self.observation)
+        return self.encoder is not None or self.convolves
+
+    @property
+    def convolves(self) -> bool:
+        """Images go through convolutions of ours."""
+        return self.encoder is None and any(leaf.is_image for leaf in self.observation)
 
 
 class RunSpec(msgspec.Struct, frozen=True, tag=True):
@@ -253,6 +261,8 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
     """
     compress: Literal["none", "zstd"] = "none"
     """what workers do with the larger arrays of their rollouts, besides what they do anyway"""
+    images_dtype: ImagesDtype = "float32"
+    """as what workers look at images, with convolutions of ours"""
     heartbeat_s: float = 1.0
     learner_timeout_s: float = 30.0
     """a worker that heard nothing of the learner for so long starts again with Hello"""

@@ -257,6 +257,20 @@ def test_torch_policy_gives_each_lane_the_bits_it_gets_alone(observation: tuple[
     np.testing.assert_allclose(together.reshape(15, 8), it.net.params(x, images).detach(), atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.parametrize("observation", IMAGES.values())
+def test_images_in_bfloat16_are_seen_nearly_the_same_under_all_weights(observation: tuple[Leaf, ...]) -> None:
+    it = loaded(observation)
+    narrow = TorchPolicy(it.spec, images="bfloat16")
+    obs = leaves(observation, (2, 5), np.random.default_rng(2))
+    for seed in (3, 4):
+        parameters, buffers = random_weights(it.spec, it.net, np.random.default_rng(seed))
+        for policy in (it.policy, narrow):
+            policy.load(parameters * np.float32(0.1), buffers)  # or every tanh is at its end
+        exact, seen = it.policy(obs), narrow(obs)
+        assert seen.dtype == np.float32
+        assert 0 < np.abs(seen - exact).max() < 0.03 * exact.std()
+
+
 def test_torch_policy_acts_as_the_numpy_policy() -> None:
     it = loaded(OBSERVATIONS["dict"])
     numpy_policy = NumpyPolicy(it.spec)

@@ -46,7 +46,7 @@ MakeCollector = Callable[[RunSpec], Collector]
 
 def acting_by_itself(run: RunSpec) -> Collector:
     """Copies of its own, one lane after another, and a policy of its own."""
-    return Collector(run, make_policy(run.policy))
+    return Collector(run, make_policy(run.policy, run.images_dtype))
 
 
 class _Abandoned(Exception):

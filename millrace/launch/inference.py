@@ -23,7 +23,7 @@ from millrace.launch.here import StartFlags, flags_of, own_address
 from millrace.launch.vector import make_vec
 from protocol.link import LearnerLink
 from protocol.policy import Policy, make_policy
-from protocol.specs import EnvSpec, PolicySpec, RunSpec
+from protocol.specs import EnvSpec, ImagesDtype, PolicySpec, RunSpec
 from workers.collector import Collector
 from workers.copies import Pulse
 from workers.host import Host, Thread
@@ -61,7 +61,7 @@ def train(
         parts = SideBySide(env, config.lanes, _patience(env, workers, config.no_workers_timeout_s))
 
         def collector(spec: RunSpec) -> Collector:
-            return Collector(spec, acting(spec.policy, run.device), parts.open, parts.begin)
+            return Collector(spec, acting(spec.policy, run.device, spec.images_dtype), parts.open, parts.begin)
 
         host = Host(lambda name: Thread(link.address, name, context, collector), 1, called="inference")
         stack.callback(host.stop)
@@ -79,13 +79,13 @@ def train(
         return run.folder.path
 
 
-def acting(spec: PolicySpec, device: str) -> Policy:
+def acting(spec: PolicySpec, device: str, images: ImagesDtype) -> Policy:
     """What acts: as on a worker, to the same bits, where that is numpy on the CPU; else torch on the device, in one pass."""
     if device == "cpu" and not spec.needs_torch:
         return make_policy(spec)
     from protocol.networks import TorchPolicy
 
-    return TorchPolicy(spec, device, together=True)
+    return TorchPolicy(spec, device, together=True, images=images)
 
 
 def _vector_env(
