@@ -88,8 +88,10 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """let other machines connect without keys: whoever reaches the port can read the run, spoil it and stop it"""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """where the learner learns"""
-    torch_threads: Count = 1
-    """threads of PyTorch in the learner; more than 1 pays only for large networks"""
+    torch_threads: Count | None = None
+    """threads of PyTorch in the learner; none: 1 for a small MLP, else as many as there are cores that no worker needs
+    meanwhile (with max_lag 0 all). Their number changes results in the last bits
+    """
     run_dir: str = "runs"
     """where run folders go"""
 

@@ -24,13 +24,14 @@ from learner.listening import join_lines, keyring_for
 from learner.metrics import Progress
 from learner.roster import Roster
 from learner.run_folder import Interrupted, RunFolder
+from protocol.cores import cores
 from protocol.errors import UsageError
 from protocol.link import LearnerLink
 from protocol.native import check_native
 from protocol.packing import why_no_zstd
 from protocol.pool import check_pool
 from protocol.spaces import action_spec, observation_leaves
-from protocol.specs import ActionSpec, EnvSpec, Leaf, RunSpec
+from protocol.specs import ActionSpec, EnvSpec, Leaf, PolicySpec, RunSpec
 
 if TYPE_CHECKING:  # they bring torch along
     from learner.algorithms import Algorithm
@@ -53,8 +54,11 @@ class Run:
         watch: Watch,
         look: Look,
         begin: Callable[[Path], None] = lambda folder: None,
+        workers: int = 0,
     ) -> None:
         """`resume`: the folder of a run that goes on from its newest checkpoint. Raises `OurError` in one line.
+
+        `workers`: how many processes share this machine's cores with it.
 
         `watch` is called after each update, `look` whenever the learner has listened to its workers. `begin` is told the
         run folder before torch is imported: workers that are started there are ready when the learner is.
@@ -63,21 +67,29 @@ class Run:
         self.folder = RunFolder.create(config) if resume is None else RunFolder.open(resume)
         try:
             begin(self.folder.path)
-            self._make(config, env, seen, link, resume is not None, watch, look)
+            self._make(config, env, seen, link, resume is not None, watch, look, workers)
         except BaseException:
             self.folder.remove()
             raise
 
     def _make(
-        self, config: Config, env: EnvSpec, seen: Spaces, link: LearnerLink, resumed: bool, watch: Watch, look: Look
+        self,
+        config: Config,
+        env: EnvSpec,
+        seen: Spaces,
+        link: LearnerLink,
+        resumed: bool,
+        watch: Watch,
+        look: Look,
+        workers: int,
     ) -> None:
         import torch
 
         from learner.algorithms import ALGORITHMS
         from learner.journal import Journal, Past, recall
 
-        torch.set_num_threads(config.torch_threads)
         spec = run_spec(config, env, seen)
+        torch.set_num_threads(threads(config, spec.policy, workers))
         self.device = _device(config)
         make = ALGORITHMS[config.algo]
         self.algorithm: Algorithm = make(
@@ -212,6 +224,17 @@ def run_spec(config: Config, env: EnvSpec, seen: Spaces | None = None) -> RunSpe
         images_dtype=config.images_dtype,
         heartbeat_s=config.heartbeat_s,
     )
+
+
+def threads(config: Config, policy: PolicySpec, workers: int) -> int:
+    """Of torch. What learns without a graph gains nothing by more than one."""
+    from learner.algorithms.fused import applies
+
+    if config.torch_threads is not None:
+        return config.torch_threads
+    if applies(policy):
+        return 1
+    return max(1, cores() - (workers if config.max_lag else 0))
 
 
 def _check_whole_episodes(config: Config, longest: int | None) -> None:

@@ -227,8 +227,3 @@ class Awake:
                 break
         self._left_out = self._to_leave_out = min(2 * self._left_out + 1, MOST_LEFT_OUT)
         return False
-
-
-def cores() -> int:
-    """How many of this machine's cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from protocol.cores import cores
 from protocol.errors import OurError, UsageError
 from protocol.messages import Answer, Array, Call, Order, Reset, Returned, Step, Stepped
 from protocol.plain import pack, unpack
-from protocol.shared import MAY_SPIN, SPIN_S, Awake, Bell, Handed, Memory, Rung, cores
+from protocol.shared import MAY_SPIN, SPIN_S, Awake, Bell, Handed, Memory, Rung
 from protocol.specs import StepSpec
 from workers.copies import CopyRaised, Pulse
 from workers.lane import environment_raised

@@ -51,7 +51,8 @@ def train(
 
         def begin() -> StartFlags:
             env = EnvSpec.of(config.env if factory is None else factory, config.env_kwargs)
-            made.append(Run(config, env, link, resume, watch, stack.enter_context(looking(config))))
+            beside = 0 if elsewhere else config.workers
+            made.append(Run(config, env, link, resume, watch, stack.enter_context(looking(config)), workers=beside))
             return flags_of(config, made[0].folder.path)
 
         env = _vector_env(config, factory, elsewhere, begin)

@@ -46,7 +46,7 @@ def train(config: Config, resume: Path | None, watch: Watch, factory: Callable[.
             hosts.append(Host(_starter(config, link.address, token, context, folder), config.workers))
             stack.callback(hosts[0].stop)
 
-        run = Run(config, env, link, resume, watch, stack.enter_context(looking(config)), begin)
+        run = Run(config, env, link, resume, watch, stack.enter_context(looking(config)), begin, config.workers)
         run.journal.workers_expected = config.workers
         run.go(config.min_workers or config.workers, hosts[0].poll)
         return run.folder.path

@@ -22,11 +22,12 @@ from learner.vector_env import ZmqVectorEnv
 from learner.vector_spec import Env, describe
 from millrace.launch.here import StartFlags, own_address, own_keys
 from protocol.address import advertised, check_address
+from protocol.cores import cores
 from protocol.errors import UsageError
 from protocol.key_folder import Keyring
 from protocol.keys import Token
 from protocol.link import LearnerLink
-from protocol.shared import POSSIBLE, SPIN_S, Bell, Handed, Memory, cores
+from protocol.shared import POSSIBLE, SPIN_S, Bell, Handed, Memory
 from protocol.specs import Scalar
 from workers.host import Host, Process, Running, Thread
 
