@@ -74,7 +74,7 @@ class Contender(NamedTuple):
 
 
 OURS, OURS_OWN = "millrace, 2 workers", "millrace, own preset"
-OVERLAPPED, NATIVE = "millrace, --max-lag 1", "millrace, --vector native"
+OVERLAPPED, NATIVE, ONE_NATIVE = "millrace, --max-lag 1", "millrace, --vector native", "millrace, 1 worker, both"
 DUMMY, SUBPROC = "SB3, one process", "SB3, SubprocVecEnv"
 _SB3, _PEERS = "benchmarks.train_stable_baselines3", "benchmarks.peers"
 AS_PUFFERLIB, AS_SAMPLE_FACTORY = "millrace, as PufferLib's own", "millrace, as Sample Factory's own"
@@ -91,6 +91,7 @@ CONTENDERS = {
     OURS: Contender("millrace", flags=("--lanes", "2")),
     OVERLAPPED: Contender("millrace", flags=("--lanes", "2", "--max-lag", "1")),
     NATIVE: Contender("millrace", flags=("--lanes", "2", "--vector", "native")),
+    ONE_NATIVE: Contender("millrace", flags=("--lanes", "1", "--workers", "1", "--vector", "native", "--max-lag", "1")),
     AS_PUFFERLIB: Contender("millrace", own=True, flags=_flags("16 64 256", "--net 64 --shared-net")),
     AS_SAMPLE_FACTORY: Contender("millrace", own=True, flags=_flags("40 32 512", "--net 512 512 --shared-net --max-lag 1")),
     OURS_OWN: Contender("millrace", own=True),
