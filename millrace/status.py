@@ -62,7 +62,7 @@ def observe(link: WorkerLink, flags: StatusFlags) -> None:
         while True:
             status = ask(link, flags.timeout_s)
             if flags.json:
-                console.out(msgspec.json.encode(status).decode(), highlight=False)
+                console.out(in_json(status), highlight=False)
             else:
                 console.print(shown(status))
             if not flags.watch:
@@ -72,6 +72,11 @@ def observe(link: WorkerLink, flags: StatusFlags) -> None:
         while True:
             live.update(shown(ask(link, flags.timeout_s)), refresh=True)
             time.sleep(EVERY_S)
+
+
+def in_json(status: Status) -> str:
+    """One line, fields by name, which the message itself leaves out."""
+    return msgspec.json.encode({"type": Status.__name__, **msgspec.structs.asdict(status)}).decode()
 
 
 def shown(status: Status) -> RenderableType:

@@ -1,9 +1,10 @@
 """Message <-> frames. Pure: bytes in, records out; bounded; no pickle.
 
-Frame 0 is the head, msgpack: the message's fields under its type's name, each array in its place as
-[dtype, shape, index of its frame]. Frames 1… are the arrays' raw bytes, C-ordered, little-endian. Everything a peer says
-is checked before it is used: the number of frames and bytes, the head's size and nesting, every type, every shape. An
-array that arrives is a read-only view on the received frame: no copy.
+Frame 0 is the head, msgpack: [type's name, field, field, …] in the order of the record, each array in its place as
+[dtype, shape, index of its frame]. `Hello` and `Refuse` alone are maps, fields by name and the type's name under `type`:
+all versions must understand them. Frames 1… are the arrays' raw bytes, C-ordered, little-endian. Everything a peer says is
+checked before it is used: the number of frames and bytes, the head's size and nesting, every type, every shape. An array
+that arrives is a read-only view on the received frame: no copy.
 
 Arrays of a rollout may come packed (`packing.py`), as [dtype, shape, index, packings]; what a message's packed arrays come
 to together is bounded by the receiver.
@@ -11,9 +12,11 @@ to together is bounded by the receiver.
 
 from __future__ import annotations
 
+import operator
 import sys
 from collections.abc import Sequence
-from typing import Any
+from functools import reduce
+from typing import Any, get_args
 
 import msgpack
 import msgspec
@@ -21,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from protocol.errors import BadMessage
-from protocol.messages import Inquire, Rollout, ToLearner, ToObserver, ToWorker
+from protocol.messages import Hello, Inquire, Refuse, Rollout, Status, ToLearner, ToObserver, ToWorker
 from protocol.packing import Packing, as_it_lies, unpacked
 
 Array = npt.NDArray[Any]
@@ -35,6 +38,12 @@ MAX_DIMENSIONS = 8
 DTYPES = {
     name: np.dtype(name) for name in ("|b1", "|i1", "|u1", "<i2", "<u2", "<i4", "<u4", "<i8", "<u8", "<f2", "<f4", "<f8")
 }
+
+# What may be said, by position and by name. To msgspec a union of both is none: what the head is says which of them to take.
+Said = tuple[Any, Any]
+TO_WORKER: Said = (reduce(operator.or_, (kind for kind in get_args(ToWorker) if kind is not Refuse)), Refuse)
+TO_LEARNER: Said = (reduce(operator.or_, (kind for kind in get_args(ToLearner | Inquire) if kind is not Hello)), Hello)
+TO_OBSERVER: Said = (Status, Status)
 
 assert sys.byteorder == "little", "millrace sends arrays as they lie in memory and knows little-endian machines only"
 
@@ -69,27 +78,29 @@ def decode_to_learner(frames: Sequence[Buffer], room: int = 0) -> ToLearner | In
 
     `room`: bytes to which its packed arrays may come, all together; 0: none may come packed.
     """
-    message: ToLearner | Inquire = _decode(frames, ToLearner | Inquire, room)
+    message: ToLearner | Inquire = _decode(frames, TO_LEARNER, room)
     return message
 
 
 def decode_to_worker(frames: Sequence[Buffer]) -> ToWorker:
     """What the learner said. Raises `BadMessage`, whatever the bytes."""
-    message: ToWorker = _decode(frames, ToWorker)
+    message: ToWorker = _decode(frames, TO_WORKER)
     return message
 
 
 def decode_to_observer(frames: Sequence[Buffer]) -> ToObserver:
     """What the learner answered. Raises `BadMessage`, whatever the bytes."""
-    message: ToObserver = _decode(frames, ToObserver)
+    message: ToObserver = _decode(frames, TO_OBSERVER)
     return message
 
 
-def _decode(frames: Sequence[Buffer], kind: Any, room: int = 0) -> Any:
+def _decode(frames: Sequence[Buffer], kinds: Said, room: int = 0) -> Any:
     if not 1 <= len(frames) <= MAX_FRAMES:
         raise BadMessage(f"message expected 1 to {MAX_FRAMES} frames, got {len(frames)}")
     if len(frames[0]) > MAX_HEAD_BYTES:
         raise BadMessage(f"head expected at most {MAX_HEAD_BYTES} bytes, got {len(frames[0])}")
+    by_position, by_name = kinds
+    head: object = None
     used: set[int] = set()
     taken = 0
 
@@ -119,15 +130,31 @@ def _decode(frames: Sequence[Buffer], kind: Any, room: int = 0) -> Any:
             max_ext_len=0,
             strict_map_key=True,
         )
-        message = msgspec.convert(head, kind, dec_hook=hook)
+        named = type(head) is dict and "type" in head  # msgspec takes a map without one for the only kind it may be
+        message = msgspec.convert(head, by_name if named else by_position, dec_hook=hook)
     except BadMessage:
         raise
     except Exception as error:  # msgpack and msgspec raise a dozen types on hostile bytes; to us they are one
-        said = " ".join(str(error).split())[:200]  # it quotes the peer
+        said = " ".join(_in_words(str(error), head, by_position).split())[:200]  # it quotes the peer
         raise BadMessage(f"head is not a message of ours: {type(error).__name__}: {said}") from error
     if len(used) != len(frames) - 1:
         raise BadMessage(f"{type(message).__name__}: expected {len(used)} arrays, got {len(frames) - 1} frames")
     return message
+
+
+def _in_words(error: str, head: object, kinds: Any) -> str:
+    """What msgspec says of a head that goes by position, with the names of fields, and their number without the type."""
+    match head:
+        case [str() as name, *given]:
+            kind = next((kind for kind in get_args(kinds) or (kinds,) if kind.__name__ == name), None)
+            fields: tuple[str, ...] = kind.__struct_fields__ if kind is not None else ()
+            what, at, where = error.rpartition(" - at `$[")
+            place, _, inside = where.partition("]")
+            if at and place.isdecimal() and 1 <= int(place) <= len(fields):
+                return f"{what} - at `{name}.{fields[int(place) - 1]}{inside}"
+            if not at and len(given) != len(fields):
+                return f"{name} expected {len(fields)} fields, got {len(given)}"
+    return error
 
 
 def _described(frames: Sequence[Buffer], value: object) -> tuple[np.dtype[Any], list[int], int, int, list[object] | None]:

@@ -13,16 +13,16 @@ import numpy.typing as npt
 from protocol.rollout import Rollout
 from protocol.specs import RunSpec, StepSpec
 
-PROTOCOL_VERSION = 2
+PROTOCOL_VERSION = 3
 
 Array = npt.NDArray[Any]
 
 
-class Message(msgspec.Struct, frozen=True, tag=True, forbid_unknown_fields=True):
-    """Base of all messages but `Rollout`, which has a file of its own."""
+class Message(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unknown_fields=True):
+    """Base of all messages but `Rollout`, which has a file of its own. They travel by position, without names of fields."""
 
 
-class Hello(Message, frozen=True):
+class Hello(Message, frozen=True, array_like=False):  # a map, as in every version, so that any two can part politely
     """I exist; may I join? Said again, with backoff, until answered."""
 
     protocol: int
@@ -46,7 +46,7 @@ class Welcome(Message, frozen=True):
     run: RunSpec | StepSpec
 
 
-class Refuse(Message, frozen=True):
+class Refuse(Message, frozen=True, array_like=False):  # a map, as Hello is
     """Leave, with exit code 2."""
 
     reason: str

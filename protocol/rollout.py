@@ -36,7 +36,7 @@ class Episode(msgspec.Struct, frozen=True, array_like=True):
     seconds: float
 
 
-class Rollout(msgspec.Struct, frozen=True, tag=True, forbid_unknown_fields=True):
+class Rollout(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unknown_fields=True):
     """T steps of a lane of N env copies, all acted under one version."""
 
     session: int

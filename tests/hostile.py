@@ -23,10 +23,11 @@ HUGE = [
 ]  # fmt: skip
 NONSENSE: list[Any] = [
     None, True, -1, 2**63, -(2**63), 1e308, float("nan"), "", "x" * 10_000, b"\x00" * 100, [], {}, [[[[[[]]]]]],
-    {"type": "Hello"}, ["|O", [1], 1], ["O", [1], 1], ["|V16", [1], 1], ["|S5", [1], 1], ["<M8[s]", [1], 1], [">f4", [1], 1],
-    ["<f4", [-1], 1], ["<f4", [-2, -2], 1], ["<f4", [2**31, 2**31], 1], ["<f4", [0, 2**40], 1], ["<f4", [1] * 40, 1],
-    ["|u1", [17, 1, 4, 8, 8], 1, ["stack"]], ["|u1", [2**9, 2, 16, 8, 8], 1, ["stack"]], ["<f4", [1], 1, []], ["stack"],
-    ["<f4", [1], 0], ["<f4", [1], -1], ["<f4", [1], 99], ["<f4", [True], 1], ["<f8", [1.5], 1], ["<f4", "12", 1],
+    {"type": "Hello"}, ["Goodbye"], ["|O", [1], 1], ["O", [1], 1], ["|V16", [1], 1], ["|S5", [1], 1], ["<M8[s]", [1], 1],
+    [">f4", [1], 1], ["<f4", [-1], 1], ["<f4", [-2, -2], 1], ["<f4", [2**31, 2**31], 1], ["<f4", [0, 2**40], 1],
+    ["<f4", [1] * 40, 1], ["|u1", [17, 1, 4, 8, 8], 1, ["stack"]], ["|u1", [2**9, 2, 16, 8, 8], 1, ["stack"]],
+    ["<f4", [1], 1, []], ["stack"], ["<f4", [1], 0], ["<f4", [1], -1], ["<f4", [1], 99], ["<f4", [True], 1],
+    ["<f8", [1.5], 1], ["<f4", "12", 1],
 ]  # fmt: skip
 
 
@@ -52,7 +53,7 @@ def hostile(seed: int, messages: Sequence[Any]) -> Iterator[Frames]:
     rng = np.random.default_rng(seed)
     frames = [[bytes(frame) for frame in encode(message, Packing(stack=True))] for message in messages]
     kinds: list[Callable[[np.random.Generator, Frames], Frames]] = [
-        _random, _flipped, _cut, _doubled, _twisted, _twisted, _lying, _as_it_is,
+        _random, _flipped, _cut, _doubled, _twisted, _twisted, _misplaced, _lying, _as_it_is,
     ]  # fmt: skip
     while True:
         yield kinds[rng.integers(len(kinds))](rng, list(frames[rng.integers(len(frames))]))
@@ -99,6 +100,22 @@ def _twisted(rng: np.random.Generator, frames: Frames) -> Frames:
         frames[0] = msgpack.packb(head)
     except OverflowError:
         frames[0] = msgspec.msgpack.encode(None)
+    return frames
+
+
+def _misplaced(rng: np.random.Generator, frames: Frames) -> Frames:
+    """One field of the head is left out, said twice, or changes places with another."""
+    head = msgpack.unpackb(frames[0])
+    fields = list(head.items()) if isinstance(head, dict) else head
+    one, other = (int(rng.integers(len(fields))) for _ in range(2))
+    match rng.integers(3):
+        case 0:
+            del fields[one]
+        case 1:
+            fields.insert(other, fields[one])
+        case _:
+            fields[one], fields[other] = fields[other], fields[one]
+    frames[0] = msgpack.packb(dict(fields) if isinstance(head, dict) else fields)
     return frames
 
 

@@ -17,9 +17,11 @@ from hypothesis.extra import numpy as hnp
 
 from protocol.codec import DTYPES, MAX_FRAMES, MAX_HEAD_BYTES, decode_to_learner, decode_to_worker, encode
 from protocol.errors import BadMessage
-from protocol.messages import Hello, ToLearner, ToWorker, Weights
+from protocol.messages import Hello, Inquire, Refuse, Rollout, ToLearner, ToWorker, Weights
+from tests.fakes import fake_rollout
 
 KINDS = [*typing.get_args(ToLearner), *typing.get_args(ToWorker)]
+BY_NAME = (Hello, Refuse)
 Frames = list[bytes]
 
 arrays = st.sampled_from(sorted(DTYPES)).flatmap(
@@ -83,7 +85,100 @@ def test_every_message_comes_back_as_it_went(message: Any) -> None:
 def test_no_message_is_taken_for_one_of_the_other_side(kind: type) -> None:
     wrong_side = decode_to_worker if kind in typing.get_args(ToLearner) else decode_to_learner
     with pytest.raises(BadMessage, match=f"Invalid value '{kind.__name__}'"):
-        wrong_side(head({"type": kind.__name__}))
+        wrong_side(head({"type": kind.__name__} if kind in BY_NAME else [kind.__name__]))
+
+
+# ------------------------------------------------------------------------------------------------ the head's form
+
+
+@settings(max_examples=200, deadline=None)
+@given(messages)
+def test_what_goes_by_position_does_not_go_by_name_nor_the_other_way_about(message: Any) -> None:
+    first, *rest = sent(message)
+    content = msgpack.unpackb(first)
+    names = ["type", *message.__struct_fields__]
+    by_name = content if type(message) in BY_NAME else dict(zip(names, content, strict=True))
+    assert list(by_name) == names
+    assert by_name["type"] == type(message).__name__
+    for wrong in (list(by_name.values()), by_name):
+        if wrong != content:
+            with pytest.raises(BadMessage, match=f"Invalid value '{type(message).__name__}'"):
+                decode(head(wrong, *rest), type(message))
+    with pytest.raises(BadMessage, match="Expected `array`, got `object`"):
+        decode(head({name: by_name[name] for name in message.__struct_fields__}, *rest), type(message))
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.one_of([values(kind) for kind in KINDS if kind not in BY_NAME]), st.data())
+def test_a_head_of_another_length_is_refused(message: Any, data: st.DataObject) -> None:
+    first, *rest = sent(message)
+    content = msgpack.unpackb(first)
+    fields = len(message.__struct_fields__)
+    given = data.draw(st.integers(0, fields + 3).filter(lambda n: n != fields))
+    frames = head([*content[: 1 + given], *[None] * (given - fields)], *rest)
+    if isinstance(message, Rollout) and given == fields - 1:  # the one default there is
+        assert plainly(decode(frames, Rollout)) == plainly(msgspec.structs.replace(message, episodes=()))
+        return
+    with pytest.raises(BadMessage, match=f"{type(message).__name__} expected {fields} fields, got {given}$"):
+        decode(frames, type(message))
+
+
+def test_a_default_stands_at_the_end_alone() -> None:
+    """By position nothing else can be left out."""
+    defaults = {kind: kind.__struct_defaults__ for kind in (*KINDS, Inquire) if kind.__struct_defaults__}
+    assert defaults == {Rollout: ((),)}
+    assert Rollout.__struct_fields__[-1] == "episodes"
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (["Heartbeat", "7", 0, 0, [], 0, {}, 0], "Expected `int`, got `str` - at `Heartbeat.session`"),
+        (["Heartbeat", 7, 0, 0, [1, None], 0, {}, 0], "Expected `int`, got `null` - at `Heartbeat.tickets[1]`"),
+        (["Heartbeat", 7, 0, 0, [], 0, {"act": "x"}, 0], "Expected `float`, got `str` - at `Heartbeat.stages[...]`"),
+        (["Heartbeat", 7, 0, 0, [], 0, {}, 1.5], "Expected `int`, got `float` - at `Heartbeat.resident_bytes`"),
+        (["Heartbeat", 7, 0, 0, [], 0, {}], "Heartbeat expected 7 fields, got 6"),
+        (["Heartbeat", 7, 0, 0, [], 0, {}, 0, 0], "Heartbeat expected 7 fields, got 8"),
+        (["Heartbeat"], "Heartbeat expected 7 fields, got 0"),
+        (["Inquire", 1], "Inquire expected 0 fields, got 1"),
+        ({"type": "Hello", "protocol": None}, "Expected `int`, got `null` - at `$.protocol`"),
+        ({"type": "Hello"}, "Object missing required field `protocol`"),
+        ({"type": "Refuse", "reason": "no"}, "Invalid value 'Refuse'"),
+    ],
+)
+def test_what_is_wrong_in_a_head_is_named(content: object, says: str) -> None:
+    with pytest.raises(BadMessage) as caught:
+        decode_to_learner(head(content))
+    assert str(caught.value) == f"head is not a message of ours: ValidationError: {says}" or says.startswith("Invalid")
+    assert says in str(caught.value)
+
+
+def test_what_is_wrong_in_a_record_within_a_message_is_named() -> None:
+    for permit, says in (
+        ([1, 2], "Expected `array` of at least length 3, got 2 - at `Collect.permits[1]`"),
+        ([1, 2, []], "Expected `int`, got `array` - at `Collect.permits[1][2]`"),
+    ):
+        with pytest.raises(BadMessage) as caught:
+            decode_to_worker(head(["Collect", 7, 0, [[1, 0, 0], permit], []]))
+        assert says in str(caught.value)
+
+
+def test_hello_and_refuse_are_for_ever_what_they_were() -> None:
+    """Bytes of protocol version 2, whose other messages went by name too: the two still part politely."""
+    hello = bytes.fromhex(
+        "88a474797065a548656c6c6fa870726f746f636f6c02a6776f726b6572a27730a4686f7374a168a370696407a46c6966654d"
+        "a8736f667477617265a173a7617474656d707401"
+    )
+    assert decode_to_learner([hello]) == Hello(2, "w0", "h", 7, 77, "s", 1)
+    assert sent(Hello(2, "w0", "h", 7, 77, "s", 1)) == [hello]
+    refuse = bytes.fromhex("82a474797065a6526566757365a6726561736f6ea26e6f")
+    assert decode_to_worker([refuse]) == Refuse("no")
+    assert sent(Refuse("no")) == [refuse]
+
+
+def test_the_head_of_a_small_rollout_is_small() -> None:
+    head, *_ = encode(fake_rollout(2**63, 0, 1, 0, 0))
+    assert len(head) < 120
 
 
 # ------------------------------------------------------------------------------------------------ hostile bytes
@@ -155,7 +250,8 @@ Json = st.recursive(
 def test_a_field_of_another_kind(message: Any, data: st.DataObject, nonsense: Any) -> None:
     frames = sent(message)
     content = msgpack.unpackb(frames[0])
-    content[data.draw(st.sampled_from(sorted(content)))] = nonsense
+    places = sorted(content) if isinstance(content, dict) else range(len(content))
+    content[data.draw(st.sampled_from(places))] = nonsense
     survives(head(content, *frames[1:]))
 
 
@@ -164,7 +260,7 @@ WEIGHTS = Weights(version=1, parameters=np.arange(3, dtype=np.float32), buffers=
 
 def weights(parameters: object, *frames: bytes) -> Frames:
     """Weights whose parameters are described so, with these array frames."""
-    return head({"type": "Weights", "version": 1, "parameters": parameters, "buffers": ["<f4", [0], 1]}, b"", *frames)
+    return head(["Weights", 1, parameters, ["<f4", [0], 1]], b"", *frames)
 
 
 def test_the_hand_made_weights_are_good_ones() -> None:
@@ -187,10 +283,16 @@ def test_the_hand_made_weights_are_good_ones() -> None:
         ([b"\xc7\x01\x05x"], "head is not a message of ours"),  # an extension type
         ([b"\xd6\xff\x00\x00\x00\x00"], "head is not a message of ours"),  # a timestamp
         (head([1] * 70_000), "exceeds max_array_len"),
-        (head({"type": "Nothing"}), "head is not a message of ours"),
-        (head({"type": "x" * 1_000_000}), "head is not a message of ours"),
-        (head({"type": "Hello\nworker w1 said: all is well"}), "head is not a message of ours"),
-        (head({"type": ["x" * 100]}), "head is not a message of ours"),
+        (head(["Nothing"]), "Invalid value 'Nothing' - at `$[0]`"),
+        (head(["Nothing - at `$[1]`"]), "Invalid value 'Nothing - at `$[1]`' - at `$[0]`"),
+        (head(["x" * 1_000_000]), "Invalid value 'xxx"),
+        (head(["Hello\nworker w1 said: all is well"]), r"Invalid value 'Hello\nworker w1 said"),
+        (head([["x" * 100]]), "Expected `str`, got"),
+        (head([]), "Expected `array` of at least length 1, got 0"),
+        (head({"type": "Nothing"}), "Invalid value 'Nothing' - at `$.type`"),
+        (head({"type": "x" * 1_000_000}), "Invalid value 'xxx"),
+        (head({"type": "Hello\nworker w1 said: all is well"}), r"Invalid value 'Hello\nworker w1 said"),
+        (head({"type": ["x" * 100]}), "Expected `str`, got"),
         (head({1: 2}), "head is not a message of ours"),
         (head({}), "head is not a message of ours"),
         (head(None), "head is not a message of ours"),

@@ -155,6 +155,8 @@ STACKS = RunSpec(
     seed=1,
 )
 ROOM = rollout_bytes(STACKS)
+OBS = 1 + Rollout.__struct_fields__.index("obs")
+"""its place in the head"""
 
 
 def a_rollout(obs: tuple[npt.NDArray[Any], ...] = (frame_stacks(17, 2, 4, (8, 8)),)) -> Rollout:
@@ -205,7 +207,7 @@ def test_who_gives_no_room_takes_no_packed_array() -> None:
         decode_to_worker(frames)
     empty = [bytes(frame) for frame in encode(a_rollout((np.zeros(0, np.uint8),)))]
     head = msgspec.msgpack.decode(empty[0])
-    head["obs"][0].append(["zstd"])
+    head[OBS][0].append(["zstd"])
     with pytest.raises(BadMessage, match="packed arrays expected at most 0 bytes together, got 0"):
         decode_to_learner([msgspec.msgpack.encode(head), *empty[1:]])
     assert decode_to_learner(frames, 8704)
@@ -224,7 +226,7 @@ def test_packed_arrays_share_the_room() -> None:
 def test_a_packed_array_is_no_larger_than_a_frame_may_be() -> None:
     frames = sent(a_rollout())
     head = msgspec.msgpack.decode(frames[0])
-    head["obs"][0][1] = [2**16, 2**4, 16, 8, 9]
+    head[OBS][0][1] = [2**16, 2**4, 16, 8, 9]
     with pytest.raises(BadMessage, match=f"packed array expected at most {MAX_FRAME_BYTES} bytes, got {2**27 * 9}"):
         decode_to_learner([msgspec.msgpack.encode(head), *frames[1:]], 2**40)
 
@@ -233,7 +235,7 @@ def test_a_frame_is_not_unpacked_twice() -> None:
     """Else a head of a megabyte could have one frame unpacked thirty thousand times."""
     frames = sent(a_rollout())
     head = msgspec.msgpack.decode(frames[0])
-    head["obs"] *= 2
+    head[OBS] *= 2
     with pytest.raises(BadMessage, match="array frame 1 expected one array, got two"):
         decode_to_learner([msgspec.msgpack.encode(head), *frames[1:]], 10 * ROOM)
 
@@ -292,7 +294,7 @@ def test_what_is_not_quite_a_packed_array_is_refused(
 def test_packings_are_a_list(packings: Any) -> None:
     frames = sent(a_rollout())
     head = msgspec.msgpack.decode(frames[0])
-    head["obs"][0][3] = packings
+    head[OBS][0][3] = packings
     with pytest.raises(BadMessage):
         decode_to_learner([msgspec.msgpack.encode(head), *frames[1:]], ROOM)
 

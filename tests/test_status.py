@@ -19,7 +19,7 @@ from learner.events import Event, Left, Stale, Told, describe
 from learner.hub import Hub
 from learner.metrics import Progress
 from learner.status import status
-from millrace.status import ask, observer_name, shown
+from millrace.status import ask, in_json, observer_name, shown
 from millrace.terminal import watching
 from protocol.codec import encode
 from protocol.errors import RunError
@@ -158,6 +158,15 @@ def test_it_is_shown_as_a_table() -> None:
     assert "w2" in text
     assert "w1" not in text
     assert "1 tickets of workers that were lost" in text or "dropped: nothing" in text
+
+
+def test_in_json_every_field_has_its_name() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(b"a")
+    found = json.loads(in_json(told(learner)))
+    assert list(found) == ["type", *Status.__struct_fields__]
+    assert (found["type"], found["env_steps"]) == ("Status", 1_000)
+    assert (found["workers"][0]["worker"], found["workers"][0]["lanes"]) == ("a", [0])
 
 
 def test_a_run_without_workers_says_so() -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import ast
 import inspect
 import re
+import textwrap
 from collections.abc import Mapping
 from enum import Enum
 from pathlib import Path
@@ -20,7 +21,7 @@ import pytest
 
 from learner import membership, roster, standing
 from protocol import codec, handshake, link, messages, packing, rollout, specs
-from protocol.messages import PROTOCOL_VERSION, Collect, Permit, Received, Rollout, ToLearner, ToWorker, Weights
+from protocol.messages import PROTOCOL_VERSION, Collect, Hello, Permit, Received, Rollout, ToLearner, ToWorker, Weights
 from workers import session, states
 
 DOCUMENT = Path(__file__).parent.parent / "protocol" / "README.md"
@@ -124,14 +125,22 @@ def fields_of(kind: type) -> list[tuple[str, str, str, str]]:
     return rows
 
 
-def record(kind: type) -> str:
-    """A heading, what the class says of itself, and its fields."""
+def record(kind: type[msgspec.Struct]) -> str:
+    """A heading, what the class says of itself, and its fields: with their places, if they go by position."""
+    config = kind.__struct_config__
     lines = [f"#### `{kind.__name__}`", "", one_line(inspect.getdoc(kind) or ""), ""]
-    if rows := fields_of(kind):
-        lines += ["| field | type | meaning |", "|---|---|---|"]
-        for name, annotation, default, meaning in rows:
+    rows = fields_of(kind)
+    if not config.array_like:
+        lines += [f"A map; `{config.tag_field}` is `{kind.__name__}`." if config.tag else "A map.", ""]
+    elif not rows:
+        lines += [f'It has no fields: `["{kind.__name__}"]`.', ""]
+    if rows:
+        places = "| place " if config.array_like else ""
+        lines += [f"{places}| field | type | meaning |", "|---" * (4 if places else 3) + "|"]
+        for place, (name, annotation, default, meaning) in enumerate(rows, 1 if config.tag else 0):
             text = f"`{one_line(annotation)}`" + (f" = `{one_line(default)}`" if default else "")
-            lines.append(f"| `{name}` | {text} | {one_line(meaning or WORDS.get(name, ''))} |")
+            at = f"| {place} " if places else ""
+            lines.append(f"{at}| `{name}` | {text} | {one_line(meaning or WORDS.get(name, ''))} |")
         lines.append("")
     return "\n".join(lines)
 
@@ -172,10 +181,12 @@ def part_version() -> str:
 def part_example() -> str:
     weights = Weights(3, np.arange(6, dtype=np.float32), np.zeros(0, np.float32))
     collect = Collect(81985529216486895, 3, (Permit(40, 0, 1),), (Received(0, 1, 9, (10,)),))
+    hello = Hello(PROTOCOL_VERSION, "w0", "host", 7, 77, "millrace", 1)
     lines = ["```"]
-    for message in (collect, weights):
+    for message in (hello, collect, weights):
         head, *arrays = codec.encode(message)
         lines.append(f"frame 0  {shown(bytes(head))}")
+        lines += [f"         {row}" for row in textwrap.wrap(bytes(head).hex(" "), 3 * 32)]
         lines += [f"frame {number}  {len(array)} bytes" for number, array in enumerate(arrays, 1)]
         lines.append("")
     lines[-1] = "```"
@@ -288,6 +299,21 @@ def test_a_difference_is_noticed() -> None:
 
 def test_rollouts_fields_stand_in_the_order_of_the_code() -> None:
     assert [name for name, *_ in fields_of(Rollout)][:5] == ["session", "lane", "ticket", "version", "sequence"]
+
+
+@pytest.mark.parametrize("kind", [*ToLearner.__args__, *ToWorker.__args__, *OF_OBSERVERS], ids=lambda kind: kind.__name__)
+def test_from_the_document_alone_a_head_can_be_read(kind: type[msgspec.Struct]) -> None:
+    """Whatever stands at a place that the document gives to a field comes back as that field."""
+    text = record(kind)
+    places = {name: int(place) for place, name in re.findall(r"^\| (\d+) \| `(\w+)`", text, re.MULTILINE)}
+    fields = {name: f"its {name}" for name in kind.__struct_fields__}
+    head = msgspec.to_builtins(kind(**fields))
+    if kind in (Hello, messages.Refuse):
+        assert "A map; `type` is" in text
+        assert (places, head) == ({}, {"type": kind.__name__} | fields)
+    else:
+        assert head == [kind.__name__, *fields.values()]
+        assert {name: head[place] for name, place in places.items()} == fields
 
 
 if __name__ == "__main__":

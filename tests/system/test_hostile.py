@@ -19,8 +19,8 @@ from tests.system.processes import START_S, Learner, Stage, free_port
 from tests.system.runs import accounted
 from workers.copies import copy_seeds
 
-MESSAGES, STRANGERS = 30_000, 5
-GROWTH_MB = 30  # in the second half
+MESSAGES, STRANGERS = 100_000, 5
+GROWTH_MB = 20  # in the second half: by then the room for what waits to be read, which stays with the heap, is there
 
 
 def result(learner: Learner) -> tuple[bytes, dict[str, Any], list[dict[str, Any]]]:
