@@ -305,7 +305,7 @@ def main() -> None:
         try:
             case.env.make().close()
         except UsageError as error:
-            Console().print(f"left out: {error}")
+            print(f"left out: {error}")
             continue
         found = collecting(case, arguments.rounds, arguments.seconds, cpu=arguments.cpu)
         rows += found
