@@ -82,7 +82,8 @@ class Ray:
 
 
 @pytest.fixture
-def ray(stage: Stage) -> Iterator[Ray]:
+def ray(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> Iterator[Ray]:
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")  # a token in the home directory would be that of another cluster
     if importlib.util.find_spec("ray") is None:
         pytest.skip("Ray is not installed: pip install '.[ray]'")
     folder = Path(tempfile.mkdtemp(prefix="ray-", dir="/tmp"))  # the path of a socket must be short
