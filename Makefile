@@ -22,7 +22,7 @@ type: .venv/installed-dev
 unit: .venv/installed-dev
 	$(BIN)/python -m pytest
 
-test-learning: .venv/installed-dev  ## published scores, three seeds each; forty minutes
+test-learning: .venv/installed-dev  ## published scores, three seeds each; ten minutes
 	$(BIN)/python -m pytest -m learning --timeout 3600 tests/learning
 
 test-cluster: .venv/installed-dev  ## Docker, Prometheus, Slurm and Ray, for real. Needs root, Debian's packages, the extra `ray`; says which
@@ -35,7 +35,7 @@ soak: .venv/installed-dev  ## faults for ten minutes, every two seconds one; the
 docs: .venv/installed-dev  ## write the generated parts of protocol/README.md
 	$(BIN)/python -m tests.test_wire_document
 
-bench: .venv/installed-dev  ## all benchmarks, a quarter of an hour: tables here, JSON and pictures in benchmarks/results
+bench: .venv/installed-dev  ## all benchmarks, ten minutes: tables here, JSON and pictures in benchmarks/results
 	$(BIN)/millrace bench
 
 bench-peers: .venv/installed-dev  ## training beside seven other systems, each in an environment of its own (3 GB); forty minutes

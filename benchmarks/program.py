@@ -56,7 +56,7 @@ BENCHMARKS = {
 def overview() -> str:
     """What there is."""
     lines = [f"  millrace bench {name:8}  {each.about}" for name, each in BENCHMARKS.items()]
-    return "\n".join([*lines, "", "Without a name: all of them, about a quarter of an hour. NAME --help tells its flags."])
+    return "\n".join([*lines, "", "Without a name: all of them, about ten minutes. NAME --help tells its flags."])
 
 
 def main(argv: list[str]) -> int:

@@ -58,7 +58,7 @@ class Run:
     ) -> None:
         """`resume`: the folder of a run that goes on from its newest checkpoint. Raises `OurError` in one line.
 
-        `workers`: how many processes share this machine's cores with it.
+        `workers`: how many processes share this machine's cores with it, and run while it learns if `max_lag` lets them.
 
         `watch` is called after each update, `look` whenever the learner has listened to its workers. `begin` is told the
         run folder before torch is imported: workers that are started there are ready when the learner is.

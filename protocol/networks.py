@@ -132,8 +132,7 @@ class FlatNetwork:
             at = end
         self._relu = spec.activation == "relu"
         self._encoder = None if spec.encoder is None else self._own(make_encoder(spec, seed).to(device))
-        images = [i for i, leaf in enumerate(spec.observation) if leaf.is_image]
-        self._images = self._own_images = [] if self._encoder else [self._image(i) for i in images]
+        self._images = self._convolutions()
         if spec.needs_torch:
             keep_freed()
 
@@ -166,7 +165,12 @@ class FlatNetwork:
     def narrow_convolutions(self) -> None:
         """From now on look at images in bfloat16, under the parameters as they are now; without gradient."""
         with torch.no_grad():
-            self._images = [image.narrowed() for image in self._own_images]
+            self._images = [image.narrowed() for image in self._convolutions()]
+
+    def _convolutions(self) -> list[Convolutions]:
+        """Of each image, under the parameters themselves."""
+        images = [i for i, leaf in enumerate(self.spec.observation) if leaf.is_image]
+        return [] if self._encoder else [self._image(i) for i in images]
 
     def _image(self, i: int) -> Convolutions:
         leaf = self.spec.observation[i]

@@ -25,7 +25,7 @@ from protocol.keys import Token
 from protocol.link import WorkerLink
 from protocol.shared import Handed
 from protocol.specs import Code
-from workers.host import NOBODY, Host, Process
+from workers.host import NOBODY, Host, Process, keeping_to
 from workers.session import NO_LEARNER, Session
 from workers.trust import entry, trusted
 from workers.watchdog import Watchdog
@@ -106,8 +106,7 @@ def _host(options: argparse.Namespace, token: Token | None) -> int:
     flags += [flag for flag, given in (("--insecure", options.insecure), ("--no-code", options.no_code)) if given]
 
     def start(name: str) -> Process:
-        pinned = ["--core", str(cores[int(name.removeprefix("w")) % len(cores)])] if cores else []
-        return Process(options.address, f"{options.name}-{name}", None, token, [*flags, *pinned])
+        return Process(options.address, f"{options.name}-{name}", None, token, [*flags, *keeping_to(cores, name)])
 
     stops = _count_signals()
     host = Host(start, options.processes)

@@ -127,6 +127,11 @@ class Process:
             self._process.kill()
 
 
+def keeping_to(cores: Sequence[int], name: str) -> list[str]:
+    """Flags of `python -m workers` for w0, w1, …: each keeps to one of these cores, in turn; to none, if there are none."""
+    return ["--core", str(cores[int(name.removeprefix("w")) % len(cores)])] if cores else []
+
+
 class Thread:
     """A worker in a thread of this process, over inproc: for debugging, for tests, and to act on the learner's side."""
 

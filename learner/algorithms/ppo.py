@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
+from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +23,6 @@ from learner.hyperparameters import PPOConfig
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
-Bools = npt.NDArray[np.bool_]
 Floats = npt.NDArray[np.float32]
 
 
@@ -70,9 +70,9 @@ class PPO:
         rows = parts.rows(batch, seen, advantage, target)
         number = math.ceil(np.count_nonzero(batch.valid) / config.batch_size)
         epochs: list[list[Measured]] = []
-        for minibatches in parts.epochs(rows, batch.valid, number):
+        for minibatches in islice(parts.epochs(rows, batch.valid, number), config.n_epochs):
             epochs.append(self._epoch(minibatches, clip_range, pulse))
-            if len(epochs) == config.n_epochs or self._too_far(epochs):
+            if self._too_far(epochs):
                 break
         parts.used(batch, seen)
         self.epochs += len(epochs)

@@ -19,6 +19,7 @@ from learner.listening import throwaway
 from protocol.errors import UsageError
 from protocol.key_folder import Keyring, asked_folder
 from protocol.keys import Token
+from workers.host import keeping_to
 
 StartFlags = Callable[[str], tuple[list[str], Path | None]]
 """By a worker's name: the flags that its process is started with, and the file that its stderr goes to."""
@@ -52,8 +53,7 @@ def flags_of(config: Config, run: Path) -> StartFlags:
     cores = cores_for(config)
 
     def flags(name: str) -> tuple[list[str], Path]:
-        pinned = ["--core", str(cores[int(name.removeprefix("w")) % len(cores)])] if cores else []
-        return ["--step-timeout-s", str(config.step_timeout_s), *pinned], logs / f"{name}.log"
+        return ["--step-timeout-s", str(config.step_timeout_s), *keeping_to(cores, name)], logs / f"{name}.log"
 
     return flags
 

@@ -51,8 +51,7 @@ def train(
 
         def begin() -> StartFlags:
             env = EnvSpec.of(config.env if factory is None else factory, config.env_kwargs)
-            beside = 0 if elsewhere else config.workers
-            made.append(Run(config, env, link, resume, watch, stack.enter_context(looking(config)), workers=beside))
+            made.append(Run(config, env, link, resume, watch, stack.enter_context(looking(config))))
             return flags_of(config, made[0].folder.path)
 
         env = _vector_env(config, factory, elsewhere, begin)

@@ -146,7 +146,7 @@ def test_a_policy_of_torch_is_the_same_whatever_the_number_of_workers(tmp_path: 
 
 @pytest.mark.parametrize("inference", ["workers", "learner"])
 def test_images_are_looked_at_as_the_run_says(tmp_path: Path, inference: str) -> None:
-    settings: dict[str, Any] = {"env_kwargs": {"observation": "image"}, "rollout_steps": 16, "steps": 300, **SMALL, **HERE}
+    settings: dict[str, Any] = {"env_kwargs": {"observation": "image"}, "rollout_steps": 16, "steps": 300, **SMALL}
     settings |= {"inference": inference}
     found = {policy_of(run(tmp_path, f"{TOY}Spaces-v0", images_dtype=as_, **settings)) for as_ in ("float32", "bfloat16")}
     assert len(found) == 2
