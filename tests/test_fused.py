@@ -24,6 +24,7 @@ from protocol.networks import ActorCritic, log_prob_and_entropy
 from protocol.policy import layout, size
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 from tests.batches import DISCRETE, GAUSSIAN, IMAGE, batch, no_pulse, normal, recurrent, shared
+from tests.rounding import growth, sums_of_absolute_values
 from tests.slopes import is_the_slope
 from tests.test_networks import ACTIONS
 
@@ -156,8 +157,8 @@ def test_the_gradient_of_every_loss_is_its_slope_in_float64(policy_loss: str, va
 
 @pytest.mark.parametrize("action", sorted(ACTIONS))
 @pytest.mark.parametrize("rows", [64, 256, 2048])
-def test_in_float32_it_is_within_a_millionth_of_float64(action: str, rows: int) -> None:
-    """Of the longest gradient of a mean over rows: as near to the truth as autograd is."""
+def test_in_float32_it_is_as_near_to_float64_as_rounding_allows(action: str, rows: int) -> None:
+    """The gradient of a mean over rows, by the kernels and by autograd: both within the bound that `rounding` derives."""
     spec = PolicySpec(BOX, ACTIONS[action], (64, 64))
     with_graph, fused = make(spec, 0, scale=0.1)
     generator = np.random.default_rng(1)
@@ -174,10 +175,17 @@ def test_in_float32_it_is_within_a_millionth_of_float64(action: str, rows: int) 
     truth = np.empty_like(flat)
     exact = FusedActorCritic(spec, flat, truth)
     exact.forward(x.astype(np.float64), taken)
-    exact.backward(*(each.astype(np.float64) for each in given_back))
-    millionth = 1e-6 * np.abs(truth).max()
-    np.testing.assert_allclose(with_graph.flat_grad.numpy(), truth, rtol=0, atol=millionth)
-    np.testing.assert_allclose(with_graph.flat_grad.numpy(), autograds, rtol=0, atol=millionth)
+    by_outputs = [each.astype(np.float64) for each in given_back]
+    exact.backward(*(each.copy() for each in by_outputs))
+    first, second, third = by_outputs
+    terms, roundings = sums_of_absolute_values(spec, flat, x.astype(np.float64), taken, (first, second, third))
+    allowed = terms * growth(roundings)
+    assert (np.abs(truth) <= terms).all()
+    assert growth(roundings) < 0.1 / rows  # a tenth of what an average row adds would show
+    for found in (with_graph.flat_grad.numpy(), autograds):
+        off = np.abs(found - truth)
+        worst = int(np.argmax(off / allowed))
+        assert (off <= allowed).all(), f"parameter {worst}: {off[worst]:.3g} off, {allowed[worst]:.3g} allowed"
 
 
 SETTINGS: list[tuple[str, dict[str, Any]]] = [
