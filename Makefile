@@ -33,7 +33,7 @@ soak: .venv/installed-dev  ## faults for ten minutes, every two seconds one; the
 	$(BIN)/python -m pytest -m soak tests/system
 
 docs: .venv/installed-dev  ## write the generated parts of protocol/README.md
-	$(BIN)/python -m tests.test_wire_document
+	$(BIN)/python -m tests.protocol.test_wire_document
 
 bench: .venv/installed-dev  ## all benchmarks, ten minutes: tables here, JSON and pictures in benchmarks/results
 	$(BIN)/millrace bench

@@ -1,7 +1,7 @@
 """Collecting in two processes, ours against the bare loop over the same copies: `python -m benchmarks.collect`.
 
-Ours is `workers.collector.Collector`, as a worker runs it: a policy acts (64-64 in numpy, or convolutions in torch), rows of
-T = 128 steps are stored with their log-probabilities, episodes are counted. The bare loop takes random actions, keeps
+Ours is `Collector` of `workers/collect`, as a worker runs it: a policy acts (64-64 in numpy, or convolutions in torch), rows
+of T = 128 steps are stored with their log-probabilities, episodes are counted. The bare loop takes random actions, keeps
 nothing and resets at an episode's end. It comes in two kinds. `sampled`, the one that counts, is `gymnasium.make` as it
 comes and `action_space.sample()`, as the field measures it. `drawn` is the fastest that a loop over these copies can be:
 gymnasium's checker left out, as we leave it out, and all actions drawn beforehand. `native` is an environment's own
@@ -35,14 +35,14 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.writing import bars, write
-from protocol.distributions import distribution
+from protocol.envs.envpool import pool_of
+from protocol.envs.spaces import action_spec, observation_leaves
+from protocol.envs.vectorized import make_native
 from protocol.errors import UsageError
-from protocol.native import make_native
-from protocol.policy import Policy, buffer_size, layout, make_policy, size
-from protocol.pool import pool_of
-from protocol.spaces import action_spec, observation_leaves
+from protocol.policy.distributions import distribution
+from protocol.policy.policy import Policy, buffer_size, layout, make_policy, size
 from protocol.specs import EnvSpec, ImagesDtype, PolicySpec, RunSpec
-from workers.collector import Collector
+from workers.collect.collector import Collector
 from workers.session import Assignment
 
 PROCESSES = 2

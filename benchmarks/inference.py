@@ -23,8 +23,8 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.writing import write
-from learner.config import resolve
-from learner.metrics import Progress
+from learner.config.config import resolve
+from learner.run_folder.metrics import Progress
 from millrace.launch.local import train
 
 WARM_UP = 2  # updates that do not count: copies are opened, torch is imported

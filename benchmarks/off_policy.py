@@ -24,9 +24,9 @@ from rich.table import Table
 
 import millrace
 from benchmarks.writing import RESULTS, write
-from learner.metrics import read_rows
-from learner.report import COLOURS, DPI, GREY, Curve, common_grid, read_curve
-from learner.run_folder import RunFolder
+from learner.report.learning_curves import COLOURS, DPI, GREY, Curve, common_grid, read_curve
+from learner.run_folder.metrics import read_rows
+from learner.run_folder.run_folder import RunFolder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -20,16 +20,16 @@ import zmq
 from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation
 
 from benchmarks.simulated import canned, run_spec
-from protocol.codec import MAX_FRAME_BYTES, decode_to_learner, encode
-from protocol.key_folder import Keyring
-from protocol.keys import Allowed, Key, Token
-from protocol.link import LearnerLink, WorkerLink
-from protocol.packing import Packing
-from protocol.policy import layout, make_policy, size
-from protocol.precision import WeightsDtype, narrowed, widened
+from protocol.keys.key_folder import Keyring
+from protocol.keys.keys import Allowed, Key, Token
+from protocol.policy.policy import layout, make_policy, size
 from protocol.rollout import Rollout, rollout_bytes
 from protocol.specs import ActionSpec, EnvSpec, Leaf, PolicySpec, RunSpec
-from workers.collector import Collector
+from protocol.wire.codec import MAX_FRAME_BYTES, decode_to_learner, encode
+from protocol.wire.compression import Packing
+from protocol.wire.link import LearnerLink, WorkerLink
+from protocol.wire.weight_dtypes import WeightsDtype, narrowed, widened
+from workers.collect.collector import Collector
 from workers.session import Assignment
 
 ATARI = RunSpec(

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks.peers import install
-from learner.metrics import read_rows
-from learner.run_folder import RunFolder
+from learner.run_folder.metrics import read_rows
+from learner.run_folder.run_folder import RunFolder
 
 ROOT = Path(__file__).parents[1]
 COMMON: dict[str, Any] = {"env": "CartPole-v1", "eval_every": 5000, "eval_episodes": 20}

@@ -15,10 +15,10 @@ from typing import NamedTuple
 
 import msgspec
 
-from learner.config import Config, resolve
+from learner.config.config import Config, resolve
 from learner.evaluate import evaluate, load_policy
-from learner.metrics import Evaluation
-from learner.run_folder import RunFolder, Summary, Which
+from learner.run_folder.metrics import Evaluation
+from learner.run_folder.run_folder import RunFolder, Summary, Which
 
 OUT = Path(__file__).parents[1] / "docs" / "results.md"
 EPISODES = 100
@@ -37,7 +37,7 @@ TAIL = """
 On HalfCheetah-v5 CleanRL's settings (in this learner) ended at 1,818. What makes the difference is a first log standard
 deviation of -2, so that the first actions are small, together with a shorter horizon (gamma 0.98, lambda 0.92), a
 narrow clip (0.1) and 20 epochs; observations and rewards are normalised in both. Settings and sources stand in
-[`learner/presets.toml`](../learner/presets.toml). [off_policy.md](off_policy.md) shows what V-trace is good for,
+[`learner/config/presets.toml`](../learner/presets.toml). [off_policy.md](off_policy.md) shows what V-trace is good for,
 [notebooks.md](notebooks.md) the runs of five teaching notebooks.
 
 Two cores, no GPU, shared with other work while these ran: read the seconds as upper bounds. Versions: {versions}.

@@ -29,11 +29,11 @@ from rich.table import Table
 
 from benchmarks.simulated import POLICY, VERSIONS, run_spec, simulate, table
 from benchmarks.writing import write
-from learner.hub import Hub
-from learner.roster import Roster
-from protocol.link import LearnerLink
-from protocol.policy import buffer_size, layout, size
+from learner.rollouts.hub import Hub
+from learner.rollouts.roster import Roster
+from protocol.policy.policy import buffer_size, layout, size
 from protocol.rollout import stack
+from protocol.wire.link import LearnerLink
 
 WORKERS = (10, 100, 1000)
 PROCESSES = 2

@@ -18,10 +18,10 @@ import numpy as np
 import numpy.typing as npt
 import zmq
 
-from protocol.codec import decode_to_worker, encode
 from protocol.messages import ToLearner
 from protocol.rollout import Rollout
 from protocol.specs import ActionSpec, EnvSpec, Leaf, PolicySpec, RunSpec
+from protocol.wire.codec import decode_to_worker, encode
 from workers.session import Effect, Identity, Leave, Say, Session, Task
 
 POLICY = PolicySpec((Leaf("", "box", (4,), "float32"),), ActionSpec("discrete", (), "int64", (2,), (0,)))

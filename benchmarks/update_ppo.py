@@ -16,9 +16,9 @@ from torch import Tensor, nn
 
 from benchmarks.contest import Contest, repeated
 from learner.algorithms.actor_critic import Minibatch
-from learner.algorithms.fused import MOST_ROWS
+from learner.algorithms.kernels.fused import MOST_ROWS
 from learner.algorithms.ppo import PPO
-from learner.hyperparameters import PPOConfig
+from learner.config.hyperparameters import PPOConfig
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
 POLICY = PolicySpec((Leaf("", "box", (4,), "float32"),), ActionSpec("discrete", (), "int64", (2,), (0,)))

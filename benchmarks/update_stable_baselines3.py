@@ -21,7 +21,7 @@ from benchmarks.contest import Contest, repeated
 from learner.algorithms.a2c import A2C
 from learner.algorithms.action_values import WithGraph
 from learner.algorithms.dqn import DQN
-from learner.hyperparameters import A2CConfig, DQNConfig
+from learner.config.hyperparameters import A2CConfig, DQNConfig
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf
 

@@ -29,11 +29,11 @@ from rich.table import Table
 from benchmarks.packing import ATARI, STACKS, atari, encrypted, packing, rounding
 from benchmarks.simulated import canned, run_spec
 from benchmarks.writing import write
-from protocol.codec import Buffer, encode
-from protocol.link import LearnerLink, WorkerLink
-from protocol.packing import Packing
 from protocol.rollout import Rollout, rollout_bytes, validate
 from protocol.specs import RunSpec
+from protocol.wire.codec import Buffer, encode
+from protocol.wire.compression import Packing
+from protocol.wire.link import LearnerLink, WorkerLink
 
 TRANSPORTS = ("ipc", "tcp")
 SHARE, PYTHON_US, OVERHEAD, FRAME = 0.8, 40, 1.02, 1.05  # targets

@@ -18,13 +18,13 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.writing import write
-from learner.config import resolve
-from learner.hub import Hub
-from learner.roster import Roster
+from learner.config.config import resolve
+from learner.rollouts.hub import Hub
+from learner.rollouts.roster import Roster
 from learner.run import run_spec
-from protocol.link import LearnerLink
-from protocol.policy import buffer_size, layout, size
+from protocol.policy.policy import buffer_size, layout, size
 from protocol.specs import EnvSpec
+from protocol.wire.link import LearnerLink
 from workers.host import Process
 
 CASES = {

@@ -11,8 +11,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from learner.report import COLOURS, DPI, GREY
-from learner.versions import versions
+from learner.report.learning_curves import COLOURS, DPI, GREY
+from learner.run_folder.versions import versions
 
 RESULTS = Path(__file__).parent / "results"
 Bars = tuple[str, Mapping[str, float]]

@@ -11,10 +11,10 @@ import logging
 import sys
 import time
 
-from learner.event_log import JsonLines
-from learner.flags import configuration
-from learner.metrics import Progress
-from learner.run_folder import Interrupted
+from learner.config.command_line import configuration
+from learner.run_folder.json_log import JsonLines
+from learner.run_folder.metrics import Progress
+from learner.run_folder.run_folder import Interrupted
 from protocol.errors import OurError
 
 log = logging.getLogger("millrace.learner")

@@ -15,13 +15,13 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from learner.metrics import Evaluation
-from learner.run_folder import RunFolder, Which
-from protocol.core import zero_state
-from protocol.distributions import distribution
+from learner.run_folder.metrics import Evaluation
+from learner.run_folder.run_folder import RunFolder, Which
+from protocol.envs.spaces import observation_leaves, reader, writer
 from protocol.errors import EnvironmentFailed
-from protocol.policy import Policy, make_policy
-from protocol.spaces import observation_leaves, reader, writer
+from protocol.policy.distributions import distribution
+from protocol.policy.policy import Policy, make_policy
+from protocol.policy.recurrent import zero_state
 from protocol.specs import EnvSpec, PolicySpec
 
 Array = npt.NDArray[Any]

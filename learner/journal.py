@@ -15,18 +15,18 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from learner import checkpoint
 from learner.algorithms import Algorithm
-from learner.config import Config
+from learner.config.config import Config
 from learner.evaluate import evaluate
-from learner.hub import Hub
-from learner.ledger import Ledger
-from learner.metrics import EpisodeWindow, Evaluation, MetricsLog, Progress
-from learner.record import TrainingRecorder
-from learner.run_folder import Best, RunFolder, Summary
-from learner.versions import versions
+from learner.recording.record import TrainingRecorder
+from learner.rollouts.hub import Hub
+from learner.rollouts.ledger import Ledger
+from learner.run_folder import checkpoint
+from learner.run_folder.metrics import EpisodeWindow, Evaluation, MetricsLog, Progress
+from learner.run_folder.run_folder import Best, RunFolder, Summary
+from learner.run_folder.versions import versions
 from protocol.errors import CheckpointError, RunError, UsageError
-from protocol.policy import make_policy
+from protocol.policy.policy import make_policy
 from protocol.rollout import Batch, Rollout
 from protocol.specs import RunSpec
 

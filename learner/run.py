@@ -18,20 +18,20 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import msgspec
 import zmq
 
-from learner.config import Config
-from learner.hub import Hub, Look
-from learner.listening import join_lines, keyring_for
-from learner.metrics import Progress
-from learner.roster import Roster
-from learner.run_folder import Interrupted, RunFolder
-from protocol.cores import cores
+from learner.config.config import Config
+from learner.members.endpoint import join_lines, keyring_for
+from learner.rollouts.hub import Hub, Look
+from learner.rollouts.roster import Roster
+from learner.run_folder.metrics import Progress
+from learner.run_folder.run_folder import Interrupted, RunFolder
+from protocol.cpu_cores import cores
+from protocol.envs.envpool import check_pool
+from protocol.envs.spaces import action_spec, observation_leaves
+from protocol.envs.vectorized import check_native
 from protocol.errors import UsageError
-from protocol.link import LearnerLink
-from protocol.native import check_native
-from protocol.packing import why_no_zstd
-from protocol.pool import check_pool
-from protocol.spaces import action_spec, observation_leaves
 from protocol.specs import ActionSpec, EnvSpec, Leaf, PolicySpec, RunSpec
+from protocol.wire.compression import why_no_zstd
+from protocol.wire.link import LearnerLink
 
 if TYPE_CHECKING:  # they bring torch along
     from learner.algorithms import Algorithm
@@ -164,7 +164,7 @@ def looking(config: Config) -> AbstractContextManager[Look]:
     """What `--metrics-bind` asks for, while it is entered; without it nothing, and no HTTP server is imported."""
     if not config.metrics_bind:
         return nullcontext(lambda hub: None)
-    from learner.exposition import exposed
+    from learner.prometheus import exposed
 
     return exposed(config)
 
@@ -197,7 +197,7 @@ def run_spec(config: Config, env: EnvSpec, seen: Spaces | None = None) -> RunSpe
     observation, action, longest = look_at(env) if seen is None else seen
     policy = ALGORITHMS[config.algo].policy_spec(config.algorithm, observation, action)
     if config.algorithm.encoder is not None:
-        from protocol.encoder import describe_encoder
+        from protocol.policy.encoder import describe_encoder
 
         encoder = describe_encoder(config.algorithm.encoder, observation, action)
         policy = msgspec.structs.replace(policy, encoder=encoder)
@@ -228,7 +228,7 @@ def run_spec(config: Config, env: EnvSpec, seen: Spaces | None = None) -> RunSpe
 
 def threads(config: Config, policy: PolicySpec, workers: int) -> int:
     """Of torch. What learns without a graph gains nothing by more than one."""
-    from learner.algorithms.fused import applies
+    from learner.algorithms.kernels.fused import applies
 
     if config.torch_threads is not None:
         return config.torch_threads

@@ -9,9 +9,9 @@ from __future__ import annotations
 import time
 
 from learner.algorithms import Algorithm
-from learner.hub import Hub
 from learner.journal import Journal
-from learner.run_folder import Interrupted
+from learner.rollouts.hub import Hub
+from learner.run_folder.run_folder import Interrupted
 from protocol.errors import RunError
 from protocol.rollout import stack
 

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, Literal
 if TYPE_CHECKING:
     from gymnasium.vector import AutoresetMode
 
-    from learner.metrics import Progress
-    from learner.vector_env import ZmqVectorEnv
-    from learner.vector_spec import Env
+    from learner.run_folder.metrics import Progress
+    from learner.vector_env.env import ZmqVectorEnv
+    from learner.vector_env.spec import Env
 
 __all__ = ["__version__", "make_vec", "train"]
 
@@ -36,8 +36,8 @@ def train(
     `millrace train` is a keyword argument of the same name: `learning_rate=1e-3`.
     `watch` is called after each update. Guard the call with `if __name__ == "__main__":` in a script. Raises `OurError`.
     """
-    from learner.config import resolve
-    from learner.resuming import AUTO, newest_run
+    from learner.config.config import resolve
+    from learner.run_folder.resume import AUTO, newest_run
     from millrace.launch import local
 
     name = env if isinstance(env, str) else getattr(env, "__name__", type(env).__name__)
@@ -85,7 +85,7 @@ def make_vec(
     on another or a new one, and the info says `worker_lost`; or, with `on_worker_loss="raise"`, `WorkerLost` is raised. What
     an environment raises is raised here, with the worker's traceback. Raises `OurError`.
     """
-    from learner.listening import Bind
+    from learner.members.endpoint import Bind
     from millrace.launch import vector
 
     return vector.make_vec(

@@ -6,7 +6,7 @@ import gc
 import sys
 from typing import NoReturn
 
-from millrace.cli import main
+from millrace.cli.main import main
 
 
 def command() -> NoReturn:

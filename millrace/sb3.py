@@ -14,8 +14,8 @@ import numpy.typing as npt
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 import millrace
-from learner.vector_env import ZmqVectorEnv
-from learner.vector_spec import Env
+from learner.vector_env.env import ZmqVectorEnv
+from learner.vector_env.spec import Env
 
 Array = npt.NDArray[Any]
 Indices = int | Iterable[int] | None

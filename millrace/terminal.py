@@ -20,8 +20,8 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from learner.event_log import JsonLines, progress_line
-from learner.metrics import Progress
+from learner.run_folder.json_log import JsonLines, progress_line
+from learner.run_folder.metrics import Progress
 
 REDRAW_EVERY_S = 0.2
 LINE_EVERY_S = 5.0

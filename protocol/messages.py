@@ -172,7 +172,7 @@ class Reset(Message, frozen=True):
     seeds: tuple[int | None, ...]
     """one for each of them"""
     options: Array
-    """[bytes] uint8, `protocol.plain`: the options of `Env.reset`, or None"""
+    """[bytes] uint8, `protocol.wire.plain_values`: the options of `Env.reset`, or None"""
 
 
 class Step(Message, frozen=True):
@@ -200,7 +200,7 @@ class Call(Message, frozen=True):
     assign: bool
     """set it, instead"""
     given: Array
-    """[bytes] uint8, `protocol.plain`: (arguments, keyword arguments), or one value for each of the copies"""
+    """[bytes] uint8, `protocol.wire.plain_values`: (arguments, keyword arguments), or one value for each of the copies"""
 
 
 class Stepped(Message, frozen=True):
@@ -220,7 +220,7 @@ class Stepped(Message, frozen=True):
     truncated: Array
     """[N] bool"""
     infos: Array
-    """[bytes] uint8, `protocol.plain`: a list of (copy, info), of the copies whose info is not empty; no bytes: of none"""
+    """[bytes] uint8: a list of (copy, info), packed by `protocol.wire.plain_values`; empty infos are left out"""
 
 
 class Returned(Message, frozen=True):
@@ -231,7 +231,7 @@ class Returned(Message, frozen=True):
     lane: int
     incarnation: int
     results: Array
-    """[bytes] uint8, `protocol.plain`: a list of what each copy gave"""
+    """[bytes] uint8, `protocol.wire.plain_values`: a list of what each copy gave"""
     error: str
     """the exception's type and text, in one line, if the call raised; else empty"""
     traceback: str

@@ -19,7 +19,7 @@ from gymnasium.envs.registration import VectorizeMode
 from gymnasium.vector import VectorEnv
 
 from protocol.errors import UsageError
-from protocol.packing import why_no_zstd
+from protocol.wire.compression import why_no_zstd
 
 REGISTRARS = {"millrace": "workers.envs", "ALE": "ale_py"}  # of a namespace: gymnasium imports them as it would a user's own
 Scalar = bool | int | float | str
@@ -86,7 +86,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self._made(lambda env_id: gymnasium.make(env_id, disable_env_checker=True, **self.kwargs, **extra))  # type: ignore[arg-type]
 
     def make_vectorised(self, copies: int) -> VectorEnv[Any, Any, Any]:
-        """So many copies as the environment's own vectorised form; `protocol.native` says which can serve."""
+        """So many copies as the environment's own vectorised form; `protocol.envs.vectorized` says which can serve."""
         own, kwargs = VectorizeMode.VECTOR_ENTRY_POINT, dict[str, Any](self.kwargs)
         return self._made(lambda env_id: gymnasium.make_vec(env_id, copies, own, **kwargs))
 
@@ -192,7 +192,7 @@ class NamedShape(msgspec.Struct, frozen=True, array_like=True):
 
 
 class EncoderSpec(msgspec.Struct, frozen=True):
-    """A torch module of the user's own, which stands before all other layers; see `protocol/encoder.py`."""
+    """A torch module of the user's own, which stands before all other layers; see `protocol/policy/encoder.py`."""
 
     factory: str
     """`my_package.networks:encoder`, a callable that makes it"""

@@ -20,14 +20,14 @@ from contextlib import suppress
 from pathlib import Path
 
 from protocol.errors import OurError, UsageError
-from protocol.key_folder import TOKEN_VARIABLE, read_token
-from protocol.keys import Token
-from protocol.link import WorkerLink
-from protocol.shared import Handed
+from protocol.keys.key_folder import TOKEN_VARIABLE, read_token
+from protocol.keys.keys import Token
 from protocol.specs import Code
+from protocol.wire.link import WorkerLink
+from protocol.wire.shared_memory import Handed
+from workers.code_trust import entry, trusted
 from workers.host import NOBODY, Host, Process, keeping_to
 from workers.session import NO_LEARNER, Session
-from workers.trust import entry, trusted
 from workers.watchdog import Watchdog
 from workers.worker import Worker, identity, parent_is_gone
 

@@ -21,11 +21,11 @@ from typing import Any, Protocol
 
 import zmq
 
-from protocol.key_folder import TOKEN_VARIABLE
-from protocol.keys import Token
-from protocol.link import WorkerLink
-from protocol.shared import Handed
+from protocol.keys.key_folder import TOKEN_VARIABLE
+from protocol.keys.keys import Token
 from protocol.specs import Code
+from protocol.wire.link import WorkerLink
+from protocol.wire.shared_memory import Handed
 from workers.session import Leave, Session
 from workers.watchdog import where_it_hung
 from workers.worker import MakeCollector, Worker, acting_by_itself, identity

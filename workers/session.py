@@ -38,8 +38,8 @@ from protocol.messages import (
     Welcome,
 )
 from protocol.specs import RunSpec, StepSpec
-from workers.orders import Orders
 from workers.states import TABLE, Broke, Emptied, Silence, State, Terminate
+from workers.step.orders import Orders
 
 HELLO_FIRST_S, HELLO_MOST_S = 0.25, 4.0
 NO_LEARNER = "no learner answered"

@@ -18,19 +18,19 @@ from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from protocol.codec import encode
 from protocol.errors import BadMessage, OurError
-from protocol.link import WorkerLink
 from protocol.messages import Order, Stepped, Weights
-from protocol.policy import make_policy
-from protocol.precision import widened
-from protocol.shared import Handed
+from protocol.policy.policy import make_policy
 from protocol.specs import Code, RunSpec, StepSpec
-from workers.breath import Breath
-from workers.collector import Collector
-from workers.lane import EnvironmentBroke
+from protocol.wire.codec import encode
+from protocol.wire.link import WorkerLink
+from protocol.wire.shared_memory import Handed
+from protocol.wire.weight_dtypes import widened
+from workers.collect.collector import Collector
+from workers.collect.lane import EnvironmentBroke
+from workers.heartbeat_thread import Breath
 from workers.session import Begin, Close, Effect, Identity, Leave, Say, Session, Task
-from workers.stepper import Stepper
+from workers.step.stepper import Stepper
 
 log = logging.getLogger("millrace.worker")
 

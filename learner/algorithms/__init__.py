@@ -1,6 +1,6 @@
 """The mathematics of learning: no sockets and no files.
 
-One file is one class, with its settings in `learner.hyperparameters`; each is entered in one dict there and here.
+One file is one class, with its settings in `learner.config.hyperparameters`; each is entered in one dict there and here.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Algorithm(Protocol):
         ...
 
     def __init__(self, config: Any, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
-        """`config` is its record of `learner.hyperparameters`; raises `UsageError` when that cannot be done here."""
+        """`config` is its record of `learner.config.hyperparameters`; raises `UsageError` when that cannot be done here."""
         ...
 
     def update(self, batch: Batch, pulse: Callable[[], None]) -> dict[str, float]:

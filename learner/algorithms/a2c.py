@@ -1,4 +1,4 @@
-"""A2C (Mnih et al. 2016, synchronous); its settings stand in `learner.hyperparameters`. No sockets, no files, no clock.
+"""A2C (Mnih et al. 2016, synchronous). Its settings: `learner.config.hyperparameters`. No sockets, no files, no clock.
 
 One update is one gradient step on all valid rows of a batch, each once: the batch must be of the weights it moves.
 """
@@ -14,7 +14,7 @@ import numpy.typing as npt
 from learner.algorithms import actor_critic, losses
 from learner.algorithms.actor_critic import Parts
 from learner.algorithms.returns import gae
-from learner.hyperparameters import A2CConfig
+from learner.config.hyperparameters import A2CConfig
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
@@ -58,7 +58,7 @@ class A2C:
         return parts.metrics([measured]) | {"train/explained_variance": explained}
 
     def weights(self) -> tuple[Floats, Floats]:
-        """Copies of the acting parameters [P] and of the buffers, as `protocol.policy` lays them out."""
+        """Copies of the acting parameters [P] and of the buffers, as `protocol.policy.policy` lays them out."""
         return self.parts.weights()
 
     def state_dict(self) -> dict[str, Any]:

@@ -15,8 +15,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from learner.algorithms import fused
-from protocol.networks import QNetwork
+from learner.algorithms.kernels import fused
+from protocol.policy.networks import QNetwork
 
 Array = npt.NDArray[Any]
 

@@ -19,13 +19,13 @@ from msgspec.structs import replace
 from torch import Tensor
 
 from learner.algorithms import losses
-from learner.algorithms.flat_step import spare_the_compiler, take_step
-from learner.algorithms.fused import MOST_ROWS, FusedActorCritic, applies
-from learner.algorithms.normalise import ObservationNormaliser, RewardScaler
-from learner.hyperparameters import ActorCriticHyperparameters, RecurrentHyperparameters
+from learner.algorithms.kernels.fused import MOST_ROWS, FusedActorCritic, applies
+from learner.algorithms.kernels.optimizer_step import spare_the_compiler, take_step
+from learner.algorithms.normalization import ObservationNormaliser, RewardScaler
+from learner.config.hyperparameters import ActorCriticHyperparameters, RecurrentHyperparameters
 from protocol.errors import RunError
-from protocol.networks import ActorCritic, Memory, log_prob_and_entropy
-from protocol.policy import features, normalized
+from protocol.policy.networks import ActorCritic, Memory, log_prob_and_entropy
+from protocol.policy.policy import features, normalized
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
@@ -339,7 +339,7 @@ class Parts:
     # ---------------------------------------------------------------- what leaves, and comes back
 
     def weights(self) -> tuple[Floats, Floats]:
-        """Copies of the acting parameters [P] and of the buffers, as `protocol.policy` lays them out."""
+        """Copies of the acting parameters [P] and of the buffers, as `protocol.policy.policy` lays them out."""
         return self.net.flat[: self.net.acting_size].cpu().numpy().copy(), self._buffers.copy()
 
     def state_dict(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""DQN (Mnih et al. 2015), double, dueling, n-step and prioritised if asked; its settings stand in `learner.hyperparameters`.
+"""DQN (Mnih et al. 2015), double, dueling, n-step and prioritised if asked. Its settings: `learner.config.hyperparameters`.
 
 No sockets, no files, no clock; seeded. One update keeps a batch in the replay and then makes a fixed number of gradient
 steps, so how often a transition is learned from is a setting, not a matter of speed. Observations are kept raw and
@@ -20,13 +20,13 @@ import torch
 
 from learner.algorithms import losses
 from learner.algorithms.action_values import action_values
-from learner.algorithms.flat_step import spare_the_compiler, take_step
-from learner.algorithms.normalise import ObservationNormaliser
+from learner.algorithms.kernels.optimizer_step import spare_the_compiler, take_step
+from learner.algorithms.normalization import ObservationNormaliser
 from learner.algorithms.replay import Replay, Sample
-from learner.hyperparameters import DQNConfig
+from learner.config.hyperparameters import DQNConfig
 from protocol.errors import RunError, UsageError
-from protocol.networks import QNetwork
-from protocol.policy import features, normalized
+from protocol.policy.networks import QNetwork
+from protocol.policy.policy import features, normalized
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 

@@ -1,4 +1,4 @@
-"""IMPALA's learner (Espeholt et al. 2018); its settings stand in `learner.hyperparameters`. No sockets, no files, no clock.
+"""IMPALA's learner (Espeholt et al. 2018). Its settings: `learner.config.hyperparameters`. No sockets, no files, no clock.
 
 A batch may have been acted on under older weights (`max_lag` above 0): V-trace weighs each row by how likely the newest
 policy, whose log-probabilities are computed here, is to act so. It is computed in time order, before any shuffle.
@@ -15,7 +15,7 @@ import numpy.typing as npt
 from learner.algorithms import actor_critic, losses
 from learner.algorithms.actor_critic import Minibatch, Parts, Seen
 from learner.algorithms.returns import vtrace
-from learner.hyperparameters import ImpalaConfig
+from learner.config.hyperparameters import ImpalaConfig
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
@@ -73,7 +73,7 @@ class Impala:
         return parts.rows(batch, seen, advantage, target), told
 
     def weights(self) -> tuple[Floats, Floats]:
-        """Copies of the acting parameters [P] and of the buffers, as `protocol.policy` lays them out."""
+        """Copies of the acting parameters [P] and of the buffers, as `protocol.policy.policy` lays them out."""
         return self.parts.weights()
 
     def state_dict(self) -> dict[str, Any]:

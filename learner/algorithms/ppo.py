@@ -1,4 +1,4 @@
-"""PPO (Schulman et al. 2017); its settings stand in `learner.hyperparameters`. No sockets, no files, no clock; seeded.
+"""PPO (Schulman et al. 2017). Its settings: `learner.config.hyperparameters`. No sockets, no files, no clock; seeded.
 
 One update uses a batch for `n_epochs` epochs of minibatches. Rows that are not valid never enter one. With one torch
 thread on a CPU the same batches give the same bits, also after `load_state_dict`.
@@ -17,9 +17,9 @@ import torch
 
 from learner.algorithms import actor_critic, losses
 from learner.algorithms.actor_critic import Minibatch, Parts
-from learner.algorithms.flat_step import take_step
+from learner.algorithms.kernels.optimizer_step import take_step
 from learner.algorithms.returns import gae
-from learner.hyperparameters import PPOConfig
+from learner.config.hyperparameters import PPOConfig
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
@@ -135,7 +135,7 @@ class PPO:
         }
 
     def weights(self) -> tuple[Floats, Floats]:
-        """Copies of the acting parameters [P] and of the buffers, as `protocol.policy` lays them out."""
+        """Copies of the acting parameters [P] and of the buffers, as `protocol.policy.policy` lays them out."""
         return self.parts.weights()
 
     def state_dict(self) -> dict[str, Any]:

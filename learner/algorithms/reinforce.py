@@ -1,4 +1,4 @@
-"""REINFORCE (Williams 1992); its settings stand in `learner.hyperparameters`. No sockets, no files, no clock.
+"""REINFORCE (Williams 1992); its settings stand in `learner.config.hyperparameters`. No sockets, no files, no clock.
 
 One update is one gradient step on the rows whose episode ends within the rollout, and on no other: all the reward that
 follows them is known. The other rows are dropped and counted. The return of an episode that the clock ended goes on with
@@ -16,7 +16,7 @@ import numpy.typing as npt
 from learner.algorithms import actor_critic, losses
 from learner.algorithms.actor_critic import Parts
 from learner.algorithms.returns import complete, gae
-from learner.hyperparameters import REINFORCEConfig
+from learner.config.hyperparameters import REINFORCEConfig
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
@@ -72,7 +72,7 @@ class REINFORCE:
         }
 
     def weights(self) -> tuple[Floats, Floats]:
-        """Copies of the acting parameters [P] and of the buffers, as `protocol.policy` lays them out."""
+        """Copies of the acting parameters [P] and of the buffers, as `protocol.policy.policy` lays them out."""
         return self.parts.weights()
 
     def state_dict(self) -> dict[str, Any]:

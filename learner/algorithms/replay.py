@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from learner.algorithms.available_memory import GIB, available_bytes
 from learner.algorithms.sum_tree import SumTree
-from learner.memory import GIB, available_bytes
 from protocol.errors import UsageError
 from protocol.rollout import Batch
 from protocol.specs import Leaf

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 
-from millrace.flags import KubernetesFlags
-from millrace.launch.placing import METRICS_PORT, learner_flags
-from protocol.key_folder import FIRST_CLIENT, KeyFolder
+from millrace.cli.flags import KubernetesFlags
+from millrace.launch.cluster_flags import METRICS_PORT, learner_flags
+from protocol.keys.key_folder import FIRST_CLIENT, KeyFolder
 
 PORT = 5555
 TOKEN = f"{FIRST_CLIENT}.token"

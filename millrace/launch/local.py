@@ -11,13 +11,13 @@ from pathlib import Path
 
 import zmq
 
-from learner.config import Config
+from learner.config.config import Config
 from learner.run import Run, Watch, looking
-from millrace.launch.here import flags_of, own_address, own_keys
+from millrace.launch.local_workers import flags_of, own_address, own_keys
 from protocol.errors import UsageError
-from protocol.keys import Token
-from protocol.link import LearnerLink
+from protocol.keys.keys import Token
 from protocol.specs import EnvSpec
+from protocol.wire.link import LearnerLink
 from workers.host import Host, Process, Running, Thread
 
 
@@ -27,7 +27,7 @@ def train(config: Config, resume: Path | None, watch: Watch, factory: Callable[.
     Raises `OurError`, or `Interrupted` when the user stopped it.
     """
     if config.inference == "learner":
-        from millrace.launch import inference
+        from millrace.launch import learner_inference as inference
 
         return inference.train(config, resume, watch, factory)
     keyring, token = own_keys(config.transport, config.keys, insecure=config.insecure)

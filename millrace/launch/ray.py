@@ -14,14 +14,14 @@ from pathlib import Path
 
 import ray
 
-from learner.flags import configuration
-from learner.listening import keyring_for
+from learner.config.command_line import configuration
+from learner.members.endpoint import keyring_for
 from learner.run import Watch, serve
-from millrace.flags import RayFlags
-from millrace.launch.actor import WorkerHost
-from millrace.launch.placing import learner_flags
+from millrace.cli.flags import RayFlags
+from millrace.launch.cluster_flags import learner_flags
+from millrace.launch.ray_actor import WorkerHost
 from protocol.errors import UsageError
-from protocol.key_folder import Keyring, read_token
+from protocol.keys.key_folder import Keyring, read_token
 
 
 def launch(flags: RayFlags, rest: Sequence[str], watch: Watch) -> Path:

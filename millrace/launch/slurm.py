@@ -9,8 +9,8 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 
-from millrace.flags import SlurmFlags
-from millrace.launch.placing import learner_flags
+from millrace.cli.flags import SlurmFlags
+from millrace.launch.cluster_flags import learner_flags
 from protocol.errors import UsageError
 
 

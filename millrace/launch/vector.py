@@ -16,19 +16,19 @@ from typing import Literal
 import zmq
 from gymnasium.vector import AutoresetMode
 
-from learner.listening import Bind, join_lines, keyring_for
-from learner.lockstep_hub import LockstepHub, Shared
-from learner.vector_env import ZmqVectorEnv
-from learner.vector_spec import Env, describe
-from millrace.launch.here import StartFlags, own_address, own_keys
+from learner.members.endpoint import Bind, join_lines, keyring_for
+from learner.vector_env.env import ZmqVectorEnv
+from learner.vector_env.spec import Env, describe
+from learner.vector_env.step_hub import LockstepHub, Shared
+from millrace.launch.local_workers import StartFlags, own_address, own_keys
 from protocol.address import advertised, check_address
-from protocol.cores import cores
+from protocol.cpu_cores import cores
 from protocol.errors import UsageError
-from protocol.key_folder import Keyring
-from protocol.keys import Token
-from protocol.link import LearnerLink
-from protocol.shared import POSSIBLE, SPIN_S, Bell, Handed, Memory
+from protocol.keys.key_folder import Keyring
+from protocol.keys.keys import Token
 from protocol.specs import Scalar
+from protocol.wire.link import LearnerLink
+from protocol.wire.shared_memory import POSSIBLE, SPIN_S, Bell, Handed, Memory
 from workers.host import Host, Process, Running, Thread
 
 log = logging.getLogger("millrace.learner")

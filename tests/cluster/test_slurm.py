@@ -11,8 +11,8 @@ from typing import Any
 import psutil
 import pytest
 
-from learner.metrics import read_rows
-from millrace.cli import main
+from learner.run_folder.metrics import read_rows
+from millrace.cli.main import main
 from tests.cluster.slurm import Slurm, why_not
 from tests.system.processes import SMALL, START_S, TOY, Stage, wait_for
 from tests.system.runs import accounted

@@ -1,7 +1,7 @@
 """What is learned, to published scores, by the command line's own presets: three seeds each (make test-learning).
 
 A run counts by its final policy, or by the one that did best in its own evaluations, tried again on episodes that it was not
-chosen by: whichever is better. Nothing is set here but seeds, lags and when to evaluate; see learner/presets.toml.
+chosen by: whichever is better. Nothing is set here but seeds, lags and when to evaluate; see learner/config/presets.toml.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from learner.config import resolve
-from learner.run_folder import RunFolder
+from learner.config.config import resolve
+from learner.run_folder.run_folder import RunFolder
 from millrace.launch.local import train
 
 pytestmark = [pytest.mark.learning, pytest.mark.timeout(3600)]

@@ -23,8 +23,8 @@ from typing import Any, TypeVar
 
 import psutil
 
-from learner.metrics import read_rows
-from protocol.key_folder import KeyFolder
+from learner.run_folder.metrics import read_rows
+from protocol.keys.key_folder import KeyFolder
 
 ROOT = Path(__file__).parents[2]
 T = TypeVar("T")

@@ -11,8 +11,8 @@ import sys
 
 import zmq
 
-from protocol.codec import encode
 from protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello
+from protocol.wire.codec import encode
 
 NAME = b"stranger"
 

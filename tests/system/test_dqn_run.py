@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from learner.config import resolve
-from learner.metrics import read_rows
+from learner.config.config import resolve
+from learner.run_folder.metrics import read_rows
 from millrace.launch.local import train
 from protocol.errors import UsageError
 

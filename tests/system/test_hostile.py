@@ -10,14 +10,14 @@ from typing import Any
 
 import zmq
 
-from protocol.codec import decode_to_observer, encode
 from protocol.errors import BadMessage
 from protocol.messages import Inquire, Status
-from tests.fakes import fake_rollout
-from tests.hostile import hostile, real
+from protocol.wire.codec import decode_to_observer, encode
+from tests.support.fake_ends import fake_rollout
+from tests.support.hostile_messages import hostile, real
 from tests.system.processes import START_S, Learner, Stage, free_port
 from tests.system.runs import accounted
-from workers.copies import copy_seeds
+from workers.collect.env_copies import copy_seeds
 
 MESSAGES, STRANGERS = 100_000, 5
 GROWTH_MB = 20  # in the second half: by then the room for what waits to be read, which stays with the heap, is there

@@ -17,8 +17,8 @@ import psutil
 import pytest
 
 import millrace
-from learner.config import resolve
-from learner.metrics import Progress, read_rows
+from learner.config.config import resolve
+from learner.run_folder.metrics import Progress, read_rows
 from millrace.launch.local import train
 from protocol.errors import EnvironmentFailed, NoWorkers, UsageError
 from tests.system.processes import Stage, free_port, wait_for

@@ -15,9 +15,9 @@ from gymnasium import spaces
 from gymnasium.wrappers import FrameStackObservation, TransformObservation
 
 import millrace
-from learner.config import resolve
+from learner.config.config import resolve
 from millrace.launch.local import train
-from protocol import packing
+from protocol.wire import compression as packing
 from tests.system.processes import START_S, Learner, Stage, crowding
 from tests.system.runs import accounted
 

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 
-from millrace.cli import main
+from millrace.cli.main import main
 from tests.system.processes import START_S, Learner, Stage, free_port
 
 

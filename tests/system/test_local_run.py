@@ -18,9 +18,9 @@ import psutil
 import pytest
 
 import millrace
-from learner.config import Config, resolve
+from learner.config.config import Config, resolve
 from learner.evaluate import load_policy
-from learner.metrics import Progress, read_rows
+from learner.run_folder.metrics import Progress, read_rows
 from millrace.launch.local import train
 from protocol.errors import EnvironmentFailed, NoWorkers, RunError, Stalled, UsageError
 

@@ -20,11 +20,11 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 import millrace
-from learner.vector_env import ZmqVectorEnv
-from learner.vector_spec import Env
+from learner.vector_env.env import ZmqVectorEnv
+from learner.vector_env.spec import Env
 from millrace.launch import vector
 from protocol.errors import EnvironmentFailed, NoWorkers, OurError, WorkerLost
-from protocol.key_folder import KeyFolder
+from protocol.keys.key_folder import KeyFolder
 from tests.system.processes import free_port
 
 WAYS = {"shared": True, "messages": False}

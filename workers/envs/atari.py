@@ -57,4 +57,4 @@ def _envpool(game: str = "Pong", repeat_action_probability: float = 0.0) -> tupl
     return f"{game}-v5", {**options, "frame_skip": SKIP, "stack_num": FRAMES, "max_episode_steps": MAX_FRAMES // SKIP}
 
 
-make_game.envpool = _envpool  # type: ignore[attr-defined]  # for protocol/pool.py
+make_game.envpool = _envpool  # type: ignore[attr-defined]  # for protocol/envs/envpool.py

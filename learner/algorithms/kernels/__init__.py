@@ -1,0 +1,1 @@
+"""Forward and backward passes written without autograd, for small networks."""

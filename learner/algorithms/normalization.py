@@ -1,0 +1,127 @@
+"""Running statistics: of the observations' features, and of the discounted return. float64; numpy only, but for the state.
+
+Only valid rows are counted. The learner alone updates; workers act with the float32 buffers that it publishes.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from learner.algorithms.returns import discounted_return
+from protocol.policy.policy import buffer_size, measured_features
+from protocol.rollout import Batch
+from protocol.specs import PolicySpec
+
+Doubles = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.float32]
+TINY = 1e-12  # a variance below this share of the squared mean is rounding: it did not vary
+
+
+class RunningMoments:
+    """Mean and variance [*shape] of all rows ever given, batch by batch (Chan, Golub and LeVeque 1979)."""
+
+    def __init__(self, shape: tuple[int, ...] = ()) -> None:
+        self.count = 0
+        self.mean: Doubles = np.zeros(shape)
+        self._squares: Doubles = np.zeros(shape)  # summed squared distances from the mean
+
+    def update(self, rows: npt.NDArray[Any]) -> None:
+        """Count rows [B, *shape]."""
+        if not len(rows):
+            return
+        mean = rows.mean(0, dtype=np.float64)
+        distance, total = mean - self.mean, self.count + len(rows)
+        self._squares = self._squares + ((rows - mean) ** 2).sum(0) + distance**2 * (self.count * len(rows) / total)
+        self.mean = self.mean + distance * (len(rows) / total)
+        self.count = total
+
+    @property
+    def std(self) -> Doubles:
+        """Standard deviation [*shape] of the population; 1 for what never varied."""
+        variance = self._squares / max(self.count, 1)
+        varied = variance > TINY * self.mean**2 + TINY**2
+        return np.sqrt(np.where(varied, variance, 1.0))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Tensors and numbers, copied."""
+        return {"count": self.count, "mean": torch.tensor(self.mean), "squares": torch.tensor(self._squares)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from there."""
+        self.count = int(state["count"])
+        self.mean, self._squares = state["mean"].numpy().copy(), state["squares"].numpy().copy()
+
+
+class ObservationNormaliser:
+    """Means and standard deviations of the measured features; one-hot and binary ones are left as they are."""
+
+    def __init__(self, spec: PolicySpec) -> None:
+        self._on = spec.normalize_observations
+        self._measured = measured_features(spec)
+        self._moments = RunningMoments(self._measured.shape)
+        assert not self._on or buffer_size(spec) == 2 * len(self._measured)
+
+    def update(self, features: Floats, valid: npt.NDArray[np.bool_]) -> None:
+        """Count features [T, N, D], not yet normalised, of the rows [T, N] that are valid."""
+        if self._on:
+            self._moments.update(features[valid])
+
+    def buffers(self) -> Floats:
+        """What workers normalise with: D means, then D standard deviations, float32; empty if the policy does not."""
+        if not self._on:
+            return np.empty(0, np.float32)
+        mean = np.where(self._measured, self._moments.mean, 0)
+        std = np.where(self._measured, self._moments.std, 1)
+        return np.concatenate([mean, std]).astype(np.float32)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Tensors and numbers, copied."""
+        return self._moments.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from there."""
+        self._moments.load_state_dict(state)
+
+
+class RewardScaler:
+    """Rewards over the running standard deviation of the discounted return (Engstrom et al. 2020), never shifted.
+
+    Each env copy's return goes on from rollout to rollout of its lane; it starts at zero with an episode or a fresh lane.
+    """
+
+    def __init__(self, gamma: float) -> None:
+        self._gamma = gamma
+        self._moments = RunningMoments()
+        self._returns: dict[int, Doubles] = {}  # lane -> [copies]
+
+    def scale(self, batch: Batch) -> Floats:
+        """Count the batch, then give its rewards [T, ΣN], scaled."""
+        ended = batch.terminated | batch.truncated
+        for at in range(0, len(batch.lane), batch.copies):  # a lane's rollouts stand in the order they were collected
+            columns = slice(at, at + batch.copies)
+            lane = int(batch.lane[at])
+            start = self._returns.get(lane)
+            if start is None or batch.fresh[at]:
+                start = np.zeros(batch.copies)
+            valid = batch.valid[:, columns]
+            found, self._returns[lane] = discounted_return(
+                batch.reward[:, columns], ended[:, columns], valid, self._gamma, start
+            )
+            self._moments.update(found[valid])
+        return (batch.reward / self._moments.std).astype(np.float32)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Tensors and numbers, copied."""
+        return {
+            "moments": self._moments.state_dict(),
+            "returns": {lane: torch.tensor(found) for lane, found in self._returns.items()},
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from there."""
+        self._moments.load_state_dict(state["moments"])
+        self._returns = {int(lane): found.numpy().copy() for lane, found in state["returns"].items()}

@@ -1,0 +1,96 @@
+"""Where a learner listens, who may come in, and what to type on another machine.
+
+The law: an address that other machines can reach has keys, or somebody has spelt out that it has none. Keys are made by
+themselves at first use. On loopback they are asked for where a key folder was named; between processes that share a file or
+memory the operating system decides.
+"""
+
+from __future__ import annotations
+
+import logging
+import socket
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Protocol
+
+from protocol.address import advertised, is_local
+from protocol.errors import UsageError
+from protocol.keys.key_folder import KeyFolder, Keyring, asked_folder
+from protocol.keys.keys import Allowed, Key, Token
+
+log = logging.getLogger("millrace.learner")
+
+
+class Listens(Protocol):
+    """Whatever says where a learner listens: a run's `Config`, or a vector environment's `Bind`."""
+
+    @property
+    def bind(self) -> str:
+        """The address."""
+        ...
+
+    @property
+    def keys(self) -> str:
+        """The key folder that was named; empty if none was."""
+        ...
+
+    @property
+    def insecure(self) -> bool:
+        """Whether other machines may connect without keys."""
+        ...
+
+
+@dataclass(frozen=True)
+class Bind:
+    """Where a vector environment listens, named as in `Config`; without an address it meets workers of its own."""
+
+    bind: str = ""
+    keys: str = ""
+    insecure: bool = False
+    advertise: str = ""
+
+
+def keyring_for(config: Listens, now: datetime) -> Keyring | None:
+    """Who may connect to `config.bind`; None where everybody may. Raises `UsageError`."""
+    if config.insecure and config.keys:
+        raise UsageError(f"keys {config.keys} or insecure: expected one, got both")
+    if not config.bind.startswith("tcp://"):
+        return None
+    if config.insecure:
+        if not is_local(config.bind):
+            log.warning(
+                "%s is open to everybody who can reach it, without keys: they can read this run, feed it false rollouts and "
+                "stop it, and nothing on the way is encrypted; leave --insecure out for keys",
+                config.bind,
+            )
+        return None
+    asked = asked_folder(config.keys)
+    if asked is None and is_local(config.bind):
+        return None
+    folder = KeyFolder(asked)
+    return Keyring(folder.server(), folder.first(now), folder)
+
+
+def throwaway(worker: str, now: datetime) -> tuple[Keyring, Token]:
+    """Keys for one run on this machine, which no file holds."""
+    server, client = Key.new(), Key.new()
+    return Keyring(server, Allowed().adding(worker, client.public, now)), Token(server.public, client)
+
+
+def join_lines(address: str, advertise: str, keyring: Keyring | None) -> list[str]:
+    """How a worker joins the learner that listens at `address`, as lines for people."""
+    reach = advertised(address, advertise, socket.gethostname())
+    if keyring is None:
+        insecure = "" if is_local(reach) else " --insecure"
+        return [f"waiting for workers; start one with: millrace worker {reach}{insecure}"]
+    folder = keyring.folder
+    tokens = [] if folder is None else [folder.token_path(name) for name in keyring.allowed.names()]
+    token = next((path for path in tokens if path.is_file()), None)
+    if token is None:
+        return [f"waiting for workers at {reach}; no token is here: `millrace keys new NAME` makes one"]
+    if is_local(reach):
+        return [f"waiting for workers; start one with: millrace worker {reach} --token {token}"]
+    return [
+        f"waiting for workers; start one with: millrace worker {reach} --token {token.name}",
+        f"the token is {token}: a secret; copy it to the worker's machine, as with scp, where it must stay 0600",
+    ]

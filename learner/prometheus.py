@@ -1,0 +1,254 @@
+"""The learner's `/metrics` for Prometheus: what the run's roster, ledger and freshness count, by Prometheus's conventions.
+
+The law: the loop publishes a snapshot now and then, a whole record in one assignment, and waits for nobody; the server's
+threads read the newest one and nothing else. Labels have few values, all ours: no names of workers, paths or keys.
+"""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from wsgiref.simple_server import WSGIRequestHandler, make_server
+
+import msgspec
+from prometheus_client import CollectorRegistry, ProcessCollector, make_wsgi_app
+from prometheus_client.exposition import ThreadingWSGIServer
+from prometheus_client.metrics_core import (
+    CounterMetricFamily,
+    GaugeMetricFamily,
+    HistogramMetricFamily,
+    InfoMetricFamily,
+    Metric,
+    SummaryMetricFamily,
+)
+from prometheus_client.registry import Collector
+
+from learner.config.config import Config
+from learner.members.membership import Member
+from learner.members.states import Standing
+from learner.rollouts.hub import Hub, Look
+from learner.run_folder.metrics import Progress
+from learner.run_folder.versions import versions
+from protocol.address import WILDCARDS, is_local
+from protocol.errors import UsageError
+
+log = logging.getLogger("millrace.learner")
+
+EVERY_S = 0.5  # between snapshots
+SILENT_SCRAPER_S = 5.0  # then its connection is closed, and its thread ends
+LAGS = (0, 1, 2, 4, 8, 16, 32)
+"""upper bounds of the histogram's buckets, in versions"""
+STAGES = {"learner": ("wait", "update", "other"), "worker": ("wait", "open", "act", "step")}
+TICKET_ENDS = ("used", "stale", "lost")
+TRANSITION_ENDS = ("used", "stale", "duplicate", "late", "invalid")
+STATES = ("active", "spare", "draining")
+
+
+class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
+    """What the learner knew at one moment."""
+
+    at_s: float = 0.0
+    """seconds since 1970; 0: the learner has not begun"""
+    progress: Progress = Progress()
+    """as of the last update"""
+    version: int = -1
+    ledger: Mapping[str, int] = {}
+    workers: Mapping[str, int] = {}
+    """how many are in each state"""
+    lags: Mapping[int, int] = {}
+    """rollouts that updates used, by lag in versions"""
+    received: tuple[int, int] = (0, 0)
+    """messages, bytes"""
+    sent: tuple[int, int] = (0, 0)
+    unheard: int = 0
+    """messages under keys that may speak no more"""
+    turned_away: int = 0
+    """handshakes that failed"""
+
+
+class Exposition(Collector):
+    """The newest snapshot, and the metrics that it makes."""
+
+    def __init__(self, config: Config, clock: Callable[[], float] = time.time) -> None:
+        """`clock` tells seconds since 1970."""
+        self._clock = clock
+        self._snapshot = Snapshot()
+        self._updates_before: int | None = None  # of a run that is resumed: those of earlier learners
+        self._about = {"env": config.env, "algo": config.algo, "seed": str(config.seed)}
+
+    def look(self, hub: Hub) -> None:
+        """Called by the loop whenever it has listened: a new snapshot, if the last one is old enough."""
+        now = self._clock()
+        if 0.0 <= now - self._snapshot.at_s < EVERY_S:
+            return
+        link, roster = hub.link, hub.roster
+        if self._updates_before is None:
+            self._updates_before = hub.progress.updates
+        states = [_state(member) for member in roster.members.values()]
+        self._snapshot = Snapshot(
+            at_s=now,
+            progress=hub.progress,
+            version=roster.version,
+            ledger=roster.ledger.counts(),
+            workers={state: states.count(state) for state in STATES},
+            lags=dict(hub.freshness.lags),
+            received=(link.received.messages, link.received.bytes),
+            sent=(link.sent.messages, link.sent.bytes),
+            unheard=link.refused_messages,
+            turned_away=link.refused,
+        )
+
+    def describe(self) -> Iterator[Metric]:
+        """Nothing in advance: the registry then does not collect to learn the names."""
+        return iter(())
+
+    def collect(self) -> Iterator[Metric]:
+        """In a thread of the server, once a scrape."""
+        yield InfoMetricFamily("millrace_build", "Versions of millrace and of what decides its results.", versions())
+        yield InfoMetricFamily("millrace_run", "What is trained.", self._about)
+        now = self._snapshot
+        if now.at_s:
+            updates = now.progress.updates - (self._updates_before or 0)
+            yield from (*_of_progress(now, updates), *_of_ledger(now.ledger), *_of_workers(now), *_of_link(now))
+
+
+def _state(member: Member) -> str:
+    if member.standing is Standing.DRAINING:
+        return "draining"
+    return "active" if member.lanes else "spare"
+
+
+def _of_progress(now: Snapshot, updates: int) -> Iterator[Metric]:
+    done = now.progress
+    yield GaugeMetricFamily("millrace_loop_timestamp_seconds", "When the learner's loop last listened.", now.at_s)
+    yield CounterMetricFamily("millrace_env_steps", "Env steps that updates have used, since the run began.", done.env_steps)
+    yield GaugeMetricFamily("millrace_target_env_steps", "Env steps to train for.", done.total_steps)
+    yield GaugeMetricFamily("millrace_env_steps_per_second", "Mean since this learner began.", done.steps_per_s)
+    yield GaugeMetricFamily("millrace_weights_version", "Updates that made the newest weights; -1 before any.", now.version)
+    if done.return_mean is not None and done.length_mean is not None:
+        yield GaugeMetricFamily(
+            "millrace_episode_return_mean", "Of the last 100 training episodes, raw rewards.", done.return_mean
+        )
+        yield GaugeMetricFamily(
+            "millrace_episode_length_mean", "Env steps, of the last 100 training episodes.", done.length_mean
+        )
+    yield SummaryMetricFamily(
+        "millrace_update_seconds",
+        "Updates by this learner and the time they took.",
+        count_value=updates,
+        sum_value=done.stages.get("learner_update", 0.0),
+    )
+    stages = CounterMetricFamily(
+        "millrace_stage_seconds", "Time in each stage: of the learner, of all workers together.", labels=("side", "stage")
+    )
+    for side, names in STAGES.items():
+        for name in names:
+            stages.add_metric((side, name), done.stages.get(f"{side}_{name}", 0.0))
+    yield stages
+
+
+def _of_ledger(ledger: Mapping[str, int]) -> Iterator[Metric]:
+    yield CounterMetricFamily("millrace_tickets_issued", "Tickets dealt, since the run began.", ledger["issued"])
+    yield _by_reason("millrace_tickets", "Tickets by what became of them.", {name: ledger[name] for name in TICKET_ENDS})
+    yield GaugeMetricFamily("millrace_tickets_outstanding", "Tickets neither used nor given up.", ledger["outstanding"])
+    yield CounterMetricFamily(
+        "millrace_transitions_received", "Transitions that reached the learner.", ledger["transitions_received"]
+    )
+    ends = {name: ledger[f"transitions_{name}"] for name in TRANSITION_ENDS}
+    yield _by_reason("millrace_transitions", "Transitions by what became of them.", ends)
+    yield GaugeMetricFamily("millrace_transitions_waiting", "Transitions not yet used.", ledger["transitions_waiting"])
+
+
+def _of_workers(now: Snapshot) -> Iterator[Metric]:
+    workers = GaugeMetricFamily("millrace_workers", "Workers by state; a spare one has no lane.", labels=("state",))
+    for state in STATES:
+        workers.add_metric((state,), now.workers.get(state, 0))
+    yield workers
+    upto = [sum(count for lag, count in now.lags.items() if lag <= bound) for bound in LAGS]
+    buckets = [*((str(bound), count) for bound, count in zip(LAGS, upto, strict=True)), ("+Inf", sum(now.lags.values()))]
+    yield HistogramMetricFamily(
+        "millrace_rollout_lag_versions",
+        "Rollouts that updates used, by how many versions old their weights were.",
+        buckets=buckets,
+        sum_value=sum(lag * count for lag, count in now.lags.items()),
+    )
+
+
+def _of_link(now: Snapshot) -> Iterator[Metric]:
+    for name, (messages, size) in (("received", now.received), ("sent", now.sent)):
+        yield CounterMetricFamily(f"millrace_{name}_messages", f"Messages {name} by this learner.", messages)
+        yield CounterMetricFamily(f"millrace_{name}_bytes", f"Bytes of the messages {name}.", size)
+    refused = {"unreadable": now.ledger["messages_bad"], "key": now.unheard}
+    yield _by_reason("millrace_refused_messages", "Messages that were not used, by reason.", refused)
+    yield CounterMetricFamily("millrace_refused_handshakes", "Connections that were not let in.", now.turned_away)
+
+
+def _by_reason(name: str, text: str, counts: Mapping[str, int]) -> CounterMetricFamily:
+    family = CounterMetricFamily(name, text, labels=("reason",))
+    for reason, count in counts.items():
+        family.add_metric((reason,), count)
+    return family
+
+
+# ---------------------------------------------------------------------------------------------------------- the server
+
+
+@contextmanager
+def exposed(config: Config) -> Iterator[Look]:
+    """Serve at `metrics_bind` while it is entered; what it gives is to be called by the loop.
+
+    Raises `UsageError` in one line if the port is in use.
+    """
+    exposition = Exposition(config)
+    registry = CollectorRegistry()
+    registry.register(exposition)
+    ProcessCollector(registry=registry)
+    with _served(config.metrics_bind, registry):
+        yield exposition.look
+
+
+@contextmanager
+def _served(bind: str, registry: CollectorRegistry) -> Iterator[None]:
+    named, _, port = bind.rpartition(":")
+    host = "" if named in WILDCARDS and ":" not in named else named.strip("[]")
+    try:
+        kind = _IPv6 if ":" in host else _Server
+        server = make_server(host, 0 if port == "*" else int(port), make_wsgi_app(registry), kind, _Quiet)
+    except OSError as error:
+        why = error.strerror or str(error)
+        raise UsageError(f"metrics_bind {bind}: cannot listen there ({why}); choose another port, or '' for none") from error
+    thread = threading.Thread(target=server.serve_forever, name="metrics", kwargs={"poll_interval": 0.1}, daemon=True)
+    thread.start()
+    try:
+        where = f"metrics at http://{named}:{server.server_port}/metrics"
+        if is_local(f"tcp://{bind}"):
+            log.info("%s", where)
+        else:
+            log.warning("%s are open to whoever can reach that port: what is trained, and how far it is", where)
+        yield
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+class _Server(ThreadingWSGIServer):
+    def handle_error(self, request: object, client_address: object) -> None:
+        """A scraper that hangs up or says nothing is none of the run's business."""
+
+
+class _IPv6(_Server):
+    address_family = socket.AF_INET6
+
+
+class _Quiet(WSGIRequestHandler):
+    """Says nothing about each scrape."""
+
+    timeout = SILENT_SCRAPER_S
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Nothing."""

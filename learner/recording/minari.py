@@ -1,0 +1,158 @@
+"""A Minari dataset that is being written. Minari is an extra, imported when it is needed.
+
+The law: the dataset is there whole or not there; if it fails, what Minari has made for it is removed. No more than
+`CHUNK_BYTES` of episodes wait in memory, and images are kept as they are, not as JPEGs.
+"""
+
+from __future__ import annotations
+
+import shutil
+import warnings
+from collections.abc import Iterator
+from contextlib import suppress
+from types import TracebackType
+from typing import Any, Self
+
+import gymnasium
+import numpy.typing as npt
+from gymnasium import spaces
+
+from learner.recording.episodes import RecordedEpisode
+from protocol.errors import RunError, UsageError
+
+Array = npt.NDArray[Any]
+CHUNK_BYTES = 64 * 2**20
+
+
+class MinariDataset:
+    """A Minari dataset that is being written, in the folder that Minari's own MINARI_DATASETS_PATH chooses.
+
+    As a context: whole after it, and gone with all that Minari has made for it if the body raises.
+    """
+
+    def __init__(self, dataset_id: str, env: gymnasium.Env[Any, Any], about: str) -> None:
+        """Raises `UsageError` if there is no such dataset to be made, or no Minari."""
+        try:
+            import h5py  # noqa: F401
+            from minari.dataset.minari_dataset import parse_dataset_id
+            from minari.storage import get_dataset_path
+        except ImportError as error:
+            raise UsageError("recording needs minari, which is an extra; pip install 'millrace[record]'") from error
+        try:
+            parse_dataset_id(dataset_id)
+        except (ValueError, TypeError):  # TypeError: a name without a version
+            raise UsageError(
+                f"dataset {dataset_id}: expected names of two letters or more and a version, as in cartpole/expert-v0"
+            ) from None
+        if slashed := next((key for key in _keys(env.observation_space) if "/" in key), None):
+            raise UsageError(f"dataset {dataset_id}: Minari cannot keep an observation whose key has a slash, {slashed}")
+        root, self._folder = get_dataset_path(), get_dataset_path(dataset_id)
+        if self._folder.exists():
+            raise UsageError(f"dataset {dataset_id} is there already, at {self._folder}; choose another name or version")
+        above = self._folder.parents[: len(self._folder.relative_to(root).parts) - 1]
+        self._new_folders = [folder for folder in above if not folder.exists()]  # innermost first
+        self._id, self._env, self._about = dataset_id, env, about
+        self._dataset: Any = None
+        self._chunk: list[Any] = []
+        self._chunk_bytes = 0
+
+    def add(self, episode: RecordedEpisode) -> None:
+        """Keep an episode; it may be written later. Raises `RunError` if the dataset cannot be written."""
+        from minari.data_collector import EpisodeBuffer
+
+        buffer = EpisodeBuffer(
+            seed=episode.seed,
+            observations=nested(self._env.observation_space, iter(episode.obs)),
+            actions=episode.action,
+            rewards=episode.reward,
+            terminations=episode.terminated,
+            truncations=episode.truncated,
+            infos={},
+        )
+        self._chunk.append(buffer)
+        self._chunk_bytes += episode.action.nbytes + sum(leaf.nbytes for leaf in episode.obs)
+        if self._chunk_bytes > CHUNK_BYTES:
+            self._write()
+
+    def close(self) -> None:
+        """Write what is left."""
+        if self._chunk:
+            self._write()
+
+    def discard(self) -> None:
+        """Leave nothing: neither the dataset's folder nor those of its namespaces that were made for it."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+        for folder in self._new_folders:
+            with suppress(OSError):
+                if {path.name for path in folder.iterdir()} <= {"namespace_metadata.json"}:
+                    shutil.rmtree(folder)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        try:
+            if error is None:
+                self.close()
+        except BaseException as failure:
+            error = failure
+            raise
+        finally:
+            if error is not None:
+                self.discard()
+
+    def _write(self) -> None:
+        import minari
+
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # Minari asks for an author, a permalink, …
+                if self._dataset is None:
+                    self._dataset = minari.create_dataset_from_buffers(
+                        self._id,
+                        buffer=self._chunk,
+                        env=self._env if _written_down(self._env) else None,
+                        observation_space=self._env.observation_space,
+                        action_space=self._env.action_space,
+                        algorithm_name="millrace",
+                        description=self._about,
+                        data_format="hdf5",
+                        jpeg_encoding=False,  # images as they were
+                    )
+                else:
+                    self._dataset.update_dataset_from_buffer(self._chunk)
+        except Exception as error:
+            says = (str(error).strip().splitlines() or [""])[0]
+            raise RunError(f"dataset {self._id} was not written: {type(error).__name__}: {says}") from error
+        self._chunk, self._chunk_bytes = [], 0
+
+
+def nested(space: gymnasium.Space[Any], leaves: Iterator[Array]) -> Any:
+    """The arrays of an observation in the space's own order, put back into its Dicts and Tuples."""
+    match space:
+        case spaces.Dict():
+            return {key: nested(inner, leaves) for key, inner in space.spaces.items()}
+        case spaces.Tuple():
+            return tuple(nested(inner, leaves) for inner in space.spaces)
+        case _:
+            return next(leaves)
+
+
+def _written_down(env: gymnasium.Env[Any, Any]) -> bool:
+    """Whether a dataset can say how to make its environment again: not if it was registered by a class or a function."""
+    try:
+        return env.spec is not None and bool(env.spec.to_json())
+    except (TypeError, ValueError):
+        return False
+
+
+def _keys(space: gymnasium.Space[Any]) -> Iterator[str]:
+    """Of all Dicts in a space."""
+    match space:
+        case spaces.Dict():
+            for key, inner in space.spaces.items():
+                yield str(key)
+                yield from _keys(inner)
+        case spaces.Tuple():
+            for inner in space.spaces:
+                yield from _keys(inner)

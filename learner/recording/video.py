@@ -1,0 +1,82 @@
+"""Films of a run's policy: greedy episodes, one mp4 each, by gymnasium's RecordVideo. Its packages are an extra.
+
+The law: a film stands in the folder whole or not at all. It is named for the seed and the episode: the same ones are filmed
+over.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from learner.recording.record import Player
+from learner.run_folder.metrics import Evaluation
+from protocol.errors import EnvironmentFailed, RunError, UsageError
+from protocol.policy.policy import Policy
+from protocol.specs import EnvSpec, PolicySpec
+
+LONGEST_FILM = 1_500  # frames; all of them are held in memory until the film is written
+LONGEST_EPISODE = 20_000  # env steps
+FOLDER = "videos"
+
+
+def film(
+    run: Path, env_spec: EnvSpec, policy: Policy, spec: PolicySpec, episodes: int, seed: int
+) -> tuple[Evaluation, list[Path]]:
+    """Play so many greedy episodes and film them; what they gave, and the films. Raises `OurError` in one line."""
+    try:
+        import moviepy  # noqa: F401
+    except ImportError as error:
+        raise UsageError("videos need moviepy, which is an extra; pip install 'millrace[video]'") from error
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+    folder = run / FOLDER
+    try:
+        folder.mkdir(exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".new-") as new, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of packages beneath gymnasium
+            found = _play(env_spec, policy, spec, episodes, seed, Path(new, "films"))
+            films = sorted(Path(new, "films").glob("*.mp4"), key=lambda path: int(path.stem.rpartition("-")[2]))
+            return found, [path.replace(folder / path.name) for path in films]
+    except OSError as error:
+        raise RunError(f"videos of run {run} were not written: {error.strerror or error}") from error
+
+
+def _play(env_spec: EnvSpec, policy: Policy, spec: PolicySpec, episodes: int, seed: int, folder: Path) -> Evaluation:
+    env: gymnasium.Env[Any, Any] = env_spec.make(render_mode="rgb_array")
+    try:
+        modes = env.metadata.get("render_modes", [])
+        if env.render_mode != "rgb_array" or "rgb_array" not in modes:
+            raise UsageError(f"environment {env_spec.id} cannot be filmed: expected it to render rgb_array, got {modes}")
+        env = gymnasium.wrappers.RecordVideo(
+            env, str(folder), episode_trigger=lambda _: True, video_length=LONGEST_FILM, name_prefix=f"seed-{seed}"
+        )
+        player = Player(env, policy, spec, seed)
+        played, cut = [], 0
+        for _ in range(episodes):
+            played.append(player.episode(longest=LONGEST_EPISODE))
+            cut += player.was_cut
+    except EnvironmentFailed as error:
+        if isinstance(error.__cause__, gymnasium.error.DependencyNotInstalled):
+            line = f"environment {env_spec.id} cannot be filmed: {error.__cause__}; pip install 'millrace[video]'"
+            raise UsageError(line) from error
+        raise
+    finally:
+        close: Callable[[], None] = env.close
+        close()  # which writes the last film
+    returns = [episode.total for episode in played]
+    return Evaluation(
+        episodes=episodes,
+        return_mean=float(np.mean(returns)),
+        return_std=float(np.std(returns)),
+        length_mean=float(np.mean([episode.length for episode in played])),
+        cut=cut,
+    )

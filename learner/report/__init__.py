@@ -1,0 +1,1 @@
+"""The HTML report and learning curves of run folders."""

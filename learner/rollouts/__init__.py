@@ -1,0 +1,1 @@
+"""Tickets, lanes and rollouts: what each worker collects and what became of it."""

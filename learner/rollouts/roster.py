@@ -1,0 +1,325 @@
+"""The learner's half of the conversation. Pure: messages and `now` in, messages out; no socket, clock, thread or torch.
+
+The law: a ticket is the permission for one rollout on one lane, and is dealt to the least advanced lane while
+
+    used + outstanding < rollouts_per_update * (version + 1 + max_lag)
+
+A lane has one owner at a time and moves only between rollouts; whoever gets it starts it afresh (its incarnation rises). A
+worker that is lost gives back its lanes and tickets, which are dealt again: that is the whole of failure handling. What a
+Heartbeat shows to be lost on the way is said again. Every ticket and every transition is counted in the ledger.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from learner.members.events import Broke, Event, Stale
+from learner.members.membership import Member, Membership, Out
+from learner.members.states import Rubbish, Standing
+from learner.rollouts.lane_placement import Placing
+from learner.rollouts.lanes import Lane, Ticket, Turns
+from learner.rollouts.ledger import Ledger
+from protocol.messages import (
+    Array,
+    Collect,
+    Drain,
+    Failure,
+    Goodbye,
+    Heartbeat,
+    HeartbeatReply,
+    Hello,
+    Permit,
+    Received,
+    Refuse,
+    Rejoin,
+    Returned,
+    Rollout,
+    Stepped,
+    ToLearner,
+    Weights,
+)
+from protocol.specs import RunSpec
+
+__all__ = ["STRIKES", "CollectingMember", "Out", "Roster"]
+
+STRIKES = 3  # rollouts or messages that could not be used, after which a worker is refused
+
+
+@dataclass
+class CollectingMember(Member):
+    """A worker as the learner of a run sees it."""
+
+    acknowledged: int = -1
+    under_way: int | None = None  # version of the Weights sent and not acknowledged
+    said_at: int = 0  # replies said when it was sent
+    strikes: int = 0
+
+
+class Roster:
+    """Members, lanes, tickets and the ledger."""
+
+    def __init__(
+        self,
+        run: RunSpec,
+        *,
+        rollouts_per_update: int,
+        max_lag: int,
+        worker_timeout_s: float,
+        first_session: int,
+        ledger: Ledger | None = None,
+        version: int = -1,
+        incarnations: Sequence[int] = (),
+    ) -> None:
+        """`version` is -1 until `publish`; `ledger`, and each lane's first incarnation, go on from a checkpoint."""
+        self.run = run
+        self.rollouts_per_update = rollouts_per_update
+        self.max_lag = max_lag
+        self.ledger = ledger or Ledger()
+        self.version = version
+        self.worker_timeout_s = worker_timeout_s
+        self.membership = Membership(run, CollectingMember, self._lost, first_session)
+        self.lanes = [Lane(n, incarnations[n] if incarnations else 0) for n in range(run.lanes)]
+        self.tickets: dict[int, Ticket] = {}
+        self.ready: list[Rollout] = []
+        self._placing, self._turns = Placing(self.lanes), Turns(self.lanes)
+        self._oldest = version  # no rollout that is ready is older
+        self.lives: dict[int, int] = {}
+        """incarnation of the lane in which each rollout that is ready, or was taken last, was collected, by its ticket"""
+        self._weights: Weights | None = None
+
+    @property
+    def members(self) -> dict[bytes, CollectingMember]:
+        """By routing id."""
+        return self.membership.members
+
+    @property
+    def events(self) -> list[Event]:
+        """What has happened, and nobody has taken note of."""
+        return self.membership.events
+
+    # ---------------------------------------------------------------- in
+
+    def receive(self, peer: bytes, message: ToLearner, now: float) -> list[Out]:
+        """What a worker said. A rollout must have passed `protocol.rollout.validate`; else call `reject`."""
+        if isinstance(message, Hello):
+            return self._hello(peer, message, now)
+        if isinstance(message, Rollout):
+            self.ledger.transitions_received += message.env_steps
+        member = self.membership.speaker(peer, message, now)
+        if member is None:
+            if isinstance(message, Rollout):
+                self.ledger.transitions_late += message.env_steps
+            return self.membership.stranger(peer, message)
+        match message:
+            case Rollout():
+                return self._rollout(member, message)
+            case Heartbeat():
+                return self._heartbeat(member, message)
+            case Stepped() | Returned():
+                return []  # nobody asked: a run collects rollouts
+            case Goodbye(_, reason):
+                self.membership.forget(member, Goodbye, f"left: {reason}")
+                return self._deal()
+            case Failure(_, error, traceback, lane):
+                hello = member.hello
+                self.events.append(Broke(hello.worker, hello.host, lane, error, traceback))
+                self.membership.forget(member, Failure, f"broke: {error}")
+                return self._deal()
+
+    def reject(self, peer: bytes, rollout: Rollout | None, why: str, now: float) -> list[Out]:
+        """A message that could not be read (`rollout` is None), or a rollout that cannot be used."""
+        member = self.members.get(peer)
+        if rollout is None:
+            self.ledger.messages_bad += 1
+        else:
+            steps = int(rollout.valid.sum()) if rollout.valid.dtype == bool else 0
+            self.ledger.transitions_received += steps
+            self.ledger.transitions_invalid += steps
+        if rollout is not None and (member is None or member.session != rollout.session):
+            return [(peer, Rejoin(rollout.session))]
+        if member is None:
+            return [(peer, Refuse(f"not understood: {why}"))]
+        member.heard_s = now
+        member.strikes += 1
+        if member.strikes >= STRIKES:
+            return self.membership.refuse(member, Rubbish, why) + self._deal()
+        if rollout is not None and rollout.ticket in member.tickets:
+            lane = self.lanes[self.tickets[rollout.ticket].lane]
+            if lane.awaits(rollout.sequence):
+                lane.arrived(rollout.sequence)
+            self._lose(member, rollout.ticket)
+        return self._deal()
+
+    def gone(self, worker: str, why: str) -> list[Out]:
+        """A worker's process is known to be dead: do not wait for its silence."""
+        return self._deal() if self.membership.gone(worker, why) else []
+
+    def revoke(self, peer: bytes, why: str) -> list[Out]:
+        """A member may speak no more: it is told so and forgotten at once, whatever it holds."""
+        return self.membership.revoke(peer, why) + self._deal()
+
+    def tick(self, now: float) -> list[Out]:
+        """Judge silence. Call it only when every message that has arrived was given to `receive`."""
+        return self._deal() if self.membership.silence(now, self.worker_timeout_s) else []
+
+    # ---------------------------------------------------------------- the learner's side
+
+    def publish(self, version: int, parameters: Array, buffers: Array) -> list[Out]:
+        """New weights: offer them to every worker, and deal the tickets that they allow."""
+        self.version = version
+        self._weights = Weights(version, parameters, buffers)
+        out = [out for member in self.membership.active() for out in self._offer(member)]
+        return out + self._deal()
+
+    def take(self) -> list[Rollout] | None:
+        """The rollouts of the next update, or None while there are too few. What is too stale is dropped and counted."""
+        if self.version - self._oldest > self.max_lag:
+            self._drop_stale()
+        if len(self.ready) < self.rollouts_per_update:
+            return None
+        self.lives = {rollout.ticket: self.lives[rollout.ticket] for rollout in self.ready}
+        taken, self.ready = self.ready[: self.rollouts_per_update], self.ready[self.rollouts_per_update :]
+        self.ledger.used += len(taken)
+        self.ledger.transitions_used += sum(rollout.env_steps for rollout in taken)
+        return taken
+
+    def deal(self) -> list[Out]:
+        """Deal what may be dealt, as after a stale drop."""
+        return self._deal()
+
+    def drain(self, reason: str) -> list[Out]:
+        """Ask everybody to leave; no more tickets."""
+        return self.membership.drain(reason)
+
+    def incarnations(self) -> list[int]:
+        """The next life of each lane, for a checkpoint: one that was dealt a ticket is not lived again."""
+        return [lane.incarnation + lane.started for lane in self.lanes]
+
+    # ---------------------------------------------------------------- inside
+
+    def _hello(self, peer: bytes, hello: Hello, now: float) -> list[Out]:
+        welcome, member = self.membership.hello(peer, hello, now)
+        if member is None:
+            return welcome
+        self._placing.joined()
+        return welcome + self._offer(member) + self._deal()
+
+    def _drop_stale(self) -> None:
+        stale = [rollout for rollout in self.ready if self.version - rollout.version > self.max_lag]
+        self.ready = [rollout for rollout in self.ready if self.version - rollout.version <= self.max_lag]
+        self._oldest = min((rollout.version for rollout in self.ready), default=self.version)
+        for rollout in stale:
+            self.ledger.stale += 1
+            self.ledger.transitions_stale += rollout.env_steps
+            self._turns.back(self.lanes[rollout.lane])
+            self.events.append(Stale(rollout.lane, self.version - rollout.version, rollout.env_steps))
+
+    def _rollout(self, member: CollectingMember, rollout: Rollout) -> list[Out]:
+        self._acknowledge(member, min(rollout.version, self.version))
+        ticket = self.tickets.get(rollout.ticket)
+        if ticket is None:
+            self.ledger.transitions_duplicate += rollout.env_steps
+            return self._offer(member)
+        if (
+            ticket.peer != member.peer
+            or ticket.lane != rollout.lane
+            or not ticket.version <= rollout.version <= self.version
+            or not self.lanes[ticket.lane].awaits(rollout.sequence)
+        ):
+            self.ledger.transitions_received -= rollout.env_steps  # `reject` counts it
+            why = f"ticket {ticket.number} expected lane {ticket.lane} under version {ticket.version} or newer, "
+            why += f"got lane {rollout.lane}, version {rollout.version}, sequence {rollout.sequence}"
+            return self.reject(member.peer, rollout, why, member.heard_s)
+        del self.tickets[ticket.number], member.tickets[ticket.number]
+        lane = self.lanes[ticket.lane]
+        lane.outstanding.remove(ticket.number)
+        lane.arrived(rollout.sequence)
+        self._placing.ended(member)
+        self.ready.append(rollout)
+        self._oldest = min(self._oldest, rollout.version)
+        self.lives[ticket.number] = ticket.incarnation
+        return self._offer(member) + self._deal()
+
+    def _heartbeat(self, member: CollectingMember, heartbeat: Heartbeat) -> list[Out]:
+        """Say again what this account shows to be lost: said before a reply that the worker has seen, yet not held."""
+        missing = member.account(heartbeat)
+        peer = member.peer
+        if member.standing is Standing.DRAINING:
+            return [(peer, Drain(self.membership.draining or ""))]
+        self._acknowledge(member, min(heartbeat.version, self.version))
+        seen = min(heartbeat.replies, member.replies)
+        if member.under_way is not None and seen > member.said_at:
+            member.under_way = None
+        out = self._offer(member)
+        out += self._collect(member, missing)
+        member.replies += 1
+        out.append((peer, HeartbeatReply(member.session, member.replies, self._received(member.lanes))))
+        return out + self._deal()
+
+    def _acknowledge(self, member: CollectingMember, version: int) -> None:
+        member.acknowledged = max(member.acknowledged, version)
+        if member.under_way is not None and version >= member.under_way:
+            member.under_way = None
+
+    def _offer(self, member: CollectingMember) -> list[Out]:
+        """The newest weights, unless the worker has them or older ones are still on their way."""
+        newest = self._weights
+        if newest is None or member.under_way is not None or member.acknowledged >= newest.version:
+            return []
+        if member.standing is not Standing.ACTIVE:
+            return []
+        member.under_way, member.said_at = newest.version, member.replies
+        return [(member.peer, newest)]
+
+    def _received(self, lanes: set[int]) -> tuple[Received, ...]:
+        mine = [self.lanes[number] for number in lanes]
+        return tuple(Received(lane.number, lane.incarnation, lane.below, tuple(lane.ahead)) for lane in mine)
+
+    def _collect(self, member: CollectingMember, tickets: Sequence[int]) -> list[Out]:
+        """Collect messages for these outstanding tickets: one for each version that they were dealt under."""
+        out: list[Out] = []
+        for version in sorted({self.tickets[number].version for number in tickets}):
+            chosen = [self.tickets[number] for number in tickets if self.tickets[number].version == version]
+            permits = tuple(Permit(ticket.number, ticket.lane, ticket.incarnation) for ticket in chosen)
+            member.tickets |= {ticket.number: member.replies for ticket in chosen}
+            out.append((member.peer, Collect(member.session, version, permits, self._received(member.lanes))))
+        return out
+
+    def _lost(self, member: CollectingMember, why: str) -> None:
+        """The worker is gone: its tickets are lost, its lanes have no owner. `_deal` gives both to the living."""
+        for number in list(member.tickets):
+            self._lose(member, number)
+        self._placing.lost(member)
+
+    def _lose(self, member: CollectingMember, number: int) -> None:
+        ticket = self.tickets.pop(number)
+        del member.tickets[number]
+        lane = self.lanes[ticket.lane]
+        lane.outstanding.remove(number)
+        self._turns.back(lane)
+        self._placing.ended(member)
+        self.ledger.lost += 1
+
+    def _deal(self) -> list[Out]:
+        """Place lanes that have no owner, even out, and deal tickets to the least advanced lanes."""
+        if self._weights is None or self.membership.draining is not None or not self.members:
+            return []
+        out = self._placing.place(self.members.values())
+        room = self.rollouts_per_update * (self.version + 1 + self.max_lag) - self.ledger.used - self.ledger.outstanding
+        dealt: dict[bytes, list[int]] = {}
+        while room > 0:
+            lane = self._turns.first()
+            if lane.owner is None or lane.moving:
+                break  # the least advanced lane comes first: in a synchronous run no other may take its place
+            number = self.ledger.issued
+            self.tickets[number] = Ticket(number, lane.number, lane.incarnation, self.version, lane.owner)
+            lane.outstanding.add(number)
+            self._turns.forward(lane)
+            lane.started = True
+            dealt.setdefault(lane.owner, []).append(number)
+            self.ledger.issued += 1
+            room -= 1
+        for peer, numbers in dealt.items():
+            out += self._collect(self.members[peer], numbers)
+        return out

@@ -1,0 +1,128 @@
+"""Checkpoints of a run: `checkpoints/<env steps>.pt`. No clock and no thread; the loop decides when.
+
+The law: a checkpoint is there whole or not at all, the newest whole one wins, and reading one runs no code
+(`weights_only`). So a state is tensors and plain data; a numpy generator goes in as its `bit_generator.state`. torch's
+loader does not notice a flipped bit, so the checksums of the file (a zip archive) are compared first.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from learner.run_folder.atomic_write import TEMPORARY, write_atomically
+from protocol.errors import CheckpointError
+
+FORMAT = 1
+FOLDER = "checkpoints"
+SUFFIX = ".pt"
+
+
+class Checkpoint(NamedTuple):
+    """A checkpoint that was read."""
+
+    path: Path
+    env_steps: int
+    state: dict[str, Any]
+
+
+class _Unreadable(Exception):
+    """The file is broken; an older one may do."""
+
+
+def save(folder: Path, state: dict[str, Any], env_steps: int, keep: int) -> Path:
+    """Write a checkpoint into the run folder and remove all but the newest `keep`.
+
+    Raises `CheckpointError`, with the older checkpoints untouched, when the disk does not take it; TypeError when the state
+    holds something that could not be read back.
+    """
+    import torch
+
+    _check_plain(state, "state")
+    path = folder / FOLDER / f"{env_steps:012d}{SUFFIX}"
+    record = {"format": FORMAT, "env_steps": env_steps, "state": state}
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for left in path.parent.glob(f"*{TEMPORARY}"):  # by a process that was killed
+            left.unlink()
+        write_atomically(path, lambda file: torch.save(record, file))
+        for old in sorted(path.parent.glob(f"*{SUFFIX}"))[:-keep]:
+            old.unlink()
+    except (OSError, RuntimeError) as error:  # torch says RuntimeError when its writer cannot go on
+        raise CheckpointError(f"checkpoint {path} not written: {_why(error)}; older checkpoints are untouched") from error
+    return path
+
+
+def newest(folder: Path) -> tuple[Checkpoint, list[str]]:
+    """The newest whole checkpoint of a run folder, and a line for each newer one that could not be read.
+
+    Raises `CheckpointError` when there is none, or when the newest is whole but of another format.
+    """
+    paths = sorted((folder / FOLDER).glob(f"*{SUFFIX}"), reverse=True)
+    if not paths:
+        raise CheckpointError(f"run {folder}: expected a checkpoint in {FOLDER}/, got none; start afresh without --resume")
+    warnings: list[str] = []
+    for path in paths:
+        try:
+            return _read(path), warnings
+        except _Unreadable as error:
+            warnings.append(f"checkpoint {path} is broken ({error}); trying the one before")
+    raise CheckpointError(
+        f"run {folder}: expected a whole checkpoint, got {len(paths)} broken; start afresh without --resume"
+    )
+
+
+def load(path: Path) -> Checkpoint:
+    """One checkpoint file. Raises `CheckpointError` in one line."""
+    try:
+        return _read(path)
+    except _Unreadable as error:
+        raise CheckpointError(f"checkpoint {path}: expected a whole file, got one that is broken ({error})") from error
+
+
+def _read(path: Path) -> Checkpoint:
+    import torch
+
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+        if damaged is not None:
+            raise _Unreadable(f"checksum of {damaged} does not match")
+        record = torch.load(path, map_location="cpu", weights_only=True)
+    except _Unreadable:
+        raise
+    except Exception as error:  # zipfile and torch raise a dozen types on damaged bytes; to us they are one
+        raise _Unreadable(_why(error)) from error
+    if not isinstance(record, dict) or "format" not in record:
+        raise CheckpointError(f"checkpoint {path}: expected one of millrace, got another program's file")
+    if record["format"] != FORMAT:
+        raise CheckpointError(
+            f"checkpoint {path}: expected format {FORMAT}, got {record['format']}; resume it with the millrace that wrote it"
+        )
+    return Checkpoint(path, record["env_steps"], record["state"])
+
+
+def _check_plain(value: object, where: str) -> None:
+    import torch
+
+    match value:
+        case dict():
+            for key, inner in value.items():
+                _check_plain(key, f"{where} key")
+                _check_plain(inner, f"{where}[{key!r}]")
+        case list() | tuple():
+            for index, inner in enumerate(value):
+                _check_plain(inner, f"{where}[{index}]")
+        case torch.Tensor():
+            pass
+        case _ if type(value) not in (bool, int, float, str, bytes, type(None)):
+            raise TypeError(
+                f"checkpoint: {where} expected tensors and plain data, got {type(value).__module__}.{type(value).__name__}"
+            )
+
+
+def _why(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")

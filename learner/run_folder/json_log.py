@@ -1,0 +1,39 @@
+"""The log as JSON, one event a line, for machines: what happened, to whom, when (`--log-json`).
+
+Every line has `time` (UTC, ISO 8601), `level`, `event` and `message`, the line that people read. `event` is "joined",
+"left", "turned", "broke", "told", "stale" (`learner.members.events`, whose fields stand beside it), "progress", or "said"
+for any other line of the log.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from datetime import UTC, datetime
+from typing import Any
+
+import msgspec
+
+from learner.run_folder.metrics import Progress
+
+
+class JsonLines(logging.Formatter):
+    """A log record as one line of JSON."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The line, without its end."""
+        event = getattr(record, "event", None)
+        fields: dict[str, Any] = {} if event is None else dataclasses.asdict(event)
+        kind = "said" if event is None else type(event).__name__.lower()
+        return _line(record.created, record.levelname.lower(), kind, record.getMessage(), fields)
+
+
+def progress_line(progress: Progress, now: float) -> str:
+    """How far the run is. `now` is wall-clock time."""
+    message = f"{progress.env_steps} of {progress.total_steps} env steps"
+    return _line(now, "info", "progress", message, msgspec.to_builtins(progress))
+
+
+def _line(time: float, level: str, event: str, message: str, fields: dict[str, Any]) -> str:
+    stamp = datetime.fromtimestamp(time, UTC).isoformat(timespec="milliseconds")
+    return msgspec.json.encode({"time": stamp, "level": level, "event": event, "message": message, **fields}).decode()

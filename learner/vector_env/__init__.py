@@ -1,0 +1,1 @@
+"""A gymnasium vector environment whose copies live in workers."""

@@ -1,0 +1,1 @@
+"""Environments as both sides describe them: spaces, and the vectorized forms."""

@@ -1,0 +1,71 @@
+"""The vectorised form that an environment brings along, gymnasium's `vector_entry_point`; or in one line why it cannot.
+
+The law: it resets in the step after an episode's end (NEXT_STEP), as a loop over copies does. Of another way of resetting
+the last observations could not be told from first ones.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+from gymnasium.vector import AutoresetMode, VectorEnv
+
+from protocol.envs.spaces import action_spec, observation_leaves
+from protocol.errors import UsageError
+from protocol.specs import ActionSpec, EnvSpec, Leaf
+
+
+def make_native(env: EnvSpec, copies: int) -> VectorEnv[Any, Any, Any]:
+    """So many copies, stepped at once by the environment's own code. Raises `UsageError`."""
+    if env.factory is not None:
+        raise UsageError(f"environment {env.id}: vector native expected an id that gymnasium registers, got a callable")
+    made = env.make_vectorised(copies)
+    try:
+        check_resets_next_step(made)
+    except UsageError:
+        made.close()
+        raise
+    return made
+
+
+def check_resets_next_step(env: VectorEnv[Any, Any, Any]) -> None:
+    """Raises `UsageError` for another way of resetting."""
+    mode = env.metadata.get("autoreset_mode")
+    if mode not in {AutoresetMode.NEXT_STEP, AutoresetMode.NEXT_STEP.value}:
+        raise UsageError(
+            f"vector environment {env}: metadata['autoreset_mode'] expected {AutoresetMode.NEXT_STEP}, got {mode}; "
+            "make it with autoreset_mode=AutoresetMode.NEXT_STEP"
+        )
+
+
+def check_native(env: EnvSpec, observation: tuple[Leaf, ...], action: ActionSpec) -> None:
+    """Raises `UsageError` unless its vectorised form can stand for copies with these spaces."""
+    made = make_native(env, 1)
+    try:
+        check_spaces(
+            env, "its vectorised form", made.single_observation_space, made.single_action_space, observation, action
+        )
+    finally:
+        made.close()
+
+
+def check_spaces(
+    env: EnvSpec,
+    whose: str,
+    observed: gymnasium.Space[Any],
+    acted: gymnasium.Space[Any],
+    observation: tuple[Leaf, ...],
+    action: ActionSpec,
+) -> None:
+    """Raises `UsageError` unless these spaces of a vectorised form say what one copy says."""
+    if (observation_leaves(observed), action_spec(acted)) != (observation, action):
+        line = f"environment {env.id}: {whose} has other spaces than itself, {observed} and {acted}; {instead_of(env)}"
+        raise UsageError(line)
+
+
+def instead_of(env: EnvSpec) -> str:
+    """What to do where the vectorised form of this id cannot serve."""
+    if env.id.startswith("ALE/"):
+        return f"take millrace/Atari-v0 --env-kwargs game {env.id[4:].partition('-')[0]}, or use --vector loop"
+    return "use --vector loop"

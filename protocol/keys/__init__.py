@@ -1,0 +1,1 @@
+"""Who may connect: keys, tokens, the CURVE handshake."""

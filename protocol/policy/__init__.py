@@ -1,0 +1,1 @@
+"""The policy: parameter layout, acting in numpy and in torch."""

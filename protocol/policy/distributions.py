@@ -1,0 +1,182 @@
+"""Action distributions in numpy: what a worker needs to act. Pure: the noise is an argument.
+
+A network's output is `params` [..., P]. The noise of a whole rollout is drawn at once, so a step costs an addition and a
+comparison, and the log-probabilities of a whole rollout are computed at once from the stored params.
+
+    Categorical   P = Σ sizes   logits; action = argmax(logits + Gumbel noise)               (Gumbel-max trick)
+    Bernoulli     P = K         logits; action = logits + logistic noise > 0
+    Gaussian      P = 2 D       mean, log standard deviation; action = mean + exp(log_std) · normal noise, not clipped
+    EpsilonGreedy P = n + 1     action values, ε; action = a uniform one where noise₀ < ε, else argmax
+
+`protocol.policy.networks` has the same log-probabilities in torch, with entropies; a test holds them equal.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from protocol.specs import PolicySpec
+
+Array = npt.NDArray[Any]
+Floats = npt.NDArray[np.float32]
+LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
+_TINY = np.float32(1e-30)
+
+
+class Distribution(Protocol):
+    """Params are [..., P] float32, noise [..., noise_size] float32, actions [..., *action]."""
+
+    params_size: int
+
+    def noise(self, generator: np.random.Generator, shape: tuple[int, ...]) -> Floats:
+        """Noise [*shape, noise_size] for `sample`."""
+        ...
+
+    def sample(self, params: Floats, noise: Floats) -> Array:
+        """A draw: deterministic in its arguments."""
+        ...
+
+    def mode(self, params: Floats) -> Array:
+        """The most probable action."""
+        ...
+
+    def log_prob(self, params: Floats, action: Array) -> Floats:
+        """Log-probability [...] of the action."""
+        ...
+
+
+class Categorical:
+    """One choice (Discrete) or several independent ones (MultiDiscrete)."""
+
+    def __init__(self, sizes: tuple[int, ...], shape: tuple[int, ...]) -> None:
+        self.params_size = sum(sizes)
+        self._shape = shape
+        ends = np.cumsum(sizes).tolist()
+        self._parts = [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
+
+    def noise(self, generator: np.random.Generator, shape: tuple[int, ...]) -> Floats:
+        """Gumbel(0, 1) noise [*shape, P]."""
+        exponential = generator.standard_exponential((*shape, self.params_size), dtype=np.float32)
+        return -np.log(np.maximum(exponential, _TINY))
+
+    def sample(self, params: Floats, noise: Floats) -> Array:
+        """A draw, int64 from 0."""
+        return self.mode(params + noise)
+
+    def mode(self, params: Floats) -> Array:
+        """The most probable choice."""
+        if not self._shape:
+            return np.asarray(params.argmax(-1))
+        chosen = np.stack([params[..., part].argmax(-1) for part in self._parts], -1)
+        return chosen.reshape(*params.shape[:-1], *self._shape)
+
+    def log_prob(self, params: Floats, action: Array) -> Floats:
+        """Log π(action) [...]: summed over the entries of a MultiDiscrete."""
+        flat = action.reshape(*params.shape[:-1], len(self._parts))
+        total = np.zeros(params.shape[:-1], np.float32)
+        for i, part in enumerate(self._parts):
+            logits = params[..., part]
+            shifted = logits - logits.max(-1, keepdims=True)
+            chosen = np.take_along_axis(shifted, flat[..., i : i + 1], -1)[..., 0]
+            total += chosen - np.log(np.exp(shifted).sum(-1))
+        return total
+
+
+class Bernoulli:
+    """Independent bits (MultiBinary)."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.params_size = math.prod(shape)
+        self._shape = shape
+
+    def noise(self, generator: np.random.Generator, shape: tuple[int, ...]) -> Floats:
+        """Logistic(0, 1) noise [*shape, K]."""
+        uniform = generator.random((*shape, self.params_size), dtype=np.float32)
+        uniform = np.clip(uniform, np.float32(1e-7), np.float32(1 - 1e-7))
+        return np.log(uniform) - np.log1p(-uniform)
+
+    def sample(self, params: Floats, noise: Floats) -> Array:
+        """A draw of bits, int64."""
+        return self.mode(params + noise)
+
+    def mode(self, params: Floats) -> Array:
+        """The more probable bits."""
+        return (params > 0).astype(np.int64).reshape(*params.shape[:-1], *self._shape)
+
+    def log_prob(self, params: Floats, action: Array) -> Floats:
+        """Log π(action) [...], summed over the bits: −softplus(−l) where 1, −softplus(l) where 0."""
+        signed = np.where(action.reshape(params.shape) > 0, params, -params)
+        return np.asarray(-np.logaddexp(np.float32(0), -signed).sum(-1))
+
+
+class Gaussian:
+    """A diagonal normal distribution (Box). Actions are stored as drawn and clipped only at the environment."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self._size = math.prod(shape)
+        self.params_size = 2 * self._size
+        self._shape = shape
+
+    def noise(self, generator: np.random.Generator, shape: tuple[int, ...]) -> Floats:
+        """Normal(0, 1) noise [*shape, D]."""
+        return generator.standard_normal((*shape, self._size), dtype=np.float32)
+
+    def sample(self, params: Floats, noise: Floats) -> Array:
+        """A draw, float32."""
+        drawn = params[..., : self._size] + np.exp(params[..., self._size :]) * noise
+        return drawn.reshape(*params.shape[:-1], *self._shape)
+
+    def mode(self, params: Floats) -> Array:
+        """The mean."""
+        return params[..., : self._size].reshape(*params.shape[:-1], *self._shape)
+
+    def log_prob(self, params: Floats, action: Array) -> Floats:
+        """Log π(action) [...], summed over dimensions: −½ z² − log σ − ½ log 2π."""
+        mean, log_std = params[..., : self._size], params[..., self._size :]
+        z = (action.reshape(mean.shape) - mean) * np.exp(-log_std)
+        return np.asarray((np.float32(-0.5) * z * z - log_std - np.float32(LOG_SQRT_2PI)).sum(-1))
+
+
+class EpsilonGreedy:
+    """The best of n actions, or with probability ε a uniform one (Discrete)."""
+
+    def __init__(self, actions: int) -> None:
+        self.params_size = actions + 1
+        self._actions = actions
+
+    def noise(self, generator: np.random.Generator, shape: tuple[int, ...]) -> Floats:
+        """Uniform(0, 1) noise [*shape, 2]: whether to explore, and which action."""
+        return generator.random((*shape, 2), dtype=np.float32)
+
+    def sample(self, params: Floats, noise: Floats) -> Array:
+        """A draw, int64 from 0."""
+        uniform = (noise[..., 1] * self._actions).astype(np.int64)  # below n: float32 noise is at most 1 - 2**-24
+        return np.where(noise[..., 0] < params[..., -1], uniform, self.mode(params))
+
+    def mode(self, params: Floats) -> Array:
+        """The best action."""
+        return np.asarray(params[..., :-1].argmax(-1))
+
+    def log_prob(self, params: Floats, action: Array) -> Floats:
+        """log(ε / n + (1 − ε) [action is the best]) [...], at least −69."""
+        epsilon = params[..., -1]
+        chance = epsilon / np.float32(self._actions) + (1 - epsilon) * (action == self.mode(params))
+        return np.asarray(np.log(np.maximum(chance, _TINY)), np.float32)
+
+
+def distribution(spec: PolicySpec) -> Distribution:
+    """The distribution of such a policy over its actions."""
+    action = spec.action
+    if spec.head == "q":
+        return EpsilonGreedy(action.sizes[0])
+    match action.kind:
+        case "discrete" | "multidiscrete":
+            return Categorical(action.sizes, action.shape)
+        case "multibinary":
+            return Bernoulli(action.shape)
+        case "box":
+            return Gaussian(action.shape)

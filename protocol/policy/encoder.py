@@ -1,0 +1,99 @@
+"""A torch module of the user's own between an observation and the rest of the network. Imports torch.
+
+`module:factory` names a callable: factory(features, images) -> torch.nn.Module, where `features` is the number of features
+of all arrays of an observation that are not images, and `images` their shapes. The module is called with features
+[B, features] float32, normalised if they are, and then each image [B, *shape] uint8; it gives [B, K] float32. A core, hidden
+layers and heads follow as they do without it; actor and critic look through the same one.
+
+Its parameters live in the flat buffer with all others. It must keep nothing else: what is not a parameter (a running mean
+of BatchNorm) would not travel with the weights, and with dropout a worker would not act as the learner thinks it does.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Sequence
+
+import torch
+
+from protocol.errors import UsageError
+from protocol.policy.policy import feature_size
+from protocol.specs import ActionSpec, EncoderSpec, Leaf, NamedShape, PolicySpec
+
+
+def describe_encoder(factory: str, observation: tuple[Leaf, ...], action: ActionSpec) -> EncoderSpec:
+    """Make one, to learn its parameters and its output's size. Raises `UsageError` in one line."""
+    spec = PolicySpec(observation, action)
+    module = _make(factory, spec, seed=0)
+    return EncoderSpec(factory, _arrays(module), _output_size(factory, module, spec))
+
+
+def make_encoder(spec: PolicySpec, seed: int) -> torch.nn.Module:
+    """The module of this policy, with the initial weights of this seed. Raises `UsageError` if it is another here."""
+    wanted = spec.encoder
+    assert wanted is not None
+    module = _make(wanted.factory, spec, seed)
+    arrays = _arrays(module)
+    if arrays != wanted.arrays:
+        ours, theirs = ({each.name: each.shape for each in of} for of in (arrays, wanted.arrays))
+        name = next((name for name in [*ours, *theirs] if ours.get(name) != theirs.get(name)), "order")
+        raise UsageError(
+            f"encoder {wanted.factory}: parameter {name} expected {theirs.get(name, 'none')} as the learner has it, got "
+            f"{ours.get(name, 'none')}; install the same version of it here and there"
+        )
+    return module
+
+
+def _arrays(module: torch.nn.Module) -> tuple[NamedShape, ...]:
+    return tuple(NamedShape(name, tuple(parameter.shape)) for name, parameter in module.named_parameters())
+
+
+def _make(factory: str, spec: PolicySpec, seed: int) -> torch.nn.Module:
+    images = [leaf.shape for leaf in spec.observation if leaf.is_image]
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        try:
+            module = _callable(factory)(feature_size(spec), images)
+        except UsageError:
+            raise
+        except Exception as error:
+            raise UsageError(f"encoder {factory} cannot be made: {type(error).__name__}: {_first_line(error)}") from error
+    if not isinstance(module, torch.nn.Module):
+        raise UsageError(f"encoder {factory}: expected it to return a torch.nn.Module, got {type(module).__name__}")
+    if kept := [name for name, _ in module.named_buffers()]:
+        raise UsageError(f"encoder {factory}: expected parameters alone, got the buffer {kept[0]}; use LayerNorm, say")
+    if strange := [name for name, parameter in module.named_parameters() if parameter.dtype != torch.float32]:
+        raise UsageError(f"encoder {factory}: expected float32 parameters, got another dtype in {strange[0]}")
+    return module.eval()
+
+
+def _callable(factory: str) -> Callable[[int, Sequence[tuple[int, ...]]], object]:
+    module, _, name = factory.partition(":")
+    if not module or not name:
+        raise UsageError(f"encoder {factory}: expected module:factory, as in my_package.networks:encoder")
+    try:
+        found: Callable[[int, Sequence[tuple[int, ...]]], object] = getattr(importlib.import_module(module), name)
+    except ModuleNotFoundError as error:
+        says = "is it installed, or its folder on PYTHONPATH?"
+        raise UsageError(f"encoder {factory}: no module named {error.name}; {says}") from error
+    except AttributeError as error:
+        raise UsageError(f"encoder {factory}: {module} has no {name}") from error
+    return found
+
+
+def _output_size(factory: str, module: torch.nn.Module, spec: PolicySpec) -> int:
+    """K, by trying it on two observations of zeros."""
+    images = [torch.zeros(2, *leaf.shape, dtype=torch.uint8) for leaf in spec.observation if leaf.is_image]
+    try:
+        with torch.no_grad():
+            out = module(torch.zeros(2, feature_size(spec)), *images)
+    except Exception as error:
+        raise UsageError(f"encoder {factory} raised {type(error).__name__}: {_first_line(error)}") from error
+    if not isinstance(out, torch.Tensor) or out.dim() != 2 or len(out) != 2 or out.dtype != torch.float32:
+        got = f"{out.dtype}{list(out.shape)}" if isinstance(out, torch.Tensor) else type(out).__name__
+        raise UsageError(f"encoder {factory}: expected float32[2, K] of two observations, got {got}")
+    return out.shape[1]
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or ["no message"])[0].strip()

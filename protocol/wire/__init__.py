@@ -1,0 +1,1 @@
+"""Frames, arrays and sockets: how messages travel."""

@@ -1,0 +1,180 @@
+"""Message <-> frames. Pure: bytes in, records out; bounded; no pickle.
+
+Frame 0 is the head, msgpack: [type's name, field, field, …] in the order of the record, each array in its place as
+[dtype, shape, index of its frame]. `Hello` and `Refuse` alone are maps, fields by name and the type's name under `type`:
+all versions must understand them. Frames 1… are the arrays' raw bytes, C-ordered, little-endian. Everything a peer says is
+checked before it is used: the number of frames and bytes, the head's size and nesting, every type, every shape. An array
+that arrives is a read-only view on the received frame: no copy.
+
+Arrays of a rollout may come packed (`packing.py`), as [dtype, shape, index, packings]; what a message's packed arrays come
+to together is bounded by the receiver.
+"""
+
+from __future__ import annotations
+
+import operator
+import sys
+from collections.abc import Sequence
+from functools import reduce
+from typing import Any, get_args
+
+import msgpack
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from protocol.errors import BadMessage
+from protocol.messages import Hello, Inquire, Refuse, Rollout, Status, ToLearner, ToObserver, ToWorker
+from protocol.wire.compression import Packing, as_it_lies, unpacked
+
+Array = npt.NDArray[Any]
+Buffer = bytes | memoryview
+
+MAX_FRAMES = 64
+MAX_HEAD_BYTES = 1 << 20  # Welcome carries a pickled factory at most this large
+MAX_FRAME_BYTES = 1 << 30
+MAX_ITEMS = 1 << 16
+MAX_DIMENSIONS = 8
+DTYPES = {
+    name: np.dtype(name) for name in ("|b1", "|i1", "|u1", "<i2", "<u2", "<i4", "<u4", "<i8", "<u8", "<f2", "<f4", "<f8")
+}
+
+# What may be said, by position and by name. To msgspec a union of both is none: what the head is says which of them to take.
+Said = tuple[Any, Any]
+TO_WORKER: Said = (reduce(operator.or_, (kind for kind in get_args(ToWorker) if kind is not Refuse)), Refuse)
+TO_LEARNER: Said = (reduce(operator.or_, (kind for kind in get_args(ToLearner | Inquire) if kind is not Hello)), Hello)
+TO_OBSERVER: Said = (Status, Status)
+
+assert sys.byteorder == "little", "millrace sends arrays as they lie in memory and knows little-endian machines only"
+
+
+def encode(message: ToLearner | Inquire | ToWorker | ToObserver, packing: Packing | None = None) -> list[Buffer]:
+    """Frames of a message. Arrays are not copied: do not change them afterwards. `packing`: for those of a rollout."""
+    frames: list[Buffer] = [b""]
+    packing = packing if isinstance(message, Rollout) else None
+
+    def hook(value: object) -> object:
+        if not isinstance(value, np.ndarray):
+            raise TypeError(f"{type(message).__name__} cannot carry a {type(value).__name__}")
+        if value.dtype.str not in DTYPES:
+            raise TypeError(f"{type(message).__name__} cannot carry an array of {value.dtype}")
+        described: list[object] = [value.dtype.str, list(value.shape), len(frames)]
+        if packing is None:
+            frames.append(as_it_lies(value))
+            return described
+        frame, packings = packing.of(value)
+        frames.append(frame)
+        return [*described, packings] if packings else described
+
+    head = msgpack.packb(msgspec.to_builtins(message, enc_hook=hook, builtin_types=(bytes,)))
+    if len(head) > MAX_HEAD_BYTES:
+        raise ValueError(f"{type(message).__name__}: head expected at most {MAX_HEAD_BYTES} bytes, got {len(head)}")
+    frames[0] = head
+    return frames
+
+
+def decode_to_learner(frames: Sequence[Buffer], room: int = 0) -> ToLearner | Inquire:
+    """What a worker said, or an observer. Raises `BadMessage`, whatever the bytes.
+
+    `room`: bytes to which its packed arrays may come, all together; 0: none may come packed.
+    """
+    message: ToLearner | Inquire = _decode(frames, TO_LEARNER, room)
+    return message
+
+
+def decode_to_worker(frames: Sequence[Buffer]) -> ToWorker:
+    """What the learner said. Raises `BadMessage`, whatever the bytes."""
+    message: ToWorker = _decode(frames, TO_WORKER)
+    return message
+
+
+def decode_to_observer(frames: Sequence[Buffer]) -> ToObserver:
+    """What the learner answered. Raises `BadMessage`, whatever the bytes."""
+    message: ToObserver = _decode(frames, TO_OBSERVER)
+    return message
+
+
+def _decode(frames: Sequence[Buffer], kinds: Said, room: int = 0) -> Any:
+    if not 1 <= len(frames) <= MAX_FRAMES:
+        raise BadMessage(f"message expected 1 to {MAX_FRAMES} frames, got {len(frames)}")
+    if len(frames[0]) > MAX_HEAD_BYTES:
+        raise BadMessage(f"head expected at most {MAX_HEAD_BYTES} bytes, got {len(frames[0])}")
+    by_position, by_name = kinds
+    head: object = None
+    used: set[int] = set()
+    taken = 0
+
+    def hook(wanted: type, value: object) -> object:
+        nonlocal taken
+        dtype, shape, index, size, packings = _described(frames, value)
+        if index in used:
+            raise BadMessage(f"array frame {index} expected one array, got two")
+        used.add(index)
+        frame = frames[index]
+        if packings is not None:
+            taken += size
+            if taken > room or not room:
+                raise BadMessage(f"packed arrays expected at most {room} bytes together, got {taken}")
+            if size > MAX_FRAME_BYTES:
+                raise BadMessage(f"packed array expected at most {MAX_FRAME_BYTES} bytes, got {size}")
+            return unpacked(frame, packings, dtype, shape)
+        if size != len(frame):
+            raise BadMessage(f"array {dtype.str}{shape} expected {size} bytes, got {len(frame)}")
+        return np.ndarray(shape, dtype, frame if type(frame) is bytes else memoryview(frame).toreadonly())
+
+    try:
+        head = msgpack.unpackb(
+            frames[0],
+            max_array_len=MAX_ITEMS,
+            max_map_len=MAX_ITEMS,
+            max_ext_len=0,
+            strict_map_key=True,
+        )
+        named = type(head) is dict and "type" in head  # msgspec takes a map without one for the only kind it may be
+        message = msgspec.convert(head, by_name if named else by_position, dec_hook=hook)
+    except BadMessage:
+        raise
+    except Exception as error:  # msgpack and msgspec raise a dozen types on hostile bytes; to us they are one
+        said = " ".join(_in_words(str(error), head, by_position).split())[:200]  # it quotes the peer
+        raise BadMessage(f"head is not a message of ours: {type(error).__name__}: {said}") from error
+    if len(used) != len(frames) - 1:
+        raise BadMessage(f"{type(message).__name__}: expected {len(used)} arrays, got {len(frames) - 1} frames")
+    return message
+
+
+def _in_words(error: str, head: object, kinds: Any) -> str:
+    """What msgspec says of a head that goes by position, with the names of fields, and their number without the type."""
+    match head:
+        case [str() as name, *given]:
+            kind = next((kind for kind in get_args(kinds) or (kinds,) if kind.__name__ == name), None)
+            fields: tuple[str, ...] = kind.__struct_fields__ if kind is not None else ()
+            what, at, where = error.rpartition(" - at `$[")
+            place, _, inside = where.partition("]")
+            if at and place.isdecimal() and 1 <= int(place) <= len(fields):
+                return f"{what} - at `{name}.{fields[int(place) - 1]}{inside}"
+            if not at and len(given) != len(fields):
+                return f"{name} expected {len(fields)} fields, got {len(given)}"
+    return error
+
+
+def _described(frames: Sequence[Buffer], value: object) -> tuple[np.dtype[Any], list[int], int, int, list[object] | None]:
+    """Dtype, shape, frame, bytes and packings of the array that `[dtype, shape, index]`, or one more, stands for."""
+    if not (type(value) is list and 3 <= len(value) <= 4):
+        raise BadMessage(f"array expected [dtype, shape, index], got {str(value)[:80]}")
+    name, shape, index = value[:3]
+    if not (type(name) is str and type(shape) is list and isinstance(index, int)):
+        raise BadMessage(f"array expected [dtype, shape, index], got {str(value)[:80]}")
+    dtype = DTYPES.get(name)
+    if dtype is None:
+        raise BadMessage(f"array dtype expected one of ours, got {name[:20]!r}")
+    size = dtype.itemsize
+    for side in shape:
+        if not (type(side) is int and 0 <= side <= MAX_FRAME_BYTES and len(shape) <= MAX_DIMENSIONS):
+            raise BadMessage(f"array shape expected at most {MAX_DIMENSIONS} whole numbers, got {str(shape)[:80]}")
+        size *= side
+    if type(index) is bool or not 1 <= index < len(frames):
+        raise BadMessage(f"array frame expected 1 to {len(frames) - 1}, got {index}")
+    packings = value[3] if len(value) == 4 else None
+    if packings is not None and type(packings) is not list:
+        raise BadMessage(f"array packings expected a list of names, got {str(packings)[:80]}")
+    return dtype, shape, index, size, packings

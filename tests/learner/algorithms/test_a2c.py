@@ -1,0 +1,121 @@
+"""A2C: one step on each batch, whose gradient is that of its neighbours where they should agree."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+
+from learner.algorithms.a2c import A2C
+from learner.algorithms.actor_critic import Minibatch
+from learner.algorithms.ppo import PPO
+from learner.algorithms.reinforce import REINFORCE
+from learner.algorithms.returns import gae
+from learner.config.hyperparameters import A2CConfig, PPOConfig, REINFORCEConfig
+from protocol.rollout import Batch
+from protocol.specs import PolicySpec
+from tests.support.batches import DISCRETE, GAUSSIAN, batch, no_pulse, normal, shared
+
+FREE: dict[str, Any] = {"max_grad_norm": 1e9, "gamma": 0.9, "ent_coef": 0.01, "normalize_rewards": False}
+
+
+def a2c(spec: PolicySpec = DISCRETE, **settings: Any) -> A2C:
+    return A2C(A2CConfig(**settings), spec, total_steps=10_000, seed=0)
+
+
+def ppo(spec: PolicySpec, **settings: Any) -> PPO:
+    return PPO(PPOConfig(n_epochs=1, batch_size=10_000, **settings), spec, total_steps=10_000, seed=0)
+
+
+def reinforce(**settings: Any) -> REINFORCE:
+    return REINFORCE(REINFORCEConfig(**settings), DISCRETE, total_steps=10_000, seed=0)
+
+
+def whole(rows: Batch) -> Batch:
+    """The same rows, all episodes of which terminate within the rollout."""
+    terminated = rows.terminated | rows.truncated
+    terminated[-1] |= rows.valid[-1]
+    return msgspec.structs.replace(rows, terminated=terminated, truncated=np.zeros_like(terminated))
+
+
+def test_an_update_is_one_step_on_all_valid_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    algorithm = a2c(gamma=0.9, gae_lambda=0.7)
+    rows = batch(algorithm, 0)
+    values = algorithm.parts.values(algorithm.parts.see(rows), no_pulse)
+    expected = gae(rows.reward, values, rows.terminated, rows.truncated, rows.valid, 0.9, 0.7)
+    seen: list[Minibatch] = []
+    step = algorithm.parts.policy_gradient_step
+
+    def watched(given: Minibatch, critic: bool = True) -> dict[str, float]:
+        assert critic
+        seen.append(given)
+        return step(given)
+
+    monkeypatch.setattr(algorithm.parts, "policy_gradient_step", watched)
+    algorithm.update(rows, no_pulse)
+    (only,) = seen
+    np.testing.assert_array_equal(only.x, rows.obs[0][:-1][rows.valid])
+    np.testing.assert_array_equal(only.action, rows.action[rows.valid])
+    np.testing.assert_array_equal(only.advantage, expected[rows.valid])
+    np.testing.assert_array_equal(only.target, (expected + values[:-1])[rows.valid])
+
+
+@pytest.mark.parametrize("spec", [DISCRETE, normal(GAUSSIAN), shared(DISCRETE)])
+@pytest.mark.parametrize("normalize", [True, False])
+def test_its_gradient_is_that_of_ppos_first_minibatch(spec: PolicySpec, normalize: bool) -> None:
+    """Where the policy has not moved, the clipped surrogate is the policy gradient."""
+    settings = FREE | {"gae_lambda": 0.8, "normalize_advantage": normalize, "normalize_rewards": True}
+    one, other = a2c(spec, **settings), ppo(spec, **settings)
+    assert torch.equal(one.net.flat, other.net.flat)
+    rows = batch(one, 0)
+    one.update(rows, no_pulse)
+    other.update(rows, no_pulse)
+    assert one.net.flat_grad.norm() > 0.01
+    torch.testing.assert_close(one.net.flat_grad, other.net.flat_grad, atol=1e-5, rtol=1e-3)
+
+
+def of_the_actor(algorithm: A2C | REINFORCE, rows: Batch) -> torch.Tensor:
+    algorithm.update(rows, no_pulse)
+    return algorithm.net.flat_grad[: algorithm.net.acting_size].clone()
+
+
+def constant_critic(algorithm: A2C | REINFORCE, value: float) -> None:
+    with torch.no_grad():
+        algorithm.net.parameters["critic.out.weight"].zero_()
+        algorithm.net.parameters["critic.out.bias"].fill_(value)
+
+
+def test_with_lambda_1_no_bootstrap_and_values_of_0_its_gradient_is_reinforces() -> None:
+    one, other = a2c(**FREE, gae_lambda=1.0), reinforce(**FREE, baseline=False, normalize_returns=False)
+    constant_critic(one, 0.0)
+    rows = whole(batch(one, 0))
+    found = of_the_actor(one, rows)
+    assert found.norm() > 0.01
+    torch.testing.assert_close(found, of_the_actor(other, rows), atol=1e-6, rtol=1e-4)
+
+
+@pytest.mark.parametrize("value", [0.0, 3.0])
+def test_a_constant_baseline_is_the_same_in_both(value: float) -> None:
+    one, other = a2c(**FREE), reinforce(**FREE, normalize_returns=False)
+    for each in (one, other):
+        constant_critic(each, value)
+    rows = whole(batch(one, 0))
+    for each in (one, other):
+        each.update(rows, no_pulse)
+    torch.testing.assert_close(one.net.flat_grad, other.net.flat_grad, atol=1e-6, rtol=1e-4)
+
+
+def test_a_constant_baseline_changes_nothing_that_is_normalised() -> None:
+    one, other = a2c(**FREE, normalize_advantage=True), reinforce(**FREE, baseline=False)
+    constant_critic(one, 5.0)
+    rows = whole(batch(one, 0))
+    torch.testing.assert_close(of_the_actor(one, rows), of_the_actor(other, rows), atol=1e-5, rtol=1e-3)
+
+
+def test_rewards_are_scaled_when_they_are_to_be() -> None:
+    plain, scaled = a2c(), a2c(normalize_rewards=True)
+    losses = [each.update(batch(each, 0), no_pulse)["train/value_loss"] for each in (plain, scaled)]
+    assert losses[1] < losses[0] / 4

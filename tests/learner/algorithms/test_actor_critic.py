@@ -1,0 +1,239 @@
+"""What A2C, IMPALA and REINFORCE have in common: bits that repeat, rows that change nothing, steps of the usual loss."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+
+from learner.algorithms import ALGORITHMS, Algorithm
+from learner.algorithms.a2c import A2C
+from learner.algorithms.actor_critic import Minibatch
+from learner.algorithms.impala import Impala
+from learner.algorithms.reinforce import REINFORCE
+from learner.config.hyperparameters import HYPERPARAMETERS
+from protocol.errors import RunError
+from protocol.policy.policy import layout, size
+from protocol.specs import PolicySpec
+from tests.support.batches import (
+    COPIES,
+    DISCRETE,
+    GAUSSIAN,
+    IMAGE,
+    LANES,
+    T,
+    batch,
+    identity_batch,
+    no_pulse,
+    normal,
+    shared,
+)
+
+NAMES = ["a2c", "impala", "reinforce"]
+Any3 = A2C | Impala | REINFORCE
+EVERYTHING = {"normalize_rewards": True, "learning_rate_schedule": "linear", "learning_rate": 0.01}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def make(name: str, spec: PolicySpec = DISCRETE, seed: int = 0, **settings: Any) -> Any3:
+    config = msgspec.convert(settings, HYPERPARAMETERS[name])
+    algorithm = ALGORITHMS[name](config, spec, total_steps=10_000, seed=seed)
+    assert isinstance(algorithm, Any3)
+    return algorithm
+
+
+def everything(name: str, spec: PolicySpec, seed: int = 0) -> Any3:
+    more = {"minibatches": 3, "n_epochs": 2} if name == "impala" else {}
+    return make(name, spec, seed, **EVERYTHING, **more)
+
+
+def same(a: Any3, b: Any3) -> bool:
+    return torch.equal(a.net.flat, b.net.flat) and all(map(np.array_equal, a.weights(), b.weights()))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_is_an_algorithm_with_the_policy_of_its_settings(name: str) -> None:
+    config = msgspec.convert({"shared_net": True, "net": [8], "normalize_observations": True}, HYPERPARAMETERS[name])
+    spec = ALGORITHMS[name].policy_spec(config, DISCRETE.observation, DISCRETE.action)
+    assert (spec.shared_net, spec.net, spec.normalize_observations) == (True, (8,), True)
+    algorithm: Algorithm = ALGORITHMS[name](config, spec, total_steps=1, seed=0)
+    assert algorithm.weights()[0].shape == (size(layout(spec)[0]),)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("spec", [DISCRETE, normal(GAUSSIAN), IMAGE, shared(IMAGE)])
+def test_the_same_batches_give_the_same_bits(name: str, spec: PolicySpec) -> None:
+    a, b, other = (everything(name, spec, seed) for seed in (0, 0, 1))
+    for seed in range(2):
+        metrics = [each.update(batch(each, seed, seed == 0), no_pulse) for each in (a, b)]
+        assert metrics[0] == metrics[1]
+    assert same(a, b)
+    other.update(batch(other, 0), no_pulse)
+    assert not same(a, other)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("optimizer", ["adam", "rmsprop"])
+@pytest.mark.parametrize("spec", [normal(DISCRETE), shared(IMAGE)])
+def test_a_restored_algorithm_makes_the_next_update_bit_for_bit(name: str, optimizer: str, spec: PolicySpec) -> None:
+    first, second = (make(name, spec, seed, **EVERYTHING, optimizer=optimizer) for seed in (0, 9))
+    for seed in range(2):
+        first.update(batch(first, seed, seed == 0), no_pulse)
+    file = io.BytesIO()
+    torch.save(first.state_dict(), file)
+    file.seek(0)
+    second.load_state_dict(torch.load(file, weights_only=True))
+    assert same(first, second)
+    for seed in (2, 3):
+        metrics = [each.update(batch(each, seed), no_pulse) for each in (first, second)]
+        assert metrics[0] == metrics[1]
+        assert same(first, second)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_saved_state_does_not_change_with_the_algorithm(name: str) -> None:
+    algorithm, late = (everything(name, normal(DISCRETE)) for _ in range(2))
+    algorithm.update(batch(algorithm, 0, fresh=True), no_pulse)
+    state, before = algorithm.state_dict(), algorithm.net.flat.clone()
+    algorithm.update(batch(algorithm, 1), no_pulse)
+    late.load_state_dict(state)
+    assert torch.equal(late.net.flat, before)
+    late.update(batch(late, 1), no_pulse)
+    assert same(late, algorithm)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("spec", [normal(DISCRETE), normal(GAUSSIAN), IMAGE])
+def test_a_row_that_is_not_valid_changes_nothing(name: str, spec: PolicySpec) -> None:
+    a, b = everything(name, spec), everything(name, spec)
+    clean, rubbish = batch(a, 0), batch(b, 0)
+    reset = ~clean.valid
+    after_termination = reset.copy()
+    after_termination[1:] &= clean.terminated[:-1]  # the obs of any other reset row is what a truncation bootstraps from
+    for array in (rubbish.action, rubbish.log_prob, rubbish.reward):
+        array[reset] = array.dtype.type(3)
+    rubbish.obs[0][:-1][after_termination] = 100
+    for leaf in rubbish.obs[1:]:
+        leaf[:-1][after_termination] = 255
+    assert a.update(clean, no_pulse) == b.update(rubbish, no_pulse)
+    assert same(a, b)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_batch_without_a_valid_row_changes_nothing(name: str) -> None:
+    a, b = make(name), make(name)
+    empty = msgspec.structs.replace(batch(a, 0), valid=np.zeros((T, LANES * COPIES), bool))
+    assert a.update(empty, no_pulse) == {}
+    assert same(a, b)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_learning_rate_follows_the_steps_used(name: str) -> None:
+    algorithm, used = everything(name, DISCRETE), 0
+    for seed in range(3):
+        left = 1 - used / 10_000
+        rows = batch(algorithm, seed)
+        metrics = algorithm.update(rows, no_pulse)
+        assert metrics["train/learning_rate"] == pytest.approx(0.01 * left)
+        assert algorithm.parts.version == seed + 1
+        used += int(rows.valid.sum())
+    assert 0 < left < 1
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("spec", [DISCRETE, GAUSSIAN])
+def test_metrics_have_the_names_of_stable_baselines(name: str, spec: PolicySpec) -> None:
+    algorithm = make(name, spec)
+    metrics = algorithm.update(batch(algorithm, 0), no_pulse)
+    names = "entropy_loss explained_variance value_loss policy_gradient_loss learning_rate n_updates grad_norm"
+    assert {f"train/{each}" for each in names.split()} <= set(metrics)
+    assert ("train/std" in metrics) == (spec is GAUSSIAN)
+    assert all(map(np.isfinite, metrics.values()))
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("broken", ["reward", "obs"])
+def test_a_loss_that_is_not_finite_is_named_and_stops_before_the_weights(name: str, broken: str) -> None:
+    algorithm = make(name, normalize_rewards=False)
+    algorithm.update(batch(algorithm, 0), no_pulse)
+    before, rows = algorithm.net.flat.clone(), batch(algorithm, 1)
+    (rows.reward if broken == "reward" else rows.obs[0])[:] = 3e38 if broken == "reward" else np.nan
+    with pytest.raises(RunError, match=r"update 1: \w+ expected finite, got"), np.errstate(all="ignore"):
+        algorithm.update(rows, no_pulse)
+    assert torch.equal(algorithm.net.flat, before)
+
+
+@pytest.mark.parametrize("spec", [DISCRETE, GAUSSIAN, shared(DISCRETE), shared(GAUSSIAN)])
+@pytest.mark.parametrize("critic", [True, False])
+def test_a_step_follows_the_gradient_of_the_usual_loss(spec: PolicySpec, critic: bool) -> None:
+    algorithm, generator = make("a2c", spec, vf_coef=0.7, ent_coef=0.3, max_grad_norm=1e9), torch.Generator().manual_seed(0)
+    x, advantage, target = (torch.randn(s, generator=generator) for s in [(30, 4), (30,), (30,)])
+    params, value = algorithm.net.forward(x)
+    if spec.action.kind == "discrete":
+        usual: Any = torch.distributions.Categorical(logits=params)
+        action = torch.randint(4, (30,), generator=generator)
+    else:
+        usual = torch.distributions.Independent(torch.distributions.Normal(params[:, :2], params[:, 2:].exp()), 1)
+        action = torch.randn((30, 2), generator=generator)
+    policy_loss = -(usual.log_prob(action) * advantage).mean()
+    value_loss = (value - target).square().mean() if critic else torch.zeros(())
+    (policy_loss + 0.7 * value_loss - 0.3 * usual.entropy().mean()).backward()
+    expected = algorithm.net.flat_grad.clone()
+    measured = algorithm.parts.policy_gradient_step(Minibatch(x, (), action, advantage, advantage, target), critic)
+    torch.testing.assert_close(algorithm.net.flat_grad, expected, atol=1e-5, rtol=1e-4)
+    assert measured["policy_gradient_loss"] == pytest.approx(policy_loss.item(), rel=1e-4)
+
+
+@pytest.mark.parametrize("optimizer", ["rmsprop", "adam"])
+def test_the_optimisers_are_torchs_on_each_array_of_the_network(optimizer: str) -> None:
+    """RMSProp with ε 1e-5 outside the square root and α 0.99, as Stable-Baselines3's A2C has it; gradients cut to 0.5."""
+    algorithm = make("a2c", optimizer=optimizer, learning_rate=0.01, max_grad_norm=0.5)
+    usual = [array.detach().clone().requires_grad_() for array in algorithm.net.parameters.values()]
+    reference: Any = (
+        torch.optim.RMSprop(usual, lr=0.01, alpha=0.99, eps=1e-5)
+        if optimizer == "rmsprop"
+        else torch.optim.Adam(usual, lr=0.01, eps=1e-5)
+    )
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(5):
+        x, advantage, target = (torch.randn(s, generator=generator) for s in [(30, 4), (30,), (30,)])
+        rows = Minibatch(x, (), torch.randint(4, (30,), generator=generator), advantage, 3 * advantage, target)
+        log_prob, _, value = algorithm.parts.forward(rows)
+        loss = -(log_prob * rows.advantage).mean() + 0.5 * (value - target).square().mean()
+        gradients = torch.autograd.grad(loss, list(algorithm.net.parameters.values()))
+        for array, gradient in zip(usual, gradients, strict=True):
+            array.grad = gradient
+        assert torch.nn.utils.clip_grad_norm_(usual, 0.5) > 0.5
+        algorithm.parts.policy_gradient_step(rows)
+        reference.step()
+        for array, expected in zip(algorithm.net.parameters.values(), usual, strict=True):
+            torch.testing.assert_close(array, expected, atol=2e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    ("spec", "start", "goal"),
+    [(normal(DISCRETE), 0.5, 0.95), (shared(DISCRETE), 0.5, 0.95), (normal(GAUSSIAN), -1.5, -0.45)],
+)
+def test_it_learns_the_identity(name: str, spec: PolicySpec, start: float, goal: float) -> None:
+    algorithm = make(name, spec, learning_rate=0.02, optimizer="adam", gamma=0.9)
+    generator = np.random.default_rng(0)
+    scores = []
+    for _ in range(150):
+        rows, score = identity_batch(algorithm, generator)
+        scores.append(score)
+        algorithm.update(rows, no_pulse)
+    assert scores[0] < start
+    assert np.mean(scores[-3:]) > goal

@@ -1,0 +1,578 @@
+"""DQN: its targets by hand, what moves the target network and ε, what a saved state holds, what it learns and refuses."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+
+from learner.algorithms import ALGORITHMS, Algorithm
+from learner.algorithms import replay as replay_module
+from learner.algorithms.dqn import DQN, LOSSES, exploration_rate
+from learner.algorithms.replay import Sample
+from learner.config.hyperparameters import DQNConfig
+from protocol.errors import RunError, UsageError
+from protocol.policy.distributions import distribution
+from protocol.policy.policy import NumpyPolicy, make_policy, views
+from protocol.rollout import Batch
+from protocol.specs import ActionSpec, Leaf
+
+Array = npt.NDArray[Any]
+Floats = npt.NDArray[np.float32]
+Ints = npt.NDArray[np.int64]
+
+BOX = Leaf("", "box", (4,), "float32")
+CHOICE = ActionSpec("discrete", (), "int64", (4,), (0,))
+IMAGE = Leaf("i", "box", (8, 8, 1), "uint8")
+LANES, COPIES, T = 2, 3, 20
+EVERYTHING = DQNConfig(
+    net=(16,),
+    replay="prioritized",
+    replay_size=300,
+    n_step=3,
+    dueling=True,
+    target="polyak",
+    tau=0.1,
+    optimizer="adamw",
+    amsgrad=True,
+    max_grad_norm=1.0,
+    max_grad_value=0.5,
+    normalize_observations=True,
+    learning_rate_schedule="linear",
+    learning_starts=100,
+    gradient_steps=5,
+)
+PLAIN = DQNConfig(net=(16,), replay_size=1000, learning_starts=0, gradient_steps=5, target_every=7)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def changed(config: DQNConfig, **settings: Any) -> DQNConfig:
+    return msgspec.structs.replace(config, **settings)
+
+
+def dqn(config: DQNConfig = PLAIN, observation: tuple[Leaf, ...] = (BOX,), seed: int = 0) -> DQN:
+    spec = DQN.policy_spec(config, observation, CHOICE)
+    return DQN(config, spec, total_steps=10_000, seed=seed)
+
+
+def no_pulse() -> None:
+    pass
+
+
+def batch(seed: int, observation: tuple[Leaf, ...] = (BOX,), fresh: bool = False) -> Batch:
+    """A batch of noise with ends of both kinds."""
+    generator = np.random.default_rng(seed)
+    N = LANES * COPIES
+    obs: list[Array] = [generator.normal(2, 3, (T + 1, N, 4)).astype(np.float32)]
+    if len(observation) > 1:
+        obs.append(generator.integers(0, 256, (T + 1, N, 8, 8, 1), dtype=np.uint8))
+    ends, kind = generator.random((T, N)) < 0.15, generator.random((T, N)) < 0.5
+    valid = np.ones((T, N), bool)
+    for t in range(1, T):
+        valid[t] = ~ends[t - 1]
+        ends[t] &= valid[t]
+    return Batch(
+        obs=tuple(obs),
+        action=generator.integers(0, 4, (T, N)),
+        log_prob=np.zeros((T, N), np.float32),
+        reward=generator.normal(1, 2, (T, N)).astype(np.float32),
+        terminated=ends & kind,
+        truncated=ends & ~kind,
+        valid=valid,
+        state=np.zeros((LANES * COPIES, 0), np.float32),
+        lane=np.repeat(np.arange(LANES), COPIES),
+        fresh=np.full(N, fresh),
+        copies=COPIES,
+        episodes=(),
+    )
+
+
+def same(a: DQN, b: DQN) -> bool:
+    nets = torch.equal(a.net.flat, b.net.flat) and torch.equal(a.target.flat, b.target.flat)
+    return nets and all(map(np.array_equal, a.weights(), b.weights()))
+
+
+# -------------------------------------------------------------------- a chain of three states, by hand
+
+STATES = np.eye(3, dtype=np.float32)
+Q = np.array([[1.0, 5.0, 2.0], [3.0, 4.0, 7.0]], np.float32)  # [action, state], of the network
+Q_TARGET = np.array([[10.0, 20.0, 30.0], [40.0, 50.0, 5.0]], np.float32)  # of the target
+
+
+def chain(**settings: Any) -> DQN:
+    """A network that is a table."""
+    config = DQNConfig(net=(), gamma=0.5, replay_size=100, **settings)
+    spec = DQN.policy_spec(config, (Leaf("", "box", (3,), "float32"),), ActionSpec("discrete", (), "int64", (2,), (0,)))
+    made = DQN(config, spec, total_steps=1000, seed=0)
+    for net, table in ((made.net, Q), (made.target, Q_TARGET)):
+        net.flat.zero_()
+        views(net.flat.numpy(), net.fields)["q.out.weight"][:] = table
+    return made
+
+
+def walk(terminated: bool, truncated: bool = False) -> Batch:
+    """0 → 1 → 2, with rewards 1 and 3, by actions 1 and 0; the second step ends as asked."""
+    ends = np.array([[False], [terminated]]), np.array([[False], [truncated]])
+    return Batch(
+        obs=(STATES[:, None],),
+        action=np.array([[1], [0]]),
+        log_prob=np.zeros((2, 1), np.float32),
+        reward=np.array([[1], [3]], np.float32),
+        terminated=ends[0],
+        truncated=ends[1],
+        valid=np.ones((2, 1), bool),
+        state=np.zeros((1, 0), np.float32),
+        lane=np.zeros(1, np.int64),
+        fresh=np.ones(1, bool),
+        copies=1,
+        episodes=(),
+    )
+
+
+@pytest.mark.parametrize(
+    ("double", "n_step", "end", "from_0", "from_1"),
+    [
+        (False, 1, "none", 1 + 0.5 * 50, 3 + 0.5 * 30),  # max Q′(1) = 50, max Q′(2) = 30
+        (False, 1, "truncated", 1 + 0.5 * 50, 3 + 0.5 * 30),
+        (False, 1, "terminated", 1 + 0.5 * 50, 3),
+        (True, 1, "none", 1 + 0.5 * 20, 3 + 0.5 * 5),  # Q prefers 0 in state 1 and 1 in state 2: Q′ says 20 and 5
+        (True, 1, "terminated", 1 + 0.5 * 20, 3),
+        (True, 2, "none", 1 + 0.5 * 3 + 0.25 * 5, 3 + 0.5 * 5),
+        (False, 2, "truncated", 1 + 0.5 * 3 + 0.25 * 30, 3 + 0.5 * 30),
+        (False, 2, "terminated", 1 + 0.5 * 3, 3),
+        (False, 5, "both", 1 + 0.5 * 3, 3),
+    ],
+)
+def test_targets_on_a_chain_by_hand(double: bool, n_step: int, end: str, from_0: float, from_1: float) -> None:
+    made = chain(double=double, n_step=n_step)
+    made.replay.add(walk(end in ("terminated", "both"), end in ("truncated", "both")))
+    drawn = made.replay.sample(50)
+    expected = np.where(drawn.leaves[0][:, 0] == 1, from_0, from_1)
+    assert len(set(expected)) == 2
+    np.testing.assert_allclose(made.targets(drawn), expected, rtol=1e-6)
+
+
+def test_a_step_moves_the_value_of_the_action_taken_towards_its_target() -> None:
+    made = chain(double=False, learning_rate=0.01)
+    made.replay.add(walk(terminated=True))
+    drawn = made.replay.sample(50)
+    before = made.net.flat.clone().numpy()
+    made.step(drawn)
+    moved = views(made.net.flat.numpy() - before, made.net.fields)["q.out.weight"]
+    assert moved[1, 0] > 0  # Q(0, 1) = 3 → 26
+    assert moved[0, 1] < 0  # Q(1, 0) = 5 → 3
+    moved[1, 0] = moved[0, 1] = 0
+    assert not moved.any()
+
+
+# -------------------------------------------------------------------- a gradient step
+
+
+@pytest.mark.parametrize("name", ["huber", "squared"])
+def test_the_gradient_of_a_loss_is_autograds(name: str) -> None:
+    generator = torch.Generator().manual_seed(0)
+    error = (3 * torch.randn(50, generator=generator)).requires_grad_()
+    weight = torch.rand(50, generator=generator)
+    usual: Any = torch.nn.functional.huber_loss if name == "huber" else torch.nn.functional.mse_loss
+    expected = (weight * usual(error, torch.zeros(50), reduction="none")).mean()
+    expected.backward()
+    loss, gradient = LOSSES[name](error.detach(), weight)
+    torch.testing.assert_close(loss, expected.detach())
+    torch.testing.assert_close(gradient, error.grad)
+
+
+@pytest.mark.parametrize("dueling", [False, True])
+def test_a_step_follows_the_gradient_of_the_usual_loss(dueling: bool) -> None:
+    made = dqn(changed(PLAIN, dueling=dueling, replay="prioritized", double=False))
+    made.replay.add(batch(0))
+    made.target.flat.mul_(1.5)
+    first = made.replay.sample(30)
+    made.replay.reprioritise(first.slots, np.linspace(0, 5, 30, dtype=np.float32))
+    drawn = made.replay.sample(64, beta=0.5)
+    x, following = torch.from_numpy(drawn.leaves[0]), torch.from_numpy(drawn.next_leaves[0])
+    with torch.no_grad():
+        target = torch.from_numpy(drawn.reward) + torch.from_numpy(drawn.discount) * made.target.params(following).amax(1)
+    chosen = made.net.params(x)[torch.arange(64), torch.from_numpy(drawn.action)]
+    loss = (torch.from_numpy(drawn.weight) * torch.nn.functional.smooth_l1_loss(chosen, target, reduction="none")).mean()
+    made.net.flat_grad.zero_()
+    torch.autograd.backward(loss)
+    expected = made.net.flat_grad.clone()
+    measured = made.step(drawn)
+    assert drawn.weight.min() < 1
+    torch.testing.assert_close(made.net.flat_grad, expected, atol=1e-6, rtol=1e-4)
+    assert measured.loss == pytest.approx(loss.item(), rel=1e-5)
+    assert measured.q_mean == pytest.approx(chosen.mean().item(), rel=1e-5)
+    assert measured.grad_norm == pytest.approx(expected.norm().item(), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("settings", "bound"),
+    [
+        ({}, None),
+        ({"max_grad_norm": 0.01}, "norm"),
+        ({"max_grad_value": 0.01}, "value"),
+        ({"max_grad_norm": 0.01, "max_grad_value": 0.005}, "both"),
+    ],
+)
+def test_gradients_are_shortened_and_cut_as_asked(settings: dict[str, Any], bound: str | None) -> None:
+    """Adam hides the length of the gradient; its first moment after one step does not."""
+    made = dqn(changed(PLAIN, **settings))
+    made.replay.add(batch(0))
+    measured = made.step(made.replay.sample(64))
+    gradient = 10 * made.state_dict()["optimizer"]["state"][0]["exp_avg"]
+    assert measured.grad_norm > 0.1
+    if bound is None:
+        assert gradient.norm().item() == pytest.approx(measured.grad_norm, rel=1e-4)
+    if bound in ("norm", "both"):
+        assert gradient.norm().item() == pytest.approx(0.01, rel=1e-4)
+    if bound == "both":  # cut first: the largest entries are as large as one another
+        assert (gradient.abs() > 0.999 * gradient.abs().max()).sum() > 10
+    if bound == "value":
+        assert gradient.abs().max().item() == pytest.approx(0.01, rel=1e-4)
+
+
+def test_optimisers_differ_as_they_should() -> None:
+    settings: dict[str, dict[str, Any]] = {"adam": {}, "amsgrad": {"amsgrad": True}, "adamw": {"optimizer": "adamw"}}
+    made = {name: dqn(changed(PLAIN, **own)) for name, own in settings.items()}
+    start = made["adam"].net.flat.clone()
+    for each in made.values():
+        each.replay.add(batch(0))
+        each.step(each.replay.sample(64))
+    adam = made["adam"].net.flat
+    torch.testing.assert_close(
+        made["adamw"].net.flat - adam, -start * made["adam"].config.learning_rate * 0.01, atol=1e-7, rtol=0.1
+    )
+    assert not torch.equal(made["adamw"].net.flat, adam)
+    assert {name for name, each in made.items() if "max_exp_avg_sq" in each.state_dict()["optimizer"]["state"][0]} == {
+        "amsgrad"
+    }
+
+
+def test_a_polyak_target_follows_at_every_gradient_step() -> None:
+    made = dqn(changed(PLAIN, target="polyak", tau=0.25, gradient_steps=1))
+    for seed in range(3):
+        before = made.target.flat.clone()
+        made.update(batch(seed), no_pulse)
+        torch.testing.assert_close(made.target.flat, 0.75 * before + 0.25 * made.net.flat)
+    assert not torch.equal(made.target.flat, made.net.flat)
+
+
+def test_a_hard_target_is_a_copy_every_so_many_gradient_steps() -> None:
+    made = dqn(changed(PLAIN, target_every=4, gradient_steps=2, learning_rate=0.01))
+    start = made.net.flat.clone()
+    copies = []
+    for seed in range(7):
+        made.update(batch(seed), no_pulse)
+        copies.append(torch.equal(made.target.flat, made.net.flat))
+        assert torch.equal(made.target.flat, start) == (seed < 1)
+    assert copies == [False, True, False, True, False, True, False]
+
+
+def test_the_next_action_is_chosen_by_the_network_if_double_and_by_the_target_if_not() -> None:
+    for double in (False, True):
+        made = dqn(changed(PLAIN, double=double))
+        made.replay.add(batch(0))
+        made.target.flat.mul_(-1)
+        drawn = made.replay.sample(64)
+        following = torch.from_numpy(drawn.next_leaves[0])
+        with torch.no_grad():
+            values, best = made.target.params(following), made.net.params(following).argmax(1)
+        value = values[torch.arange(64), best] if double else values.amax(1)
+        expected = torch.from_numpy(drawn.reward) + torch.from_numpy(drawn.discount) * value
+        torch.testing.assert_close(torch.from_numpy(made.targets(drawn)), expected)
+        assert (value < values.amax(1)).any() == double
+
+
+def test_priorities_are_the_errors_and_beta_grows_to_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = dqn(changed(PLAIN, replay="prioritized", gradient_steps=1, priority_beta=0.4))
+    betas: list[float] = []
+    seen: list[tuple[Ints, Floats]] = []
+    sample, told = made.replay.sample, made.replay.reprioritise
+
+    def watched_sample(count: int, beta: float) -> Sample:
+        betas.append(beta)
+        return sample(count, beta)
+
+    def watched_telling(slots: Ints, error: Floats) -> None:
+        seen.append((slots, error))
+        told(slots, error)
+
+    monkeypatch.setattr(made.replay, "sample", watched_sample)
+    monkeypatch.setattr(made.replay, "reprioritise", watched_telling)
+    made.update(batch(0), no_pulse)
+    assert betas == [pytest.approx(0.4)]
+    made.env_steps = 5_000
+    made.update(batch(1), no_pulse)
+    made.env_steps = 10**6
+    made.update(batch(2), no_pulse)
+    assert betas[1:] == [pytest.approx(0.7), pytest.approx(1.0)]
+    assert len(seen) == 3
+    assert all(error.shape == slots.shape and np.abs(error).max() > 0.1 for slots, error in seen)
+
+
+# -------------------------------------------------------------------- an update
+
+
+def test_it_is_an_algorithm() -> None:
+    spec = ALGORITHMS["dqn"].policy_spec(PLAIN, (BOX,), CHOICE)
+    algorithm: Algorithm = ALGORITHMS["dqn"](PLAIN, spec, total_steps=1, seed=0)
+    assert algorithm.weights()[0].dtype == algorithm.weights()[1].dtype == np.float32
+
+
+def test_weights_are_snapshots() -> None:
+    made = dqn(EVERYTHING)
+    parameters, buffers = made.weights()
+    before = parameters.copy(), buffers.copy()
+    for seed in range(3):
+        made.update(batch(seed), no_pulse)
+    np.testing.assert_array_equal(parameters, before[0])
+    np.testing.assert_array_equal(buffers, before[1])
+    assert not (made.weights()[0] == parameters).all()
+    for array, again in zip(made.weights(), made.weights(), strict=True):
+        array[:] = 7
+        assert not (again == 7).any()
+    assert not any((array == 7).any() for array in made.weights())
+
+
+def test_what_is_published_acts_as_the_network_and_explores_by_epsilon() -> None:
+    made = dqn(changed(EVERYTHING, epsilon_start=0.75, epsilon_end=0.25, epsilon_steps=10**6))
+    for seed in range(2):
+        made.update(batch(seed), no_pulse)
+    policy = NumpyPolicy(made.policy)
+    policy.load(*made.weights())
+    obs = batch(5).obs[0][:1]
+    params = policy([obs])
+    assert params[..., -1] == pytest.approx(exploration_rate(made.config, made.env_steps))
+    assert made.weights()[1][:4] == pytest.approx([2] * 4, abs=1)
+    assert made.weights()[1][4:8] == pytest.approx([3] * 4, abs=1)
+    with torch.no_grad():
+        values = made.net.params(torch.from_numpy(made._inputs([obs[0]])[0])).numpy()
+    np.testing.assert_allclose(params[0, :, :-1], values, atol=1e-5)
+    assert (distribution(made.policy).mode(params) == values.argmax(-1)).all()  # greedy: ε plays no part
+
+
+@pytest.mark.parametrize(
+    ("schedule", "expected"),
+    [
+        ("linear", {0: 1.0, 500: 0.55, 1000: 0.1, 9000: 0.1}),
+        ("exponential", {0: 1.0, 500: 0.1 + 0.9 * math.exp(-0.5), 1000: 0.1 + 0.9 / math.e, 9000: 0.1 + 0.9 * math.exp(-9)}),
+    ],
+)
+def test_epsilon_falls_with_the_env_steps(schedule: Any, expected: dict[int, float]) -> None:
+    config = changed(PLAIN, epsilon_end=0.1, epsilon_steps=1000, epsilon_schedule=schedule, gradient_steps=1)
+    assert {steps: exploration_rate(config, steps) for steps in expected} == pytest.approx(expected)
+    made = dqn(config)
+    assert made.weights()[1].tolist() == [1.0]
+    rows = batch(0)
+    metrics = made.update(rows, no_pulse)
+    assert metrics["rollout/exploration_rate"] == pytest.approx(exploration_rate(config, rows.env_steps))
+    assert made.weights()[1] == pytest.approx(exploration_rate(config, rows.env_steps))
+
+
+def test_learning_starts_after_so_many_env_steps_and_keeps_the_replay_ratio() -> None:
+    made = dqn(changed(PLAIN, learning_starts=200, gradient_steps=6))
+    start, pulses = made.net.flat.clone(), []
+    rows = [batch(seed) for seed in range(4)]
+    seen = [made.update(each, lambda: pulses.append(1)) for each in rows]
+    steps = np.cumsum([each.env_steps for each in rows])
+    assert steps[0] < 200 <= steps[1]
+    assert [metrics["train/n_updates"] for metrics in seen] == [0, 6, 12, 18]
+    assert len(pulses) == 18
+    assert "train/loss" not in seen[0]
+    assert [metrics["replay/size"] for metrics in seen] == steps.tolist()
+    for metrics, each in zip(seen[1:], rows[1:], strict=True):
+        assert metrics["replay/env_steps_per_gradient_step"] == pytest.approx(each.env_steps / 6)
+    assert not torch.equal(made.net.flat, start)
+    names = {"rollout/exploration_rate", "replay/bytes"}
+    names |= {f"train/{name}" for name in ("loss", "q_mean", "learning_rate", "n_updates", "grad_norm")}
+    assert names <= seen[-1].keys()
+
+
+def test_the_learning_rate_falls_to_zero_if_asked() -> None:
+    made = dqn(changed(PLAIN, learning_rate=1e-3, learning_rate_schedule="linear"))
+    rates = [made.update(batch(seed), no_pulse)["train/learning_rate"] for seed in range(2)]
+    assert rates == pytest.approx([1e-3, 1e-3 * (1 - batch(0).env_steps / 10_000)])
+
+
+@pytest.mark.parametrize("observation", [(BOX,), (BOX, IMAGE)])
+@pytest.mark.parametrize("config", [PLAIN, EVERYTHING])
+def test_a_restored_algorithm_makes_the_next_update_bit_for_bit(config: DQNConfig, observation: tuple[Leaf, ...]) -> None:
+    first = dqn(config, observation)
+    for seed in range(4):
+        first.update(batch(seed, observation, fresh=seed == 0), no_pulse)
+    file = io.BytesIO()
+    torch.save(first.state_dict(), file)
+    file.seek(0)
+    second = dqn(config, observation, seed=9)
+    second.load_state_dict(torch.load(file, weights_only=True))
+    assert same(first, second)
+    for seed in (4, 5):
+        metrics = [each.update(batch(seed, observation), no_pulse) for each in (first, second)]
+        assert metrics[0] == metrics[1]
+        assert same(first, second)
+    make_policy(first.policy).load(*first.weights())
+
+
+def test_a_saved_state_does_not_change_with_the_algorithm() -> None:
+    made = dqn(EVERYTHING)
+    for seed in range(3):
+        made.update(batch(seed), no_pulse)
+    state = made.state_dict()
+    restored, late = dqn(EVERYTHING), dqn(EVERYTHING)
+    restored.load_state_dict(state)
+    made.update(batch(3), no_pulse)
+    restored.update(batch(3), no_pulse)
+    late.load_state_dict(state)
+    late.update(batch(3), no_pulse)
+    assert same(made, late)
+    assert same(made, restored)
+
+
+@pytest.mark.parametrize("config", [PLAIN, EVERYTHING])
+def test_the_same_batches_give_the_same_bits(config: DQNConfig) -> None:
+    a, b, other = dqn(config), dqn(config), dqn(config, seed=1)
+    for seed in range(3):
+        metrics = [each.update(batch(seed), no_pulse) for each in (a, b, other)]
+        assert metrics[0] == metrics[1]
+    assert same(a, b)
+    assert not same(a, other)
+
+
+@pytest.mark.parametrize("config", [PLAIN, EVERYTHING])
+def test_a_row_that_is_not_valid_changes_nothing(config: DQNConfig) -> None:
+    a, b = dqn(config), dqn(config)
+    clean, rubbish = batch(0), batch(0)
+    reset = ~clean.valid
+    after_termination = reset.copy()
+    after_termination[1:] &= clean.terminated[:-1]  # the obs of any other reset row is what a truncation bootstraps from
+    assert after_termination.any()
+    rubbish.action[reset], rubbish.reward[reset] = 3, 1e6
+    rubbish.obs[0][:-1][after_termination] = 100
+    for rows, made in ((clean, a), (rubbish, b)):
+        made.update(rows, no_pulse)
+        made.update(batch(1), no_pulse)
+    assert same(a, b)
+
+
+def test_a_loss_that_is_not_finite_is_named_and_stops_before_the_weights() -> None:
+    made = dqn(changed(PLAIN, loss="squared"))
+    made.update(batch(0), no_pulse)
+    before = made.net.flat.clone()
+    broken = batch(1)
+    broken.reward[:] = 3e38
+    with pytest.raises(RunError, match=r"update 2: loss expected finite, got inf; .* not taken"):
+        made.update(broken, no_pulse)
+        for _ in range(20):
+            made.update(broken, no_pulse)
+    assert torch.isfinite(made.net.flat).all()
+    assert not torch.equal(before, torch.zeros_like(before))
+
+
+# -------------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize(
+    ("action", "got"),
+    [
+        (ActionSpec("box", (2,), "float32", low=(-1.0,) * 2, high=(1.0,) * 2), r"box\[2\]"),
+        (ActionSpec("multidiscrete", (2,), "int64", (2, 3), (0, 0)), r"multidiscrete\[2\]"),
+        (ActionSpec("multibinary", (4,), "int8"), r"multibinary\[4\]"),
+    ],
+)
+def test_actions_that_are_not_one_choice_are_refused(action: ActionSpec, got: str) -> None:
+    with pytest.raises(
+        UsageError, match=rf"dqn: expected an action space Discrete\(n\), got {got}; take --algo ppo"
+    ) as error:
+        DQN.policy_spec(PLAIN, (BOX,), action)
+    assert "\n" not in str(error.value)
+
+
+def test_a_replay_too_big_for_this_machine_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(replay_module, "available_bytes", lambda: 10**6)
+    with pytest.raises(UsageError, match=r"replay_size 100000: .* take --replay-size \d+ or less"):
+        dqn(DQNConfig())
+
+
+# -------------------------------------------------------------------- learning
+
+
+def corridor(made: DQN, generator: np.random.Generator, ends: str) -> Batch:
+    """Four states in a row; 1 goes right, 0 left, 1 reward on leaving at the right, which ends the episode as said."""
+    steps, N = 32, 4
+    policy, over = NumpyPolicy(made.policy), distribution(made.policy)
+    policy.load(*made.weights())
+    at, obs = generator.integers(0, 4, N), np.zeros((steps + 1, N, 4), np.float32)
+    action, reward = np.zeros((steps, N), np.int64), np.zeros((steps, N), np.float32)
+    ended, valid = np.zeros((steps, N), bool), np.ones((steps, N), bool)
+    for t in range(steps):
+        obs[t] = np.eye(4)[at]
+        action[t] = over.sample(policy([obs[t][None]])[0], over.noise(generator, (N,)))
+        valid[t] = ~ended[t - 1] if t else True
+        ended[t] = valid[t] & (at == 3) & (action[t] == 1)
+        reward[t] = ended[t]
+        moved = np.clip(at + 2 * (action[t] == 1) - 1, 0, 3)
+        at = np.where(valid[t], moved, generator.integers(0, 4, N))
+    obs[-1] = np.eye(4)[at]
+    none = np.zeros_like(ended)
+    return Batch(
+        obs=(obs,),
+        action=action,
+        log_prob=np.zeros((steps, N), np.float32),
+        reward=reward,
+        terminated=ended if ends == "terminated" else none,
+        truncated=none if ends == "terminated" else ended,
+        valid=valid,
+        state=np.zeros((N, 0), np.float32),
+        lane=np.zeros(N, np.int64),
+        fresh=np.ones(N, bool),
+        copies=N,
+        episodes=(),
+    )
+
+
+@pytest.mark.parametrize("settings", [{}, {"replay": "prioritized", "n_step": 3, "dueling": True, "target": "polyak"}])
+@pytest.mark.parametrize("ends", ["terminated", "truncated"])
+def test_it_learns_a_corridor_and_what_its_end_is_worth(ends: str, settings: dict[str, Any]) -> None:
+    """Leaving pays 1 once if the task ends there; if only the clock does, it pays for ever: the copy would go on."""
+    config = DQNConfig(
+        net=(32,),
+        gamma=0.5,
+        learning_rate=3e-3,
+        learning_starts=0,
+        gradient_steps=32,
+        epsilon_steps=1000,
+        epsilon_end=0.3,
+        target_every=20,
+        tau=0.05,
+        replay_size=5000,
+        **settings,
+    )
+    made = DQN(config, DQN.policy_spec(config, (BOX,), replace_sizes(CHOICE, 2)), total_steps=10**6, seed=0)
+    generator = np.random.default_rng(0)
+    for _ in range(30):
+        made.update(corridor(made, generator, ends), no_pulse)
+    with torch.no_grad():
+        values = made.net.params(torch.eye(4)).numpy()
+    assert (values.argmax(1) == 1).all()
+    at_the_end = 1.0 if ends == "terminated" else 2.0  # v = 1 + ½ v
+    expected = at_the_end * 0.5 ** np.arange(3, -1, -1)
+    atol = 0.12 if config.n_step == 1 else 0.25  # several steps hold what exploring cost
+    np.testing.assert_allclose(values[:, 1], expected, atol=atol)
+
+
+def replace_sizes(action: ActionSpec, choices: int) -> ActionSpec:
+    return msgspec.structs.replace(action, sizes=(choices,))

@@ -1,0 +1,298 @@
+"""The update without a graph is the update with one: outputs, gradients, losses, a thousand steps; and when it is chosen."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from typing import Any
+from unittest.mock import patch
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from learner.algorithms import ALGORITHMS, losses
+from learner.algorithms.actor_critic import Minibatch
+from learner.algorithms.kernels import mlp as layers
+from learner.algorithms.kernels.fused import FusedActorCritic, applies
+from learner.algorithms.ppo import PPO
+from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
+from protocol.policy.networks import ActorCritic, log_prob_and_entropy
+from protocol.policy.policy import layout, size
+from protocol.specs import ActionSpec, Leaf, PolicySpec
+from tests.protocol.policy.test_networks import ACTIONS
+from tests.support.batches import DISCRETE, GAUSSIAN, IMAGE, batch, no_pulse, normal, recurrent, shared
+from tests.support.finite_differences import is_the_slope
+from tests.support.rounding import growth, sums_of_absolute_values
+
+Array = npt.NDArray[Any]
+BOX = (Leaf("", "box", (4,), "float32"),)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def some_actions(spec: ActionSpec, rows: int, generator: np.random.Generator) -> Array:
+    if spec.kind == "box":
+        return generator.normal(size=(rows, *spec.shape)).astype(np.float32)
+    high = np.reshape(spec.sizes, spec.shape) if spec.sizes else 2
+    return generator.integers(0, high, (rows, *spec.shape))
+
+
+def make(spec: PolicySpec, seed: int, scale: float = 0.4) -> tuple[ActorCritic, FusedActorCritic]:
+    net = ActorCritic(spec)
+    net.flat.copy_(torch.tensor(np.random.default_rng(seed).normal(0, scale, len(net.flat)), dtype=torch.float32))
+    return net, FusedActorCritic(spec, net.flat.numpy(), net.flat_grad.numpy())
+
+
+@given(
+    st.sampled_from(sorted(ACTIONS)),
+    st.sampled_from(["tanh", "relu"]),
+    st.lists(st.integers(1, 9), max_size=3),
+    st.booleans(),
+    st.integers(1, 40),
+    st.sampled_from([512, 7, 1]),
+    st.booleans(),
+    st.integers(0, 2**32),
+)
+@settings(max_examples=300, deadline=None)
+def test_outputs_and_gradients_are_autograds(
+    action: str, activation: Any, net: list[int], shared_net: bool, rows: int, piece: int, by_torch: bool, seed: int
+) -> None:
+    with patch.multiple(layers, PIECE=piece, LARGE=0 if by_torch else layers.LARGE):
+        outputs_and_gradients(PolicySpec(BOX, ACTIONS[action], tuple(net), activation, shared_net=shared_net), rows, seed)
+
+
+@pytest.mark.parametrize("rows", [64, 129, 513, 2048])
+@pytest.mark.parametrize("shared_net", [False, True])
+def test_so_they_are_at_the_sizes_that_are_used(rows: int, shared_net: bool) -> None:
+    outputs_and_gradients(PolicySpec(BOX, ACTIONS["discrete"], (64, 64), shared_net=shared_net), rows, 0)
+
+
+def outputs_and_gradients(spec: PolicySpec, rows: int, seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    with_graph, fused = make(spec, seed)
+    x, taken = generator.normal(size=(rows, 4)).astype(np.float32), some_actions(spec.action, rows, generator)
+    params, value = with_graph.forward(torch.tensor(x))
+    expected = (*log_prob_and_entropy(spec.action, params, torch.tensor(taken)), value)
+    found = fused.forward(x, taken)
+    np.testing.assert_allclose(fused.value(x), found[2], rtol=1e-4, atol=1e-4)
+    for ours, theirs in zip(found, expected, strict=True):
+        np.testing.assert_allclose(ours, theirs.detach().numpy(), rtol=1e-4, atol=1e-4)
+    given_back = [generator.normal(size=rows).astype(np.float32) for _ in range(3)]
+    with_graph.flat_grad.zero_()
+    torch.autograd.backward(expected, [torch.tensor(each) for each in given_back])
+    reference = with_graph.flat_grad.numpy().copy()
+    with_graph.flat_grad.fill_(7.0)  # every gradient is written, none added to
+    fused.backward(*given_back)
+    np.testing.assert_allclose(
+        with_graph.flat_grad.numpy(), reference, rtol=1e-3, atol=1e-5 * max(1, np.abs(reference).max())
+    )
+
+
+@pytest.mark.parametrize("action", sorted(ACTIONS))
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+@pytest.mark.parametrize("shared_net", [False, True])
+@pytest.mark.parametrize(("piece", "large"), [(512, layers.LARGE), (4, 0)])
+def test_the_gradient_is_the_slope_in_float64(
+    action: str, activation: Any, shared_net: bool, piece: int, large: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Central differences of a weighted sum of all outputs, by every parameter."""
+    monkeypatch.setattr(layers, "PIECE", piece)
+    monkeypatch.setattr(layers, "LARGE", large)
+    generator = np.random.default_rng(3)
+    spec = PolicySpec(BOX, ACTIONS[action], (5, 3), activation, shared_net=shared_net)
+    flat = generator.normal(0, 0.5, sum(map(size, layout(spec))))
+    grad = np.full_like(flat, np.nan)
+    fused = FusedActorCritic(spec, flat, grad)
+    x, taken = generator.normal(size=(6, 4)), some_actions(spec.action, 6, generator)
+    weights = generator.normal(size=(3, 6))
+
+    def total() -> float:
+        return float(sum((w * out).sum() for w, out in zip(weights, fused.forward(x, taken), strict=True)))
+
+    total()
+    fused.backward(*weights.copy())
+    is_the_slope(grad, total, flat, 1e-6)
+
+
+PPO_LOSSES = ("clipped surrogate", "policy gradient"), ("squared", "clipped"), (0.0, 0.02)
+
+
+@pytest.mark.parametrize(("policy_loss", "value_loss", "ent_coef"), list(itertools.product(*PPO_LOSSES)))
+def test_the_gradient_of_every_loss_is_its_slope_in_float64(policy_loss: str, value_loss: str, ent_coef: float) -> None:
+    generator, rows = np.random.default_rng(4), 8
+    spec = PolicySpec(BOX, ACTIONS["discrete"], (5, 3))
+    flat = generator.normal(0, 0.5, sum(map(size, layout(spec))))
+    grad = np.full_like(flat, np.nan)
+    fused = FusedActorCritic(spec, flat, grad)
+    x, taken = generator.normal(size=(rows, 4)), some_actions(spec.action, rows, generator)
+    before, advantage = -1.4 + 0.4 * generator.normal(size=rows), losses.standardized(generator.normal(size=rows))
+    target, value_before = generator.normal(size=(2, rows))
+
+    def loss_and_gradients() -> tuple[float, tuple[Array, Array, Array]]:
+        log_prob, entropy, value = fused.forward(x, taken)
+        if policy_loss == "policy gradient":
+            first, by_log_prob = losses.policy_gradient(log_prob, advantage)
+        else:
+            first, by_log_prob = losses.clipped_surrogate(losses.ratio(log_prob, before)[1], advantage, 0.2)
+        if value_loss == "squared":
+            second, by_value = losses.value_loss(value, target)
+        else:
+            second, by_value = losses.clipped_value_loss(value, target, value_before, 0.5)
+        third, by_entropy = losses.entropy_loss(entropy)
+        return float(first + 0.5 * second + ent_coef * third), (by_log_prob, ent_coef * by_entropy, 0.5 * by_value)
+
+    fused.backward(*loss_and_gradients()[1])
+    is_the_slope(grad, lambda: loss_and_gradients()[0], flat, 1e-7)
+
+
+@pytest.mark.parametrize("action", sorted(ACTIONS))
+@pytest.mark.parametrize("rows", [64, 256, 2048])
+def test_in_float32_it_is_as_near_to_float64_as_rounding_allows(action: str, rows: int) -> None:
+    """The gradient of a mean over rows, by the kernels and by autograd: both within the bound that `rounding` derives."""
+    spec = PolicySpec(BOX, ACTIONS[action], (64, 64))
+    with_graph, fused = make(spec, 0, scale=0.1)
+    generator = np.random.default_rng(1)
+    x, taken = generator.normal(size=(rows, 4)).astype(np.float32), some_actions(spec.action, rows, generator)
+    given_back = [(generator.normal(size=rows) / rows).astype(np.float32) for _ in range(3)]
+    params, value = with_graph.forward(torch.tensor(x))
+    outputs = (*log_prob_and_entropy(spec.action, params, torch.tensor(taken)), value)
+    with_graph.flat_grad.zero_()
+    torch.autograd.backward(outputs, [torch.tensor(each) for each in given_back])
+    autograds = with_graph.flat_grad.numpy().copy()
+    fused.forward(x, taken)
+    fused.backward(*given_back)
+    flat = with_graph.flat.numpy().astype(np.float64)
+    truth = np.empty_like(flat)
+    exact = FusedActorCritic(spec, flat, truth)
+    exact.forward(x.astype(np.float64), taken)
+    by_outputs = [each.astype(np.float64) for each in given_back]
+    exact.backward(*(each.copy() for each in by_outputs))
+    first, second, third = by_outputs
+    terms, roundings = sums_of_absolute_values(spec, flat, x.astype(np.float64), taken, (first, second, third))
+    allowed = terms * growth(roundings)
+    assert (np.abs(truth) <= terms).all()
+    assert growth(roundings) < 0.1 / rows  # a tenth of what an average row adds would show
+    for found in (with_graph.flat_grad.numpy(), autograds):
+        off = np.abs(found - truth)
+        worst = int(np.argmax(off / allowed))
+        assert (off <= allowed).all(), f"parameter {worst}: {off[worst]:.3g} off, {allowed[worst]:.3g} allowed"
+
+
+SETTINGS: list[tuple[str, dict[str, Any]]] = [
+    ("ppo", {"ent_coef": 0.01, "batch_size": 32}),
+    ("ppo", {"clip_range_vf": 0.1, "normalize_advantage": False, "max_grad_norm": 0.1}),
+    ("ppo", {"target_kl": 0.01, "shared_net": True}),
+    ("a2c", {"ent_coef": 0.01, "normalize_advantage": True, "optimizer": "adam"}),
+    ("impala", {"n_epochs": 2, "minibatches": 3}),
+    ("reinforce", {"ent_coef": 0.01, "rollout_steps": 20}),
+]
+
+
+@pytest.mark.parametrize("spec", [DISCRETE, normal(GAUSSIAN)], ids=["discrete", "gaussian"])
+@pytest.mark.parametrize(("name", "changes"), SETTINGS)
+def test_an_update_is_the_same_either_way(
+    name: str, changes: dict[str, Any], spec: PolicySpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = msgspec.convert(changes, HYPERPARAMETERS[name])
+    spec = shared(spec) if config.shared_net else spec  # type: ignore[attr-defined]
+    found: list[tuple[Array, dict[str, float]]] = []
+    for most in (512, 0):
+        monkeypatch.setattr("learner.algorithms.actor_critic.MOST_ROWS", most)
+        algorithm: Any = ALGORITHMS[name](config, spec, total_steps=1_000, seed=0)
+        for seed in range(3):
+            metrics = algorithm.update(batch(algorithm, seed, fresh=seed == 0), no_pulse)
+        found.append((algorithm.net.flat.numpy().copy(), metrics))
+    np.testing.assert_allclose(found[0][0], found[1][0], atol=2e-5)
+    assert found[0][1] == pytest.approx(found[1][1], rel=1e-3, abs=1e-4, nan_ok=True)
+
+
+def test_a_thousand_steps_stay_together() -> None:
+    """Two copies of the same policy, one with the graph and one without, on the same minibatches."""
+    generator = np.random.default_rng(0)
+    config = PPOConfig(ent_coef=0.01)
+    spec = PolicySpec(BOX, ACTIONS["discrete"])
+    one, other = (PPO(config, spec, total_steps=1, seed=0) for _ in range(2))
+    for _ in range(1_000):
+        x = generator.normal(size=(64, 4)).astype(np.float32)
+        action = (x[:, 0] > 0) + 2 * (x[:, 1] > 0)
+        target, advantage = x.sum(-1), generator.normal(size=64).astype(np.float32)
+        rows = Minibatch(x, (), action, np.full(64, -1.386, np.float32), advantage, target)
+        first = one.step(rows, 0.2)
+        tensors: list[Any] = [torch.tensor(part) if len(part) else () for part in rows[:6]]
+        second = other.step(Minibatch(*tensors), 0.2)
+    assert float((one.net.flat - other.net.flat).abs().max()) < 1e-3
+    assert first._asdict() == pytest.approx(second._asdict(), rel=1e-2, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("spec", "expected"),
+    [
+        (DISCRETE, True),
+        (shared(GAUSSIAN), True),
+        (IMAGE, False),
+        (recurrent(DISCRETE, "gru"), False),
+        (msgspec.structs.replace(DISCRETE, head="q"), True),
+        (msgspec.structs.replace(DISCRETE, net=(64, 256)), True),
+        (msgspec.structs.replace(DISCRETE, net=(64, 257)), False),
+    ],
+)
+def test_it_is_for_small_layers_and_nothing_else(spec: PolicySpec, expected: bool) -> None:
+    assert applies(spec) == expected
+
+
+def test_sizes_of_minibatches_come_and_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(layers, "KEPT", 30)
+    _, fused = make(PolicySpec(BOX, ACTIONS["discrete"], (5,)), 0)
+    x = np.random.default_rng(0).normal(size=(99, 4)).astype(np.float32)
+    whole = fused.value(x).copy()
+    for rows in (*range(1, 99), 40, 2):
+        np.testing.assert_allclose(fused.value(x[:rows]), whole[:rows], atol=1e-6)
+        assert len(fused._critic._passes) <= 30
+    assert {40, 2} <= set(fused._critic._passes)
+
+
+def test_sizes_of_minibatches_share_their_memory() -> None:
+    """And give the bits that they would give alone, whichever came before."""
+    spec = PolicySpec(BOX, ACTIONS["discrete"], (32,))
+    _, fused = make(spec, 0)
+    x = np.random.default_rng(0).normal(size=(2 * layers.PIECE, 4)).astype(np.float32)
+    action = np.zeros((len(x), 1), np.int64)
+    for rows in (200, 256, 255, 2 * layers.PIECE, 256, 1, 255):
+        _, alone = make(spec, 0)
+        for found in (alone, fused):
+            found.forward(x[:rows], action[:rows])
+        ones = np.ones(rows, np.float32)
+        gradients = []
+        for found in (alone, fused):
+            said = [each.copy() for each in found.forward(x[:rows], action[:rows])]
+            found.backward(ones, ones, ones)
+            gradients.append([*said, *(layer.weight_grad.copy() for layer in found._layers._hidden)])
+        for one, other in zip(*gradients, strict=True):
+            np.testing.assert_array_equal(one, other)
+    passes = fused._layers._passes
+    assert np.shares_memory(passes[256].said[0], passes[255].said[0])
+    assert sum(array.nbytes for array in fused._layers._memory._arrays) < 3 * 4 * 2 * layers.PIECE * (4 + 4 * 32 * 2)
+
+
+def test_large_minibatches_keep_the_graph(monkeypatch: pytest.MonkeyPatch) -> None:
+    kinds: list[type] = []
+    for most in (30, 29):
+        monkeypatch.setattr("learner.algorithms.actor_critic.MOST_ROWS", most)
+        algorithm = PPO(PPOConfig(batch_size=30, n_epochs=1), DISCRETE, total_steps=1, seed=0)
+        rows = batch(algorithm, 0)
+        given_rows = algorithm.parts.rows(rows, algorithm.parts.see(rows), rows.reward, rows.reward)
+        mask = np.zeros_like(rows.valid)
+        mask.reshape(-1)[:60] = True
+        kinds.append(type(next(algorithm.parts.minibatches(given_rows, mask, 2)).x))
+    assert kinds == [np.ndarray, torch.Tensor]

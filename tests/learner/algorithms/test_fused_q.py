@@ -1,0 +1,182 @@
+"""Action values without a graph are those with one: outputs, gradients, options, a thousand steps; and when it is chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+from unittest.mock import patch
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from learner.algorithms.action_values import WithGraph, WithoutGraph, action_values
+from learner.algorithms.dqn import DQN, LOSSES
+from learner.algorithms.kernels import fused
+from learner.algorithms.kernels import mlp as layers
+from learner.algorithms.kernels.fused import FusedQ
+from learner.algorithms.replay import Sample
+from learner.config.hyperparameters import DQNConfig
+from protocol.policy.networks import QNetwork
+from protocol.policy.policy import layout, size
+from protocol.specs import PolicySpec
+from tests.learner.algorithms.test_dqn import batch
+from tests.support.batches import BOX, DISCRETE, IMAGE, no_pulse
+from tests.support.finite_differences import is_the_slope
+
+Array = npt.NDArray[Any]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def policy(net: tuple[int, ...], activation: Any = "tanh", dueling: bool = False) -> PolicySpec:
+    return msgspec.structs.replace(DISCRETE, head="q", net=net, activation=activation, dueling=dueling)
+
+
+def outputs_and_gradients(spec: PolicySpec, rows: int, seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    net = QNetwork(spec)
+    net.flat.copy_(torch.tensor(generator.normal(0, 0.4, len(net.flat)), dtype=torch.float32))
+    x, by_value = generator.normal(size=(rows, 4)), generator.normal(size=(4, rows))
+    values = net.params(torch.tensor(x, dtype=torch.float32))
+    net.flat_grad.zero_()
+    torch.autograd.backward(values, torch.tensor(by_value.T, dtype=torch.float32))
+    expected = net.flat_grad.numpy().copy()
+    net.flat_grad.fill_(7.0)  # every gradient is written, none added to
+    without = FusedQ(spec, net.flat.numpy(), net.flat_grad.numpy())
+    found = without.forward(x.astype(np.float32))
+    np.testing.assert_allclose(found, values.detach().numpy().T, rtol=1e-5, atol=1e-5)
+    without.backward(by_value.astype(np.float32))
+    np.testing.assert_allclose(net.flat_grad.numpy(), expected, rtol=1e-4, atol=2e-6 * max(1, np.abs(expected).max()))
+
+
+@given(
+    st.sampled_from(["tanh", "relu"]),
+    st.lists(st.integers(1, 9), max_size=3),
+    st.booleans(),
+    st.integers(1, 40),
+    st.sampled_from([512, 7, 1]),
+    st.booleans(),
+    st.integers(0, 2**32),
+)
+@settings(max_examples=200, deadline=None)
+def test_outputs_and_gradients_are_autograds(
+    activation: Any, net: list[int], dueling: bool, rows: int, piece: int, by_torch: bool, seed: int
+) -> None:
+    with patch.multiple(layers, PIECE=piece, LARGE=0 if by_torch else layers.LARGE):
+        outputs_and_gradients(policy(tuple(net), activation, dueling), rows, seed)
+
+
+@pytest.mark.parametrize("dueling", [False, True])
+@pytest.mark.parametrize("rows", [32, 64, 129, 2048])
+def test_so_they_are_at_the_sizes_that_are_used(dueling: bool, rows: int) -> None:
+    outputs_and_gradients(policy((64, 64), "relu", dueling), rows, 0)
+    outputs_and_gradients(policy((256, 256), "tanh", dueling), rows, 1)
+
+
+@pytest.mark.parametrize("dueling", [False, True])
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+@pytest.mark.parametrize("loss", sorted(LOSSES))
+@pytest.mark.parametrize(("piece", "large"), [(512, layers.LARGE), (4, 0)])
+def test_the_gradient_is_the_slope_of_the_loss_in_float64(
+    dueling: bool, activation: Any, loss: str, piece: int, large: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Central differences of the loss of the values of some actions, by every parameter."""
+    monkeypatch.setattr(layers, "PIECE", piece)
+    monkeypatch.setattr(layers, "LARGE", large)
+    generator, rows = np.random.default_rng(5), 9
+    spec = policy((5, 3), activation, dueling)
+    flat = generator.normal(0, 0.5, sum(map(size, layout(spec))))
+    grad = np.full_like(flat, np.nan)
+    without = FusedQ(spec, flat, grad)
+    x, action = generator.normal(size=(rows, 4)), generator.integers(0, 4, rows)
+    target, weight = 2 * generator.normal(size=rows), generator.random(rows)
+
+    def loss_and_gradient() -> tuple[float, Array]:
+        found, by_error = LOSSES[loss](without.forward(x)[action, np.arange(rows)] - target, weight)
+        return float(found), by_error
+
+    by_value = np.zeros((4, rows))
+    by_value[action, np.arange(rows)] = loss_and_gradient()[1]
+    without.backward(by_value)
+    is_the_slope(grad, lambda: loss_and_gradient()[0], flat, 1e-7, 1e-8)
+
+
+OPTIONS: list[dict[str, Any]] = [
+    {},
+    {"double": False, "loss": "squared"},
+    {"dueling": True, "n_step": 3, "target": "polyak", "tau": 0.1},
+    {"replay": "prioritized", "double": False, "max_grad_norm": 0.5},
+    {"max_grad_value": 0.01, "activation": "tanh", "loss": "squared"},
+    {"max_grad_value": 0.05, "max_grad_norm": 0.1, "optimizer": "adamw", "amsgrad": True},
+    {"normalize_observations": True, "dueling": True, "double": False, "replay": "prioritized", "amsgrad": True},
+    {"net": (), "batch_size": 700},
+]
+
+
+@pytest.mark.parametrize("options", OPTIONS, ids=str)
+def test_updates_are_the_same_either_way(options: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = {"net": (16,), "replay_size": 1000, "learning_starts": 0, "gradient_steps": 8, "target_every": 5}
+    config = msgspec.convert(settings | options, DQNConfig)
+    found: list[tuple[DQN, dict[str, float]]] = []
+    for most in (fused.MOST_ROWS, 0):
+        monkeypatch.setattr(fused, "MOST_ROWS", most)
+        made = DQN(config, DQN.policy_spec(config, (BOX,), DISCRETE.action), total_steps=1000, seed=0)
+        for seed in range(3):
+            metrics = made.update(batch(seed, fresh=seed == 0), no_pulse)
+        found.append((made, metrics))
+    (one, metrics), (other, expected) = found
+    assert isinstance(one._values, WithoutGraph)
+    assert isinstance(other._values, WithGraph)
+    assert not torch.equal(one.net.flat, QNetwork(one.policy, seed=0).flat)
+    torch.testing.assert_close(one.net.flat, other.net.flat, atol=2e-5, rtol=0)
+    torch.testing.assert_close(one.target.flat, other.target.flat, atol=2e-5, rtol=0)
+    assert metrics == pytest.approx(expected, rel=1e-3, abs=1e-4)
+
+
+def test_a_thousand_steps_stay_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two copies of the same values, one with the graph and one without, on the same minibatches."""
+    config = DQNConfig(target_every=50, replay_size=100)
+    spec = DQN.policy_spec(config, (BOX,), DISCRETE.action)
+    one = DQN(config, spec, total_steps=1, seed=0)
+    monkeypatch.setattr(fused, "MOST_ROWS", 0)
+    other = DQN(config, spec, total_steps=1, seed=0)
+    generator = np.random.default_rng(0)
+    for _ in range(1_000):
+        x = generator.normal(size=(2, 64, 4)).astype(np.float32)
+        sample = Sample(
+            slots=np.arange(64),
+            leaves=(x[0],),
+            action=generator.integers(0, 4, 64),
+            reward=np.tanh(x[0].sum(-1)),
+            discount=np.full(64, 0.9, np.float32),
+            next_leaves=(x[1],),
+            weight=np.ones(64, np.float32),
+        )
+        first, second = one.step(sample), other.step(sample)
+    assert float((one.net.flat - other.net.flat).abs().max()) < 1e-3
+    assert first._asdict() == pytest.approx(second._asdict(), rel=1e-2, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("spec", "rows", "expected"),
+    [
+        (policy((16,)), 64, WithoutGraph),
+        (policy((16,), dueling=True), fused.MOST_ROWS, WithoutGraph),
+        (policy((16,)), fused.MOST_ROWS + 1, WithGraph),
+        (policy((fused.MOST_UNITS + 1,)), 64, WithGraph),
+        (msgspec.structs.replace(IMAGE, head="q"), 64, WithGraph),
+    ],
+)
+def test_it_is_chosen_by_the_policy_and_the_minibatch(spec: PolicySpec, rows: int, expected: type) -> None:
+    assert type(action_values(QNetwork(spec), rows)) is expected

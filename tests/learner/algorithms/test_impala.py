@@ -1,0 +1,133 @@
+"""IMPALA: the loss of the paper on rows that older weights acted, and A2C's where they are the newest."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from learner.algorithms.a2c import A2C
+from learner.algorithms.actor_critic import Minibatch
+from learner.algorithms.impala import Impala
+from learner.config.hyperparameters import A2CConfig, ImpalaConfig
+from protocol.specs import PolicySpec
+from tests.learner.algorithms.test_returns import Rows
+from tests.learner.algorithms.test_vtrace import OffPolicy, slow_vtrace
+from tests.support.batches import DISCRETE, GAUSSIAN, batch, identity_batch, no_pulse, normal, shared
+
+GAMMA = 0.9
+
+
+def impala(spec: PolicySpec = DISCRETE, seed: int = 0, **settings: Any) -> Impala:
+    settings = {"max_grad_norm": 1e9, **settings}
+    return Impala(ImpalaConfig(gamma=GAMMA, **settings), spec, total_steps=10_000, seed=seed)
+
+
+@pytest.mark.parametrize("spec", [DISCRETE, normal(GAUSSIAN), shared(DISCRETE)])
+@pytest.mark.parametrize("lam", [1.0, 0.7])
+def test_on_rows_of_the_newest_weights_its_gradient_is_a2cs(spec: PolicySpec, lam: float) -> None:
+    config = A2CConfig(gamma=GAMMA, max_grad_norm=1e9, gae_lambda=lam, ent_coef=0.01, normalize_rewards=True)
+    one = impala(spec, vtrace_lambda=lam, ent_coef=0.01, normalize_rewards=True)
+    other = A2C(config, spec, total_steps=10_000, seed=0)
+    rows = batch(one, 0)
+    metrics = one.update(rows, no_pulse)
+    other.update(rows, no_pulse)
+    assert metrics["train/rho"] == pytest.approx(1, abs=1e-5)
+    assert one.net.flat_grad.norm() > 0.01
+    torch.testing.assert_close(one.net.flat_grad, other.net.flat_grad, atol=1e-5, rtol=1e-3)
+
+
+@pytest.mark.parametrize("spec", [DISCRETE, GAUSSIAN])
+def test_on_rows_of_older_weights_it_follows_the_gradient_of_the_papers_loss(spec: PolicySpec) -> None:
+    algorithm = impala(spec, vf_coef=0.7, ent_coef=0.3, rho_bar=1.2, c_bar=0.9, vtrace_lambda=0.8)
+    older = impala(spec, seed=1)
+    with torch.no_grad():
+        algorithm.net.parameters["actor.out.weight"].mul_(60)  # far from the older policy
+    rows = batch(older, 0)
+    valid = torch.from_numpy(rows.valid.flatten())
+    params, value = algorithm.net.forward(torch.from_numpy(rows.obs[0]).flatten(0, 1))
+    action = torch.from_numpy(rows.action).flatten(0, 1)
+    params = params[: len(action)]
+    usual: Any
+    if spec is DISCRETE:
+        usual = torch.distributions.Categorical(logits=params)
+    else:
+        usual = torch.distributions.Independent(torch.distributions.Normal(params[:, :2], params[:, 2:].exp()), 1)
+    log_prob = usual.log_prob(action)
+    log_ratio = log_prob.detach().numpy().reshape(rows.valid.shape) - rows.log_prob
+    values = value.detach().numpy().reshape(len(rows.valid) + 1, -1)
+    o = OffPolicy(Rows(rows.reward, values, rows.terminated, rows.truncated, rows.valid), log_ratio)
+    target, advantage = (torch.from_numpy(each).flatten().float() for each in slow_vtrace(o, GAMMA, 0.8, 1.2, 0.9))
+    policy_loss = -(log_prob * advantage)[valid].mean()
+    value_loss = (value[: len(target)] - target)[valid].square().mean()
+    (policy_loss + 0.7 * value_loss - 0.3 * usual.entropy()[valid].mean()).backward()
+    expected = algorithm.net.flat_grad.clone()
+    metrics = algorithm.update(rows, no_pulse)
+    assert metrics["train/rho"] < 0.9
+    torch.testing.assert_close(algorithm.net.flat_grad, expected, atol=1e-4, rtol=1e-3)
+
+
+def watch(algorithm: Impala, monkeypatch: pytest.MonkeyPatch) -> list[Minibatch]:
+    seen: list[Minibatch] = []
+    step = algorithm.parts.policy_gradient_step
+
+    def watched(given: Minibatch, critic: bool = True) -> dict[str, float]:
+        assert critic
+        seen.append(given)
+        return step(given)
+
+    monkeypatch.setattr(algorithm.parts, "policy_gradient_step", watched)
+    return seen
+
+
+def by_row(given: list[Minibatch]) -> list[tuple[float, ...]]:
+    """Rows of minibatches, sorted: features, advantage, target."""
+    return sorted((*m.x[i].tolist(), float(m.advantage[i]), float(m.target[i])) for m in given for i in range(len(m.x)))
+
+
+def test_vtrace_is_computed_in_time_order_before_rows_are_shared_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, shared_out = impala(), impala(minibatches=4)
+    rows = batch(impala(seed=1), 0)
+    once, parts = watch(whole, monkeypatch), watch(shared_out, monkeypatch)
+    pulses: list[int] = []
+    whole.update(rows, no_pulse)
+    shared_out.update(rows, lambda: pulses.append(1))
+    count = int(rows.valid.sum())
+    assert len(once) == 1
+    assert {len(each.x) for each in parts} <= {count // 4, count // 4 + 1}
+    assert len(parts) == 4 < len(pulses)
+    assert by_row(parts) == by_row(once)
+    assert parts[0].x.tolist() != sorted(parts[0].x.tolist())
+
+
+def test_vtrace_is_computed_anew_for_each_epoch(monkeypatch: pytest.MonkeyPatch) -> None:
+    algorithm = impala(n_epochs=2, learning_rate=0.05, optimizer="adam")
+    seen = watch(algorithm, monkeypatch)
+    rows = batch(algorithm, 0)
+    algorithm.update(rows, no_pulse)
+    first, second = seen
+    assert sorted(first.x.tolist()) == sorted(second.x.tolist())
+    assert by_row([first]) != by_row([second])
+
+
+def test_more_minibatches_than_rows_is_one_for_each_row() -> None:
+    algorithm = impala(minibatches=1000)
+    metrics = algorithm.update(batch(algorithm, 0, steps=2), no_pulse)
+    assert np.isfinite(algorithm.weights()[0]).all()
+    assert np.isfinite(metrics["train/value_loss"])
+
+
+@pytest.mark.parametrize("spec", [normal(DISCRETE), normal(GAUSSIAN)])
+def test_it_learns_the_identity_from_rows_four_versions_old(spec: PolicySpec) -> None:
+    algorithm = impala(spec, learning_rate=0.01, optimizer="adam", max_grad_norm=0.5)
+    generator = np.random.default_rng(0)
+    waiting, scores = [], []
+    for _ in range(200):
+        rows, score = identity_batch(algorithm, generator)
+        waiting.append(rows)
+        scores.append(score)
+        if len(waiting) > 4:
+            algorithm.update(waiting.pop(0), no_pulse)
+    assert np.mean(scores[-3:]) > (0.95 if spec.action.kind == "discrete" else -0.45)

@@ -1,0 +1,196 @@
+"""Running statistics: any way the rows are divided into batches gives the same, and only valid rows count."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import hypothesis.extra.numpy as hnp
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from learner.algorithms.normalization import ObservationNormaliser, RewardScaler, RunningMoments
+from protocol.policy.policy import buffer_size
+from protocol.rollout import Batch
+from protocol.specs import ActionSpec, Leaf, PolicySpec
+
+Array = npt.NDArray[Any]
+GAMMA = 0.9
+
+
+def through_a_file(state: dict[str, Any]) -> dict[str, Any]:
+    file = io.BytesIO()
+    torch.save(state, file)
+    file.seek(0)
+    loaded: dict[str, Any] = torch.load(file, weights_only=True)
+    return loaded
+
+
+@given(hnp.arrays(np.float64, (20, 2), elements=st.floats(-1e3, 1e3)), st.lists(st.integers(0, 20), max_size=4))
+@settings(max_examples=100, deadline=None)
+def test_moments_do_not_depend_on_the_division_into_batches(rows: Array, cuts: list[int]) -> None:
+    moments = RunningMoments((2,))
+    for batch in np.split(rows, sorted(cuts)):
+        moments.update(batch)
+    assert moments.count == 20
+    np.testing.assert_allclose(moments.mean, rows.mean(0), atol=1e-9)
+    np.testing.assert_allclose(moments.std, np.where(rows.var(0) > 1e-9, rows.std(0), moments.std), rtol=1e-6)
+
+
+def test_moments_keep_their_digits_far_from_zero() -> None:
+    moments = RunningMoments()
+    for _ in range(100):
+        moments.update(1e6 + np.array([-1.0, 1.0]))
+    np.testing.assert_allclose(moments.std, 1.0, rtol=1e-6)
+
+
+SPEC = PolicySpec(
+    (
+        Leaf("a", "box", (2,), "float32"),
+        Leaf("b", "discrete", (), "int64", (3,), (0,)),
+        Leaf("c", "box", (8, 8, 3), "uint8"),
+        Leaf("d", "box", (1,), "float32"),
+    ),
+    ActionSpec("discrete", (), "int64", (2,), (0,)),
+    normalize_observations=True,
+)
+
+
+def test_only_measured_features_of_valid_rows_are_counted() -> None:
+    x = np.random.default_rng(0).normal(3, 2, (5, 4, 6)).astype(np.float32)
+    valid = np.ones((5, 4), bool)
+    valid[2, 1] = valid[3, 3] = False
+    x[~valid] = np.nan
+    normaliser = ObservationNormaliser(SPEC)
+    assert normaliser.buffers().tolist() == [0.0] * 6 + [1.0] * 6
+    normaliser.update(x, valid)
+    buffers = normaliser.buffers()
+    assert buffers.dtype == np.float32
+    assert buffers.shape == (buffer_size(SPEC),)
+    measured = [0, 1, 5]
+    np.testing.assert_allclose(buffers[:6][measured], x[valid].mean(0)[measured], rtol=1e-5)
+    np.testing.assert_allclose(buffers[6:][measured], x[valid].std(0)[measured], rtol=1e-5)
+    assert buffers[[2, 3, 4]].tolist() == [0.0] * 3
+    assert buffers[[8, 9, 10]].tolist() == [1.0] * 3
+
+
+def batch(
+    reward: Array,
+    lane: list[int],
+    fresh: list[bool],
+    ended: Array | None = None,
+    first_valid: Array | None = None,
+    copies: int = 2,
+) -> Batch:
+    """Rewards [T, ΣN] with ends; the row after an end is not valid."""
+    T, N = reward.shape
+    ended = np.zeros((T, N), bool) if ended is None else ended
+    valid = np.ones((T, N), bool) if first_valid is None else np.broadcast_to(first_valid, (T, N)).copy()
+    valid[1:] = ~ended[:-1]
+    return Batch(
+        obs=(np.zeros((T + 1, N, 1), np.float32),),
+        action=np.zeros((T, N), np.int64),
+        log_prob=np.zeros((T, N), np.float32),
+        reward=reward.astype(np.float32),
+        terminated=ended & (np.arange(T)[:, None] % 2 == 0),  # either flag ends
+        truncated=ended & (np.arange(T)[:, None] % 2 == 1),
+        valid=valid,
+        state=np.zeros((len(lane), 0), np.float32),
+        lane=np.array(lane),
+        fresh=np.array(fresh),
+        copies=copies,
+        episodes=(),
+    )
+
+
+def slow_std(columns: list[tuple[Array, Array, Array]]) -> float:
+    """Standard deviation of the discounted returns of whole columns (reward, ended, valid), each one env copy's life."""
+    found = []
+    for reward, ended, valid in columns:
+        g = 0.0
+        for r, end, ok in zip(reward, ended, valid, strict=True):
+            if ok:
+                g = GAMMA * g + float(r)
+                found.append(g)
+            if end or not ok:
+                g = 0.0
+    return float(np.std(found))
+
+
+def lives(T: int, N: int) -> tuple[Array, Array, Array]:
+    generator = np.random.default_rng(4)
+    reward, ended = generator.normal(1, 1, (T, N)).astype(np.float32), generator.random((T, N)) < 0.3
+    for t in range(1, T):
+        ended[t] &= ~ended[t - 1]
+    valid = np.ones((T, N), bool)
+    valid[1:] = ~ended[:-1]
+    return reward, ended, valid
+
+
+def columns_of(life: tuple[Array, Array, Array]) -> list[tuple[Array, Array, Array]]:
+    reward, ended, valid = life
+    return [(reward[:, n], ended[:, n], valid[:, n]) for n in range(reward.shape[1])]
+
+
+def test_returns_go_on_from_rollout_to_rollout_of_a_lane_and_its_copies() -> None:
+    reward, ended, valid = life = lives(12, 4)  # lanes 0 and 1, two copies each
+    scaler = RewardScaler(GAMMA)
+    for at in (0, 4, 8):
+        rows = slice(at, at + 4)
+        scaled = scaler.scale(batch(reward[rows], [0, 0, 1, 1], [at == 0] * 4, ended[rows], valid[at]))
+    np.testing.assert_allclose(scaled, reward[8:] / slow_std(columns_of(life)), rtol=1e-5)
+
+
+def test_a_lane_may_stand_twice_in_a_batch_in_its_own_order() -> None:
+    life = lives(8, 4)
+    wide = [np.concatenate([a[:4, :2], a[4:, :2], a[:4, 2:], a[4:, 2:]], 1) for a in life]
+    scaler = RewardScaler(GAMMA)
+    scaled = scaler.scale(batch(wide[0], [0] * 4 + [1] * 4, [True, True, False, False] * 2, wide[1], wide[2][0]))
+    np.testing.assert_allclose(scaled, wide[0] / slow_std(columns_of(life)), rtol=1e-5)
+
+
+def test_a_fresh_lane_starts_from_zero() -> None:
+    first, second = lives(6, 2), lives(5, 2)
+    scaler = RewardScaler(GAMMA)
+    scaler.scale(batch(first[0], [0, 0], [True, True], first[1], first[2][0]))
+    scaled = scaler.scale(batch(second[0], [0, 0], [True, True], second[1], second[2][0]))
+    np.testing.assert_allclose(scaled, second[0] / slow_std(columns_of(first) + columns_of(second)), rtol=1e-5)
+
+
+def test_the_reward_of_a_row_that_is_not_valid_changes_nothing() -> None:
+    reward, ended, valid = lives(12, 2)
+    assert not valid.all()
+    other = np.where(valid, reward, np.float32(1e6))
+    scaled = [RewardScaler(GAMMA).scale(batch(r, [0, 0], [True, True], ended)) for r in (reward, other)]
+    np.testing.assert_array_equal(scaled[0][valid], scaled[1][valid])
+
+
+def test_what_never_varied_is_divided_by_one() -> None:
+    constant = batch(np.full((1, 3), 0.3), [0, 0, 0], [True] * 3, copies=3)
+    np.testing.assert_array_equal(RewardScaler(GAMMA).scale(constant), constant.reward)
+    moments = RunningMoments((2,))
+    for _ in range(10):
+        moments.update(np.stack([np.full(7, 123.456), np.arange(7) * 1e-9], -1))
+    np.testing.assert_allclose(moments.std, [1, 2e-9], rtol=1e-6)  # small is not constant
+
+
+@pytest.mark.parametrize("steps", [1, 4])
+def test_the_state_goes_through_a_file(steps: int) -> None:
+    reward, ended, valid = lives(8, 2)
+    scaler, again = RewardScaler(GAMMA), RewardScaler(GAMMA)
+    scaler.scale(batch(reward[:4], [0, 0], [True, True], ended[:4], valid[0]))
+    again.load_state_dict(through_a_file(scaler.state_dict()))
+    following = batch(reward[4 : 4 + steps], [0, 0], [False, False], ended[4 : 4 + steps], valid[4])
+    np.testing.assert_array_equal(again.scale(following), scaler.scale(following))
+
+    x = np.random.default_rng(0).normal(size=(2, 3, 6)).astype(np.float32)
+    normaliser, restored = ObservationNormaliser(SPEC), ObservationNormaliser(SPEC)
+    normaliser.update(x, np.ones((2, 3), bool))
+    restored.load_state_dict(through_a_file(normaliser.state_dict()))
+    for each in (normaliser, restored):
+        each.update(x * 2, np.ones((2, 3), bool))
+    np.testing.assert_array_equal(restored.buffers(), normaliser.buffers())

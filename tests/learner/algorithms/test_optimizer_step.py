@@ -1,0 +1,79 @@
+"""A step without the ceremony has the bits of the optimiser's own, and leaves a state that the optimiser goes on from."""
+
+from __future__ import annotations
+
+import copy
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+from torch.optim import SGD, Adam, AdamW, Optimizer, RMSprop
+
+from learner.algorithms.kernels.optimizer_step import take_step
+
+KINDS: dict[str, Callable[[list[Tensor]], Optimizer]] = {
+    "adam": lambda flat: Adam(flat, lr=1e-2, eps=1e-5, fused=True),
+    "amsgrad": lambda flat: Adam(flat, lr=1e-2, amsgrad=True, fused=True),
+    "adamw": lambda flat: AdamW(flat, lr=1e-2, fused=True),
+    "adamw amsgrad": lambda flat: AdamW(flat, lr=1e-2, amsgrad=True, fused=True),
+    "rmsprop": lambda flat: RMSprop(flat, lr=1e-2, alpha=0.99, eps=1e-5),
+    "any other": lambda flat: SGD(flat, lr=1e-2),
+}
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_bits_are_the_optimisers(kind: str) -> None:
+    generator = torch.Generator().manual_seed(0)
+    start = torch.randn(1001, generator=generator)
+    flats = [start.clone() for _ in range(2)]
+    optimizers = [KINDS[kind]([flat]) for flat in flats]
+    for step in range(30):
+        gradient = torch.randn(1001, generator=generator)
+        for flat in flats:
+            flat.grad = gradient.clone()
+        for optimizer in optimizers:
+            optimizer.param_groups[0]["lr"] = 1e-2 / (1 + step)
+        optimizers[0].step()
+        take_step(optimizers[1])
+        assert torch.equal(*flats)
+    ours, theirs = (optimizer.state_dict() for optimizer in reversed(optimizers))
+    torch.testing.assert_close(ours["state"], theirs["state"], rtol=0, atol=0)
+    assert not torch.equal(flats[0], start)
+    resumed = KINDS[kind]([flats[1]])
+    resumed.load_state_dict(copy.deepcopy(ours))
+    optimizers[0].step()
+    take_step(resumed)
+    assert torch.equal(*flats)
+
+
+@pytest.mark.parametrize("kind", ["adam", "amsgrad", "adamw", "rmsprop"])
+def test_moments_that_fade_are_zero_before_they_are_denormal_and_only_they(kind: str) -> None:
+    flat = torch.zeros(100)
+    optimizer = KINDS[kind]([flat])
+    flat.grad = torch.full((100,), 1e-20)
+    take_step(optimizer)
+    flat.grad.zero_()
+    for _ in range(1500):
+        take_step(optimizer)
+    smallest = torch.finfo(torch.float32).tiny
+    for moment in optimizer.state[flat].values():
+        assert not ((moment > 0) & (moment < smallest)).any()
+    denormal = torch.tensor(smallest) / 2
+    assert 0 < denormal * 1 < smallest  # to whatever runs in this thread afterwards
+
+
+@pytest.mark.parametrize("algo", ["ppo", "a2c", "dqn"])
+def test_a_run_that_compiles_nothing_does_not_import_the_compiler(algo: str, tmp_path: Path) -> None:
+    program = f"""
+import sys, millrace
+run = millrace.train("CartPole-v1", algo="{algo}", steps=2000, run_dir={str(tmp_path)!r}, transport="inproc")
+assert "torch" in sys.modules
+assert "torch._dynamo" not in sys.modules
+"""
+    root = Path(__file__).parents[3]
+    done = subprocess.run([sys.executable, "-c", program], cwd=root, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr

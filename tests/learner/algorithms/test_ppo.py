@@ -1,0 +1,315 @@
+"""PPO's update: what it may not use, what it must repeat bit for bit, what it learns."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+
+from learner.algorithms import ALGORITHMS, Algorithm
+from learner.algorithms.actor_critic import Minibatch
+from learner.algorithms.ppo import PPO
+from learner.config.hyperparameters import PPOConfig
+from protocol.errors import RunError
+from protocol.policy.policy import layout, size
+from protocol.specs import PolicySpec
+from tests.support.batches import (
+    COPIES,
+    DISCRETE,
+    GAUSSIAN,
+    IMAGE,
+    LANES,
+    T,
+    batch,
+    identity_batch,
+    no_pulse,
+    normal,
+    shared,
+)
+
+EVERYTHING = PPOConfig(normalize_rewards=True, learning_rate_schedule="linear", clip_range_schedule="linear", n_epochs=3)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def ppo(config: PPOConfig | None = None, spec: PolicySpec = DISCRETE, seed: int = 0) -> PPO:
+    return PPO(config or PPOConfig(), spec, total_steps=10_000, seed=seed)
+
+
+def same(a: PPO, b: PPO) -> bool:
+    return torch.equal(a.net.flat, b.net.flat) and all(map(np.array_equal, a.weights(), b.weights()))
+
+
+def test_it_is_an_algorithm() -> None:
+    algorithm: Algorithm = ALGORITHMS["ppo"](PPOConfig(), DISCRETE, total_steps=1, seed=0)
+    assert algorithm.weights()[0].dtype == np.float32
+
+
+@pytest.mark.parametrize("spec", [DISCRETE, GAUSSIAN, normal(GAUSSIAN), IMAGE, shared(IMAGE)])
+def test_the_same_batches_give_the_same_bits(spec: PolicySpec) -> None:
+    a, b, other = ppo(EVERYTHING, spec), ppo(EVERYTHING, spec), ppo(EVERYTHING, spec, seed=1)
+    for seed in range(2):
+        metrics = [each.update(batch(each, seed, seed == 0), no_pulse) for each in (a, b)]
+        assert metrics[0] == metrics[1]
+    assert same(a, b)
+    other.update(batch(other, 0), no_pulse)
+    assert not same(a, other)
+
+
+@pytest.mark.parametrize("spec", [normal(DISCRETE), normal(GAUSSIAN), IMAGE])
+def test_a_restored_algorithm_makes_the_next_update_bit_for_bit(spec: PolicySpec) -> None:
+    first = ppo(EVERYTHING, spec)
+    for seed in range(2):
+        first.update(batch(first, seed, seed == 0), no_pulse)
+    file = io.BytesIO()
+    torch.save(first.state_dict(), file)
+    file.seek(0)
+    second = ppo(EVERYTHING, spec, seed=9)
+    second.load_state_dict(torch.load(file, weights_only=True))
+    assert same(first, second)
+    for seed in (2, 3):
+        metrics = [each.update(batch(each, seed), no_pulse) for each in (first, second)]
+        assert metrics[0] == metrics[1]
+        assert same(first, second)
+
+
+def test_a_saved_state_does_not_change_with_the_algorithm() -> None:
+    algorithm = ppo(EVERYTHING, normal(DISCRETE))
+    algorithm.update(batch(algorithm, 0, fresh=True), no_pulse)
+    state = algorithm.state_dict()
+    restored = ppo(EVERYTHING, normal(DISCRETE))
+    restored.load_state_dict(state)
+    algorithm.update(batch(algorithm, 1), no_pulse)
+    late = ppo(EVERYTHING, normal(DISCRETE))
+    late.load_state_dict(state)
+    assert same(restored, late)
+    for each in (restored, late):
+        each.update(batch(each, 1), no_pulse)
+    assert same(restored, late)
+    assert same(restored, algorithm)
+
+
+def test_weights_are_snapshots_of_the_acting_part() -> None:
+    algorithm = ppo(spec=normal(GAUSSIAN))
+    parameters, buffers = algorithm.weights()
+    assert parameters.shape == (size(layout(GAUSSIAN)[0]),)
+    assert buffers.tolist() == [0.0] * 4 + [1.0] * 4
+    before = parameters.copy(), buffers.copy()
+    algorithm.update(batch(algorithm, 0), no_pulse)
+    np.testing.assert_array_equal(parameters, before[0])
+    np.testing.assert_array_equal(buffers, before[1])
+    for array, again in zip(algorithm.weights(), algorithm.weights(), strict=True):
+        array[:] = 7
+        assert not (again == 7).any()
+    assert not any((array == 7).any() for array in algorithm.weights())
+
+
+@pytest.mark.parametrize("spec", [normal(DISCRETE), normal(GAUSSIAN), IMAGE])
+def test_a_row_that_is_not_valid_changes_nothing(spec: PolicySpec) -> None:
+    a, b = ppo(EVERYTHING, spec), ppo(EVERYTHING, spec)
+    clean, rubbish = batch(a, 0), batch(b, 0)
+    reset = ~clean.valid
+    after_termination = reset.copy()
+    after_termination[1:] &= clean.terminated[:-1]  # the obs of any other reset row is what a truncation bootstraps from
+    assert after_termination.any()
+    for array in (rubbish.action, rubbish.log_prob, rubbish.reward):
+        array[reset] = array.dtype.type(3)
+    rubbish.obs[0][:-1][after_termination] = 100
+    for leaf in rubbish.obs[1:]:
+        leaf[:-1][after_termination] = 255
+    assert a.update(clean, no_pulse) == b.update(rubbish, no_pulse)
+    assert same(a, b)
+
+
+@pytest.mark.parametrize("spec", [normal(DISCRETE), normal(GAUSSIAN)])
+def test_losses_see_observations_as_the_worker_did(spec: PolicySpec) -> None:
+    """The statistics change between versions, never between acting and learning: the first ratio is 1."""
+    algorithm = ppo(PPOConfig(n_epochs=1, batch_size=10_000), spec)
+    for seed in range(2):
+        metrics = algorithm.update(batch(algorithm, seed), no_pulse)
+        assert abs(metrics["train/approx_kl"]) < 1e-6
+        assert metrics["train/clip_fraction"] == 0
+    assert algorithm.weights()[1][:4] == pytest.approx([2] * 4, abs=1)
+    assert algorithm.weights()[1][4:] == pytest.approx([3] * 4, abs=1)
+
+
+def test_minibatches_hold_each_valid_row_once_an_epoch_in_nearly_equal_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    algorithm = ppo(PPOConfig(batch_size=25, n_epochs=2))
+    seen: list[Minibatch] = []
+    step = algorithm.step
+
+    def watched(rows: Minibatch, clip_range: float) -> Any:
+        seen.append(rows)
+        return step(rows, clip_range)
+
+    monkeypatch.setattr(algorithm, "step", watched)
+    rows = batch(algorithm, 0)
+    pulses: list[int] = []
+    algorithm.update(rows, lambda: pulses.append(1))
+    count = int(rows.valid.sum())
+    parts = -(-count // 25)
+    assert len(seen) == 2 * parts
+    assert len(pulses) >= 2 * parts
+    assert {len(each.target) for each in seen} <= {count // parts, count // parts + 1}
+    expected = sorted(map(tuple, rows.obs[0][:-1][rows.valid].tolist()))
+    epochs = [np.concatenate([each.x for each in seen[at : at + parts]]).tolist() for at in (0, parts)]
+    assert epochs[0] != epochs[1]
+    for epoch in epochs:
+        assert sorted(map(tuple, epoch)) == expected
+
+
+def test_a_minibatch_of_one_row_is_learned_from() -> None:
+    algorithm = ppo(PPOConfig(batch_size=1, n_epochs=1))
+    metrics = algorithm.update(batch(algorithm, 0, steps=2), no_pulse)
+    assert np.isfinite(algorithm.weights()[0]).all()
+    assert np.isfinite(metrics["train/loss"])
+
+
+def test_a_batch_without_a_valid_row_changes_nothing() -> None:
+    a, b = ppo(), ppo()
+    empty = msgspec.structs.replace(batch(a, 0), valid=np.zeros((T, LANES * COPIES), bool))
+    assert a.update(empty, no_pulse) == {}
+    assert same(a, b)
+
+
+def test_target_kl_stops_before_the_step_that_would_go_on() -> None:
+    free, held = (ppo(PPOConfig(learning_rate=0.05, n_epochs=5, target_kl=limit)) for limit in (None, 1e-4))
+    start = held.net.flat.clone()
+    free_metrics, held_metrics = (each.update(batch(each, 0), no_pulse) for each in (free, held))
+    assert free_metrics["train/n_updates"] == 5
+    assert held_metrics["train/n_updates"] == 1
+    assert int(held.state_dict()["optimizer"]["state"][0]["step"]) == 1  # the second minibatch saw how far the first went
+    assert not torch.equal(held.net.flat, start)
+
+
+def test_schedules_follow_the_steps_used() -> None:
+    algorithm = ppo(msgspec.structs.replace(EVERYTHING, learning_rate=1.0e-3, clip_range=0.2))
+    found = []
+    for seed in range(3):
+        left = 1 - algorithm.parts.env_steps / 10_000
+        metrics = algorithm.update(batch(algorithm, seed), no_pulse)
+        assert metrics["train/learning_rate"] == pytest.approx(1e-3 * left)
+        assert metrics["train/clip_range"] == pytest.approx(0.2 * left)
+        found.append(metrics["train/learning_rate"])
+    assert found[0] == 1e-3
+    assert found[2] < found[1] < found[0]
+
+
+@pytest.mark.parametrize("spec", [DISCRETE, GAUSSIAN])
+def test_metrics_have_the_names_of_stable_baselines(spec: PolicySpec) -> None:
+    algorithm = ppo(PPOConfig(ent_coef=0.1, batch_size=1000, n_epochs=1), spec)
+    metrics = algorithm.update(batch(algorithm, 0), no_pulse)
+    names = "approx_kl clip_fraction entropy_loss explained_variance value_loss policy_gradient_loss loss learning_rate "
+    names += "clip_range n_updates" + (" std" if spec is GAUSSIAN else "")
+    assert {f"train/{name}" for name in names.split()} <= set(metrics)
+    parts = (metrics[f"train/{name}"] for name in ("policy_gradient_loss", "value_loss", "entropy_loss"))
+    policy, value, entropy = parts
+    assert metrics["train/loss"] == pytest.approx(policy + 0.5 * value + 0.1 * entropy)
+    if spec is DISCRETE:
+        assert entropy == pytest.approx(-np.log(4), abs=1e-2)
+    else:
+        assert metrics["train/std"] == pytest.approx(1, abs=1e-2)
+
+
+@pytest.mark.parametrize("name", ["log_prob", "reward"])
+def test_a_loss_that_is_not_finite_is_named_and_stops_before_the_weights(name: str) -> None:
+    algorithm = ppo()
+    algorithm.update(batch(algorithm, 0), no_pulse)
+    before = algorithm.net.flat.clone()
+    broken = batch(algorithm, 1)
+    getattr(broken, name)[broken.valid] = 3e38 if name == "reward" else -np.inf
+    with pytest.raises(RunError, match=r"update 1: \w+ expected finite, got"), np.errstate(all="ignore"):
+        algorithm.update(broken, no_pulse)
+    assert torch.equal(algorithm.net.flat, before)
+
+
+def test_the_gradient_is_shortened_to_max_grad_norm() -> None:
+    """Adam hides the length of the gradient; its first moment after one step does not."""
+    algorithm = ppo(PPOConfig(max_grad_norm=0.01, batch_size=1000, n_epochs=1))
+    metrics = algorithm.update(batch(algorithm, 0), no_pulse)
+    assert metrics["train/grad_norm"] > 0.01
+    moment = algorithm.state_dict()["optimizer"]["state"][0]["exp_avg"]
+    assert moment.norm().item() == pytest.approx(0.1 * 0.01, rel=1e-4)
+
+
+@pytest.mark.parametrize("spec", [DISCRETE, GAUSSIAN])
+def test_a_step_follows_the_gradient_of_the_usual_loss(spec: PolicySpec) -> None:
+    config = PPOConfig(vf_coef=0.7, ent_coef=0.3, max_grad_norm=1e9, clip_range=0.1)
+    algorithm, generator = ppo(config, spec), torch.Generator().manual_seed(0)
+    x, advantage, target = (torch.randn(s, generator=generator) for s in [(30, 4), (30,), (30,)])
+    params, value = algorithm.net.forward(x)
+    if spec is DISCRETE:
+        usual: Any = torch.distributions.Categorical(logits=params)
+        action = torch.randint(4, (30,), generator=generator)
+    else:
+        usual = torch.distributions.Independent(torch.distributions.Normal(params[:, :2], params[:, 2:].exp()), 1)
+        action = torch.randn((30, 2), generator=generator)
+    old = usual.log_prob(action).detach() + 0.2 * torch.randn(30, generator=generator)
+    ratio = (usual.log_prob(action) - old).exp()
+    a = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+    policy_loss = -torch.min(ratio * a, ratio.clamp(0.9, 1.1) * a).mean()
+    (policy_loss + 0.7 * (value - target).square().mean() - 0.3 * usual.entropy().mean()).backward()
+    expected = algorithm.net.flat_grad.clone()
+    measured = algorithm.step(Minibatch(x, (), action, old, advantage, target), 0.1)
+    torch.testing.assert_close(algorithm.net.flat_grad, expected, atol=1e-5, rtol=1e-4)
+    assert measured.clip_fraction > 0
+    assert measured.policy_gradient_loss == pytest.approx(policy_loss.item(), rel=1e-4)
+
+
+def test_clipped_values_move_less() -> None:
+    """With a step size that moves them far in an epoch, and nothing else to learn."""
+    moved = []
+    for limit in (None, 0.05):
+        config = PPOConfig(
+            clip_range_vf=limit, learning_rate=0.01, n_epochs=10, batch_size=1000, ent_coef=0.0, max_grad_norm=1e9
+        )
+        algorithm = ppo(config)
+        rows = batch(algorithm, 0)
+        seen = algorithm.parts.see(rows)
+        before = algorithm.parts.values(seen, no_pulse)
+        algorithm.update(rows, no_pulse)
+        moved.append(float(np.abs(algorithm.parts.values(seen, no_pulse) - before)[:-1][rows.valid].mean()))
+    assert moved[0] > 0.4
+    assert moved[1] < 0.6 * moved[0]
+
+
+@pytest.mark.parametrize("before", [-3.0, 0.0, 0.7, 5.0])
+def test_a_step_with_clipped_values_follows_the_gradient_of_the_usual_loss(before: float) -> None:
+    """The value before the update is the target less the advantage, which is standardised only afterwards."""
+    algorithm, generator = (
+        ppo(PPOConfig(vf_coef=1.0, max_grad_norm=1e9, clip_range_vf=0.5)),
+        torch.Generator().manual_seed(0),
+    )
+    x, target = torch.randn(30, 4, generator=generator), torch.randn(30, generator=generator)
+    old = torch.full((30,), before)
+    _, value = algorithm.net.forward(x)
+    clipped = old + (value - old).clamp(-0.5, 0.5)
+    torch.maximum((value - target).square(), (clipped - target).square()).mean().backward()  # type: ignore[no-untyped-call]
+    expected = algorithm.net.flat_grad.clone()[algorithm.net.acting_size :]
+    algorithm.step(Minibatch(x, (), torch.zeros(30, dtype=torch.int64), torch.zeros(30), target - old, target), 0.2)
+    found = algorithm.net.flat_grad[algorithm.net.acting_size :]
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("spec", "start", "goal"), [(normal(DISCRETE), 0.5, 0.95), (normal(GAUSSIAN), -1.5, -0.35)])
+def test_it_learns_the_identity(spec: PolicySpec, start: float, goal: float) -> None:
+    algorithm = ppo(PPOConfig(learning_rate=0.01, n_epochs=5, gamma=0.9), spec)
+    generator = np.random.default_rng(0)
+    scores = []
+    for _ in range(40):
+        rows, score = identity_batch(algorithm, generator)
+        scores.append(score)
+        algorithm.update(rows, no_pulse)
+    assert scores[0] < start
+    assert np.mean(scores[-3:]) > goal

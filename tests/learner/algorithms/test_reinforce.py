@@ -1,0 +1,135 @@
+"""REINFORCE: exactly the rows whose return is known, and runs refused in which that could be none."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import msgspec
+import numpy as np
+import pytest
+import torch
+
+from learner.algorithms.actor_critic import Minibatch
+from learner.algorithms.reinforce import REINFORCE
+from learner.config.config import resolve
+from learner.config.hyperparameters import REINFORCEConfig
+from learner.run import run_spec
+from protocol.errors import UsageError
+from protocol.rollout import Batch
+from protocol.specs import EnvSpec, PolicySpec
+from tests.support.batches import DISCRETE, GAUSSIAN, batch, no_pulse
+
+GAMMA = 0.9
+
+
+def reinforce(spec: PolicySpec = DISCRETE, **settings: Any) -> REINFORCE:
+    settings = {"normalize_rewards": False, **settings}
+    return REINFORCE(REINFORCEConfig(gamma=GAMMA, **settings), spec, total_steps=10_000, seed=0)
+
+
+def slow_returns(rows: Batch, values: np.ndarray[Any, Any] | None) -> list[tuple[int, int, float]]:
+    """(t, n, G) of every row whose episode ends within the rollout; G goes on with a value where the clock ended it."""
+    found = []
+    T, N = rows.reward.shape
+    for t, n in np.ndindex(T, N):
+        g = 0.0
+        for k in range(t, T):
+            if not rows.valid[k, n]:
+                break
+            g += GAMMA ** (k - t) * float(rows.reward[k, n])
+            if rows.terminated[k, n] or rows.truncated[k, n]:
+                if values is not None and not rows.terminated[k, n]:
+                    g += GAMMA ** (k - t + 1) * float(values[k + 1, n])
+                found.append((t, n, g))
+                break
+    return found
+
+
+@pytest.mark.parametrize("baseline", [True, False])
+@pytest.mark.parametrize("normalize", [True, False])
+@pytest.mark.parametrize("spec", [DISCRETE, GAUSSIAN])
+def test_it_learns_from_the_known_returns_alone(
+    monkeypatch: pytest.MonkeyPatch, baseline: bool, normalize: bool, spec: PolicySpec
+) -> None:
+    algorithm = reinforce(spec, baseline=baseline, normalize_returns=normalize)
+    rows = batch(algorithm, 0)
+    values = algorithm.parts.values(algorithm.parts.see(rows), no_pulse)
+    expected = slow_returns(rows, values if baseline else None)
+    assert 0 < len(expected) < rows.valid.sum()
+    advantage = np.array([g - (values[t, n] if baseline else 0) for t, n, g in expected])
+    if normalize:
+        advantage = (advantage - advantage.mean()) / advantage.std(ddof=1)
+    seen: list[Minibatch] = []
+    step = algorithm.parts.policy_gradient_step
+
+    def watched(given: Minibatch, critic: bool = True) -> dict[str, float]:
+        assert critic == baseline
+        seen.append(given)
+        return step(given, critic)
+
+    monkeypatch.setattr(algorithm.parts, "policy_gradient_step", watched)
+    metrics = algorithm.update(rows, no_pulse)
+    (only,) = seen
+    np.testing.assert_array_equal(only.x, [rows.obs[0][t, n] for t, n, _ in expected])
+    np.testing.assert_allclose(only.advantage, advantage, atol=1e-4)
+    if baseline:
+        np.testing.assert_allclose(only.target, [g for _, _, g in expected], atol=1e-4)
+    assert metrics["train/rows_used"] == len(expected)
+    assert metrics["train/rows_dropped"] == rows.valid.sum() - len(expected)
+
+
+def test_rows_of_an_episode_that_goes_on_change_nothing() -> None:
+    a, b = reinforce(), reinforce()
+    clean, rubbish = batch(a, 0), batch(b, 0)
+    known = np.zeros_like(clean.valid)
+    for t, n, _ in slow_returns(clean, None):
+        known[t, n] = True
+    rubbish.reward[~known] = 1e6
+    rubbish.action[~known] = 3
+    assert a.update(clean, no_pulse) == b.update(rubbish, no_pulse)
+    assert torch.equal(a.net.flat, b.net.flat)
+
+
+def test_without_a_baseline_the_critic_stays_as_it_is() -> None:
+    algorithm = reinforce(baseline=False)
+    before = algorithm.net.flat.clone()
+    algorithm.update(batch(algorithm, 0), no_pulse)
+    acting = algorithm.net.acting_size
+    assert torch.equal(algorithm.net.flat[acting:], before[acting:])
+    assert not torch.equal(algorithm.net.flat[:acting], before[:acting])
+
+
+def test_a_batch_in_which_no_episode_ends_is_counted_and_changes_no_weight() -> None:
+    algorithm = reinforce(normalize_rewards=True)
+    rows = batch(algorithm, 0)
+    none = np.zeros_like(rows.valid)
+    rows = msgspec.structs.replace(rows, terminated=none, truncated=none, valid=~none)
+    before = algorithm.net.flat.clone()
+    metrics = algorithm.update(rows, no_pulse)
+    assert torch.equal(algorithm.net.flat, before)
+    assert (metrics["train/rows_used"], metrics["train/rows_dropped"]) == (0, none.size)
+    assert (algorithm.parts.env_steps, algorithm.parts.version) == (none.size, 1)
+
+
+def spec_of(env: EnvSpec, steps: int, algo: str = "reinforce") -> int:
+    return run_spec(resolve(env.id, algo=algo, preset="none", rollout_steps=steps), env).rollout_steps
+
+
+def test_rollouts_shorter_than_an_episode_can_be_are_refused() -> None:
+    with pytest.raises(UsageError) as refused:
+        spec_of(EnvSpec("CartPole-v1"), 500)
+    assert str(refused.value) == (
+        "rollout_steps 500: reinforce learns from whole episodes, and those of CartPole-v1 take up to 500 steps; "
+        "expected at least 501"
+    )
+    assert spec_of(EnvSpec("CartPole-v1"), 501) == 501
+    assert spec_of(EnvSpec("CartPole-v1"), 8, "a2c") == 8
+
+
+def test_where_nothing_says_how_long_an_episode_can_be_nothing_is_refused() -> None:
+    def endless() -> gymnasium.Env[Any, Any]:
+        return gymnasium.make("CartPole-v1").unwrapped
+
+    assert spec_of(EnvSpec("CartPole-v1", {"max_episode_steps": -1}), 8) == 8
+    assert spec_of(EnvSpec.of(endless), 600) == 600

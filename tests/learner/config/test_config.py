@@ -1,0 +1,207 @@
+"""The configuration: its layers in order, its one-line refusals, its file."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from learner.algorithms import ALGORITHMS
+from learner.config.config import PRESETS, Config, lower_layers, named_presets, resolve
+from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
+from protocol.errors import UsageError
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "my.toml"
+    path.write_text(text)
+    return path
+
+
+def refusal(env: str = "CartPole-v1", **keywords: Any) -> str:
+    with pytest.raises(UsageError) as caught:
+        resolve(env, **keywords)
+    text = str(caught.value)
+    assert "\n" not in text
+    return text
+
+
+def ppo(config: Config) -> PPOConfig:
+    assert isinstance(config.algorithm, PPOConfig)
+    return config.algorithm
+
+
+def test_each_layer_overrides_the_one_below(tmp_path: Path) -> None:
+    file = written(tmp_path, "seed = 7\nworkers = 5\n[ppo]\ngamma = 0.5\nclip_range = 0.3\n")
+    unknown_env = resolve("MountainCar-v0")
+    assert unknown_env.algorithm == PPOConfig()
+    preset = resolve("CartPole-v1")
+    assert (ppo(preset).gae_lambda, preset.algorithm.gamma) == (0.8, 0.98)
+    assert ppo(preset).learning_rate_schedule == "linear"
+    config = resolve("CartPole-v1", file=file, workers=3, clip_range=0.1)
+    assert ppo(config).gae_lambda == 0.8  # preset over default
+    assert (config.seed, config.algorithm.gamma) == (7, 0.5)  # file over preset
+    assert (config.workers, ppo(config).clip_range) == (3, 0.1)  # keyword over file
+
+
+def test_a_preset_can_be_left_out_or_borrowed() -> None:
+    assert resolve("CartPole-v1", preset="none").algorithm == PPOConfig()
+    assert resolve("my.envs:Cart-v0", preset="CartPole-v1").algorithm == resolve("CartPole-v1").algorithm
+    assert "did you mean CartPole-v1?" in refusal(preset="CartPole-v0")
+
+
+def test_the_environment_may_come_from_the_file_or_above_it(tmp_path: Path) -> None:
+    file = written(tmp_path, 'env = "Pendulum-v1"\n')
+    from_file = resolve(file=file)
+    assert from_file.env == "Pendulum-v1"
+    assert from_file.algorithm.gamma == 0.9  # the preset follows the environment, wherever its name stands
+    assert resolve("CartPole-v1", file=file).algorithm.gamma == 0.98
+    assert "which environment?" in refusal("")
+
+
+@pytest.mark.parametrize("env", ["CartPole-v1", "Pendulum-v1", "MountainCar-v0"])
+def test_a_file_repeats_the_run_to_the_letter(tmp_path: Path, env: str) -> None:
+    config = resolve(
+        env,
+        env_kwargs={"a": True, "b": 2, "c": 2.5, "d": 'quo"ted'},
+        target_return=-150.5,
+        net=[32, 16],
+        normalize_observations=True,
+        seed=11,
+    )
+    assert Config.from_toml(config.to_toml()) == config
+    assert resolve(file=written(tmp_path, config.to_toml())) == config
+
+
+def test_what_was_unset_over_a_preset_stays_unset(tmp_path: Path) -> None:
+    text = resolve("CartPole-v1", target_return=475.0).to_toml()
+    assert Config.from_toml(text).target_return == 475.0
+    assert resolve(file=written(tmp_path, text), target_return=None).target_return is None
+    assert resolve(file=written(tmp_path, text.replace("475.0", '"none"'))).target_return is None
+
+
+def test_env_kwargs_are_merged(tmp_path: Path) -> None:
+    file = written(tmp_path, "[env_kwargs]\ng = 9.0\nmode = 'a'\n")
+    assert resolve("Pendulum-v1", file=file, env_kwargs={"g": 1.0}).env_kwargs == {"g": 1.0, "mode": "a"}
+
+
+def test_a_whole_number_may_be_written_in_powers_of_ten(tmp_path: Path) -> None:
+    assert resolve("CartPole-v1", steps=1e6).steps == 1_000_000
+    assert resolve("CartPole-v1", file=written(tmp_path, "steps = 3e5")).steps == 300_000
+    assert "steps expected int" in refusal(steps=1.5)
+
+
+@pytest.mark.parametrize(
+    ("keywords", "says"),
+    [
+        ({"workers": 0}, "workers expected int >= 1, got 0"),
+        ({"workers": "two"}, "workers expected int, got 'two'"),
+        ({"steps": 0}, "steps expected int >= 1, got 0"),
+        ({"max_lag": -1}, "max_lag expected int >= 0, got -1"),
+        ({"envs": 6}, "6 envs cannot be shared evenly among 4 lanes; take 4 or 8, or 3 lanes"),
+        ({"envs": 2}, "2 envs cannot be shared evenly among 4 lanes; take 4, or 2 lanes"),
+        ({"transport": "udp"}, "transport expected one of inproc, ipc, tcp, got 'udp'"),
+        ({"activation": "gelu"}, "activation expected one of tanh, relu, got 'gelu'"),
+        ({"learning_rate": -1.0}, "learning_rate expected float > 0.0, got -1.0"),
+        ({"target_return": "high"}, "target_return expected float or \"none\", got 'high'"),
+        ({"learning_rat": 1.0}, "unknown setting learning_rat; did you mean learning_rate?"),
+        ({"algo": "dqn", "core": "gru"}, "unknown setting core; it is one of ppo, a2c, impala alone"),
+        ({"algo": "reinforce", "core": "gru"}, "unknown setting core; it is one of ppo, a2c, impala alone"),
+        ({"core": "rnn"}, "core expected one of lstm, gru, none, got 'rnn'"),
+        ({"algo": "pp0"}, "algo pp0: expected one of ppo"),
+        ({"bind": "0.0.0.0:5555"}, "address 0.0.0.0:5555: expected inproc://NAME, ipc://PATH or tcp://HOST:PORT"),
+        ({"file": Path("/no/such.toml")}, "config file /no/such.toml cannot be read: No such file or directory"),
+    ],
+)
+def test_bad_values_are_refused_in_one_line(keywords: dict[str, Any], says: str) -> None:
+    assert says in refusal(**keywords)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("stepps = 3", "unknown setting stepps; did you mean steps?"),
+        ("[ppo]\nlearning_rat = 3", "unknown setting learning_rat; did you mean learning_rate?"),
+        ("learning_rate = 3", "learning_rate is a setting of the algorithm; put it in the table [ppo]"),
+        ("[ppo]\nsteps = 3", "steps is a setting of the run; put it above the table [ppo]"),
+        ("ppo = 3", "ppo expected a table, [ppo], got 3"),
+        ("seed = -1", "seed expected int >= 0, got -1"),
+        ("env_kwargs = 3", "env_kwargs expected table, got 3"),
+        ("algorithm = 3", "unknown setting algorithm"),
+        ("a =", "is not TOML"),
+    ],
+)
+def test_a_bad_file_is_named(tmp_path: Path, text: str, says: str) -> None:
+    file = written(tmp_path, text)
+    line = refusal(file=file)
+    assert says in line
+    assert str(file) in line
+
+
+def test_a_file_of_bytes_is_not_text(tmp_path: Path) -> None:
+    file = tmp_path / "my.toml"
+    file.write_bytes(b"\xff\xfe\x00")
+    assert f"config file {file} cannot be read: it is not text" in refusal(file=file)
+
+
+def test_lower_layers_are_not_yet_judged_as_a_whole(tmp_path: Path) -> None:
+    """A flag may still repair what a file alone would break."""
+    file = written(tmp_path, "lanes = 3\n")
+    assert lower_layers("CartPole-v1", file=file).lanes == 3
+    assert resolve("CartPole-v1", file=file, envs=9).envs == 9
+    assert "8 envs" in refusal(file=file)
+
+
+def test_a_resumed_run_keeps_its_settings_but_for_those_given(tmp_path: Path) -> None:
+    config = resolve("CartPole-v1", preset="none", gamma=0.5)
+    (tmp_path / "config.toml").write_text(config.to_toml())
+    assert resolve(resume=tmp_path) == resolve("CartPole-v1", resume=tmp_path) == config
+    assert resolve(resume=tmp_path, steps=5).steps == 5
+    assert f"run {tmp_path} is of CartPole-v1, not of Pendulum-v1" in refusal("Pendulum-v1", resume=tmp_path)
+    assert "expected one, got both" in refusal(resume=tmp_path, file=tmp_path / "config.toml")
+    assert "nowhere: expected a run folder with a config.toml to resume, got none" in refusal(resume=tmp_path / "nowhere")
+
+
+def test_every_preset_makes_a_configuration_of_its_own() -> None:
+    import tomllib
+
+    for algo, presets in tomllib.loads(PRESETS.read_text()).items():
+        if algo == "named":
+            continue
+        assert algo in HYPERPARAMETERS
+        for env in presets:
+            assert resolve(env, algo=algo) != resolve(env, algo=algo, preset="none")
+
+
+def test_every_named_preset_is_on_the_page_of_the_notebooks() -> None:
+    page = Path(__file__).parents[3] / "docs" / "notebooks.md"
+    assert set(re.findall(r"--preset ([\w-]+)", page.read_text())) == set(named_presets())
+    images = re.findall(r"\]\((images/[^)]+)\)", page.read_text())
+    assert len(images) == 5
+    assert all((page.parent / image).is_file() for image in images)
+
+
+def test_every_named_preset_is_a_whole_run() -> None:
+    assert named_presets()
+    for name, preset in named_presets().items():
+        config = resolve(preset=name)
+        assert (config.env, config.algo) == (preset.settings["env"], preset.settings["algo"])
+        assert preset.about
+
+
+def test_every_algorithm_has_its_settings() -> None:
+    assert ALGORITHMS.keys() == HYPERPARAMETERS.keys()
+
+
+def test_no_setting_of_an_algorithm_hides_one_of_the_run() -> None:
+    """They share the flags' namespace."""
+    own = {field.name for field in msgspec.structs.fields(Config)}
+    for kind in HYPERPARAMETERS.values():
+        assert not own & {field.name for field in msgspec.structs.fields(kind)}
+
+
+def test_rollouts_that_do_not_travel_are_not_compressed() -> None:
+    assert "compress expected none, got zstd" in refusal(inference="learner", compress="zstd")
+    assert "compress expected one of none, zstd, got 'gzip'" in refusal(compress="gzip")
+    assert resolve("CartPole-v1", compress="none").compress == "none"

@@ -1,0 +1,415 @@
+"""Episodes kept: whole, in order, as they were; and the dataset that Minari reads back."""
+
+import sys
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given
+from hypothesis import strategies as st
+
+from learner.config.config import resolve
+from learner.evaluate import load_policy
+from learner.recording import minari as dataset_module
+from learner.recording.episodes import EpisodeAssembler, RecordedEpisode
+from learner.recording.record import Player, record
+from learner.run_folder.run_folder import RunFolder
+from protocol.envs.spaces import action_spec, observation_leaves
+from protocol.errors import EnvironmentFailed, OurError, RunError, UsageError
+from protocol.policy.policy import buffer_size, layout, size
+from protocol.rollout import Rollout
+from protocol.specs import EnvSpec, PolicySpec
+
+Array = np.ndarray[Any, Any]
+
+# ---------------------------------------------------------------------------------------- rows of lanes -> episodes
+
+
+def lives(ends: list[list[list[int]]], steps: int) -> Iterator[tuple[int, Rollout]]:
+    """Incarnations of a lane as rollouts of T `steps`; `ends`: for each, for each row, for each copy: 0, or how it ends.
+
+    An observation says where it stands: incarnation, copy, episode, step of the episode.
+    """
+    for incarnation, rows in enumerate(ends):
+        N = len(rows[0])
+        episode, step, over = np.zeros(N, int), np.zeros(N, int), np.zeros(N, bool)
+        where = [np.stack([np.full(N, incarnation), np.arange(N), episode, step], -1)]
+        valid, terminated, truncated = [], [], []
+        for flags in rows:
+            valid.append(~over)
+            flag = np.where(over, 0, flags)
+            episode, step = np.where(over, episode + 1, episode), np.where(over, 0, step + 1)
+            terminated.append(flag % 2 == 1)
+            truncated.append(flag >= 2)
+            over = flag > 0
+            where.append(np.stack([np.full(N, incarnation), np.arange(N), episode, step], -1))
+        obs = np.array(where, np.float32)
+        for sequence in range(len(rows) // steps):
+            at = slice(sequence * steps, (sequence + 1) * steps)
+            seen = obs[at.start : at.stop + 1]
+            yield (
+                incarnation,
+                Rollout(
+                    session=1,
+                    lane=3,
+                    ticket=sequence,
+                    version=0,
+                    sequence=sequence,
+                    obs=(seen, seen[..., 3].astype(np.int64)),
+                    action=(10 * seen[:-1, :, 2] + seen[:-1, :, 3]).astype(np.int64),
+                    log_prob=np.zeros((steps, N), np.float32),
+                    reward=seen[1:, :, 3].copy(),
+                    terminated=np.array(terminated[at]),
+                    truncated=np.array(truncated[at]),
+                    valid=np.array(valid[at]),
+                    state=np.zeros((N, 0), np.float32),
+                ),
+            )
+
+
+@st.composite
+def rollouts(draw: st.DrawFn) -> list[tuple[int, Rollout]]:
+    steps, copies = draw(st.integers(1, 5)), draw(st.integers(1, 3))
+    row = st.lists(st.sampled_from([0, 0, 0, 1, 2, 3]), min_size=copies, max_size=copies)
+    counts = draw(st.lists(st.integers(1, 6), min_size=1, max_size=3))
+    ends = [draw(st.lists(row, min_size=steps * count, max_size=steps * count)) for count in counts]
+    return list(lives(ends, steps))
+
+
+def check_whole(episode: RecordedEpisode) -> None:
+    """It has no hole: of one incarnation, copy and episode, every step from the first to the last."""
+    (where, step), L = episode.obs, episode.length
+    assert (where[:, :3] == where[0, :3]).all()
+    assert where[:, 3].tolist() == step.tolist() == list(range(L + 1))
+    assert episode.reward.tolist() == list(range(1, L + 1))
+    assert episode.action.tolist() == [100 + 10 * where[0, 2] + t for t in range(L)]
+    ended = episode.terminated | episode.truncated
+    assert ended[-1]
+    assert not ended[:-1].any()
+
+
+def taken(action: Array) -> Array:
+    return action + 100
+
+
+@given(rollouts())
+def test_the_episodes_of_a_copy_are_its_rows_without_the_resets(stream: list[tuple[int, Rollout]]) -> None:
+    assembler = EpisodeAssembler(taken)
+    episodes = [episode for incarnation, rollout in stream for episode in assembler.add(rollout, incarnation)]
+    for episode in episodes:
+        check_whole(episode)
+    steps = sum(rollout.env_steps for _, rollout in stream)
+    assert sum(episode.length for episode in episodes) + assembler.waiting + assembler.left_out == steps
+    for incarnation in {incarnation for incarnation, _ in stream}:
+        rows = [rollout for i, rollout in stream if i == incarnation]
+        obs, valid, action, reward, terminated, truncated = (
+            np.concatenate(arrays)
+            for arrays in (
+                [r.obs[0][:-1] for r in rows],
+                [r.valid for r in rows],
+                [taken(r.action) for r in rows],
+                [r.reward for r in rows],
+                [r.terminated for r in rows],
+                [r.truncated for r in rows],
+            )
+        )
+        for n in range(obs.shape[1]):
+            mine = [e for e in episodes if tuple(e.obs[0][0, :2]) == (incarnation, n)]
+            done = np.flatnonzero((terminated | truncated)[:, n])
+            kept = np.flatnonzero(valid[: done[-1] + 1 if len(done) else 0, n])
+            assert sum(e.length for e in mine) == len(kept)
+            if mine:
+                assert np.array_equal(np.concatenate([e.obs[0][:-1] for e in mine]), obs[kept, n])
+                assert np.array_equal(np.concatenate([e.action for e in mine]), action[kept, n])
+                assert np.array_equal(np.concatenate([e.reward for e in mine]), reward[kept, n])
+                assert np.array_equal(np.concatenate([e.terminated for e in mine]), terminated[kept, n])
+                assert np.array_equal(np.concatenate([e.truncated for e in mine]), truncated[kept, n])
+
+
+@given(rollouts(), st.data())
+def test_an_episode_has_no_hole_whatever_is_dropped_or_late(stream: list[tuple[int, Rollout]], data: st.DataObject) -> None:
+    came = data.draw(st.lists(st.sampled_from(range(len(stream))), max_size=len(stream), unique=True))
+    if data.draw(st.booleans()):
+        came = sorted(came)
+    assembler = EpisodeAssembler(taken)
+    episodes, steps = [], 0
+    for i in came:
+        incarnation, rollout = stream[i]
+        episodes += assembler.add(rollout, incarnation)
+        steps += rollout.env_steps
+    for episode in episodes:
+        check_whole(episode)
+    starts = [tuple(episode.obs[0][0]) for episode in episodes]
+    assert len(set(starts)) == len(starts)
+    assert sum(episode.length for episode in episodes) + assembler.waiting + assembler.left_out == steps
+
+
+def test_what_is_kept_is_a_copy() -> None:
+    ((_, first), (_, second)) = lives([[[0], [0], [0], [1]]], steps=2)
+    assembler = EpisodeAssembler(lambda action: action)
+    assert assembler.add(first, 0) == []
+    for array in (*first.obs, first.action, first.reward):
+        array[...] = 77
+    (episode,) = assembler.add(second, 0)
+    assert episode.obs[1].tolist() == [0, 1, 2, 3, 4]
+    assert episode.action.tolist() == [0, 1, 2, 3]
+    assert (assembler.waiting, assembler.left_out) == (0, 0)
+
+
+def test_the_episode_that_ended_first_comes_first() -> None:
+    ((_, rollout),) = lives([[[0, 0], [0, 1], [1, 0], [0, 1]]], steps=4)
+    episodes = EpisodeAssembler(taken).add(rollout, 0)
+    assert [(int(episode.obs[0][0, 1]), episode.length) for episode in episodes] == [(1, 2), (0, 3), (1, 1)]
+
+
+# ----------------------------------------------------------------------------------------------- a policy -> a dataset
+
+
+class Box(gymnasium.Env[Any, Any]):
+    """A Dict of Tuple observation. Episodes of 3, 4, 5, 3, … steps; odd ones are truncated, even ones terminated."""
+
+    def __init__(self, endless: bool = False, fails_at: int = 0, key: str = "inner") -> None:
+        self.observation_space = spaces.Dict(
+            {
+                "step": spaces.Discrete(1000, start=-1),
+                key: spaces.Tuple((spaces.Box(-9, 9, (2,)), spaces.MultiBinary(3))),
+                "camera": spaces.Box(0, 255, (4, 5), np.uint8),
+            }
+        )
+        self.action_space = spaces.Box(np.float32(-0.25), np.float32(0.25), (2,))
+        self.key, self.endless, self.fails_at = key, endless, fails_at
+        self.episode, self.steps, self.total = -1, 0, 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.episode, self.steps = self.episode + 1, 0
+        return self._seen(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.steps, self.total = self.steps + 1, self.total + 1
+        if self.total == self.fails_at:
+            raise RuntimeError("the spring broke")
+        ended = not self.endless and self.steps == 3 + self.episode % 3
+        odd = self.episode % 2 == 1
+        return self._seen(), 0.1 * self.steps, ended and not odd, ended and odd, {"noise": 1}
+
+    def _seen(self) -> dict[str, Any]:
+        random = self.np_random
+        inner = (random.normal(size=2).astype(np.float32).clip(-9, 9), random.integers(0, 2, 3, np.int8))
+        return {"step": self.steps - 1, self.key: inner, "camera": random.integers(0, 256, (4, 5), np.uint8)}
+
+
+gymnasium.register("millrace-tests/Box-v0", entry_point=lambda **kwargs: Box(**kwargs))
+
+
+def a_run(folder: Path, env: EnvSpec) -> Path:
+    made = env.make()
+    spec = PolicySpec(observation_leaves(made.observation_space), action_spec(made.action_space), net=(8,))
+    run = RunFolder.create(resolve(env.id, run_dir=str(folder)))
+    rng = np.random.default_rng(0)
+    run.write_policy(
+        spec, env, 0.1 * rng.standard_normal(size(layout(spec)[0]), np.float32), np.zeros(buffer_size(spec), np.float32)
+    )
+    return run.path
+
+
+@pytest.fixture
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
+    return tmp_path / "datasets"
+
+
+def read(dataset_id: str) -> Any:
+    import minari
+
+    return minari.load_dataset(dataset_id)
+
+
+def played(run: Path, seed: int, stochastic: bool, episodes: int) -> list[RecordedEpisode]:
+    policy, spec, env_spec = load_policy(run)
+    env = env_spec.make()
+    player = Player(env, policy, spec, seed, stochastic)
+    return [player.episode(1000) for _ in range(episodes)]
+
+
+@pytest.mark.parametrize("chunk_bytes", [1, 2**30])
+def test_minari_reads_back_what_was_played(
+    tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch, chunk_bytes: int
+) -> None:
+    monkeypatch.setattr(dataset_module, "CHUNK_BYTES", chunk_bytes)
+    run = a_run(tmp_path, EnvSpec("millrace-tests/Box-v0"))
+    found = record(run, "tests/box/mixed-v0", 40, seed=5, stochastic=True)
+    # Lengths 3, 4, 5 in turn: the eleventh episode, of 4 steps, is the one that passes 40.
+    assert (found.steps, found.episodes, found.cut) == (43, 11, 0)
+    expected = played(run, 5, True, 11)
+    dataset = read("tests/box/mixed-v0")
+    assert (dataset.total_episodes, dataset.total_steps) == (11, 43)
+    assert dataset.observation_space == Box().observation_space
+    for i, (got, want) in enumerate(zip(dataset.iterate_episodes(), expected, strict=True)):
+        L = 3 + i % 3
+        assert len(got.rewards) == len(got.actions) == want.length == L
+        assert np.array_equal(got.rewards, [0.1 * (t + 1) for t in range(L)])
+        assert got.terminations.tolist() == [False] * (L - 1) + [i % 2 == 0]
+        assert got.truncations.tolist() == [False] * (L - 1) + [i % 2 == 1]
+        assert got.observations["step"].tolist() == list(range(-1, L))  # the last one is that of the end, not of a reset
+        leaves = [got.observations["camera"], *got.observations["inner"], got.observations["step"]]
+        names = [leaf.path for leaf in observation_leaves(Box().observation_space)]
+        assert names == ["camera", "inner/0", "inner/1", "step"]
+        for leaf, array in zip(leaves, want.obs, strict=True):
+            assert len(leaf) == L + 1
+            assert leaf.dtype == array.dtype
+            assert np.array_equal(leaf, array)
+        assert np.array_equal(got.actions, want.action)
+        assert got.actions.dtype == np.float32
+        assert np.abs(got.actions).max() <= 0.25  # as the environment took them: clipped
+    seeds = [metadata["seed"] for metadata in dataset.storage.get_episode_metadata(range(11))]
+    assert seeds == [episode.seed for episode in expected]
+    returns = [episode.total for episode in expected]
+    assert [found.return_mean, found.return_std] == [float(np.mean(returns)), float(np.std(returns))]
+
+
+def test_the_environment_comes_back_with_the_dataset_and_each_episode_can_be_repeated(tmp_path: Path, root: Path) -> None:
+    run = a_run(tmp_path, EnvSpec("CartPole-v1"))
+    assert str(record(run, "cartpole/greedy-v0", 60, seed=1)).startswith("dataset cartpole/greedy-v0: ")
+    dataset = read("cartpole/greedy-v0")
+    env = dataset.recover_environment()
+    assert env.spec.id == "CartPole-v1"
+    for episode, metadata in zip(dataset, dataset.storage.get_episode_metadata(range(len(dataset))), strict=True):
+        obs, _ = env.reset(seed=metadata["seed"])
+        for t, action in enumerate(episode.actions):
+            assert np.array_equal(obs, episode.observations[t])
+            obs, _, terminated, truncated, _ = env.step(action)
+        assert np.array_equal(obs, episode.observations[-1])
+        assert (terminated, truncated) == (episode.terminations[-1], episode.truncations[-1])
+    env.close()
+
+
+def test_images_are_kept_as_they_are(root: Path) -> None:
+    env = Box()
+    env.observation_space = spaces.Box(0, 255, (8, 9, 3), np.uint8)
+    images = np.random.default_rng(0).integers(0, 256, (3, 8, 9, 3), np.uint8)
+    with dataset_module.MinariDataset("tests/images-v0", env, "two steps") as dataset:
+        flags = np.zeros(2, bool)
+        dataset.add(RecordedEpisode((images,), np.zeros((2, 2), np.float32), np.zeros(2), flags, flags))
+    (episode,) = read("tests/images-v0")
+    assert np.array_equal(episode.observations, images)
+
+
+def test_the_same_seed_plays_the_same_and_drawn_actions_are_not_the_most_probable(tmp_path: Path) -> None:
+    run = a_run(tmp_path, EnvSpec("CartPole-v1"))
+    first, again, drawn = (played(run, 3, stochastic, 2) for stochastic in (False, False, True))
+    for a, b in zip(first, again, strict=True):
+        assert np.array_equal(a.action, b.action)
+        assert np.array_equal(a.obs[0], b.obs[0])
+    assert first[0].seed == drawn[0].seed
+    assert not np.array_equal(first[0].action, drawn[0].action)
+
+
+def test_the_notebooks_array_has_a_row_for_each_step(tmp_path: Path, root: Path) -> None:
+    run = a_run(tmp_path, EnvSpec("millrace-tests/Box-v0"))
+    record(run, "tests/box-v0", 10, seed=2, npy=tmp_path / "rows.npy")
+    rows = np.load(tmp_path / "rows.npy", allow_pickle=False)
+    assert (rows.shape, rows.dtype) == ((12, 20 + 2 + 3 + 1 + 2), np.float32)
+    t = 0
+    for episode in played(run, 2, False, 3):
+        for step in range(episode.length):
+            row = np.concatenate([np.ravel(leaf[step]) for leaf in episode.obs] + [episode.action[step]]).astype(np.float32)
+            assert np.array_equal(rows[t], row)
+            t += 1
+    assert t == 12
+    assert sorted(path.name for path in tmp_path.iterdir() if path.is_file()) == ["rows.npy"]
+
+
+def test_an_episode_that_would_double_the_steps_is_cut_and_marked_truncated(tmp_path: Path, root: Path) -> None:
+    run = a_run(tmp_path, EnvSpec("millrace-tests/Box-v0", {"endless": True}))
+    found = record(run, "tests/endless-v0", 7, seed=1)
+    assert (found.steps, found.episodes, found.cut) == (14, 1, 1)
+    assert "14 steps, 1 episodes, the last of them cut short, return" in str(found)
+    (episode,) = read("tests/endless-v0")
+    assert episode.truncations.tolist() == [False] * 13 + [True]
+    assert not episode.terminations.any()
+    assert len(episode.observations["step"]) == 15
+
+
+# ------------------------------------------------------------------------------------------------------ what goes wrong
+
+
+def everything(root: Path) -> set[str]:
+    return {str(path.relative_to(root)) for path in root.rglob("*")} if root.exists() else set()
+
+
+def fails(run: Path, dataset_id: str, kind: type[OurError], says: str, npy: Path | None = None) -> OurError:
+    with pytest.raises(kind, match=says) as caught:
+        record(run, dataset_id, 40, seed=1, npy=npy)
+    assert "\n" not in str(caught.value)
+    return caught.value
+
+
+def test_nothing_is_left_of_a_dataset_whose_environment_raises(
+    tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dataset_module, "CHUNK_BYTES", 1)  # some episodes are written by then
+    run = a_run(tmp_path, EnvSpec("millrace-tests/Box-v0", {"fails_at": 20}))
+    error = fails(
+        run, "new/deep/box-v0", EnvironmentFailed, "Box-v0 raised while it was played: RuntimeError: the spring broke"
+    )
+    assert "in step" in error.detail
+    assert everything(root) == set()
+
+
+def test_a_namespace_with_another_dataset_in_it_stays(tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    good = a_run(tmp_path, EnvSpec("millrace-tests/Box-v0"))
+    record(good, "ours/good-v0", 5, seed=1)
+    before = everything(root)
+    bad = a_run(tmp_path / "bad", EnvSpec("millrace-tests/Box-v0", {"fails_at": 2}))
+    fails(bad, "ours/deeper/bad-v0", EnvironmentFailed, "the spring broke")
+    assert everything(root) == before
+    fails(good, "ours/good-v0", UsageError, "dataset ours/good-v0 is there already, at .*; choose another name or version")
+    assert everything(root) == before
+
+
+def test_what_minari_leaves_when_it_fails_is_removed(tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from minari.dataset.minari_storage import MinariStorage
+
+    def full(*_: Any, **__: Any) -> None:
+        assert "ns/box-v0/data" in everything(root)
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(MinariStorage, "new", full)
+    run = a_run(tmp_path, EnvSpec("millrace-tests/Box-v0"))
+    says = "dataset ns/box-v0 was not written: OSError: .*No space left on device"
+    fails(run, "ns/box-v0", RunError, says, npy=tmp_path / "rows.npy")
+    assert everything(root) == set()
+    assert not [path for path in tmp_path.iterdir() if path.is_file()]
+
+
+@pytest.mark.parametrize("dataset_id", ["box", "../box-v0", "/abs/box-v0", "two words-v0", ""])
+def test_a_dataset_needs_a_name_that_minari_takes(tmp_path: Path, root: Path, dataset_id: str) -> None:
+    run = a_run(tmp_path, EnvSpec("millrace-tests/Box-v0"))
+    fails(run, dataset_id, UsageError, "expected names of two letters or more and a version, as in cartpole/expert-v0")
+    assert everything(root) == set()
+
+
+def test_what_cannot_be_kept_is_said_before_a_step_is_made(
+    tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = a_run(tmp_path, EnvSpec("millrace-tests/Box-v0"))
+    fails(run, "ns/box-v0", UsageError, "cannot be written: no such folder", npy=tmp_path / "no" / "rows.npy")
+    slashed = a_run(tmp_path / "slashed", EnvSpec("millrace-tests/Box-v0", {"key": "a/b"}))
+    fails(slashed, "ns/box-v0", UsageError, "Minari cannot keep an observation whose key has a slash, a/b")
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    fails(run, "ns/box-v0", UsageError, r"recording needs minari, which is an extra; pip install 'millrace\[record\]'")
+    assert everything(root) == set()
+
+
+def test_minaris_own_warnings_stay_its_own(tmp_path: Path, root: Path) -> None:
+    run = a_run(tmp_path, EnvSpec("CartPole-v1"))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        record(run, "tests/quiet-v0", 10, seed=1)
+    assert not caught

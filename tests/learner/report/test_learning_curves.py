@@ -1,0 +1,86 @@
+"""Learning curves: what is drawn is what was measured."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from learner.config.config import resolve
+from learner.report.learning_curves import Curve, common_grid, plot, read_curve
+from learner.run_folder.metrics import MetricsLog, Progress
+from learner.run_folder.run_folder import RunFolder
+from protocol.errors import RunError, UsageError
+
+Floats = np.ndarray[Any, Any]
+
+
+def a_run(folder: Path, env: str = "CartPole-v1", seed: int = 1, length: int = 20) -> Path:
+    run = RunFolder.create(resolve(env, run_dir=str(folder), seed=seed)).path
+    log = MetricsLog(run)
+    for i in range(1, length + 1):
+        log.write(Progress(env_steps=100 * i, return_mean=None if i == 1 else 5.0 * i + seed), {})
+    log.close()
+    return run
+
+
+def test_a_curve_is_what_the_run_measured(tmp_path: Path) -> None:
+    curve = read_curve(a_run(tmp_path, seed=3, length=4))
+    assert (curve.env, curve.algo, curve.seed) == ("CartPole-v1", "ppo", 3)
+    assert curve.env_steps.tolist() == [200, 300, 400]  # no episode had ended at 100
+    assert curve.returns.tolist() == [13.0, 18.0, 23.0]
+
+
+def test_seeds_meet_on_a_grid_that_all_of_them_cover() -> None:
+    line = np.arange(0.0, 1100.0, 100.0)
+    long = Curve("e", "a", 1, line, 2 * line)
+    short = Curve("e", "a", 2, line[2:7] + 50, 4 * (line[2:7] + 50))
+    grid, returns = common_grid([long, short])
+    assert (grid[0], grid[-1]) == (250, 650)
+    np.testing.assert_allclose(returns, [2 * grid, 4 * grid])
+
+
+def pixels(path: Path) -> Floats:
+    from matplotlib.image import imread
+
+    image: Floats = imread(path)
+    return image
+
+
+def share_of(image: Floats, rgb: tuple[float, float, float]) -> float:
+    return float((np.abs(image[..., :3] - rgb).max(-1) < 0.1).mean())
+
+
+BLUE, WHITE = (0.0, 0.447, 0.698), (1.0, 1.0, 1.0)
+
+
+def test_the_picture_shows_curves(tmp_path: Path) -> None:
+    runs = [a_run(tmp_path, seed=seed) for seed in (1, 2, 3)]
+    out = plot(runs, tmp_path / "curves.png")
+    image = pixels(out)
+    assert image.shape[:2] == (630, 960)  # 6.4 x 4.2 inches at 150 dpi
+    assert 0.5 < share_of(image, WHITE) < 0.99
+    assert share_of(image, BLUE) > 0.002
+    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["curves.png"]
+
+
+def test_each_environment_has_a_panel_of_its_own(tmp_path: Path) -> None:
+    runs = [a_run(tmp_path, env) for env in ("CartPole-v1", "Pendulum-v1", "Acrobot-v1", "MountainCar-v0")]
+    image = pixels(plot(runs, tmp_path / "curves.png"))
+    assert image.shape[:2] == (2 * 630, 3 * 960)
+    top, bottom = image[:630], image[630:]
+    for column in range(3):
+        assert share_of(top[:, 960 * column : 960 * (column + 1)], BLUE) > 0.001
+    assert share_of(bottom[:, :960], BLUE) > 0.001
+    assert share_of(bottom[:, 960:], WHITE) == 1.0  # no empty axes
+
+
+def test_what_cannot_be_plotted_is_said_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="expected a run folder to plot, got no such folder"):
+        read_curve(tmp_path / "nowhere")
+    with pytest.raises(UsageError, match=r"expected a run folder to plot, got no config\.toml"):
+        read_curve(tmp_path)
+    with pytest.raises(UsageError, match="nothing to plot, no episode has ended yet"):
+        read_curve(a_run(tmp_path, length=1))
+    with pytest.raises(RunError, match="not written: No such file or directory"):
+        plot([a_run(tmp_path, seed=2)], tmp_path / "nowhere" / "curves.png")

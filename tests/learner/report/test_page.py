@@ -1,0 +1,285 @@
+"""The report: one file that needs nothing else, and tells what the run folders tell."""
+
+import html
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tomli_w
+
+from learner.config.config import resolve
+from learner.report import sections
+from learner.report.charts import MINUS, Trace, chart, engineering, ticks
+from learner.report.html_parts import time_text
+from learner.report.page import page, write_page
+from learner.report.runs import Told, group, read_run
+from learner.run_folder.metrics import Evaluation, MetricsLog, Progress
+from learner.run_folder.run_folder import RunFolder, Summary
+from protocol.errors import RunError, UsageError
+
+ROOT = Path(__file__).parents[3]
+LEDGER = {"issued": 30, "used": 20, "outstanding": 4, "stale": 5, "lost": 1, "transitions_received": 900,
+          "transitions_used": 800, "transitions_waiting": 50, "transitions_stale": 50, "messages_bad": 0}  # fmt: skip
+STAGES = {"learner_wait": 1.0, "learner_update": 3.0, "worker_step": 2.0, "worker_wait": 2.0}
+
+
+def a_run(
+    folder: Path, env: str = "CartPole-v1", seed: int = 1, finished: bool = True, length: int = 20, **settings: Any
+) -> Path:
+    """A run folder; `ledger` among the keywords is what the metrics and the summary tell of it, others are settings."""
+    ledger = settings.pop("ledger", LEDGER)
+    run = RunFolder.create(resolve(env, run_dir=str(folder), seed=seed, **settings))
+    log = MetricsLog(run.path)
+    for i in range(1, length + 1):
+        mean = None if i == 1 else 5.0 * i + seed
+        log.write(
+            Progress(env_steps=100 * i, updates=i, wall_s=2.0 * i, return_mean=mean, ledger=ledger, stages=STAGES),
+            {"eval/mean_reward": 77.0} if i == 10 else {},
+        )
+    log.close()
+    if finished:
+        evaluation = Evaluation(episodes=100, return_mean=-1234.56 + seed, return_std=7.5, length_mean=9.0)
+        run.write_summary(
+            Summary(
+                env=env, algo="ppo", seed=seed, env_steps=123_456, updates=789, wall_s=61.0, env_steps_per_s=4321.0,
+                stop_reason="all steps done", return_mean_100=99.5, evaluation=evaluation, ledger=ledger, stages=STAGES,
+            )
+        )  # fmt: skip
+    return run.path
+
+
+class Reader(HTMLParser):
+    """Tags that are opened and closed as they should be, the text between them, and every attribute."""
+
+    VOID = {"meta", "br", "line", "circle"}
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[str] = []
+        self.attributes: list[tuple[str, str]] = []
+        self.said: list[str] = []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.attributes += [(name, value or "") for name, value in attrs]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if "style" not in self.open:
+            self.said.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.said).split())
+
+
+def told(*runs: Path) -> Told:
+    return group([read_run(run) for run in runs])
+
+
+def text_of(section: str) -> str:
+    return Reader(section).text
+
+
+def test_the_page_is_one_file_that_asks_for_nothing(tmp_path: Path) -> None:
+    runs = [a_run(tmp_path, seed=seed) for seed in (1, 2)] + [a_run(tmp_path, "Pendulum-v1")]
+    (runs[0] / "videos").mkdir()
+    (runs[0] / "videos" / "a.mp4").write_bytes(b"film")
+    out = write_page(runs, tmp_path / "report.html")
+    text = out.read_text()
+    found = Reader(text)
+    assert text.startswith("<!doctype html>")
+    assert "script" not in found.tags
+    assert "link" not in found.tags
+    assert not re.search(r"https?:|//[a-z]|@import|url\(", text)
+    sources = [value for name, value in found.attributes if name in ("src", "href", "srcset", "data", "poster")]
+    assert sources == ["data:video/mp4;base64,ZmlsbQ=="]
+    assert "default-src 'none'; style-src 'unsafe-inline'; img-src data:; media-src data:" in [
+        value for _, value in found.attributes
+    ]
+    assert "prefers-color-scheme: dark" in text
+    assert page(runs) == text
+    assert sorted(path.name for path in tmp_path.iterdir() if path.is_file()) == ["report.html"]
+
+
+def test_text_from_a_run_is_text_and_not_markup(tmp_path: Path) -> None:
+    nasty = "<script>alert(1)</script>\"'&"
+    run = a_run(tmp_path, finished=False)
+    config = tomllib.loads((run / "config.toml").read_text()) | {"env": nasty}
+    (run / "config.toml").write_text(tomli_w.dumps(config))
+    text = page([run])
+    assert "script" not in Reader(text).tags
+    assert html.escape(nasty) in text
+    assert read_run(run).env == nasty
+
+
+def test_each_run_has_its_headline(tmp_path: Path) -> None:
+    said = text_of(sections.headlines(told(a_run(tmp_path, seed=1), a_run(tmp_path, seed=3))))
+    assert "CartPole-v1 PPO greedy −1,232.6 on average, −1,233.6 to −1,231.6" in said
+    assert "seed 1 −1,233.6 ± 7.5, 100 episodes 99.5 123,456 4,321 61.0 s 789 all steps done" in said
+    assert said.index("seed 1") < said.index("seed 3")
+
+
+def test_a_run_that_goes_on_is_told_as_far_as_it_got(tmp_path: Path) -> None:
+    run = a_run(tmp_path, finished=False)
+    assert "seed 1 – not evaluated 101.0 2,000 50 40.0 s 20 not finished" in text_of(sections.headlines(told(run)))
+    assert "30 = 20 + 4 + 5 + 1 balances" in Reader(page([run])).text
+    new = a_run(tmp_path, seed=2, finished=False, length=1)
+    text = Reader(page([new])).text
+    assert "PPO: no episode has ended yet" in text
+    (new / "metrics.jsonl").write_text("")
+    assert "Tickets issued used outstanding stale lost seed 2 not known" in Reader(page([new])).text
+
+
+def test_the_ledger_balances_or_says_by_how_much_it_does_not(tmp_path: Path) -> None:
+    good = a_run(tmp_path)
+    bad = a_run(tmp_path, seed=2, ledger={**LEDGER, "used": 13, "transitions_stale": 5000, "messages_bad": 3})
+    text = Reader(page([good, bad])).text
+    assert "seed 1 30 = 20 + 4 + 5 + 1 balances" in text
+    assert "seed 2 30 = 13 + 4 + 5 + 1 off by 7" in text
+    assert "seed 1 900 = 800 + 50 + 50 + 0 + 0 + 0 balances" in text
+    assert "seed 2 900 = 800 + 50 + 5,000 + 0 + 0 + 0 off by −4,950" in text
+    assert "3 messages could not be read." in text
+
+
+def test_settings_that_differ_come_first_and_the_rest_is_folded(tmp_path: Path) -> None:
+    runs = [a_run(tmp_path, seed=seed) for seed in (1, 2)] + [a_run(tmp_path, seed=3, gamma=0.5, env_kwargs={"g": 1.5})]
+    differing, _, folded = sections.settings(told(*runs)).partition("<details>")
+    said = re.sub(r"<[^>]+>", " ", differing)
+    assert " ".join(said.split()) == (
+        "Settings What differs CartPole-v1 PPO A CartPole-v1 PPO B seed 1, 2 3 gamma 0.98 0.5 env_kwargs.g – 1.5"
+    )
+    assert "<dt>gae_lambda</dt><dd>0.8</dd>" in folded
+    assert "<dt>gamma</dt>" not in folded
+    assert f"{folded.count('<dt>')} settings are the same in all runs" in folded
+    alone = sections.settings(told(runs[0]))
+    assert "<table" not in alone
+    assert "<dt>gamma</dt><dd>0.98</dd>" in alone
+
+
+def test_runs_that_differ_in_their_seeds_alone_are_one_line(tmp_path: Path) -> None:
+    found = told(
+        a_run(tmp_path, seed=2),
+        a_run(tmp_path, "Pendulum-v1", seed=1),
+        a_run(tmp_path / "elsewhere", seed=1),
+        a_run(tmp_path, seed=4, gamma=0.5, n_epochs=3, clip_range=0.3, learning_rate=0.5, workers=1),
+    )
+    assert [(line.env, line.name, [run.seed for run in line.runs]) for line in found.lines] == [
+        ("CartPole-v1", "PPO A", [1, 2]),
+        ("CartPole-v1", "PPO B", [4]),
+        ("Pendulum-v1", "PPO", [1]),
+    ]
+    assert found.lines[2].differs == ""
+    assert found.lines[1].differs.endswith(", 2 more")
+    assert "workers" not in found.lines[1].differs  # the algorithm's own say more
+    assert found.short_names() == [
+        "CartPole-v1, PPO A, seed 1", "CartPole-v1, PPO A, seed 2", "CartPole-v1, PPO B, seed 4", "Pendulum-v1, seed 1",
+    ]  # fmt: skip
+    (first,) = {line.env: line.runs[0].path for line in found.lines if line.env == "Pendulum-v1"}.values()
+    twice = told(first, a_run(tmp_path / "again", "Pendulum-v1", seed=1))
+    assert twice.short_names() == ["seed 1 (1)", "seed 1 (2)"]
+    assert Reader(page([first, first])).text == Reader(page([first])).text
+
+
+def test_curves_are_a_line_each_with_a_mean_and_a_band_and_dots_for_evaluations(tmp_path: Path) -> None:
+    drawn = sections.curves(told(*[a_run(tmp_path, seed=seed) for seed in (1, 2, 3)]))
+    assert [drawn.count(f'class="{kind} c0"') for kind in ("thin", "line", "band", "dots")] == [3, 1, 1, 3]
+    assert "PPO, 3 seeds" in drawn
+    assert "PPO, seed 2: 102.0 at 2,000 env steps" in drawn
+    alone = sections.curves(told(a_run(tmp_path, seed=4)))
+    assert [alone.count(f'class="{kind} c0"') for kind in ("thin", "line", "band")] == [0, 1, 0]
+
+
+def test_a_curve_is_drawn_where_it_was_measured() -> None:
+    x, y = np.array([0.0, 50.0, 100.0]), np.array([-10.0, 0.0, 10.0])
+    drawn = chart([Trace("line", 2, x, y)], 200, 100, "env steps", "a & b")
+    assert 'aria-label="a &amp; b"' in drawn
+    (path,) = re.findall(r'<path class="line c2" d="M([^"]*)"', drawn)
+    points = np.array([point.split() for point in path.split("L")], float)
+    assert points[[0, -1], 0].tolist() == [52.0, 186.0]  # from the axis to the right margin
+    assert points[1, 1] == pytest.approx(points[[0, 2], 1].mean(), abs=0.1)
+    assert points[0, 1] > points[2, 1]
+    assert f">{MINUS}10</text>" in drawn
+    long = np.arange(10_000.0)
+    (path,) = re.findall(r' d="([^"]*)"', chart([Trace("line", 0, long, long)], 200, 100, "", ""))
+    assert 400 < path.count("L") <= 501
+    assert path.endswith(path.split("L")[-1])
+    assert path.split("L")[-1].split()[0] == "186.0"  # the last point is among them
+
+
+def test_ticks_are_round_and_within() -> None:
+    assert ticks(0, 100_000, 5) == [0, 20_000, 40_000, 60_000, 80_000, 100_000]
+    assert ticks(-1290, -140, 5) == [-1200, -1000, -800, -600, -400, -200]
+    assert ticks(0.1, 0.9, 4) == pytest.approx([0.2, 0.4, 0.6, 0.8])
+    assert ticks(3, 3, 5) == [3]
+    assert [engineering(x) for x in (0, 0.25, 500, 2e4, -1200, 1.5e6)] == ["0", "0.25", "500", "20k", f"{MINUS}1.2k", "1.5M"]
+    assert [time_text(s) for s in (0.04, 99.96, 119.8, 3599.0, 7260.0)] == [
+        "0.0 s", "100.0 s", "2 min 0 s", "59 min 59 s", "2 h 1 min",
+    ]  # fmt: skip
+
+
+def test_stages_are_shares_of_a_bar(tmp_path: Path) -> None:
+    text = page([a_run(tmp_path)])
+    assert re.search(r'class="b0" style="width:75.00%" title="update: 3.0 s, 75.0 %">75 %<', text)
+    assert re.search(r'class="wait" style="width:25.00%" title="wait: 1.0 s, 25.0 %">25 %<', text)
+
+
+def test_the_newest_film_is_on_the_page_if_it_is_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = a_run(tmp_path)
+    assert sections.films(told(run)) == ""
+    (run / "videos").mkdir()
+    for age, name in ((200, "b.mp4"), (100, "a.mp4"), (300, "c.mp4")):
+        (run / "videos" / name).write_bytes(name.encode())
+        os.utime(run / "videos" / name, (10_000 - age, 10_000 - age))
+    shown = sections.films(told(run))
+    assert "base64,YS5tcDQ=" in shown
+    assert shown.count("<video") == 1
+    monkeypatch.setattr(sections, "FILM_BYTES", 3)
+    assert "<video" not in sections.films(told(run))
+    assert "too large for this page" in sections.films(told(run))
+
+
+def test_what_cannot_be_reported_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="expected a run folder to report on, got no such folder"):
+        page([tmp_path / "nowhere"])
+    with pytest.raises(UsageError, match=r"expected a run folder to report on, got no config\.toml"):
+        page([tmp_path])
+    run = a_run(tmp_path)
+    with pytest.raises(RunError, match="not written: No such file or directory"):
+        write_page([run], tmp_path / "no" / "report.html")
+    with pytest.raises(UsageError, match=r"is a folder; expected the file to write"):
+        write_page([run], tmp_path)
+    (run / "metrics.jsonl").write_text("not json\n")
+    with pytest.raises(UsageError, match="cannot be reported on"):
+        page([run])
+    (run / "config.toml").write_text("env = ")
+    with pytest.raises(UsageError, match="cannot be reported on"):
+        page([run])
+
+
+@pytest.mark.parametrize(
+    "module", ["learner.report.page", "learner.recording.record", "learner.recording.video", "learner.recording.episodes"]
+)
+def test_the_report_and_the_recorder_start_quickly(module: str) -> None:
+    heavy = {"torch", "matplotlib", "tensorboard", "minari", "h5py", "moviepy", "pygame"}
+    asks = f"import sys, {module}; assert not sys.modules.keys() & {heavy}, sys.modules.keys() & {heavy}"
+    done = subprocess.run([sys.executable, "-c", asks], cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr

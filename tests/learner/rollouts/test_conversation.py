@@ -1,0 +1,61 @@
+"""The two pure halves talk over a hostile network, thousands of times, and every rule holds after every event."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from tests.support.fake_ends import Faults, World
+
+BLOCKS, CASES = 8, 250
+
+
+def case(seed: int) -> World:
+    """A world drawn at random: every fault, any number of workers, synchronous or not."""
+    draw = random.Random(seed)
+    lanes = draw.randint(1, 5)
+    until_s = draw.uniform(3, 15)
+    faults = Faults(
+        loss=draw.choice([0.0, 0.0, 0.05, 0.3]),
+        repeat=draw.choice([0.0, 0.2]),
+        delay_s=draw.choice([0.01, 0.1, 0.8]),
+        spoiled=draw.choice([0.0, 0.0, 0.05]),
+        deaths=draw.randint(0, 4),
+        freezes=draw.randint(0, 3),
+        late_joiners=draw.randint(0, 2),
+        leaves=draw.randint(0, 1),
+        learner_restarts=draw.choice([0, 0, 1, 2]),
+        until_s=until_s,
+    )
+    per_update = lanes if draw.random() < 0.7 else draw.randint(1, lanes)
+    return World(
+        seed, faults, workers=draw.randint(1, 4), lanes=lanes, max_lag=draw.choice([0, 0, 1, 4]), per_update=per_update
+    )
+
+
+@pytest.mark.parametrize("block", range(BLOCKS))
+def test_every_rule_holds_over_a_hostile_network(block: int) -> None:
+    for seed in range(block * CASES, (block + 1) * CASES):
+        world = case(seed)
+        try:
+            world.play(updates=12)
+        except Exception as error:
+            raise AssertionError(f"case {seed} at {world.now:.3f} s: {error!r}") from error
+
+
+def test_without_faults_nothing_is_lost_or_said_twice() -> None:
+    world = World(1, Faults(until_s=0.0), workers=2, lanes=4, max_lag=0, per_update=4)
+    world.play(updates=200)
+    counts = world.roster.ledger.counts()
+    assert counts["lost"] == counts["stale"] == counts["transitions_duplicate"] == counts["transitions_late"] == 0
+    assert counts["used"] == 4 * 200
+
+
+def test_lost_messages_cost_no_transition() -> None:
+    """Loss alone, without a death: every rollout is said again until it arrives."""
+    world = World(5, Faults(loss=0.05, until_s=0.0), workers=2, lanes=4, max_lag=1, per_update=4)
+    world.roster.worker_timeout_s = 1e9
+    world.play(updates=100, limit_s=4000.0)
+    assert world.roster.ledger.lost == 0
+    assert world.roster.ledger.used == 4 * 100

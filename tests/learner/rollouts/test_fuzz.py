@@ -1,0 +1,41 @@
+"""Hostile messages against the codec: one kind of error, and memory stays flat."""
+
+from __future__ import annotations
+
+from itertools import islice
+
+import psutil
+
+from protocol.errors import BadMessage
+from protocol.wire.codec import decode_to_learner
+from tests.support.fake_ends import fake_rollout
+from tests.support.hostile_messages import Frames, hostile, real
+
+MESSAGES = 100_000
+ROOM = 100_000
+GROWTH_MB = 20
+
+
+def _refusal(frames: Frames) -> str | None:
+    """What is said of these frames; None if they are a message. Whatever else is raised fails the test."""
+    try:
+        decode_to_learner(frames, ROOM)
+    except BadMessage as error:
+        return str(error)
+    return None
+
+
+def test_a_hundred_thousand_hostile_messages_raise_one_error_and_leave_no_memory_behind() -> None:
+    process = psutil.Process()
+    refused = understood = 0
+    before_mb = 0.0
+    for number, frames in enumerate(islice(hostile(1, real(fake_rollout(7, 0, 1, 0, 0))), MESSAGES)):
+        if number == MESSAGES // 10:  # what is used once is there
+            before_mb = process.memory_info().rss / 2**20
+        says = _refusal(frames)
+        assert says is None or ("\n" not in says and len(says) < 1_000)
+        refused += says is not None
+        understood += says is None
+    assert refused > 0.6 * MESSAGES
+    assert understood > 0.05 * MESSAGES  # those of other sessions: the roster's to judge
+    assert process.memory_info().rss / 2**20 - before_mb < GROWTH_MB

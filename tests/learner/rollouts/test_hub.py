@@ -1,0 +1,159 @@
+"""The shell round the roster, over a link and a clock that are not real: when silence counts, and what is sent."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from typing import cast
+
+import numpy as np
+import pytest
+
+from learner.rollouts.hub import AWAY_S, POLL_S, PULSE_S, Hub
+from learner.rollouts.roster import Roster
+from protocol.errors import RunError
+from protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello, ToLearner, Weights
+from protocol.rollout import rollout_bytes
+from protocol.wire.codec import Buffer, decode_to_worker
+from protocol.wire.link import LearnerLink
+from protocol.wire.weight_dtypes import WeightsDtype, widened
+from tests.support.fake_ends import run_spec
+
+WORKER_TIMEOUT_S = 3.0
+
+
+class FakeLink:
+    """Holds what workers have said until it is asked for; waiting takes time."""
+
+    address, keyring = "fake", None
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        self.room = 0
+        self.sent: list[Sequence[Buffer]] = []
+        self.inbox: list[tuple[bytes, ToLearner]] = []
+
+    def poll(self, timeout_s: float) -> bool:
+        if not self.inbox:
+            self.now += timeout_s
+        return bool(self.inbox)
+
+    def receive(self) -> Iterator[tuple[bytes, ToLearner]]:
+        while self.inbox:
+            yield self.inbox.pop(0)
+
+    def send(self, peer: bytes, frames: Sequence[Buffer]) -> bool:
+        self.sent.append(frames)
+        return True
+
+    def why_not(self, peer: bytes) -> str:
+        return ""
+
+
+def hub_with_a_worker(weights_dtype: WeightsDtype = "float32") -> tuple[FakeLink, Hub, Heartbeat]:
+    link = FakeLink()
+    roster = Roster(run_spec(lanes=1), rollouts_per_update=1, max_lag=0, worker_timeout_s=WORKER_TIMEOUT_S, first_session=1)
+    hub = Hub(
+        cast(LearnerLink, link),
+        roster,
+        no_workers_timeout_s=60.0,
+        stall_timeout_s=600.0,
+        max_env_failures=0,
+        weights_dtype=weights_dtype,
+        clock=lambda: link.now,
+    )
+    link.inbox.append((b"w0", Hello(PROTOCOL_VERSION, "w0", "host", 1, 1, "fake", 1)))
+    hub.wait_for(1)
+    return link, hub, Heartbeat(1, 0, -1, (), 0, {}, 0)
+
+
+def listen(hub: Hub, link: FakeLink, seconds: float) -> None:
+    until_s = link.now + seconds
+    while link.now < until_s:
+        hub.pulse()
+        link.now += POLL_S
+
+
+def test_a_message_may_unpack_to_a_rollout_of_the_run_and_no_more() -> None:
+    link, hub, _ = hub_with_a_worker()
+    assert link.room == rollout_bytes(hub.roster.run) > 0
+
+
+@pytest.mark.parametrize(("dtype", "sent"), [("float32", "<f4"), ("bfloat16", "<u2"), ("float16", "<f2")])
+def test_weights_are_rounded_and_encoded_once_for_all_workers(dtype: WeightsDtype, sent: str) -> None:
+    link, hub, _ = hub_with_a_worker(dtype)
+    link.inbox.append((b"w1", Hello(PROTOCOL_VERSION, "w1", "host", 2, 2, "fake", 1)))
+    hub.wait_for(2)
+    parameters = np.array([1.00001, -2.0], np.float32)
+    link.sent.clear()
+    hub.publish(0, parameters, np.zeros(0, np.float32))
+    first, second = (frames for frames in link.sent if len(frames) > 1)
+    assert first is second
+    weights = decode_to_worker(first)
+    assert isinstance(weights, Weights)
+    assert weights.parameters.dtype.str == sent
+    assert (
+        widened(weights.parameters).tobytes() == (parameters if sent == "<f4" else np.array([1, -2], np.float32)).tobytes()
+    )
+
+
+def test_weights_that_do_not_fit_are_not_published() -> None:
+    link, hub, _ = hub_with_a_worker("float16")
+    link.sent.clear()
+    with pytest.raises(RunError, match="weights_dtype float16: parameter 1 expected less than 65520"):
+        hub.publish(0, np.array([1, -70_000], np.float32), np.zeros(0, np.float32))
+    assert (hub.roster.version, link.sent) == (-1, [])
+
+
+def test_a_silent_worker_is_given_up_while_the_learner_listens() -> None:
+    link, hub, _ = hub_with_a_worker()
+    listen(hub, link, WORKER_TIMEOUT_S - 2 * POLL_S)
+    assert hub.roster.members
+    listen(hub, link, 4 * POLL_S)
+    assert not hub.roster.members
+
+
+def test_a_learner_that_was_stopped_listens_before_it_judges() -> None:
+    """Its inbox is empty when it wakes, because what fills it was stopped too."""
+    link, hub, heartbeat = hub_with_a_worker()
+    link.now += 2 * WORKER_TIMEOUT_S
+    hub.pulse()
+    assert hub.roster.members, "the worker was given up before what it had said could arrive"
+    link.inbox.append((b"w0", heartbeat))
+    listen(hub, link, 2 * AWAY_S)
+    assert hub.roster.members
+
+
+def test_a_learner_that_was_stopped_judges_after_a_while() -> None:
+    link, hub, _ = hub_with_a_worker()
+    link.now += 2 * WORKER_TIMEOUT_S
+    listen(hub, link, AWAY_S + 2 * POLL_S)
+    assert not hub.roster.members
+
+
+def test_a_flood_of_an_ended_session_is_one_line(caplog: pytest.LogCaptureFixture) -> None:
+    """As after a restart of the learner, from every worker that went on saying Heartbeat."""
+    link, hub, _ = hub_with_a_worker()
+    caplog.set_level(logging.INFO)
+    link.inbox += [(b"w1", Heartbeat(7, number, -1, (), 0, {}, 0)) for number in range(100)]
+    link.now += PULSE_S
+    hub.pulse()
+    assert [record.getMessage() for record in caplog.records] == ["worker w1 was told to join again: its session had ended"]
+    link.now += 100
+    link.inbox.append((b"w1", Heartbeat(7, 100, -1, (), 0, {}, 0)))
+    hub.pulse()
+    assert caplog.records[-1].getMessage().endswith("had ended (99 more like this since the last line)")
+
+
+def test_between_short_minibatches_it_listens_now_and_then() -> None:
+    link, hub, heartbeat = hub_with_a_worker()
+    link.now += PULSE_S
+    hub.pulse()
+    link.inbox.append((b"w0", heartbeat))
+    for _ in range(8):
+        link.now += PULSE_S / 10
+        hub.pulse()
+    assert link.inbox, "it listened as often as it was asked"
+    link.now += PULSE_S / 2
+    hub.pulse()
+    assert not link.inbox

@@ -1,0 +1,1007 @@
+"""Each rule of the learner's half of the conversation, by name. Pure: the test is the workers, time is a number."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+import msgspec
+import numpy as np
+import pytest
+
+from learner.members.events import Broke, Joined, Left, Turned
+from learner.members.states import TABLE, Rubbish, Silence, Standing
+from learner.rollouts.ledger import Ledger
+from learner.rollouts.roster import STRIKES, Out, Roster
+from protocol.messages import (
+    PROTOCOL_VERSION,
+    Collect,
+    Drain,
+    Failure,
+    Goodbye,
+    Heartbeat,
+    HeartbeatReply,
+    Hello,
+    LaneLife,
+    Permit,
+    Received,
+    Refuse,
+    Rejoin,
+    Release,
+    Returned,
+    Rollout,
+    Stepped,
+    ToLearner,
+    Weights,
+    Welcome,
+)
+from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollout, run_spec
+
+M = TypeVar("M")
+A, B, C = b"a", b"b", b"c"
+TIMEOUT_S = 5.0
+
+
+class Learner:
+    """A roster, and shorthand for what workers say to it. Every call checks that the ledger balances."""
+
+    def __init__(
+        self,
+        lanes: int = 2,
+        max_lag: int = 0,
+        per_update: int | None = None,
+        ledger: Ledger | None = None,
+        incarnations: Sequence[int] = (),
+        publish: bool = True,
+    ) -> None:
+        self.roster = Roster(
+            run_spec(lanes),
+            rollouts_per_update=lanes if per_update is None else per_update,
+            max_lag=max_lag,
+            worker_timeout_s=TIMEOUT_S,
+            first_session=100,
+            ledger=ledger,
+            incarnations=incarnations,
+        )
+        self.now = 0.0
+        if publish:
+            self.publish(0)
+
+    def publish(self, version: int) -> list[Out]:
+        return self.balanced(self.roster.publish(version, PARAMETERS, BUFFERS))
+
+    def says(self, peer: bytes, message: ToLearner) -> list[Out]:
+        return self.balanced(self.roster.receive(peer, message, self.now))
+
+    def joins(self, peer: bytes, *, pid: int = 1, attempt: int = 1, host: str = "host") -> list[Out]:
+        return self.says(peer, Hello(PROTOCOL_VERSION, peer.decode(), host, pid, 1000 * len(host) + pid, "fake", attempt))
+
+    def session(self, peer: bytes) -> int:
+        return self.roster.members[peer].session
+
+    def tickets(self, peer: bytes | None = None) -> list[int]:
+        """Numbers of the tickets that are with this worker, or with any."""
+        return sorted(number for number, ticket in self.roster.tickets.items() if peer in (None, ticket.peer))
+
+    def rollout_of(self, number: int, sequence: int | None = None, version: int | None = None) -> Rollout:
+        """The rollout of an outstanding ticket, as its worker would send it."""
+        ticket = self.roster.tickets[number]
+        lane = self.roster.lanes[ticket.lane]
+        expected = lane.below + sorted(lane.outstanding).index(number)
+        return fake_rollout(
+            self.session(ticket.peer),
+            ticket.lane,
+            number,
+            ticket.version if version is None else version,
+            expected if sequence is None else sequence,
+        )
+
+    def delivers(self, number: int) -> list[Out]:
+        return self.says(self.roster.tickets[number].peer, self.rollout_of(number))
+
+    def deliver_all(self) -> None:
+        for number in self.tickets():
+            self.delivers(number)
+
+    def beats(
+        self, peer: bytes, *, version: int = 0, tickets: Sequence[int] | None = None, replies: int | None = None
+    ) -> list[Out]:
+        """A Heartbeat: by default of a worker that lost nothing."""
+        held = self.tickets(peer) if tickets is None else tickets
+        seen = self.roster.members[peer].replies if replies is None else replies
+        return self.says(peer, Heartbeat(self.session(peer), seen, version, tuple(held), 0, {}, 0))
+
+    def take(self) -> list[Rollout]:
+        taken = self.roster.take()
+        assert taken is not None
+        self.balanced([])
+        return taken
+
+    def update(self) -> list[Rollout]:
+        """A whole synchronous update: everything delivered, taken, published."""
+        self.deliver_all()
+        taken = self.take()
+        self.publish(self.roster.version + 1)
+        return taken
+
+    def balanced(self, outs: list[Out]) -> list[Out]:
+        roster, ledger = self.roster, self.roster.ledger
+        in_flight = len(roster.tickets) + len(roster.ready)
+        assert ledger.issued == ledger.used + ledger.stale + ledger.lost + in_flight
+        assert ledger.transitions_waiting == len(roster.ready)  # a fake rollout is one transition
+        return outs
+
+
+def of(outs: Sequence[Out], kind: type[M], peer: bytes | None = None) -> list[M]:
+    """The messages of this kind, to this worker or to any."""
+    return [message for to, message in outs if isinstance(message, kind) and peer in (None, to)]
+
+
+def permits(outs: Sequence[Out], peer: bytes | None = None) -> list[Permit]:
+    return [permit for collect in of(outs, Collect, peer) for permit in collect.permits]
+
+
+def kinds(outs: Sequence[Out], peer: bytes) -> list[type]:
+    return [type(message) for to, message in outs if to == peer]
+
+
+def lanes_of(learner: Learner, peer: bytes) -> set[int]:
+    return learner.roster.members[peer].lanes
+
+
+# -------------------------------------------------------------------- joining
+
+
+def test_hello_is_answered_by_welcome_weights_and_collect_in_this_order() -> None:
+    learner = Learner(lanes=2)
+    outs = learner.joins(A)
+    assert kinds(outs, A) == [Welcome, Weights, Collect]
+    assert of(outs, Welcome) == [Welcome(100, 1, learner.roster.run)]
+    assert learner.roster.events == [Joined("a", "host", 1)]
+
+
+def test_before_the_first_weights_a_worker_is_welcomed_and_given_nothing() -> None:
+    learner = Learner(publish=False)
+    assert kinds(learner.joins(A), A) == [Welcome]
+    assert learner.roster.ledger.issued == 0
+    assert kinds(learner.publish(0), A) == [Weights, Collect]
+
+
+def test_a_repeated_hello_is_answered_by_the_same_welcome() -> None:
+    learner = Learner()
+    first = of(learner.joins(A), Welcome)
+    again = learner.joins(A)
+    assert again == [(A, first[0])]
+    assert learner.roster.ledger.lost == 0
+
+
+def test_a_repeated_hello_is_a_sign_of_life() -> None:
+    learner = Learner()
+    learner.joins(A)
+    learner.now = TIMEOUT_S
+    learner.joins(A)
+    learner.roster.tick(TIMEOUT_S + 1)
+    assert A in learner.roster.members
+
+
+def test_a_later_attempt_of_the_same_process_begins_a_new_session() -> None:
+    learner = Learner(lanes=2)
+    learner.joins(A)
+    outs = learner.joins(A, attempt=2)
+    assert of(outs, Welcome) == [Welcome(101, 2, learner.roster.run)]
+    assert learner.roster.ledger.lost == 2
+    assert {permit.incarnation for permit in permits(outs)} == {1}
+
+
+def test_a_late_hello_of_an_earlier_attempt_is_ignored() -> None:
+    learner = Learner()
+    learner.joins(A, attempt=2)
+    assert learner.joins(A, attempt=1) == []
+    assert learner.session(A) == 100
+
+
+@pytest.mark.parametrize(("pid", "host"), [(2, "host"), (1, "elsewhere")])
+def test_the_same_name_from_another_process_replaces_the_old_one(pid: int, host: str) -> None:
+    learner = Learner(lanes=2)
+    learner.joins(A)
+    outs = learner.joins(A, pid=pid, host=host)
+    assert kinds(outs, A) == [Welcome, Weights, Collect]
+    assert learner.session(A) == 101
+    assert learner.roster.ledger.lost == 2
+    assert Left("a", f"replaced by process {pid}", 2, False) in learner.roster.events
+
+
+def test_the_one_that_was_replaced_is_told_why_when_it_comes_back() -> None:
+    """Two live processes under one name must not take it from each other for ever."""
+    learner = Learner(lanes=2)
+    learner.joins(A)
+    learner.joins(A, pid=2)
+    (refuse,) = of(learner.joins(A, pid=1, attempt=2), Refuse)
+    assert "give each worker a name of its own" in refuse.reason
+    assert learner.roster.members[A].hello.pid == 2
+
+
+def test_a_name_that_is_not_the_routing_id_is_refused() -> None:
+    learner = Learner()
+    (refuse,) = of(learner.says(A, Hello(PROTOCOL_VERSION, "b", "host", 1, 1001, "fake", 1)), Refuse)
+    assert "routing id" in refuse.reason
+    assert learner.roster.members == {}
+
+
+def test_another_protocol_is_refused_and_says_what_to_do() -> None:
+    learner = Learner()
+    outs = learner.says(A, Hello(PROTOCOL_VERSION + 1, "a", "host", 1, 1001, "fake", 1))
+    (refuse,) = of(outs, Refuse)
+    assert f"expected {PROTOCOL_VERSION}, got {PROTOCOL_VERSION + 1}" in refuse.reason
+    assert learner.roster.members == {}
+    assert isinstance(learner.roster.events[0], Turned)
+
+
+@pytest.mark.parametrize("known", [False, True], ids=["unknown worker", "earlier session"])
+def test_a_message_of_no_session_of_ours_is_answered_by_rejoin(known: bool) -> None:
+    learner = Learner()
+    if known:
+        learner.joins(A)
+    for message in (Heartbeat(5, 0, 0, (), 0, {}, 0), fake_rollout(5, 0, 0, 0, 0)):
+        assert learner.says(A, message) == [(A, Rejoin(5))]
+
+
+def test_a_last_word_of_no_session_of_ours_is_not_answered() -> None:
+    learner = Learner()
+    learner.joins(A)
+    assert learner.says(A, Goodbye(5, "bye", ())) == learner.says(A, Failure(5, "broke", "", None)) == []
+    assert A in learner.roster.members
+
+
+# -------------------------------------------------------------------- the ticket law
+
+
+@pytest.mark.parametrize("max_lag", [0, 1, 4])
+@pytest.mark.parametrize(("lanes", "per_update"), [(2, 2), (3, 1), (1, 3), (4, 3)])
+def test_tickets_are_dealt_while_used_and_outstanding_are_below_the_bound(max_lag: int, lanes: int, per_update: int) -> None:
+    """The law: used + outstanding < per_update * (version + 1 + max_lag). As many as it allows are dealt, never more."""
+    learner = Learner(lanes, max_lag, per_update)
+    learner.joins(A)
+    for version in range(1, 6):
+        ledger = learner.roster.ledger
+        assert ledger.used + ledger.outstanding == per_update * (version + max_lag)
+        while len(learner.roster.ready) < per_update:
+            learner.delivers(learner.tickets()[0])
+        assert ledger.used + ledger.outstanding == per_update * (version + max_lag)
+        learner.take()
+        assert learner.roster.deal() == []
+        learner.publish(version)
+
+
+def test_a_stale_drop_makes_room_for_a_fresh_ticket() -> None:
+    learner = Learner(lanes=2, max_lag=1, per_update=2)
+    learner.joins(A)
+    learner.delivers(1)
+    learner.publish(1)
+    learner.publish(2)  # ticket 1 was acted under version 0: staler than max_lag
+    issued = learner.roster.ledger.issued
+    assert learner.roster.take() is None
+    outs = learner.balanced(learner.roster.deal())
+    assert learner.roster.ledger.stale == 1
+    assert learner.roster.ledger.transitions_stale == 1
+    assert [permit.ticket for permit in permits(outs)] == [issued]
+    assert [permit.lane for permit in permits(outs)] == [1]  # the lane whose rollout was dropped
+
+
+def test_a_rollout_exactly_max_lag_old_is_used() -> None:
+    learner = Learner(lanes=1, max_lag=2, per_update=1)
+    learner.joins(A)
+    learner.delivers(0)
+    learner.publish(1)
+    learner.publish(2)
+    assert [rollout.version for rollout in learner.take()] == [0]
+    assert learner.roster.ledger.stale == 0
+
+
+def test_the_least_advanced_lane_is_dealt_to_first() -> None:
+    learner = Learner(lanes=3, max_lag=0, per_update=1)
+    learner.joins(A)
+    order = []
+    for version in range(1, 7):
+        order += [learner.roster.tickets[number].lane for number in learner.tickets()]
+        learner.update()
+        assert learner.roster.version == version
+    assert order == [0, 1, 2, 0, 1, 2]
+
+
+def test_a_lane_that_fell_behind_catches_up() -> None:
+    learner = Learner(lanes=2, max_lag=0, per_update=2)
+    learner.joins(A)
+    learner.delivers(1)
+    member = learner.roster.members[A]
+    outs = learner.balanced(learner.roster.reject(A, learner.rollout_of(0), "broken", 0.0))
+    assert [permit.lane for permit in permits(outs)] == [0]
+    assert member.strikes == 1
+
+
+def test_a_synchronous_update_uses_exactly_one_rollout_of_every_lane_under_the_newest_weights() -> None:
+    learner = Learner(lanes=4)
+    learner.joins(A)
+    learner.joins(B)
+    for version in range(5):
+        taken = learner.update()
+        assert sorted(rollout.lane for rollout in taken) == [0, 1, 2, 3]
+        assert {rollout.version for rollout in taken} == {version}
+
+
+def test_in_a_synchronous_run_no_lane_gets_two_tickets_in_a_round_while_another_is_moving() -> None:
+    """A worker leaves and a newcomer comes in mid-round: the round is finished by the lanes that it began with."""
+    learner = Learner(lanes=3)
+    learner.joins(A)
+    learner.delivers(learner.tickets()[0])  # lane 0 is done with its round
+    learner.joins(B)  # a lane moves to B, at a rollout boundary
+    round_lanes = [r.lane for r in learner.roster.ready] + [t.lane for t in learner.roster.tickets.values()]
+    assert sorted(round_lanes) == [0, 1, 2]
+    learner.says(A, Goodbye(learner.session(A), "bye", ()))
+    round_lanes = [r.lane for r in learner.roster.ready] + [t.lane for t in learner.roster.tickets.values()]
+    assert sorted(round_lanes) == [0, 1, 2]
+
+
+def test_while_the_least_advanced_lane_is_moving_no_other_takes_its_place() -> None:
+    learner = Learner(lanes=2, max_lag=1, per_update=1)  # two tickets: one for each lane
+    learner.joins(A)
+    learner.joins(B)  # lane 1 waits for its ticket to end
+    (moving,) = [lane for lane in learner.roster.lanes if lane.moving]
+    learner.publish(1)  # room for one more; both lanes stand at 1, lane 0 goes first
+    assert learner.roster.lanes[0].progress == 2 or moving.number == 0
+    learner.publish(2)  # room for another: it would be the moving lane's turn
+    other = learner.roster.lanes[1 - moving.number]
+    assert moving.progress == 1
+    assert other.progress <= 2
+
+
+def test_when_every_worker_is_lost_no_ticket_is_dealt_until_one_joins() -> None:
+    learner = Learner(lanes=2)
+    learner.joins(A)
+    assert learner.balanced(learner.roster.gone("a", "killed")) == []
+    assert learner.roster.deal() == []
+    outs = learner.joins(B)
+    assert {(permit.lane, permit.incarnation) for permit in permits(outs)} == {(0, 1), (1, 1)}
+
+
+def test_a_ticket_asks_for_the_version_it_was_dealt_under() -> None:
+    learner = Learner(lanes=1, max_lag=1)
+    assert [collect.version for collect in of(learner.joins(A), Collect)] == [0]
+    assert [collect.version for collect in of(learner.publish(1), Collect)] == [1]
+
+
+def test_a_ticket_is_used_once_and_a_repeat_is_counted() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    rollout = learner.rollout_of(0)
+    learner.says(A, rollout)
+    learner.says(A, rollout)
+    assert [r.ticket for r in learner.take()] == [0]
+    learner.says(A, rollout)
+    ledger = learner.roster.ledger
+    assert (ledger.used, ledger.transitions_used, ledger.transitions_duplicate) == (1, 1, 2)
+
+
+def test_a_late_rollout_of_an_ended_session_is_counted_and_answered_by_rejoin() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    rollout = learner.rollout_of(0)
+    learner.roster.gone("a", "killed")
+    assert learner.says(A, rollout) == [(A, Rejoin(100))]
+    assert (learner.roster.ledger.transitions_late, learner.roster.ready) == (1, [])
+
+
+def test_a_rollout_under_older_weights_than_its_ticket_asks_for_is_not_used() -> None:
+    learner = Learner(lanes=1, max_lag=1)
+    learner.joins(A)
+    learner.publish(1)
+    newest = learner.tickets()[-1]
+    outs = learner.says(A, learner.rollout_of(newest, version=0))
+    assert [permit.lane for permit in permits(outs)] == [0]  # dealt again
+    assert learner.roster.ledger.transitions_invalid == 1
+
+
+@pytest.mark.parametrize("change", [{"version": 7}, {"lane": 1}], ids=["weights that do not exist", "another lane"])
+def test_a_rollout_that_does_not_fit_its_ticket_is_not_used(change: dict[str, int]) -> None:
+    learner = Learner(lanes=2)
+    learner.joins(A)
+    learner.says(A, msgspec.structs.replace(learner.rollout_of(0), **change))
+    ledger = learner.roster.ledger
+    assert (learner.roster.ready, ledger.transitions_invalid, ledger.lost) == ([], 1, 1)
+    assert learner.roster.members[A].strikes == 1
+
+
+def test_a_rollout_of_another_workers_ticket_is_not_used_and_costs_that_worker_nothing() -> None:
+    learner = Learner(lanes=2)
+    learner.joins(A)
+    learner.joins(B)
+    learner.update()
+    (theirs,) = learner.tickets(B)
+    learner.says(A, msgspec.structs.replace(learner.rollout_of(theirs), session=learner.session(A)))
+    assert learner.roster.ready == []
+    assert learner.tickets(B) == [theirs]
+    assert (learner.roster.members[A].strikes, learner.roster.members[B].strikes) == (1, 0)
+
+
+# -------------------------------------------------------------------- lanes
+
+
+def test_a_lost_workers_tickets_and_lanes_are_dealt_to_the_living_with_a_higher_incarnation() -> None:
+    learner = Learner(lanes=2)
+    learner.joins(A)
+    learner.joins(B)
+    learner.update()
+    (lost,) = learner.tickets(A)
+    lane = learner.roster.tickets[lost].lane
+    before = learner.roster.lanes[lane].incarnation
+    outs = learner.balanced(learner.roster.gone("a", "killed"))
+    assert [(p.lane, p.incarnation) for p in permits(outs, B)] == [(lane, before + 1)]
+    assert lost not in learner.roster.tickets
+    assert lanes_of(learner, B) == {0, 1}
+
+
+def test_a_new_life_of_a_lane_has_received_nothing() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    learner.update()
+    learner.joins(B)
+    outs = learner.roster.gone("a", "killed")
+    (collect,) = of(outs, Collect, B)
+    assert collect.received == (Received(0, 1, 0, ()),)
+
+
+def test_a_lane_that_was_never_started_keeps_its_incarnation_when_moved() -> None:
+    learner = Learner(lanes=2, max_lag=0, per_update=1)  # one ticket a round: lane 1 is not started yet
+    learner.joins(A)
+    learner.joins(B)
+    assert lanes_of(learner, B) == {1}
+    assert [lane.incarnation for lane in learner.roster.lanes] == [0, 0]
+    learner.update()
+    (number,) = learner.tickets(B)
+    assert learner.roster.tickets[number].incarnation == 0
+
+
+def test_lanes_even_out_to_a_newcomer_only_at_a_rollout_boundary() -> None:
+    learner = Learner(lanes=4)
+    learner.joins(A)
+    assert of(learner.joins(B), Release) == []  # every lane is in the middle of a rollout
+    assert lanes_of(learner, B) == set()
+    outs = learner.delivers(3)  # lane 3 is at its boundary
+    assert of(outs, Release, A) == [Release(learner.session(A), (LaneLife(3, 0),))]
+    assert lanes_of(learner, B) == {3}
+    assert learner.roster.lanes[3].incarnation == 1
+    learner.update()
+    assert len(lanes_of(learner, A)) == len(lanes_of(learner, B)) == 2
+    assert learner.roster.ledger.lost == 0
+
+
+def test_release_travels_before_what_the_lanes_new_owner_is_told() -> None:
+    learner = Learner(lanes=2, max_lag=1)  # two rounds are outstanding
+    learner.joins(A)
+    learner.joins(B)
+    learner.delivers(0)
+    learner.publish(1)
+    outs = learner.delivers(2)  # lane 0 has nothing outstanding any more: it moves, and is dealt a ticket at once
+    assert [type(message) for _, message in outs if isinstance(message, Release | Collect)] == [Release, Collect, Collect]
+    assert [permit.lane for permit in permits(outs, B)] == [0]
+
+
+def test_a_newcomer_takes_from_the_fullest() -> None:
+    learner = Learner(lanes=6)
+    for peer in (A, B):
+        learner.joins(peer)
+        learner.update()
+    learner.joins(C)
+    learner.update()
+    assert [len(lanes_of(learner, peer)) for peer in (A, B, C)] == [2, 2, 2]
+
+
+def test_more_workers_than_lanes_stand_by() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    learner.joins(B)
+    learner.update()
+    assert (lanes_of(learner, A), lanes_of(learner, B)) == ({0}, set())
+
+
+def test_a_lane_has_one_owner_whoever_comes_and_goes() -> None:
+    learner = Learner(lanes=5)
+    for step, peer in enumerate([A, B, C, A, B, A, C, B] * 4):
+        if peer in learner.roster.members and step % 3:
+            learner.balanced(learner.roster.gone(peer.decode(), "killed"))
+        else:
+            learner.joins(peer, pid=step)
+        if learner.roster.members:
+            learner.update()
+            owned = [n for member in learner.roster.members.values() for n in member.lanes]
+            assert sorted(owned) == [0, 1, 2, 3, 4]
+            assert all(learner.roster.lanes[n].owner == m.peer for m in learner.roster.members.values() for n in m.lanes)
+
+
+# -------------------------------------------------------------------- weights
+
+
+def test_at_most_one_weights_is_unacknowledged_and_the_next_is_the_newest() -> None:
+    learner = Learner(lanes=1)
+    assert [w.version for w in of(learner.joins(A), Weights)] == [0]
+    for version in (1, 2, 3):
+        assert of(learner.publish(version), Weights) == []
+    assert [w.version for w in of(learner.beats(A, version=0), Weights)] == [3]
+    assert of(learner.beats(A, version=0, replies=0), Weights) == []
+    assert of(learner.beats(A, version=3), Weights) == []
+
+
+def test_a_rollout_acknowledges_weights() -> None:
+    learner = Learner(lanes=1, max_lag=2)
+    learner.joins(A)
+    learner.publish(1)
+    assert [w.version for w in of(learner.delivers(0), Weights)] == [1]
+
+
+def test_weights_travel_before_collect() -> None:
+    learner = Learner(lanes=2)
+    learner.joins(A)
+    learner.beats(A)
+    learner.deliver_all()
+    learner.take()
+    assert kinds(learner.publish(1), A) == [Weights, Collect]
+
+
+def test_one_weights_is_said_to_all_so_that_it_is_encoded_once() -> None:
+    learner = Learner(lanes=2)
+    for peer in (A, B):
+        learner.joins(peer)
+        learner.beats(peer)
+    first, second = of(learner.publish(1), Weights)
+    assert first is second
+
+
+# -------------------------------------------------------------------- what travels together
+
+
+def test_what_is_dealt_together_travels_together() -> None:
+    learner = Learner(lanes=4)
+    (collect,) = of(learner.joins(A), Collect)
+    assert [permit.lane for permit in collect.permits] == [0, 1, 2, 3]
+    learner.joins(B)
+    learner.update()
+    learner.deliver_all()
+    learner.take()
+    outs = learner.publish(2)
+    assert len(of(outs, Collect, A)) == len(of(outs, Collect, B)) == 1
+
+
+def test_collect_says_what_has_arrived_of_every_lane_of_the_worker() -> None:
+    learner = Learner(lanes=2)
+    learner.joins(A)
+    learner.deliver_all()
+    learner.take()
+    (collect,) = of(learner.publish(1), Collect)
+    assert collect.received == (Received(0, 0, 1, ()), Received(1, 0, 1, ()))
+
+
+def test_a_rollout_that_came_before_an_earlier_one_is_said_to_be_ahead() -> None:
+    learner = Learner(lanes=1, max_lag=1)
+    learner.joins(A)
+    learner.says(A, learner.rollout_of(1, sequence=1))
+    (reply,) = of(learner.beats(A), HeartbeatReply)
+    assert reply.received == (Received(0, 0, 0, (1,)),)
+    learner.says(A, learner.rollout_of(0, sequence=0))
+    (reply,) = of(learner.beats(A), HeartbeatReply)
+    assert reply.received == (Received(0, 0, 2, ()),)
+
+
+# -------------------------------------------------------------------- the heartbeat repairs
+
+
+def test_a_heartbeat_is_answered_and_replies_are_numbered() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    for number in (1, 2, 3):
+        assert of(learner.beats(A), HeartbeatReply) == [HeartbeatReply(100, number, (Received(0, 0, 0, ()),))]
+
+
+def test_a_lost_collect_is_said_again_only_when_a_reply_said_after_it_has_been_seen() -> None:
+    learner = Learner(lanes=1)
+    (first,) = of(learner.joins(A), Collect)
+    assert of(learner.beats(A, tickets=[], replies=0), Collect) == []  # it may still be on its way
+    assert of(learner.beats(A, tickets=[], replies=1), Collect) == [first]
+    assert of(learner.beats(A, tickets=[], replies=1), Collect) == []  # the repeat may be on its way
+    assert of(learner.beats(A, tickets=[], replies=2), Collect) == [first]  # reply 2 was said after it
+    assert of(learner.beats(A, tickets=[0]), Collect) == []
+    assert learner.roster.ledger.issued == 1
+
+
+def test_lost_weights_are_said_again_only_when_a_reply_said_after_them_has_been_seen() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    assert of(learner.beats(A, version=-1, replies=0), Weights) == []
+    assert len(of(learner.beats(A, version=-1, replies=1), Weights)) == 1
+    assert of(learner.beats(A, version=-1, replies=1), Weights) == []
+
+
+def test_lost_weights_are_made_good_by_the_newest() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    learner.beats(A, version=-1, replies=0)
+    learner.publish(1)
+    assert [w.version for w in of(learner.beats(A, version=-1, replies=1), Weights)] == [1]
+
+
+def test_a_lost_rollout_is_asked_for_again() -> None:
+    """Its worker holds the ticket no more, and the learner has not got it: the same Collect brings it back."""
+    learner = Learner(lanes=2)
+    learner.joins(A)
+    learner.beats(A)
+    outs = learner.beats(A, tickets=[1])
+    assert permits(outs) == [Permit(0, 0, 0)]
+    assert learner.roster.ledger.lost == 0
+
+
+def test_lost_collects_of_several_versions_are_said_again_each_under_its_own() -> None:
+    learner = Learner(lanes=1, max_lag=1)
+    learner.joins(A)
+    learner.publish(1)
+    learner.beats(A)
+    collects = of(learner.beats(A, tickets=[]), Collect)
+    assert [(collect.version, [p.ticket for p in collect.permits]) for collect in collects] == [(0, [0, 1]), (1, [2])]
+
+
+def test_what_is_said_again_travels_before_the_reply() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    learner.beats(A, version=-1, replies=0)
+    assert kinds(learner.beats(A, version=-1, tickets=[], replies=1), A) == [Weights, Collect, HeartbeatReply]
+
+
+def test_a_reply_leaves_out_lanes_that_live_elsewhere() -> None:
+    learner = Learner(lanes=2)
+    learner.joins(A)
+    learner.joins(B)
+    learner.deliver_all()
+    for peer in (A, B):
+        (reply,) = of(learner.beats(peer), HeartbeatReply)
+        assert {received.lane for received in reply.received} == lanes_of(learner, peer)
+        assert len(reply.received) == 1
+
+
+# -------------------------------------------------------------------- rubbish
+
+
+def test_a_bad_rollout_is_counted_and_its_ticket_dealt_again() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    outs = learner.balanced(learner.roster.reject(A, learner.rollout_of(0), "obs are NaN", 0.0))
+    assert permits(outs) == [Permit(1, 0, 0)]
+    ledger = learner.roster.ledger
+    assert (ledger.lost, ledger.transitions_invalid, ledger.outstanding) == (1, 1, 1)
+
+
+def test_a_bad_rollout_is_let_go_by_its_worker() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    (collect,) = of(learner.roster.reject(A, learner.rollout_of(0), "obs are NaN", 0.0), Collect)
+    assert collect.received == (Received(0, 0, 1, ()),)
+
+
+@pytest.mark.parametrize("kind", ["message", "rollout"])
+def test_a_worker_that_keeps_sending_rubbish_is_refused_and_what_it_held_is_dealt_again(kind: str) -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    outs: list[Out] = []
+    for strike in range(STRIKES):
+        assert A in learner.roster.members, strike
+        rollout = learner.rollout_of(learner.tickets()[0]) if kind == "rollout" else None
+        outs = learner.balanced(learner.roster.reject(A, rollout, "not understood", 0.0))
+    assert outs == [(A, Refuse("not understood"))]
+    assert A not in learner.roster.members
+    assert learner.roster.ledger.outstanding == 0
+    assert learner.roster.ledger.messages_bad == (STRIKES if kind == "message" else 0)
+    assert Turned("a", "not understood") in learner.roster.events
+
+
+def test_one_that_was_refused_stays_refused_and_another_process_of_its_name_may_join() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A, pid=1)
+    for _ in range(STRIKES):
+        learner.roster.reject(A, None, "rubbish", 0.0)
+    assert learner.joins(A, pid=1, attempt=2) == [(A, Refuse("rubbish"))]
+    assert kinds(learner.joins(A, pid=2), A) == [Welcome, Weights, Collect]
+
+
+def test_rubbish_of_a_stranger_is_counted_and_refused() -> None:
+    learner = Learner()
+    ((peer, refuse),) = learner.roster.reject(b"stranger", None, "no head", 0.0)
+    assert isinstance(refuse, Refuse)
+    assert (peer, learner.roster.ledger.messages_bad, learner.roster.members) == (b"stranger", 1, {})
+
+
+def test_whatever_dtype_a_bad_rollouts_flags_have_they_are_counted_without_raising() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    bad = msgspec.structs.replace(learner.rollout_of(0), valid=np.full((1, 1), 9.0, np.float32))
+    learner.balanced(learner.roster.reject(A, bad, "valid expected bool", 0.0))
+    assert learner.roster.ledger.transitions_invalid == 0
+
+
+def test_a_late_bad_rollout_of_an_ended_session_does_not_touch_the_ticket_of_the_same_number() -> None:
+    """A learner that resumed counts tickets on from its checkpoint, so numbers come again."""
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    late = fake_rollout(session=5, lane=0, ticket=0, version=0, sequence=3)
+    learner.balanced(learner.roster.reject(A, late, "obs are NaN", 0.0))
+    assert learner.tickets(A) == [0]
+    assert learner.roster.lanes[0].ahead == set()
+
+
+@pytest.mark.parametrize("sequence", [-1, 1, 1 << 62])
+def test_a_rollout_whose_sequence_cannot_be_is_not_used(sequence: int) -> None:
+    """Else `ahead` grows by one for every rollout, and goes out with every reply."""
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    learner.says(A, learner.rollout_of(0, sequence=sequence))
+    assert learner.roster.lanes[0].ahead == set()
+    assert learner.roster.ledger.transitions_invalid == 1
+
+
+# -------------------------------------------------------------------- leaving
+
+
+def test_goodbye_forgets_the_worker_and_deals_what_it_held() -> None:
+    learner = Learner(lanes=2)
+    learner.joins(A)
+    learner.joins(B)
+    outs = learner.says(A, Goodbye(learner.session(A), "told to stop", (0, 1)))
+    assert A not in learner.roster.members
+    assert {permit.lane for permit in permits(outs, B)} == {0, 1}
+    assert learner.roster.events[-1] == Left("a", "left: told to stop", 2, True)
+
+
+def test_failure_forgets_the_worker_and_its_traceback_is_kept_for_the_log() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    learner.joins(B)
+    outs = learner.says(A, Failure(learner.session(A), "ValueError: x", "Traceback: …", 0))
+    assert A not in learner.roster.members
+    assert [permit.incarnation for permit in permits(outs, B)] == [1]
+    assert Broke("a", "host", 0, "ValueError: x", "Traceback: …") in learner.roster.events
+    assert learner.roster.events[-1] == Left("a", "broke: ValueError: x", 1, False)
+
+
+def test_silence_is_judged_in_tick_only() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    learner.now = 1000.0
+    assert of(learner.publish(1), Rejoin) == []
+    learner.joins(B)
+    learner.beats(A)  # it was only slow to be heard
+    learner.roster.tick(1000.0)
+    assert A in learner.roster.members
+
+
+def test_a_silent_worker_is_forgotten_by_tick() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    assert learner.roster.tick(TIMEOUT_S) == []
+    assert A in learner.roster.members
+    learner.balanced(learner.roster.tick(TIMEOUT_S + 0.1))
+    assert learner.roster.members == {}
+    assert learner.roster.events[-1] == Left("a", "silent for 5 s", 1, False)
+
+
+@pytest.mark.parametrize("kind", ["heartbeat", "rollout", "rubbish"])
+def test_any_message_of_the_session_is_a_sign_of_life(kind: str) -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    learner.now = 4.0
+    match kind:
+        case "heartbeat":
+            learner.beats(A)
+        case "rollout":
+            learner.delivers(0)
+        case _:
+            learner.roster.reject(A, None, "rubbish", learner.now)
+    learner.roster.tick(4.0 + TIMEOUT_S)
+    assert A in learner.roster.members
+
+
+def test_drain_asks_everybody_to_leave_and_deals_no_more() -> None:
+    learner = Learner(lanes=2)
+    learner.joins(A)
+    learner.joins(B)
+    assert learner.balanced(learner.roster.drain("finished")) == [(A, Drain("finished")), (B, Drain("finished"))]
+    learner.deliver_all()
+    issued = learner.roster.ledger.issued
+    learner.take()
+    assert learner.publish(1) == learner.roster.deal() == []
+    assert learner.roster.ledger.issued == issued
+
+
+def test_what_a_draining_worker_still_delivers_is_counted_and_can_be_used() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    learner.roster.drain("finished")
+    assert learner.delivers(0) == []
+    assert len(learner.take()) == 1
+    assert learner.says(A, Goodbye(100, "finished", ())) == []
+    assert learner.roster.members == {}
+
+
+def test_a_lost_drain_is_said_again_at_each_heartbeat() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    learner.roster.drain("finished")
+    assert learner.beats(A) == [(A, Drain("finished"))]
+
+
+def test_whoever_says_hello_to_a_draining_learner_is_told_to_leave() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    learner.roster.drain("finished")
+    assert learner.joins(B) == [(B, Drain("finished"))]
+    assert learner.joins(A, attempt=2) == [(A, Drain("finished"))]
+
+
+def test_a_draining_worker_that_falls_silent_is_forgotten() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    learner.roster.drain("finished")
+    assert learner.balanced(learner.roster.tick(TIMEOUT_S + 0.1)) == []
+    assert learner.roster.members == {}
+
+
+def test_gone_does_not_wait_for_silence() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    learner.joins(B)
+    outs = learner.balanced(learner.roster.gone("a", "killed by signal 9"))
+    assert [permit.lane for permit in permits(outs, B)] == [0]
+    assert learner.roster.gone("a", "again") == []
+
+
+# -------------------------------------------------------------------- the ledger and the checkpoint
+
+
+def test_every_ticket_ends_as_used_stale_or_lost() -> None:
+    """One of each; `Learner.balanced` has checked both identities after every event."""
+    learner = Learner(lanes=2, max_lag=1, per_update=2)
+    learner.joins(A)
+    learner.delivers(0)
+    learner.publish(1)
+    learner.publish(2)
+    learner.roster.take()  # 0 was stale
+    learner.roster.deal()
+    learner.roster.gone("a", "killed")
+    learner.joins(B)
+    learner.deliver_all()
+    learner.take()
+    counts = learner.roster.ledger.counts()
+    assert counts["stale"] == 1
+    assert counts["lost"] >= 1
+    assert counts["used"] == 2
+    assert counts["issued"] == counts["used"] + counts["stale"] + counts["lost"] + counts["outstanding"]
+
+
+def test_every_transition_that_arrived_is_used_or_counted_under_a_reason() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    rollout = learner.rollout_of(0)
+    learner.says(A, rollout)
+    learner.says(A, rollout)  # duplicate
+    learner.take()
+    learner.publish(1)
+    learner.roster.reject(A, learner.rollout_of(1), "NaN", 0.0)  # invalid
+    learner.says(A, msgspec.structs.replace(rollout, session=5))  # late
+    counts = learner.roster.ledger.counts()
+    named = ("used", "duplicate", "invalid", "late")
+    assert [counts[f"transitions_{name}"] for name in named] == [1, 1, 1, 1]
+    assert counts["transitions_received"] == 4
+    assert counts["transitions_waiting"] == 0
+
+
+def test_incarnations_for_a_checkpoint_name_no_life_that_was_dealt_a_ticket() -> None:
+    learner = Learner(lanes=3, per_update=1)  # one ticket a round
+    assert learner.roster.incarnations() == [0, 0, 0]
+    learner.joins(A)
+    assert learner.roster.incarnations() == [1, 0, 0]
+    learner.update()
+    assert learner.roster.incarnations() == [1, 1, 0]
+    learner.roster.gone("a", "killed")
+    assert learner.roster.incarnations() == [1, 1, 0]
+
+
+def test_no_life_is_lived_twice_across_resumes() -> None:
+    """Every (lane, incarnation) that is dealt tickets is dealt them in one session of one learner."""
+    lives: set[tuple[int, int]] = set()
+    ledger, incarnations, version = Ledger(), [0, 0, 0], 0
+    for pid in range(4):
+        learner = Learner(lanes=3, ledger=ledger, incarnations=incarnations, publish=False)
+        learner.publish(version)
+        for peer in (A, B, C):
+            fresh = {(permit.lane, permit.incarnation) for permit in permits(learner.joins(peer, pid=pid))}
+            assert len(fresh) == 3
+            assert not fresh & lives
+            lives |= fresh
+            learner.update()
+            learner.roster.gone(peer.decode(), "killed")
+        version, ledger = learner.roster.version, msgspec.structs.replace(learner.roster.ledger)
+        incarnations = learner.roster.incarnations()
+        ledger.lost += ledger.outstanding
+
+
+def test_a_resumed_learner_counts_tickets_on() -> None:
+    ledger = Ledger(issued=10, used=8, lost=2)
+    learner = Learner(lanes=2, ledger=ledger, publish=False)
+    learner.publish(4)
+    outs = learner.joins(A)
+    assert [permit.ticket for permit in permits(outs)] == [10, 11]
+
+
+# -------------------------------------------------------------------- the table
+
+
+def standing_of(learner: Learner, peer: bytes) -> Standing:
+    member = learner.roster.members.get(peer)
+    return Standing.UNKNOWN if member is None else member.standing
+
+
+def in_standing(standing: Standing) -> Learner:
+    learner = Learner(lanes=1)
+    if standing is not Standing.UNKNOWN:
+        learner.joins(A)
+    if standing is Standing.DRAINING:
+        learner.roster.drain("finished")
+    assert standing_of(learner, A) is standing
+    return learner
+
+
+EVERY_MESSAGE: list[ToLearner] = [
+    Hello(PROTOCOL_VERSION, "a", "host", 1, 1001, "fake", 1),
+    fake_rollout(100, 0, 0, 0, 0),
+    Heartbeat(100, 0, 0, (0,), 0, {}, 0),
+    Goodbye(100, "bye", ()),
+    Failure(100, "broke", "", None),
+    Stepped(100, 0, 0, 0, (), *(np.zeros(1) for _ in range(4))),
+    Returned(100, 0, 0, 0, np.zeros(0, np.uint8), "", ""),
+]
+
+
+def test_every_message_to_a_learner_is_tried() -> None:
+    assert {type(message) for message in EVERY_MESSAGE} == set(ToLearner.__args__)
+
+
+@pytest.mark.parametrize("standing", Standing)
+@pytest.mark.parametrize("message", EVERY_MESSAGE, ids=lambda message: type(message).__name__)
+def test_the_table_names_the_standing_that_follows(standing: Standing, message: ToLearner) -> None:
+    learner = in_standing(standing)
+    learner.says(A, message)
+    assert standing_of(learner, A) is TABLE[standing].get(type(message), standing)
+
+
+@pytest.mark.parametrize("standing", [Standing.ACTIVE, Standing.DRAINING])
+@pytest.mark.parametrize("event", [Silence, Rubbish])
+def test_the_table_names_the_standing_that_follows_an_event(standing: Standing, event: type) -> None:
+    learner = in_standing(standing)
+    if event is Silence:
+        learner.roster.tick(1e6)
+    else:
+        for _ in range(STRIKES):
+            learner.roster.reject(A, None, "rubbish", 0.0)
+    assert standing_of(learner, A) is TABLE[standing][event] is Standing.UNKNOWN
+
+
+def test_why_one_was_silent_is_told_once_it_is_known() -> None:
+    learner = Learner()
+    learner.joins(b"a")
+    learner.joins(b"b")
+    learner.now += TIMEOUT_S + 1
+    learner.balanced(learner.roster.tick(learner.now))
+    learner.roster.events.clear()
+    for _ in range(2):
+        learner.balanced(learner.roster.gone("a", "was ended: too slow"))
+    assert learner.roster.events == [Left("a", "was ended: too slow", 0, False)]
+    learner.joins(b"b", attempt=2)
+    learner.says(b"b", Goodbye(learner.session(b"b"), "told to stop", ()))
+    learner.roster.events.clear()
+    learner.balanced(learner.roster.gone("b", "ended with exit code 0"))
+    assert learner.roster.events == []

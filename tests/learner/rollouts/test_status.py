@@ -1,0 +1,259 @@
+"""What the learner tells whoever asks, and the log as JSON."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import zmq
+from rich.console import Console
+
+from learner.members.events import Event, Left, Stale, Told, describe
+from learner.rollouts.hub import Hub
+from learner.rollouts.status import status
+from learner.run_folder.json_log import JsonLines, progress_line
+from learner.run_folder.metrics import Progress
+from millrace.cli.status import ask, in_json, observer_name, shown
+from millrace.terminal import watching
+from protocol.errors import RunError
+from protocol.messages import Goodbye, Heartbeat, Inquire, Status
+from protocol.wire.codec import encode
+from protocol.wire.link import LearnerLink, WorkerLink
+from tests.learner.rollouts.test_roster import Learner
+
+PROGRESS = Progress(env_steps=1_000, total_steps=10_000, steps_per_s=50.0, return_mean=12.5, lag_mean=0.5, lag_max=2)
+
+
+def told(learner: Learner) -> Status:
+    return status(learner.roster, PROGRESS, learner.now)
+
+
+def counts(learner: Learner, peer: bytes, steps: int, resident: int = 0) -> None:
+    seen = learner.roster.members[peer].replies
+    held = tuple(learner.tickets(peer))
+    learner.says(peer, Heartbeat(learner.session(peer), seen, 0, held, steps, {}, resident))
+
+
+def test_it_tells_of_the_run_and_of_every_worker_in_the_order_of_joining() -> None:
+    learner = Learner(lanes=3)
+    learner.joins(b"b", pid=7)
+    learner.joins(b"a", host="far")
+    learner.deliver_all()
+    found = told(learner)
+    assert (found.env, found.version) == (learner.roster.run.env.id, 0)
+    assert (found.env_steps, found.total_steps, found.return_mean, found.lag_max) == (1_000, 10_000, 12.5, 2)
+    assert [(w.worker, w.host, w.pid, w.standing) for w in found.workers] == [
+        ("b", "host", 7, "active"),
+        ("a", "far", 1, "active"),
+    ]
+    assert sorted(lane for worker in found.workers for lane in worker.lanes) == [0, 1, 2]
+    assert found.ledger == learner.roster.ledger.counts()
+    learner.roster.drain("done")
+    assert {worker.standing for worker in told(learner).workers} == {"draining"}
+
+
+def test_silence_is_counted_from_the_last_message() -> None:
+    learner = Learner()
+    learner.joins(b"a")
+    learner.now += 3.0
+    assert told(learner).workers[0].silent_s == 3.0
+    learner.beats(b"a")
+    assert told(learner).workers[0].silent_s == 0.0
+
+
+def test_speed_is_measured_between_two_accounts_that_are_apart() -> None:
+    learner = Learner()
+    learner.now = 10.0
+    learner.joins(b"a")
+    counts(learner, b"a", steps=1_000, resident=5)
+    assert told(learner).workers[0].steps_per_s == 0.0  # nobody knows since when
+    learner.now += 0.1
+    counts(learner, b"a", steps=1_010)  # early, to acknowledge weights
+    learner.now += 1.9
+    counts(learner, b"a", steps=1_400, resident=6)
+    worker = told(learner).workers[0]
+    assert (worker.steps_per_s, worker.steps, worker.resident_bytes) == (200.0, 1_400, 6)
+
+
+def test_weights_count_as_held_when_the_worker_says_so() -> None:
+    learner = Learner()
+    learner.joins(b"a")
+    assert told(learner).workers[0].version == -1
+    learner.beats(b"a", version=0)
+    assert told(learner).workers[0].version == 0
+
+
+def test_asking_changes_nothing() -> None:
+    learner = Learner()
+    learner.joins(b"a")
+    before = (repr(vars(learner.roster)), repr(learner.roster.members))
+    told(learner)
+    assert before == (repr(vars(learner.roster)), repr(learner.roster.members))
+
+
+# ------------------------------------------------------------------------------------------------ over a socket
+
+
+@pytest.fixture
+def context() -> Iterator[zmq.Context[zmq.Socket[bytes]]]:
+    made: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    yield made
+    made.term()
+
+
+def test_a_learner_answers_one_who_is_no_worker(context: zmq.Context[zmq.Socket[bytes]]) -> None:
+    learner = Learner()
+    link = LearnerLink("tcp://127.0.0.1:*", context)
+    hub = Hub(link, learner.roster, no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=0)
+    hub.progress = PROGRESS
+    asking = WorkerLink(link.address, observer_name(), context)
+    found: list[Status] = []
+    thread = threading.Thread(target=lambda: found.append(ask(asking, 10.0)))
+    thread.start()
+    deadline_s = time.monotonic() + 10.0
+    while thread.is_alive() and time.monotonic() < deadline_s:
+        if link.poll(0.1):
+            hub.pulse()
+    thread.join(10.0)
+    asking.close(0)
+    link.close(0)
+    assert found == [status(learner.roster, PROGRESS, 0.0)]
+    assert not learner.roster.members
+
+
+def test_nobody_there_is_said_at_the_deadline(context: zmq.Context[zmq.Socket[bytes]]) -> None:
+    link = WorkerLink("tcp://127.0.0.1:9", observer_name(), context)
+    with pytest.raises(RunError, match=r"no learner answered within 0\.05 s; is it running, and is this its address\?"):
+        ask(link, 0.05)
+    link.close(0)
+
+
+# ------------------------------------------------------------------------------------------------ as it is shown
+
+
+def as_text(found: Status) -> str:
+    console = Console(file=io.StringIO(), width=140)
+    console.print(shown(found))
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
+def test_it_is_shown_as_a_table() -> None:
+    learner = Learner(lanes=2)
+    learner.joins(b"w0")
+    counts(learner, b"w0", steps=10, resident=50 * 2**20)
+    learner.joins(b"w1")
+    for name in (b"w2",):
+        learner.joins(name)
+    learner.says(b"w1", Goodbye(learner.session(b"w1"), "told to stop", ()))
+    text = as_text(told(learner))
+    assert "1,000 of 10,000 env steps, 50 steps/s, return 12.5" in text
+    assert "50 MB" in text
+    assert "w2" in text
+    assert "w1" not in text
+    assert "1 tickets of workers that were lost" in text or "dropped: nothing" in text
+
+
+def test_in_json_every_field_has_its_name() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(b"a")
+    found = json.loads(in_json(told(learner)))
+    assert list(found) == ["type", *Status.__struct_fields__]
+    assert (found["type"], found["env_steps"]) == ("Status", 1_000)
+    assert (found["workers"][0]["worker"], found["workers"][0]["lanes"]) == ("a", [0])
+
+
+def test_a_run_without_workers_says_so() -> None:
+    text = as_text(told(Learner()))
+    assert "no worker is here" in text
+    assert "silent" not in text
+    assert "dropped: nothing" in text
+
+
+# ------------------------------------------------------------------------------------------------ events
+
+
+def test_one_whose_session_has_ended_is_told_to_join_again_and_that_is_an_event() -> None:
+    learner = Learner()
+    learner.joins(b"a")
+    late = learner.rollout_of(learner.tickets()[0])
+    learner.roster.gone("a", "was killed")
+    learner.roster.events.clear()
+    learner.says(b"a", late)
+    assert learner.roster.events == [Told("a", late.session, 1)]
+    assert "1 transitions that it sent are counted, not used" in describe(learner.roster.events[0])
+
+
+def test_a_rollout_that_is_too_old_is_an_event() -> None:
+    learner = Learner(lanes=1, max_lag=1)
+    learner.joins(b"a")
+    learner.deliver_all()
+    learner.publish(1)
+    learner.publish(2)
+    learner.roster.events.clear()
+    assert learner.roster.take() is None
+    stale = [event for event in learner.roster.events if isinstance(event, Stale)]
+    assert stale
+    assert stale[0].lag == 2
+    assert "2 versions old" in describe(stale[0])
+
+
+EVENTS: list[tuple[Event, dict[str, Any]]] = [
+    (Left("w0", "was killed", 2, False), {"event": "left", "worker": "w0", "why": "was killed", "tickets": 2}),
+    (Stale(3, 2, 640), {"event": "stale", "lane": 3, "lag": 2, "transitions": 640}),
+]
+
+
+@pytest.mark.parametrize(("event", "expected"), EVENTS)
+def test_an_event_is_one_line_of_json(event: Event, expected: dict[str, Any]) -> None:
+    record = logging.LogRecord("millrace.learner", logging.WARNING, "", 0, "%s", (describe(event),), None)
+    record.event = event
+    line = JsonLines().format(record)
+    found = json.loads(line)
+    assert "\n" not in line
+    assert expected.items() <= found.items()
+    assert (found["level"], found["message"]) == ("warning", describe(event))
+    assert found["time"].endswith("+00:00")
+
+
+def test_any_other_line_and_the_progress_are_lines_of_json_too() -> None:
+    record = logging.LogRecord("millrace.learner", logging.INFO, "", 0, "two\nlines %d", (3,), None)
+    assert json.loads(JsonLines().format(record)) | {"time": ""} == {
+        "time": "", "level": "info", "event": "said", "message": "two\nlines 3",
+    }  # fmt: skip
+    found = json.loads(progress_line(PROGRESS, 0.0))
+    assert (found["event"], found["time"], found["env_steps"]) == ("progress", "1970-01-01T00:00:00.000+00:00", 1_000)
+
+
+def test_a_run_that_is_watched_by_a_machine_says_nothing_but_json(capsys: pytest.CaptureFixture[str]) -> None:
+    logger = logging.getLogger("millrace.learner")
+    with watching(log_json=True) as watch:
+        watch(Progress(total_steps=5, note="saved"))
+        logger.info("worker w1 joined")
+    logger.info("nobody listens any more")
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert [json.loads(line)["event"] for line in err.splitlines()] == ["progress", "said"]
+
+
+def test_a_question_is_a_message_without_a_session() -> None:
+    assert len(encode(Inquire())) == 1
+
+
+def test_what_is_unusual_about_a_worker_is_shown() -> None:
+    learner = Learner(lanes=1)
+    for name in (b"w0", b"w1"):
+        learner.joins(name)
+    learner.roster.reject(b"w1", None, "rubbish", learner.now)
+    text = as_text(told(learner))
+    assert "spare" in text
+    assert "w1 (1 strikes)" in text
+    assert "none" in text
+    learner.roster.drain("done")
+    assert "draining" in as_text(told(learner))

@@ -1,0 +1,172 @@
+"""Checkpoints: whole or not at all, newest whole one wins, no code in them."""
+
+import errno
+import os
+import pickle
+import resource
+import shutil
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from learner.run_folder import checkpoint
+from protocol.errors import CheckpointError
+
+
+def state(number: float) -> dict[str, Any]:
+    return {
+        "flat": torch.full((1000,), float(number)),
+        "generator": np.random.default_rng(int(number)).bit_generator.state,
+        "torch": torch.get_rng_state(),
+        "episodes": [[1.5, 20, 0.1]],
+        "best": None,
+    }
+
+
+def files(folder: Path) -> list[str]:
+    return sorted(path.name for path in (folder / "checkpoints").iterdir())
+
+
+def test_what_was_saved_comes_back(tmp_path: Path) -> None:
+    saved = state(3)
+    path = checkpoint.save(tmp_path, saved, env_steps=2048, keep=3)
+    assert path.name == "000000002048.pt"
+    found, warnings = checkpoint.newest(tmp_path)
+    assert (found.env_steps, found.path, warnings) == (2048, path, [])
+    assert torch.equal(found.state["flat"], saved["flat"])
+    generator = np.random.default_rng()
+    generator.bit_generator.state = found.state["generator"]
+    assert generator.random() == np.random.default_rng(3).random()
+    assert found.state["episodes"] == [[1.5, 20, 0.1]]
+
+
+def test_only_the_newest_stay(tmp_path: Path) -> None:
+    for steps in (999_999, 1_000_000, 5, 2_000_000):
+        checkpoint.save(tmp_path, state(1), steps, keep=2)
+    assert files(tmp_path) == ["000001000000.pt", "000002000000.pt"]
+
+
+@pytest.mark.parametrize("step", ["fsync", "replace"])
+def test_a_failure_at_any_step_leaves_the_old_one_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
+    checkpoint.save(tmp_path, state(1), 100, keep=3)
+
+    def fails(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(f"learner.run_folder.atomic_write.os.{step}", fails)
+    with pytest.raises(CheckpointError, match=r"000000000200\.pt not written: No space left on device; older .* untouched"):
+        checkpoint.save(tmp_path, state(2), 200, keep=3)
+    monkeypatch.undo()
+    assert files(tmp_path) == ["000000000100.pt"]
+    assert checkpoint.newest(tmp_path)[0].state["flat"][0] == 1
+
+
+@contextmanager
+def files_end_at_4_kb() -> Iterator[None]:
+    """The kernel refuses to let any file of this process grow beyond 4 KiB, as a full disk does: pytest's own log too."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
+
+
+def test_a_disk_that_is_full_in_mid_file_leaves_nothing_behind(tmp_path: Path) -> None:
+    checkpoint.save(tmp_path, {"flat": torch.ones(1)}, 100, keep=3)
+    with files_end_at_4_kb(), pytest.raises(CheckpointError, match="not written") as caught:
+        checkpoint.save(tmp_path, {"flat": torch.ones(100_000)}, 200, keep=3)
+    assert "\n" not in str(caught.value)
+    assert files(tmp_path) == ["000000000100.pt"]
+    assert checkpoint.newest(tmp_path)[0].env_steps == 100
+
+
+def test_what_a_killed_process_left_is_cleared_away(tmp_path: Path) -> None:
+    path = checkpoint.save(tmp_path, state(1), 100, keep=3)
+    (path.parent / "000000000200.pt.tmp").write_bytes(path.read_bytes()[:500])  # killed before the rename
+    assert checkpoint.newest(tmp_path)[0].env_steps == 100
+    checkpoint.save(tmp_path, state(3), 300, keep=3)
+    assert files(tmp_path) == ["000000000100.pt", "000000000300.pt"]
+
+
+def damaged(whole: bytes, how: str) -> bytes:
+    match how:
+        case "truncated":
+            return whole[: len(whole) // 2]
+        case "empty":
+            return b""
+        case "a flipped bit":  # among the numbers, where torch.load does not notice
+            at = whole.index(torch.full((4,), 2.0).numpy().tobytes()) + 100
+            return whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :]
+        case _:
+            return b"not a checkpoint at all"
+
+
+@pytest.mark.parametrize("how", ["truncated", "empty", "a flipped bit", "rubbish"])
+def test_a_damaged_newest_gives_way_to_the_one_before(tmp_path: Path, how: str) -> None:
+    checkpoint.save(tmp_path, state(1), 100, keep=3)
+    path = checkpoint.save(tmp_path, state(2), 200, keep=3)
+    path.write_bytes(damaged(path.read_bytes(), how))
+    found, (warning,) = checkpoint.newest(tmp_path)
+    assert found.env_steps == 100
+    assert found.state["flat"][0] == 1
+    assert str(path) in warning
+    assert "\n" not in warning
+    with pytest.raises(CheckpointError, match="expected a whole file, got one that is broken"):
+        checkpoint.load(path)
+
+
+def test_nothing_to_go_on_with_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"expected a checkpoint in checkpoints/, got none; start afresh"):
+        checkpoint.newest(tmp_path)
+    path = checkpoint.save(tmp_path, state(1), 100, keep=3)
+    path.write_bytes(b"")
+    with pytest.raises(CheckpointError, match=r"expected a whole checkpoint, got 1 broken; start afresh"):
+        checkpoint.newest(tmp_path)
+
+
+@pytest.mark.parametrize("other", [0, 2])
+def test_another_format_is_said_and_not_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, other: int) -> None:
+    checkpoint.save(tmp_path, state(1), 100, keep=3)
+    with monkeypatch.context() as then:
+        then.setattr(checkpoint, "FORMAT", other)
+        checkpoint.save(tmp_path, state(2), 200, keep=3)
+    with pytest.raises(CheckpointError, match=f"expected format 1, got {other}; resume it with the millrace that wrote it"):
+        checkpoint.newest(tmp_path)
+
+
+def test_another_programs_file_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "model.pt"
+    torch.save({"weights": torch.ones(3)}, path)
+    with pytest.raises(CheckpointError, match="expected one of millrace, got another program's file"):
+        checkpoint.load(path)
+
+
+class Harmful:
+    def __reduce__(self) -> tuple[Any, ...]:
+        return shutil.rmtree, ("/no/such/folder/of/millrace",)
+
+
+def test_reading_runs_no_code(tmp_path: Path) -> None:
+    path = tmp_path / "model.pt"
+    torch.save({"format": 1, "env_steps": 3, "state": {"x": Harmful()}}, path)
+    with pytest.raises(CheckpointError, match="broken"):
+        checkpoint.load(path)
+    path.write_bytes(pickle.dumps(Harmful()))
+    with pytest.raises(CheckpointError, match="broken"):
+        checkpoint.load(path)
+
+
+@pytest.mark.parametrize("stray", [np.float64(1.0), np.zeros(3), {1, 2}, np.random.default_rng(0)])
+def test_a_state_that_could_not_be_read_back_is_not_written(tmp_path: Path, stray: object) -> None:
+    with pytest.raises(TypeError, match=r"state\['inner'\]\[0\] expected tensors and plain data, got"):
+        checkpoint.save(tmp_path, {"inner": [stray]}, 100, keep=3)
+    assert not (tmp_path / "checkpoints").exists()

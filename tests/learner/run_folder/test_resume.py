@@ -1,0 +1,83 @@
+"""`--resume auto`: one command that starts a run and goes on with it, whatever happened to the learner meanwhile."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import millrace
+from learner.config.command_line import configuration
+from learner.config.config import Config, resolve
+from learner.run_folder.resume import newest_run
+from learner.run_folder.run_folder import RunFolder
+from millrace.launch import local
+
+HOURS = 3_600.0
+
+
+def a_run(config: Config, started_s: float, checkpoint: bool = True) -> Path:
+    folder = RunFolder.create(config, started_s).path
+    if checkpoint:
+        (folder / "checkpoints").mkdir()
+        (folder / "checkpoints" / "000000000512.pt").touch()
+    return folder
+
+
+def test_without_a_run_there_is_nothing_to_go_on_with(tmp_path: Path) -> None:
+    assert newest_run(resolve("CartPole-v1", run_dir=str(tmp_path / "not yet"))) is None
+    assert newest_run(resolve("CartPole-v1", run_dir=str(tmp_path))) is None
+
+
+def test_the_newest_with_a_checkpoint_is_taken(tmp_path: Path) -> None:
+    config = resolve("CartPole-v1", run_dir=str(tmp_path))
+    a_run(config, 1 * HOURS)
+    newer = a_run(config, 3 * HOURS)
+    a_run(config, 2 * HOURS)
+    a_run(config, 4 * HOURS, checkpoint=False)  # killed before its first checkpoint
+    (tmp_path / "CartPole-v1-ppo-s1-old-99999999-999999").mkdir()
+    assert newest_run(config) == newer
+
+
+@pytest.mark.parametrize("other", [{"seed": 2}, {"algo": "a2c"}, {"env": "Pendulum-v1"}, {"env": "CartPole:v1"}])
+def test_a_run_of_another_environment_algorithm_or_seed_is_let_be(tmp_path: Path, other: dict[str, object]) -> None:
+    mine = resolve("CartPole-v1", run_dir=str(tmp_path))
+    a_run(resolve(**{"env": "CartPole-v1", "run_dir": str(tmp_path), **other}), HOURS)  # type: ignore[arg-type]
+    assert newest_run(mine) is None
+    assert newest_run(resolve("CartPole-v1", run_dir=str(tmp_path), seed=11)) is None
+
+
+def test_the_first_time_it_starts_and_then_it_goes_on_with_the_runs_own_settings(tmp_path: Path) -> None:
+    file = tmp_path / "my.toml"
+    file.write_text("[ppo]\ngamma = 0.5\n")
+    flags = ["CartPole-v1", "--run-dir", str(tmp_path / "runs"), "--resume", "auto", "--config", str(file), "--steps", "9"]
+    config, resume = configuration("learner", flags)
+    assert (config.algorithm.gamma, config.steps, resume) == (0.5, 9, None)
+    run = a_run(config, HOURS)
+    file.write_text("[ppo]\ngamma = 0.7\n")  # the run has its own settings now
+    assert configuration("learner", flags) == (config, run)
+    again, _ = configuration("learner", [*flags, "--steps", "20"])
+    assert (again.algorithm.gamma, again.steps) == (0.5, 20)
+
+
+def test_a_run_by_name_is_found_again(tmp_path: Path) -> None:
+    flags = ["--preset", "cartpole-dqn", "--run-dir", str(tmp_path), "--resume", "auto"]
+    config, resume = configuration("train", flags)
+    assert (config.algo, resume) == ("dqn", None)
+    run = a_run(config, HOURS)
+    assert configuration("train", flags) == (config, run)
+
+
+def test_in_python_it_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[Config, Path | None]] = []
+
+    def train(config: Config, resume: Path | None, watch: object, factory: object = None) -> Path:
+        asked.append((config, resume))
+        return tmp_path
+
+    monkeypatch.setattr(local, "train", train)
+    millrace.train("CartPole-v1", resume="auto", run_dir=str(tmp_path), gamma=0.5)
+    run = a_run(asked[0][0], HOURS)
+    millrace.train("CartPole-v1", resume="auto", run_dir=str(tmp_path))
+    assert [resume for _, resume in asked] == [None, run]
+    assert asked[1][0] == asked[0][0]

@@ -1,0 +1,245 @@
+"""The run folder and what stands in it: whole files, the same bytes for the same policy, curves that never go back."""
+
+import errno
+import itertools
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from learner.config.config import Config, resolve
+from learner.run_folder.metrics import EVENTS_EVERY_S, EpisodeWindow, Evaluation, MetricsLog, Progress, read_rows
+from learner.run_folder.run_folder import RunFolder, Summary, sanitised
+from protocol.envs.spaces import action_spec, observation_leaves
+from protocol.errors import RunError, UsageError
+from protocol.policy.policy import buffer_size, layout, size
+from protocol.rollout import Episode
+from protocol.specs import EnvSpec, PolicySpec
+
+STARTED_S = 1_700_000_000.0
+
+
+def config(folder: Path, env: str = "CartPole-v1") -> Config:
+    return resolve(env, run_dir=str(folder), seed=3)
+
+
+def pendulum_like(bound: float) -> PolicySpec:
+    return PolicySpec(
+        observation_leaves(spaces.Box(-1, 1, (3,))),
+        action_spec(spaces.Box(-bound, bound, (2,))),
+        net=(8,),
+        normalize_observations=True,
+    )
+
+
+def weights(spec: PolicySpec) -> tuple[np.ndarray, np.ndarray]:
+    acting, critic = layout(spec)
+    rng = np.random.default_rng(0)
+    return (
+        rng.standard_normal(size(acting) + size(critic), dtype=np.float32),
+        rng.random(buffer_size(spec), dtype=np.float32),
+    )
+
+
+def test_a_run_has_a_folder_of_its_own(tmp_path: Path) -> None:
+    folder = RunFolder.create(config(tmp_path), STARTED_S)
+    assert folder.path.parent == tmp_path
+    assert folder.path.name.startswith("CartPole-v1-ppo-s3-202311")
+    assert folder.config() == config(tmp_path)
+    (folder.path / "mine.txt").write_text("mine")
+    with pytest.raises(UsageError, match=r"run folder .*CartPole-v1-ppo-s3-\S+ exists; .*--run-dir"):
+        RunFolder.create(config(tmp_path), STARTED_S)
+    assert (folder.path / "mine.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("env", "name"),
+    [("ALE/Pong-v5", "ALE-Pong-v5"), ("my.envs:My Env-v0", "my.envs-My-Env-v0"), ("../../etc", "etc"), ("/", "env")],
+)
+def test_no_environment_leads_out_of_the_folder(env: str, name: str) -> None:
+    assert sanitised(env) == name
+
+
+def test_what_is_no_run_folder_is_said(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no such folder"):
+        RunFolder.open(tmp_path / "nowhere")
+    with pytest.raises(UsageError, match=r"expected a run folder, got one without config\.toml"):
+        RunFolder.open(tmp_path)
+    with pytest.raises(UsageError, match=r"cannot be made: Not a directory; choose another --run-dir"):
+        (tmp_path / "file").touch()
+        RunFolder.create(config(tmp_path / "file"))
+
+
+@pytest.mark.parametrize("bound", [2.0, np.inf])
+def test_a_policy_comes_back_as_it_was(tmp_path: Path, bound: float) -> None:
+    spec = pendulum_like(bound)
+    parameters, buffers = weights(spec)
+    folder = RunFolder(tmp_path)
+    folder.write_policy(spec, EnvSpec("Mine-v0", {"g": 9.8}), parameters, buffers)
+    card, acting, normal = folder.read_policy()
+    assert (card.policy, card.env, card.env_kwargs) == (spec, "Mine-v0", {"g": 9.8})
+    assert acting.tobytes() == parameters[: size(layout(spec)[0])].tobytes()
+    assert normal.tobytes() == buffers.tobytes()
+
+
+def test_another_program_can_act_from_the_two_files(tmp_path: Path) -> None:
+    """With safetensors and json alone: names, shapes and offsets say where each array stood."""
+    from safetensors.numpy import load_file
+
+    spec = pendulum_like(2.0)
+    parameters, buffers = weights(spec)
+    RunFolder(tmp_path).write_policy(spec, EnvSpec("Mine-v0"), parameters, buffers)
+    arrays = load_file(tmp_path / "policy.safetensors")
+    card = json.loads((tmp_path / "policy.json").read_text())
+    assert [entry["name"] for entry in card["arrays"]] == [
+        "actor.0.weight", "actor.0.bias", "actor.out.weight", "actor.out.bias", "actor.log_std",
+    ]  # fmt: skip
+    assert set(arrays) == {entry["name"] for entry in card["arrays"]} | {"observation_mean", "observation_std"}
+    for entry in card["arrays"]:
+        count = int(np.prod(entry["shape"]))
+        there = parameters[entry["offset"] : entry["offset"] + count].reshape(entry["shape"])
+        assert np.array_equal(arrays[entry["name"]], there)
+    assert np.array_equal(np.concatenate([arrays["observation_mean"], arrays["observation_std"]]), buffers)
+
+
+def test_the_same_policy_gives_the_same_bytes(tmp_path: Path) -> None:
+    spec = pendulum_like(2.0)
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        RunFolder(tmp_path / name).write_policy(spec, EnvSpec("Mine-v0"), *weights(spec))
+    for name in ("policy.safetensors", "policy.json"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+def test_a_policy_that_does_not_fit_its_card_is_refused(tmp_path: Path) -> None:
+    spec = pendulum_like(2.0)
+    folder = RunFolder(tmp_path)
+    with pytest.raises(UsageError, match="has the run saved its policy yet"):
+        folder.read_policy()
+    folder.write_policy(spec, EnvSpec("Mine-v0"), *weights(spec))
+    card = tmp_path / "policy.json"
+    whole = card.read_text()
+    card.write_text(whole.replace('"net": [\n      8', '"net": [\n      9'))
+    with pytest.raises(UsageError, match=r"actor\.0\.bias expected float32 \(9,\), got \(8,\)"):
+        folder.read_policy()
+    card.write_text(whole.replace('"format": 1', '"format": 2'))
+    with pytest.raises(UsageError, match="expected format 1, got 2"):
+        folder.read_policy()
+    card.write_text(whole)
+    (tmp_path / "policy.safetensors").write_bytes((tmp_path / "policy.safetensors").read_bytes()[:-4])
+    with pytest.raises(UsageError, match="cannot be read"):
+        folder.read_policy()
+
+
+def test_a_full_disk_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = RunFolder(tmp_path)
+    summary = Summary(
+        env="CartPole-v1", algo="ppo", seed=1, env_steps=10, updates=1, wall_s=0.5, env_steps_per_s=20.0,
+        stop_reason="finished", return_mean_100=None, ledger={"used": 1}, stages={"update": 0.2},
+        evaluation=Evaluation(episodes=2, return_mean=9.5, return_std=0.5, length_mean=9.5),
+    )  # fmt: skip
+    folder.write_summary(summary)
+    before = (tmp_path / "summary.json").read_text()
+    assert json.loads(before)["evaluation"]["return_mean"] == 9.5
+    assert json.loads(before)["return_mean_100"] is None
+
+    def fails(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("learner.run_folder.atomic_write.os.fsync", fails)
+    with pytest.raises(RunError, match=r"summary\.json not written: No space left on device"):
+        folder.write_summary(summary)
+    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["summary.json"]
+    assert (tmp_path / "summary.json").read_text() == before
+
+
+def test_a_row_has_the_names_that_users_know(tmp_path: Path) -> None:
+    log = MetricsLog(tmp_path)
+    progress = Progress(
+        env_steps=256, updates=1, wall_s=2.0, steps_per_s=128.0, return_mean=20.5, length_mean=20.0, lag_mean=0.5,
+        lag_max=1, ledger={"issued": 8, "used": 7, "stale": 1}, stages={"update": 0.5},
+    )  # fmt: skip
+    log.write(progress, {"train/approx_kl": 0.01, "loss": float("nan")})
+    log.close()
+    (row,) = read_rows(tmp_path / "metrics.jsonl")
+    assert row == {
+        "rollout/ep_rew_mean": 20.5, "rollout/ep_len_mean": 20.0, "time/fps": 128.0, "time/iterations": 1,
+        "time/time_elapsed": 2.0, "time/total_timesteps": 256, "lag/mean": 0.5, "lag/max": 1, "drop/stale": 1,
+        "ledger/issued": 8, "ledger/used": 7, "ledger/stale": 1, "stage/update": 0.5, "train/approx_kl": 0.01,
+        "train/loss": None,
+    }  # fmt: skip
+
+
+def scalars(folder: Path, name: str) -> list[tuple[int, float]]:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(folder / "tensorboard"))
+    events.Reload()
+    return [(event.step, event.value) for event in events.Scalars(name)]
+
+
+def test_tensorboard_gets_rows_a_while_apart_and_evaluations_and_the_last(tmp_path: Path) -> None:
+    now = 0.0
+    log = MetricsLog(tmp_path, clock=lambda: now)
+    for number in range(1, 26):
+        log.write(Progress(env_steps=number, return_mean=1.0), {"eval/mean_reward": 9.0} if number == 7 else {})
+        now += EVENTS_EVERY_S / 10
+    log.close()
+    assert [row["time/total_timesteps"] for row in read_rows(tmp_path / "metrics.jsonl")] == list(range(1, 26))
+    assert scalars(tmp_path, "rollout/ep_rew_mean") == [(number, 1.0) for number in (1, 7, 17, 25)]
+
+
+def test_a_resumed_run_takes_back_what_its_checkpoint_does_not_know(tmp_path: Path) -> None:
+    seconds = itertools.count()
+    log = MetricsLog(tmp_path, clock=lambda: next(seconds))
+    for steps in (100, 200, 300, 400):
+        log.write(Progress(env_steps=steps, return_mean=1.0), {})
+    log.close()
+    with (tmp_path / "metrics.jsonl").open("ab") as file:
+        file.write(b'{"time/total_timesteps": 50')  # killed in mid-row
+    log = MetricsLog(tmp_path, from_env_steps=200, clock=lambda: next(seconds))
+    for steps in (250, 350):
+        log.write(Progress(env_steps=steps, return_mean=2.0), {})
+    log.close()
+    assert [row["time/total_timesteps"] for row in read_rows(tmp_path / "metrics.jsonl")] == [100, 200, 250, 350]
+    assert scalars(tmp_path, "rollout/ep_rew_mean") == [(100, 1.0), (200, 1.0), (250, 2.0), (350, 2.0)]
+
+
+def test_a_row_that_the_disk_cuts_off_is_taken_back(tmp_path: Path) -> None:
+    log = MetricsLog(tmp_path)
+    log.write(Progress(env_steps=100), {})
+    appender = log._table
+    file = appender._file
+
+    class Full:
+        """Takes ten bytes and no more."""
+
+        def write(self, record: bytes) -> int:
+            return file.write(record[:10])
+
+        def truncate(self, length: int) -> None:
+            file.truncate(length)
+
+    appender._file = Full()  # type: ignore[assignment]
+    with pytest.raises(RunError, match=r"metrics\.jsonl: a row was not written: No space left on device"):
+        log.write(Progress(env_steps=200), {})
+    appender._file = file
+    log.write(Progress(env_steps=300), {})
+    log.close()
+    assert [row["time/total_timesteps"] for row in read_rows(tmp_path / "metrics.jsonl")] == [100, 300]
+
+
+def test_the_window_holds_the_last_hundred_episodes() -> None:
+    window = EpisodeWindow()
+    assert window.return_mean is None
+    assert window.length_mean is None
+    window.extend(Episode(float(i), 2 * i, 0.0) for i in range(150))
+    assert window.return_mean == np.mean(range(50, 150))
+    assert window.length_mean == 2 * np.mean(range(50, 150))
+    again = EpisodeWindow.of_state(json.loads(json.dumps(window.state())))
+    assert again.return_mean == window.return_mean
+    again.extend([Episode(0.0, 0, 0.0)])
+    assert again.return_mean == (np.sum(range(51, 150))) / 100

@@ -1,0 +1,103 @@
+"""A run that goes on from a checkpoint makes the same next update as one that did not stop: bit for bit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from learner.algorithms.ppo import PPO
+from learner.config.config import Config, resolve
+from learner.config.hyperparameters import PPOConfig
+from learner.journal import Past, recall
+from learner.rollouts.ledger import Ledger
+from learner.run import run_spec
+from learner.run_folder import checkpoint
+from learner.run_folder.run_folder import RunFolder
+from protocol.errors import CheckpointError
+from protocol.policy.policy import make_policy
+from protocol.rollout import Batch, Rollout, stack
+from protocol.specs import EnvSpec, RunSpec
+from workers.collect.collector import Collector
+from workers.session import Assignment
+
+
+def ppo(config: Config) -> PPOConfig:
+    assert isinstance(config.algorithm, PPOConfig)
+    return config.algorithm
+
+
+def record(run: RunSpec, algorithm: PPO, batches: int) -> list[Batch]:
+    """Batches as workers would have sent them (all under the first weights: what is compared is the learner)."""
+    collector = Collector(run, make_policy(run.policy))
+    collector.load(*algorithm.weights())
+    recorded: list[list[Rollout]] = []
+    for sequence in range(batches):
+        lanes = [Assignment(sequence * run.lanes + lane, lane, 0, sequence) for lane in range(run.lanes)]
+        recorded.append(collector.collect(lanes, 0, 1, lambda: None))
+    collector.close_all()
+    return [stack(rollouts) for rollouts in recorded]
+
+
+@pytest.mark.parametrize("env", ["CartPole-v1", "Pendulum-v1"])
+def test_the_next_update_is_the_same_as_without_a_stop(tmp_path: Path, env: str) -> None:
+    everything: dict[str, Any] = {
+        "rollout_steps": 16, "learning_rate_schedule": "linear", "clip_range_schedule": "linear",
+        "normalize_observations": True, "normalize_rewards": True, "batch_size": 32, "run_dir": str(tmp_path),
+    }  # fmt: skip
+    config = resolve(env, **everything)
+    run = run_spec(config, EnvSpec(env))
+
+    def algorithm() -> PPO:
+        return PPO(ppo(config), run.policy, total_steps=10_000, seed=1)
+
+    straight = algorithm()
+    first, second, third = record(run, straight, 3)
+    folder = RunFolder.create(config)
+    straight.update(first, lambda: None)
+    straight.update(second, lambda: None)
+    state = {"past": msgspec.to_builtins(Past(version=2)), "algorithm": straight.state_dict()}
+    checkpoint.save(folder.path, state, env_steps=2, keep=3)
+    metrics = straight.update(third, lambda: None)
+
+    resumed = algorithm()
+    past = recall(folder, resumed)
+    assert past.version == 2
+    metrics_again = resumed.update(third, lambda: None)
+    assert metrics_again == metrics
+    for expected, got in zip(straight.weights(), resumed.weights(), strict=True):
+        assert np.array_equal(expected, got)
+    not_resumed = algorithm()
+    not_resumed.update(third, lambda: None)
+    assert not np.array_equal(not_resumed.weights()[0], straight.weights()[0]), "the checkpoint changes nothing"
+
+
+def test_tickets_of_the_learner_that_died_are_lost_and_the_ledger_balances(tmp_path: Path) -> None:
+    config = resolve("CartPole-v1", run_dir=str(tmp_path))
+    run = run_spec(config, EnvSpec("CartPole-v1"))
+    algorithm = PPO(ppo(config), run.policy, total_steps=1, seed=1)
+    folder = RunFolder.create(config)
+    past = Past(ledger=Ledger(issued=10, used=6, transitions_received=80, transitions_used=60))
+    state = {"past": msgspec.to_builtins(past), "algorithm": algorithm.state_dict()}
+    checkpoint.save(folder.path, state, env_steps=60, keep=1)
+    ledger = recall(folder, algorithm).ledger
+    assert (ledger.lost, ledger.outstanding, ledger.transitions_late, ledger.transitions_waiting) == (4, 0, 20, 0)
+
+
+def test_a_checkpoint_of_another_network_is_refused_in_one_line(tmp_path: Path) -> None:
+    config = resolve("CartPole-v1", run_dir=str(tmp_path))
+    run = run_spec(config, EnvSpec("CartPole-v1"))
+    folder = RunFolder.create(config)
+    state = {
+        "past": msgspec.to_builtins(Past()),
+        "algorithm": PPO(ppo(config), run.policy, total_steps=1, seed=1).state_dict(),
+    }
+    checkpoint.save(folder.path, state, env_steps=0, keep=1)
+    wider = resolve("CartPole-v1", net=(32, 32), run_dir=str(tmp_path))
+    other = PPO(ppo(wider), run_spec(wider, EnvSpec("CartPole-v1")).policy, total_steps=1, seed=1)
+    with pytest.raises(CheckpointError, match="expected the state of this configuration") as failure:
+        recall(folder, other)
+    assert "\n" not in str(failure.value)

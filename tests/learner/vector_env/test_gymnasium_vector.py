@@ -1,0 +1,266 @@
+"""What gymnasium's own tests assert of its vector environments holds of ours: spaces, seeds, masks, calls, errors, ends."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector.utils import batch_space
+
+import millrace
+from learner.vector_env.env import ZmqVectorEnv
+from protocol.errors import EnvironmentFailed, OurError, UsageError
+from tests.support.bit_equality import alike
+from workers.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_ACTIONS, UNSUPPORTED_OBSERVATIONS
+
+SPACES = "workers.envs.toy:Spaces-v0"
+
+
+def inproc(env: Any, num_envs: int | None = 3, **keywords: Any) -> ZmqVectorEnv:
+    """With one worker, a thread: nothing here depends on the way."""
+    return millrace.make_vec(env, num_envs, **{"workers": 1, "transport": "inproc", "timeout": 20.0, **keywords})
+
+
+def sync(env: str, num_envs: int, **kwargs: Any) -> SyncVectorEnv[Any, Any]:
+    return SyncVectorEnv([lambda: gymnasium.make(env, disable_env_checker=True, **kwargs) for _ in range(num_envs)])
+
+
+# ---------------------------------------------------------------- spaces
+
+
+def space_cases() -> list[tuple[str, str]]:
+    observations = [(name, "discrete") for name in OBSERVATIONS if name not in UNSUPPORTED_OBSERVATIONS]
+    return observations + [("box", name) for name in ACTIONS if name not in UNSUPPORTED_ACTIONS]
+
+
+@pytest.mark.parametrize(("observation", "action"), space_cases())
+def test_of_every_space_there_is_a_batch(observation: str, action: str) -> None:
+    theirs = sync(SPACES, 3, observation=observation, action=action)
+    with inproc(SPACES, observation=observation, action=action) as env:
+        assert env.observation_space == batch_space(env.single_observation_space, 3) == theirs.observation_space
+        assert env.action_space == batch_space(env.single_action_space, 3) == theirs.action_space
+        first, infos = env.reset(seed=3)
+        assert first in env.observation_space
+        assert infos == {}
+        assert alike(first, theirs.reset(seed=3)[0])
+        theirs.action_space.seed(1)
+        for _ in range(6):
+            actions = theirs.action_space.sample()
+            row = env.step(actions)
+            assert row[0] in env.observation_space
+            assert alike(row, theirs.step(actions))
+    theirs.close()
+
+
+@pytest.mark.parametrize("shared_memory", [True, False])
+def test_observations_of_half_precision(shared_memory: bool) -> None:
+    class Half(gymnasium.Env[Any, Any]):
+        observation_space = spaces.Box(-1, 1, (3,), np.float16)
+        action_space = spaces.Discrete(2)
+
+        def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+            super().reset(seed=seed)
+            return np.full(3, 0.1, np.float16), {}
+
+        def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+            return np.full(3, 0.2, np.float16), 1, False, False, {}
+
+    with millrace.make_vec(Half, 2, workers=1, shared_memory=shared_memory) as env:
+        for observation, value in (env.reset()[0], 0.1), (env.step(np.zeros(2, np.int64))[0], 0.2):
+            assert alike(observation, np.full((2, 3), value, np.float16))
+
+
+class Sign(spaces.Space[str]):
+    """A space of somebody's own."""
+
+
+def test_a_space_of_ones_own_is_refused_in_one_line() -> None:
+    def odd() -> gymnasium.Env[Any, Any]:
+        env = gymnasium.make(SPACES)
+        env.unwrapped.observation_space = Sign()
+        return env.unwrapped
+
+    with pytest.raises(UsageError, match=r"observation space .* is not supported") as raised:
+        inproc(odd)
+    assert "\n" not in str(raised.value)
+
+
+def test_copies_of_different_spaces_are_refused() -> None:
+    envs = ["CartPole-v1", "FrozenLake-v1"]
+    with inproc(envs, None) as env, pytest.raises(OurError, match="all copies must have the same"):
+        env.reset()
+
+
+def test_the_metadata_of_the_environment_is_not_touched() -> None:
+    with inproc("CartPole-v1", autoreset_mode="NextStep") as a, inproc("CartPole-v1", autoreset_mode="SameStep") as b:
+        assert a.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+        assert b.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    assert "autoreset_mode" not in gymnasium.make("CartPole-v1").metadata
+
+
+# ---------------------------------------------------------------- reset and step
+
+
+@pytest.mark.parametrize("listed", [True, False])
+def test_what_a_step_gives(listed: bool) -> None:
+    """Also for a list of single actions."""
+    with inproc("CartPole-v1") as env:
+        observation, infos = env.reset()
+        assert (observation.dtype, observation.shape, type(infos)) == (np.float32, (3, 4), dict)
+        actions = [env.single_action_space.sample() for _ in range(3)] if listed else env.action_space.sample()
+        observation, reward, terminated, truncated, infos = env.step(actions)
+        assert (observation.dtype, observation.shape, type(infos)) == (np.float32, (3, 4), dict)
+        assert [array.dtype for array in (reward, terminated, truncated)] == [np.float64, np.bool_, np.bool_]
+        assert {array.shape for array in (reward, terminated, truncated)} == {(3,)}
+
+
+def test_the_seeds_of_the_copies_differ_and_stay() -> None:
+    with inproc("CartPole-v1") as env:
+        assert len(set(env.np_random_seed)) == 3, "before the first reset"
+        first, _ = env.reset(seed=42)
+        assert env.np_random_seed == (42, 43, 44)
+        assert len({row.tobytes() for row in first}) == 3
+        again, _ = env.reset()
+        assert env.np_random_seed == (42, 43, 44)
+        assert (again != first).all(), "a reset without a seed goes on with the generator"
+        assert (env.reset(seed=[42, None, 7])[0][0] == first[0]).all()
+        assert env.np_random_seed == (42, 43, 7)
+
+
+def test_some_copies_are_reset_and_the_others_stay_where_they_are() -> None:
+    with inproc("CartPole-v1", autoreset_mode="Disabled") as env:
+        env.reset(options={"reset_mask": np.array([True, False, True])})
+        with pytest.raises(UsageError, match=r"step before reset of copies \[1\]"):
+            env.step(np.zeros(3, np.int64))
+        first, _ = env.reset(seed=[0, 1, 2], options={"reset_mask": np.array([True, True, True])})
+        for _ in range(3):
+            stepped = env.step(np.zeros(3, np.int64))[0]
+        mask = np.array([True, True, False])
+        options = {"reset_mask": mask}
+        found, _ = env.reset(seed=[0, 1, 0], options=options)
+        assert (found[:2] == first[:2]).all()
+        assert (found[2] == stepped[2]).all()
+        for wrong, error in (
+            (np.array([True]), ValueError),
+            (np.array([True, True, False, False]), ValueError),
+            (np.array([[True, True, True]]), ValueError),
+            (np.array([1, 1, 0]), TypeError),
+            (np.array([1.0, 1.0, 0.0]), TypeError),
+            (np.zeros(3, bool), ValueError),
+        ):
+            with pytest.raises(error, match="reset_mask"):
+                env.reset(options={"reset_mask": wrong})
+        assert env.step(np.zeros(3, np.int64))[1].tolist() == [1.0] * 3
+        for actions, error in (np.zeros(2, np.int64), ValueError), (np.zeros(4, np.int64), ValueError), (0, TypeError):
+            with pytest.raises(error, match="actions expected one for each of 3 copies"):
+                env.step(actions)
+
+
+@pytest.mark.parametrize("mode", AutoresetMode, ids=lambda mode: mode.value)
+def test_what_is_told_of_an_episodes_end(mode: AutoresetMode) -> None:
+    zeros = np.zeros(2, np.int64)
+    with inproc("workers.envs.toy:Countdown-v0", 2, k=2, autoreset_mode=mode) as env:
+        env.reset(seed=1)
+        env.step(zeros)
+        observation, reward, terminated, _, infos = env.step(zeros)
+        assert terminated.all()
+        assert reward.tolist() == [1.0, 1.0]
+        if mode is AutoresetMode.SAME_STEP:
+            assert observation.tolist() == [[1.0], [1.0]]
+            assert [last.tolist() for last in infos["final_obs"]] == [[0.0], [0.0]]
+            assert infos["_final_obs"].tolist() == infos["_final_info"].tolist() == [True, True]
+            assert infos["final_info"] == {}
+            return
+        assert observation.tolist() == [[0.0], [0.0]]
+        assert "final_obs" not in infos
+        if mode is AutoresetMode.NEXT_STEP:
+            observation, reward, terminated, *_ = env.step(zeros)
+            assert (observation.tolist(), reward.tolist()) == ([[1.0], [1.0]], [0.0, 0.0])
+            assert not terminated.any()
+        else:
+            with pytest.raises(UsageError, match=r"copies \[0, 1\] have ended"):
+                env.step(zeros)
+
+
+def test_what_reset_raises_comes_with_its_own_traceback() -> None:
+    class Picky(gymnasium.Env[Any, Any]):
+        observation_space, action_space = spaces.Discrete(2), spaces.Discrete(2)
+
+        def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+            if seed == 1:
+                raise ValueError("not this seed")
+            return 0, {}
+
+    with inproc(Picky, 2, workers=1) as env:
+        assert env.reset(seed=[0, 0])[0].tolist() == [0, 0]
+        with pytest.raises(EnvironmentFailed, match=r"copy 1, reset: its environment raised ValueError: not this seed") as e:
+            env.reset(seed=[0, 1])
+        assert 'raise ValueError("not this seed")' in e.value.detail
+
+
+# ---------------------------------------------------------------- calls
+
+
+def test_attributes_are_set_before_the_first_reset_and_of_another_number_not_at_all() -> None:
+    with inproc("CartPole-v1", 4) as env:
+        env.set_attr("gravity", [9.81, 3.72, 8.87, 1.62])
+        assert env.get_attr("gravity") == (9.81, 3.72, 8.87, 1.62)
+        env.reset(seed=1)
+        for wrong in ([1.0, 2.0], (1.0,) * 5, []):
+            with pytest.raises(ValueError, match="values expected one for each of 4 copies"):
+                env.set_attr("gravity", wrong)
+        assert env.get_attr("gravity") == (9.81, 3.72, 8.87, 1.62)
+        env.set_attr("gravity", 9.8)
+        assert env.call("gravity") == (9.8,) * 4
+
+
+def test_lists_of_frames_are_rendered() -> None:
+    with inproc("CartPole-v1", 2, render_mode="rgb_array_list") as env:
+        env.reset()
+        images = env.call("render")
+        assert [[frame.shape for frame in frames] for frames in images] == [[(400, 600, 3)]] * 2
+
+
+# ---------------------------------------------------------------- the end
+
+DOINGS: dict[str, Callable[[ZmqVectorEnv], object]] = {
+    "reset": lambda env: env.reset(),
+    "step": lambda env: env.step(np.zeros(3, np.int64)),
+    "step_async": lambda env: env.step_async(np.zeros(3, np.int64)),
+    "call": lambda env: env.call("gravity"),
+    "get_attr": lambda env: env.get_attr("gravity"),
+    "set_attr": lambda env: env.set_attr("gravity", 1.0),
+    "render": lambda env: env.render(),
+    "step_wait": lambda env: env.step_wait(),
+}
+
+
+def test_while_a_step_is_pending_nothing_else_is_done() -> None:
+    with inproc("CartPole-v1") as env:
+        env.reset(seed=1)
+        env.step_async(np.zeros(3, np.int64))
+        for doing, do in DOINGS.items():
+            if doing != "step_wait":
+                with pytest.raises(AlreadyPendingCallError, match="a step is pending"):
+                    do(env)
+        assert env.step_wait()[1].tolist() == [1.0] * 3, "and the step is not lost by it"
+
+
+@pytest.mark.parametrize("pending", [False, True])
+def test_after_its_end_nothing_is_done(pending: bool) -> None:
+    env = inproc("CartPole-v1")
+    env.reset(seed=1)
+    if pending:
+        env.step_async(np.zeros(3, np.int64))
+    env.close()
+    env.close()
+    assert env.closed
+    for do in DOINGS.values():
+        with pytest.raises(ClosedEnvironmentError, match=r"after close\(\)"):
+            do(env)

@@ -1,0 +1,362 @@
+"""The vector environment is, to the bit, gymnasium's SyncVectorEnv, whichever way the steps travel."""
+
+from __future__ import annotations
+
+import io
+import logging
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from copy import deepcopy
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.wrappers import vector as wrappers
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.console import Console
+
+import millrace
+from learner.vector_env.env import ZmqVectorEnv
+from millrace.cli.status import ask, observer_name, shown
+from protocol.errors import EnvironmentFailed, UsageError
+from protocol.wire.link import WorkerLink
+from tests.support.bit_equality import alike
+
+MODES = tuple(AutoresetMode)
+WAYS: dict[str, dict[str, Any]] = {
+    "shared": {},
+    "ipc": {"shared_memory": False},
+    "tcp": {"shared_memory": False, "transport": "tcp"},
+    "inproc": {"transport": "inproc"},
+}
+CASES: dict[str, dict[str, Any]] = {
+    "CartPole-v1": {},
+    "Pendulum-v1": {"max_episode_steps": 30},
+    "Taxi-v4": {"max_episode_steps": 20},
+    "workers.envs.toy:Informs-v0": {},
+    "workers.envs.toy:Spaces-v0": {"observation": "nested", "action": "table"},
+}
+
+
+@contextmanager
+def both(
+    env: str, num_envs: int, mode: AutoresetMode, way: str, workers: int = 2, **kwargs: Any
+) -> Iterator[tuple[ZmqVectorEnv, SyncVectorEnv[Any, Any]]]:
+    """Ours, and gymnasium's own in this process."""
+    with ExitStack() as stack:
+        ours = millrace.make_vec(env, num_envs, workers=workers, autoreset_mode=mode, timeout=20, **WAYS[way], **kwargs)
+        stack.callback(ours.close)
+        theirs = SyncVectorEnv(
+            [lambda: gymnasium.make(env, disable_env_checker=True, **kwargs) for _ in range(num_envs)], autoreset_mode=mode
+        )
+        stack.callback(theirs.close)
+        yield ours, theirs
+
+
+def play(ours: ZmqVectorEnv, theirs: SyncVectorEnv[Any, Any], steps: int, mode: AutoresetMode) -> None:
+    """The same seeds and actions to both."""
+    assert alike(ours.reset(seed=7), theirs.reset(seed=7))
+    theirs.action_space.seed(3)
+    for t in range(steps):
+        action = theirs.action_space.sample()
+        mine, wanted = ours.step(action), theirs.step(action)
+        assert alike(mine, wanted), f"step {t}: {mine} is not {wanted}"
+        ended = wanted[2] | wanted[3]
+        if mode is AutoresetMode.DISABLED and ended.any():
+            given = [{"reset_mask": ended.copy()} for _ in range(2)]
+            assert alike(ours.reset(options=given[0]), theirs.reset(options=given[1]))
+
+
+@pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.value)
+@pytest.mark.parametrize("env", CASES)
+def test_through_shared_memory_it_is_gymnasiums_own(env: str, mode: AutoresetMode) -> None:
+    with both(env, 5, mode, "shared", **CASES[env]) as (ours, theirs):
+        play(ours, theirs, 2000 if env == "CartPole-v1" else 200, mode)
+
+
+@pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.value)
+@pytest.mark.parametrize("way", ["ipc", "tcp", "inproc"])
+def test_by_messages_it_is_gymnasiums_own(way: str, mode: AutoresetMode) -> None:
+    with both("workers.envs.toy:Informs-v0", 5, mode, way) as (ours, theirs):
+        play(ours, theirs, 150, mode)
+
+
+def test_its_face_is_gymnasiums_own() -> None:
+    with both("CartPole-v1", 3, AutoresetMode.SAME_STEP, "inproc") as (ours, theirs):
+        assert isinstance(ours, VectorEnv)
+        for name in ("num_envs", "observation_space", "action_space", "single_observation_space", "single_action_space"):
+            assert getattr(ours, name) == getattr(theirs, name)
+        assert ours.metadata == theirs.metadata
+        assert ours.render_mode is None
+        assert repr(ours) == "ZmqVectorEnv(CartPole-v1, num_envs=3)"
+        assert ours.unwrapped is ours
+
+
+def test_calls_and_attributes() -> None:
+    with both("workers.envs.toy:Informs-v0", 5, AutoresetMode.NEXT_STEP, "shared") as (ours, theirs):
+        assert ours.get_attr("level") == theirs.get_attr("level") == (1,) * 5
+        for env in (ours, theirs):
+            env.reset(seed=1)
+            env.set_attr("level", [1, 2, 3, 4, 5])
+        assert alike(ours.get_attr("level"), theirs.get_attr("level"))
+        assert ours.call("shout", "hm", times=2) == theirs.call("shout", "hm", times=2)
+        assert ours.call_some([1, 4], "level") == (2, 5)
+        assert alike(ours.np_random_seed, theirs.np_random_seed)
+        with pytest.raises(AttributeError, match="no_such_thing"):
+            ours.get_attr("no_such_thing")
+        with pytest.raises(EnvironmentFailed, match="expected plain data") as raised:
+            ours.get_attr("unwrapped")
+        assert "Traceback" in raised.value.detail
+        with pytest.raises(ValueError, match="use reset"):
+            ours.call("reset")
+        theirs.action_space.seed(3)
+        action = theirs.action_space.sample()
+        assert alike(ours.step(action), theirs.step(action))  # no call has hurt it
+
+
+def test_frames_are_rendered_where_the_copies_are() -> None:
+    with millrace.make_vec("CartPole-v1", 2, workers=1, render_mode="rgb_array") as env:
+        env.reset(seed=1)
+        frames = env.render()
+        assert env.render_mode == "rgb_array"
+        assert [frame.shape for frame in frames] == [(400, 600, 3)] * 2
+
+
+def test_a_callable_and_a_list_of_environments() -> None:
+    def made(k: int) -> Any:
+        return lambda: gymnasium.make("workers.envs.toy:Countdown-v0", k=k)
+
+    with millrace.make_vec([made(2), made(3), "workers.envs.toy:Countdown-v0"], workers=2) as env:
+        assert env.num_envs == 3
+        env.reset()
+        ended = [env.step(np.zeros(3, np.int64))[2].tolist() for _ in range(3)]
+        assert ended == [[False, False, False], [True, False, False], [False, True, False]]
+
+
+def test_actions_of_another_dtype_reach_the_environment_as_they_are() -> None:
+    """A float64 action in a float32 space: rounding it would change the bits of what follows."""
+    with both("Pendulum-v1", 3, AutoresetMode.NEXT_STEP, "shared") as (ours, theirs):
+        ours.reset(seed=1), theirs.reset(seed=1)
+        draw = np.random.default_rng(1)
+        for _ in range(20):
+            action = draw.uniform(-2, 2, (3, 1))
+            assert alike(ours.step(action), theirs.step(action))
+
+
+def test_observations_are_copies_unless_that_is_turned_off() -> None:
+    zeros = np.zeros(2, np.int64)
+    with millrace.make_vec("CartPole-v1", 2, workers=1) as env:
+        first, _ = env.reset(seed=1)
+        kept = first.copy()
+        env.step(zeros)
+        assert (first == kept).all()
+    with millrace.make_vec("CartPole-v1", 2, workers=1, copy=False) as env:
+        first, _ = env.reset(seed=1)
+        kept = first.copy()
+        second = env.step(zeros)[0]
+        assert (first == second).all()
+        assert (first != kept).any()
+
+
+def test_gymnasiums_wrappers_stand_over_it() -> None:
+    def wrapped(env: VectorEnv[Any, Any, Any]) -> VectorEnv[Any, Any, Any]:
+        env = wrappers.RecordEpisodeStatistics(env)
+        env = wrappers.NormalizeObservation(env)
+        env = wrappers.ClipReward(env, -0.5, 0.5)
+        return wrappers.DictInfoToList(env)
+
+    with both("CartPole-v1", 4, AutoresetMode.NEXT_STEP, "shared") as (ours, theirs):
+        mine, other = wrapped(ours), wrapped(theirs)
+        a, b = mine.reset(seed=2), other.reset(seed=2)
+        assert alike(a[0], b[0])
+        ended = 0
+        for t in range(200):
+            action = np.random.default_rng(t).integers(0, 2, 4)
+            (*row, infos), (*their_row, their_infos) = mine.step(action), other.step(action)
+            assert alike(row, their_row)
+            returns = [info.get("episode", {}).get("r") for info in infos]  # type: ignore[attr-defined]
+            assert returns == [info.get("episode", {}).get("r") for info in their_infos]  # type: ignore[attr-defined]
+            ended += sum(one is not None for one in returns)
+        assert ended > 10
+
+
+def test_an_info_that_is_no_plain_data_comes_as_its_repr_and_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    with (
+        caplog.at_level(logging.WARNING, "millrace.learner"),
+        millrace.make_vec("workers.envs.toy:Informs-v0", 2, workers=1, odd=True) as env,
+    ):
+        env.reset(seed=1)
+        action = env.action_space.sample()
+        for _ in range(3):
+            infos = env.step(action)[4]
+        assert infos["odd"].tolist() == ["<odd>", "<odd>"]
+    assert [record.message for record in caplog.records].count(
+        "info odd of copy 0 is no plain data: it comes as its repr, a string"
+    ) == 1
+
+
+def test_infos_too_long_for_shared_memory_travel_as_a_message() -> None:
+    with both("workers.envs.toy:Informs-v0", 2, AutoresetMode.NEXT_STEP, "shared", wordy=1_000_000) as (ours, theirs):
+        play(ours, theirs, 5, AutoresetMode.NEXT_STEP)
+        assert len(ours.step(ours.action_space.sample())[4]["word"][0]) > 1_000_000
+
+
+def test_whoever_asks_how_it_is_is_answered_while_it_steps() -> None:
+    zeros = np.zeros(3, np.int64)
+    with millrace.make_vec("CartPole-v1", 3, workers=2) as env, ThreadPoolExecutor(1) as pool:
+        env.reset(seed=1)
+        link = WorkerLink(env._hub.link.address, observer_name())
+        asked = pool.submit(ask, link, 20.0)
+        while not asked.done():
+            env.step(zeros)
+        link.close(0)
+        status = asked.result()
+    assert (status.env, status.total_steps) == ("CartPole-v1", 0)
+    assert [(worker.worker, worker.lanes) for worker in sorted(status.workers, key=lambda one: one.worker)] == [
+        ("w0", (0,)),
+        ("w1", (1,)),
+    ]
+    console = Console(width=120, file=io.StringIO(), record=True)
+    console.print(shown(status))
+    assert "CartPole-v1, a vector environment: " in console.export_text()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"num_envs": 0}, "num_envs expected at least 1"),
+        ({"lanes": 9}, "lanes expected 1 to num_envs"),
+        ({"transport": "pigeon"}, "transport expected"),
+        ({"bind": "tcp://127.0.0.1:*"}, "workers expected 0 with a bind address"),
+        ({"workers": None, "bind": "tcp://127.0.0.1:*", "env": lambda: None}, "factory"),
+        ({"workers": None, "bind": "tcp://0.0.0.0:*", "insecure": True, "keys": "k"}, "got both"),
+        ({"workers": None, "bind": "tcp://0.0.0.0:*", "advertise": "host:7"}, "expected an IPv6 address in brackets"),
+        ({"autoreset_mode": "Never"}, "autoreset_mode expected"),
+        ({"on_worker_loss": "shrug"}, "on_worker_loss expected"),
+        ({"env": "NoSuchEnv-v7"}, "is not registered"),
+        ({"env": "workers.envs.toy:Spaces-v0", "observation": "text"}, "is not supported"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_line(wrong: dict[str, Any], says: str) -> None:
+    with pytest.raises(UsageError, match=says):
+        millrace.make_vec(**{"env": "CartPole-v1", "num_envs": 2, "workers": 1, **wrong})
+
+
+def test_the_order_of_calls_is_gymnasiums() -> None:
+    zeros = np.zeros(2, np.int64)
+    with millrace.make_vec("CartPole-v1", 2, transport="inproc", autoreset_mode="Disabled") as env:
+        with pytest.raises(UsageError, match="call reset"):
+            env.step(zeros)
+        env.reset(seed=1)
+        with pytest.raises(gymnasium.error.NoAsyncCallError):
+            env.step_wait()
+        env.step_async(zeros)
+        with pytest.raises(gymnasium.error.AlreadyPendingCallError):
+            env.step_async(zeros)
+        with pytest.raises(gymnasium.error.AlreadyPendingCallError):
+            env.reset()
+        env.step_wait()
+        with pytest.raises(UsageError, match="have ended"):
+            for _ in range(50):
+                env.step(zeros)
+        for mask, error in ([True, False], TypeError), (np.zeros(2, bool), ValueError), (np.ones(3, bool), ValueError):
+            with pytest.raises(error):
+                env.reset(options={"reset_mask": mask})
+        with pytest.raises(ValueError, match="seed expected one for each"):
+            env.reset(seed=[1])
+        with pytest.raises(ValueError, match="actions expected one for each"):
+            env.reset(), env.step(np.zeros(3, np.int64))
+    env.close()
+    with pytest.raises(gymnasium.error.ClosedEnvironmentError):
+        env.reset()
+
+
+seeds = st.none() | st.integers(0, 9) | st.lists(st.none() | st.integers(0, 9), min_size=3, max_size=3)
+options = st.none() | st.dictionaries(st.sampled_from(["why", "how"]), st.text(max_size=3) | st.integers(-3, 3), max_size=2)
+masks = st.lists(st.booleans(), min_size=3, max_size=3).filter(any)
+calls = st.lists(
+    st.one_of(
+        st.tuples(st.just("step"), st.integers(1, 4)),
+        st.tuples(st.just("step_async"), st.none()),
+        st.tuples(st.just("reset"), st.tuples(seeds, options)),
+        st.tuples(st.just("mask"), st.tuples(seeds, options, masks)),
+        st.tuples(st.just("call"), st.tuples(st.text(max_size=3), st.integers(0, 2))),
+        st.tuples(st.just("set_attr"), st.integers(-3, 3) | st.lists(st.integers(-3, 3), min_size=3, max_size=3)),
+        st.tuples(st.just("get_attr"), st.sampled_from(["level", "np_random_seed", "metadata"])),
+        st.tuples(st.just("render"), st.none()),
+    ),
+    max_size=15,
+)
+
+
+def test_any_sequence_of_calls_gives_the_same() -> None:
+    """Through shared memory and by messages, in each mode: whatever comes back is compared, after every call."""
+    with ExitStack() as stack:
+        pairs = {
+            (mode, way): stack.enter_context(both("workers.envs.toy:Informs-v0", 3, mode, way))
+            for mode in MODES
+            for way in ("shared", "inproc")
+        }
+
+        @settings(max_examples=120, deadline=None)
+        @given(st.sampled_from(sorted(pairs, key=str)), st.integers(0, 1000), calls)
+        def any_sequence(pair: tuple[AutoresetMode, str], seed: int, sequence: list[tuple[str, Any]]) -> None:
+            play_sequence(*pairs[pair], pair[0], seed, sequence)
+
+        any_sequence()
+
+
+def play_sequence(
+    ours: ZmqVectorEnv, theirs: SyncVectorEnv[Any, Any], mode: AutoresetMode, seed: int, sequence: list[tuple[str, Any]]
+) -> None:
+    def same(name: str, *args: Any, **keywords: Any) -> Any:
+        mine, wanted = (getattr(env, name)(*args, **deepcopy(keywords)) for env in (ours, theirs))
+        assert alike(mine, wanted), f"{name}: {mine} is not {wanted}"
+        return wanted
+
+    theirs.action_space.seed(seed)
+    same("reset", seed=seed)
+    same("set_attr", "level", 1)
+    ended = np.zeros(3, bool)
+    for kind, value in sequence:
+        match kind:
+            case "step" | "step_async":
+                for _ in range(value or 1):
+                    if mode is AutoresetMode.DISABLED and ended.any():
+                        same("reset", options={"reset_mask": ended, "why": "ended"})
+                    action = theirs.action_space.sample()
+                    if kind == "step_async":
+                        ours.step_async(action)
+                        mine, wanted = ours.step_wait(), theirs.step(action)
+                        assert alike(mine, wanted), f"{mine} is not {wanted}"
+                    else:
+                        wanted = same("step", action)
+                    ended = wanted[2] | wanted[3]
+            case "reset":
+                same("reset", seed=value[0], options=value[1])
+                ended[:] = False
+            case "mask":
+                given, told, chosen = value
+                same("reset", seed=given, options={"reset_mask": np.array(chosen), **(told or {})})
+                ended &= ~np.array(chosen)
+            case "call":
+                same("call", "shout", value[0], times=value[1])
+            case "set_attr":
+                same("set_attr", "level", value)
+            case "get_attr":
+                same("get_attr", value)
+            case "render":
+                same("render")
+
+
+def test_lanes_that_are_more_than_workers_move_in_at_once() -> None:
+    """Nobody waits for a worker that is not to come: only a lane whose worker died waits for its successor."""
+    env = millrace.make_vec("CartPole-v1", 4, workers=1, lanes=4, timeout=5)
+    env.reset(seed=1)  # within the deadline, which is shorter than a lane's patience
+    assert env.step(np.zeros(4, np.int64))[1].tolist() == [1.0] * 4
+    assert env.workers == 1
+    env.close()

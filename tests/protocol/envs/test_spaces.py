@@ -1,0 +1,192 @@
+"""Every space a policy can see or act in, from the environment into a rollout and back; the others in one line."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector.utils import batch_space
+
+from protocol.envs.spaces import action_spec, observation_leaves, reader, writer
+from protocol.errors import BadRollout, UsageError
+from protocol.rollout import Array, Episode, Rollout, validate
+from protocol.specs import RunSpec
+from tests.support.collectors import TOY, a_collector, bits, collect, over_sync, run_of
+from workers.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_ACTIONS, UNSUPPORTED_OBSERVATIONS
+
+SEEN = sorted(OBSERVATIONS.keys() - UNSUPPORTED_OBSERVATIONS)
+DONE = sorted(ACTIONS.keys() - UNSUPPORTED_ACTIONS)
+
+
+def spaces_run(observation: str = "box", action: str = "discrete") -> RunSpec:
+    return run_of(f"{TOY}Spaces-v0", T=6, N=3, kwargs={"observation": observation, "action": action})
+
+
+@pytest.mark.parametrize(("observation", "action"), [(seen, "discrete") for seen in SEEN] + [("box", done) for done in DONE])
+def test_every_space_collects_alike_in_a_loop_and_in_a_vector_environment(observation: str, action: str) -> None:
+    run = spaces_run(observation, action)
+    loop, sync = a_collector(run), a_collector(run, over_sync([run.env.make] * 3))
+    for k in range(2):
+        ours, theirs = (collect(collector, run, k, lanes=(0, 1)) for collector in (loop, sync))  # the toy checks its actions
+        assert [bits(rollout) for rollout in ours] == [bits(rollout) for rollout in theirs]
+        assert all(map(np.ptp, ours[0].obs))  # something was seen,
+        assert np.ptp(ours[0].action)  # and done
+        assert (ours[0].reward[~ours[0].valid] == 0).all()
+
+
+@pytest.mark.parametrize("observation", SEEN)
+def test_the_leaves_of_an_observation_are_its_arrays_as_they_are(observation: str) -> None:
+    run, space = spaces_run(observation), OBSERVATIONS[observation]
+    (rollout,) = collect(a_collector(run), run)
+    env = run.env.make()
+    for leaf, array in zip(observation_leaves(space), rollout.obs, strict=True):
+        inner = space
+        for key in filter(None, leaf.path.split("/")):
+            inner = inner[int(key) if key.isdigit() else key]  # type: ignore[index]
+        for value in array.reshape(-1, *leaf.shape):
+            assert inner.contains(np.asarray(value) if leaf.kind == "box" else value)
+    env.close()
+
+
+def test_leaves_are_named_by_their_path_and_keep_the_order_of_the_space() -> None:
+    leaves = observation_leaves(OBSERVATIONS["nested"])
+    assert [(leaf.path, leaf.kind, leaf.shape, leaf.dtype) for leaf in leaves] == [
+        ("arm/0", "discrete", (), "int64"),
+        ("arm/1", "box", (3,), "float32"),
+        ("camera/left", "box", (12, 12, 3), "uint8"),
+    ]
+    assert [leaf.is_image for leaf in leaves] == [False, False, True]
+    assert (leaves[0].sizes, leaves[0].start) == ((4,), (-1,))
+
+
+@pytest.mark.parametrize("observation", SEEN)
+def test_a_batch_is_read_like_one_observation(observation: str) -> None:
+    space = OBSERVATIONS[observation]
+    read, leaves = reader(space), observation_leaves(space)
+    one, batch = read(space.sample()), read(batch_space(space, 5).sample())
+    for leaf, single, several in zip(leaves, one, batch, strict=True):
+        assert np.shape(single) == leaf.shape
+        assert np.shape(several) == (5, *leaf.shape)
+
+
+@pytest.mark.parametrize("action", DONE)
+def test_whatever_is_sampled_is_written_into_the_space(action: str) -> None:
+    space = ACTIONS[action]
+    spec = action_spec(space)
+    generator = np.random.default_rng(0)
+    sizes = np.reshape(spec.sizes, spec.shape) if spec.sizes else 2
+    drawn = (
+        generator.normal(0, 10, (50, *spec.shape)) if spec.kind == "box" else generator.integers(0, sizes, (50, *spec.shape))
+    )
+    stored = drawn.astype(spec.stored_dtype)
+    before = stored.copy()
+    written = writer(spec)(stored)
+    assert written.dtype == space.dtype
+    assert all(space.contains(np.asarray(row)) for row in written)
+    assert (stored == before).all()
+
+
+def test_actions_are_shifted_to_where_the_space_starts() -> None:
+    table = action_spec(ACTIONS["table"])
+    assert writer(table)(np.zeros((1, 2, 2), np.int64)).tolist() == [[[1, 0], [0, -2]]]
+    assert writer(action_spec(ACTIONS["offset"]))(np.array([0, 1, 2])).tolist() == [5, 6, 7]
+
+
+def test_only_what_is_outside_is_clipped() -> None:
+    write = writer(action_spec(ACTIONS["half"]))  # from 0 up, and from 0 down
+    assert write(np.array([[-3, -3], [3, 3], [0.5, -0.5]], np.float32)).tolist() == [[0, -3], [3, 0], [0.5, -0.5]]
+
+
+@pytest.mark.parametrize("name", UNSUPPORTED_OBSERVATIONS)
+def test_an_observation_space_that_is_not_supported_is_one_line(name: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        spaces_run(observation=name)
+    line = str(caught.value)
+    assert line.startswith("observation space Text(")
+    assert line.endswith(
+        "is not supported; supported are Box, Discrete, MultiBinary, MultiDiscrete, and Dict and Tuple of these"
+    )
+    assert (" at said " in line) is (name == "words")
+    assert "\n" not in line
+
+
+@pytest.mark.parametrize("name", UNSUPPORTED_ACTIONS)
+def test_an_action_space_that_is_not_supported_is_one_line(name: str) -> None:
+    with pytest.raises(
+        UsageError, match=r"^action space .* is not supported; supported are Discrete, MultiDiscrete, .*$"
+    ) as caught:
+        spaces_run(action=name)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        spaces.Box(0, 1, (2,), np.longdouble),
+        spaces.Graph(spaces.Discrete(2), None),
+        spaces.Sequence(spaces.Discrete(2)),
+        spaces.OneOf([spaces.Discrete(2)]),
+    ],
+    ids=str,
+)
+def test_observations_without_a_fixed_array_are_refused(space: gymnasium.Space[object]) -> None:
+    with pytest.raises(UsageError, match="is not supported"):
+        observation_leaves(space)
+
+
+# ------------------------------------------------------------------------------------------------ what the learner refuses
+
+
+def altered(observation: str = "box", action_space: str = "discrete", **changes: object) -> str:
+    """What `validate` says of a good rollout after these changes."""
+    run = run_of(f"{TOY}Spaces-v0", T=6, N=3, kwargs={"observation": observation, "action": action_space})
+    (good,) = collect(a_collector(run), run)
+    fields = {name: getattr(good, name) for name in good.__struct_fields__} | {
+        name: change(getattr(good, name)) for name, change in changes.items() if callable(change)
+    }
+    with pytest.raises(BadRollout) as caught:
+        validate(Rollout(**fields), run)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def _with(array: Array, at: tuple[int, ...], value: object) -> Array:
+    changed = array.copy()
+    changed[at] = value
+    return changed
+
+
+def test_a_rollout_that_breaks_the_law_is_refused_in_one_line() -> None:
+    assert altered(obs=lambda obs: (obs[0].astype(np.float64),)) == (
+        "obs expected float32[7, 3, 3], got float64[7, 3, 3]; is its environment the same version?"
+    )
+    assert altered(obs=lambda obs: ()) == "obs expected 1 arrays, got 0"
+    assert altered(reward=lambda a: a[:-1]).startswith("reward expected float32[6, 3], got float32[5, 3]")
+    assert altered(reward=lambda a: _with(a, (2, 1), np.nan)) == "reward expected finite values, got nan at step 2, copy 1"
+    assert (
+        altered(log_prob=lambda a: _with(a, (0, 2), -np.inf))
+        == "log_prob expected finite values, got -inf at step 0, copy 2"
+    )
+    assert (
+        altered(obs=lambda o: (_with(o[0], (6, 0, 1), np.inf),)) == "obs expected finite values, got inf at step 6, copy 0"
+    )
+    assert altered(action=lambda a: _with(a, (0, 0), 3)).startswith("action expected 0 to 2, got 0 to 3")
+    assert altered(action=lambda a: _with(a, (0, 0), -1)).startswith("action expected 0 to 2, got -1")
+    assert altered(lane=lambda _: 8) == "lane expected 0 to 7, got 8"
+    assert altered(valid=lambda a: _with(a, (4, 1), True)) == "valid expected False at step 4, copy 1, got True"
+    assert altered(truncated=lambda a: _with(a, (3, 0), False)) == "valid expected True at step 4, copy 0, got False"
+    assert altered(terminated=lambda a: _with(a, (5, 2), True)) == "episodes expected 4, got 3"
+    assert altered(episodes=lambda e: e[1:]) == "episodes expected 3, got 2"
+    assert altered(valid=lambda a: (a.view(np.uint8) * 3).view(bool)) == "valid expected bytes 0 and 1, got 3"
+
+
+def test_values_that_are_not_of_the_space_are_refused() -> None:
+    """Else the learner's one-hot features would be indexed out of their bounds."""
+    low = altered(observation="discrete", obs=lambda o: (o[0] - 100,))
+    assert low.startswith("obs expected ")
+    assert altered(observation="discrete", obs=lambda o: (o[0] + 100,)).startswith("obs expected ")
+    assert altered(observation="multidiscrete", obs=lambda o: (o[0] + 100,)).startswith("obs expected ")
+    assert altered(action_space="multibinary", action=lambda a: a + 2).startswith("action expected 0 to 1, got ")
+    assert altered(episodes=lambda e: (Episode(float("nan"), 1, 1.0), *e[1:])).startswith("episode expected a finite return")
+    assert altered(episodes=lambda e: (Episode(1.0, 0, 1.0), *e[1:])).startswith("episode expected a finite return")

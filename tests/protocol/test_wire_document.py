@@ -1,0 +1,327 @@
+"""`protocol/README.md` cannot lie: its generated parts are made here from the code, and the test fails when they differ.
+
+python -m tests.protocol.test_wire_document        (or `make docs`) writes them
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+import textwrap
+from collections.abc import Mapping
+from enum import Enum
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from learner.members import membership
+from learner.members import states as standing
+from learner.rollouts import roster
+from protocol import messages, rollout, specs
+from protocol.keys import handshake
+from protocol.messages import PROTOCOL_VERSION, Collect, Hello, Permit, Received, Rollout, ToLearner, ToWorker, Weights
+from protocol.wire import codec, link
+from protocol.wire import compression as packing
+from workers import session, states
+
+DOCUMENT = Path(__file__).parents[2] / "protocol" / "README.md"
+BEGIN, END = "<!-- generated {name}: `make docs` writes what follows -->", "<!-- end of {name} -->"
+
+# Records that travel inside messages, in the order in which a reader meets them.
+RECORDS: tuple[type, ...] = (
+    messages.Permit,
+    messages.Received,
+    messages.LaneLife,
+    messages.WorkerStatus,
+    rollout.Episode,
+    specs.RunSpec,
+    specs.StepSpec,
+    specs.EnvSpec,
+    specs.PolicySpec,
+    specs.EncoderSpec,
+    specs.NamedShape,
+    specs.Leaf,
+    specs.ActionSpec,
+)
+# Fields that mean the same wherever they stand, or whose name says it all: used where the code adds nothing to the name.
+WORDS: Mapping[str, str] = {
+    "session": "the stay that this belongs to",
+    "lane": "number of the lane",
+    "incarnation": "which life of the lane",
+    "ticket": "number of the ticket",
+    "tickets": "numbers of tickets",
+    "version": "how many updates made the weights",
+    "protocol": "`PROTOCOL_VERSION` of the worker",
+    "host": "where the worker runs, for people",
+    "pid": "of the worker's process; with `host` it tells a repeat from another process of that name",
+    "software": "for people",
+    "reason": "for people: who, what, expected, got, what to do",
+    "error": "what was raised, in one line",
+    "traceback": "where it was raised, as text",
+    "number": "counts the replies of this session, from 1",
+    "permits": "the tickets, each for one rollout",
+    "received": "one for each lane that is the worker's: a lane that is missing lives elsewhere",
+    "below": "every sequence below this has arrived",
+    "lanes": "the lanes (in `RunSpec`: how many there are)",
+    "run": "the run that the worker joins",
+    "episodes": "those that ended in this rollout",
+    "length": "steps",
+    "seconds": "wall-clock seconds",
+    "env": "the environment",
+    "policy": "what acts",
+    "seed": "of the run; env copies and action generators are seeded by (seed, lane, incarnation, …)",
+    "heartbeat_s": "seconds between two heartbeats of a worker",
+    "observation": "the arrays of an observation, in order",
+    "action": "what the policy chooses",
+    "activation": "between hidden layers",
+    "kind": "the gymnasium space it comes from",
+    "shape": "without T and N",
+}
+# What each limit bounds. A new MAX_* constant without a line here fails a test.
+LIMITS: Mapping[tuple[ModuleType, str], str] = {
+    (codec, "MAX_FRAMES"): "frames of a message, the head included",
+    (codec, "MAX_HEAD_BYTES"): "bytes of the head",
+    (codec, "MAX_FRAME_BYTES"): "bytes of any one frame: the connection is closed before more is read",
+    (codec, "MAX_ITEMS"): "items of any list or map in the head",
+    (codec, "MAX_DIMENSIONS"): "dimensions of an array",
+    (packing, "MAX_STACK"): "frames of a stack that travels packed",
+    (packing, "LEAST_FRAME_BYTES"): "bytes of a frame of such a stack, at least",
+    (session, "HELLO_FIRST_S"): "seconds from the first Hello to the second; each wait is twice the last",
+    (session, "HELLO_MOST_S"): "seconds between two Hello at most",
+    (session, "REMEMBERED_TICKETS"): "finished tickets of a lane that a worker remembers, to know a late repeat",
+    (roster, "STRIKES"): "messages or rollouts that cannot be used, after which a worker is refused",
+    (membership, "REMEMBERED_REFUSALS"): "refused processes that the learner remembers, so that they do not come back",
+    (handshake, "HANDSHAKE_MS"): "milliseconds that a connection may take to say who it is",
+    (link, "LINGER_MS"): "milliseconds for which a closing side still sends what is queued",
+}
+
+
+# -------------------------------------------------------------------- from the code to markdown
+
+
+def class_of(kind: type) -> ast.ClassDef:
+    """The class as it is written in its file."""
+    tree = ast.parse(inspect.getsource(inspect.getmodule(kind) or messages))
+    return next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == kind.__name__)
+
+
+def one_line(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|")
+
+
+def fields_of(kind: type) -> list[tuple[str, str, str, str]]:
+    """Name, type, default and meaning of each field, as they are written."""
+    rows: list[tuple[str, str, str, str]] = []
+    body = class_of(kind).body
+    for node, after in zip(body, [*body[1:], None], strict=True):
+        if not isinstance(node, ast.AnnAssign) or not isinstance(node.target, ast.Name):
+            continue
+        meaning = ""
+        if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) and isinstance(after.value.value, str):
+            meaning = after.value.value
+        default = "" if node.value is None else ast.unparse(node.value)
+        rows.append((node.target.id, ast.unparse(node.annotation), default, meaning))
+    assert [row[0] for row in rows] == [field.name for field in msgspec.structs.fields(kind)]
+    return rows
+
+
+def record(kind: type[msgspec.Struct]) -> str:
+    """A heading, what the class says of itself, and its fields: with their places, if they go by position."""
+    config = kind.__struct_config__
+    lines = [f"#### `{kind.__name__}`", "", one_line(inspect.getdoc(kind) or ""), ""]
+    rows = fields_of(kind)
+    if not config.array_like:
+        lines += [f"A map; `{config.tag_field}` is `{kind.__name__}`." if config.tag else "A map.", ""]
+    elif not rows:
+        lines += [f'It has no fields: `["{kind.__name__}"]`.', ""]
+    if rows:
+        places = "| place " if config.array_like else ""
+        lines += [f"{places}| field | type | meaning |", "|---" * (4 if places else 3) + "|"]
+        for place, (name, annotation, default, meaning) in enumerate(rows, 1 if config.tag else 0):
+            text = f"`{one_line(annotation)}`" + (f" = `{one_line(default)}`" if default else "")
+            at = f"| {place} " if places else ""
+            lines.append(f"{at}| `{name}` | {text} | {one_line(meaning or WORDS.get(name, ''))} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def state_table(table: Mapping[Any, Mapping[type, Any]]) -> str:
+    """One row for each message or (in italics) internal event, one column for each state; a dash: nothing changes."""
+    states = list(table)
+    events = list(dict.fromkeys(event for row in table.values() for event in row))
+    said = [event for event in events if is_message(event)]
+    inner = [event for event in events if not is_message(event)]
+
+    def cell(state: Enum, event: type) -> str:
+        after = table[state].get(event)
+        return "–" if after is None else "stays" if after is state else f"**{after.value}**"
+
+    lines = ["| | " + " | ".join(state.value for state in states) + " |", "|---" * (len(states) + 1) + "|"]
+    for event in said + inner:
+        name = f"`{event.__name__}`" if is_message(event) else f"*{event.__name__}*"
+        lines.append(f"| {name} | " + " | ".join(cell(state, event) for state in states) + " |")
+    lines.append("")
+    lines += [f"- *{event.__name__}*: {one_line(inspect.getdoc(event) or '').removeprefix('Event: ')}" for event in inner]
+    return "\n".join(lines) + "\n"
+
+
+def is_message(kind: type) -> bool:
+    return kind in ToLearner.__args__ + ToWorker.__args__
+
+
+def shown(head: bytes) -> str:
+    """A head, as JSON."""
+    return msgspec.json.encode(msgspec.msgpack.decode(head)).decode()
+
+
+def part_version() -> str:
+    return f"This document describes protocol version **{PROTOCOL_VERSION}**.\n"
+
+
+def part_example() -> str:
+    weights = Weights(3, np.arange(6, dtype=np.float32), np.zeros(0, np.float32))
+    collect = Collect(81985529216486895, 3, (Permit(40, 0, 1),), (Received(0, 1, 9, (10,)),))
+    hello = Hello(PROTOCOL_VERSION, "w0", "host", 7, 77, "millrace", 1)
+    lines = ["```"]
+    for message in (hello, collect, weights):
+        head, *arrays = codec.encode(message)
+        lines.append(f"frame 0  {shown(bytes(head))}")
+        lines += [f"         {row}" for row in textwrap.wrap(bytes(head).hex(" "), 3 * 32)]
+        lines += [f"frame {number}  {len(array)} bytes" for number, array in enumerate(arrays, 1)]
+        lines.append("")
+    lines[-1] = "```"
+    return "\n".join(lines) + "\n"
+
+
+def part_dtypes() -> str:
+    return "Dtypes, in numpy's letters: " + ", ".join(f"`{dtype}`" for dtype in sorted(codec.DTYPES)) + ".\n"
+
+
+def part_messages() -> str:
+    parts = ["### What a worker says\n"]
+    parts += [record(kind) for kind in ToLearner.__args__]
+    parts.append("### What the learner says\n")
+    parts += [record(kind) for kind in ToWorker.__args__]
+    parts.append("### What an observer says, and is told\n")
+    parts += [record(messages.Inquire), record(messages.Status)]
+    parts.append("### Records inside messages\n")
+    parts += [record(kind) for kind in RECORDS]
+    return "\n".join(parts)
+
+
+def part_limits() -> str:
+    lines = ["| limit | value | bounds |", "|---|---|---|"]
+    for (module, name), meaning in LIMITS.items():
+        lines.append(f"| `{module.__name__}.{name}` | {getattr(module, name)} | {meaning} |")
+    return "\n".join(lines) + "\n"
+
+
+PARTS = {
+    "version": part_version,
+    "example": part_example,
+    "dtypes": part_dtypes,
+    "messages": part_messages,
+    "worker table": lambda: state_table(states.TABLE),
+    "learner table": lambda: state_table(standing.TABLE),
+    "limits": part_limits,
+}
+
+
+def rewritten(text: str) -> str:
+    """The document, with every generated part made afresh. Raises ValueError when a part's markers are missing."""
+    for name, make in PARTS.items():
+        begin, end = BEGIN.format(name=name), END.format(name=name)
+        before, found, rest = text.partition(begin)
+        _, closed, after = rest.partition(end)
+        if not found or not closed:
+            raise ValueError(f"{DOCUMENT.name}: expected the markers {begin} and {end}")
+        text = f"{before}{begin}\n\n{make()}\n{end}{after}"
+    return text
+
+
+# -------------------------------------------------------------------- the tests
+
+
+def test_the_wire_document_says_what_the_code_does() -> None:
+    text = DOCUMENT.read_text(encoding="utf-8")
+    assert rewritten(text) == text, (
+        "protocol/README.md differs from the code; run: python -m tests.protocol.test_wire_document"
+    )
+
+
+def test_every_generated_part_of_the_document_has_a_maker() -> None:
+    found = re.findall(r"<!-- generated (.+?):", DOCUMENT.read_text(encoding="utf-8"))
+    assert sorted(found) == sorted(PARTS)
+
+
+OF_OBSERVERS = (messages.Inquire, messages.Status)
+
+
+@pytest.mark.parametrize(
+    "kind", [*ToLearner.__args__, *ToWorker.__args__, *OF_OBSERVERS, *RECORDS], ids=lambda kind: kind.__name__
+)
+def test_every_message_and_field_says_what_it_means(kind: type) -> None:
+    assert ast.get_docstring(class_of(kind))
+    assert [name for name, _, _, meaning in fields_of(kind) if not (meaning or WORDS.get(name))] == []
+
+
+def test_every_record_that_travels_is_described() -> None:
+    """Whatever a field's type names, the document has a heading for."""
+    described = {*ToLearner.__args__, *ToWorker.__args__, *OF_OBSERVERS, *RECORDS}
+    for kind in described:
+        for field in msgspec.structs.fields(kind):
+            for name in re.findall(r"\b[A-Z]\w+", str(field.type)):
+                if isinstance(inner := getattr(messages, name, getattr(specs, name, None)), type):
+                    assert inner in described or not issubclass(inner, msgspec.Struct), f"{kind.__name__}.{field.name}"
+
+
+def test_every_limit_is_in_the_document() -> None:
+    for module in (codec, link, packing, session, roster, messages, rollout, specs):
+        for name in re.findall(r"^(MAX_\w+) = ", inspect.getsource(module), re.MULTILINE):
+            assert (module, name) in LIMITS, f"say in LIMITS what {name} bounds"
+
+
+def test_every_state_has_a_row_in_its_table() -> None:
+    assert set(states.TABLE) == set(states.State)
+    assert set(standing.TABLE) == set(standing.Standing)
+
+
+def test_a_worker_is_told_by_its_table_what_to_do_with_every_message() -> None:
+    """Every message to a worker is heeded in some state, and every message to a learner in some standing."""
+    heeded = {event for row in states.TABLE.values() for event in row if is_message(event)}
+    assert heeded == set(ToWorker.__args__)
+    heard = {event for row in standing.TABLE.values() for event in row if is_message(event)}
+    assert heard - {messages.Drain} == set(ToLearner.__args__)
+
+
+def test_a_difference_is_noticed() -> None:
+    text = DOCUMENT.read_text(encoding="utf-8").replace("| `sequence` | `int`", "| `sequence` | `str`")
+    assert rewritten(text) != text
+
+
+def test_rollouts_fields_stand_in_the_order_of_the_code() -> None:
+    assert [name for name, *_ in fields_of(Rollout)][:5] == ["session", "lane", "ticket", "version", "sequence"]
+
+
+@pytest.mark.parametrize("kind", [*ToLearner.__args__, *ToWorker.__args__, *OF_OBSERVERS], ids=lambda kind: kind.__name__)
+def test_from_the_document_alone_a_head_can_be_read(kind: type[msgspec.Struct]) -> None:
+    """Whatever stands at a place that the document gives to a field comes back as that field."""
+    text = record(kind)
+    places = {name: int(place) for place, name in re.findall(r"^\| (\d+) \| `(\w+)`", text, re.MULTILINE)}
+    fields = {name: f"its {name}" for name in kind.__struct_fields__}
+    head = msgspec.to_builtins(kind(**fields))
+    if kind in (Hello, messages.Refuse):
+        assert "A map; `type` is" in text
+        assert (places, head) == ({}, {"type": kind.__name__} | fields)
+    else:
+        assert head == [kind.__name__, *fields.values()]
+        assert {name: head[place] for name, place in places.items()} == fields
+
+
+if __name__ == "__main__":
+    DOCUMENT.write_text(rewritten(DOCUMENT.read_text(encoding="utf-8")), encoding="utf-8")

@@ -1,0 +1,366 @@
+"""The codec: every message comes back as it went; whatever bytes come instead, `BadMessage` and nothing else."""
+
+from __future__ import annotations
+
+import tracemalloc
+import types
+import typing
+from typing import Any, Literal
+
+import msgpack
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from protocol.errors import BadMessage
+from protocol.messages import Hello, Inquire, Refuse, Rollout, ToLearner, ToWorker, Weights
+from protocol.wire.codec import DTYPES, MAX_FRAMES, MAX_HEAD_BYTES, decode_to_learner, decode_to_worker, encode
+from tests.support.fake_ends import fake_rollout
+
+KINDS = [*typing.get_args(ToLearner), *typing.get_args(ToWorker)]
+BY_NAME = (Hello, Refuse)
+Frames = list[bytes]
+
+arrays = st.sampled_from(sorted(DTYPES)).flatmap(
+    lambda dtype: hnp.arrays(np.dtype(dtype), hnp.array_shapes(min_dims=0, max_dims=4, min_side=0, max_side=3))
+)
+
+
+def values(wanted: Any) -> st.SearchStrategy[Any]:
+    """Anything of this type: a message is told by its fields, so that a new one needs no new test."""
+    plain: dict[Any, st.SearchStrategy[Any]] = {
+        int: st.integers(-(2**63), 2**64 - 1),
+        float: st.floats(allow_nan=False),
+        bool: st.booleans(),
+        str: st.text(max_size=20),
+        bytes: st.binary(max_size=20),
+        types.NoneType: st.none(),
+    }
+    origin, inner = typing.get_origin(wanted), typing.get_args(wanted)
+    if wanted in plain:
+        return plain[wanted]
+    if isinstance(wanted, type) and issubclass(wanted, msgspec.Struct):
+        hints = typing.get_type_hints(wanted)
+        return st.builds(wanted, **{name: values(hints[name]) for name in wanted.__struct_fields__})
+    if origin is np.ndarray:
+        return arrays
+    if origin is tuple:
+        return st.lists(values(inner[0]), max_size=3).map(tuple)
+    if origin is dict:
+        return st.dictionaries(values(inner[0]), values(inner[1]), max_size=3)
+    if origin is Literal:
+        return st.sampled_from(inner)
+    return st.one_of([values(one) for one in inner])
+
+
+messages = st.one_of([values(kind) for kind in KINDS])
+
+
+def sent(message: Any) -> Frames:
+    return [bytes(frame) for frame in encode(message)]
+
+
+def decode(frames: Frames, kind: type) -> Any:
+    return (decode_to_learner if kind in typing.get_args(ToLearner) else decode_to_worker)(frames)
+
+
+def plainly(message: Any) -> object:
+    """The message with its arrays spelled out, so that it can be compared."""
+    return msgspec.to_builtins(message, enc_hook=lambda array: (array.dtype.str, array.shape, array.tobytes()))
+
+
+@settings(max_examples=200, deadline=None)
+@given(messages)
+def test_every_message_comes_back_as_it_went(message: Any) -> None:
+    back = decode(sent(message), type(message))
+    assert type(back) is type(message)
+    assert plainly(back) == plainly(message)
+    assert encode(back) == encode(message)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_message_is_taken_for_one_of_the_other_side(kind: type) -> None:
+    wrong_side = decode_to_worker if kind in typing.get_args(ToLearner) else decode_to_learner
+    with pytest.raises(BadMessage, match=f"Invalid value '{kind.__name__}'"):
+        wrong_side(head({"type": kind.__name__} if kind in BY_NAME else [kind.__name__]))
+
+
+# ------------------------------------------------------------------------------------------------ the head's form
+
+
+@settings(max_examples=200, deadline=None)
+@given(messages)
+def test_what_goes_by_position_does_not_go_by_name_nor_the_other_way_about(message: Any) -> None:
+    first, *rest = sent(message)
+    content = msgpack.unpackb(first)
+    names = ["type", *message.__struct_fields__]
+    by_name = content if type(message) in BY_NAME else dict(zip(names, content, strict=True))
+    assert list(by_name) == names
+    assert by_name["type"] == type(message).__name__
+    for wrong in (list(by_name.values()), by_name):
+        if wrong != content:
+            with pytest.raises(BadMessage, match=f"Invalid value '{type(message).__name__}'"):
+                decode(head(wrong, *rest), type(message))
+    with pytest.raises(BadMessage, match="Expected `array`, got `object`"):
+        decode(head({name: by_name[name] for name in message.__struct_fields__}, *rest), type(message))
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.one_of([values(kind) for kind in KINDS if kind not in BY_NAME]), st.data())
+def test_a_head_of_another_length_is_refused(message: Any, data: st.DataObject) -> None:
+    first, *rest = sent(message)
+    content = msgpack.unpackb(first)
+    fields = len(message.__struct_fields__)
+    given = data.draw(st.integers(0, fields + 3).filter(lambda n: n != fields))
+    frames = head([*content[: 1 + given], *[None] * (given - fields)], *rest)
+    if isinstance(message, Rollout) and given == fields - 1:  # the one default there is
+        assert plainly(decode(frames, Rollout)) == plainly(msgspec.structs.replace(message, episodes=()))
+        return
+    with pytest.raises(BadMessage, match=f"{type(message).__name__} expected {fields} fields, got {given}$"):
+        decode(frames, type(message))
+
+
+def test_a_default_stands_at_the_end_alone() -> None:
+    """By position nothing else can be left out."""
+    defaults = {kind: kind.__struct_defaults__ for kind in (*KINDS, Inquire) if kind.__struct_defaults__}
+    assert defaults == {Rollout: ((),)}
+    assert Rollout.__struct_fields__[-1] == "episodes"
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (["Heartbeat", "7", 0, 0, [], 0, {}, 0], "Expected `int`, got `str` - at `Heartbeat.session`"),
+        (["Heartbeat", 7, 0, 0, [1, None], 0, {}, 0], "Expected `int`, got `null` - at `Heartbeat.tickets[1]`"),
+        (["Heartbeat", 7, 0, 0, [], 0, {"act": "x"}, 0], "Expected `float`, got `str` - at `Heartbeat.stages[...]`"),
+        (["Heartbeat", 7, 0, 0, [], 0, {}, 1.5], "Expected `int`, got `float` - at `Heartbeat.resident_bytes`"),
+        (["Heartbeat", 7, 0, 0, [], 0, {}], "Heartbeat expected 7 fields, got 6"),
+        (["Heartbeat", 7, 0, 0, [], 0, {}, 0, 0], "Heartbeat expected 7 fields, got 8"),
+        (["Heartbeat"], "Heartbeat expected 7 fields, got 0"),
+        (["Inquire", 1], "Inquire expected 0 fields, got 1"),
+        ({"type": "Hello", "protocol": None}, "Expected `int`, got `null` - at `$.protocol`"),
+        ({"type": "Hello"}, "Object missing required field `protocol`"),
+        ({"type": "Refuse", "reason": "no"}, "Invalid value 'Refuse'"),
+    ],
+)
+def test_what_is_wrong_in_a_head_is_named(content: object, says: str) -> None:
+    with pytest.raises(BadMessage) as caught:
+        decode_to_learner(head(content))
+    assert str(caught.value) == f"head is not a message of ours: ValidationError: {says}" or says.startswith("Invalid")
+    assert says in str(caught.value)
+
+
+def test_what_is_wrong_in_a_record_within_a_message_is_named() -> None:
+    for permit, says in (
+        ([1, 2], "Expected `array` of at least length 3, got 2 - at `Collect.permits[1]`"),
+        ([1, 2, []], "Expected `int`, got `array` - at `Collect.permits[1][2]`"),
+    ):
+        with pytest.raises(BadMessage) as caught:
+            decode_to_worker(head(["Collect", 7, 0, [[1, 0, 0], permit], []]))
+        assert says in str(caught.value)
+
+
+def test_hello_and_refuse_are_for_ever_what_they_were() -> None:
+    """Bytes of protocol version 2, whose other messages went by name too: the two still part politely."""
+    hello = bytes.fromhex(
+        "88a474797065a548656c6c6fa870726f746f636f6c02a6776f726b6572a27730a4686f7374a168a370696407a46c6966654d"
+        "a8736f667477617265a173a7617474656d707401"
+    )
+    assert decode_to_learner([hello]) == Hello(2, "w0", "h", 7, 77, "s", 1)
+    assert sent(Hello(2, "w0", "h", 7, 77, "s", 1)) == [hello]
+    refuse = bytes.fromhex("82a474797065a6526566757365a6726561736f6ea26e6f")
+    assert decode_to_worker([refuse]) == Refuse("no")
+    assert sent(Refuse("no")) == [refuse]
+
+
+def test_the_head_of_a_small_rollout_is_small() -> None:
+    head, *_ = encode(fake_rollout(2**63, 0, 1, 0, 0))
+    assert len(head) < 120
+
+
+# ------------------------------------------------------------------------------------------------ hostile bytes
+
+
+def head(content: object, *frames: bytes) -> Frames:
+    return [msgpack.packb(content), *frames]
+
+
+def refused(frames: Frames) -> str:
+    """Both ends refuse these frames; what they say of them is short."""
+    said = ""
+    for decoder in (decode_to_learner, decode_to_worker):
+        with pytest.raises(BadMessage) as caught:
+            decoder(frames)
+        said = str(caught.value)
+        assert "\n" not in said
+        assert len(said) < 500
+    return said
+
+
+def survives(frames: Frames) -> None:
+    """Either end takes the frames for a message, or raises `BadMessage`."""
+    for decoder in (decode_to_learner, decode_to_worker):
+        try:
+            message = decoder(frames)
+        except BadMessage:
+            continue
+        for array in arrays_in(message):
+            assert not array.flags.writeable
+            assert array.dtype.kind in "biuf"
+
+
+def arrays_in(message: object) -> list[np.ndarray[Any, Any]]:
+    found: list[np.ndarray[Any, Any]] = []
+    msgspec.to_builtins(message, enc_hook=found.append)
+    return found
+
+
+@settings(max_examples=150, deadline=None)
+@given(messages, st.data())
+def test_damaged_messages(message: Any, data: st.DataObject) -> None:
+    frames = sent(message)
+    which = data.draw(st.integers(0, len(frames) - 1))
+    frame = frames[which]
+    if data.draw(st.booleans()) and frame:
+        at, mask = data.draw(st.integers(0, len(frame) - 1)), data.draw(st.integers(1, 255))
+        frame = frame[:at] + bytes([frame[at] ^ mask]) + frame[at + 1 :]
+    else:
+        frame = frame[: data.draw(st.integers(0, len(frame)))] + data.draw(st.binary(max_size=5))
+    survives([*frames[:which], frame, *frames[which + 1 :]])
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.lists(st.binary(max_size=50), max_size=4))
+def test_random_bytes(frames: Frames) -> None:
+    survives(frames)
+
+
+Json = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text(max_size=5) | st.binary(max_size=5),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5) | st.sampled_from(["type"]), inner),
+    max_leaves=8,
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(messages, st.data(), Json)
+def test_a_field_of_another_kind(message: Any, data: st.DataObject, nonsense: Any) -> None:
+    frames = sent(message)
+    content = msgpack.unpackb(frames[0])
+    places = sorted(content) if isinstance(content, dict) else range(len(content))
+    content[data.draw(st.sampled_from(places))] = nonsense
+    survives(head(content, *frames[1:]))
+
+
+WEIGHTS = Weights(version=1, parameters=np.arange(3, dtype=np.float32), buffers=np.zeros(0, np.float32))
+
+
+def weights(parameters: object, *frames: bytes) -> Frames:
+    """Weights whose parameters are described so, with these array frames."""
+    return head(["Weights", 1, parameters, ["<f4", [0], 1]], b"", *frames)
+
+
+def test_the_hand_made_weights_are_good_ones() -> None:
+    back = decode_to_worker(weights(["<f4", [3], 2], bytes(12)))
+    assert isinstance(back, Weights)
+    assert back.parameters.tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("frames", "says"),
+    [
+        ([], "expected 1 to 64 frames, got 0"),
+        ([b""] * (MAX_FRAMES + 1), "expected 1 to 64 frames, got 65"),
+        ([b"\xc0" * (MAX_HEAD_BYTES + 1)], "head expected at most 1048576 bytes"),
+        ([b"\x91" * 100_000], "head is not a message of ours"),  # nested a hundred thousand deep
+        ([b"\x81\xa1a" * 100_000], "head is not a message of ours"),
+        ([b"\xdd\xff\xff\xff\xff"], "exceeds max_array_len"),  # says it has four thousand million items
+        ([b"\xdf\xff\xff\xff\xff"], "exceeds max_map_len"),
+        ([b"\xdb\xff\xff\xff\xff"], "head is not a message of ours"),
+        ([b"\xc7\x01\x05x"], "head is not a message of ours"),  # an extension type
+        ([b"\xd6\xff\x00\x00\x00\x00"], "head is not a message of ours"),  # a timestamp
+        (head([1] * 70_000), "exceeds max_array_len"),
+        (head(["Nothing"]), "Invalid value 'Nothing' - at `$[0]`"),
+        (head(["Nothing - at `$[1]`"]), "Invalid value 'Nothing - at `$[1]`' - at `$[0]`"),
+        (head(["x" * 1_000_000]), "Invalid value 'xxx"),
+        (head(["Hello\nworker w1 said: all is well"]), r"Invalid value 'Hello\nworker w1 said"),
+        (head([["x" * 100]]), "Expected `str`, got"),
+        (head([]), "Expected `array` of at least length 1, got 0"),
+        (head({"type": "Nothing"}), "Invalid value 'Nothing' - at `$.type`"),
+        (head({"type": "x" * 1_000_000}), "Invalid value 'xxx"),
+        (head({"type": "Hello\nworker w1 said: all is well"}), r"Invalid value 'Hello\nworker w1 said"),
+        (head({"type": ["x" * 100]}), "Expected `str`, got"),
+        (head({1: 2}), "head is not a message of ours"),
+        (head({}), "head is not a message of ours"),
+        (head(None), "head is not a message of ours"),
+        ([*sent(WEIGHTS), b"more"], "Weights: expected 2 arrays, got 3 frames"),
+        (sent(WEIGHTS)[:-1], "array frame expected 1 to 1, got 2"),
+        (weights(["|O", [1], 2], bytes(8)), "array dtype expected one of ours"),
+        (weights(["<U3", [1], 2], bytes(12)), "array dtype expected one of ours"),
+        (weights([">f4", [3], 2], bytes(12)), "array dtype expected one of ours"),
+        (weights(["<f4,<f4", [1], 2], bytes(8)), "array dtype expected one of ours"),
+        (weights(["|V8", [1], 2], bytes(8)), "array dtype expected one of ours"),
+        (weights(["<c8", [1], 2], bytes(8)), "array dtype expected one of ours"),
+        (weights([["<f4"], [3], 2], bytes(12)), "array expected [dtype, shape, index]"),
+        (weights(["<f4", [3], 3], bytes(12)), "array frame expected 1 to 2"),
+        (weights(["<f4", [3], 0], bytes(12)), "array frame expected 1 to 2"),
+        (weights(["<f4", [3], -1], bytes(12)), "array frame expected 1 to 2"),
+        (weights(["<f4", [3], True], bytes(12)), "array frame expected 1 to 2"),
+        (weights(["<f4", [3], 2.0], bytes(12)), "array expected [dtype, shape, index]"),
+        (weights(["<f4", [4], 2], bytes(12)), "expected 16 bytes, got 12"),
+        (weights(["<f4", [-3], 2], bytes(12)), "array shape expected"),
+        (weights(["<f4", [-1, -3], 2], bytes(12)), "array shape expected"),
+        (weights(["<f4", [2**32, 2**32], 2], bytes(0)), "array shape expected"),
+        (weights(["<f4", [2**30] * 8, 2], bytes(12)), " bytes, got 12"),
+        (weights(["<f4", [True, 3], 2], bytes(12)), "array shape expected"),
+        (weights(["<f4", ["3"], 2], bytes(12)), "array shape expected"),
+        (weights(["<f4", [1] * 100 + [3], 2], bytes(12)), "array shape expected"),
+        (weights(["<f4", 3, 2], bytes(12)), "array expected [dtype, shape, index]"),
+        (weights(["<f4", [3]], bytes(12)), "array expected [dtype, shape, index]"),
+        (weights(None, bytes(12)), "array expected [dtype, shape, index]"),
+        (weights("x" * 100_000, bytes(12)), "array expected [dtype, shape, index]"),
+        (weights(bytes(12), bytes(12)), "array expected [dtype, shape, index]"),
+    ],
+)
+def test_hostile_frames_are_refused(frames: Frames, says: str) -> None:
+    assert says in refused(frames)
+
+
+def test_the_head_may_not_grow_on_the_way_in() -> None:
+    """A few bytes that promise much are refused before anything is set aside for them."""
+    tracemalloc.start()
+    for promise in (b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff", b"\xdb\xff\xff\xff\xff"):
+        refused([promise])
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 1_000_000
+
+
+def test_arrays_are_read_only_views_on_the_frame() -> None:
+    frames = encode(WEIGHTS)
+    writable = [bytearray(frame) for frame in frames]
+    back = decode_to_worker(writable)  # type: ignore[arg-type]
+    assert isinstance(back, Weights)
+    assert np.shares_memory(back.parameters, np.frombuffer(writable[1], np.uint8))
+    with pytest.raises(ValueError, match="read-only"):
+        back.parameters[0] = 1
+
+
+def test_arrays_are_sent_without_a_copy() -> None:
+    parameters = np.arange(4, dtype=np.float32)
+    _, frame, _ = encode(Weights(version=0, parameters=parameters, buffers=np.zeros(0, np.float32)))
+    assert np.shares_memory(np.frombuffer(frame, np.uint8), parameters)
+
+
+@pytest.mark.parametrize("array", [np.array([None]), np.array(["a"]), np.zeros(1, complex), np.zeros(1, ">f4")], ids=str)
+def test_what_cannot_be_sent_is_not_sent(array: Any) -> None:
+    with pytest.raises(TypeError, match="Weights cannot carry an array of"):
+        encode(Weights(version=0, parameters=array, buffers=array))
+
+
+def test_a_head_that_the_other_side_would_refuse_is_not_sent() -> None:
+    with pytest.raises(ValueError, match="head expected at most"):
+        encode(Hello(1, "w", "h", 1, 1, "x" * MAX_HEAD_BYTES, 1))

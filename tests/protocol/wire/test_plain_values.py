@@ -1,0 +1,86 @@
+"""Plain values come back with their types; what is not plain is named; hostile bytes raise one error."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from protocol.errors import BadMessage
+from protocol.wire.plain_values import MAX_DEPTH, Shown, pack, shown_keys, unpack
+from tests.support.bit_equality import alike
+
+scalars = hnp.arrays(
+    st.one_of(hnp.scalar_dtypes(), hnp.byte_string_dtypes(), hnp.unicode_string_dtypes()).filter(
+        lambda d: d.kind in "biufcSUmM" and d.itemsize <= 16
+    ),
+    hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=3),
+)
+leaves = st.one_of(
+    st.none(), st.booleans(), st.integers(), st.floats(), st.complex_numbers(), st.text(), st.binary(), scalars,
+    scalars.filter(lambda a: a.size > 0).map(lambda a: a.ravel()[0]),
+)  # fmt: skip
+values = st.recursive(
+    leaves,
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=3),
+        st.lists(inner, max_size=3).map(tuple),
+        st.dictionaries(st.text(max_size=3), inner, max_size=3),
+        st.dictionaries(st.integers() | st.text(max_size=3), inner, max_size=3),
+    ),
+    max_leaves=8,
+)
+
+
+@given(values)
+def test_plain_values_come_back_with_their_types(value: Any) -> None:
+    assert alike(unpack(pack(value)), value)
+
+
+def test_arrays_of_objects_come_back() -> None:
+    array = np.array([None, "a", 3], dtype=object).reshape(3, 1)
+    assert alike(unpack(pack(array)), array)
+
+
+class Odd:
+    def __repr__(self) -> str:
+        return "<odd>"
+
+
+def test_what_is_not_plain_is_named() -> None:
+    with pytest.raises(TypeError, match=r"^level\.inner\[1\]: expected plain data .*, got Odd$"):
+        pack({"level": {"inner": [1, Odd()]}})
+
+
+def test_what_is_not_plain_is_shown_if_asked_so_and_can_be_found() -> None:
+    back = unpack(pack({"a": {"b": Odd()}, "c": "<odd>"}, show=True))
+    assert back == {"a": {"b": "<odd>"}, "c": "<odd>"}
+    assert type(back["a"]["b"]) is Shown
+    assert shown_keys(back) == ["a.b"]
+
+
+def test_what_is_too_deep_is_refused() -> None:
+    deep: Any = 1
+    for _ in range(MAX_DEPTH + 2):
+        deep = (deep,)
+    with pytest.raises(TypeError, match="levels"):
+        pack(deep)
+
+
+@given(st.binary(max_size=200))
+def test_hostile_bytes_raise_one_error(data: bytes) -> None:
+    with suppress(BadMessage):
+        unpack(data)
+
+
+@given(values, st.integers(0, 400), st.integers(0, 255))
+def test_spoiled_bytes_raise_one_error(value: Any, at: int, byte: int) -> None:
+    data = bytearray(pack(value))
+    data[at % len(data)] = byte
+    with suppress(BadMessage):
+        unpack(bytes(data))

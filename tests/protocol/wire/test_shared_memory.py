@@ -1,0 +1,80 @@
+"""Shared memory's words, its bells, and waiting awake."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+import pytest
+
+from learner.vector_env.spec import describe
+from protocol.wire.shared_memory import MAY_SPIN, POSSIBLE, Awake, Bell, Memory, Rung
+
+pytestmark = pytest.mark.skipif(not POSSIBLE, reason="needs Linux")
+
+
+@pytest.fixture
+def bell() -> Iterator[Bell]:
+    made = Bell()
+    yield made
+    made.close()
+
+
+def test_a_bell_tells_a_message_from_a_step_and_forgets_what_it_told(bell: Bell) -> None:
+    assert bell.wait(0) is Rung.NOT
+    bell.ring()
+    bell.ring(Rung.MESSAGE)
+    bell.ring()
+    assert bell.wait(0) is Rung.MESSAGE
+    assert bell.wait(0) is Rung.NOT
+    bell.ring()
+    assert bell.wait(0) is Rung.STEP
+
+
+def test_ringing_never_waits_and_never_fails(bell: Bell) -> None:
+    for _ in range(100_000):  # more than a pipe holds
+        bell.ring()
+    assert bell.wait(0) is Rung.STEP
+    ours = Bell(rings=os.dup(bell.rings))
+    bell.close()
+    ours.ring()  # nobody is left to hear it
+    ours.close()
+
+
+def test_who_is_done_last_sees_that_nobody_is_under_way() -> None:
+    spec = describe("CartPole-v1", 6, lanes=3).step
+    here = Memory(spec)
+    there = Memory(spec, os.dup(here.fd))
+    for lane in range(3):
+        here.order(lane, 7)
+    left = []
+    for lane in (2, 0, 1):
+        assert there.answer(lane, there.ordered(lane), b"")
+        left.append(there.under_way())
+    assert left == [2, 1, 0]
+    here.close()
+    there.close()
+
+
+@pytest.mark.skipif(not MAY_SPIN, reason="nobody waits awake on this kind of machine")
+def test_waiting_awake_is_tried_less_often_while_it_is_in_vain() -> None:
+    awake, looks = Awake(), 0
+
+    def never() -> bool:
+        nonlocal looks
+        looks += 1
+        return False
+
+    tried = []
+    for _ in range(12):
+        looks = 0
+        assert not awake.wait(never, 1e-4)
+        tried.append(looks > 1)  # one look is made in any case
+    assert tried == [True, False, True, False, False, False, True, *[False] * 5]
+    for _ in range(2):  # what was left out counts down
+        assert not awake.wait(never, 1e-4)
+    answers = iter([False, True])
+    assert awake.wait(lambda: next(answers), 1.0)  # now it comes at once
+    looks = 0
+    assert not awake.wait(never, 1e-4)
+    assert looks > 1

@@ -1,0 +1,104 @@
+"""What the tests of collecting share: runs of one environment, collectors with random weights, equality to the bit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import gymnasium
+import msgspec
+import numpy as np
+from gymnasium.vector import SyncVectorEnv
+
+from learner.config.config import resolve
+from millrace.launch.local import train
+from protocol.envs.spaces import action_spec, observation_leaves
+from protocol.policy.policy import Policy, buffer_size, layout, make_policy, size
+from protocol.rollout import Rollout, validate
+from protocol.specs import EnvSpec, PolicySpec, RunSpec
+from workers.collect.collector import Collector, OpenCopies, copies_of
+from workers.collect.env_copies import CopyLoop, VectorCopies
+from workers.session import Assignment
+
+TOY = "workers.envs.toy:"
+VERSION, SESSION = 7, 3
+
+
+def no_pulse() -> None:
+    """Nobody listens."""
+
+
+def run_of(env: str, T: int = 8, N: int = 2, kwargs: dict[str, Any] | None = None, **policy: Any) -> RunSpec:
+    """A run of this environment, on as many lanes as you like."""
+    spec = EnvSpec.of(env, kwargs)
+    made = spec.make()
+    described = PolicySpec(observation_leaves(made.observation_space), action_spec(made.action_space), **policy)
+    made.close()
+    return RunSpec(spec, described, rollout_steps=T, copies=N, lanes=8, seed=1)
+
+
+def run_around(env: gymnasium.Env[Any, Any], T: int) -> RunSpec:
+    """A run with the spaces of this environment, of one copy."""
+    policy = PolicySpec(observation_leaves(env.observation_space), action_spec(env.action_space))
+    return RunSpec(EnvSpec(type(env).__name__), policy, rollout_steps=T, copies=1, lanes=8, seed=1)
+
+
+def with_env(run: RunSpec, env: str, **kwargs: Any) -> RunSpec:
+    """The same run, on an environment that only seems to be the same."""
+    return msgspec.structs.replace(run, env=EnvSpec.of(env, kwargs))
+
+
+def random_policy(spec: PolicySpec) -> Policy:
+    """A policy with random weights, the same ones each time."""
+    generator = np.random.default_rng(5)
+    policy = make_policy(spec)
+    parameters = generator.normal(0, 0.3, size(layout(spec)[0])).astype(np.float32)
+    policy.load(parameters, generator.uniform(0.5, 1.5, buffer_size(spec)).astype(np.float32))
+    return policy
+
+
+def a_collector(run: RunSpec, open_copies: OpenCopies = copies_of) -> Collector:
+    """A collector that acts with random weights."""
+    return Collector(run, random_policy(run.policy), open_copies)
+
+
+def over_copies_of(makes: Sequence[Callable[[], gymnasium.Env[Any, Any]]]) -> OpenCopies:
+    """A loop over these copies, one of each."""
+    return lambda run, lane, pulse: CopyLoop(iter([make() for make in makes]).__next__, len(makes), pulse)
+
+
+def over_sync(makes: Sequence[Callable[[], gymnasium.Env[Any, Any]]]) -> OpenCopies:
+    """A SyncVectorEnv over these copies, one of each."""
+    return lambda run, lane, pulse: VectorCopies(SyncVectorEnv(makes))
+
+
+def collect(
+    collector: Collector, run: RunSpec, sequence: int = 0, lanes: Iterable[int] = (0,), incarnation: int = 0
+) -> list[Rollout]:
+    """Rollout number `sequence` of each lane; each keeps the law."""
+    assignments = [Assignment(100 + lane, lane, incarnation, sequence) for lane in lanes]
+    rollouts = collector.collect(assignments, VERSION, SESSION, no_pulse)
+    for assignment, rollout in zip(assignments, rollouts, strict=True):
+        validate(rollout, run)
+        assert (rollout.lane, rollout.ticket, rollout.sequence) == (assignment.lane, assignment.ticket, sequence)
+        assert (rollout.version, rollout.session) == (VERSION, SESSION)
+    return rollouts
+
+
+def bits(rollout: Rollout) -> dict[str, object]:
+    """All of a rollout that must not depend on who collects it, as bytes."""
+    fields = ("action", "log_prob", "reward", "terminated", "truncated", "valid", "state")
+    found: dict[str, object] = {name: getattr(rollout, name).tobytes() for name in fields}
+    found["obs"] = [leaf.tobytes() for leaf in rollout.obs]
+    found["episodes"] = [(episode.reward, episode.length) for episode in rollout.episodes]
+    return found
+
+
+def trained(folder: Path, vector: Literal["native", "envpool"], workers: int) -> bytes:
+    """The policy of a short run on CartPole-v1, whose lanes are stepped like that."""
+    config = resolve(
+        "CartPole-v1", vector=vector, steps=1_500, workers=workers, transport="inproc", eval_episodes=1,
+        run_dir=str(folder / str(workers)),
+    )  # fmt: skip
+    return (train(config, None, lambda progress: None) / "policy.safetensors").read_bytes()

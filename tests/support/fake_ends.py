@@ -1,0 +1,341 @@
+"""Fakes: a run as plain data, rollouts without an environment, and a hostile network between the two pure halves.
+
+The network keeps the order of what one worker says to the learner and of what the learner says to it (as a TCP connection
+does), loses, repeats and delays, and knows nothing of what it carries. Time is simulated: a case takes milliseconds.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import random
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import msgspec
+import numpy as np
+
+from learner.rollouts.ledger import Ledger
+from learner.rollouts.roster import Out, Roster
+from protocol.messages import Rollout, ToLearner, ToWorker
+from protocol.specs import ActionSpec, EnvSpec, Leaf, PolicySpec, RunSpec
+from workers.session import Effect, Identity, Leave, Say, Session, Task
+
+PARAMETERS = np.zeros(1, np.float32)
+BUFFERS = np.zeros(0, np.float32)
+
+
+def run_spec(lanes: int = 4, **changes: object) -> RunSpec:
+    """A run of one copy and one step a lane: the smallest there is."""
+    policy = PolicySpec((Leaf("", "box", (1,), "float32"),), ActionSpec("discrete", (), "int64", (2,), (0,)))
+    spec = RunSpec(EnvSpec("Fake-v0"), policy, rollout_steps=1, copies=1, lanes=lanes, seed=0, learner_timeout_s=6.0)
+    return msgspec.structs.replace(spec, **changes)
+
+
+def fake_rollout(session: int, lane: int, ticket: int, version: int, sequence: int) -> Rollout:
+    """One valid transition."""
+    return Rollout(
+        session=session,
+        lane=lane,
+        ticket=ticket,
+        version=version,
+        sequence=sequence,
+        obs=(np.zeros((2, 1, 1), np.float32),),
+        action=np.zeros((1, 1), np.int64),
+        log_prob=np.zeros((1, 1), np.float32),
+        reward=np.zeros((1, 1), np.float32),
+        terminated=np.zeros((1, 1), bool),
+        truncated=np.zeros((1, 1), bool),
+        valid=np.ones((1, 1), bool),
+        state=np.zeros((1, 0), np.float32),
+    )
+
+
+def fake_rollouts(task: Task) -> list[Rollout]:
+    """What a collector would have made of this task."""
+    return [fake_rollout(task.session, a.lane, a.ticket, task.weights.version, a.sequence) for a in task.assignments]
+
+
+@dataclass
+class Faults:
+    """What the network and fate do, until `until_s`; after that only `loss` goes on."""
+
+    loss: float = 0.0
+    repeat: float = 0.0
+    delay_s: float = 0.05
+    spoiled: float = 0.0  # rollouts that break the law of a row
+    deaths: int = 0
+    freezes: int = 0
+    late_joiners: int = 0
+    leaves: int = 0
+    learner_restarts: int = 0
+    until_s: float = 30.0
+
+
+@dataclass
+class FakeWorker:
+    """A worker process: dies, freezes, comes back under the same name, and pid."""
+
+    name: bytes
+    session: Session
+    task: Task | None = None
+    frozen: bool = False
+    inbox: list[ToWorker] = field(default_factory=list)
+
+
+class World:
+    """One learner, some workers, simulated time; checks every rule after every event."""
+
+    def __init__(self, seed: int, faults: Faults, *, workers: int, lanes: int, max_lag: int, per_update: int) -> None:
+        self.random = random.Random(seed)
+        self.faults = faults
+        self.run = run_spec(lanes)
+        self.max_lag, self.per_update = max_lag, per_update
+        self.now = 0.0
+        self.lives = itertools.count(1)
+        self.order = itertools.count()
+        self.queue: list[tuple[float, int, Callable[[], None]]] = []
+        self.arrival: dict[tuple[bytes, str], float] = {}  # a stream's last delivery: order is kept within it
+        self.workers: dict[bytes, FakeWorker] = {}
+        self.used: set[int] = set()
+        self.updates = 0
+        self.epoch = 0
+        self.checkpoint: tuple[Ledger, int, list[int]] = (Ledger(), 0, [0] * lanes)
+        self.roster = self._learner()
+        for number in range(workers):
+            self.spawn(f"w{number}".encode())
+        self._schedule_faults(workers)
+        self.every(0.5, self._tick)
+
+    # ------------------------------------------------------------ time
+
+    def at(self, delay_s: float, action: Callable[[], None]) -> None:
+        heapq.heappush(self.queue, (self.now + delay_s, next(self.order), action))
+
+    def every(self, interval_s: float, action: Callable[[], None]) -> None:
+        def again() -> None:
+            action()
+            self.at(interval_s, again)
+
+        self.at(interval_s, again)
+
+    def play(self, updates: int, limit_s: float = 400.0) -> None:
+        """Run until so many updates were made. A deadlock shows as the time limit."""
+        while self.updates < updates or self.now < self.faults.until_s:
+            assert self.queue
+            self.now, _, action = heapq.heappop(self.queue)
+            assert self.now < limit_s, f"only {self.updates} of {updates} updates after {limit_s} s: deadlock"
+            action()
+            self.check()
+
+    # ------------------------------------------------------------ network
+
+    def carry(self, key: tuple[bytes, str], deliver: Callable[[], None]) -> None:
+        epoch = self.epoch
+        faulty = self.now < self.faults.until_s
+        if self.random.random() < self.faults.loss:
+            return
+        copies = 2 if faulty and self.random.random() < self.faults.repeat else 1
+        for _ in range(copies):
+            delay = self.random.uniform(0.001, self.faults.delay_s if faulty else 0.01)
+            arrival = max(self.now + delay, self.arrival.get(key, 0.0))
+            self.arrival[key] = arrival
+            self.at(arrival - self.now, lambda: deliver() if epoch == self.epoch else None)
+
+    def to_workers(self, outs: list[Out]) -> None:
+        for peer, message in outs:
+            self.carry((peer, "down"), lambda peer=peer, message=message: self._arrives(peer, message))  # type: ignore[misc]
+
+    def _arrives(self, peer: bytes, message: ToWorker) -> None:
+        worker = self.workers.get(peer)
+        if worker is None:
+            return
+        worker.inbox.append(message)
+        self._serve(worker)
+
+    def say(self, worker: FakeWorker, effects: list[Effect]) -> None:
+        for effect in effects:
+            match effect:
+                case Say(message):
+                    self.carry((worker.name, "up"), lambda m=message: self._hears(worker.name, m))  # type: ignore[misc]
+                case Leave():
+                    self.workers.pop(worker.name, None)
+
+    def _hears(self, peer: bytes, message: ToLearner) -> None:
+        faulty = self.now < self.faults.until_s and self.random.random() < self.faults.spoiled
+        if faulty and isinstance(message, Rollout):
+            self.to_workers(self.roster.reject(peer, message, "spoiled", self.now))
+        else:
+            self.to_workers(self.roster.receive(peer, message, self.now))
+        self.check()
+        self._learn()
+
+    # ------------------------------------------------------------ worker
+
+    def spawn(self, name: bytes) -> None:
+        who = Identity(name.decode(), "host", 1, next(self.lives), "fake")  # in a container every pid is 1
+        worker = FakeWorker(name, Session(who, self.now, join_timeout_s=1e9, rejoin_timeout_s=1e9))
+        self.workers[name] = worker
+
+        def tick() -> None:
+            if self.workers.get(name) is worker:
+                if not worker.frozen:
+                    self._serve(worker)
+                self.at(0.25, tick)
+
+        self.at(0.0, tick)
+
+    def _serve(self, worker: FakeWorker) -> None:
+        if worker.frozen:
+            return
+        session = worker.session
+        while worker.inbox:
+            self.say(worker, session.handle(worker.inbox.pop(0), self.now))
+        if worker.task is not None and session.abandoned(worker.task.session):
+            worker.task = None
+            self.say(worker, session.finished([]))
+        if worker.task is None and (task := session.next_task()) is not None:
+            worker.task = task
+            self.at(self.random.uniform(0.01, 0.4), lambda: self._finish(worker, task))
+        self.say(worker, session.tick(self.now))
+
+    def _finish(self, worker: FakeWorker, task: Task) -> None:
+        if worker.task is not task or self.workers.get(worker.name) is not worker:
+            return
+        if worker.frozen:
+            self.at(0.5, lambda: self._finish(worker, task))
+            return
+        worker.task = None
+        self.say(worker, worker.session.finished(fake_rollouts(task)))
+        self._serve(worker)
+
+    # ------------------------------------------------------------ learner
+
+    def _learner(self) -> Roster:
+        ledger, version, incarnations = self.checkpoint
+        ledger = msgspec.structs.replace(ledger)
+        ledger.lost += ledger.outstanding  # of the learner that died
+        ledger.transitions_late += ledger.transitions_waiting
+        self.used = {ticket for ticket in self.used if ticket < ledger.issued}
+        self.updates = version
+        self.updating = False
+        roster = Roster(
+            self.run,
+            rollouts_per_update=self.per_update,
+            max_lag=self.max_lag,
+            worker_timeout_s=3.0,
+            first_session=self.random.getrandbits(48),
+            ledger=ledger,
+            incarnations=incarnations,
+        )
+        self.roster = roster
+        self.to_workers(roster.publish(version, PARAMETERS, BUFFERS))
+        return roster
+
+    def restart_learner(self) -> None:
+        self.epoch += 1  # whatever was under way is lost with its connections
+        self._learner()
+
+    def _tick(self) -> None:
+        self.to_workers(self.roster.tick(self.now))
+        self._learn()
+
+    def _learn(self) -> None:
+        """Take a batch if there is one; publish new weights a little later."""
+        if self.updating:
+            return
+        taken = self.roster.take()
+        self.to_workers(self.roster.deal())
+        if taken is None:
+            return
+        assert len(taken) == self.per_update
+        for rollout in taken:
+            assert rollout.ticket not in self.used, "a ticket was used twice"
+            self.used.add(rollout.ticket)
+            assert 0 <= self.roster.version - rollout.version <= self.max_lag
+        if self.max_lag == 0 and self.per_update == self.run.lanes:
+            assert sorted(rollout.lane for rollout in taken) == list(range(self.run.lanes))
+        self.updating = True
+        roster = self.roster
+
+        def publish() -> None:
+            if self.roster is not roster:
+                return
+            self.updates += 1
+            self.updating = False
+            self.to_workers(roster.publish(self.updates, PARAMETERS, BUFFERS))
+            if self.random.random() < 0.3:
+                self.checkpoint = (msgspec.structs.replace(roster.ledger), self.updates, roster.incarnations())
+            self._learn()
+
+        self.at(self.random.uniform(0.0, 0.3), publish)
+
+    # ------------------------------------------------------------ fate
+
+    def _schedule_faults(self, workers: int) -> None:
+        faults = self.faults
+
+        def when() -> float:
+            return self.random.uniform(0.0, faults.until_s)
+
+        for _ in range(faults.deaths):
+            self.at(when(), self._kill_one)
+        for _ in range(faults.freezes):
+            self.at(when(), self._freeze_one)
+        for _ in range(faults.leaves):
+            self.at(when(), self._leave_one)
+        for number in range(faults.late_joiners):
+            self.at(when(), lambda number=number: self.spawn(f"late{number}".encode()))  # type: ignore[misc]
+        for _ in range(faults.learner_restarts):
+            self.at(when(), self.restart_learner)
+        self.at(faults.until_s, lambda: self._revive(workers))
+
+    def _revive(self, workers: int) -> None:
+        for name in (f"w{number}".encode() for number in range(workers)):
+            if name not in self.workers:
+                self.spawn(name)
+
+    def _kill_one(self) -> None:
+        if self.workers:
+            name = self.random.choice(sorted(self.workers))
+            del self.workers[name]
+            if self.random.random() < 0.5:  # the host sees it at once; else only silence tells
+                self.to_workers(self.roster.gone(name.decode(), "killed"))
+            self.at(self.random.uniform(0.1, 8.0), lambda: self.spawn(name) if name not in self.workers else None)
+
+    def _freeze_one(self) -> None:
+        if self.workers:
+            worker = self.workers[self.random.choice(sorted(self.workers))]
+            worker.frozen = True
+
+            def thaw() -> None:
+                worker.frozen = False
+
+            self.at(self.random.uniform(0.5, 8.0), thaw)
+
+    def _leave_one(self) -> None:
+        running = [worker for worker in self.workers.values() if not worker.frozen]
+        if len(running) > 1:
+            worker = self.random.choice(sorted(running, key=lambda worker: worker.name))
+            self.say(worker, worker.session.terminate())
+
+    # ------------------------------------------------------------ the rules
+
+    def check(self) -> None:
+        roster, ledger = self.roster, self.roster.ledger
+        in_flight = len(roster.tickets) + len(roster.ready)
+        assert ledger.issued == ledger.used + ledger.stale + ledger.lost + in_flight, "the ledger does not balance"
+        assert ledger.transitions_waiting == sum(r.env_steps for r in roster.ready), "transitions do not balance"
+        bound = self.per_update * (roster.version + 1 + self.max_lag)
+        assert ledger.used + in_flight <= bound, "more tickets than the bound allows"
+        for lane in roster.lanes:
+            owners = [member for member in roster.members.values() if lane.number in member.lanes]
+            assert len(owners) == (lane.owner is not None), "a lane has two owners"
+            assert all(owner.peer == lane.owner for owner in owners)
+        for number, ticket in roster.tickets.items():
+            assert number in roster.members[ticket.peer].tickets, "an outstanding ticket is with nobody"
+            assert roster.lanes[ticket.lane].owner == ticket.peer, "a ticket of a lane that its worker does not own"
+        if self.epoch == 0:
+            for worker in self.workers.values():
+                holds = worker.session.in_memory()
+                assert holds <= self.per_update * (1 + self.max_lag), f"{worker.name!r} holds {holds} rollouts"

@@ -1,0 +1,102 @@
+"""Atari games: one copy, the emulator's own vectorised form and envpool show the same screens, pay and end alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+import pytest
+
+from learner.config.config import Config
+from learner.config.hyperparameters import PPOConfig
+from learner.run import run_spec
+from protocol.envs.envpool import pool_of
+from protocol.envs.vectorized import make_native
+from protocol.errors import UsageError
+from protocol.specs import EnvSpec, RunSpec
+from tests.support.collectors import a_collector, bits, collect, no_pulse
+from workers.collect.env_copies import Copies, CopyLoop, VectorCopies, copy_seeds
+from workers.collect.envpool_copies import PoolCopies
+from workers.envs import atari
+
+envpool = pytest.mark.skipif(find_spec("envpool") is None, reason="envpool is not here: pip install 'millrace[envpool]'")
+pytestmark = pytest.mark.skipif(
+    find_spec("ale_py") is None or find_spec("cv2") is None, reason="the emulator is not here: pip install 'millrace[atari]'"
+)
+
+KINDS = ["loop", "native", pytest.param("envpool", marks=envpool)]
+OPEN: dict[str, Callable[[EnvSpec, int], Copies]] = {
+    "loop": lambda env, N: CopyLoop(env.make, N, no_pulse),
+    "native": lambda env, N: VectorCopies(make_native(env, N)),
+    "envpool": lambda env, N: PoolCopies(pool_of(env), N),
+}
+BREAKOUT = EnvSpec("millrace/Atari-v0", {"game": "Breakout"})
+
+
+@pytest.mark.parametrize(("game", "max_frames", "flag"), [("Pong", 600, "truncated"), ("Breakout", 108_000, "terminated")])
+def test_the_vectorised_form_shows_rewards_and_ends_as_the_loop_does(
+    game: str, max_frames: int, flag: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Screens, flags and reset rows, of episodes that begin alike; Breakout's end by themselves, Pong's by the clock."""
+    monkeypatch.setattr(atari, "MAX_FRAMES", max_frames)
+    monkeypatch.setattr(atari, "NOOPS", 0)
+    N, env = 2, EnvSpec("millrace/Atari-v0", {"game": game})
+    one, other = OPEN["native"](env, N), OPEN["loop"](env, N)
+    np.testing.assert_array_equal(one.reset([3, 4], no_pulse)[0], other.reset([3, 4], no_pulse)[0])
+    generator, ended = np.random.default_rng(0), {"terminated": 0, "truncated": 0}
+    for _ in range(500):
+        actions = generator.integers(4, size=N)
+        row, looped = one.step(actions, no_pulse), other.step(actions, no_pulse)
+        np.testing.assert_array_equal(row.leaves[0], looped.leaves[0])
+        assert row.reward.tolist() == looped.reward
+        assert (row.terminated.tolist(), row.truncated.tolist()) == (looped.terminated, looped.truncated)
+        for name in ended:
+            ended[name] += int(np.count_nonzero(getattr(row, name)))
+    assert [name for name, times in ended.items() if times > 1] == [flag]
+    for copies in (one, other):
+        copies.close()
+
+
+def described(vector: Any) -> RunSpec:
+    config = Config(env=BREAKOUT.id, vector=vector, envs=8, lanes=4, algorithm=PPOConfig(rollout_steps=24))
+    return run_spec(config, BREAKOUT)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_lanes_are_the_same_again_and_others_than_their_neighbours(kind: str) -> None:
+    run = described(kind)
+    assert run.policy.observation[0].shape == (4, 84, 84)
+    once = collect(a_collector(run), run, lanes=(0, 1))
+    again = collect(a_collector(run), run, lanes=(0, 1))
+    assert [bits(rollout) for rollout in once] == [bits(rollout) for rollout in again]
+    assert once[0].obs[0].tobytes() != once[1].obs[0].tobytes()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_step_after_an_end_only_resets(kind: str) -> None:
+    N = 3
+    copies = OPEN[kind](BREAKOUT, N)
+    copies.reset(copy_seeds(1, 0, 0, N), no_pulse)
+    generator, ended, ends = np.random.default_rng(1), np.zeros(N, bool), 0
+    for _ in range(400):
+        row = copies.step(generator.integers(4, size=N), no_pulse)
+        for n in np.flatnonzero(ended):
+            assert (row.reward[n], row.terminated[n], row.truncated[n]) == (0, False, False)
+            screens = np.asarray(row.leaves[0][n])
+            assert screens[3].any()
+            assert (screens[:3] == (screens[3] if kind == "envpool" else 0)).all()
+        ended = np.logical_or(row.terminated, row.truncated)
+        ends += int(ended.sum())
+    assert ends > 2
+    copies.close()
+
+
+def test_an_id_of_the_emulators_own_is_refused_where_one_copy_shows_something_else() -> None:
+    env = EnvSpec("ALE/Pong-v5")
+    with pytest.raises(
+        UsageError, match=r"has other spaces .*; take millrace/Atari-v0 --env-kwargs game Pong, or use"
+    ) as caught:
+        run_spec(Config(env=env.id, vector="native"), env)
+    assert "\n" not in str(caught.value)

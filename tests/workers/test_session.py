@@ -1,0 +1,709 @@
+"""Each rule of the worker's half of the conversation, by name. Pure: the test is the learner, time is a number."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import TypeVar
+
+import msgspec
+import numpy as np
+import pytest
+
+from protocol.messages import (
+    PROTOCOL_VERSION,
+    Call,
+    Collect,
+    Drain,
+    Failure,
+    Goodbye,
+    Heartbeat,
+    HeartbeatReply,
+    Hello,
+    LaneLife,
+    Permit,
+    Received,
+    Refuse,
+    Rejoin,
+    Release,
+    Reset,
+    Rollout,
+    Step,
+    ToLearner,
+    ToWorker,
+    Weights,
+    Welcome,
+)
+from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollouts, run_spec
+from workers.session import (
+    HELLO_FIRST_S,
+    HELLO_MOST_S,
+    Begin,
+    Close,
+    Effect,
+    Identity,
+    Leave,
+    Say,
+    Session,
+    Task,
+)
+from workers.states import TABLE, State
+
+M = TypeVar("M")
+
+WHO = Identity("w0", "host", 7, 77, "fake 1")
+RUN = run_spec(lanes=4)  # heartbeat_s 1, learner_timeout_s 6
+SESSION = 11
+JOIN_S, REJOIN_S = 60.0, 600.0
+
+
+def said(effects: Sequence[Effect], kind: type[M]) -> list[M]:
+    """The messages of this kind among the effects."""
+    return [effect.message for effect in effects if isinstance(effect, Say) and isinstance(effect.message, kind)]
+
+
+def weights(version: int) -> Weights:
+    return Weights(version, PARAMETERS, BUFFERS)
+
+
+def lanes(*numbers: int, below: int = 0, ahead: tuple[int, ...] = (), incarnation: int = 0) -> tuple[Received, ...]:
+    """The learner's account: these lanes are the worker's, and so much of each has arrived."""
+    return tuple(Received(number, incarnation, below, ahead) for number in numbers)
+
+
+def collect(
+    *permits: tuple[int, int], version: int = 0, incarnation: int = 0, received: tuple[Received, ...] | None = None
+) -> Collect:
+    """Permission for (ticket, lane) pairs; the lanes named are all that the worker has, unless `received` says more."""
+    named = sorted({lane for _, lane in permits})
+    theirs = lanes(*named, incarnation=incarnation) if received is None else received
+    return Collect(SESSION, version, tuple(Permit(ticket, lane, incarnation) for ticket, lane in permits), theirs)
+
+
+def joining() -> Session:
+    return Session(WHO, 0.0, join_timeout_s=JOIN_S, rejoin_timeout_s=REJOIN_S)
+
+
+def ready(*messages: ToWorker, version: int | None = 0) -> Session:
+    """A session that was welcomed at time 0, holds weights of this version, and then heard `messages`."""
+    session = joining()
+    session.tick(0.0)
+    session.handle(Welcome(SESSION, 1, RUN), 0.0)
+    if version is not None:
+        session.handle(weights(version), 0.0)
+        session.tick(0.0)  # acknowledges them
+    for message in messages:
+        session.handle(message, 0.0)
+    return session
+
+
+def task_of(session: Session) -> Task:
+    task = session.next_task()
+    assert task is not None
+    return task
+
+
+def collected(session: Session) -> list[Rollout]:
+    """Collect the next task; the rollouts that were said."""
+    return said(session.finished(fake_rollouts(task_of(session))), Rollout)
+
+
+def hello_attempt(effects: Sequence[Effect]) -> int:
+    (hello,) = said(effects, Hello)
+    return hello.attempt
+
+
+# -------------------------------------------------------------------- joining
+
+
+def test_hello_says_who_this_is_and_which_protocol_it_speaks() -> None:
+    (hello,) = said(joining().tick(0.0), Hello)
+    assert hello == Hello(PROTOCOL_VERSION, "w0", "host", 7, 77, "fake 1", 1)
+
+
+def test_hello_repeats_with_backoff_and_keeps_its_attempt() -> None:
+    session = joining()
+    times, attempts = [], set()
+    for step in range(120):
+        now = step * HELLO_FIRST_S
+        for hello in said(session.tick(now), Hello):
+            times.append(now)
+            attempts.add(hello.attempt)
+    gaps = [after - before for before, after in itertools.pairwise(times)]
+    assert gaps[:5] == [0.25, 0.5, 1.0, 2.0, 4.0]
+    assert set(gaps[4:]) == {HELLO_MOST_S}
+    assert attempts == {1}
+
+
+def test_next_due_names_the_time_of_the_next_hello() -> None:
+    session = joining()
+    assert session.next_due_s() == 0.0
+    session.tick(0.0)
+    assert session.next_due_s() == HELLO_FIRST_S
+
+
+def test_a_new_joining_raises_the_attempt_and_begins_the_backoff_again() -> None:
+    session = ready()
+    assert hello_attempt(session.handle(Rejoin(SESSION), 5.0)) == 2
+    assert session.next_due_s() == 5.0 + HELLO_FIRST_S
+
+
+def test_welcome_begins_a_session() -> None:
+    session = joining()
+    session.tick(0.0)
+    assert session.handle(Welcome(SESSION, 1, RUN), 0.1) == [Begin(RUN)]
+    assert (session.state, session.session, session.run) == (State.READY, SESSION, RUN)
+
+
+def test_welcome_for_an_older_attempt_is_ignored() -> None:
+    session = ready()
+    session.handle(Rejoin(SESSION), 1.0)
+    assert session.handle(Welcome(12, 1, RUN), 1.1) == []
+    assert session.state is State.JOINING
+    assert session.handle(Welcome(13, 2, RUN), 1.2) == [Begin(RUN)]
+
+
+def test_a_repeated_welcome_is_ignored() -> None:
+    session = ready(collect((0, 0)))
+    assert session.handle(Welcome(SESSION, 1, RUN), 0.1) == []
+    assert session.in_memory() == 1
+
+
+def test_welcome_to_another_session_of_the_same_attempt_begins_afresh() -> None:
+    """The learner gave this worker up, then heard a late Hello of it."""
+    session = ready(collect((0, 0)))
+    assert session.handle(Welcome(12, 1, RUN), 0.1) == [Begin(RUN)]
+    assert (session.session, session.in_memory()) == (12, 0)
+
+
+def test_whatever_else_is_said_while_joining_is_ignored() -> None:
+    session = joining()
+    session.tick(0.0)
+    for message in (weights(0), collect((0, 0)), HeartbeatReply(0, 1, ()), Release(0, (LaneLife(0, 0),)), Rejoin(0)):
+        assert session.handle(message, 0.1) == []
+    assert (session.state, session.in_memory()) == (State.JOINING, 0)
+
+
+def test_joining_for_too_long_is_given_up_with_exit_code_1() -> None:
+    session = joining()
+    assert said(session.tick(JOIN_S), Hello)
+    (leave,) = session.tick(JOIN_S + 0.1)
+    assert isinstance(leave, Leave)
+    assert leave.exit_code == 1
+    assert "no learner answered for 60 s" in leave.reason
+
+
+def test_one_that_had_joined_waits_longer_for_a_learner_to_come_back() -> None:
+    session = ready()
+    session.handle(Rejoin(SESSION), 1.0)
+    assert said(session.tick(1.0 + REJOIN_S), Hello)
+    (leave,) = session.tick(1.0 + REJOIN_S + 0.1)
+    assert isinstance(leave, Leave)
+
+
+# -------------------------------------------------------------------- tickets
+
+
+def test_a_repeated_collect_is_collected_once() -> None:
+    session = ready(collect((0, 0)), collect((0, 0)))
+    assert session.in_memory() == 1
+    assert len(collected(session)) == 1
+    assert session.next_task() is None
+
+
+def test_a_repeat_of_the_ticket_in_hand_is_collected_once() -> None:
+    session = ready(collect((0, 0)))
+    task = task_of(session)
+    session.handle(collect((0, 0)), 0.1)
+    assert len(said(session.finished(fake_rollouts(task)), Rollout)) == 1
+    assert session.next_task() is None
+
+
+def test_asked_again_for_a_finished_ticket_the_same_rollout_object_is_said_again() -> None:
+    session = ready(collect((0, 0)))
+    (rollout,) = collected(session)
+    (again,) = said(session.handle(collect((0, 0)), 1.0), Rollout)
+    assert again is rollout
+    assert session.next_task() is None
+
+
+def test_a_rollout_is_kept_until_received_says_that_it_has_arrived_and_then_forgotten() -> None:
+    session = ready(collect((0, 0)))
+    collected(session)
+    session.handle(HeartbeatReply(SESSION, 1, lanes(0, below=0)), 1.0)
+    assert session.in_memory() == 1
+    session.handle(HeartbeatReply(SESSION, 2, lanes(0, below=1)), 2.0)
+    assert session.in_memory() == 0
+
+
+def test_a_rollout_that_arrived_ahead_of_a_lost_one_is_forgotten_and_the_lost_one_kept() -> None:
+    session = ready(collect((0, 0), (1, 0)))
+    first, second = collected(session) + collected(session)
+    assert (first.sequence, second.sequence) == (0, 1)
+    session.handle(HeartbeatReply(SESSION, 1, lanes(0, below=0, ahead=(1,))), 1.0)
+    assert session.in_memory() == 1
+    assert said(session.handle(collect((0, 0)), 1.0), Rollout) == [first]
+
+
+def test_collect_too_says_what_has_arrived() -> None:
+    session = ready(collect((0, 0)))
+    collected(session)
+    session.handle(collect((1, 0), received=lanes(0, below=1)), 0.1)
+    assert session.in_memory() == 1  # the new ticket
+
+
+def test_received_of_another_life_of_the_lane_forgets_nothing() -> None:
+    session = ready(collect((0, 0), incarnation=1))
+    collected(session)
+    session.handle(HeartbeatReply(SESSION, 1, lanes(0, below=9, incarnation=0)), 1.0)
+    assert session.in_memory() == 1
+
+
+def test_a_late_repeat_of_a_ticket_whose_rollout_has_arrived_is_known_for_what_it_is() -> None:
+    session = ready(collect((0, 0)))
+    collected(session)
+    session.handle(HeartbeatReply(SESSION, 1, lanes(0, below=1)), 1.0)
+    assert session.handle(collect((0, 0), received=lanes(0, below=1)), 1.1) == []
+    assert session.next_task() is None
+
+
+def test_the_sequence_counts_the_rollouts_of_a_life_of_the_lane() -> None:
+    session = ready(collect((0, 0), (1, 0), (2, 0)))
+    assert [rollout.sequence for _ in range(3) for rollout in collected(session)] == [0, 1, 2]
+
+
+def test_a_rollout_starts_only_under_weights_at_least_as_new_as_its_ticket_asks_for() -> None:
+    session = ready(collect((0, 0), version=2), version=1)
+    assert session.next_task() is None
+    session.handle(weights(2), 0.2)
+    assert task_of(session).weights.version == 2
+
+
+def test_without_weights_nothing_starts() -> None:
+    session = ready(collect((0, 0), version=0), version=None)
+    assert session.next_task() is None
+
+
+def test_acts_under_the_newest_weights_held() -> None:
+    session = ready(weights(3), weights(2), collect((0, 0), version=1))
+    assert task_of(session).weights.version == 3
+
+
+def test_a_ticket_that_asks_for_newer_weights_does_not_hold_up_an_older_one_of_its_lane() -> None:
+    session = ready(collect((0, 0), version=5), collect((1, 0), version=0))
+    assert [assignment.ticket for assignment in task_of(session).assignments] == [1]
+
+
+def test_the_oldest_startable_ticket_of_every_lane_is_taken_together_in_lane_order() -> None:
+    session = ready(collect((5, 2), (3, 2), (9, 0), (4, 1)))
+    assert [(a.lane, a.ticket) for a in task_of(session).assignments] == [(0, 9), (1, 4), (2, 3)]
+
+
+def test_one_task_at_a_time() -> None:
+    session = ready(collect((0, 0), (1, 0), (2, 1)))
+    task = task_of(session)
+    assert session.next_task() is None
+    session.finished(fake_rollouts(task))
+    assert task_of(session).assignments[0].ticket == 1
+
+
+def test_finished_with_nothing_puts_the_tickets_back() -> None:
+    session = ready(collect((0, 0)))
+    task_of(session)
+    assert session.finished([]) == []
+    assert task_of(session).assignments[0].ticket == 0
+
+
+def test_what_is_in_memory_is_bounded_by_what_the_learner_has_outstanding() -> None:
+    """Five tickets outstanding at any time, a hundred rounds: what has arrived goes as the next are dealt."""
+    session = ready()
+    issued = arrived = 0
+    for _ in range(100):
+        fresh = [(issued + n, 0) for n in range(5)]
+        session.handle(collect(*fresh, received=lanes(0, below=arrived)), 0.1)
+        issued += 5
+        assert session.in_memory() <= 5
+        while session.next_task() is not None:
+            session.finished([])
+            arrived += len(collected(session))
+            assert session.in_memory() <= 5
+    assert arrived == issued == 500
+
+
+def test_what_is_remembered_of_old_tickets_is_bounded() -> None:
+    session = ready()
+    for ticket in range(200):
+        session.handle(collect((ticket, 0), received=lanes(0, below=ticket)), 0.1)
+        collected(session)
+    assert len(session._stay.lanes[0].done) <= 64
+
+
+# -------------------------------------------------------------------- acknowledging
+
+
+def test_weights_are_acknowledged_at_once_when_nothing_else_does() -> None:
+    session = ready()
+    assert session.tick(0.1) == []
+    session.handle(weights(1), 0.2)
+    (heartbeat,) = said(session.tick(0.2), Heartbeat)
+    assert heartbeat.version == 1
+    assert session.tick(0.3) == []  # once
+
+
+def test_a_rollout_acknowledges_the_weights_it_was_acted_under() -> None:
+    session = ready(weights(1), collect((0, 0)))
+    (rollout,) = collected(session)
+    assert rollout.version == 1
+    assert session.tick(0.1) == []
+
+
+def test_a_heartbeat_every_heartbeat_s_says_all_that_is_held() -> None:
+    session = ready(collect((7, 0), (8, 1), version=9))
+    session.handle(HeartbeatReply(SESSION, 4, lanes(0, 1)), 0.5)
+    session.steps, session.stages = 120, {"env": 0.5}
+    assert session.tick(0.9) == []
+    (heartbeat,) = said(session.tick(1.0), Heartbeat)
+    assert heartbeat == Heartbeat(SESSION, 4, 0, (7, 8), 120, {"env": 0.5}, 0)
+    assert session.next_due_s() == 2.0
+
+
+def test_a_heartbeat_lists_the_ticket_in_hand_and_not_a_finished_one() -> None:
+    session = ready(collect((7, 0), (8, 0)))
+    task = task_of(session)
+    assert said(session.tick(1.0), Heartbeat)[0].tickets == (7, 8)
+    session.finished(fake_rollouts(task))
+    assert said(session.tick(2.0), Heartbeat)[0].tickets == (8,)
+
+
+def test_before_the_first_weights_a_heartbeat_says_minus_one() -> None:
+    session = ready(version=None)
+    (heartbeat,) = said(session.tick(1.0), Heartbeat)
+    assert heartbeat.version == -1
+
+
+# -------------------------------------------------------------------- lanes
+
+
+def test_a_higher_incarnation_starts_the_lane_afresh_with_sequence_0() -> None:
+    session = ready(collect((0, 0), (1, 0)))
+    collected(session)
+    session.handle(collect((2, 0), incarnation=1), 0.1)
+    assert session.in_memory() == 1  # the old life's ticket and rollout are gone
+    (assignment,) = task_of(session).assignments
+    assert (assignment.ticket, assignment.incarnation, assignment.sequence) == (2, 1, 0)
+
+
+def test_a_ticket_of_an_older_life_is_ignored() -> None:
+    session = ready(collect((2, 0), incarnation=1))
+    session.handle(collect((1, 0), received=lanes(0, incarnation=1)), 0.1)
+    assert session.in_memory() == 1
+    assert task_of(session).assignments[0].ticket == 2
+
+
+def test_release_closes_the_lane_and_forgets_what_was_held_for_it() -> None:
+    session = ready(collect((0, 0), (1, 1)))
+    collected(session)
+    assert session.handle(Release(SESSION, (LaneLife(0, 0),)), 0.1) == [Close((LaneLife(0, 0),))]
+    assert session.in_memory() == 1
+    assert session.handle(Release(SESSION, (LaneLife(0, 0),)), 0.2) == []  # a repeat
+
+
+def test_a_late_release_does_not_close_a_later_life() -> None:
+    session = ready(collect((0, 0), incarnation=2))
+    assert session.handle(Release(SESSION, (LaneLife(0, 1),)), 0.1) == []
+    assert session.in_memory() == 1
+
+
+@pytest.mark.parametrize(
+    "message",
+    [HeartbeatReply(SESSION, 1, lanes(1)), collect((2, 1), received=lanes(1))],
+    ids=["HeartbeatReply", "Collect"],
+)
+def test_a_lane_missing_from_received_is_closed(message: ToWorker) -> None:
+    session = ready(collect((0, 0), (1, 1)))
+    assert session.handle(message, 1.0) == [Close((LaneLife(0, 0),))]
+
+
+def test_a_rollout_of_a_lane_that_was_released_while_it_was_collected_is_not_said() -> None:
+    session = ready(collect((0, 0), (1, 1)))
+    task = task_of(session)
+    session.handle(Release(SESSION, (LaneLife(0, 0),)), 0.1)
+    assert [rollout.lane for rollout in said(session.finished(fake_rollouts(task)), Rollout)] == [1]
+
+
+# -------------------------------------------------------------------- sessions
+
+
+def test_nothing_of_a_session_outlives_it() -> None:
+    session = ready(collect((0, 0), (1, 0), (2, 1)))
+    rollouts = fake_rollouts(task_of(session))
+    session.finished(rollouts)
+    session.handle(HeartbeatReply(SESSION, 9, lanes(0, 1)), 0.1)
+    closed, *_ = session.handle(Rejoin(SESSION), 1.0)
+    assert closed == Close((LaneLife(0, 0), LaneLife(1, 0)))
+    assert session.in_memory() == 0
+    session.handle(Welcome(12, 2, RUN), 1.1)
+    assert session.in_memory() == 0
+    assert session.next_task() is None
+    (heartbeat,) = said(session.tick(2.2), Heartbeat)
+    assert (heartbeat.session, heartbeat.replies, heartbeat.version, heartbeat.tickets) == (12, 0, -1, ())
+
+
+def test_a_task_of_an_ended_session_is_abandoned_and_its_rollouts_are_not_said() -> None:
+    session = ready(collect((0, 0)))
+    task = task_of(session)
+    assert not session.abandoned(task.session)
+    session.handle(Rejoin(SESSION), 1.0)
+    assert session.abandoned(task.session)
+    session.handle(Welcome(12, 2, RUN), 1.1)
+    assert session.abandoned(task.session)
+    session.handle(msgspec.structs.replace(collect((0, 0)), session=12), 1.2)  # the same ticket number again
+    assert session.finished(fake_rollouts(task)) == []
+    assert session.in_memory() == 1
+
+
+def test_a_message_of_another_session_is_ignored() -> None:
+    session = ready(collect((0, 0)))
+    other = SESSION - 1
+    for message in (
+        msgspec.structs.replace(collect((5, 0)), session=other),
+        HeartbeatReply(other, 7, ()),
+        Release(other, (LaneLife(0, 0),)),
+        Rejoin(other),
+    ):
+        assert session.handle(message, 1.0) == []
+    assert (session.state, session.in_memory()) == (State.READY, 1)
+    assert said(session.tick(1.0), Heartbeat)[0].replies == 0
+
+
+def test_rejoin_is_answered_by_hello_at_once() -> None:
+    session = ready(collect((0, 0)))
+    effects = session.handle(Rejoin(SESSION), 3.0)
+    assert session.state is State.JOINING
+    assert effects[0] == Close((LaneLife(0, 0),))
+    assert hello_attempt(effects) == 2
+
+
+def test_a_silent_learner_is_joined_anew() -> None:
+    session = ready(collect((0, 0)))
+    assert said(session.tick(6.0), Heartbeat)
+    assert hello_attempt(session.tick(6.1)) == 2
+    assert (session.state, session.in_memory()) == (State.JOINING, 0)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [weights(1), HeartbeatReply(SESSION, 1, ()), collect((0, 0)), Release(SESSION, ())],
+    ids=lambda message: type(message).__name__,
+)
+def test_any_message_of_the_session_is_a_sign_of_life(message: ToWorker) -> None:
+    session = ready()
+    session.handle(message, 5.0)
+    assert said(session.tick(10.9), Heartbeat)
+    assert said(session.tick(11.1), Hello)
+
+
+# -------------------------------------------------------------------- leaving
+
+
+def test_sigterm_finishes_the_rollout_in_hand_and_hands_back_the_rest_in_goodbye() -> None:
+    session = ready(collect((0, 0), (1, 0), (2, 1)))
+    task = task_of(session)  # tickets 0 and 2
+    assert session.terminate() == []
+    assert session.state is State.DRAINING
+    assert not session.abandoned(task.session)
+    *rollouts, goodbye, leave = session.finished(fake_rollouts(task))
+    assert [rollout.ticket for rollout in said(rollouts, Rollout)] == [0, 2]
+    assert goodbye == Say(Goodbye(SESSION, "told to stop", (1,)))
+    assert leave == Leave(0, "told to stop")
+
+
+def test_sigterm_with_nothing_in_hand_leaves_at_once() -> None:
+    session = ready(collect((0, 0)))
+    assert session.terminate() == [Say(Goodbye(SESSION, "told to stop", (0,))), Leave(0, "told to stop")]
+    assert session.state is State.LEFT
+
+
+def test_sigterm_while_joining_leaves_at_once() -> None:
+    session = joining()
+    assert session.terminate() == [Leave(0, "told to stop")]
+
+
+def test_sigterm_twice_leaves_at_once() -> None:
+    session = ready(collect((0, 0)))
+    task = task_of(session)
+    session.terminate()
+    assert session.terminate() == [Leave(0, "told to stop")]
+    assert session.abandoned(task.session)
+    assert session.terminate() == []
+
+
+def test_drain_finishes_the_rollout_in_hand_and_then_leaves() -> None:
+    session = ready(collect((0, 0), (1, 0)))
+    task = task_of(session)
+    assert session.handle(Drain("finished"), 0.1) == []
+    assert session.next_task() is None
+    effects = session.finished(fake_rollouts(task))
+    assert len(said(effects, Rollout)) == 1
+    assert effects[-2:] == [Say(Goodbye(SESSION, "finished", (1,))), Leave(0, "finished")]
+
+
+def test_drain_with_nothing_in_hand_leaves_at_once() -> None:
+    session = ready()
+    assert session.handle(Drain("finished"), 0.1) == [Say(Goodbye(SESSION, "finished", ())), Leave(0, "finished")]
+
+
+def test_drain_while_joining_leaves_with_exit_code_0() -> None:
+    session = joining()
+    assert session.handle(Drain("finished"), 0.1) == [Leave(0, "finished")]
+
+
+def test_no_ticket_is_taken_while_draining() -> None:
+    session = ready(collect((0, 0)))
+    task = task_of(session)
+    session.terminate()
+    assert session.handle(collect((1, 0)), 0.1) == []
+    effects = session.finished(fake_rollouts(task))
+    assert said(effects, Goodbye)[0].tickets == ()
+
+
+def test_heartbeats_go_on_while_draining() -> None:
+    session = ready(collect((0, 0)))
+    task_of(session)
+    session.terminate()
+    assert said(session.tick(1.0), Heartbeat)
+    session.handle(HeartbeatReply(SESSION, 1, lanes(0)), 5.0)
+    assert said(session.tick(10.0), Heartbeat)
+
+
+def test_the_drain_that_answers_its_heartbeats_is_a_sign_of_life_to_a_draining_worker() -> None:
+    """The rollout in hand takes longer than learner_timeout_s; a draining learner answers each heartbeat by Drain."""
+    session = ready(collect((0, 0)))
+    task_of(session)
+    for second in range(20):
+        assert session.handle(Drain("finished"), float(second)) == []
+        assert all(not isinstance(effect, Leave) for effect in session.tick(second + 0.5))
+
+
+def test_a_silent_learner_is_not_waited_for_while_draining() -> None:
+    session = ready(collect((0, 0)))
+    task_of(session)
+    session.terminate()
+    (leave,) = session.tick(6.1)
+    assert isinstance(leave, Leave)
+    assert "silent" in leave.reason
+
+
+def test_rejoin_while_draining_leaves() -> None:
+    session = ready(collect((0, 0)))
+    task_of(session)
+    session.terminate()
+    (leave,) = session.handle(Rejoin(SESSION), 0.1)
+    assert isinstance(leave, Leave)
+
+
+@pytest.mark.parametrize("state", [State.JOINING, State.READY, State.DRAINING])
+def test_refuse_leaves_with_exit_code_2_in_every_state(state: State) -> None:
+    session = in_state(state)
+    assert session.handle(Refuse("another protocol"), 0.1) == [Leave(2, "another protocol")]
+    assert session.state is State.LEFT
+
+
+def test_a_failure_is_told_with_its_traceback_and_leaves_with_exit_code_1() -> None:
+    session = ready(collect((0, 3)))
+    task_of(session)
+    effects = session.broke("ValueError: bad action", "Traceback: …", 3)
+    assert effects == [
+        Say(Failure(SESSION, "ValueError: bad action", "Traceback: …", 3)),
+        Leave(1, "ValueError: bad action"),
+    ]
+
+
+def test_a_failure_before_any_session_has_nobody_to_be_told_to() -> None:
+    assert joining().broke("no such environment", "", None) == [Leave(1, "no such environment")]
+
+
+def test_a_run_that_it_will_not_take_part_in_is_left_with_exit_code_2_and_a_word() -> None:
+    assert ready().decline("no code") == [Say(Goodbye(SESSION, "no code", ())), Leave(2, "no code")]
+
+
+def test_one_whose_key_is_refused_leaves_with_exit_code_2_whatever_it_was_doing() -> None:
+    for state in (State.JOINING, State.READY, State.DRAINING):
+        session = in_state(state)
+        assert session.turned_away("refused") == [Leave(2, "refused")]
+        assert session.state is State.LEFT
+        assert session.turned_away("refused") == []
+
+
+def test_one_that_has_left_says_nothing_more() -> None:
+    session = in_state(State.LEFT)
+    for message in EVERY_MESSAGE:
+        assert session.handle(message, 1.0) == []
+    assert session.tick(1e6) == session.terminate() == session.broke("x", "", None) == []
+    assert session.next_task() is None
+
+
+# -------------------------------------------------------------------- the table
+
+EVERY_MESSAGE: list[ToWorker] = [
+    Welcome(SESSION, 1, RUN),
+    Refuse("no"),
+    Rejoin(SESSION),
+    weights(5),
+    collect((50, 0)),
+    Release(SESSION, (LaneLife(0, 0),)),
+    HeartbeatReply(SESSION, 1, lanes(0)),
+    Drain("finished"),
+    Reset(SESSION, 60, 0, 0, (0,), (None,), np.zeros(0, np.uint8)),
+    Step(SESSION, 61, 0, 0, (np.zeros(1),)),
+    Call(SESSION, 62, 0, 0, (0,), "render_mode", False, np.zeros(0, np.uint8)),
+]
+
+
+def in_state(state: State) -> Session:
+    """A session in this state; DRAINING with ticket 0 in hand."""
+    if state is State.JOINING:
+        return joining()
+    session = ready(collect((0, 0)))
+    task_of(session)
+    if state in (State.DRAINING, State.LEFT):
+        session.terminate()
+    if state is State.LEFT:
+        session.terminate()
+    assert session.state is state
+    return session
+
+
+def test_every_message_to_a_worker_is_tried() -> None:
+    assert {type(message) for message in EVERY_MESSAGE} == set(ToWorker.__args__)
+
+
+@pytest.mark.parametrize("state", State)
+@pytest.mark.parametrize("message", EVERY_MESSAGE, ids=lambda message: type(message).__name__)
+def test_a_message_that_the_table_does_not_list_changes_nothing(state: State, message: ToWorker) -> None:
+    session = in_state(state)
+    held = session.in_memory()
+    effects = session.handle(message, 0.1)
+    if type(message) not in TABLE[state]:
+        assert (effects, session.state, session.in_memory()) == ([], state, held)
+
+
+@pytest.mark.parametrize("state", State)
+@pytest.mark.parametrize("message", EVERY_MESSAGE, ids=lambda message: type(message).__name__)
+def test_the_table_names_the_state_that_follows(state: State, message: ToWorker) -> None:
+    session = in_state(state)
+    session.handle(message, 0.1)
+    assert session.state is TABLE[state].get(type(message), state)
+
+
+def test_all_that_a_worker_says_can_be_said_to_a_learner() -> None:
+    kinds = set(ToLearner.__args__)
+    session = ready(collect((0, 0)))
+    effects = session.finished(fake_rollouts(task_of(session))) + session.tick(1.0) + session.terminate()
+    assert {type(effect.message) for effect in effects if isinstance(effect, Say)} <= kinds
+
+
+def test_weights_are_held_and_not_copied() -> None:
+    parameters = np.zeros(3, np.float32)
+    session = ready(Weights(1, parameters, BUFFERS), collect((0, 0)))
+    assert task_of(session).weights.parameters is parameters

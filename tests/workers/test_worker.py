@@ -1,0 +1,113 @@
+"""The shell round a session, over a link that is not real: which runs it takes part in, how it packs, what it acts under."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Sequence
+from typing import cast
+
+import msgspec
+import numpy as np
+import pytest
+
+from protocol.messages import (
+    Collect,
+    Drain,
+    Goodbye,
+    Inquire,
+    Permit,
+    Received,
+    Rollout,
+    ToLearner,
+    ToWorker,
+    Weights,
+    Welcome,
+)
+from protocol.policy.policy import buffer_size, layout, size
+from protocol.rollout import Array, rollout_bytes
+from protocol.specs import RunSpec
+from protocol.wire.codec import Buffer, decode_to_learner, decode_to_worker, encode
+from protocol.wire.compression import Packing
+from protocol.wire.link import WorkerLink
+from protocol.wire.weight_dtypes import WeightsDtype, narrowed, widened
+from tests.support.collectors import a_collector, bits, collect, run_of
+from workers.session import Leave, Session
+from workers.worker import Worker, identity
+
+RUN = msgspec.structs.replace(run_of("CartPole-v1", T=40, N=8), learner_timeout_s=1e9)
+
+
+class FakeLink:
+    """Says one message each time it is asked, and keeps what is answered."""
+
+    address, trouble = "fake", None
+
+    def __init__(self, messages: Sequence[ToWorker], stack: bool = False) -> None:
+        self.packing = Packing(stack=stack)
+        self.messages = list(messages)
+        self.sent: list[list[Buffer]] = []
+
+    def poll(self, timeout_s: float) -> bool:
+        return bool(self.messages)
+
+    def receive(self) -> Iterator[ToWorker]:
+        yield self.messages.pop(0)
+
+    def send(self, frames: list[Buffer]) -> None:
+        self.sent.append(frames)
+
+    def close(self) -> None:
+        pass
+
+    def heard(self, room: int = 0) -> list[ToLearner | Inquire]:
+        return [decode_to_learner(frames, room) for frames in self.sent]
+
+
+def work(link: FakeLink) -> Leave:
+    return Worker(cast(WorkerLink, link), Session(identity("w0"), 0.0), clock=lambda: 0.0).run()
+
+
+PARAMETERS = np.random.default_rng(0).normal(0, 0.1, size(layout(RUN.policy)[0])).astype(np.float32)
+BUFFERS = np.ones(buffer_size(RUN.policy), np.float32)
+
+
+def said_to_a_worker(run: RunSpec, parameters: Array = PARAMETERS) -> list[ToWorker]:
+    """To join, collect one rollout and leave."""
+    permits, received = (Permit(0, 0, 0),), (Received(0, 0, 0),)
+    return [Welcome(1, 1, run), Weights(0, parameters, BUFFERS), Collect(1, 0, permits, received), Drain("done")]
+
+
+def test_a_worker_compresses_when_the_run_says_so() -> None:
+    rollouts, bytes_sent = [], []
+    for compress in ("none", "zstd"):
+        link = FakeLink(said_to_a_worker(msgspec.structs.replace(RUN, compress=compress)))
+        assert work(link).exit_code == 0
+        (rollout,) = (message for message in link.heard(rollout_bytes(RUN)) if isinstance(message, Rollout))
+        rollouts.append([bytes(frame) for frame in encode(rollout)[1:]])
+        bytes_sent += [sum(map(len, frames)) for frames in link.sent if len(frames) > 1]
+    assert rollouts[0] == rollouts[1]
+    assert bytes_sent[1] < 0.75 * bytes_sent[0]
+
+
+def test_a_worker_that_cannot_compress_leaves_at_once_and_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "zstandard", None)
+    link = FakeLink(said_to_a_worker(msgspec.structs.replace(RUN, compress="zstd")))
+    why = "compress zstd needs the package zstandard, which is an extra; pip install 'millrace[compress]'"
+    assert work(link) == Leave(2, why)
+    assert link.heard()[-1] == Goodbye(1, why, ())
+
+
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16", "float16"])
+def test_a_worker_acts_under_the_weights_that_travelled(dtype: WeightsDtype) -> None:
+    travelling = narrowed(PARAMETERS, dtype)
+    (welcome, weights, *rest) = said_to_a_worker(RUN, travelling)
+    link = FakeLink([welcome, decode_to_worker(encode(weights)), *rest])
+    assert work(link).exit_code == 0
+    (rollout,) = (message for message in link.heard() if isinstance(message, Rollout))
+    found = []
+    for parameters in (widened(travelling), PARAMETERS):
+        collector = a_collector(RUN)
+        collector.load(parameters, BUFFERS)
+        found.append(bits(collect(collector, RUN)[0])["log_prob"])
+    assert rollout.log_prob.tobytes() == found[0]
+    assert (found[0] == found[1]) == (dtype == "float32")

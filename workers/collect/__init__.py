@@ -1,0 +1,1 @@
+"""Rollouts: env copies of a lane, stepped with the policy's actions."""

@@ -1,0 +1,162 @@
+"""One lane as it lives in a worker: its env copies, where each of them stands, and the generator of its actions.
+
+It keeps what must outlast a rollout (the last observations, who has ended, the running episodes) and refuses what no
+rollout can hold: an environment that raises, observations that do not fit their space, NaN.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from time import perf_counter
+from traceback import format_exception
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from protocol.envs.spaces import action_spec, observation_leaves
+from protocol.errors import RunError, UsageError
+from protocol.policy.recurrent import zero_state
+from protocol.rollout import Episode, first_not_finite
+from protocol.specs import Leaf, RunSpec
+from workers.collect.env_copies import Copies, CopyRaised, Leaves, Pulse, Row, copy_seeds
+
+Array = npt.NDArray[Any]
+Bools = npt.NDArray[np.bool_]
+Floats = npt.NDArray[np.float32]
+
+
+class EnvironmentBroke(RunError):
+    """The environment raised, or gave what no rollout can hold; `detail` is its traceback, if it raised."""
+
+    def __init__(self, lane: int, line: str, detail: str = "") -> None:
+        super().__init__(f"lane {lane}, {line}", detail)
+        self.lane = lane
+
+
+def environment_raised(lane: int, when: str, error: CopyRaised) -> EnvironmentBroke:
+    """The environment's own exception, in one line and with its traceback."""
+    cause = error.__cause__ or error
+    where = when if error.copy is None else f"copy {error.copy}, {when}"
+    says = str(cause).strip().splitlines() or [""]
+    line = f"{where}: its environment raised {type(cause).__name__}: {says[0]}"
+    return EnvironmentBroke(lane, line, "".join(format_exception(cause)))
+
+
+class Lane:
+    """A numbered group of N env copies that are stepped together."""
+
+    def __init__(self, run: RunSpec, number: int, incarnation: int, copies: Copies) -> None:
+        self.number = number
+        self.incarnation = incarnation
+        self.copies = copies
+        self.generator = np.random.default_rng(np.random.SeedSequence([run.seed, number, incarnation], spawn_key=(0,)))
+        self.obs = tuple(
+            np.empty((run.copies, *leaf.shape), leaf.dtype) for leaf in run.policy.observation
+        )  # [N, *leaf] each
+        self.state = zero_state(run.policy, run.copies)  # [N, S] what the policy remembers
+        self.ended = np.zeros(run.copies, bool)  # [N] the next step only resets this copy
+        self._run = run
+        self._seeds = copy_seeds(run.seed, number, incarnation, run.copies)
+        self._return = [0.0] * run.copies  # of the running episodes
+        self._length = [0] * run.copies
+        self._began = [0.0] * run.copies  # seconds, by perf_counter
+        self._proven = False
+
+    def reset(self, pulse: Pulse) -> None:
+        """Begin. Raises `UsageError` when the copies' spaces are not the run's."""
+        policy, observation, action = self._run.policy, self.copies.observation_space, self.copies.action_space
+        if (observation_leaves(observation), action_spec(action)) != (policy.observation, policy.action):
+            raise UsageError(
+                f"environment {self._run.env.id}: its observations {observation} and actions {action} are not what "
+                "the learner has; install the same version of it here and there"
+            )
+        try:
+            leaves = self.copies.reset(self._seeds, pulse)
+        except CopyRaised as error:
+            raise environment_raised(self.number, "first reset", error) from error
+        self._check_fit(leaves, "first reset")
+        for array, leaf in zip(self.obs, leaves, strict=True):
+            array[:] = leaf
+        self._began = [perf_counter()] * len(self._began)
+
+    def step(self, actions: Array, t: int, pulse: Pulse) -> Row:
+        """Step `t` of a rollout, with actions [N, *action]."""
+        try:
+            row = self.copies.step(actions, pulse)
+        except CopyRaised as error:
+            raise environment_raised(self.number, f"step {t}", error) from error
+        if not self._proven:
+            self._check_fit(row.leaves, f"step {t}")
+            self._proven = True
+        return row
+
+    def _check_fit(self, leaves: Leaves, when: str) -> None:
+        """Raise if an observation is not of its space's shape, or would lose more than a float's precision in its dtype.
+
+        Asked at the first reset and the first step: an environment that fits then, fits later.
+        """
+        for leaf, values in zip(self._run.policy.observation, leaves, strict=True):
+            wanted = np.dtype(leaf.dtype)
+            for n, value in enumerate(values):
+                try:
+                    array = np.asarray(value)
+                except ValueError:  # rows of different lengths
+                    array = np.asarray(None)
+                if (
+                    array.shape != leaf.shape
+                    or not np.can_cast(array.dtype, wanted, "same_kind")
+                    or (wanted.kind in "iu" and (array.astype(wanted) != array).any())
+                ):
+                    raise EnvironmentBroke(
+                        self.number,
+                        f"copy {n}, {when}: {_name(leaf)} expected {wanted}{list(leaf.shape)} as its space says, "
+                        f"got {array.dtype}{list(array.shape)}; mend the environment or its observation_space",
+                    )
+
+    def check_sense(self, obs: Sequence[Array], reward: Array) -> None:
+        """Raise, naming step and copy, if observations [rows, N, *leaf] or rewards [rows, N] cannot be right."""
+        for leaf, array in zip(self._run.policy.observation, obs, strict=True):
+            if array.dtype.kind == "f" and not np.isfinite(array).all():
+                raise EnvironmentBroke(self.number, f"{_name(leaf)}: {first_not_finite(array)}")
+            if leaf.sizes:
+                start, size = (np.reshape(values, leaf.shape) for values in (leaf.start, leaf.sizes))
+                wrong = (array < start) | (array >= start + size)
+                if wrong.any():
+                    t, n = np.argwhere(wrong)[0][:2]
+                    line = f"{_name(leaf)}: expected a value of its space, got {array[t, n]} at step {t}, copy {n}"
+                    raise EnvironmentBroke(self.number, line)
+        if not np.isfinite(reward).all():
+            raise EnvironmentBroke(self.number, f"reward: {first_not_finite(reward)}")
+
+    def finish(self, reward: Array, done: Bools, clock: Sequence[float]) -> tuple[Bools, tuple[Episode, ...]]:
+        """Close the account of T rows: which are valid [T, N], and the episodes that ended, oldest first.
+
+        `reward` [T, N] float64 is raw and, in rows that are not valid, made 0; `done` [T, N] is terminated or truncated;
+        `clock` [T] tells when each step was over. An episode's seconds begin where the copy's last one ended.
+        """
+        valid = ~np.concatenate([self.ended[None], done[:-1]])
+        reward[~valid] = 0.0
+        self.ended = done[-1].copy()
+        rewards = reward.T.tolist()  # by copy
+        first, resets = [0] * len(rewards), (~valid[0]).tolist()  # where its next account begins, with a reset or not
+        episodes = []
+
+        def add(n: int, end: int) -> None:
+            self._return[n] += sum(rewards[n][first[n] : end])
+            self._length[n] += end - first[n] - resets[n]  # only the first row of an account can be one that resets
+            first[n], resets[n] = end, True
+
+        for t, n in np.argwhere(done).tolist():
+            add(n, t + 1)
+            if valid[t, n]:
+                episodes.append(Episode(self._return[n], self._length[n], clock[t] - self._began[n]))
+            self._return[n], self._length[n], self._began[n] = 0.0, 0, clock[t]
+        for n in range(len(rewards)):
+            if first[n] < len(clock):
+                add(n, len(clock))
+        return valid, tuple(episodes)
+
+
+def _name(leaf: Leaf) -> str:
+    return f"observation {leaf.path}".strip()
