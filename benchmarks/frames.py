@@ -11,10 +11,9 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import numpy.typing as npt
 from gymnasium import spaces
 
-Bytes = npt.NDArray[np.uint8]
+from protocol.arrays import Bytes
 
 SKIP = 4  # screens in a step
 _LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32)

@@ -13,7 +13,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import numpy.typing as npt
 
 from learner.run_folder.metrics import Evaluation
 from learner.run_folder.run_folder import RunFolder, Which
@@ -24,7 +23,6 @@ from protocol.policy.policy import Policy, make_policy
 from protocol.policy.recurrent import zero_state
 from protocol.specs import EnvSpec, PolicySpec
 
-Array = npt.NDArray[Any]
 COPIES = 20
 LONGEST_EPISODE = 100_000  # env steps; an environment without a time limit must not stop a run from ending
 

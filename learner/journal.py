@@ -12,8 +12,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import msgspec
-import numpy as np
-import numpy.typing as npt
 
 from learner.algorithms import Algorithm
 from learner.config.config import Config
@@ -25,6 +23,7 @@ from learner.run_folder import checkpoint
 from learner.run_folder.metrics import EpisodeWindow, Evaluation, MetricsLog, Progress
 from learner.run_folder.run_folder import Best, RunFolder, Summary
 from learner.run_folder.versions import versions
+from protocol.arrays import Floats
 from protocol.errors import CheckpointError, RunError, UsageError
 from protocol.policy.policy import make_policy
 from protocol.rollout import Batch, Rollout
@@ -32,7 +31,6 @@ from protocol.specs import RunSpec
 
 log = logging.getLogger("millrace.learner")
 
-Floats = npt.NDArray[np.float32]
 
 EVALUATION_SEED, CONFIRMATION_SEED = 1_000_000, 2_000_000  # far from the seeds of training, and from each other
 

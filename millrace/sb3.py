@@ -10,14 +10,13 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 import millrace
 from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.spec import Env
+from protocol.arrays import Array
 
-Array = npt.NDArray[Any]
 Indices = int | Iterable[int] | None
 
 

@@ -5,17 +5,13 @@ A session is one stay of one worker with one learner; a message of another sessi
 
 from __future__ import annotations
 
-from typing import Any
-
 import msgspec
-import numpy.typing as npt
 
+from protocol.arrays import Array
 from protocol.rollout import Rollout
 from protocol.specs import RunSpec, StepSpec
 
 PROTOCOL_VERSION = 3
-
-Array = npt.NDArray[Any]
 
 
 class Message(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unknown_fields=True):

@@ -13,18 +13,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from protocol.arrays import Array, Bools, Floats
 from protocol.errors import BadRollout
 from protocol.specs import Leaf, RunSpec
-
-Array = npt.NDArray[Any]
-Bools = npt.NDArray[np.bool_]
-Floats = npt.NDArray[np.float32]
 
 
 class Episode(msgspec.Struct, frozen=True, array_like=True):

@@ -8,18 +8,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol
 
-import numpy as np
-import numpy.typing as npt
-
 from learner.algorithms.a2c import A2C
 from learner.algorithms.dqn import DQN
 from learner.algorithms.impala import Impala
 from learner.algorithms.ppo import PPO
 from learner.algorithms.reinforce import REINFORCE
+from protocol.arrays import Floats
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
-
-Floats = npt.NDArray[np.float32]
 
 
 class Algorithm(Protocol):

@@ -8,17 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
 from learner.algorithms import actor_critic, losses
 from learner.algorithms.actor_critic import Parts
 from learner.algorithms.returns import gae
 from learner.config.hyperparameters import A2CConfig
+from protocol.arrays import Floats
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
-
-Floats = npt.NDArray[np.float32]
 
 
 class A2C:

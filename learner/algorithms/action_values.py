@@ -11,14 +11,12 @@ from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from learner.algorithms.kernels import fused
+from protocol.arrays import Array
 from protocol.policy.networks import QNetwork
-
-Array = npt.NDArray[Any]
 
 
 class ActionValues(Protocol):

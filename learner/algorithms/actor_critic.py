@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from msgspec.structs import replace
 from torch import Tensor
@@ -23,15 +22,13 @@ from learner.algorithms.kernels.fused import MOST_ROWS, FusedActorCritic, applie
 from learner.algorithms.kernels.optimizer_step import spare_the_compiler, take_step
 from learner.algorithms.normalization import ObservationNormaliser, RewardScaler
 from learner.config.hyperparameters import ActorCriticHyperparameters, RecurrentHyperparameters
+from protocol.arrays import Array, Bools, Floats
 from protocol.errors import RunError
 from protocol.policy.networks import ActorCritic, Memory, log_prob_and_entropy
 from protocol.policy.policy import features, normalized
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
-Array = npt.NDArray[Any]
-Bools = npt.NDArray[np.bool_]
-Floats = npt.NDArray[np.float32]
 Pulse = Callable[[], None]
 Rows = Tensor | slice
 View = tuple[Tensor, list[Tensor], Memory | None]  # what the network takes

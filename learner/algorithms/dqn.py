@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from learner.algorithms import losses
@@ -24,14 +23,12 @@ from learner.algorithms.kernels.optimizer_step import spare_the_compiler, take_s
 from learner.algorithms.normalization import ObservationNormaliser
 from learner.algorithms.replay import Replay, Sample
 from learner.config.hyperparameters import DQNConfig
+from protocol.arrays import Array, Floats
 from protocol.errors import RunError, UsageError
 from protocol.policy.networks import QNetwork
 from protocol.policy.policy import features, normalized
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
-
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float32]
 
 
 class Measured(NamedTuple):

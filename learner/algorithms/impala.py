@@ -10,16 +10,14 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from learner.algorithms import actor_critic, losses
 from learner.algorithms.actor_critic import Minibatch, Parts, Seen
 from learner.algorithms.returns import vtrace
 from learner.config.hyperparameters import ImpalaConfig
+from protocol.arrays import Floats
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
-
-Floats = npt.NDArray[np.float32]
 
 
 class Impala:

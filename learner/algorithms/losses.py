@@ -15,7 +15,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-Floats = npt.NDArray[np.float32]
+from protocol.arrays import Floats
+
 A = TypeVar("A", Tensor, npt.NDArray[Any])
 
 

@@ -12,12 +12,11 @@ import numpy.typing as npt
 import torch
 
 from learner.algorithms.returns import discounted_return
+from protocol.arrays import Doubles, Floats
 from protocol.policy.policy import buffer_size, measured_features
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
 
-Doubles = npt.NDArray[np.float64]
-Floats = npt.NDArray[np.float32]
 TINY = 1e-12  # a variance below this share of the squared mean is rounding: it did not vary
 
 

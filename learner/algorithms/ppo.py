@@ -12,7 +12,6 @@ from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from learner.algorithms import actor_critic, losses
@@ -20,10 +19,9 @@ from learner.algorithms.actor_critic import Minibatch, Parts
 from learner.algorithms.kernels.optimizer_step import take_step
 from learner.algorithms.returns import gae
 from learner.config.hyperparameters import PPOConfig
+from protocol.arrays import Floats
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
-
-Floats = npt.NDArray[np.float32]
 
 
 class Measured(NamedTuple):

@@ -11,16 +11,14 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from learner.algorithms import actor_critic, losses
 from learner.algorithms.actor_critic import Parts
 from learner.algorithms.returns import complete, gae
 from learner.config.hyperparameters import REINFORCEConfig
+from protocol.arrays import Floats
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
-
-Floats = npt.NDArray[np.float32]
 
 
 class REINFORCE:

@@ -15,20 +15,14 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from learner.algorithms.available_memory import GIB, available_bytes
 from learner.algorithms.sum_tree import SumTree
+from protocol.arrays import Array, Bools, Doubles, Floats, Ints
 from protocol.errors import UsageError
 from protocol.rollout import Batch
 from protocol.specs import Leaf
-
-Array = npt.NDArray[Any]
-Bools = npt.NDArray[np.bool_]
-Doubles = npt.NDArray[np.float64]
-Floats = npt.NDArray[np.float32]
-Ints = npt.NDArray[np.int64]
 
 TINY = 1e-6  # added to errors, so that no transition is never drawn again
 NOWHERE = -1

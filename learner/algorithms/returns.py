@@ -12,8 +12,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-Bools = npt.NDArray[np.bool_]
-Floats = npt.NDArray[np.float32]
+from protocol.arrays import Bools, Floats
 
 
 def gae(

@@ -14,13 +14,12 @@ from types import TracebackType
 from typing import Any, Self
 
 import gymnasium
-import numpy.typing as npt
 from gymnasium import spaces
 
 from learner.recording.episodes import RecordedEpisode
+from protocol.arrays import Array
 from protocol.errors import RunError, UsageError
 
-Array = npt.NDArray[Any]
 CHUNK_BYTES = 64 * 2**20
 
 

@@ -20,12 +20,12 @@ from typing import Any, BinaryIO, Self
 import gymnasium
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from learner.evaluate import load_policy
 from learner.recording.episodes import EpisodeAssembler, RecordedEpisode
 from learner.recording.minari import MinariDataset
 from learner.run_folder.atomic_write import write_atomically
+from protocol.arrays import Array
 from protocol.envs.spaces import reader, writer
 from protocol.errors import EnvironmentFailed, RunError, UsageError
 from protocol.policy.distributions import distribution
@@ -33,8 +33,6 @@ from protocol.policy.policy import Policy
 from protocol.policy.recurrent import zero_state
 from protocol.rollout import Rollout
 from protocol.specs import EnvSpec, PolicySpec
-
-Array = npt.NDArray[Any]
 
 
 class Recorded(msgspec.Struct, frozen=True, kw_only=True):

@@ -8,9 +8,9 @@ from html import escape
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from protocol.arrays import Doubles
+
 COLOURS = 7  # that the style sheet has
 LEFT, RIGHT, TOP, BOTTOM = 52, 14, 10, 40
 MOST_POINTS = 500
@@ -23,8 +23,8 @@ class Trace(NamedTuple):
     kind: str
     """line (bold), thin, band or dots: a class of the style sheet"""
     colour: int
-    x: Floats  # [K]
-    y: Floats  # [K], or [K, 2] of a band
+    x: Doubles  # [K]
+    y: Doubles  # [K], or [K, 2] of a band
     says: str = ""
     """shown when the pointer rests on it"""
 
@@ -58,10 +58,10 @@ def chart(traces: Sequence[Trace], width: int, height: int, x_label: str, descri
     low, high = (0.0 if 0 <= low < 0.4 * high else low - 0.05 * (high - low)), high + 0.05 * (high - low)
     plot_w, plot_h = width - LEFT - RIGHT, height - TOP - BOTTOM
 
-    def across(x: Floats | float) -> Floats:
+    def across(x: Doubles | float) -> Doubles:
         return np.asarray(LEFT + np.asarray(x) / x_max * plot_w)
 
-    def down(y: Floats | float) -> Floats:
+    def down(y: Doubles | float) -> Doubles:
         return np.asarray(TOP + (high - np.asarray(y)) / (high - low) * plot_h)
 
     parts = [f'<svg class="chart" viewBox="0 0 {width} {height}" role="img" aria-label="{escape(describe)}">']
@@ -81,7 +81,7 @@ def chart(traces: Sequence[Trace], width: int, height: int, x_label: str, descri
     return "\n".join([*parts, "</svg>"])
 
 
-def _drawn(trace: Trace, x: Floats, y: Floats) -> str:
+def _drawn(trace: Trace, x: Doubles, y: Doubles) -> str:
     says = f"<title>{escape(trace.says)}</title>" if trace.says else ""
     css = f'class="{trace.kind} c{trace.colour % COLOURS}"'
     match trace.kind:
@@ -96,13 +96,13 @@ def _drawn(trace: Trace, x: Floats, y: Floats) -> str:
             return f'<path {css} d="{_path(np.column_stack(_thinned(x, y)))}">{says}</path>'
 
 
-def _thinned(x: Floats, y: Floats) -> tuple[Floats, Floats]:
+def _thinned(x: Doubles, y: Doubles) -> tuple[Doubles, Doubles]:
     """At most about 500 of the points, the last one among them: more than that is not seen."""
     every = math.ceil(len(x) / MOST_POINTS)
     keep = np.unique([*range(0, len(x), every), len(x) - 1])
     return x[keep], y[keep]
 
 
-def _path(points: Floats) -> str:
+def _path(points: Doubles) -> str:
     """[K, 2] as path commands."""
     return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points)

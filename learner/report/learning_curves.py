@@ -14,16 +14,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from learner.run_folder.atomic_write import write_atomically
 from learner.run_folder.metrics import WINDOW, X, read_rows
+from protocol.arrays import Doubles
 from protocol.errors import RunError, UsageError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Floats = npt.NDArray[np.float64]
 Y = "rollout/ep_rew_mean"
 POINTS = 400
 PANEL_INCHES = (6.4, 4.2)
@@ -47,8 +46,8 @@ class Curve(NamedTuple):
     env: str
     algo: str
     seed: int
-    env_steps: Floats  # [K] rising
-    returns: Floats  # [K]
+    env_steps: Doubles  # [K] rising
+    returns: Doubles  # [K]
 
 
 def read_curve(run: Path) -> Curve:
@@ -96,7 +95,7 @@ def plot(runs: Sequence[Path], out: Path) -> Path:
     return out
 
 
-def common_grid(curves: Sequence[Curve]) -> tuple[Floats, Floats]:
+def common_grid(curves: Sequence[Curve]) -> tuple[Doubles, Doubles]:
     """Env steps [G] that all curves cover, and their returns [curves, G] there, by linear interpolation."""
     first, last = max(curve.env_steps[0] for curve in curves), min(curve.env_steps[-1] for curve in curves)
     grid = np.linspace(first, last, POINTS) if last > first else np.zeros(0)

@@ -15,14 +15,13 @@ from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from learner.report.learning_curves import Curve, Y
 from learner.run_folder.metrics import Evaluation, X, read_rows
 from learner.run_folder.run_folder import RunFolder
+from protocol.arrays import Doubles
 from protocol.errors import UsageError
 
-Floats = npt.NDArray[np.float64]
 NOT_THE_SAME_LINE = ("seed", "run_dir")  # settings that may differ between the runs of one line
 NAMED = 3  # differing settings that are told with the name of a line
 
@@ -57,7 +56,7 @@ class Run:
     numbers: Numbers
     curve: Curve | None
     """None before the first episode has ended"""
-    evaluations: Floats  # [K, 2] env steps and greedy return, while it trained
+    evaluations: Doubles  # [K, 2] env steps and greedy return, while it trained
     films: tuple[Path, ...]
 
 

@@ -23,10 +23,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from learner.run_folder.atomic_write import write_atomically
 from learner.run_folder.metrics import Evaluation
+from protocol.arrays import Floats
 from protocol.errors import RunError, UsageError
 from protocol.policy.policy import Field, buffer_fields, layout, size, views
 from protocol.specs import EnvSpec, PolicySpec, Scalar
@@ -34,7 +34,6 @@ from protocol.specs import EnvSpec, PolicySpec, Scalar
 if TYPE_CHECKING:
     from learner.config.config import Config  # brings torch along, and reading a policy needs none
 
-Floats = npt.NDArray[np.float32]
 POLICY_FORMAT = 1
 Which = Literal["final", "best"]
 POLICY_ARRAYS = {"final": "policy.safetensors", "best": "best.safetensors"}

@@ -21,6 +21,7 @@ from gymnasium.vector.utils import batch_space
 from learner.vector_env.spec import Described
 from learner.vector_env.step_hub import LockstepHub
 from learner.vector_env.step_roster import Make
+from protocol.arrays import Array
 from protocol.envs.spaces import nester, reader
 from protocol.errors import BadMessage, EnvironmentFailed, UsageError, WorkerLost
 from protocol.messages import Answer, Call, LaneLife, Reset, Returned, Step, Stepped
@@ -29,7 +30,6 @@ from protocol.wire.shared_memory import Memory
 
 log = logging.getLogger("millrace.learner")
 
-Array = npt.NDArray[Any]
 Infos = dict[str, Any]
 StepResult = tuple[Any, Array, Array, Array, Infos]
 ATTEMPTS = 3  # workers that may be lost, one after another, while the same lane is reset

@@ -12,13 +12,11 @@ from typing import Any
 import gymnasium
 import msgspec
 import numpy as np
-import numpy.typing as npt
 from gymnasium import spaces
 
+from protocol.arrays import Array
 from protocol.errors import UsageError
 from protocol.specs import ActionSpec, Leaf
-
-Array = npt.NDArray[Any]
 
 OBSERVATIONS = "Box, Discrete, MultiBinary, MultiDiscrete, and Dict and Tuple of these"
 ACTIONS = "Discrete, MultiDiscrete, MultiBinary and Box"

@@ -14,15 +14,13 @@ comparison, and the log-probabilities of a whole rollout are computed at once fr
 from __future__ import annotations
 
 import math
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from protocol.arrays import Array, Floats
 from protocol.specs import PolicySpec
 
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float32]
 LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 _TINY = np.float32(1e-30)
 

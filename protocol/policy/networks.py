@@ -13,11 +13,11 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from protocol.arrays import Array, Floats
 from protocol.policy.distributions import LOG_SQRT_2PI
 from protocol.policy.encoder import make_encoder
 from protocol.policy.malloc import keep_freed
@@ -35,9 +35,6 @@ from protocol.policy.policy import (
 )
 from protocol.policy.recurrent import zero_state
 from protocol.specs import ActionSpec, ImagesDtype, PolicySpec
-
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float32]
 
 
 class Memory(NamedTuple):

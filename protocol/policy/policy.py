@@ -12,17 +12,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from protocol.arrays import Array, Floats
 from protocol.policy.distributions import distribution
 from protocol.policy.recurrent import advance, core_shapes, zero_state
 from protocol.specs import ImagesDtype, Leaf, PolicySpec
-
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float32]
 
 CLIP = np.float32(10.0)  # normalised observations are clipped to ±10
 IMAGE_FEATURES = 128  # width of the layer between the convolutions of one image and the rest

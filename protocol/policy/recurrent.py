@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from protocol.arrays import Floats
 from protocol.specs import PolicySpec
 
-Floats = npt.NDArray[np.float32]
 GATES = {"lstm": 4, "gru": 3}
 
 

@@ -21,13 +21,11 @@ from typing import Any, get_args
 import msgpack
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from protocol.errors import BadMessage
 from protocol.messages import Hello, Inquire, Refuse, Rollout, Status, ToLearner, ToObserver, ToWorker
 from protocol.wire.compression import Packing, as_it_lies, unpacked
 
-Array = npt.NDArray[Any]
 Buffer = bytes | memoryview
 
 MAX_FRAMES = 64

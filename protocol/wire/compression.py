@@ -21,13 +21,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from protocol.arrays import Array, Bools, Bytes
 from protocol.errors import BadMessage
 
-Array = npt.NDArray[Any]
-Bytes = npt.NDArray[np.uint8]
-Bools = npt.NDArray[np.bool_]
 Frame = bytes | memoryview
 
 MAX_STACK = 16

@@ -17,14 +17,12 @@ from collections.abc import Callable
 from contextlib import suppress
 from enum import IntEnum
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from protocol.arrays import Array
 from protocol.specs import StepSpec
-
-Array = npt.NDArray[Any]
 
 POSSIBLE = hasattr(os, "memfd_create") and hasattr(os, "pipe2")
 LINE = 64  # bytes of a cache line: each lane's words have lines of their own

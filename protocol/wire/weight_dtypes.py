@@ -7,15 +7,13 @@ its log-probabilities are those of the rounded weights; a weight that would beco
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
+from protocol.arrays import Array, Floats
 from protocol.errors import RunError
 
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float32]
 WeightsDtype = Literal["float32", "bfloat16", "float16"]
 
 # What would be rounded to infinity: halfway between the largest number and what would come next.

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
+from protocol.arrays import Array
 from protocol.policy.distributions import distribution
 from protocol.policy.policy import NumpyPolicy
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
-
-Array = npt.NDArray[Any]
 
 BOX = Leaf("", "box", (4,), "float32")
 DISCRETE = PolicySpec((BOX,), ActionSpec("discrete", (), "int64", (4,), (0,)), (16,))

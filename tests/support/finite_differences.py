@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
-import numpy.typing as npt
+from protocol.arrays import Array
 
-Array = npt.NDArray[Any]
 STEP = 1e-6
 
 

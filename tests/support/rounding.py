@@ -12,17 +12,15 @@ analysis", theorem 2.4 with λ = 4). The order of the sum, and so the processor 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
+from protocol.arrays import Array
 from protocol.policy.networks import log_prob_and_entropy
 from protocol.policy.policy import hidden_names, layout, size, views
 from protocol.specs import PolicySpec
 
-Array = npt.NDArray[Any]
 UNIT = 2.0**-24
 ELEMENTWISE = 16  # roundings that an activation, a softmax or a log-probability adds
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from gymnasium.wrappers import OrderEnforcing, TimeLimit
 
+from protocol.arrays import Array
 from protocol.policy.distributions import distribution
-from protocol.rollout import Array
 from protocol.specs import Leaf, RunSpec
 from tests.support.collectors import (
     TOY,

@@ -22,12 +22,12 @@ from gymnasium.error import DependencyNotInstalled, ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
 import workers.envs
+from protocol.arrays import Doubles
 from workers.envs.double_pendulum import (
     DT_S,
     SPEED_LIMIT,
     SUBSTEPS,
     CartDoublePendulum,
-    Doubles,
     Physics,
     State,
     accelerations,

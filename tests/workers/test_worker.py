@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from protocol.arrays import Array
 from protocol.messages import (
     Collect,
     Drain,
@@ -24,7 +25,7 @@ from protocol.messages import (
     Welcome,
 )
 from protocol.policy.policy import buffer_size, layout, size
-from protocol.rollout import Array, rollout_bytes
+from protocol.rollout import rollout_bytes
 from protocol.specs import RunSpec
 from protocol.wire.codec import Buffer, decode_to_learner, decode_to_worker, encode
 from protocol.wire.compression import Packing

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from protocol.arrays import Array, Floats
 from protocol.envs.envpool import pool_of
 from protocol.envs.spaces import writer
 from protocol.envs.vectorized import make_native
@@ -27,8 +28,6 @@ from workers.collect.envpool_copies import PoolCopies
 from workers.collect.lane import EnvironmentBroke, Lane, environment_raised
 from workers.session import Assignment
 
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float32]
 OpenCopies = Callable[[RunSpec, int, Pulse], Copies]
 """The copies of the lane of this number."""
 Begin = Callable[[Sequence[int], Array, Pulse], None]

@@ -13,15 +13,14 @@ from typing import Any, NamedTuple, Protocol
 
 import gymnasium
 import numpy as np
-import numpy.typing as npt
 from gymnasium.vector import VectorEnv
 from gymnasium.wrappers import OrderEnforcing
 
+from protocol.arrays import Array
 from protocol.envs.spaces import reader
 from protocol.envs.vectorized import check_resets_next_step
 from protocol.errors import UsageError
 
-Array = npt.NDArray[Any]
 Leaves = Sequence[Any]  # for each leaf of the observation: an array [N, *leaf], or a sequence of N observations
 Pulse = Callable[[], None]
 

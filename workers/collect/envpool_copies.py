@@ -12,14 +12,12 @@ from contextlib import suppress
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from gymnasium.vector import VectorEnv
 
+from protocol.arrays import Array
 from protocol.envs.envpool import Pool
 from protocol.envs.spaces import reader
 from workers.collect.env_copies import CopyRaised, Leaves, Pulse, Row
-
-Array = npt.NDArray[Any]
 
 
 class PoolCopies:

@@ -9,21 +9,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from time import perf_counter
 from traceback import format_exception
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from protocol.arrays import Array, Bools
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import RunError, UsageError
 from protocol.policy.recurrent import zero_state
 from protocol.rollout import Episode, first_not_finite
 from protocol.specs import Leaf, RunSpec
 from workers.collect.env_copies import Copies, CopyRaised, Leaves, Pulse, Row, copy_seeds
-
-Array = npt.NDArray[Any]
-Bools = npt.NDArray[np.bool_]
-Floats = npt.NDArray[np.float32]
 
 
 class EnvironmentBroke(RunError):

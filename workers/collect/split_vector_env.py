@@ -10,15 +10,13 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from gymnasium.vector import VectorEnv
 
+from protocol.arrays import Array
 from protocol.envs.spaces import reader
 from protocol.errors import NoWorkers
 from protocol.specs import RunSpec
 from workers.collect.env_copies import Copies, Leaves, Pulse, Row
-
-Array = npt.NDArray[Any]
 
 
 class SideBySide:

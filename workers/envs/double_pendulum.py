@@ -18,14 +18,12 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 
+from protocol.arrays import Doubles, Floats
 from workers.envs.double_pendulum_screen import Screen
 
-Floats = npt.NDArray[np.float32]
-Doubles = npt.NDArray[np.float64]
 State = tuple[float, float, float, float, float, float]  # x_m, theta_rad, phi_rad, and their derivatives, each per second
 Accelerations = Callable[[float, float, float, float, float, float], tuple[float, float, float]]
 

@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-Floats = npt.NDArray[np.float32]
+from protocol.arrays import Floats
+
 Info = dict[str, Any]
 
 

@@ -14,14 +14,13 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
-import numpy.typing as npt
 
+from protocol.arrays import Array
 from protocol.envs.spaces import exact_leaves, nester, reader
 from protocol.errors import UsageError
 from protocol.specs import StepSpec
 from workers.collect.env_copies import PULSE_S, CopyRaised, Pulse
 
-Array = npt.NDArray[Any]
 Infos = list[tuple[int, dict[str, Any]]]  # (copy, its info), where it is not empty
 
 

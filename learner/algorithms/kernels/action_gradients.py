@@ -7,15 +7,13 @@ The law: they are those of `log_prob_and_entropy` (`protocol.policy.networks`) a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from protocol.arrays import Array
 from protocol.policy.distributions import LOG_SQRT_2PI
 from protocol.specs import ActionSpec
-
-Array = npt.NDArray[Any]
 
 
 class Actions(Protocol):

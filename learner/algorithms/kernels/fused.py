@@ -11,14 +11,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from learner.algorithms.kernels.action_gradients import Actions, actions
 from learner.algorithms.kernels.mlp import Head, Layers, Linear
+from protocol.arrays import Array
 from protocol.policy.policy import feature_size, hidden_names, layout, size, views
 from protocol.specs import PolicySpec
-
-Array = npt.NDArray[Any]
 
 MOST_ROWS = 16_384  # of a minibatch: what is kept of one takes memory
 MOST_UNITS = 256  # of a layer: above, the products are all that counts (`python -m benchmarks.update`)

@@ -13,14 +13,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from numpy.lib.stride_tricks import as_strided
 
-Array = npt.NDArray[Any]
+from protocol.arrays import Array
+
 Call = Callable[[], object]
 
 PIECE = 512  # rows, at most

@@ -9,7 +9,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 import pytest
 import torch
 
@@ -18,15 +17,12 @@ from learner.algorithms import replay as replay_module
 from learner.algorithms.dqn import DQN, LOSSES, exploration_rate
 from learner.algorithms.replay import Sample
 from learner.config.hyperparameters import DQNConfig
+from protocol.arrays import Array, Floats, Ints
 from protocol.errors import RunError, UsageError
 from protocol.policy.distributions import distribution
 from protocol.policy.policy import NumpyPolicy, make_policy, views
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf
-
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float32]
-Ints = npt.NDArray[np.int64]
 
 BOX = Leaf("", "box", (4,), "float32")
 CHOICE = ActionSpec("discrete", (), "int64", (4,), (0,))

@@ -9,7 +9,6 @@ from unittest.mock import patch
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 import pytest
 import torch
 from hypothesis import given, settings
@@ -21,6 +20,7 @@ from learner.algorithms.kernels import mlp as layers
 from learner.algorithms.kernels.fused import FusedActorCritic, applies
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
+from protocol.arrays import Array
 from protocol.policy.networks import ActorCritic, log_prob_and_entropy
 from protocol.policy.policy import layout, size
 from protocol.specs import ActionSpec, Leaf, PolicySpec
@@ -29,7 +29,6 @@ from tests.support.batches import DISCRETE, GAUSSIAN, IMAGE, batch, no_pulse, no
 from tests.support.finite_differences import is_the_slope
 from tests.support.rounding import growth, sums_of_absolute_values
 
-Array = npt.NDArray[Any]
 BOX = (Leaf("", "box", (4,), "float32"),)
 
 

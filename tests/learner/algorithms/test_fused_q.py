@@ -8,7 +8,6 @@ from unittest.mock import patch
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 import pytest
 import torch
 from hypothesis import given, settings
@@ -21,14 +20,13 @@ from learner.algorithms.kernels import mlp as layers
 from learner.algorithms.kernels.fused import FusedQ
 from learner.algorithms.replay import Sample
 from learner.config.hyperparameters import DQNConfig
+from protocol.arrays import Array
 from protocol.policy.networks import QNetwork
 from protocol.policy.policy import layout, size
 from protocol.specs import PolicySpec
 from tests.learner.algorithms.test_dqn import batch
 from tests.support.batches import BOX, DISCRETE, IMAGE, no_pulse
 from tests.support.finite_differences import is_the_slope
-
-Array = npt.NDArray[Any]
 
 
 @pytest.fixture(autouse=True, scope="module")

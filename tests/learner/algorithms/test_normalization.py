@@ -7,18 +7,17 @@ from typing import Any
 
 import hypothesis.extra.numpy as hnp
 import numpy as np
-import numpy.typing as npt
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from learner.algorithms.normalization import ObservationNormaliser, RewardScaler, RunningMoments
+from protocol.arrays import Array
 from protocol.policy.policy import buffer_size
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
-Array = npt.NDArray[Any]
 GAMMA = 0.9
 
 

@@ -25,7 +25,6 @@ from protocol.errors import UsageError
 from protocol.rollout import Batch
 from protocol.specs import Leaf
 
-Array = npt.NDArray[Any]
 OBS = (Leaf("", "box", (1,), "float64"),)
 GAMMA = 0.9
 RUBBISH = 77  # stands in every row that is not valid, and must never be seen again

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import hypothesis.extra.numpy as hnp
 import numpy as np
-import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from learner.algorithms.returns import discounted_return, gae
+from protocol.arrays import Array
 
-Array = npt.NDArray[Any]
 GAMMA, LAMBDA = 0.9, 0.8
 
 

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from learner.algorithms.returns import complete, vtrace
+from protocol.arrays import Array
 from tests.learner.algorithms.test_returns import GAMMA, Rows, lawful, rows
 
-Array = npt.NDArray[Any]
 BARS = st.floats(0.1, 1.5)
 
 

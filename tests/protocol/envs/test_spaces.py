@@ -8,9 +8,10 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
+from protocol.arrays import Array
 from protocol.envs.spaces import action_spec, observation_leaves, reader, writer
 from protocol.errors import BadRollout, UsageError
-from protocol.rollout import Array, Episode, Rollout, validate
+from protocol.rollout import Episode, Rollout, validate
 from protocol.specs import RunSpec
 from tests.support.collectors import TOY, a_collector, bits, collect, over_sync, run_of
 from workers.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_ACTIONS, UNSUPPORTED_OBSERVATIONS

@@ -8,20 +8,18 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from protocol.arrays import Array
 from protocol.policy import policy as acting
 from protocol.policy.distributions import distribution
 from protocol.policy.networks import MLP, ActorCritic, TorchPolicy, log_prob_and_entropy
 from protocol.policy.policy import NumpyPolicy, buffer_size, features, layout, normalized, size
 from protocol.specs import ActionSpec, Leaf, PolicySpec
-
-Array = npt.NDArray[Any]
 
 BOX = Leaf("x", "box", (2, 3), "float32")
 OBSERVATIONS = {

@@ -7,7 +7,6 @@ from typing import Any, Literal
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 import pytest
 import torch
 
@@ -17,6 +16,7 @@ from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
 from learner.evaluate import evaluate
 from learner.recording.record import Player
+from protocol.arrays import Array
 from protocol.errors import BadRollout
 from protocol.policy.distributions import distribution
 from protocol.policy.networks import ActorCritic, Memory, TorchPolicy
@@ -30,7 +30,6 @@ from workers.collect.collector import Collector
 from workers.envs.toy import Scripted
 from workers.session import Assignment
 
-Array = npt.NDArray[Any]
 Core = Literal["lstm", "gru"]
 CORES: tuple[Core, Core] = ("lstm", "gru")
 

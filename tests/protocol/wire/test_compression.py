@@ -18,6 +18,7 @@ from gymnasium.wrappers import FrameStackObservation
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from protocol.arrays import Bytes
 from protocol.errors import BadMessage
 from protocol.rollout import Rollout, rollout_bytes
 from protocol.specs import ActionSpec, EnvSpec, Leaf, PolicySpec, RunSpec
@@ -25,7 +26,6 @@ from protocol.wire.codec import MAX_FRAME_BYTES, decode_to_learner, decode_to_wo
 from protocol.wire.compression import Packing, stacked, unpacked, unstacked, why_no_zstd
 from tests.support.collectors import a_collector, collect, over_copies_of, run_around, run_of
 
-Bytes = npt.NDArray[np.uint8]
 U1 = np.dtype(np.uint8)
 
 

@@ -5,16 +5,15 @@ from __future__ import annotations
 from typing import Any, get_args
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from protocol.arrays import Floats
 from protocol.errors import RunError
 from protocol.wire.weight_dtypes import BOUNDS, WeightsDtype, narrowed, widened
 
-Floats = npt.NDArray[np.float32]
 HALVES: list[WeightsDtype] = ["bfloat16", "float16"]
 TORCHS = {"bfloat16": torch.bfloat16, "float16": torch.float16}
 
