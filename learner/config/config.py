@@ -20,6 +20,7 @@ from tyro.conf import Positional
 
 from learner.config.did_you_mean import nearest
 from learner.config.hyperparameters import HYPERPARAMETERS, Hyperparameters, PPOConfig, elsewhere
+from learner.config.settings import CheckpointPolicy, EvaluationSettings, StopRule
 from protocol.address import advertised, check_address
 from protocol.errors import UsageError
 from protocol.specs import ImagesDtype
@@ -135,6 +136,23 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """end the run, after a checkpoint, when nothing has arrived for so many seconds"""
     max_env_failures: Natural = 3
     """end the run when the environment has raised more often than this"""
+
+    def stop_rule(self) -> StopRule:
+        """When training ends."""
+        return StopRule(steps=self.steps, target_return=self.target_return, target_mean_return=self.target_mean_return)
+
+    def checkpoint_policy(self) -> CheckpointPolicy:
+        """When checkpoints are written, and how many are kept."""
+        return CheckpointPolicy(
+            every_s=self.checkpoint_every_s,
+            every_episodes=self.checkpoint_every_episodes,
+            every_updates=self.checkpoint_every_updates,
+            keep=self.keep_checkpoints,
+        )
+
+    def evaluation_settings(self) -> EvaluationSettings:
+        """How often the policy is evaluated, and on which episodes."""
+        return EvaluationSettings(episodes=self.eval_episodes, every_env_steps=self.eval_every, seed=self.seed)
 
     def to_toml(self) -> str:
         """As text that `from_toml` reads: every setting, in the order of the fields; what is not set is "none"."""

@@ -1,0 +1,63 @@
+"""Narrow records of settings: what one part of a run needs, taken from `Config`. Pure.
+
+Each record decides its own question (stop? write a checkpoint?) from numbers that the caller gives.
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+
+class StopRule(msgspec.Struct, frozen=True, kw_only=True):
+    """When training ends."""
+
+    steps: int
+    """env steps to train for"""
+    target_return: float | None
+    """mean return of a greedy evaluation that ends the run"""
+    target_mean_return: float | None
+    """mean return of the last training episodes that ends the run"""
+
+    def reason_to_stop(
+        self, *, env_steps_after_next_update: int, evaluation_return: float | None, training_return: float | None
+    ) -> str | None:
+        """Why the run should end now, or None.
+
+        `evaluation_return`: mean return of the newest greedy evaluation, if there was one. `training_return`: mean return of
+        the last episodes of training, if there were enough of them.
+        """
+        if self.target_return is not None and evaluation_return is not None and evaluation_return >= self.target_return:
+            return f"target return {self.target_return:g} reached"
+        target = self.target_mean_return
+        if target is not None and training_return is not None and training_return >= target:
+            return f"mean return {target:g} of the last episodes reached"
+        return "all steps done" if env_steps_after_next_update > self.steps else None
+
+
+class CheckpointPolicy(msgspec.Struct, frozen=True, kw_only=True):
+    """When to write a checkpoint, and how many to keep."""
+
+    every_s: float
+    every_episodes: int
+    """0: the number of episodes does not matter"""
+    every_updates: int
+    """0: the number of updates does not matter"""
+    keep: int
+    """how many of the newest checkpoints stay in the run folder"""
+
+    def is_due(self, *, since_last_s: float, episodes_since_last: int, updates: int) -> bool:
+        """Whether to write one now. `since_last_s` and `episodes_since_last`: since the last one; `updates`: in all."""
+        by_episodes = self.every_episodes > 0 and episodes_since_last >= self.every_episodes
+        by_updates = self.every_updates > 0 and updates % self.every_updates == 0
+        return by_episodes or by_updates or since_last_s > self.every_s
+
+
+class EvaluationSettings(msgspec.Struct, frozen=True, kw_only=True):
+    """How often the policy is evaluated greedily, and on which episodes."""
+
+    episodes: int
+    """episodes of one evaluation"""
+    every_env_steps: int
+    """env steps between evaluations during training; 0: evaluate only at the end"""
+    seed: int
+    """the run's seed: it decides which episodes are played"""
