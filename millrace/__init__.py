@@ -112,6 +112,6 @@ def __getattr__(name: str) -> str:
     from importlib import metadata
 
     try:
-        return metadata.version("millrace")
+        return metadata.version("millrace-rl")
     except metadata.PackageNotFoundError:
         return "0+uninstalled"

@@ -119,7 +119,7 @@ def _why_not_made(env_id: str, error: Exception) -> str:
     says = _first_line(error)
     match error:
         case gymnasium.error.NamespaceNotFound() if env_id.startswith("ALE/"):
-            return f"environment {env_id}: Atari games are an extra; pip install 'millrace[atari]'"
+            return f"environment {env_id}: Atari games are an extra; pip install 'millrace-rl[atari]'"
         case gymnasium.error.DependencyNotInstalled():
             return f"environment {env_id}: {says}"
         case ModuleNotFoundError() if colon and f"'{module.split('.')[0]}" in says:

@@ -263,7 +263,7 @@ def _line(error: Exception) -> str:
 def identity(name: str) -> Identity:
     """Who this process (or thread of it) is."""
     try:
-        software = f"millrace {version('millrace')}"
+        software = f"millrace {version('millrace-rl')}"
     except PackageNotFoundError:
         software = "millrace"
     software = f"{software}, python {platform.python_version()}"

@@ -59,7 +59,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """how many versions old the weights behind a rollout may be; 0 is synchronous"""
     vector: Literal["auto", "loop", "native", "envpool"] = "auto"
     """how a lane's env copies are stepped: one after another (loop), or at once by the environment's own vectorised form
-    (native) or by envpool's (pip install 'millrace[envpool]'), with other random numbers; auto is loop, wherever it runs
+    (native) or by envpool's (pip install 'millrace-rl[envpool]'), with other random numbers; auto is loop, wherever it runs
     """
 
     inference: Literal["workers", "learner"] = "workers"
@@ -69,7 +69,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """how local workers are reached: threads of this process, local sockets, or loopback TCP"""
     compress: Literal["none", "zstd"] = "none"
     """how workers compress their rollouts: not at all, or by Zstandard, which pays for images, on almost any network
-    (pip install 'millrace[compress]', here and with every worker)
+    (pip install 'millrace-rl[compress]', here and with every worker)
     """
     weights_dtype: WeightsDtype = "float32"
     """as what weights travel to workers: rounded, as bfloat16 or float16, they are half as many bytes. Workers act under the
@@ -117,7 +117,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """where Prometheus finds the metrics, as 127.0.0.1:9464; 0.0.0.0:9464 lets everybody read them; if not given, nowhere"""
 
     record: str = ""
-    """id of a Minari dataset of every whole training episode, as cartpole/ppo-v0 (pip install 'millrace[record]')"""
+    """id of a Minari dataset of every whole training episode, as cartpole/ppo-v0 (pip install 'millrace-rl[record]')"""
 
     min_workers: Natural = 0
     """start when so many workers have joined; 0: all local workers, or the first one"""

@@ -35,7 +35,7 @@ def film(
     try:
         import moviepy  # noqa: F401
     except ImportError as error:
-        raise UsageError("videos need moviepy, which is an extra; pip install 'millrace[video]'") from error
+        raise UsageError("videos need moviepy, which is an extra; pip install 'millrace-rl[video]'") from error
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     folder = run / FOLDER
@@ -66,7 +66,7 @@ def _play(env_spec: EnvSpec, policy: Policy, spec: PolicySpec, episodes: int, se
             cut += player.was_cut
     except EnvironmentFailed as error:
         if isinstance(error.__cause__, gymnasium.error.DependencyNotInstalled):
-            line = f"environment {env_spec.id} cannot be filmed: {error.__cause__}; pip install 'millrace[video]'"
+            line = f"environment {env_spec.id} cannot be filmed: {error.__cause__}; pip install 'millrace-rl[video]'"
             raise UsageError(line) from error
         raise
     finally:

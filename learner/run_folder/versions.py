@@ -7,12 +7,15 @@ from contextlib import suppress
 from functools import cache
 from importlib import metadata
 
+DISTRIBUTIONS = {"millrace": "millrace-rl", "torch": "torch", "gymnasium": "gymnasium", "numpy": "numpy"}
+"""Name of the installed distribution, by import name."""
+
 
 @cache
 def versions() -> dict[str, str]:
-    """Of millrace, Python and the packages that decide results, by name."""
+    """Versions of Python and of the packages that decide results, by import name; without those not installed."""
     found = {"python": platform.python_version()}
-    for package in ("millrace", "torch", "gymnasium", "numpy"):
+    for name, distribution in DISTRIBUTIONS.items():
         with suppress(metadata.PackageNotFoundError):
-            found[package] = metadata.version(package)
+            found[name] = metadata.version(distribution)
     return found

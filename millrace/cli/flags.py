@@ -21,7 +21,7 @@ class EvaluateFlags(msgspec.Struct, frozen=True, kw_only=True):
     best: bool = False
     """of the policy that did best in the run's own evaluations (--eval-every), instead of the newest"""
     video: bool = False
-    """film them: an mp4 of each in the run's videos folder (pip install 'millrace[video]')"""
+    """film them: an mp4 of each in the run's videos folder (pip install 'millrace-rl[video]')"""
     debug: bool = False
     """show the traceback of an error"""
 
@@ -57,7 +57,7 @@ class PlotFlags(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RecordFlags(msgspec.Struct, frozen=True, kw_only=True):
-    """A Minari dataset of a run's newest policy: whole episodes, raw rewards (pip install 'millrace[record]')."""
+    """A Minari dataset of a run's newest policy: whole episodes, raw rewards (pip install 'millrace-rl[record]')."""
 
     run: Positional[Path]
     """the run folder"""
@@ -180,7 +180,7 @@ class SlurmFlags(LaunchFlags, frozen=True, kw_only=True):
 
 
 class RayFlags(LaunchFlags, frozen=True, kw_only=True):
-    """The learner here, its workers as actors of the Ray cluster of this machine (pip install 'millrace[ray]')."""
+    """The learner here, its workers as actors of the Ray cluster of this machine (pip install 'millrace-rl[ray]')."""
 
     address: str = "auto"
     """of the cluster, as HOST:PORT; if not given, RAY_ADDRESS or the one that runs here"""

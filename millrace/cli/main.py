@@ -264,7 +264,7 @@ def _launch_ray(argv: list[str]) -> int:
     except ModuleNotFoundError as error:
         if error.name != "ray":
             raise
-        raise UsageError("launch ray: Ray is not installed; pip install 'millrace[ray]'") from None
+        raise UsageError("launch ray: Ray is not installed; pip install 'millrace-rl[ray]'") from None
     from millrace.terminal import watching
 
     with watching("--log-json" in argv) as watch:

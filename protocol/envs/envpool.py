@@ -65,7 +65,7 @@ def pool_of(env: EnvSpec) -> Pool:
     try:
         import envpool
     except ImportError as error:
-        line = f"environment {env.id}: vector envpool needs envpool ({error}); pip install 'millrace[envpool]'"
+        line = f"environment {env.id}: vector envpool needs envpool ({error}); pip install 'millrace-rl[envpool]'"
         raise UsageError(line) from error
     known = env.registered()
     task, options = _named(env, known)

@@ -81,7 +81,7 @@ def why_no_zstd() -> str:
     try:
         import zstandard  # noqa: F401  (an extra)
     except ImportError:
-        return "compress zstd needs the package zstandard, which is an extra; pip install 'millrace[compress]'"
+        return "compress zstd needs the package zstandard, which is an extra; pip install 'millrace-rl[compress]'"
     return ""
 
 

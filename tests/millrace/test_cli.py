@@ -402,10 +402,10 @@ def test_what_cannot_be_filmed_is_said(tmp_path: Path, capsys: Captured, monkeyp
     assert not list((run / "videos").iterdir())
     monkeypatch.setattr("gymnasium.envs.classic_control.cartpole.CartPoleEnv.render", no_pygame)
     line = refusal(capsys, "evaluate", str(a_run_that_acts(tmp_path)), "--video")
-    assert line == "environment CartPole-v1 cannot be filmed: pygame is not installed; pip install 'millrace[video]'"
+    assert line == "environment CartPole-v1 cannot be filmed: pygame is not installed; pip install 'millrace-rl[video]'"
     monkeypatch.setitem(sys.modules, "moviepy", None)
     line = refusal(capsys, "evaluate", str(run), "--video")
-    assert line == "videos need moviepy, which is an extra; pip install 'millrace[video]'"
+    assert line == "videos need moviepy, which is an extra; pip install 'millrace-rl[video]'"
 
 
 def no_pygame(*_: Any) -> None:

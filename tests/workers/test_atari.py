@@ -21,9 +21,9 @@ from workers.collect.env_copies import Copies, CopyLoop, VectorCopies, copy_seed
 from workers.collect.envpool_copies import PoolCopies
 from workers.envs import atari
 
-envpool = pytest.mark.skipif(find_spec("envpool") is None, reason="envpool is not here: pip install 'millrace[envpool]'")
+envpool = pytest.mark.skipif(find_spec("envpool") is None, reason="envpool is not here: pip install 'millrace-rl[envpool]'")
 pytestmark = pytest.mark.skipif(
-    find_spec("ale_py") is None or find_spec("cv2") is None, reason="the emulator is not here: pip install 'millrace[atari]'"
+    find_spec("ale_py") is None or find_spec("cv2") is None, reason="no emulator: pip install 'millrace-rl[atari]'"
 )
 
 KINDS = ["loop", "native", pytest.param("envpool", marks=envpool)]

@@ -93,7 +93,7 @@ def test_a_worker_compresses_when_the_run_says_so() -> None:
 def test_a_worker_that_cannot_compress_leaves_at_once_and_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "zstandard", None)
     link = FakeLink(said_to_a_worker(msgspec.structs.replace(RUN, compress="zstd")))
-    why = "compress zstd needs the package zstandard, which is an extra; pip install 'millrace[compress]'"
+    why = "compress zstd needs the package zstandard, which is an extra; pip install 'millrace-rl[compress]'"
     assert work(link) == Leave(2, why)
     assert link.heard()[-1] == Goodbye(1, why, ())
 

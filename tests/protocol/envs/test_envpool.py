@@ -24,7 +24,7 @@ from workers.collect.env_copies import CopyLoop, Row, copy_seeds
 from workers.collect.envpool_copies import PoolCopies
 from workers.envs.toy import Countdown
 
-here = pytest.mark.skipif(find_spec("envpool") is None, reason="envpool is not here: pip install 'millrace[envpool]'")
+here = pytest.mark.skipif(find_spec("envpool") is None, reason="envpool is not here: pip install 'millrace-rl[envpool]'")
 
 
 def pooled(run: RunSpec) -> RunSpec:

@@ -422,7 +422,7 @@ def test_packings_are_undone_in_one_order_only() -> None:
 
 def test_a_learner_that_cannot_decompress_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "zstandard", None)
-    assert "pip install 'millrace[compress]'" in why_no_zstd()
+    assert "pip install 'millrace-rl[compress]'" in why_no_zstd()
     with pytest.raises(BadMessage, match="zstd was not asked for"):
         unpacked(ZEROS, ["zstd"], U1, SHAPE)
 
