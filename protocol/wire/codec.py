@@ -15,6 +15,7 @@ from __future__ import annotations
 import operator
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import reduce
 from typing import Any, get_args
 
@@ -42,6 +43,12 @@ Said = tuple[Any, Any]
 TO_WORKER: Said = (reduce(operator.or_, (kind for kind in get_args(ToWorker) if kind is not Refuse)), Refuse)
 TO_LEARNER: Said = (reduce(operator.or_, (kind for kind in get_args(ToLearner | Inquire) if kind is not Hello)), Hello)
 TO_OBSERVER: Said = (Status, Status)
+
+# msgspec builds its type information for a record at the first conversion to it, and crashes the process if two threads do
+# that at the same moment. So all of it is built here, where only one thread can be.
+for _kind in (*TO_WORKER, *TO_LEARNER, *TO_OBSERVER):
+    with suppress(msgspec.ValidationError):
+        msgspec.convert(None, _kind)
 
 assert sys.byteorder == "little", "millrace sends arrays as they lie in memory and knows little-endian machines only"
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import tracemalloc
 import types
 import typing
+from pathlib import Path
 from typing import Any, Literal
 
 import msgpack
@@ -16,12 +20,13 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from protocol.errors import BadMessage
-from protocol.messages import Hello, Inquire, Refuse, Rollout, ToLearner, ToWorker, Weights
+from protocol.messages import Hello, Inquire, Refuse, Rollout, ToLearner, ToWorker, Weights, Welcome
 from protocol.wire.codec import DTYPES, MAX_FRAMES, MAX_HEAD_BYTES, decode_to_learner, decode_to_worker, encode
-from tests.support.fake_ends import fake_rollout
+from tests.support.fake_ends import fake_rollout, run_spec
 
 KINDS = [*typing.get_args(ToLearner), *typing.get_args(ToWorker)]
 BY_NAME = (Hello, Refuse)
+ROOT = Path(__file__).parents[3]
 Frames = list[bytes]
 
 arrays = st.sampled_from(sorted(DTYPES)).flatmap(
@@ -86,6 +91,40 @@ def test_no_message_is_taken_for_one_of_the_other_side(kind: type) -> None:
     wrong_side = decode_to_worker if kind in typing.get_args(ToLearner) else decode_to_learner
     with pytest.raises(BadMessage, match=f"Invalid value '{kind.__name__}'"):
         wrong_side(head({"type": kind.__name__} if kind in BY_NAME else [kind.__name__]))
+
+
+FIRST_DECODE_IN_MANY_THREADS = """
+import os, sys, threading
+from protocol.wire.codec import decode_to_worker
+
+frames = [bytes.fromhex(sys.argv[1])]
+sys.setswitchinterval(1e-6)
+
+def decode_all_at_once():
+    barrier = threading.Barrier(8)
+    threads = [threading.Thread(target=lambda: (barrier.wait(), decode_to_worker(frames))) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+for _ in range(20):
+    child = os.fork()
+    if child == 0:
+        decode_all_at_once()
+        os._exit(0)
+    _, status = os.waitpid(child, 0)
+    if status:
+        sys.exit(f"a process in which threads decoded their first Welcome ended with status {status}")
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="starts copies of a process that has decoded nothing yet")
+def test_threads_may_decode_their_first_welcome_at_the_same_moment() -> None:
+    (frame,) = sent(Welcome(session=1, attempt=1, run=run_spec()))
+    command = [sys.executable, "-c", FIRST_DECODE_IN_MANY_THREADS, frame.hex()]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 # ------------------------------------------------------------------------------------------------ the head's form
