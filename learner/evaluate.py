@@ -17,7 +17,7 @@ import numpy as np
 from learner.run_folder.metrics import Evaluation
 from learner.run_folder.run_folder import RunFolder, Which
 from protocol.envs.spaces import observation_leaves, reader, writer
-from protocol.errors import EnvironmentFailed
+from protocol.errors import EnvironmentFailed, first_line
 from protocol.policy.distributions import distribution
 from protocol.policy.policy import Policy, make_policy
 from protocol.policy.recurrent import zero_state
@@ -125,6 +125,5 @@ def load_policy(run: Path, which: Which = "final") -> tuple[Policy, PolicySpec, 
 def _failed(env: gymnasium.Env[Any, Any], error: Exception) -> EnvironmentFailed:
     """What the environment raised, as ours, with its traceback as text."""
     name = env.spec.id if env.spec else type(env.unwrapped).__name__
-    says = (str(error).strip().splitlines() or [""])[0]
-    line = f"environment {name} raised while the policy was evaluated: {type(error).__name__}: {says}"
+    line = f"environment {name} raised while the policy was evaluated: {type(error).__name__}: {first_line(error, '')}"
     return EnvironmentFailed(line, traceback.format_exc())

@@ -18,6 +18,11 @@ A message is one line: who, what, expected, got, what to do next.
 """
 
 
+def first_line(error: BaseException, otherwise: str = "no message") -> str:
+    """The first line of an exception's message; `otherwise` if it has none."""
+    return (str(error).strip().splitlines() or [otherwise])[0].strip()
+
+
 class MillraceError(Exception):
     """Base of all errors of millrace."""
 

@@ -18,7 +18,7 @@ import msgspec
 from gymnasium.envs.registration import VectorizeMode
 from gymnasium.vector import VectorEnv
 
-from protocol.errors import UsageError
+from protocol.errors import UsageError, first_line
 from protocol.wire.compression import why_no_zstd
 
 REGISTRARS = {"millrace": "workers.envs", "ALE": "ale_py"}  # of a namespace: gymnasium imports them as it would a user's own
@@ -109,14 +109,14 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         except (gymnasium.error.Error, ImportError, TypeError) as error:  # TypeError: keyword arguments it does not take
             raise UsageError(_why_not_made(self.id, error)) from error
         except Exception as error:  # its own constructor raised, whatever that may be
-            line = f"environment {self.id} cannot be made: {type(error).__name__}: {_first_line(error)}"
+            line = f"environment {self.id} cannot be made: {type(error).__name__}: {first_line(error)}"
             raise UsageError(line, traceback.format_exc()) from error
 
 
 def _why_not_made(env_id: str, error: Exception) -> str:
     """One line for an environment that is not known, or whose package is missing."""
     module, colon, _ = env_id.partition(":")
-    says = _first_line(error)
+    says = first_line(error)
     match error:
         case gymnasium.error.NamespaceNotFound() if env_id.startswith("ALE/"):
             return f"environment {env_id}: Atari games are an extra; pip install 'millrace-rl[atari]'"
@@ -134,10 +134,6 @@ def _why_not_made(env_id: str, error: Exception) -> str:
             return f"environment {env_id} is not registered: {says} One of your own is given as my_module:MyEnv-v0"
         case _:
             return f"environment {env_id} cannot be made: {says}"
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or ["no message"])[0].strip()
 
 
 class Leaf(msgspec.Struct, frozen=True):

@@ -18,7 +18,7 @@ from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from protocol.errors import BadMessage, OurError
+from protocol.errors import BadMessage, OurError, first_line
 from protocol.messages import Order, Stepped, Weights
 from protocol.policy.policy import make_policy
 from protocol.specs import Code, RunSpec, StepSpec
@@ -256,8 +256,9 @@ def _resident_bytes() -> int:
 
 
 def _line(error: Exception) -> str:
-    text = str(error) if isinstance(error, OurError) else f"{type(error).__name__}: {error}"
-    return (text.strip().splitlines() or [type(error).__name__])[0][:1000]
+    if isinstance(error, OurError):
+        return first_line(error, type(error).__name__)[:1000]
+    return f"{type(error).__name__}: {first_line(error, '')}".strip()[:1000]
 
 
 def identity(name: str) -> Identity:

@@ -18,7 +18,7 @@ from gymnasium import spaces
 
 from learner.recording.episodes import RecordedEpisode
 from protocol.arrays import Array
-from protocol.errors import RunError, UsageError
+from protocol.errors import RunError, UsageError, first_line
 
 CHUNK_BYTES = 64 * 2**20
 
@@ -121,7 +121,7 @@ class MinariDataset:
                 else:
                     self._dataset.update_dataset_from_buffer(self._chunk)
         except Exception as error:
-            says = (str(error).strip().splitlines() or [""])[0]
+            says = first_line(error, "")
             raise RunError(f"dataset {self._id} was not written: {type(error).__name__}: {says}") from error
         self._chunk, self._chunk_bytes = [], 0
 

@@ -27,7 +27,7 @@ from learner.recording.minari import MinariDataset
 from learner.run_folder.atomic_write import write_atomically
 from protocol.arrays import Array
 from protocol.envs.spaces import reader, writer
-from protocol.errors import EnvironmentFailed, RunError, UsageError
+from protocol.errors import EnvironmentFailed, RunError, UsageError, first_line
 from protocol.policy.distributions import distribution
 from protocol.policy.policy import Policy
 from protocol.policy.recurrent import zero_state
@@ -229,6 +229,5 @@ class _Rows:
 def _failed(env: gymnasium.Env[Any, Any], error: Exception) -> EnvironmentFailed:
     """What the environment raised, as ours, with its traceback as text."""
     name = env.spec.id if env.spec else type(env.unwrapped).__name__
-    says = (str(error).strip().splitlines() or [""])[0]
-    line = f"environment {name} raised while it was played: {type(error).__name__}: {says}"
+    line = f"environment {name} raised while it was played: {type(error).__name__}: {first_line(error, '')}"
     return EnvironmentFailed(line, traceback.format_exc())

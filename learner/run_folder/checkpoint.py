@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from learner.run_folder.atomic_write import TEMPORARY, write_atomically
-from protocol.errors import CheckpointError
+from protocol.errors import CheckpointError, first_line
 
 FORMAT = 1
 FOLDER = "checkpoints"
@@ -125,4 +125,4 @@ def _check_plain(value: object, where: str) -> None:
 def _why(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
-    return (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")
+    return first_line(error, type(error).__name__).rstrip(".")

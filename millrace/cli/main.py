@@ -16,7 +16,7 @@ from typing import NamedTuple
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # before numpy; --torch-threads sets the learner's
 
-from protocol.errors import OurError, UsageError
+from protocol.errors import OurError, UsageError, first_line
 
 WHAT = "Worker processes step a gymnasium environment, one PyTorch learner learns."
 
@@ -51,9 +51,8 @@ def main(argv: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except Exception as error:
-        says = (str(error).strip().splitlines() or ["no message"])[0]
         hint = "" if "--debug" in argv else "; --debug shows the traceback"
-        _say(f"millrace: internal error: {type(error).__name__}: {says}{hint}")
+        _say(f"millrace: internal error: {type(error).__name__}: {first_line(error)}{hint}")
         return _trace(argv, 1)
 
 

@@ -20,7 +20,7 @@ from learner.run import Watch, serve
 from millrace.cli.flags import RayFlags
 from millrace.launch.cluster_flags import learner_flags
 from millrace.launch.ray_actor import WorkerHost
-from protocol.errors import UsageError
+from protocol.errors import UsageError, first_line
 from protocol.keys.key_folder import Keyring, read_token
 
 
@@ -60,7 +60,7 @@ def _cluster(address: str) -> Iterator[str]:
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.WARNING)
     except (ConnectionError, RuntimeError, ValueError) as error:
-        says = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        says = first_line(error, type(error).__name__)
         raise UsageError(f"no Ray cluster at {address}: {says}; `ray start --head` starts one") from error
     try:
         here = ray.get_runtime_context().get_node_id()

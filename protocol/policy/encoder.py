@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 
 import torch
 
-from protocol.errors import UsageError
+from protocol.errors import UsageError, first_line
 from protocol.policy.policy import feature_size
 from protocol.specs import ActionSpec, EncoderSpec, Leaf, NamedShape, PolicySpec
 
@@ -57,7 +57,7 @@ def _make(factory: str, spec: PolicySpec, seed: int) -> torch.nn.Module:
         except UsageError:
             raise
         except Exception as error:
-            raise UsageError(f"encoder {factory} cannot be made: {type(error).__name__}: {_first_line(error)}") from error
+            raise UsageError(f"encoder {factory} cannot be made: {type(error).__name__}: {first_line(error)}") from error
     if not isinstance(module, torch.nn.Module):
         raise UsageError(f"encoder {factory}: expected it to return a torch.nn.Module, got {type(module).__name__}")
     if kept := [name for name, _ in module.named_buffers()]:
@@ -88,12 +88,8 @@ def _output_size(factory: str, module: torch.nn.Module, spec: PolicySpec) -> int
         with torch.no_grad():
             out = module(torch.zeros(2, feature_size(spec)), *images)
     except Exception as error:
-        raise UsageError(f"encoder {factory} raised {type(error).__name__}: {_first_line(error)}") from error
+        raise UsageError(f"encoder {factory} raised {type(error).__name__}: {first_line(error)}") from error
     if not isinstance(out, torch.Tensor) or out.dim() != 2 or len(out) != 2 or out.dtype != torch.float32:
         got = f"{out.dtype}{list(out.shape)}" if isinstance(out, torch.Tensor) else type(out).__name__
         raise UsageError(f"encoder {factory}: expected float32[2, K] of two observations, got {got}")
     return out.shape[1]
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or ["no message"])[0].strip()

@@ -14,7 +14,7 @@ import numpy as np
 
 from protocol.arrays import Array, Bools
 from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import RunError, UsageError
+from protocol.errors import RunError, UsageError, first_line
 from protocol.policy.recurrent import zero_state
 from protocol.rollout import Episode, first_not_finite
 from protocol.specs import Leaf, RunSpec
@@ -33,8 +33,7 @@ def environment_raised(lane: int, when: str, error: CopyRaised) -> EnvironmentBr
     """The environment's own exception, in one line and with its traceback."""
     cause = error.__cause__ or error
     where = when if error.copy is None else f"copy {error.copy}, {when}"
-    says = str(cause).strip().splitlines() or [""]
-    line = f"{where}: its environment raised {type(cause).__name__}: {says[0]}"
+    line = f"{where}: its environment raised {type(cause).__name__}: {first_line(cause, '')}"
     return EnvironmentBroke(lane, line, "".join(format_exception(cause)))
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from protocol.cpu_cores import cores
-from protocol.errors import OurError, UsageError
+from protocol.errors import UsageError, first_line
 from protocol.messages import Answer, Array, Call, Order, Reset, Returned, Step, Stepped
 from protocol.specs import StepSpec
 from protocol.wire.plain_values import pack, unpack
@@ -202,13 +202,7 @@ def _call(order: Call, lane: SteppedLane, private: bool) -> Returned:
     except Exception as raised:
         packed, error, detail = (
             b"",
-            f"{type(raised).__name__}: {_first_line(raised)}",
+            f"{type(raised).__name__}: {first_line(raised)}",
             traceback.format_exc()[-MAX_TRACEBACK:],
         )
     return Returned(order.session, order.ticket, order.lane, order.incarnation, _array(packed), error, detail)
-
-
-def _first_line(error: Exception) -> str:
-    if isinstance(error, OurError):
-        return str(error)
-    return (str(error).strip().splitlines() or ["no message"])[0]
