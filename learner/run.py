@@ -85,13 +85,13 @@ class Run:
     ) -> None:
         import torch
 
-        from learner.algorithms import ALGORITHMS
+        from learner.algorithms import algorithm_class
         from learner.journal import Journal, Past, recall
 
         spec = run_spec(config, env, seen)
         torch.set_num_threads(threads(config, spec.policy, workers))
         self.device = _device(config)
-        make = ALGORITHMS[config.algo]
+        make = algorithm_class(config.algo)
         self.algorithm: Algorithm = make(
             config.algorithm, spec.policy, total_steps=config.steps, seed=config.seed, device=self.device
         )
@@ -190,12 +190,12 @@ def look_at(env: EnvSpec) -> Spaces:
 
 def run_spec(config: Config, env: EnvSpec, seen: Spaces | None = None) -> RunSpec:
     """What the workers are told; `seen`: of this environment. Raises `UsageError` if it is not for this algorithm."""
-    from learner.algorithms import ALGORITHMS
+    from learner.algorithms import algorithm_class
 
     if config.compress == "zstd" and (why := why_no_zstd()):
         raise UsageError(why)
     observation, action, longest = look_at(env) if seen is None else seen
-    policy = ALGORITHMS[config.algo].policy_spec(config.algorithm, observation, action)
+    policy = algorithm_class(config.algo).policy_spec(config.algorithm, observation, action)
     if config.algorithm.encoder is not None:
         from protocol.policy.encoder import describe_encoder
 
@@ -205,7 +205,7 @@ def run_spec(config: Config, env: EnvSpec, seen: Spaces | None = None) -> RunSpe
         raise UsageError(
             f"images_dtype {config.images_dtype}: expected float32, for this policy has no convolutions of ours"
         )
-    if getattr(ALGORITHMS[config.algo], "whole_episodes", False):
+    if algorithm_class(config.algo).whole_episodes:
         _check_whole_episodes(config, longest)
     match vector := "loop" if config.vector == "auto" else config.vector:
         case "native":

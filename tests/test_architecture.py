@@ -109,6 +109,7 @@ def test_every_file_says_first_what_it_holds() -> None:
     [
         "workers.__main__",
         "millrace.cli.main",
+        "learner.algorithms",
         "learner.config.command_line",
         "learner.report.learning_curves",
         "learner.evaluate",

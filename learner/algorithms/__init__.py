@@ -1,56 +1,66 @@
-"""The mathematics of learning: no sockets and no files.
+"""The mathematics of learning. No sockets, no files.
 
-One file is one class, with its settings in `learner.config.hyperparameters`; each is entered in one dict there and here.
+Each algorithm is one class in one file. Its settings are one record in `learner.config.hyperparameters`. `ALGORITHMS` here
+and `HYPERPARAMETERS` there list them by name. Importing this module does not import torch; calling `algorithm_class` does.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib import import_module
 from typing import Any, Protocol
 
-from learner.algorithms.a2c import A2C
-from learner.algorithms.dqn import DQN
-from learner.algorithms.impala import Impala
-from learner.algorithms.ppo import PPO
-from learner.algorithms.reinforce import REINFORCE
 from protocol.arrays import Floats
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
+ALGORITHMS = {
+    "ppo": "learner.algorithms.ppo:PPO",
+    "a2c": "learner.algorithms.a2c:A2C",
+    "dqn": "learner.algorithms.dqn:DQN",
+    "impala": "learner.algorithms.impala:Impala",
+    "reinforce": "learner.algorithms.reinforce:REINFORCE",
+}
+"""`module:Class` of each algorithm, imported when it is used"""
+
 
 class Algorithm(Protocol):
-    """What the loop of `learner.train` drives."""
+    """What the training loop of `learner.train` needs of an algorithm."""
+
+    whole_episodes: bool
+    """True if the algorithm learns only from whole episodes: a run whose rollouts are too short for one is refused."""
 
     @staticmethod
     def policy_spec(config: Any, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
-        """The policy that it learns. Raises `UsageError`, in one line, when it cannot learn on such spaces."""
+        """The policy to train. Raises `UsageError` in one line when the algorithm does not support these spaces."""
         ...
 
     def __init__(self, config: Any, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
-        """`config` is its record of `learner.config.hyperparameters`; raises `UsageError` when that cannot be done here."""
+        """`config` is the record of `HYPERPARAMETERS`. Raises `UsageError` when this machine cannot do what it asks for."""
         ...
 
     def update(self, batch: Batch, pulse: Callable[[], None]) -> dict[str, float]:
-        """Learn from a batch, calling `pulse` now and then; metrics by the names users know."""
+        """Learn from a batch and return metrics by name.
+
+        Calls `pulse` between gradient steps, so that the learner can answer its workers meanwhile.
+        """
         ...
 
     def weights(self) -> tuple[Floats, Floats]:
-        """Copies of the acting parameters and of the policy's buffers: what `Weights` carries."""
+        """Copies of the acting parameters [P] and of the policy's buffers, both float32, as `Weights` carries them."""
         ...
 
     def state_dict(self) -> dict[str, Any]:
-        """A copy of all that the next update depends on, in tensors and plain data."""
+        """A copy of everything that the next update depends on, as tensors and plain data."""
         ...
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from there."""
+        """Continue from a `state_dict`."""
         ...
 
 
-ALGORITHMS: dict[str, type[Algorithm]] = {
-    "ppo": PPO,
-    "a2c": A2C,
-    "dqn": DQN,
-    "impala": Impala,
-    "reinforce": REINFORCE,
-}
+def algorithm_class(name: str) -> type[Algorithm]:
+    """The class of an algorithm in `ALGORITHMS`, imported now. Raises KeyError for any other name."""
+    module, _, attribute = ALGORITHMS[name].partition(":")
+    found: type[Algorithm] = getattr(import_module(module), attribute)
+    return found

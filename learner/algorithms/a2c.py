@@ -20,6 +20,8 @@ from protocol.specs import ActionSpec, Leaf, PolicySpec
 class A2C:
     """The policy, its optimiser and their schedules."""
 
+    whole_episodes = False
+
     @staticmethod
     def policy_spec(config: A2CConfig, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
         """An actor and a critic, on any of the supported spaces."""

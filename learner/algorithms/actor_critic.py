@@ -24,14 +24,14 @@ from learner.algorithms.normalization import ObservationNormaliser, RewardScaler
 from learner.config.hyperparameters import ActorCriticHyperparameters, RecurrentHyperparameters
 from protocol.arrays import Array, Bools, Floats
 from protocol.errors import RunError
-from protocol.policy.networks import ActorCritic, Memory, log_prob_and_entropy
+from protocol.policy.networks import ActorCriticNetwork, RecurrentInput, log_prob_and_entropy
 from protocol.policy.policy import features, normalized
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
 Pulse = Callable[[], None]
 Rows = Tensor | slice
-View = tuple[Tensor, list[Tensor], Memory | None]  # what the network takes
+View = tuple[Tensor, list[Tensor], RecurrentInput | None]  # what the network takes
 
 AT_ONCE = 1024  # observations that are looked at together where no gradient is wanted: bounds memory
 
@@ -45,14 +45,14 @@ class Minibatch(NamedTuple):
     log_prob: Any  # [B] float32, by the worker, as acted
     advantage: Any  # [B] float32
     target: Any  # [B] float32, the returns to fit values to
-    memory: Memory | None = None  # with a core: x and images are [T · C, …], and B of them are wanted
+    recurrent: RecurrentInput | None = None  # with a core: x and images are [T · C, …], and B of them are wanted
 
     def in_numpy(self) -> Minibatch:
         """The same memory as numpy arrays."""
         x, _, action, log_prob, advantage, target, _ = self
         return Minibatch(x.numpy(), (), action.numpy(), log_prob.numpy(), advantage.numpy(), target.numpy())
 
-    def rows(self, index: Any, seen: Tensor | None = None, memory: Memory | None = None) -> Minibatch:
+    def rows(self, index: Any, seen: Tensor | None = None, recurrent: RecurrentInput | None = None) -> Minibatch:
         """Some of these rows, copied; `seen`: the observations to look at, if others are needed besides."""
         seen = index if seen is None else seen
         return Minibatch(
@@ -62,17 +62,17 @@ class Minibatch(NamedTuple):
             self.log_prob[index],
             self.advantage[index],
             self.target[index],
-            memory,
+            recurrent,
         )
 
     def columns(self, chosen: Tensor, mask: Tensor) -> Minibatch:
         """The rows of whole columns, in time order, where `mask` [T, C] is True; the core sees the others too."""
-        assert self.memory is not None
-        state, carried, _ = self.memory
+        assert self.recurrent is not None
+        state, carried, _ = self.recurrent
         seen = _rows_of(len(carried), carried.shape[1], chosen)
         inside = mask.flatten()[seen]
-        memory = Memory(state[chosen], carried[:, chosen], torch.nonzero(inside)[:, 0])
-        return self.rows(seen[inside], seen, memory)
+        recurrent = RecurrentInput(state[chosen], carried[:, chosen], torch.nonzero(inside)[:, 0])
+        return self.rows(seen[inside], seen, recurrent)
 
 
 class Seen(NamedTuple):
@@ -81,13 +81,13 @@ class Seen(NamedTuple):
     raw: Floats  # [T+1, ΣN, D] features, not yet normalised
     x: Tensor  # [(T+1) · ΣN, D] float32, normalised features
     images: tuple[Tensor, ...]  # [(T+1) · ΣN, *leaf] uint8 each
-    memory: Memory  # of all T+1 steps
+    recurrent: RecurrentInput  # of all T+1 steps
 
     def view(self, steps: int, columns: Rows, rows: Rows) -> View:
         """What the network looks at: these rows, with the memory of the first steps of these columns, if they have one."""
-        state, carried, _ = self.memory
-        memory = Memory(state[columns], carried[:steps, columns]) if state.shape[1] else None
-        return self.x[rows], [image[rows] for image in self.images], memory
+        state, carried, _ = self.recurrent
+        recurrent = RecurrentInput(state[columns], carried[:steps, columns]) if state.shape[1] else None
+        return self.x[rows], [image[rows] for image in self.images], recurrent
 
 
 def policy_spec(config: ActorCriticHyperparameters, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
@@ -105,7 +105,7 @@ def policy_spec(config: ActorCriticHyperparameters, observation: tuple[Leaf, ...
     return spec
 
 
-def make_optimizer(kind: Literal["adam", "rmsprop"], net: ActorCritic, learning_rate: float) -> torch.optim.Optimizer:
+def make_optimizer(kind: Literal["adam", "rmsprop"], net: ActorCriticNetwork, learning_rate: float) -> torch.optim.Optimizer:
     """Over the flat parameters. 1e-5 stands outside the square root, as in Stable-Baselines3."""
     spare_the_compiler()
     if kind == "adam":
@@ -128,7 +128,7 @@ class Parts:
     ) -> None:
         self.config = config
         self.policy = policy
-        self.net = ActorCritic(policy, device, seed=seed)
+        self.net = ActorCriticNetwork(policy, device, seed=seed)
         if policy.action.kind == "box":
             self.net.parameters["actor.log_std"].detach().fill_(config.log_std_init)
         self.optimizer = make_optimizer(optimizer, self.net, config.learning_rate)
@@ -151,8 +151,8 @@ class Parts:
         x = normalized(raw, *np.split(self._buffers, 2)) if self.policy.normalize_observations else raw
         images = [array for leaf, array in zip(self.policy.observation, batch.obs, strict=True) if leaf.is_image]
         carried = np.concatenate([np.ones((1, raw.shape[1]), bool), batch.valid]).astype(np.float32)
-        memory = Memory(self._to_device(batch.state), self._to_device(carried))
-        return Seen(raw, self.tensor(x), tuple(map(self.tensor, images)), memory)
+        recurrent = RecurrentInput(self._to_device(batch.state), self._to_device(carried))
+        return Seen(raw, self.tensor(x), tuple(map(self.tensor, images)), recurrent)
 
     def rewards(self, batch: Batch) -> Floats:
         """[T, ΣN] of a batch, scaled if they are to be; ask once for each batch."""
@@ -196,13 +196,13 @@ class Parts:
 
     def rows(self, batch: Batch, seen: Seen, advantage: Floats, target: Floats) -> Minibatch:
         """All T · ΣN rows, those that are not valid too."""
-        x, images, memory = seen.view(len(batch.valid), slice(None), slice(batch.valid.size))
+        x, images, recurrent = seen.view(len(batch.valid), slice(None), slice(batch.valid.size))
         action, log_prob = self.tensor(batch.action), self.tensor(batch.log_prob)
-        return Minibatch(x, tuple(images), action, log_prob, self.tensor(advantage), self.tensor(target), memory)
+        return Minibatch(x, tuple(images), action, log_prob, self.tensor(advantage), self.tensor(target), recurrent)
 
     def only(self, rows: Minibatch, mask: Bools) -> Minibatch:
         """Those of all rows where `mask` [T, ΣN] is True."""
-        if rows.memory is None:
+        if rows.recurrent is None:
             index = np.flatnonzero(mask)
             return rows.in_numpy().rows(index) if self._small(len(index)) else rows.rows(self._to_device(index))
         return rows.columns(self._to_device(np.arange(mask.shape[1])), self._to_device(mask))
@@ -218,7 +218,7 @@ class Parts:
 
         With a core, which learns what to remember from what came of it, whole columns go together: no more parts than they.
         """
-        if rows.memory is None:
+        if rows.recurrent is None:
             valid = np.flatnonzero(mask)
             if self._small(math.ceil(len(valid) / parts)):
                 rows = rows.in_numpy()
@@ -267,7 +267,7 @@ class Parts:
         if isinstance(rows.x, np.ndarray):
             assert self._fused is not None
             return self._fused.forward(rows.x, rows.action)
-        params, value = self.net.forward(rows.x, rows.images, rows.memory)
+        params, value = self.net.forward(rows.x, rows.images, rows.recurrent)
         return *log_prob_and_entropy(self.policy.action, params, rows.action), value
 
     def backward(self, outputs: Sequence[Any], gradients: Sequence[Any], numbers: Mapping[str, Any]) -> dict[str, float]:

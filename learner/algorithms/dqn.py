@@ -51,6 +51,8 @@ def exploration_rate(config: DQNConfig, env_steps: int) -> float:
 class DQN:
     """Action values, those of the target, their optimiser, and the replay."""
 
+    whole_episodes = False
+
     @staticmethod
     def policy_spec(config: DQNConfig, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
         """Action values, on any of the supported observations; one choice among a few is the only action it can learn."""

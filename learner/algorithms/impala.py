@@ -23,6 +23,8 @@ from protocol.specs import ActionSpec, Leaf, PolicySpec
 class Impala:
     """The policy, its optimiser and their schedules."""
 
+    whole_episodes = False
+
     @staticmethod
     def policy_spec(config: ImpalaConfig, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
         """An actor and a critic, on any of the supported spaces."""

@@ -38,6 +38,8 @@ class Measured(NamedTuple):
 class PPO:
     """The policy, its optimiser and their schedules."""
 
+    whole_episodes = False
+
     @staticmethod
     def policy_spec(config: PPOConfig, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
         """An actor and a critic, on any of the supported spaces."""

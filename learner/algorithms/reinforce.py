@@ -24,7 +24,7 @@ from protocol.specs import ActionSpec, Leaf, PolicySpec
 class REINFORCE:
     """The policy, its optimiser and their schedules."""
 
-    whole_episodes = True  # a run whose rollouts are too short for one is refused
+    whole_episodes = True
 
     @staticmethod
     def policy_spec(config: REINFORCEConfig, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:

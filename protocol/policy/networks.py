@@ -37,12 +37,12 @@ from protocol.policy.recurrent import zero_state
 from protocol.specs import ActionSpec, ImagesDtype, PolicySpec
 
 
-class Memory(NamedTuple):
-    """What a core needs besides T steps of C columns, which lie in time order [T · C, …]."""
+class RecurrentInput(NamedTuple):
+    """What a recurrent core needs in addition to the features of T steps of C env copies, in time order [T · C, …]."""
 
-    state: Tensor  # [C, S] float32, before the first step
-    carried: Tensor  # [T, C] float32: 0 where an episode begins, and the state with it, else 1
-    wanted: Tensor | None = None  # [B] int64, the rows of T · C that come out; None: all
+    initial_state: Tensor  # [C, S] float32, before the first step
+    keep_state: Tensor  # [T, C] float32: 0 where an episode begins and the state is reset, else 1
+    output_rows: Tensor | None = None  # [B] int64, the rows of T · C to return; None: all
 
 
 class MLP(torch.autograd.Function):
@@ -188,12 +188,12 @@ class FlatNetwork:
         parts += [convolutions(image) for convolutions, image in zip(self._images, images, strict=True)]
         return torch.cat(parts, -1) if images else x
 
-    def core(self, x: Tensor, memory: Memory) -> tuple[Tensor, Tensor]:
+    def core(self, x: Tensor, recurrent: RecurrentInput) -> tuple[Tensor, Tensor]:
         """Inputs [T · C, D] -> what the core says of them [T · C, H], and its state after the last [C, S]; see `core.py`."""
         weights = [self.parameters[f"core.{side}.{kind}"] for kind in ("weight", "bias") for side in ("input", "state")]
-        found, state = [], memory.state
-        for step, carried in zip(x.view(*memory.carried.shape, -1), memory.carried.unsqueeze(-1), strict=True):
-            state = state * carried
+        found, state = [], recurrent.initial_state
+        for step, keep in zip(x.view(*recurrent.keep_state.shape, -1), recurrent.keep_state.unsqueeze(-1), strict=True):
+            state = state * keep
             if self.spec.core == "lstm":
                 h, c = torch.lstm_cell(step, state.chunk(2, -1), *weights)
                 state = torch.cat((h, c), -1)
@@ -203,7 +203,7 @@ class FlatNetwork:
         return torch.cat(found), state
 
 
-class ActorCritic(FlatNetwork):
+class ActorCriticNetwork(FlatNetwork):
     """An actor and a critic: an MLP each, or two heads on one; both on one core, if there is one."""
 
     def __init__(self, spec: PolicySpec, device: str | torch.device = "cpu", *, seed: int = 0) -> None:
@@ -219,34 +219,36 @@ class ActorCritic(FlatNetwork):
             return out
         return torch.cat([out, self.parameters["actor.log_std"].expand_as(out)], -1)
 
-    def _common(self, x: Tensor, images: Sequence[Tensor], memory: Memory | None) -> Tensor:
+    def _common(self, x: Tensor, images: Sequence[Tensor], recurrent: RecurrentInput | None) -> Tensor:
         h = self.inputs(x, images)
-        if memory is not None:
-            h, _ = self.core(h, memory)
-            h = h if memory.wanted is None else h[memory.wanted]
+        if recurrent is not None:
+            h, _ = self.core(h, recurrent)
+            h = h if recurrent.output_rows is None else h[recurrent.output_rows]
         return self.hidden(h, self._trunk)
 
-    def forward(self, x: Tensor, images: Sequence[Tensor] = (), memory: Memory | None = None) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, x: Tensor, images: Sequence[Tensor] = (), recurrent: RecurrentInput | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Features [B, D] float32 and images [B, *leaf] uint8 -> distribution params [B, P], value [B].
 
-        With a core they are [T · C, …] and `memory` tells how they follow each other, and which B of them are wanted.
+        With a core, x and images are [T · C, …], and `recurrent` says where episodes begin and which B rows to return.
         """
-        h = self._common(x, images, memory)
+        h = self._common(x, images, recurrent)
         return self._params(h), self.mlp(h, self._critic)[:, 0]
 
-    def params(self, x: Tensor, images: Sequence[Tensor] = (), memory: Memory | None = None) -> Tensor:
+    def params(self, x: Tensor, images: Sequence[Tensor] = (), recurrent: RecurrentInput | None = None) -> Tensor:
         """Distribution params [B, P] alone."""
-        return self._params(self._common(x, images, memory))
+        return self._params(self._common(x, images, recurrent))
 
-    def value(self, x: Tensor, images: Sequence[Tensor] = (), memory: Memory | None = None) -> Tensor:
+    def value(self, x: Tensor, images: Sequence[Tensor] = (), recurrent: RecurrentInput | None = None) -> Tensor:
         """Value [B] alone."""
-        return self.mlp(self._common(x, images, memory), self._critic)[:, 0]
+        return self.mlp(self._common(x, images, recurrent), self._critic)[:, 0]
 
     def act(self, x: Tensor, images: Sequence[Tensor], state: Tensor) -> tuple[Tensor, Tensor]:
         """Distribution params [B, P] of one step of B copies, and the core's state after it [B, S]."""
         h = self.inputs(x, images)
         if self.spec.core is not None:
-            h, state = self.core(h, Memory(state, x.new_ones(1, len(x))))
+            h, state = self.core(h, RecurrentInput(state, x.new_ones(1, len(x))))
         return self._params(self.hidden(h, self._trunk)), state
 
 
@@ -313,7 +315,7 @@ class TorchPolicy:
         self.spec = spec
         self._images = images
         self._device, self._together = device, together
-        self._net = QNetwork(spec, device) if spec.head == "q" else ActorCritic(spec, device)
+        self._net = QNetwork(spec, device) if spec.head == "q" else ActorCriticNetwork(spec, device)
         self._buffers: dict[str, Floats] = {}
 
     def load(self, parameters: Floats, buffers: Floats) -> None:

@@ -28,7 +28,7 @@ def applies(spec: PolicySpec) -> bool:
 
 
 class FusedActorCritic:
-    """`ActorCritic` on the same flat parameters and gradients."""
+    """`ActorCriticNetwork` on the same flat parameters and gradients."""
 
     def __init__(self, spec: PolicySpec, flat: Array, flat_grad: Array) -> None:
         """`flat`, `flat_grad`: [P] as `protocol.policy.policy.layout` says, changed in place by others and by `backward`."""

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from learner.algorithms import ALGORITHMS, Algorithm
+from learner.algorithms import Algorithm, algorithm_class
 from learner.algorithms.a2c import A2C
 from learner.algorithms.actor_critic import Minibatch
 from learner.algorithms.impala import Impala
@@ -49,7 +49,7 @@ def _one_thread() -> Iterator[None]:
 
 def make(name: str, spec: PolicySpec = DISCRETE, seed: int = 0, **settings: Any) -> Any3:
     config = msgspec.convert(settings, HYPERPARAMETERS[name])
-    algorithm = ALGORITHMS[name](config, spec, total_steps=10_000, seed=seed)
+    algorithm = algorithm_class(name)(config, spec, total_steps=10_000, seed=seed)
     assert isinstance(algorithm, Any3)
     return algorithm
 
@@ -66,9 +66,9 @@ def same(a: Any3, b: Any3) -> bool:
 @pytest.mark.parametrize("name", NAMES)
 def test_each_is_an_algorithm_with_the_policy_of_its_settings(name: str) -> None:
     config = msgspec.convert({"shared_net": True, "net": [8], "normalize_observations": True}, HYPERPARAMETERS[name])
-    spec = ALGORITHMS[name].policy_spec(config, DISCRETE.observation, DISCRETE.action)
+    spec = algorithm_class(name).policy_spec(config, DISCRETE.observation, DISCRETE.action)
     assert (spec.shared_net, spec.net, spec.normalize_observations) == (True, (8,), True)
-    algorithm: Algorithm = ALGORITHMS[name](config, spec, total_steps=1, seed=0)
+    algorithm: Algorithm = algorithm_class(name)(config, spec, total_steps=1, seed=0)
     assert algorithm.weights()[0].shape == (size(layout(spec)[0]),)
 
 

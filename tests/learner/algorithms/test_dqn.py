@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from learner.algorithms import ALGORITHMS, Algorithm
+from learner.algorithms import Algorithm, algorithm_class
 from learner.algorithms import replay as replay_module
 from learner.algorithms.dqn import DQN, LOSSES, exploration_rate
 from learner.algorithms.replay import Sample
@@ -324,8 +324,8 @@ def test_priorities_are_the_errors_and_beta_grows_to_one(monkeypatch: pytest.Mon
 
 
 def test_it_is_an_algorithm() -> None:
-    spec = ALGORITHMS["dqn"].policy_spec(PLAIN, (BOX,), CHOICE)
-    algorithm: Algorithm = ALGORITHMS["dqn"](PLAIN, spec, total_steps=1, seed=0)
+    spec = algorithm_class("dqn").policy_spec(PLAIN, (BOX,), CHOICE)
+    algorithm: Algorithm = algorithm_class("dqn")(PLAIN, spec, total_steps=1, seed=0)
     assert algorithm.weights()[0].dtype == algorithm.weights()[1].dtype == np.float32
 
 

@@ -14,14 +14,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from learner.algorithms import ALGORITHMS, losses
+from learner.algorithms import algorithm_class, losses
 from learner.algorithms.actor_critic import Minibatch
 from learner.algorithms.kernels import mlp as layers
 from learner.algorithms.kernels.fused import FusedActorCritic, applies
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
 from protocol.arrays import Array
-from protocol.policy.networks import ActorCritic, log_prob_and_entropy
+from protocol.policy.networks import ActorCriticNetwork, log_prob_and_entropy
 from protocol.policy.policy import layout, size
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 from tests.protocol.policy.test_networks import ACTIONS
@@ -47,8 +47,8 @@ def some_actions(spec: ActionSpec, rows: int, generator: np.random.Generator) ->
     return generator.integers(0, high, (rows, *spec.shape))
 
 
-def make(spec: PolicySpec, seed: int, scale: float = 0.4) -> tuple[ActorCritic, FusedActorCritic]:
-    net = ActorCritic(spec)
+def make(spec: PolicySpec, seed: int, scale: float = 0.4) -> tuple[ActorCriticNetwork, FusedActorCritic]:
+    net = ActorCriticNetwork(spec)
     net.flat.copy_(torch.tensor(np.random.default_rng(seed).normal(0, scale, len(net.flat)), dtype=torch.float32))
     return net, FusedActorCritic(spec, net.flat.numpy(), net.flat_grad.numpy())
 
@@ -208,7 +208,7 @@ def test_an_update_is_the_same_either_way(
     found: list[tuple[Array, dict[str, float]]] = []
     for most in (512, 0):
         monkeypatch.setattr("learner.algorithms.actor_critic.MOST_ROWS", most)
-        algorithm: Any = ALGORITHMS[name](config, spec, total_steps=1_000, seed=0)
+        algorithm: Any = algorithm_class(name)(config, spec, total_steps=1_000, seed=0)
         for seed in range(3):
             metrics = algorithm.update(batch(algorithm, seed, fresh=seed == 0), no_pulse)
         found.append((algorithm.net.flat.numpy().copy(), metrics))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from learner.algorithms import ALGORITHMS, Algorithm
+from learner.algorithms import Algorithm, algorithm_class
 from learner.algorithms.actor_critic import Minibatch
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import PPOConfig
@@ -52,7 +52,7 @@ def same(a: PPO, b: PPO) -> bool:
 
 
 def test_it_is_an_algorithm() -> None:
-    algorithm: Algorithm = ALGORITHMS["ppo"](PPOConfig(), DISCRETE, total_steps=1, seed=0)
+    algorithm: Algorithm = algorithm_class("ppo")(PPOConfig(), DISCRETE, total_steps=1, seed=0)
     assert algorithm.weights()[0].dtype == np.float32
 
 

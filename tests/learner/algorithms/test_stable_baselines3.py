@@ -28,7 +28,7 @@ from learner.config.hyperparameters import DQNConfig, PPOConfig
 from learner.run_folder.run_folder import RunFolder
 from protocol.envs.spaces import action_spec, observation_leaves, writer
 from protocol.policy.distributions import distribution
-from protocol.policy.networks import ActorCritic, log_prob_and_entropy
+from protocol.policy.networks import ActorCriticNetwork, log_prob_and_entropy
 from protocol.policy.policy import make_policy
 from protocol.specs import EnvSpec, PolicySpec
 from tests.support.batches import batch, no_pulse
@@ -117,7 +117,7 @@ def their_policy(spec: PolicySpec, action: spaces.Space[Any]) -> ActorCriticPoli
     return ActorCriticPolicy(OBSERVATION, action, lambda _: 0.0, activation_fn=activation, **trunk)
 
 
-def differences(spec: PolicySpec, net: ActorCritic, other: ActorCriticPolicy) -> dict[str, float]:
+def differences(spec: PolicySpec, net: ActorCriticNetwork, other: ActorCriticPolicy) -> dict[str, float]:
     """The largest absolute difference of each thing that two policies say about the same observations and actions."""
     generator = np.random.default_rng(5)
     obs = generator.normal(0, 2, (ROWS, *OBSERVATION.shape)).astype(np.float32)
@@ -158,7 +158,7 @@ def test_our_weights_in_their_policy(action: str, activation: str, shared: bool)
 @pytest.mark.parametrize("action", ["box", "discrete"])
 def test_their_weights_in_our_network(action: str) -> None:
     spec = policy_spec(ACTIONS[action], net=(16, 12))
-    other, net = their_policy(spec, ACTIONS[action]), ActorCritic(spec, seed=3)
+    other, net = their_policy(spec, ACTIONS[action]), ActorCriticNetwork(spec, seed=3)
     generator = torch.Generator().manual_seed(4)
     for own in other.parameters():
         own.data.normal_(0, 0.4, generator=generator)
@@ -238,7 +238,7 @@ def test_the_page_takes_a_run_to_stable_baselines3(tmp_path: Path, env: str, act
         activation=activation,  # type: ignore[arg-type]
         normalize_observations=normal,
     )
-    net = ActorCritic(spec)
+    net = ActorCriticNetwork(spec)
     net.flat.normal_(0, 0.5, generator=torch.Generator().manual_seed(2))
     count = sum(int(np.prod(leaf.shape)) for leaf in spec.observation)
     buffers = np.random.default_rng(3).uniform(0.5, 2, 2 * count).astype(np.float32) if normal else np.zeros(0, np.float32)

@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from learner.algorithms import ALGORITHMS
+from learner.algorithms import ALGORITHMS, algorithm_class
 from learner.config.config import PRESETS, Config, lower_layers, named_presets, resolve
 from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
 from protocol.errors import UsageError
@@ -192,6 +192,7 @@ def test_every_named_preset_is_a_whole_run() -> None:
 
 def test_every_algorithm_has_its_settings() -> None:
     assert ALGORITHMS.keys() == HYPERPARAMETERS.keys()
+    assert {name: algorithm_class(name).__name__.lower() for name in ALGORITHMS} == {name: name for name in ALGORITHMS}
 
 
 def test_no_setting_of_an_algorithm_hides_one_of_the_run() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from learner.algorithms import ALGORITHMS
+from learner.algorithms import algorithm_class
 from learner.config.config import resolve
 from learner.config.hyperparameters import HYPERPARAMETERS
 from learner.evaluate import load_policy
@@ -18,7 +18,7 @@ from learner.run import run_spec
 from learner.run_folder.run_folder import RunFolder
 from protocol.errors import UsageError
 from protocol.policy.encoder import describe_encoder, make_encoder
-from protocol.policy.networks import ActorCritic, QNetwork, TorchPolicy
+from protocol.policy.networks import ActorCriticNetwork, QNetwork, TorchPolicy
 from protocol.policy.policy import layout, make_policy, size
 from protocol.specs import Code, EnvSpec, NamedShape, PolicySpec
 from tests.support.batches import DISCRETE, IMAGE, batch, no_pulse, recurrent
@@ -33,7 +33,7 @@ def encoded(spec: PolicySpec, name: str = "mixer") -> PolicySpec:
 @pytest.mark.parametrize("spec", [DISCRETE, IMAGE, recurrent(IMAGE, "lstm")])
 def test_its_parameters_are_views_of_the_flat_ones_and_keep_their_first_values(spec: PolicySpec) -> None:
     spec = encoded(spec)
-    net = ActorCritic(spec, seed=3)
+    net = ActorCriticNetwork(spec, seed=3)
     alone = make_encoder(spec, seed=3)
     assert not [field for field in net.fields if field.name.startswith("image")]
     for name, parameter in alone.named_parameters():
@@ -43,7 +43,7 @@ def test_its_parameters_are_views_of_the_flat_ones_and_keep_their_first_values(s
         assert ours.grad is not None
         assert ours.grad.untyped_storage().data_ptr() == net.flat_grad.untyped_storage().data_ptr()
     assert sum(map(torch.numel, net.parameters.values())) == len(net.flat)
-    assert not torch.equal(net.flat, ActorCritic(spec, seed=4).flat)
+    assert not torch.equal(net.flat, ActorCriticNetwork(spec, seed=4).flat)
     x = torch.randn(6, 4)
     images = [torch.randint(0, 256, (6, *leaf.shape), dtype=torch.uint8) for leaf in spec.observation[1:]]
     expected = alone(x, *images)
@@ -57,7 +57,7 @@ def test_its_parameters_are_views_of_the_flat_ones_and_keep_their_first_values(s
 @pytest.mark.parametrize("name", ["ppo", "a2c", "impala", "reinforce"])
 def test_it_learns_with_the_rest(name: str) -> None:
     spec = encoded(IMAGE)
-    algorithm: Any = ALGORITHMS[name](HYPERPARAMETERS[name](), spec, total_steps=1000, seed=0)
+    algorithm: Any = algorithm_class(name)(HYPERPARAMETERS[name](), spec, total_steps=1000, seed=0)
     before = {field: tensor.detach().clone() for field, tensor in algorithm.net.parameters.items()}
     algorithm.update(batch(algorithm, 0), no_pulse)
     for field, tensor in algorithm.net.parameters.items():
@@ -69,14 +69,14 @@ def test_it_learns_with_the_rest(name: str) -> None:
 @pytest.mark.parametrize("spec", [DISCRETE, recurrent(DISCRETE, "gru"), msgspec.structs.replace(DISCRETE, head="q")])
 def test_acting_with_it_is_learning_with_it(spec: PolicySpec) -> None:
     spec = encoded(spec)
-    net = (QNetwork if spec.head == "q" else ActorCritic)(spec, seed=1)
+    net = (QNetwork if spec.head == "q" else ActorCriticNetwork)(spec, seed=1)
     policy = make_policy(spec)
     assert isinstance(policy, TorchPolicy)
     policy.load(net.flat.numpy()[: net.acting_size], np.zeros(int(spec.head == "q"), np.float32))
     obs = np.random.default_rng(0).normal(size=(2, 3, 4)).astype(np.float32)
     with torch.no_grad():
         x = torch.tensor(obs).flatten(0, 1)
-        if isinstance(net, ActorCritic):
+        if isinstance(net, ActorCriticNetwork):
             params, _ = net.act(x, (), torch.zeros(6, spec.state_size))
         else:
             params = net.params(x)
@@ -89,10 +89,10 @@ def test_one_that_is_different_here_is_refused() -> None:
     first, *rest = spec.encoder.arrays
     other = msgspec.structs.replace(spec.encoder, arrays=(NamedShape(first.name, (7, 4)), *rest))
     with pytest.raises(UsageError, match=rf"parameter {first.name} expected \(7, 4\) as the learner has it, got \(12, 4\)"):
-        ActorCritic(msgspec.structs.replace(spec, encoder=other))
+        ActorCriticNetwork(msgspec.structs.replace(spec, encoder=other))
     more = msgspec.structs.replace(spec.encoder, arrays=(*spec.encoder.arrays, NamedShape("more", (1,))))
     with pytest.raises(UsageError, match=r"parameter more expected \(1,\) as the learner has it, got none"):
-        ActorCritic(msgspec.structs.replace(spec, encoder=more))
+        ActorCriticNetwork(msgspec.structs.replace(spec, encoder=more))
 
 
 @pytest.mark.parametrize(
@@ -120,7 +120,7 @@ def test_one_without_parameters_will_do() -> None:
     spec = encoded(DISCRETE, "nothing_to_learn")
     assert spec.encoder is not None
     assert (spec.encoder.arrays, spec.encoder.size) == ((), 4)
-    ActorCritic(spec)
+    ActorCriticNetwork(spec)
 
 
 def test_a_setting_names_it_and_a_run_folder_keeps_it(tmp_path: Path) -> None:

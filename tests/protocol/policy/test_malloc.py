@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from protocol.policy.malloc import keep_freed
-from protocol.policy.networks import ActorCritic
+from protocol.policy.networks import ActorCriticNetwork
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
@@ -34,7 +34,7 @@ def test_networks_that_look_at_images_keep_it_and_others_do_not(monkeypatch: pyt
     kept: list[bool] = []
     monkeypatch.setattr("protocol.policy.networks.keep_freed", lambda: kept.append(True))
     action = ActionSpec("discrete", (), "int64", (4,), (0,))
-    ActorCritic(PolicySpec((Leaf("", "box", (4,), "float32"),), action))
+    ActorCriticNetwork(PolicySpec((Leaf("", "box", (4,), "float32"),), action))
     assert kept == []
-    ActorCritic(PolicySpec((Leaf("", "box", (36, 36, 1), "uint8"),), action))
+    ActorCriticNetwork(PolicySpec((Leaf("", "box", (36, 36, 1), "uint8"),), action))
     assert kept == [True]

@@ -17,7 +17,7 @@ from torch import Tensor
 from protocol.arrays import Array
 from protocol.policy import policy as acting
 from protocol.policy.distributions import distribution
-from protocol.policy.networks import MLP, ActorCritic, TorchPolicy, log_prob_and_entropy
+from protocol.policy.networks import MLP, ActorCriticNetwork, TorchPolicy, log_prob_and_entropy
 from protocol.policy.policy import NumpyPolicy, buffer_size, features, layout, normalized, size
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
@@ -58,7 +58,7 @@ def leaves(observation: tuple[Leaf, ...], lead: tuple[int, ...], generator: np.r
     return found
 
 
-def random_weights(spec: PolicySpec, net: ActorCritic, generator: np.random.Generator) -> tuple[Array, Array]:
+def random_weights(spec: PolicySpec, net: ActorCriticNetwork, generator: np.random.Generator) -> tuple[Array, Array]:
     """Fill the network with random parameters; give the acting ones and random buffers."""
     net.flat.copy_(torch.tensor(generator.normal(0, 0.5, len(net.flat)), dtype=torch.float32))
     buffers = generator.uniform(0.5, 2, buffer_size(spec)).astype(np.float32)
@@ -79,7 +79,7 @@ def test_numpy_and_torch_agree(
 ) -> None:
     generator = np.random.default_rng(seed)
     spec = PolicySpec(OBSERVATIONS[observation], ACTIONS[action], tuple(net), activation, normal)
-    torch_net, numpy_net = ActorCritic(spec), NumpyPolicy(spec)
+    torch_net, numpy_net = ActorCriticNetwork(spec), NumpyPolicy(spec)
     parameters, buffers = random_weights(spec, torch_net, generator)
     numpy_net.load(parameters, buffers)
     obs = leaves(spec.observation, (1, 7), generator)
@@ -117,7 +117,7 @@ def test_gaussian_log_probability_and_entropy_are_those_of_torch() -> None:
     torch.testing.assert_close(entropy, normal.entropy().sum(-1))  # type: ignore[no-untyped-call]
 
 
-def plain(net: ActorCritic, x: Tensor, images: list[Tensor]) -> tuple[Tensor, Tensor]:
+def plain(net: ActorCriticNetwork, x: Tensor, images: list[Tensor]) -> tuple[Tensor, Tensor]:
     """The forward pass as a textbook writes it."""
     p, spec = net.parameters, net.spec
     act = torch.tanh if spec.activation == "tanh" else torch.relu
@@ -144,7 +144,7 @@ def plain(net: ActorCritic, x: Tensor, images: list[Tensor]) -> tuple[Tensor, Te
 def test_forward_and_gradients_are_those_of_the_textbook(observation: tuple[Leaf, ...], activation: Any) -> None:
     generator = np.random.default_rng(0)
     spec = PolicySpec(observation, ACTIONS["discrete"], (7, 5), activation)
-    net = ActorCritic(spec, seed=3)
+    net = ActorCriticNetwork(spec, seed=3)
     net.flat.add_(0.1 * torch.randn(net.flat.shape, generator=torch.Generator().manual_seed(0)))
     obs = leaves(observation, (6,), generator)
     x = torch.tensor(features(spec, obs))
@@ -169,7 +169,7 @@ def test_the_mlps_derivative_is_exact(relu: bool) -> None:
 
 def test_every_parameter_and_gradient_is_a_view_of_one_flat_tensor() -> None:
     spec = PolicySpec((BOX, *IMAGES["channels last"]), ACTIONS["box"])
-    net = ActorCritic(spec)
+    net = ActorCriticNetwork(spec)
     assert net.flat.grad is net.flat_grad
     acting_fields, critic_fields = layout(spec)
     assert list(net.parameters) == [field.name for field in (*acting_fields, *critic_fields)]
@@ -189,7 +189,7 @@ def test_every_parameter_and_gradient_is_a_view_of_one_flat_tensor() -> None:
 
 
 def test_a_backward_pass_fills_the_flat_gradient_in_place() -> None:
-    net = ActorCritic(PolicySpec((BOX,), ACTIONS["box"]))
+    net = ActorCriticNetwork(PolicySpec((BOX,), ACTIONS["box"]))
     before = net.flat_grad.data_ptr()
     params, value = net.forward(torch.ones(3, 6))
     (params.sum() + value.sum()).backward()  # type: ignore[no-untyped-call]
@@ -202,7 +202,7 @@ def test_a_backward_pass_fills_the_flat_gradient_in_place() -> None:
 
 def test_initialisation_is_orthogonal_with_each_fields_gain() -> None:
     spec = PolicySpec((BOX, *IMAGES["channels last"]), ACTIONS["box"], (8, 8))
-    net = ActorCritic(spec, seed=1)
+    net = ActorCriticNetwork(spec, seed=1)
     for field in net.fields:
         weight = net.parameters[field.name].detach()
         if field.gain == 0:
@@ -218,23 +218,23 @@ def test_initialisation_is_orthogonal_with_each_fields_gain() -> None:
 def test_initialisation_follows_from_the_seed_alone() -> None:
     spec = PolicySpec((BOX,), ACTIONS["discrete"])
     torch.manual_seed(0)
-    first = ActorCritic(spec, seed=5).flat
+    first = ActorCriticNetwork(spec, seed=5).flat
     torch.manual_seed(1)
-    assert torch.equal(first, ActorCritic(spec, seed=5).flat)
-    assert not torch.equal(first, ActorCritic(spec, seed=6).flat)
+    assert torch.equal(first, ActorCriticNetwork(spec, seed=5).flat)
+    assert not torch.equal(first, ActorCriticNetwork(spec, seed=6).flat)
 
 
 @dataclasses.dataclass(frozen=True)
 class Loaded:
     policy: TorchPolicy
-    net: ActorCritic
+    net: ActorCriticNetwork
     spec: PolicySpec
     buffers: Array
 
 
 def loaded(observation: tuple[Leaf, ...]) -> Loaded:
     spec = PolicySpec(observation, ACTIONS["box"], (8,), normalize_observations=True)
-    net, policy = ActorCritic(spec), TorchPolicy(spec)
+    net, policy = ActorCriticNetwork(spec), TorchPolicy(spec)
     parameters, buffers = random_weights(spec, net, np.random.default_rng(1))
     parameters.flags.writeable = False  # as it comes from a frame
     policy.load(parameters, buffers)

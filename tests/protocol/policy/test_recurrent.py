@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from learner.algorithms import ALGORITHMS
+from learner.algorithms import algorithm_class
 from learner.algorithms.actor_critic import Minibatch
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
@@ -19,7 +19,7 @@ from learner.recording.record import Player
 from protocol.arrays import Array
 from protocol.errors import BadRollout
 from protocol.policy.distributions import distribution
-from protocol.policy.networks import ActorCritic, Memory, TorchPolicy
+from protocol.policy.networks import ActorCriticNetwork, RecurrentInput, TorchPolicy
 from protocol.policy.policy import NumpyPolicy, buffer_size, make_policy
 from protocol.policy.recurrent import advance, zero_state
 from protocol.rollout import Rollout, stack, validate
@@ -42,13 +42,13 @@ def _one_thread() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-def random_net(spec: PolicySpec, seed: int = 0) -> ActorCritic:
-    net = ActorCritic(spec)
+def random_net(spec: PolicySpec, seed: int = 0) -> ActorCriticNetwork:
+    net = ActorCriticNetwork(spec)
     net.flat.copy_(torch.tensor(np.random.default_rng(seed).normal(0, 0.5, len(net.flat)), dtype=torch.float32))
     return net
 
 
-def acting(net: ActorCritic) -> Array:
+def acting(net: ActorCriticNetwork) -> Array:
     return net.flat.numpy()[: net.acting_size].copy()
 
 
@@ -70,7 +70,7 @@ def test_it_computes_what_torch_computes(core: Core) -> None:
     begun = tuple(part[None].contiguous() for part in state.chunk(2, -1)) if core == "lstm" else state[None]
     with torch.no_grad():
         expected, after = own(x, begun)
-        found, last = net.core(x.flatten(0, 1), Memory(state, torch.ones(T, C)))
+        found, last = net.core(x.flatten(0, 1), RecurrentInput(state, torch.ones(T, C)))
     torch.testing.assert_close(found.view(T, C, 8), expected)
     torch.testing.assert_close(last, torch.cat(after, -1)[0] if core == "lstm" else after[0])
     now = state.numpy()[None].copy()
@@ -105,14 +105,14 @@ def test_acting_step_by_step_is_learning_over_the_sequence(core: Core, spec: Pol
         now[~carried[t]] = 0
         acted.append(policy([leaf[t] for leaf in leaves], now))
     x = (leaves[0] - buffers[:4]) / buffers[4:8] if spec.normalize_observations else leaves[0]
-    memory = Memory(torch.tensor(state).flatten(0, 1), torch.tensor(carried.astype(np.float32)).flatten(1))
+    recurrent_input = RecurrentInput(torch.tensor(state).flatten(0, 1), torch.tensor(carried.astype(np.float32)).flatten(1))
     images = [torch.tensor(leaf).flatten(0, 2) for leaf in leaves[1:]]
     with torch.no_grad():
-        params, value = net.forward(torch.tensor(x).flatten(0, 2), images, memory)
+        params, value = net.forward(torch.tensor(x).flatten(0, 2), images, recurrent_input)
     np.testing.assert_allclose(np.stack(acted).reshape(T * L * N, -1), params.numpy(), atol=1e-4)
     wanted = torch.tensor([3, 30, 17])
     with torch.no_grad():
-        some = net.forward(torch.tensor(x).flatten(0, 2), images, memory._replace(wanted=wanted))
+        some = net.forward(torch.tensor(x).flatten(0, 2), images, recurrent_input._replace(output_rows=wanted))
     torch.testing.assert_close(some, (params[wanted], value[wanted]))
 
 
@@ -190,8 +190,8 @@ def test_a_policy_that_has_not_moved_has_ratio_one(core: Core, spec: PolicySpec)
 
 
 def _columns(minibatch: Minibatch) -> int:
-    assert minibatch.memory is not None
-    return len(minibatch.memory.state)
+    assert minibatch.recurrent is not None
+    return len(minibatch.recurrent.initial_state)
 
 
 @pytest.mark.parametrize("parts", [1, 2, 4, 50])
@@ -205,15 +205,15 @@ def test_a_minibatch_is_whole_columns_and_every_valid_row_is_in_one(parts: int) 
     assert len(found) == min(parts, 6)
     assert sorted(torch.cat([each.target for each in found]).tolist()) == count[rows.valid].tolist()
     for each in found:
-        assert each.memory is not None
-        assert each.memory.wanted is not None
-        columns = each.memory.state[:, 0].long()
+        assert each.recurrent is not None
+        assert each.recurrent.output_rows is not None
+        columns = each.recurrent.initial_state[:, 0].long()
         x = each.x.view(len(rows.valid), len(columns), 4)
         np.testing.assert_array_equal(x.numpy(), rows.obs[0][:-1][:, columns.numpy()])
-        t, column = each.memory.wanted // len(columns), columns[each.memory.wanted % len(columns)]
+        t, column = each.recurrent.output_rows // len(columns), columns[each.recurrent.output_rows % len(columns)]
         assert (each.target == (t * 6 + column).float()).all()  # each row is the one that the core is asked for
         expected = np.concatenate([np.ones((1, 6), bool), rows.valid[:-1]])[:, columns.numpy()]
-        np.testing.assert_array_equal(each.memory.carried.numpy(), expected)
+        np.testing.assert_array_equal(each.recurrent.keep_state.numpy(), expected)
 
 
 @pytest.mark.parametrize("name", ["ppo", "a2c", "impala"])
@@ -221,7 +221,7 @@ def test_a_minibatch_is_whole_columns_and_every_valid_row_is_in_one(parts: int) 
 def test_what_a_copy_did_before_its_episode_changes_nothing(name: str, core: Core) -> None:
     """Two batches that differ in the rows before a reset give equal values, and log-probabilities, after it."""
     config = HYPERPARAMETERS[name]()
-    algorithm: Any = ALGORITHMS[name](config, recurrent(DISCRETE, core), total_steps=1000, seed=0)
+    algorithm: Any = algorithm_class(name)(config, recurrent(DISCRETE, core), total_steps=1000, seed=0)
     rows = batch(algorithm, 0)
     t, n = np.argwhere(~rows.valid)[0]
     other = batch(algorithm, 0)
@@ -256,9 +256,9 @@ def learned(name: str, core: Core | None, updates: int) -> float:
     T, N, lanes = 16, 16, 2
     config = msgspec.convert({**SETTINGS[name], "core": core, "core_size": 16, "net": [16]}, HYPERPARAMETERS[name])
     run = run_of(f"{TOY}Recall-v0", T=T, N=N)
-    spec = ALGORITHMS[name].policy_spec(config, run.policy.observation, run.policy.action)
+    spec = algorithm_class(name).policy_spec(config, run.policy.observation, run.policy.action)
     run = msgspec.structs.replace(run, policy=spec)
-    algorithm = ALGORITHMS[name](config, spec, total_steps=updates * T * N * lanes, seed=0)
+    algorithm = algorithm_class(name)(config, spec, total_steps=updates * T * N * lanes, seed=0)
     collector = Collector(run, make_policy(spec))
     for k in range(updates):
         collector.load(*algorithm.weights())
