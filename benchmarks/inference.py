@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.writing import write
-from learner.config.config import resolve
+from learner.config.layers import resolve
 from learner.run_folder.metrics import Progress
 from millrace.launch.local import train
 

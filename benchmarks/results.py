@@ -15,7 +15,8 @@ from typing import NamedTuple
 
 import msgspec
 
-from learner.config.config import Config, resolve
+from learner.config.config import Config
+from learner.config.layers import resolve
 from learner.evaluate import evaluate, load_policy
 from learner.run_folder.metrics import Evaluation
 from learner.run_folder.run_folder import RunFolder, Summary, Which

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.writing import write
-from learner.config.config import resolve
+from learner.config.layers import resolve
 from learner.rollouts.hub import Hub
 from learner.rollouts.roster import Roster
 from learner.run import run_spec

@@ -11,7 +11,7 @@ import logging
 import sys
 import time
 
-from learner.config.command_line import configuration
+from learner.config.command_line import read_config
 from learner.run_folder.json_log import JsonLines
 from learner.run_folder.metrics import Progress
 from learner.run_folder.run_folder import Interrupted
@@ -37,7 +37,7 @@ def main(argv: list[str]) -> int:
             log.info("%s, return %s, %d workers", steps, progress.return_mean, progress.workers_alive)
 
     try:
-        config, resume = configuration("learner", argv)
+        config, resume = read_config("learner", argv)
         from learner.run import serve  # torch: not before the flags are known to be right
 
         log.info("run folder: %s", serve(config, resume, watch))

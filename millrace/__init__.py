@@ -36,7 +36,7 @@ def train(
     `millrace train` is a keyword argument of the same name: `learning_rate=1e-3`.
     `watch` is called after each update. Guard the call with `if __name__ == "__main__":` in a script. Raises `OurError`.
     """
-    from learner.config.config import resolve
+    from learner.config.layers import resolve
     from learner.run_folder.resume import AUTO, newest_run
     from millrace.launch import local
 

@@ -1,28 +1,20 @@
-"""The configuration of a run: one record, whose texts are the help of the command line. Pure but for reading TOML files.
+"""All settings of a run, in one record. The texts under the fields are the help of the command line. Pure.
 
-Resolution, weakest first: the defaults here < the preset of (algorithm, environment) < a TOML file < flags or keyword
-arguments. A setting has one name: the field `learning_rate` is the TOML key `learning_rate` and the flag `--learning-rate`.
-The algorithm's own settings stand in a TOML table named after it, `[ppo]`, and among the other flags.
+How the settings of a run are put together from presets, files and flags: learner/config/layers.py.
 """
 
 from __future__ import annotations
 
-import re
-import tomllib
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, get_args, get_type_hints
+from typing import Annotated, Any, Literal
 
 import msgspec
 import tomli_w
 from msgspec import Meta
 from tyro.conf import Positional
 
-from learner.config.did_you_mean import nearest
-from learner.config.hyperparameters import HYPERPARAMETERS, Hyperparameters, PPOConfig, elsewhere
+from learner.config.hyperparameters import Hyperparameters, PPOConfig
 from learner.config.settings import CheckpointPolicy, EvaluationSettings, StopRule
-from protocol.address import advertised, check_address
-from protocol.errors import UsageError
 from protocol.specs import ImagesDtype
 from protocol.wire.weight_dtypes import WeightsDtype
 
@@ -155,212 +147,11 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return EvaluationSettings(episodes=self.eval_episodes, every_env_steps=self.eval_every, seed=self.seed)
 
     def to_toml(self) -> str:
-        """As text that `from_toml` reads: every setting, in the order of the fields; what is not set is "none"."""
+        """All settings as TOML, in the order of the fields. A setting that is None is written as "none"."""
         plain: dict[str, Any] = msgspec.to_builtins(self)
         tables = {"env_kwargs": plain.pop("env_kwargs"), self.algo: _without_none(plain.pop("algorithm"))}
         return tomli_w.dumps(_without_none(plain) | tables)
 
-    @staticmethod
-    def from_toml(text: str, where: str = "config.toml") -> Config:
-        """From text, over the defaults alone (no preset). Raises `UsageError` that names `where`."""
-        return checked(_over_toml(Config(), _parse(text, where), where), where)
-
-
-def resolve(
-    env: str = "", *, file: Path | None = None, resume: Path | None = None, preset: str = "auto", **keywords: Any
-) -> Config:
-    """The configuration of a run from all layers, checked. Raises `UsageError` in one line.
-
-    `preset` is "auto" (that of the environment, if there is one), "none", the environment whose preset to take, or the name
-    of a whole run. A run that is resumed has its own file, and no preset.
-    """
-    base = lower_layers(env, algo=keywords.get("algo"), file=file, resume=resume, preset=preset)
-    return checked(over(base, keywords, "keyword argument"))
-
-
-class Preset(NamedTuple):
-    """A whole run by name: environment, algorithm and settings."""
-
-    about: str
-    settings: dict[str, Any]
-
-
-def named_presets() -> dict[str, Preset]:
-    """The presets that `--preset NAME` takes besides those of an environment."""
-    tables: dict[str, dict[str, Any]] = _presets().get("named", {})
-    return {name: Preset(table.pop("about"), table) for name, table in tables.items()}
-
-
-def presets_of_environments() -> list[tuple[str, str]]:
-    """Algorithm and environment of every preset that is taken by itself."""
-    return [(algo, env) for algo, envs in _presets().items() if algo != "named" for env in envs]
-
-
-def _presets() -> dict[str, Any]:
-    return tomllib.loads(PRESETS.read_text())
-
-
-def lower_layers(
-    env: str,
-    *,
-    algo: str | None = None,
-    file: Path | None = None,
-    resume: Path | None = None,
-    preset: str = "auto",
-) -> Config:
-    """What stands below flags and keyword arguments: defaults, preset, file. Fields fit their types, and no more."""
-    if resume is not None:
-        if file is not None:
-            raise UsageError(f"a config file ({file}) or a run to resume ({resume}): expected one, got both")
-        file, preset = resume / "config.toml", "none"
-        if not file.is_file():
-            raise UsageError(f"run {resume}: expected a run folder with a config.toml to resume, got none")
-    where = str(file)
-    table: dict[str, Any] = {}
-    if file is not None:
-        try:
-            table = _parse(file.read_text(), where)
-        except (OSError, UnicodeDecodeError) as error:
-            says = error.strerror if isinstance(error, OSError) else "it is not text"
-            raise UsageError(f"config file {where} cannot be read: {says}") from error
-    if resume is not None and env not in ("", table.get("env")):
-        raise UsageError(f"run {resume} is of {table.get('env')}, not of {env}; resume it without naming an environment")
-    named = named_presets()
-    whole = named[preset].settings if preset in named else {}
-    env = env or str(table.get("env", whole.get("env", "")))
-    config = _of_algorithm(algo or str(table.get("algo", whole.get("algo", "ppo"))))
-    if preset != "none":
-        known = _presets().get(config.algo, {})
-        name = env if preset == "auto" or preset in named else preset
-        if name not in known and name == preset:
-            near = nearest(name, [*known, *named])
-            raise UsageError(f"preset {name}: {config.algo} has none of this name{near or '; millrace presets lists them'}")
-        config = over(over(config, known.get(name, {}), str(PRESETS)), {**whole, "algo": config.algo}, str(PRESETS))
-    config = _over_toml(config, {**table, "algo": config.algo}, where)
-    return over(config, {"env": env}, "ENV")
-
-
-def over(config: Config, values: Mapping[str, Any], where: str) -> Config:
-    """The configuration with these values, named flatly, laid over it; `env_kwargs` are merged. Types are checked."""
-    config = _of_algorithm(values["algo"]) if values.get("algo", config.algo) != config.algo else config
-    plain: dict[str, Any] = msgspec.to_builtins(config)
-    own: dict[str, Any] = plain["algorithm"]
-    for name, value in values.items():
-        if name in own:
-            own[name] = _fitting(config.algorithm, name, value)
-        elif name == "env_kwargs" and isinstance(value, Mapping):
-            plain[name] |= value
-        elif name in plain and name != "algorithm":
-            plain[name] = _fitting(config, name, value)
-        else:
-            raise UsageError(f"{where}: unknown setting {name}{elsewhere(name) or nearest(name, [*plain, *own])}")
-    return _typed(plain, where)
-
-
-def checked(config: Config, where: str = "") -> Config:
-    """The configuration, if a run can be made of it. Raises `UsageError` that says what could."""
-    at = f"{where}: " if where else ""
-    config = _typed(msgspec.to_builtins(config), where)
-    if not config.env:
-        raise UsageError(f"{at}which environment? expected one that gymnasium.make takes, as in: millrace train CartPole-v1")
-    if config.envs % config.lanes:
-        fewer = config.envs - config.envs % config.lanes
-        near = f"{fewer} or {fewer + config.lanes}" if fewer else f"{config.lanes}"
-        divisor = max(n for n in range(1, min(config.lanes, config.envs) + 1) if config.envs % n == 0)
-        raise UsageError(
-            f"{at}{config.envs} envs cannot be shared evenly among {config.lanes} lanes; take {near}, or {divisor} lanes"
-        )
-    if config.inference == "learner" and config.compress != "none":
-        raise UsageError(
-            f"{at}inference learner: compress expected none, got {config.compress}; rollouts are made beside the learner"
-        )
-    if config.inference == "learner" and config.max_lag:
-        raise UsageError(
-            f"{at}inference learner: max_lag expected 0, got {config.max_lag}; the policy acts under the newest weights"
-        )
-    if config.inference == "learner" and config.vector not in {"auto", "loop"}:
-        raise UsageError(
-            f"{at}inference learner: vector expected auto or loop, got {config.vector}; its workers step copies one by one"
-        )
-    check_address(config.bind)
-    if config.metrics_bind:
-        try:
-            check_address(f"tcp://{config.metrics_bind}")
-        except UsageError:
-            expected = "expected HOST:PORT, as in 127.0.0.1:9464"
-            raise UsageError(f"{at}metrics_bind {config.metrics_bind}: {expected}") from None
-    try:
-        check_address(advertised("tcp://*:1", config.advertise, "machine"))
-    except UsageError:
-        raise UsageError(
-            f"{at}advertise {config.advertise}: expected a host name or an IP address, without a port"
-        ) from None
-    return config
-
 
 def _without_none(plain: dict[str, Any]) -> dict[str, Any]:
     return {name: "none" if value is None else value for name, value in plain.items()}
-
-
-def _of_algorithm(algo: str) -> Config:
-    if algo not in HYPERPARAMETERS:
-        raise UsageError(f"algo {algo}: expected one of {', '.join(HYPERPARAMETERS)}{nearest(algo, HYPERPARAMETERS)}")
-    return Config(algo=algo, algorithm=HYPERPARAMETERS[algo]())
-
-
-def _parse(text: str, where: str) -> dict[str, Any]:
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise UsageError(f"{where} is not TOML: {error}") from error
-
-
-def _over_toml(config: Config, table: dict[str, Any], where: str) -> Config:
-    """Tables of other algorithms are let be, so that one file can hold the settings of several."""
-    algo = str(table.get("algo", config.algo))
-    top = {name: value for name, value in table.items() if name not in HYPERPARAMETERS}
-    own = table.get(algo, {})
-    if not isinstance(own, dict):
-        raise UsageError(f"{where}: {algo} expected a table, [{algo}], got {own}")
-    if strays := top.keys() & set(msgspec.structs.asdict(config.algorithm)):
-        raise UsageError(f"{where}: {min(strays)} is a setting of the algorithm; put it in the table [{algo}]")
-    if strays := own.keys() & set(msgspec.structs.asdict(config)):
-        raise UsageError(f"{where}: {min(strays)} is a setting of the run; put it above the table [{algo}]")
-    return over(config, top | own, where)
-
-
-def _fitting(record: msgspec.Struct, name: str, value: Any) -> Any:
-    """The value as its field wants it: 1e5 for a whole number is a whole number, and "none" is None where that may be."""
-    default = getattr(type(record)(), name)
-    if value == "none" and default is None:
-        return None
-    if isinstance(value, float) and type(default) is int and value.is_integer():
-        return int(value)
-    return value
-
-
-def _typed(plain: dict[str, Any], where: str) -> Config:
-    """The record of these values. Raises `UsageError` that names the setting, what was expected and what was got."""
-    try:
-        kind: type[msgspec.Struct] = HYPERPARAMETERS[plain["algo"]]
-        own = msgspec.convert(plain["algorithm"], kind)
-        return msgspec.structs.replace(msgspec.convert({**plain, "algorithm": {}}, Config), algorithm=own)
-    except msgspec.ValidationError as error:
-        raise UsageError(f"{where}: {_what_is_wrong(plain, str(error))}".removeprefix(": ")) from error
-
-
-def _what_is_wrong(plain: dict[str, Any], says: str) -> str:
-    """Of msgspec's text: the setting, what was expected and what was got."""
-    expected, _, path = says.replace(" | null", ' or "none"').replace("`object`", "table").partition(" - at `$.")
-    name = re.split(r"[.\[`]", path)[0]
-    record = HYPERPARAMETERS[plain["algo"]] if name in plain["algorithm"] else Config
-    got = plain["algorithm"].get(name, plain.get(name))
-    if expected.startswith("Invalid enum value"):
-        return f"{name} expected one of {', '.join(_choices(get_type_hints(record)[name]))}, got {got!r}"
-    return f"{name} {expected.replace('`', '').replace('Expected', 'expected').partition(', got ')[0]}, got {got!r}"
-
-
-def _choices(hint: Any) -> list[str]:
-    """What a Literal allows, or a Literal or None."""
-    found = [_choices(part) if get_args(part) else ["none" if part is type(None) else str(part)] for part in get_args(hint)]
-    return [choice for choices in found for choice in choices]

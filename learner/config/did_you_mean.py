@@ -1,4 +1,4 @@
-"""What a misspelt name was perhaps meant to be. Pure."""
+"""Suggestions for misspelled names. Pure."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Iterable
 
 
-def nearest(name: str, known: Iterable[str], prefix: str = "") -> str:
-    """`; did you mean …?` if something known is close to the name, else nothing. `prefix` is put before the guess."""
-    found = difflib.get_close_matches(name, list(known), n=1)
-    return f"; did you mean {prefix}{found[0]}?" if found else ""
+def did_you_mean(name: str, known: Iterable[str], prefix: str = "") -> str:
+    """`; did you mean NAME?` if a known name is similar, else an empty string. `prefix` is put before the suggestion."""
+    similar = difflib.get_close_matches(name, list(known), n=1)
+    return f"; did you mean {prefix}{similar[0]}?" if similar else ""

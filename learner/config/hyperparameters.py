@@ -204,7 +204,7 @@ HYPERPARAMETERS: dict[str, type[Hyperparameters]] = {
 }
 
 
-def elsewhere(name: str) -> str:
-    """`; … have it` if a setting is one of other algorithms, else nothing."""
+def algorithms_with(name: str) -> str:
+    """`; it is one of ALGORITHMS alone` if these algorithms have a setting of this name, else an empty string."""
     owners = [algo for algo, record in HYPERPARAMETERS.items() if name in record.__struct_fields__]
     return f"; it is one of {', '.join(owners)} alone" if owners else ""

@@ -149,10 +149,10 @@ class RunFolder:
 
     def config(self) -> Config:
         """The configuration of the run."""
-        from learner.config.config import Config
+        from learner.config.layers import config_from_toml
 
         where = self.path / "config.toml"
-        return Config.from_toml(where.read_text(), str(where))
+        return config_from_toml(where.read_text(), str(where))
 
     def write_policy(
         self, spec: PolicySpec, env: EnvSpec, parameters: Floats, buffers: Floats, which: Which = "final"

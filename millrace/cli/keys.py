@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from datetime import UTC, datetime
 
-from learner.config.command_line import parse
-from learner.config.did_you_mean import nearest
+from learner.config.did_you_mean import did_you_mean
+from learner.config.flag_parser import parse_flags
 from millrace.cli.flags import KeysAllowFlags, KeysFlags, KeysNewFlags, KeysRevokeFlags, KeysShowFlags
 from protocol.errors import UsageError
 from protocol.keys.key_folder import KeyFolder, asked_folder
@@ -22,13 +22,13 @@ def keys(argv: list[str]) -> list[str]:
     if command in ("-h", "--help"):
         return [f"  millrace keys {usage:18} {what}" for usage, what in USAGE.items()]
     if command not in COMMANDS:
-        said = f"keys {command}: no such command{nearest(command, COMMANDS)};" if command else "keys: which command?"
+        said = f"keys {command}: no such command{did_you_mean(command, COMMANDS)};" if command else "keys: which command?"
         raise UsageError(f"{said} expected one of {', '.join(COMMANDS)}")
     return COMMANDS[command](rest)
 
 
 def _new(argv: list[str]) -> list[str]:
-    flags = parse(KeysNewFlags, argv, "keys new")
+    flags = parse_flags(KeysNewFlags, argv, "keys new")
     folder = _folder(flags)
     if flags.server:
         token, public = folder.foreign(flags.name, public_key(flags.server, "--server"))
@@ -43,7 +43,7 @@ def _new(argv: list[str]) -> list[str]:
 
 
 def _show(argv: list[str]) -> list[str]:
-    folder = _folder(parse(KeysShowFlags, argv, "keys show"))
+    folder = _folder(parse_flags(KeysShowFlags, argv, "keys show"))
     allowed = folder.allowed()
     lines = [f"key folder: {folder.path}", f"learner: {folder.server().public.hex()}"]
     width = max((len(client.name) for client in allowed.clients), default=0)
@@ -54,14 +54,14 @@ def _show(argv: list[str]) -> list[str]:
 
 
 def _allow(argv: list[str]) -> list[str]:
-    flags = parse(KeysAllowFlags, argv, "keys allow")
+    flags = parse_flags(KeysAllowFlags, argv, "keys allow")
     folder = _folder(flags)
     folder.allow(flags.name, public_key(flags.public, "keys allow"), _now())
     return [f"{flags.name} may connect"]
 
 
 def _revoke(argv: list[str]) -> list[str]:
-    flags = parse(KeysRevokeFlags, argv, "keys revoke")
+    flags = parse_flags(KeysRevokeFlags, argv, "keys revoke")
     _folder(flags).revoke(flags.name, _now())
     return [f"{flags.name} is shut out; learners that run cut it off within a second or two"]
 

@@ -67,9 +67,9 @@ def _dispatch(argv: list[str]) -> int:
         return 0
     name, *rest = argv
     if name not in COMMANDS:
-        from learner.config.did_you_mean import nearest
+        from learner.config.did_you_mean import did_you_mean
 
-        raise UsageError(f"unknown command {name}{nearest(name, COMMANDS) or '; millrace --help lists them'}")
+        raise UsageError(f"unknown command {name}{did_you_mean(name, COMMANDS) or '; millrace --help lists them'}")
     return COMMANDS[name].run(rest)
 
 
@@ -83,9 +83,9 @@ def _overview() -> str:
 
 
 def _train(argv: list[str]) -> int:
-    from learner.config.command_line import configuration
+    from learner.config.command_line import read_config
 
-    config, resume = configuration("train", argv)
+    config, resume = read_config("train", argv)
     from millrace.launch import local
     from millrace.terminal import watching
 
@@ -95,9 +95,9 @@ def _train(argv: list[str]) -> int:
 
 
 def _learner(argv: list[str]) -> int:
-    from learner.config.command_line import configuration
+    from learner.config.command_line import read_config
 
-    config, resume = configuration("learner", argv)
+    config, resume = read_config("learner", argv)
     from learner.run import serve
     from millrace.launch import learner_inference as inference
     from millrace.terminal import watching
@@ -130,11 +130,11 @@ def _worker(argv: list[str]) -> int:
 
 
 def _evaluate(argv: list[str]) -> int:
-    from learner.config.command_line import parse
+    from learner.config.flag_parser import parse_flags
     from learner.evaluate import evaluate, load_policy
     from millrace.cli.flags import EvaluateFlags
 
-    flags = parse(EvaluateFlags, argv, "evaluate")
+    flags = parse_flags(EvaluateFlags, argv, "evaluate")
     episodes = flags.episodes if flags.episodes is not None else 3 if flags.video else 100
     _at_least("episodes", episodes, 1)
     _at_least("seed", flags.seed, 0)
@@ -150,11 +150,11 @@ def _evaluate(argv: list[str]) -> int:
 
 
 def _record(argv: list[str]) -> int:
-    from learner.config.command_line import parse
+    from learner.config.flag_parser import parse_flags
     from learner.recording.record import record
     from millrace.cli.flags import RecordFlags
 
-    flags = parse(RecordFlags, argv, "record")
+    flags = parse_flags(RecordFlags, argv, "record")
     _at_least("steps", flags.steps, 1)
     _at_least("seed", flags.seed, 0)
     print(record(flags.run, flags.out, flags.steps, flags.seed, stochastic=flags.stochastic, npy=flags.npy, best=flags.best))
@@ -164,11 +164,11 @@ def _record(argv: list[str]) -> int:
 
 
 def _report(argv: list[str]) -> int:
-    from learner.config.command_line import parse
+    from learner.config.flag_parser import parse_flags
     from learner.report.page import write_page
     from millrace.cli.flags import ReportFlags
 
-    flags = parse(ReportFlags, argv, "report")
+    flags = parse_flags(ReportFlags, argv, "report")
     if not flags.runs:
         raise UsageError("report: which runs? expected run folders, as in: millrace report runs/*")
     print(write_page(flags.runs, flags.out or flags.runs[0] / "report.html"))
@@ -176,11 +176,11 @@ def _report(argv: list[str]) -> int:
 
 
 def _plot(argv: list[str]) -> int:
-    from learner.config.command_line import parse
+    from learner.config.flag_parser import parse_flags
     from learner.report.learning_curves import plot
     from millrace.cli.flags import PlotFlags
 
-    flags = parse(PlotFlags, argv, "plot")
+    flags = parse_flags(PlotFlags, argv, "plot")
     if not flags.runs:
         raise UsageError("plot: which runs? expected run folders, as in: millrace plot runs/*")
     print(plot(flags.runs, flags.out or flags.runs[0] / "curves.png"))
@@ -190,10 +190,10 @@ def _plot(argv: list[str]) -> int:
 def _presets(argv: list[str]) -> int:
     if argv:
         raise UsageError(f"presets: unexpected argument {argv[0]}")
-    from learner.config.config import named_presets, presets_of_environments
+    from learner.config.presets import algorithms_and_environments, named_presets
 
     print("Taken by themselves, by environment and --algo:\n")
-    for algo, env in presets_of_environments():
+    for algo, env in algorithms_and_environments():
         print(f"  millrace train {env} --algo {algo}")
     print("\nWhole runs by name:\n")
     for name, preset in named_presets().items():
@@ -202,10 +202,10 @@ def _presets(argv: list[str]) -> int:
 
 
 def _status(argv: list[str]) -> int:
-    from learner.config.command_line import parse
+    from learner.config.flag_parser import parse_flags
     from millrace.cli.flags import StatusFlags
 
-    flags = parse(StatusFlags, argv, "status")
+    flags = parse_flags(StatusFlags, argv, "status")
     from millrace.cli.status import observe, observer_name
     from protocol.keys.key_folder import read_token
     from protocol.wire.link import WorkerLink

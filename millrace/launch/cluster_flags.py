@@ -10,7 +10,8 @@ import re
 from collections.abc import Sequence
 from typing import TypeVar
 
-from learner.config.command_line import configuration, parse
+from learner.config.command_line import read_config
+from learner.config.flag_parser import parse_flags
 from millrace.cli.flags import LaunchFlags
 from protocol.errors import UsageError
 
@@ -31,7 +32,7 @@ def read(kind: type[Flags], argv: Sequence[str], command: str, ours: Sequence[st
     if "--" in own:
         at = own.index("--")
         own, rest = own[:at], own[at + 1 :]
-    flags = parse(kind, own, f"launch {command}")
+    flags = parse_flags(kind, own, f"launch {command}")
     if flags.workers < 1:
         raise UsageError(f"workers expected int >= 1, got {flags.workers}")
     if not DNS_LABEL.fullmatch(flags.name):
@@ -39,7 +40,7 @@ def read(kind: type[Flags], argv: Sequence[str], command: str, ours: Sequence[st
     for flag in rest:
         if flag.partition("=")[0].removeprefix("--").replace("_", "-") in ours:
             raise UsageError(f"launch {command}: {flag} is the launcher's to set; leave it out")
-    configuration("learner", learner_flags(flags.env, rest, bind="tcp://0.0.0.0:5555", runs=os.devnull))
+    read_config("learner", learner_flags(flags.env, rest, bind="tcp://0.0.0.0:5555", runs=os.devnull))
     return flags, rest
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import ray
 
-from learner.config.command_line import configuration
+from learner.config.command_line import read_config
 from learner.members.endpoint import keyring_for
 from learner.run import Watch, serve
 from millrace.cli.flags import RayFlags
@@ -31,7 +31,7 @@ def launch(flags: RayFlags, rest: Sequence[str], watch: Watch) -> Path:
             raise UsageError(f"{name} expected int >= 1, got {getattr(flags, name)}")
     with _cluster(flags.address) as host:
         bind = f"tcp://{f'[{host}]' if ':' in host else host}:{flags.port}"
-        config, resume = configuration("learner", learner_flags(flags.env, rest, bind, "runs"))
+        config, resume = read_config("learner", learner_flags(flags.env, rest, bind, "runs"))
         token = _token(keyring_for(config, datetime.now(UTC).replace(microsecond=0)))
         actor = ray.remote(
             num_cpus=flags.processes, max_restarts=-1, max_task_retries=-1, scheduling_strategy="SPREAD"

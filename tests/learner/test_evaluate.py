@@ -11,7 +11,7 @@ import pytest
 from gymnasium import spaces
 
 from learner import evaluate as evaluate_module
-from learner.config.config import resolve
+from learner.config.layers import resolve
 from learner.evaluate import COPIES, evaluate, load_policy
 from learner.run_folder.run_folder import RunFolder
 from protocol.envs.spaces import action_spec, observation_leaves

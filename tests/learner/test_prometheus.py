@@ -20,7 +20,8 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
 import learner.prometheus
-from learner.config.config import Config, resolve
+from learner.config.config import Config
+from learner.config.layers import resolve
 from learner.prometheus import EVERY_S, STAGES, Exposition, exposed
 from learner.rollouts.hub import PULSE_S, Hub
 from learner.run import looking

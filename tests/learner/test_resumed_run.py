@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from learner.algorithms.ppo import PPO
-from learner.config.config import Config, resolve
+from learner.config.config import Config
 from learner.config.hyperparameters import PPOConfig
+from learner.config.layers import resolve
 from learner.journal import Past, recall
 from learner.rollouts.ledger import Ledger
 from learner.run import run_spec

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from learner.config.config import resolve
+from learner.config.layers import resolve
 from learner.run import threads
 from millrace.launch.local_workers import cores_for
 from protocol import cpu_cores as counting

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from learner.config.config import resolve
+from learner.config.layers import resolve
 from learner.run_folder.run_folder import RunFolder
 from millrace.launch.local import train
 

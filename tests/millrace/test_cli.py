@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 import millrace
-from learner.config.config import Config, resolve
+from learner.config.config import Config
 from learner.config.hyperparameters import HYPERPARAMETERS
+from learner.config.layers import resolve
 from learner.run_folder import checkpoint
 from learner.run_folder.metrics import MetricsLog, Progress
 from learner.run_folder.run_folder import Interrupted, RunFolder

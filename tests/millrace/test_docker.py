@@ -16,7 +16,7 @@ import pytest
 import yaml
 from prometheus_client.samples import Sample
 
-from learner.config.command_line import configuration
+from learner.config.command_line import read_config
 from learner.config.config import Config
 from learner.prometheus import Exposition, Snapshot
 from learner.rollouts.ledger import Ledger
@@ -110,7 +110,7 @@ def compose() -> dict[str, Any]:
 
 def test_the_learner_is_started_with_flags_that_it_knows(compose: dict[str, Any], tmp_path: Path) -> None:
     command, *flags = shlex.split(compose["services"]["learner"]["command"])
-    config, resume = configuration(command, [*flags, "--run-dir", str(tmp_path)])
+    config, resume = read_config(command, [*flags, "--run-dir", str(tmp_path)])
     assert (command, config.env, resume) == ("learner", "CartPole-v1", None)
     assert "--resume auto" in " ".join(flags)
 

@@ -15,7 +15,7 @@ import kubernetes_validate
 import pytest
 import yaml
 
-from learner.config.command_line import configuration
+from learner.config.command_line import read_config
 from millrace.cli.main import main
 
 ROOT = Path(__file__).parents[2]
@@ -89,7 +89,7 @@ def test_the_checker_sees_a_wrong_name(cluster: dict[str, dict[str, Any]]) -> No
 
 def test_the_learners_command_is_one_that_it_knows(cluster: dict[str, dict[str, Any]]) -> None:
     command, *flags = container(cluster["Job"])["args"]
-    config, resume = configuration(command, flags)
+    config, resume = read_config(command, flags)
     assert (command, config.env, config.steps, config.run_dir, resume) == ("learner", "CartPole-v1", 1000, "/runs", None)
     assert config.advertise == cluster["Service"]["metadata"]["name"]
 
@@ -189,6 +189,6 @@ def test_what_is_odd_in_a_flag_reaches_the_learner_as_it_is(capsys: pytest.Captu
         ["bash", "-c", f"port=5; folder=f; printf '%s\\0' learner {line}"], capture_output=True, timeout=10, check=True
     ).stdout
     command, *argv = said.decode().split("\0")[:-1]
-    config, _ = configuration(command, [*argv, "--run-dir", str(tmp_path)])
+    config, _ = read_config(command, [*argv, "--run-dir", str(tmp_path)])
     assert (config.env, config.seed, config.env_kwargs) == ("CartPole-v1", 7, {"render_mode": odd})
     assert (config.bind, config.keys) == ("tcp://0.0.0.0:5", "f/keys")

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from gymnasium.vector import SyncVectorEnv
 
-from learner.config.config import resolve
+from learner.config.layers import resolve
 from millrace.launch.local import train
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.policy.policy import Policy, buffer_size, layout, make_policy, size

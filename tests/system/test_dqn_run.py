@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from learner.config.config import resolve
+from learner.config.layers import resolve
 from learner.run_folder.metrics import read_rows
 from millrace.launch.local import train
 from protocol.errors import UsageError

@@ -17,7 +17,7 @@ import psutil
 import pytest
 
 import millrace
-from learner.config.config import resolve
+from learner.config.layers import resolve
 from learner.run_folder.metrics import Progress, read_rows
 from millrace.launch.local import train
 from protocol.errors import EnvironmentFailed, NoWorkers, UsageError

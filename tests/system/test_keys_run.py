@@ -15,7 +15,7 @@ from gymnasium import spaces
 from gymnasium.wrappers import FrameStackObservation, TransformObservation
 
 import millrace
-from learner.config.config import resolve
+from learner.config.layers import resolve
 from millrace.launch.local import train
 from protocol.wire import compression as packing
 from tests.system.processes import START_S, Learner, Stage, crowding

@@ -18,7 +18,7 @@ import psutil
 import pytest
 
 import millrace
-from learner.config.config import Config, resolve
+from learner.config.layers import config_from_toml, resolve
 from learner.evaluate import load_policy
 from learner.run_folder.metrics import Progress, read_rows
 from millrace.launch.local import train
@@ -73,7 +73,7 @@ def test_compressed_rollouts_change_nothing_but_their_bytes(tmp_path: Path) -> N
     settings: dict[str, Any] = {"steps": 2_000, "rollout_steps": 64, "seed": 3, "eval_episodes": 1}
     plain, compressed = (run(tmp_path, "CartPole-v1", compress=compress, **settings) for compress in ("none", "zstd"))
     assert (plain / "policy.safetensors").read_bytes() == (compressed / "policy.safetensors").read_bytes()
-    assert Config.from_toml((compressed / "config.toml").read_text()).compress == "zstd"
+    assert config_from_toml((compressed / "config.toml").read_text()).compress == "zstd"
 
 
 def test_a_learner_that_cannot_decompress_does_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -365,7 +365,7 @@ def test_a_learner_that_was_killed_goes_on_from_its_newest_checkpoint(tmp_path: 
     def watch(progress: Progress) -> None:
         first.append(progress)
 
-    config = Config.from_toml((folder / "config.toml").read_text())
+    config = config_from_toml((folder / "config.toml").read_text())
     train(config, folder, watch)
     assert saved < first[0].env_steps <= saved + 256, "it did not go on from the newest checkpoint"
     assert first[0].wall_s > 0.5, "the clock began again"

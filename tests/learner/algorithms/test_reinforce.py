@@ -12,8 +12,8 @@ import torch
 
 from learner.algorithms.actor_critic import Minibatch
 from learner.algorithms.reinforce import REINFORCE
-from learner.config.config import resolve
 from learner.config.hyperparameters import REINFORCEConfig
+from learner.config.layers import resolve
 from learner.run import run_spec
 from protocol.errors import UsageError
 from protocol.rollout import Batch

@@ -8,8 +8,10 @@ import msgspec
 import pytest
 
 from learner.algorithms import ALGORITHMS, algorithm_class
-from learner.config.config import PRESETS, Config, lower_layers, named_presets, resolve
+from learner.config.config import Config
 from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
+from learner.config.layers import config_from_toml, lower_layers, resolve
+from learner.config.presets import PRESETS, named_presets
 from protocol.errors import UsageError
 
 
@@ -70,13 +72,13 @@ def test_a_file_repeats_the_run_to_the_letter(tmp_path: Path, env: str) -> None:
         normalize_observations=True,
         seed=11,
     )
-    assert Config.from_toml(config.to_toml()) == config
+    assert config_from_toml(config.to_toml()) == config
     assert resolve(file=written(tmp_path, config.to_toml())) == config
 
 
 def test_what_was_unset_over_a_preset_stays_unset(tmp_path: Path) -> None:
     text = resolve("CartPole-v1", target_return=475.0).to_toml()
-    assert Config.from_toml(text).target_return == 475.0
+    assert config_from_toml(text).target_return == 475.0
     assert resolve(file=written(tmp_path, text), target_return=None).target_return is None
     assert resolve(file=written(tmp_path, text.replace("475.0", '"none"'))).target_return is None
 

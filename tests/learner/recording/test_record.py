@@ -13,7 +13,7 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
-from learner.config.config import resolve
+from learner.config.layers import resolve
 from learner.evaluate import load_policy
 from learner.recording import minari as dataset_module
 from learner.recording.episodes import EpisodeAssembler, RecordedEpisode

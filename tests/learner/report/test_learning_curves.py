@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from learner.config.config import resolve
+from learner.config.layers import resolve
 from learner.report.learning_curves import Curve, common_grid, plot, read_curve
 from learner.run_folder.metrics import MetricsLog, Progress
 from learner.run_folder.run_folder import RunFolder

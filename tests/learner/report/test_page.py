@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from learner.config.config import resolve
+from learner.config.layers import resolve
 from learner.report import sections
 from learner.report.charts import MINUS, Trace, chart, engineering, ticks
 from learner.report.html_parts import time_text

@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 import millrace
-from learner.config.command_line import configuration
-from learner.config.config import Config, resolve
+from learner.config.command_line import read_config
+from learner.config.config import Config
+from learner.config.layers import resolve
 from learner.run_folder.resume import newest_run
 from learner.run_folder.run_folder import RunFolder
 from millrace.launch import local
@@ -51,21 +52,21 @@ def test_the_first_time_it_starts_and_then_it_goes_on_with_the_runs_own_settings
     file = tmp_path / "my.toml"
     file.write_text("[ppo]\ngamma = 0.5\n")
     flags = ["CartPole-v1", "--run-dir", str(tmp_path / "runs"), "--resume", "auto", "--config", str(file), "--steps", "9"]
-    config, resume = configuration("learner", flags)
+    config, resume = read_config("learner", flags)
     assert (config.algorithm.gamma, config.steps, resume) == (0.5, 9, None)
     run = a_run(config, HOURS)
     file.write_text("[ppo]\ngamma = 0.7\n")  # the run has its own settings now
-    assert configuration("learner", flags) == (config, run)
-    again, _ = configuration("learner", [*flags, "--steps", "20"])
+    assert read_config("learner", flags) == (config, run)
+    again, _ = read_config("learner", [*flags, "--steps", "20"])
     assert (again.algorithm.gamma, again.steps) == (0.5, 20)
 
 
 def test_a_run_by_name_is_found_again(tmp_path: Path) -> None:
     flags = ["--preset", "cartpole-dqn", "--run-dir", str(tmp_path), "--resume", "auto"]
-    config, resume = configuration("train", flags)
+    config, resume = read_config("train", flags)
     assert (config.algo, resume) == ("dqn", None)
     run = a_run(config, HOURS)
-    assert configuration("train", flags) == (config, run)
+    assert read_config("train", flags) == (config, run)
 
 
 def test_in_python_it_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from learner.config.config import Config, resolve
+from learner.config.config import Config
+from learner.config.layers import resolve
 from learner.run_folder.metrics import EVENTS_EVERY_S, EpisodeWindow, Evaluation, MetricsLog, Progress, read_rows
 from learner.run_folder.run_folder import RunFolder, Summary, sanitised
 from protocol.envs.spaces import action_spec, observation_leaves

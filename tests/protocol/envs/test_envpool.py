@@ -14,7 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from learner.config.config import Config, resolve
+from learner.config.config import Config
+from learner.config.layers import resolve
 from learner.run import run_spec
 from protocol.envs.envpool import pool_of
 from protocol.errors import UsageError

@@ -12,7 +12,8 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from learner.config.config import Config, resolve
+from learner.config.config import Config
+from learner.config.layers import resolve
 from learner.run import run_spec
 from protocol.envs.vectorized import make_native
 from protocol.errors import UsageError

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from learner.algorithms import algorithm_class
-from learner.config.config import resolve
 from learner.config.hyperparameters import HYPERPARAMETERS
+from learner.config.layers import resolve
 from learner.evaluate import load_policy
 from learner.run import run_spec
 from learner.run_folder.run_folder import RunFolder

@@ -1,0 +1,142 @@
+"""The layers that a run's settings come from, and how one overrides another. Pure but for reading TOML files.
+
+From the weakest to the strongest: the defaults of `Config`, the preset of (algorithm, environment), a TOML file, flags or
+keyword arguments. A setting has one name everywhere: the field `learning_rate` is the TOML key `learning_rate` and the flag
+`--learning-rate`. The settings of the algorithm stand in a TOML table named after it, as [ppo].
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from learner.config.config import Config
+from learner.config.did_you_mean import did_you_mean
+from learner.config.hyperparameters import HYPERPARAMETERS, algorithms_with
+from learner.config.presets import PRESETS, environment_presets, named_presets
+from learner.config.validation import convert, validate
+from protocol.errors import UsageError
+
+
+def resolve(
+    env: str = "", *, file: Path | None = None, resume: Path | None = None, preset: str = "auto", **keywords: Any
+) -> Config:
+    """The settings of a run from all layers, validated. Raises `UsageError` in one line.
+
+    `file`: a TOML file of settings. `resume`: a run folder; its config.toml takes the place of file and preset.
+    `preset`: "auto" (that of the environment, if there is one), "none", the environment whose preset to take, or a whole run
+    by name.
+    """
+    below = lower_layers(env, algo=keywords.get("algo"), file=file, resume=resume, preset=preset)
+    return validate(override(below, keywords, "keyword argument"))
+
+
+def config_from_toml(text: str, where: str = "config.toml") -> Config:
+    """The settings that `Config.to_toml` wrote, over the defaults (no preset). Raises `UsageError` that names `where`."""
+    return validate(_override_from_toml(Config(), _parse_toml(text, where), where), where)
+
+
+def lower_layers(
+    env: str,
+    *,
+    algo: str | None = None,
+    file: Path | None = None,
+    resume: Path | None = None,
+    preset: str = "auto",
+) -> Config:
+    """The layers below flags and keyword arguments: defaults, preset and file. Only the types are checked yet."""
+    if resume is not None:
+        if file is not None:
+            raise UsageError(f"a config file ({file}) or a run to resume ({resume}): expected one, got both")
+        file, preset = resume / "config.toml", "none"
+        if not file.is_file():
+            raise UsageError(f"run {resume}: expected a run folder with a config.toml to resume, got none")
+    where = str(file)
+    table = {} if file is None else _read_toml(file)
+    if resume is not None and env not in ("", table.get("env")):
+        raise UsageError(f"run {resume} is of {table.get('env')}, not of {env}; resume it without naming an environment")
+    named = named_presets()
+    whole_run = named[preset].settings if preset in named else {}
+    env = env or str(table.get("env", whole_run.get("env", "")))
+    config = _defaults_of(algo or str(table.get("algo", whole_run.get("algo", "ppo"))))
+    if preset != "none":
+        by_env = environment_presets(config.algo)
+        name = env if preset == "auto" or preset in named else preset
+        if name not in by_env and name == preset:
+            hint = did_you_mean(name, [*by_env, *named]) or "; millrace presets lists them"
+            raise UsageError(f"preset {name}: {config.algo} has none of this name{hint}")
+        config = override(config, by_env.get(name, {}), str(PRESETS))
+        config = override(config, {**whole_run, "algo": config.algo}, str(PRESETS))
+    config = _override_from_toml(config, {**table, "algo": config.algo}, where)
+    return override(config, {"env": env}, "ENV")
+
+
+def override(config: Config, values: Mapping[str, Any], where: str) -> Config:
+    """The configuration with these values instead of its own. Types are checked.
+
+    `values` has settings of the run and of the algorithm side by side. `env_kwargs` are merged with those that are there.
+    """
+    config = _defaults_of(values["algo"]) if values.get("algo", config.algo) != config.algo else config
+    settings: dict[str, Any] = msgspec.to_builtins(config)
+    algorithm: dict[str, Any] = settings["algorithm"]
+    for name, value in values.items():
+        if name in algorithm:
+            algorithm[name] = _coerce(config.algorithm, name, value)
+        elif name == "env_kwargs" and isinstance(value, Mapping):
+            settings[name] |= value
+        elif name in settings and name != "algorithm":
+            settings[name] = _coerce(config, name, value)
+        else:
+            hint = algorithms_with(name) or did_you_mean(name, [*settings, *algorithm])
+            raise UsageError(f"{where}: unknown setting {name}{hint}")
+    return convert(settings, where)
+
+
+def _defaults_of(algo: str) -> Config:
+    if algo not in HYPERPARAMETERS:
+        names = ", ".join(HYPERPARAMETERS)
+        raise UsageError(f"algo {algo}: expected one of {names}{did_you_mean(algo, HYPERPARAMETERS)}")
+    return Config(algo=algo, algorithm=HYPERPARAMETERS[algo]())
+
+
+def _coerce(record: msgspec.Struct, name: str, value: Any) -> Any:
+    """1e5 becomes an integer where the field is one, and "none" becomes None where the default is None."""
+    default = getattr(type(record)(), name)
+    if value == "none" and default is None:
+        return None
+    if isinstance(value, float) and type(default) is int and value.is_integer():
+        return int(value)
+    return value
+
+
+def _read_toml(file: Path) -> dict[str, Any]:
+    try:
+        return _parse_toml(file.read_text(), str(file))
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "it is not text"
+        raise UsageError(f"config file {file} cannot be read: {why}") from error
+
+
+def _parse_toml(text: str, where: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise UsageError(f"{where} is not TOML: {error}") from error
+
+
+def _override_from_toml(config: Config, table: dict[str, Any], where: str) -> Config:
+    """Tables of other algorithms are ignored, so that one file can hold the settings of several."""
+    algo = str(table.get("algo", config.algo))
+    of_run = {name: value for name, value in table.items() if name not in HYPERPARAMETERS}
+    of_algorithm = table.get(algo, {})
+    if not isinstance(of_algorithm, dict):
+        raise UsageError(f"{where}: {algo} expected a table, [{algo}], got {of_algorithm}")
+    if misplaced := of_run.keys() & set(msgspec.structs.asdict(config.algorithm)):
+        raise UsageError(f"{where}: {min(misplaced)} is a setting of the algorithm; put it in the table [{algo}]")
+    if misplaced := of_algorithm.keys() & set(msgspec.structs.asdict(config)):
+        raise UsageError(f"{where}: {min(misplaced)} is a setting of the run; put it above the table [{algo}]")
+    return override(config, of_run | of_algorithm, where)

@@ -1,0 +1,87 @@
+"""Checks of a configuration. Each error is one line that names the setting, what was expected and what was given. Pure."""
+
+from __future__ import annotations
+
+import re
+from typing import Any, get_args, get_type_hints
+
+import msgspec
+
+from learner.config.config import Config
+from learner.config.hyperparameters import HYPERPARAMETERS
+from protocol.address import advertised, check_address
+from protocol.errors import UsageError
+
+
+def convert(settings: dict[str, Any], where: str) -> Config:
+    """The record of these settings (plain data), each checked by itself.
+
+    Raises `UsageError` that names the setting, what was expected and what was given. `where` says in which file it stands.
+    """
+    try:
+        kind: type[msgspec.Struct] = HYPERPARAMETERS[settings["algo"]]
+        algorithm = msgspec.convert(settings["algorithm"], kind)
+        config = msgspec.convert({**settings, "algorithm": {}}, Config)
+        return msgspec.structs.replace(config, algorithm=algorithm)
+    except msgspec.ValidationError as error:
+        raise UsageError(f"{where}: {_reworded(str(error), settings)}".removeprefix(": ")) from error
+
+
+def validate(config: Config, where: str = "") -> Config:
+    """The same configuration, if a run can be made of it. Raises `UsageError` that says what is wrong."""
+    at = f"{where}: " if where else ""
+    config = convert(msgspec.to_builtins(config), where)
+    if not config.env:
+        raise UsageError(f"{at}which environment? expected one that gymnasium.make takes, as in: millrace train CartPole-v1")
+    if config.envs % config.lanes:
+        fewer = config.envs - config.envs % config.lanes
+        near = f"{fewer} or {fewer + config.lanes}" if fewer else f"{config.lanes}"
+        divisor = max(n for n in range(1, min(config.lanes, config.envs) + 1) if config.envs % n == 0)
+        raise UsageError(
+            f"{at}{config.envs} envs cannot be shared evenly among {config.lanes} lanes; take {near}, or {divisor} lanes"
+        )
+    if config.inference == "learner":
+        _check_learner_inference(config, at)
+    check_address(config.bind)
+    if config.metrics_bind:
+        try:
+            check_address(f"tcp://{config.metrics_bind}")
+        except UsageError:
+            expected = "expected HOST:PORT, as in 127.0.0.1:9464"
+            raise UsageError(f"{at}metrics_bind {config.metrics_bind}: {expected}") from None
+    try:
+        check_address(advertised("tcp://*:1", config.advertise, "machine"))
+    except UsageError:
+        raise UsageError(
+            f"{at}advertise {config.advertise}: expected a host name or an IP address, without a port"
+        ) from None
+    return config
+
+
+def _check_learner_inference(config: Config, at: str) -> None:
+    if config.compress != "none":
+        wrong = f"compress expected none, got {config.compress}; rollouts are made beside the learner"
+    elif config.max_lag:
+        wrong = f"max_lag expected 0, got {config.max_lag}; the policy acts under the newest weights"
+    elif config.vector not in {"auto", "loop"}:
+        wrong = f"vector expected auto or loop, got {config.vector}; its workers step copies one by one"
+    else:
+        return
+    raise UsageError(f"{at}inference learner: {wrong}")
+
+
+def _reworded(message: str, settings: dict[str, Any]) -> str:
+    """Msgspec's message in our words: the setting, what was expected and what was given."""
+    expected, _, path = message.replace(" | null", ' or "none"').replace("`object`", "table").partition(" - at `$.")
+    name = re.split(r"[.\[`]", path)[0]
+    record = HYPERPARAMETERS[settings["algo"]] if name in settings["algorithm"] else Config
+    given = settings["algorithm"].get(name, settings.get(name))
+    if expected.startswith("Invalid enum value"):
+        return f"{name} expected one of {', '.join(_choices(get_type_hints(record)[name]))}, got {given!r}"
+    return f"{name} {expected.replace('`', '').replace('Expected', 'expected').partition(', got ')[0]}, got {given!r}"
+
+
+def _choices(hint: Any) -> list[str]:
+    """The values that a type allows: a Literal, or a Literal or None."""
+    parts = [_choices(part) if get_args(part) else ["none" if part is type(None) else str(part)] for part in get_args(hint)]
+    return [choice for choices in parts for choice in choices]
