@@ -24,7 +24,7 @@ from rich.table import Table
 
 from benchmarks.writing import write
 from learner.config.layers import resolve
-from learner.run_folder.metrics import Progress
+from learner.run_folder.progress import Progress
 from millrace.launch.local import train
 
 WARM_UP = 2  # updates that do not count: copies are opened, torch is imported

@@ -25,7 +25,7 @@ from rich.table import Table
 import millrace
 from benchmarks.writing import RESULTS, write
 from learner.report.learning_curves import COLOURS, DPI, GREY, Curve, common_grid, read_curve
-from learner.run_folder.metrics import read_rows
+from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.run_folder import RunFolder
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks.peers import install
-from learner.run_folder.metrics import read_rows
+from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.run_folder import RunFolder
 
 ROOT = Path(__file__).parents[1]

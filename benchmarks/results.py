@@ -18,8 +18,8 @@ import msgspec
 from learner.config.config import Config
 from learner.config.layers import resolve
 from learner.evaluate import evaluate, load_policy
-from learner.run_folder.metrics import Evaluation
-from learner.run_folder.run_folder import RunFolder, Summary, Which
+from learner.run_folder.results import Evaluation, Summary
+from learner.run_folder.run_folder import RunFolder, Which
 
 OUT = Path(__file__).parents[1] / "docs" / "results.md"
 EPISODES = 100

@@ -13,7 +13,7 @@ import time
 
 from learner.config.command_line import read_config
 from learner.run_folder.json_log import JsonLines
-from learner.run_folder.metrics import Progress
+from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import Interrupted
 from protocol.errors import OurError
 

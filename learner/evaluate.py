@@ -14,7 +14,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from learner.run_folder.metrics import Evaluation
+from learner.run_folder.results import Evaluation
 from learner.run_folder.run_folder import RunFolder, Which
 from protocol.envs.spaces import observation_leaves, reader, writer
 from protocol.errors import EnvironmentFailed, first_line

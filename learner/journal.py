@@ -20,8 +20,11 @@ from learner.recording.record import TrainingRecorder
 from learner.rollouts.hub import Hub
 from learner.rollouts.ledger import Ledger
 from learner.run_folder import checkpoint
-from learner.run_folder.metrics import EpisodeWindow, Evaluation, MetricsLog, Progress
-from learner.run_folder.run_folder import Best, RunFolder, Summary
+from learner.run_folder.episode_window import EpisodeWindow
+from learner.run_folder.metrics_log import MetricsLog
+from learner.run_folder.progress import Progress
+from learner.run_folder.results import Best, Evaluation, Summary
+from learner.run_folder.run_folder import RunFolder
 from learner.run_folder.versions import versions
 from protocol.arrays import Floats
 from protocol.errors import CheckpointError, RunError, UsageError
@@ -87,7 +90,7 @@ class Journal:
         self.stages = {"update": 0.0, "other": 0.0}
         self.workers_expected = 0
         """how many workers there should be; 0: any number"""
-        self._window = EpisodeWindow.of_state(past.episodes)
+        self._window = EpisodeWindow.from_state(past.episodes)
         self._metrics = MetricsLog(folder.path, past.env_steps)
         self._watch = watch
         self._wall_before_s, self._steps_before = past.wall_s, past.env_steps

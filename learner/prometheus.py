@@ -31,7 +31,7 @@ from learner.config.config import Config
 from learner.members.membership import Member
 from learner.members.states import Standing
 from learner.rollouts.hub import Hub, Look
-from learner.run_folder.metrics import Progress
+from learner.run_folder.progress import Progress
 from learner.run_folder.versions import versions
 from protocol.address import WILDCARDS, is_local
 from protocol.errors import UsageError

@@ -22,7 +22,7 @@ from learner.config.config import Config
 from learner.members.endpoint import join_lines, keyring_for
 from learner.rollouts.hub import Hub, Look
 from learner.rollouts.roster import Roster
-from learner.run_folder.metrics import Progress
+from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import Interrupted, RunFolder
 from protocol.cpu_cores import cores
 from protocol.envs.envpool import check_pool

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 if TYPE_CHECKING:
     from gymnasium.vector import AutoresetMode
 
-    from learner.run_folder.metrics import Progress
+    from learner.run_folder.progress import Progress
     from learner.vector_env.env import ZmqVectorEnv
     from learner.vector_env.spec import Env
 

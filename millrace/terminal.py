@@ -21,7 +21,7 @@ from rich.table import Table
 from rich.text import Text
 
 from learner.run_folder.json_log import JsonLines, progress_line
-from learner.run_folder.metrics import Progress
+from learner.run_folder.progress import Progress
 
 REDRAW_EVERY_S = 0.2
 LINE_EVERY_S = 5.0

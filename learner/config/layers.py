@@ -19,6 +19,7 @@ from learner.config.did_you_mean import did_you_mean
 from learner.config.hyperparameters import HYPERPARAMETERS, algorithms_with
 from learner.config.presets import PRESETS, environment_presets, named_presets
 from learner.config.validation import convert, validate
+from learner.run_folder.run_format import check_format
 from protocol.errors import UsageError
 
 
@@ -55,6 +56,7 @@ def lower_layers(
         file, preset = resume / "config.toml", "none"
         if not file.is_file():
             raise UsageError(f"run {resume}: expected a run folder with a config.toml to resume, got none")
+        check_format(resume)
     where = str(file)
     table = {} if file is None else _read_toml(file)
     if resume is not None and env not in ("", table.get("env")):

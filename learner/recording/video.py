@@ -18,7 +18,7 @@ import gymnasium
 import numpy as np
 
 from learner.recording.record import Player
-from learner.run_folder.metrics import Evaluation
+from learner.run_folder.results import Evaluation
 from protocol.errors import EnvironmentFailed, RunError, UsageError
 from protocol.policy.policy import Policy
 from protocol.specs import EnvSpec, PolicySpec

@@ -16,14 +16,16 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from learner.run_folder.atomic_write import write_atomically
-from learner.run_folder.metrics import WINDOW, X, read_rows
+from learner.run_folder.episode_window import WINDOW_EPISODES
+from learner.run_folder.metrics_log import read_rows
+from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
+from learner.run_folder.run_format import check_format
 from protocol.arrays import Doubles
 from protocol.errors import RunError, UsageError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Y = "rollout/ep_rew_mean"
 POINTS = 400
 PANEL_INCHES = (6.4, 4.2)
 COLUMNS = 3
@@ -52,6 +54,7 @@ class Curve(NamedTuple):
 
 def read_curve(run: Path) -> Curve:
     """The learning curve of a run folder. Raises `UsageError` in one line."""
+    check_format(run)
     try:
         config = tomllib.loads((run / "config.toml").read_text())
         rows = read_rows(run / "metrics.jsonl")
@@ -61,7 +64,7 @@ def read_curve(run: Path) -> Curve:
         raise UsageError(f"run {run}: expected a run folder to plot, got {what}") from error
     except (OSError, ValueError, KeyError) as error:
         raise UsageError(f"run {run} cannot be plotted: {error}") from error
-    points = [(row[X], row[Y]) for row in rows if row.get(Y) is not None]
+    points = [(row[ENV_STEPS_KEY], row[RETURN_KEY]) for row in rows if row.get(RETURN_KEY) is not None]
     if not points:
         raise UsageError(f"run {run}: nothing to plot, no episode has ended yet")
     env_steps, returns = np.asarray(points, np.float64).T
@@ -123,7 +126,7 @@ def _dress(panel: Axes, env: str) -> None:
 
     panel.set_title(env, fontsize=12, fontweight="bold", loc="left")
     panel.set_xlabel("env steps", fontsize=10, color=GREY)
-    panel.set_ylabel(f"return, mean of the last {WINDOW} episodes", fontsize=10, color=GREY)
+    panel.set_ylabel(f"return, mean of the last {WINDOW_EPISODES} episodes", fontsize=10, color=GREY)
     panel.xaxis.set_major_formatter(EngFormatter(sep=""))
     panel.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
     panel.set_xlim(left=0)

@@ -16,9 +16,12 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from learner.report.learning_curves import Curve, Y
-from learner.run_folder.metrics import Evaluation, X, read_rows
+from learner.report.learning_curves import Curve
+from learner.run_folder.metrics_log import read_rows
+from learner.run_folder.progress import ENV_STEPS_KEY, EVALUATION_KEY, RETURN_KEY
+from learner.run_folder.results import Evaluation
 from learner.run_folder.run_folder import RunFolder
+from learner.run_folder.run_format import check_format
 from protocol.arrays import Doubles
 from protocol.errors import UsageError
 
@@ -108,6 +111,7 @@ class Told:
 
 def read_run(path: Path) -> Run:
     """A run folder. Raises `UsageError` in one line."""
+    check_format(path)
     try:
         config = tomllib.loads((path / "config.toml").read_text())
         env, algo, seed = str(config["env"]), str(config["algo"]), int(config["seed"])
@@ -117,8 +121,8 @@ def read_run(path: Path) -> Run:
         raise UsageError(f"run {path}: expected a run folder to report on, got {what}") from error
     except (OSError, ValueError, KeyError, TypeError, msgspec.MsgspecError) as error:
         raise UsageError(f"run {path} cannot be reported on: {error}") from error
-    points = [(row[X], row[Y]) for row in rows if row.get(Y) is not None]
-    greedy = [(row[X], row["eval/mean_reward"]) for row in rows if row.get("eval/mean_reward") is not None]
+    points = [(row[ENV_STEPS_KEY], row[RETURN_KEY]) for row in rows if row.get(RETURN_KEY) is not None]
+    greedy = [(row[ENV_STEPS_KEY], row[EVALUATION_KEY]) for row in rows if row.get(EVALUATION_KEY) is not None]
     return Run(
         path=path,
         env=env,
@@ -190,13 +194,13 @@ def _numbers(path: Path, rows: Sequence[dict[str, Any]]) -> Numbers:
             summary.evaluation, summary.stop_reason, summary.ledger, summary.stages,
         )  # fmt: skip
     last = rows[-1] if rows else {}
-    env_steps, wall_s = int(last.get(X) or 0), float(last.get("time/time_elapsed") or 0)
+    env_steps, wall_s = int(last.get(ENV_STEPS_KEY) or 0), float(last.get("time/time_elapsed") or 0)
     return Numbers(
         env_steps=env_steps,
         updates=int(last.get("time/iterations") or 0),
         wall_s=wall_s,
         env_steps_per_s=env_steps / wall_s if wall_s else 0.0,
-        return_mean_100=last.get(Y),
+        return_mean_100=last.get(RETURN_KEY),
         evaluation=None,
         ended="not finished",
         ledger={name.removeprefix("ledger/"): int(last[name]) for name in last if name.startswith("ledger/")},

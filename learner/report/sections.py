@@ -12,7 +12,7 @@ from learner.report.charts import Trace, chart
 from learner.report.html_parts import dot, return_text, section, time_text
 from learner.report.learning_curves import common_grid
 from learner.report.runs import Line, Told, differing
-from learner.run_folder.metrics import WINDOW
+from learner.run_folder.episode_window import WINDOW_EPISODES
 
 WIDE, NARROW = (1080, 360), (540, 320)
 FILM_BYTES, ALL_FILMS_BYTES = 4 * 2**20, 24 * 2**20
@@ -37,7 +37,16 @@ def head(told: Told) -> str:
 
 def headlines(told: Told) -> str:
     """A row for each run, under the line it belongs to."""
-    columns = ("Run", "Greedy return", f"Last {WINDOW} episodes", "Env steps", "Steps/s", "Wall time", "Versions", "Ended")
+    columns = (
+        "Run",
+        "Greedy return",
+        f"Last {WINDOW_EPISODES} episodes",
+        "Env steps",
+        "Steps/s",
+        "Wall time",
+        "Versions",
+        "Ended",
+    )
     heads = "".join(f'<th scope="col" class="{_side(name)}">{escape(name)}</th>' for name in columns)
     bodies = "".join(_line_of_runs(line) for line in told.lines)
     table = f'<table class="runs"><thead><tr>{heads}</tr></thead>{bodies}</table>'
@@ -85,7 +94,7 @@ def curves(told: Told) -> str:
             legend += '<li><i class="ring"></i>greedy evaluations</li>'
         drawn = chart(traces, *size, "env steps", f"Learning curves of {env}") if traces else ""
         panels.append(f'<figure><h3>{escape(env)}</h3><ul class="legend">{legend}</ul>{drawn}</figure>')
-    about = f"Return, mean of the last {WINDOW} training episodes."
+    about = f"Return, mean of the last {WINDOW_EPISODES} training episodes."
     if any(len(line.curves) > 1 for line in told.lines):
         about += " Bold: the mean over seeds. Band: from the worst to the best. Thin: each seed."
     return section("Learning curves", about, f'<div class="panels n{min(len(told.envs), 2)}">{"".join(panels)}</div>')

@@ -16,7 +16,7 @@ from learner.members.peer_log import Doorkeeper, Lid
 from learner.rollouts.roster import Roster
 from learner.rollouts.status import status
 from learner.rollouts.weight_age import Freshness
-from learner.run_folder.metrics import Progress
+from learner.run_folder.progress import Progress
 from protocol.address import name_of
 from protocol.errors import BadMessage, BadRollout, EnvironmentFailed, NoWorkers, Stalled
 from protocol.messages import Array, Inquire, Rollout, ToWorker, Weights

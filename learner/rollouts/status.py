@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from learner.members.membership import Member
 from learner.rollouts.roster import CollectingMember, Roster
-from learner.run_folder.metrics import Progress
+from learner.run_folder.progress import Progress
 from learner.vector_env.step_roster import Lockstep
 from protocol.messages import Status, WorkerStatus
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import msgspec
 
-from learner.run_folder.metrics import Progress
+from learner.run_folder.progress import Progress
 
 
 class JsonLines(logging.Formatter):

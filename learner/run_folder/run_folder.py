@@ -2,9 +2,10 @@
 
     runs/<env>-<algo>-s<seed>-<time>/
       config.toml           the resolved configuration
-      metrics.jsonl         a row per update                       } learner.metrics
+      run.json              the format of the folder (run_format.py)
+      metrics.jsonl         a row per update                       } metrics_log.py
       tensorboard/                                                 }
-      checkpoints/          learner.checkpoint
+      checkpoints/          checkpoint.py
       policy.safetensors    the arrays that act, by name           } all that another program needs to act,
       best.safetensors      those of the best evaluation           }
       policy.json           what they mean                         } the same bytes for the same policy
@@ -25,7 +26,8 @@ import msgspec
 import numpy as np
 
 from learner.run_folder.atomic_write import write_atomically
-from learner.run_folder.metrics import Evaluation
+from learner.run_folder.results import Summary
+from learner.run_folder.run_format import RUN_FILE, check_format, write_format
 from protocol.arrays import Floats
 from protocol.errors import RunError, UsageError
 from protocol.policy.policy import Field, buffer_fields, layout, size, views
@@ -46,44 +48,6 @@ class Interrupted(KeyboardInterrupt):
     def __init__(self, run: Path) -> None:
         super().__init__(str(run))
         self.run = run
-
-
-class Best(msgspec.Struct, frozen=True, kw_only=True):
-    """The policy that did best in the run's own evaluations."""
-
-    env_steps: int
-    """when that was"""
-    chosen_by: float
-    """the mean return it was chosen by: the highest of several, so it flatters"""
-    evaluation: Evaluation
-    """of the same policy, once more and on other episodes"""
-
-
-class Summary(msgspec.Struct, frozen=True, kw_only=True):
-    """How a run went: summary.json."""
-
-    env: str
-    algo: str
-    seed: int
-    env_steps: int
-    updates: int
-    wall_s: float
-    env_steps_per_s: float
-    stop_reason: str
-    return_mean_100: float | None
-    """mean return of the last 100 training episodes"""
-    evaluation: Evaluation | None
-    """of the final policy"""
-    best: Best | None = None
-    """of the policy that did best in the run's own evaluations, if it made any"""
-    ledger: dict[str, int] = {}
-    lags: dict[str, int] = {}
-    """rollouts that updates used, by their lag, since this learner started"""
-    first_use_s: dict[str, float] = {}
-    """of each worker: median seconds from publishing new weights to the arrival of its first rollout under them"""
-    stages: dict[str, float] = {}
-    versions: dict[str, str] = {}
-    """of millrace and of what decides its results"""
 
 
 class ArrayCard(msgspec.Struct, frozen=True):
@@ -134,6 +98,7 @@ class RunFolder:
         """A folder that is there. Raises `UsageError` if it is not one of ours."""
         if not path.is_dir():
             raise UsageError(f"run {path}: no such folder")
+        check_format(path)
         if not (path / "config.toml").is_file():
             raise UsageError(f"run {path}: expected a run folder, got one without config.toml")
         return RunFolder(path)
@@ -144,7 +109,11 @@ class RunFolder:
             shutil.rmtree(self._made, ignore_errors=True)
 
     def write_config(self, config: Config) -> None:
-        """config.toml: at the start, and again when a run is resumed with other settings."""
+        """Write config.toml and run.json: at the start, and again when a run is resumed, perhaps with other settings."""
+        try:
+            write_format(self.path)
+        except OSError as error:
+            raise RunError(f"{self.path / RUN_FILE} not written: {error.strerror}") from error
         self._write("config.toml", f"# Repeat this run: millrace train --config THIS_FILE\n{config.to_toml()}".encode())
 
     def config(self) -> Config:

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from learner.run_folder.metrics import read_rows
+from learner.run_folder.metrics_log import read_rows
 from tests.cluster import stock
 from tests.cluster.compose import BASE, LOOK_EVERY_S, USER, Cluster, Program, prepare
 from tests.cluster.engine import TOOLS, Engine, why_not

@@ -11,7 +11,7 @@ from typing import Any
 import psutil
 import pytest
 
-from learner.run_folder.metrics import read_rows
+from learner.run_folder.metrics_log import read_rows
 from millrace.cli.main import main
 from tests.cluster.slurm import Slurm, why_not
 from tests.system.processes import SMALL, START_S, TOY, Stage, wait_for

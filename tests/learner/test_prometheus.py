@@ -25,7 +25,7 @@ from learner.config.layers import resolve
 from learner.prometheus import EVERY_S, STAGES, Exposition, exposed
 from learner.rollouts.hub import PULSE_S, Hub
 from learner.run import looking
-from learner.run_folder.metrics import Progress
+from learner.run_folder.progress import Progress
 from millrace.launch import local
 from protocol.errors import UsageError
 from protocol.messages import Drain

@@ -18,7 +18,8 @@ from learner.config.config import Config
 from learner.config.hyperparameters import HYPERPARAMETERS
 from learner.config.layers import resolve
 from learner.run_folder import checkpoint
-from learner.run_folder.metrics import MetricsLog, Progress
+from learner.run_folder.metrics_log import MetricsLog
+from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import Interrupted, RunFolder
 from millrace.cli.main import COMMANDS, main
 from protocol.envs.spaces import action_spec, observation_leaves

@@ -20,7 +20,7 @@ from learner.config.command_line import read_config
 from learner.config.config import Config
 from learner.prometheus import Exposition, Snapshot
 from learner.rollouts.ledger import Ledger
-from learner.run_folder.metrics import Progress
+from learner.run_folder.progress import Progress
 from tests.test_architecture import imported, sources
 
 ROOT = Path(__file__).parents[2]

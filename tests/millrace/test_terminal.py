@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from learner.run_folder.metrics import Progress
+from learner.run_folder.progress import Progress
 from millrace.terminal import Block, Lines, Pace, block, details, watching
 
 PROGRESS = Progress(

@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 
 import psutil
 
-from learner.run_folder.metrics import read_rows
+from learner.run_folder.metrics_log import read_rows
 from protocol.keys.key_folder import KeyFolder
 
 ROOT = Path(__file__).parents[2]

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from learner.config.layers import resolve
-from learner.run_folder.metrics import read_rows
+from learner.run_folder.metrics_log import read_rows
 from millrace.launch.local import train
 from protocol.errors import UsageError
 

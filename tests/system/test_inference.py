@@ -18,7 +18,8 @@ import pytest
 
 import millrace
 from learner.config.layers import resolve
-from learner.run_folder.metrics import Progress, read_rows
+from learner.run_folder.metrics_log import read_rows
+from learner.run_folder.progress import Progress
 from millrace.launch.local import train
 from protocol.errors import EnvironmentFailed, NoWorkers, UsageError
 from tests.system.processes import Stage, free_port, wait_for

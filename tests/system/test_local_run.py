@@ -20,7 +20,8 @@ import pytest
 import millrace
 from learner.config.layers import config_from_toml, resolve
 from learner.evaluate import load_policy
-from learner.run_folder.metrics import Progress, read_rows
+from learner.run_folder.metrics_log import read_rows
+from learner.run_folder.progress import Progress
 from millrace.launch.local import train
 from protocol.errors import EnvironmentFailed, NoWorkers, RunError, Stalled, UsageError
 

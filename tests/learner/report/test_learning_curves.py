@@ -8,7 +8,8 @@ import pytest
 
 from learner.config.layers import resolve
 from learner.report.learning_curves import Curve, common_grid, plot, read_curve
-from learner.run_folder.metrics import MetricsLog, Progress
+from learner.run_folder.metrics_log import MetricsLog
+from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import RunFolder
 from protocol.errors import RunError, UsageError
 

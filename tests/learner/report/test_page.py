@@ -20,8 +20,10 @@ from learner.report.charts import MINUS, Trace, chart, engineering, ticks
 from learner.report.html_parts import time_text
 from learner.report.page import page, write_page
 from learner.report.runs import Told, group, read_run
-from learner.run_folder.metrics import Evaluation, MetricsLog, Progress
-from learner.run_folder.run_folder import RunFolder, Summary
+from learner.run_folder.metrics_log import MetricsLog
+from learner.run_folder.progress import Progress
+from learner.run_folder.results import Evaluation, Summary
+from learner.run_folder.run_folder import RunFolder
 from protocol.errors import RunError, UsageError
 
 ROOT = Path(__file__).parents[3]

@@ -18,7 +18,7 @@ from learner.members.events import Event, Left, Stale, Told, describe
 from learner.rollouts.hub import Hub
 from learner.rollouts.status import status
 from learner.run_folder.json_log import JsonLines, progress_line
-from learner.run_folder.metrics import Progress
+from learner.run_folder.progress import Progress
 from millrace.cli.status import ask, in_json, observer_name, shown
 from millrace.terminal import watching
 from protocol.errors import RunError

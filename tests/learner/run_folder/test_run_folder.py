@@ -12,8 +12,11 @@ from gymnasium import spaces
 
 from learner.config.config import Config
 from learner.config.layers import resolve
-from learner.run_folder.metrics import EVENTS_EVERY_S, EpisodeWindow, Evaluation, MetricsLog, Progress, read_rows
-from learner.run_folder.run_folder import RunFolder, Summary, sanitised
+from learner.run_folder.episode_window import EpisodeWindow
+from learner.run_folder.metrics_log import EVENTS_EVERY_S, MetricsLog, read_rows
+from learner.run_folder.progress import Progress
+from learner.run_folder.results import Evaluation, Summary
+from learner.run_folder.run_folder import RunFolder, sanitised
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import RunError, UsageError
 from protocol.policy.policy import buffer_size, layout, size
@@ -240,7 +243,7 @@ def test_the_window_holds_the_last_hundred_episodes() -> None:
     window.extend(Episode(float(i), 2 * i, 0.0) for i in range(150))
     assert window.return_mean == np.mean(range(50, 150))
     assert window.length_mean == 2 * np.mean(range(50, 150))
-    again = EpisodeWindow.of_state(json.loads(json.dumps(window.state())))
+    again = EpisodeWindow.from_state(json.loads(json.dumps(window.state())))
     assert again.return_mean == window.return_mean
     again.extend([Episode(0.0, 0, 0.0)])
     assert again.return_mean == (np.sum(range(51, 150))) / 100

@@ -1,0 +1,50 @@
+"""The last 100 training episodes and their means. Pure."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from protocol.rollout import Episode
+
+WINDOW_EPISODES = 100
+
+
+class EpisodeWindow:
+    """The last 100 episodes."""
+
+    def __init__(self, episodes: Iterable[Episode] = ()) -> None:
+        self._episodes: deque[Episode] = deque(episodes, maxlen=WINDOW_EPISODES)
+
+    @staticmethod
+    def from_state(state: list[Any]) -> EpisodeWindow:
+        """The window whose `state` this is."""
+        return EpisodeWindow(msgspec.convert(state, list[Episode]))
+
+    def state(self) -> list[Any]:
+        """The episodes as plain data, for a checkpoint."""
+        state: list[Any] = msgspec.to_builtins(list(self._episodes))
+        return state
+
+    def extend(self, episodes: Iterable[Episode]) -> None:
+        """Add episodes that have just ended, in order."""
+        self._episodes.extend(episodes)
+
+    @property
+    def full(self) -> bool:
+        """True once there are 100."""
+        return len(self._episodes) == WINDOW_EPISODES
+
+    @property
+    def return_mean(self) -> float | None:
+        """Mean return, or None before the first episode has ended."""
+        return float(np.mean([episode.reward for episode in self._episodes])) if self._episodes else None
+
+    @property
+    def length_mean(self) -> float | None:
+        """Mean length in env steps, or None before the first episode has ended."""
+        return float(np.mean([episode.length for episode in self._episodes])) if self._episodes else None

@@ -1,0 +1,134 @@
+"""The metrics of a run on disk: metrics.jsonl and TensorBoard.
+
+The law: a file ends with a whole row. A resumed run first removes the rows that its checkpoint knows nothing of, so no curve
+covers the same env steps twice.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import math
+import os
+import socket
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from learner.run_folder.atomic_write import write_atomically
+from learner.run_folder.progress import ENV_STEPS_KEY, Progress, Row
+from protocol.errors import RunError
+
+METRICS_FILE = "metrics.jsonl"
+EVENTS_EVERY_S = 0.2  # a fast run makes a hundred updates in that time, and an event takes as long as a small minibatch
+
+
+class MetricsLog:
+    """Writes metrics.jsonl and a TensorBoard events file.
+
+    Every row goes to metrics.jsonl. TensorBoard gets a row per `EVENTS_EVERY_S`, every row with an evaluation, and the last.
+    """
+
+    def __init__(self, folder: Path, from_env_steps: int = 0, clock: Callable[[], float] = time.monotonic) -> None:
+        """`from_env_steps`: env steps of the checkpoint that the run goes on from; later rows are removed."""
+        table = folder / METRICS_FILE
+        if table.exists():
+            kept = [row for row in read_rows(table) if (row.get(ENV_STEPS_KEY) or 0) <= from_env_steps]
+            write_atomically(table, lambda file: file.writelines(_json_line(row) for row in kept))
+        events = folder / "tensorboard" / f"events.out.tfevents.{time.time_ns()}.{socket.gethostname()}.{os.getpid()}"
+        events.parent.mkdir(exist_ok=True)
+        self._table, self._events = _RecordFile(table), _RecordFile(events)
+        self._events.append(_first_event(from_env_steps))
+        self._clock, self._last_event_s = clock, -math.inf
+        self._unwritten: tuple[Row, int] | None = None  # the newest row and its env steps, if TensorBoard has not got it
+
+    def write(self, progress: Progress, train: Mapping[str, float]) -> None:
+        """Add a row. `train`: the metrics of the algorithm, and of an evaluation if there was one.
+
+        Raises `RunError` in one line when the disk does not take it; the rows before it stay readable.
+        """
+        row = progress.row(train)
+        self._table.append(_json_line(row))
+        self._unwritten = row, progress.env_steps
+        if self._clock() - self._last_event_s >= EVENTS_EVERY_S or any(name.startswith("eval/") for name in row):
+            self._write_event()
+
+    def close(self) -> None:
+        """Close both files."""
+        with suppress(RunError):  # metrics.jsonl has the row
+            self._write_event()
+        self._table.close()
+        self._events.close()
+
+    def _write_event(self) -> None:
+        if self._unwritten is not None:
+            unwritten, self._unwritten = self._unwritten, None
+            self._last_event_s = self._clock()
+            self._events.append(_event(*unwritten))
+
+
+class _RecordFile:
+    """A file to which whole records are appended. A record that a full disk cut off is removed."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file = path.open("ab", buffering=0)
+        self._bytes = path.stat().st_size
+
+    def append(self, record: bytes) -> None:
+        try:
+            if self._file.write(record) != len(record):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        except OSError as error:
+            with suppress(OSError):
+                self._file.truncate(self._bytes)
+            raise RunError(f"{self._path}: a row was not written: {error.strerror}") from error
+        self._bytes += len(record)
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """The rows of a metrics.jsonl. A last line that was cut off is ignored."""
+    lines = path.read_bytes().splitlines(keepends=True)
+    return [msgspec.json.decode(line, type=dict[str, Any]) for line in lines if line.endswith(b"\n")]
+
+
+def _json_line(row: Row) -> bytes:
+    return msgspec.json.encode(row) + b"\n"
+
+
+def _event(row: Row, env_steps: int) -> bytes:
+    from tensorboard.compat.proto.event_pb2 import Event
+    from tensorboard.compat.proto.summary_pb2 import Summary
+
+    values = [Summary.Value(tag=name, simple_value=number) for name, number in row.items() if number is not None]
+    return _framed(Event(wall_time=time.time(), step=env_steps, summary=Summary(value=values)))
+
+
+def _first_event(env_steps: int) -> bytes:
+    """The beginning of an events file. In a resumed run it tells TensorBoard to forget what it read beyond these steps."""
+    from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+
+    version = _framed(Event(wall_time=time.time(), file_version="brain.Event:2"))
+    if not env_steps:
+        return version
+    start = SessionLog(status=SessionLog.START)
+    return version + _framed(Event(wall_time=time.time(), step=env_steps + 1, session_log=start))
+
+
+def _framed(event: Any) -> bytes:
+    """An event as TensorBoard frames it: length, checksum of the length, event, checksum of the event.
+
+    TensorBoard's own writer would start a thread.
+    """
+    from tensorboard.summary.writer.record_writer import RecordWriter
+
+    framed = io.BytesIO()
+    RecordWriter(framed).write(event.SerializeToString())
+    return framed.getvalue()

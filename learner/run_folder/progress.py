@@ -1,0 +1,62 @@
+"""How far a run is, and the names under which its numbers are logged.
+
+The names are those of Stable-Baselines3 where it has one. The x axis is env steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import msgspec
+
+ENV_STEPS_KEY = "time/total_timesteps"
+RETURN_KEY = "rollout/ep_rew_mean"
+EVALUATION_KEY = "eval/mean_reward"
+Row = Mapping[str, float | None]
+
+
+class Progress(msgspec.Struct, frozen=True, kw_only=True):
+    """How far a run is: what the terminal shows and the metrics record after each update."""
+
+    run: str = ""
+    """path of the run folder"""
+    env_steps: int = 0
+    total_steps: int = 0
+    """env steps to train for"""
+    updates: int = 0
+    wall_s: float = 0.0
+    """seconds of training, those before a resume included"""
+    steps_per_s: float = 0.0
+    """env steps per second since this process started"""
+    return_mean: float | None = None
+    """mean return of the last 100 training episodes, in raw rewards; None before the first has ended"""
+    length_mean: float | None = None
+    """mean length of the same episodes, in env steps"""
+    lag_mean: float = 0.0
+    lag_max: int = 0
+    workers_alive: int = 0
+    workers_expected: int = 0
+    """0: any number"""
+    ledger: dict[str, int] = {}
+    """number of tickets and transitions in each state"""
+    stages: dict[str, float] = {}
+    """seconds spent in each stage so far"""
+    note: str = ""
+    """a message to the user, in one line"""
+
+    def row(self, train: Mapping[str, float]) -> dict[str, float | None]:
+        """One flat row of metrics. `train`: the metrics of the algorithm."""
+        row: dict[str, float | None] = {
+            RETURN_KEY: self.return_mean,
+            "rollout/ep_len_mean": self.length_mean,
+            "time/fps": self.steps_per_s,
+            "time/iterations": self.updates,
+            "time/time_elapsed": self.wall_s,
+            ENV_STEPS_KEY: self.env_steps,
+            "lag/mean": self.lag_mean,
+            "lag/max": self.lag_max,
+            "drop/stale": self.ledger.get("stale", 0),
+        }
+        row |= {f"ledger/{name}": count for name, count in self.ledger.items()}
+        row |= {f"stage/{name}": seconds for name, seconds in self.stages.items()}
+        return row | {name if "/" in name else f"train/{name}": value for name, value in train.items()}

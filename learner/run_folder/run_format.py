@@ -1,0 +1,48 @@
+"""The format version of a run folder: run.json, written when the folder is made.
+
+The law: a folder of the current format or an older one can be evaluated, reported and resumed; a newer one is rejected in
+one line. Format 1 had no run.json. Raise `RUN_FORMAT` when older code could not read a folder of the new one.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+
+from learner.run_folder.atomic_write import write_atomically
+from learner.run_folder.versions import versions
+from protocol.errors import UsageError
+
+RUN_FORMAT = 2
+RUN_FILE = "run.json"
+
+
+class RunFormat(msgspec.Struct, frozen=True, kw_only=True):
+    """run.json."""
+
+    format: int
+    millrace: str
+    """the version of millrace that wrote it"""
+
+
+def write_format(folder: Path) -> None:
+    """Write run.json with the current format. Raises OSError."""
+    content = msgspec.json.encode(RunFormat(format=RUN_FORMAT, millrace=versions().get("millrace", "")))
+    write_atomically(folder / RUN_FILE, lambda file: file.write(content + b"\n"))
+
+
+def check_format(folder: Path) -> int:
+    """The format of a run folder. Raises `UsageError` in one line if this version of millrace cannot read it."""
+    try:
+        found = msgspec.json.decode((folder / RUN_FILE).read_bytes(), type=RunFormat)
+    except (FileNotFoundError, NotADirectoryError):
+        return 1
+    except (OSError, msgspec.MsgspecError) as error:
+        raise UsageError(f"run {folder}: {RUN_FILE} cannot be read: {error}") from error
+    if found.format > RUN_FORMAT:
+        raise UsageError(
+            f"run {folder}: its format is {found.format}, and this millrace reads formats up to {RUN_FORMAT}; "
+            f"install the millrace that wrote it ({found.millrace or 'unknown version'}) or a newer one"
+        )
+    return found.format

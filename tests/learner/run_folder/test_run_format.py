@@ -1,0 +1,85 @@
+"""The format version: a folder without one is of format 1 and still read; a newer one is rejected wherever it is read."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from learner.config.command_line import read_config
+from learner.config.layers import resolve
+from learner.evaluate import load_policy
+from learner.report.learning_curves import plot
+from learner.report.page import write_page
+from learner.run_folder.metrics_log import MetricsLog
+from learner.run_folder.progress import Progress
+from learner.run_folder.run_folder import RunFolder
+from learner.run_folder.run_format import RUN_FILE, RUN_FORMAT, check_format
+from protocol.envs.spaces import action_spec, observation_leaves
+from protocol.errors import UsageError
+from protocol.policy.policy import layout, size
+from protocol.specs import EnvSpec, PolicySpec
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """A run folder with a policy and two rows of metrics."""
+    folder = RunFolder.create(resolve("CartPole-v1", run_dir=str(tmp_path)))
+    env = EnvSpec("CartPole-v1")
+    made = env.make()
+    spec = PolicySpec(observation_leaves(made.observation_space), action_spec(made.action_space), net=(4,))
+    folder.write_policy(spec, env, np.zeros(size(layout(spec)[0]), np.float32), np.zeros(0, np.float32))
+    log = MetricsLog(folder.path)
+    for steps in (100, 200):
+        log.write(Progress(env_steps=steps, return_mean=1.0), {})
+    log.close()
+    return folder.path
+
+
+READERS: list[Callable[[Path], object]] = [
+    load_policy,
+    lambda run: plot([run], run / "curves.png"),
+    lambda run: write_page([run], run / "report.html"),
+    lambda run: read_config("train", ["--resume", str(run)]),
+    lambda run: resolve(resume=run),
+]
+
+
+def test_a_new_folder_carries_the_format_and_the_version_that_wrote_it(run: Path) -> None:
+    written = json.loads((run / RUN_FILE).read_text())
+    assert written["format"] == RUN_FORMAT == check_format(run)
+    assert written.keys() == {"format", "millrace"}
+
+
+@pytest.mark.parametrize("read", READERS)
+def test_a_folder_without_a_format_is_of_the_first_and_is_read(run: Path, read: Callable[[Path], object]) -> None:
+    (run / RUN_FILE).unlink()
+    assert check_format(run) == 1
+    read(run)
+
+
+@pytest.mark.parametrize("read", READERS)
+def test_a_folder_of_a_newer_format_is_rejected_with_advice(run: Path, read: Callable[[Path], object]) -> None:
+    (run / RUN_FILE).write_text(json.dumps({"format": RUN_FORMAT + 1, "millrace": "9.9", "and": "more"}))
+    with (run / "config.toml").open("a") as config:
+        config.write("a_setting_of_the_future = 1\n")
+    with pytest.raises(UsageError) as caught:
+        read(run)
+    assert str(caught.value) == (
+        f"run {run}: its format is {RUN_FORMAT + 1}, and this millrace reads formats up to {RUN_FORMAT}; "
+        "install the millrace that wrote it (9.9) or a newer one"
+    )
+
+
+def test_a_damaged_format_is_said_in_one_line(run: Path) -> None:
+    (run / RUN_FILE).write_text("{")
+    with pytest.raises(UsageError, match=r"run\.json cannot be read: Input data was truncated"):
+        RunFolder.open(run)
+
+
+def test_a_resumed_folder_gets_the_current_format(run: Path) -> None:
+    (run / RUN_FILE).unlink()
+    folder = RunFolder.open(run)
+    folder.write_config(folder.config())
+    assert check_format(run) == RUN_FORMAT
