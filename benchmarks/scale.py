@@ -29,7 +29,7 @@ from rich.table import Table
 
 from benchmarks.simulated import POLICY, VERSIONS, run_spec, simulate, table
 from benchmarks.writing import write
-from learner.rollouts.hub import Hub
+from learner.rollouts.hub import Hub, HubSettings
 from learner.rollouts.roster import Roster
 from protocol.policy.policy import buffer_size, layout, size
 from protocol.rollout import stack
@@ -73,7 +73,7 @@ def learn(workers: int, seconds: float, transport: str, folder: Path, told: Conn
     run = run_spec(workers)
     link = LearnerLink(f"ipc://{folder}/learner" if transport == "ipc" else "tcp://127.0.0.1:*")
     roster = Roster(run, rollouts_per_update=workers, max_lag=0, worker_timeout_s=10, first_session=1)
-    hub = Hub(link, roster, no_workers_timeout_s=60, stall_timeout_s=30, max_env_failures=0)
+    hub = Hub(link, roster, HubSettings(no_workers_timeout_s=60, stall_timeout_s=30, max_env_failures=0))
     parameters = np.zeros(size(layout(POLICY)[0]), np.float32)
     buffers = np.zeros(buffer_size(POLICY), np.float32)
     published_s: list[float] = []
@@ -89,13 +89,13 @@ def learn(workers: int, seconds: float, transport: str, folder: Path, told: Conn
     join_s = time.monotonic() - began_s
     publish()
     for _ in range(WARM_UP):
-        stack(hub.gather())
+        stack([arrived.rollout for arrived in hub.gather()])
         publish()
     warm_mb = _resident_mb(me)
     first, bytes_before, used_before = len(published_s), link.received.bytes, roster.ledger.used
     cpu_s, python_s, began_s = time.process_time(), time.thread_time(), time.monotonic()
     while time.monotonic() - began_s < seconds and len(published_s) < VERSIONS:
-        stack(hub.gather())
+        stack([arrived.rollout for arrived in hub.gather()])
         publish()
     took_s = time.monotonic() - began_s
     cpu_s, python_s = time.process_time() - cpu_s, time.thread_time() - python_s

@@ -19,7 +19,7 @@ from rich.table import Table
 
 from benchmarks.writing import write
 from learner.config.layers import resolve
-from learner.rollouts.hub import Hub
+from learner.rollouts.hub import Hub, HubSettings
 from learner.rollouts.roster import Roster
 from learner.run import run_spec
 from protocol.policy.policy import buffer_size, layout, size
@@ -40,7 +40,7 @@ def start_one(env: EnvSpec) -> tuple[float, float]:
     with tempfile.TemporaryDirectory() as folder:
         link = LearnerLink(f"ipc://{folder}/learner")
         roster = Roster(run, rollouts_per_update=1, max_lag=0, worker_timeout_s=60, first_session=1)
-        hub = Hub(link, roster, no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=0)
+        hub = Hub(link, roster, HubSettings(no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=0))
         hub.publish(0, np.zeros(size(acting), np.float32), np.zeros(buffer_size(run.policy), np.float32))
         began_s = time.perf_counter()
         worker = Process(link.address, "w0", Path(folder) / "log")

@@ -17,7 +17,8 @@ from learner.algorithms import Algorithm
 from learner.config.config import Config
 from learner.evaluate import evaluate
 from learner.recording.record import TrainingRecorder
-from learner.rollouts.hub import Hub
+from learner.rollouts.arrived_rollout import ArrivedRollout
+from learner.rollouts.hub import Hub, HubSnapshot
 from learner.rollouts.ledger import Ledger
 from learner.run_folder import checkpoint
 from learner.run_folder.episode_window import EpisodeWindow
@@ -29,7 +30,7 @@ from learner.run_folder.versions import versions
 from protocol.arrays import Floats
 from protocol.errors import CheckpointError, RunError, UsageError
 from protocol.policy.policy import make_policy
-from protocol.rollout import Batch, Rollout
+from protocol.rollout import Batch
 from protocol.specs import RunSpec
 
 log = logging.getLogger("millrace.learner")
@@ -106,8 +107,8 @@ class Journal:
         self._workers_alive = 0
         self._best = past.best
         self._episodes_until_save = config.checkpoint_every_episodes
-        self._worker_stages: dict[int, dict[str, float]] = {}  # by session: those of workers that have left count too
-        hub.progress = self.progress()
+        self._worker_stages: dict[int, Mapping[str, float]] = {}  # by session: those of workers that have left count too
+        hub.report_progress(self.progress())
 
     # ---------------------------------------------------------------- what the loop calls
 
@@ -123,10 +124,10 @@ class Journal:
         enough = self.version > 0 and self.env_steps + one_more > self.config.steps
         return "all steps done" if enough else None
 
-    def gathered(self, rollouts: Sequence[Rollout]) -> None:
+    def gathered(self, rollouts: Sequence[ArrivedRollout]) -> None:
         """Rollouts that are about to be learned from: keep their episodes, if they are to be recorded."""
         if self._recorder is not None:
-            self._recorder.add(rollouts, self.hub.roster.lives)
+            self._recorder.add(rollouts)
 
     def updated(self, batch: Batch, metrics: Mapping[str, float], update_s: float) -> None:
         """An update was made and published: count, write, and now and then evaluate and checkpoint."""
@@ -144,7 +145,7 @@ class Journal:
             self._keep_if_best(found)
         progress = self.progress()
         self._surely(lambda: self._metrics.write(progress, {**metrics, **extra}))
-        self.hub.progress = progress
+        self.hub.report_progress(progress)
         self._watch(progress)
         self._episodes_until_save -= len(batch.episodes)
         every = self.config.checkpoint_every_updates
@@ -163,12 +164,13 @@ class Journal:
 
     def save(self) -> None:
         """A checkpoint and the policy; a disk that does not take them costs a warning."""
+        snapshot = self.hub.snapshot()
         past = Past(
             version=self.version,
             env_steps=self.env_steps,
             wall_s=self._wall_s(),
-            ledger=self.hub.roster.ledger,
-            incarnations=self.hub.roster.incarnations(),
+            ledger=snapshot.ledger,
+            incarnations=snapshot.incarnations,
             episodes=self._window.state(),
             best=self._best,
         )
@@ -196,7 +198,7 @@ class Journal:
 
     def finish(self, reason: str) -> None:
         """The summary."""
-        wall_s = self._wall_s()
+        wall_s, snapshot = self._wall_s(), self.hub.snapshot()
         self._surely(
             lambda: self.folder.write_summary(
                 Summary(
@@ -211,10 +213,10 @@ class Journal:
                     return_mean_100=self._window.return_mean,
                     evaluation=self.evaluation if self._evaluated_version == self.version else None,
                     best=self._confirmed,
-                    ledger=self.hub.roster.ledger.counts(),
-                    lags=self.hub.freshness.histogram(),
-                    first_use_s=self.hub.freshness.first_use_s(),
-                    stages=self._stages(),
+                    ledger=snapshot.ledger.counts(),
+                    lags=self.hub.lag_histogram(),
+                    first_use_s=self.hub.first_use_s(),
+                    stages=self._stages(snapshot),
                     versions=versions(),
                 )
             )
@@ -229,9 +231,9 @@ class Journal:
 
     def progress(self) -> Progress:
         """How far the run is."""
-        wall_s = self._wall_s()
+        wall_s, snapshot = self._wall_s(), self.hub.snapshot()
         here_s = wall_s - self._wall_before_s
-        lags = self.hub.lags or [0]
+        lags = snapshot.lags or [0]
         return Progress(
             run=str(self.folder.path),
             env_steps=self.env_steps,
@@ -245,19 +247,17 @@ class Journal:
             lag_max=max(lags),
             workers_alive=self._workers_alive,
             workers_expected=self.workers_expected,
-            ledger=self.hub.roster.ledger.counts(),
-            stages=self._stages(),
+            ledger=snapshot.ledger.counts(),
+            stages=self._stages(snapshot),
             note=self._note,
         )
 
     # ---------------------------------------------------------------- inside
 
-    def _stages(self) -> dict[str, float]:
+    def _stages(self, snapshot: HubSnapshot) -> dict[str, float]:
         """Seconds: of the learner, and of all workers together (as their last heartbeats told)."""
-        stages = {"learner_wait": self.hub.wait_s} | {f"learner_{name}": s for name, s in self.stages.items()}
-        for member in self.hub.roster.members.values():
-            if member.heartbeat is not None:
-                self._worker_stages[member.session] = member.heartbeat.stages
+        stages = {"learner_wait": snapshot.wait_s} | {f"learner_{name}": s for name, s in self.stages.items()}
+        self._worker_stages |= snapshot.worker_stages()
         for told in self._worker_stages.values():
             for name, seconds in told.items():
                 stages[f"worker_{name}"] = stages.get(f"worker_{name}", 0.0) + seconds

@@ -28,9 +28,7 @@ from prometheus_client.metrics_core import (
 from prometheus_client.registry import Collector
 
 from learner.config.config import Config
-from learner.members.membership import Member
-from learner.members.states import Standing
-from learner.rollouts.hub import Hub, Look
+from learner.rollouts.hub import Hub, HubObserver
 from learner.run_folder.progress import Progress
 from learner.run_folder.versions import versions
 from protocol.address import WILDCARDS, is_local
@@ -85,21 +83,21 @@ class Exposition(Collector):
         now = self._clock()
         if 0.0 <= now - self._snapshot.at_s < EVERY_S:
             return
-        link, roster = hub.link, hub.roster
+        known = hub.snapshot()
         if self._updates_before is None:
-            self._updates_before = hub.progress.updates
-        states = [_state(member) for member in roster.members.values()]
+            self._updates_before = known.progress.updates
+        states = known.worker_states()
         self._snapshot = Snapshot(
             at_s=now,
-            progress=hub.progress,
-            version=roster.version,
-            ledger=roster.ledger.counts(),
-            workers={state: states.count(state) for state in STATES},
-            lags=dict(hub.freshness.lags),
-            received=(link.received.messages, link.received.bytes),
-            sent=(link.sent.messages, link.sent.bytes),
-            unheard=link.refused_messages,
-            turned_away=link.refused,
+            progress=known.progress,
+            version=known.version,
+            ledger=known.ledger.counts(),
+            workers={state: states[state] for state in STATES},
+            lags=known.lag_counts,
+            received=known.received,
+            sent=known.sent,
+            unheard=known.refused_messages,
+            turned_away=known.refused_handshakes,
         )
 
     def describe(self) -> Iterator[Metric]:
@@ -114,12 +112,6 @@ class Exposition(Collector):
         if now.at_s:
             updates = now.progress.updates - (self._updates_before or 0)
             yield from (*_of_progress(now, updates), *_of_ledger(now.ledger), *_of_workers(now), *_of_link(now))
-
-
-def _state(member: Member) -> str:
-    if member.standing is Standing.DRAINING:
-        return "draining"
-    return "active" if member.lanes else "spare"
 
 
 def _of_progress(now: Snapshot, updates: int) -> Iterator[Metric]:
@@ -198,7 +190,7 @@ def _by_reason(name: str, text: str, counts: Mapping[str, int]) -> CounterMetric
 
 
 @contextmanager
-def exposed(config: Config) -> Iterator[Look]:
+def exposed(config: Config) -> Iterator[HubObserver]:
     """Serve at `metrics_bind` while it is entered; what it gives is to be called by the loop.
 
     Raises `UsageError` in one line if the port is in use.

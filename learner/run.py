@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,7 +20,8 @@ import zmq
 
 from learner.config.config import Config
 from learner.members.endpoint import join_lines, keyring_for
-from learner.rollouts.hub import Hub, Look
+from learner.members.worker_processes import WorkerProcesses
+from learner.rollouts.hub import Hub, HubObserver, HubSettings
 from learner.rollouts.roster import Roster
 from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import Interrupted, RunFolder
@@ -35,11 +36,13 @@ from protocol.wire.link import LearnerLink
 
 if TYPE_CHECKING:  # they bring torch along
     from learner.algorithms import Algorithm
+    from learner.journal import Journal, Past
 
 log = logging.getLogger("millrace.learner")
 
 Watch = Callable[[Progress], None]
-DeadWorkers = Callable[[], Iterable[tuple[str, str]]]
+Begin = Callable[[Path], WorkerProcesses]
+"""Told the run folder; it may start worker processes, and says which are this program's."""
 
 
 class Run:
@@ -52,55 +55,61 @@ class Run:
         link: LearnerLink,
         resume: Path | None,
         watch: Watch,
-        look: Look,
-        begin: Callable[[Path], None] = lambda folder: None,
+        observer: HubObserver,
+        begin: Begin = lambda folder: WorkerProcesses(),
         workers: int = 0,
     ) -> None:
         """`resume`: the folder of a run that goes on from its newest checkpoint. Raises `OurError` in one line.
 
         `workers`: how many processes share this machine's cores with it, and run while it learns if `max_lag` lets them.
 
-        `watch` is called after each update, `look` whenever the learner has listened to its workers. `begin` is told the
-        run folder before torch is imported: workers that are started there are ready when the learner is.
+        `watch` is called after each update, `observer` whenever the learner has listened to its workers. `begin` is
+        called before torch is imported: workers that are started there are ready when the learner is.
         """
+        self._signals: list[int] = []
         seen = look_at(env)
         self.folder = RunFolder.create(config) if resume is None else RunFolder.open(resume)
         try:
-            begin(self.folder.path)
-            self._make(config, env, seen, link, resume is not None, watch, look, workers)
+            processes = begin(self.folder.path)
+            past = self._make(config, env, seen, resume is not None, workers)
+            self.hub = Hub(
+                link,
+                self._roster(config, past),
+                HubSettings(
+                    config.no_workers_timeout_s, config.stall_timeout_s, config.max_env_failures, config.weights_dtype
+                ),
+                processes,
+                self._check_interrupt,
+                observer,
+            )
+            self.journal = self._journal(config, past, watch)
         except BaseException:
             self.folder.remove()
             raise
 
-    def _make(
-        self,
-        config: Config,
-        env: EnvSpec,
-        seen: Spaces,
-        link: LearnerLink,
-        resumed: bool,
-        watch: Watch,
-        look: Look,
-        workers: int,
-    ) -> None:
+    def _make(self, config: Config, env: EnvSpec, seen: Spaces, resumed: bool, workers: int) -> Past:
+        """The algorithm; where the run stands."""
         import torch
 
         from learner.algorithms import algorithm_class
-        from learner.journal import Journal, Past, recall
+        from learner.journal import Past, recall
 
-        spec = run_spec(config, env, seen)
-        torch.set_num_threads(threads(config, spec.policy, workers))
+        self.spec = run_spec(config, env, seen)
+        torch.set_num_threads(threads(config, self.spec.policy, workers))
         self.device = _device(config)
         make = algorithm_class(config.algo)
         self.algorithm: Algorithm = make(
-            config.algorithm, spec.policy, total_steps=config.steps, seed=config.seed, device=self.device
+            config.algorithm, self.spec.policy, total_steps=config.steps, seed=config.seed, device=self.device
         )
         past = Past()
         if resumed:
             past = recall(self.folder, self.algorithm)
             self.folder.write_config(config)
-        roster = Roster(
-            spec,
+        return past
+
+    def _roster(self, config: Config, past: Past) -> Roster:
+        return Roster(
+            self.spec,
             rollouts_per_update=config.lanes,
             max_lag=config.max_lag,
             worker_timeout_s=config.worker_timeout_s,
@@ -108,30 +117,22 @@ class Run:
             ledger=past.ledger,
             incarnations=past.incarnations,
         )
-        self.hub = Hub(
-            link,
-            roster,
-            no_workers_timeout_s=config.no_workers_timeout_s,
-            stall_timeout_s=config.stall_timeout_s,
-            max_env_failures=config.max_env_failures,
-            weights_dtype=config.weights_dtype,
-            look=look,
-        )
-        self.journal = Journal(config, self.folder, spec, self.algorithm, self.hub, past, watch)
 
-    def go(self, workers: int, dead_workers: DeadWorkers = lambda: ()) -> None:
-        """Train until done. `workers`: how many to wait for; `dead_workers` names those known to have ended, and why."""
+    def _journal(self, config: Config, past: Past, watch: Watch) -> Journal:
+        from learner.journal import Journal
+
+        return Journal(config, self.folder, self.spec, self.algorithm, self.hub, past, watch)
+
+    def _check_interrupt(self) -> None:
+        if self._signals:
+            raise Interrupted(self.folder.path)
+
+    def go(self, workers: int) -> None:
+        """Train until done. `workers`: how many to wait for."""
         from learner.train import train
 
-        signals: list[int] = []
-
-        def check() -> None:
-            if signals:
-                raise Interrupted(self.folder.path)
-
-        self.hub.dead_workers, self.hub.watch = dead_workers, check
         try:
-            with _signals_into(signals):
+            with _signals_into(self._signals):
                 train(self.algorithm, self.hub, self.journal, workers)
         except BaseException as error:
             reason = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error)
@@ -152,15 +153,15 @@ def serve(config: Config, resume: Path | None, watch: Watch) -> Path:
         stack.callback(context.term)
         link = LearnerLink(config.bind, context, keyring)
         stack.callback(link.close)
-        look = stack.enter_context(looking(config))
-        run = Run(config, EnvSpec.of(config.env, config.env_kwargs), link, resume, watch, look)
+        observer = stack.enter_context(looking(config))
+        run = Run(config, EnvSpec.of(config.env, config.env_kwargs), link, resume, watch, observer)
         for line in join_lines(link.address, config.advertise, keyring):
             log.warning("%s", line)
         run.go(config.min_workers or 1)
         return run.folder.path
 
 
-def looking(config: Config) -> AbstractContextManager[Look]:
+def looking(config: Config) -> AbstractContextManager[HubObserver]:
     """What `--metrics-bind` asks for, while it is entered; without it nothing, and no HTTP server is imported."""
     if not config.metrics_bind:
         return nullcontext(lambda hub: None)

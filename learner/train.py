@@ -28,13 +28,13 @@ def train(algorithm: Algorithm, hub: Hub, journal: Journal, workers: int) -> str
         hub.publish(journal.version, *algorithm.weights())
     while (reason := journal.stop_reason()) is None:
         try:
-            rollouts = hub.gather()
+            arrived = hub.gather()
         except (RunError, Interrupted):
             journal.save()
             raise
-        journal.gathered(rollouts)
+        journal.gathered(arrived)
         began_s = time.monotonic()
-        batch = stack(rollouts)
+        batch = stack([one.rollout for one in arrived])
         metrics = algorithm.update(batch, hub.pulse)
         hub.publish(journal.version + 1, *algorithm.weights())
         journal.updated(batch, metrics, time.monotonic() - began_s)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -24,6 +24,7 @@ import numpy as np
 from learner.evaluate import load_policy
 from learner.recording.episodes import EpisodeAssembler, RecordedEpisode
 from learner.recording.minari import MinariDataset
+from learner.rollouts.arrived_rollout import ArrivedRollout
 from learner.run_folder.atomic_write import write_atomically
 from protocol.arrays import Array
 from protocol.envs.spaces import reader, writer
@@ -31,7 +32,6 @@ from protocol.errors import EnvironmentFailed, RunError, UsageError, first_line
 from protocol.policy.distributions import distribution
 from protocol.policy.policy import Policy
 from protocol.policy.recurrent import zero_state
-from protocol.rollout import Rollout
 from protocol.specs import EnvSpec, PolicySpec
 
 
@@ -108,10 +108,10 @@ class TrainingRecorder:
             self._env.close()
             raise
 
-    def add(self, rollouts: Sequence[Rollout], lives: Mapping[int, int]) -> None:
-        """Rollouts of an update; `lives`: the incarnation of the lane of each ticket."""
-        for rollout in rollouts:
-            for episode in self._assembler.add(rollout, lives[rollout.ticket]):
+    def add(self, rollouts: Sequence[ArrivedRollout]) -> None:
+        """Rollouts of an update."""
+        for arrived in rollouts:
+            for episode in self._assembler.add(arrived.rollout, arrived.incarnation):
                 self._dataset.add(episode)
                 self._episodes += 1
 

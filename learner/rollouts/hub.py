@@ -8,12 +8,18 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 from learner.members.events import Broke, Joined, Left, Stale, Told, Turned, describe
 from learner.members.membership import Out
 from learner.members.peer_log import Doorkeeper, Lid
-from learner.rollouts.roster import Roster
+from learner.members.states import Standing
+from learner.members.worker_processes import WorkerProcesses
+from learner.rollouts.arrived_rollout import ArrivedRollout
+from learner.rollouts.ledger import Ledger
+from learner.rollouts.roster import CollectingMember, Roster
 from learner.rollouts.status import status
 from learner.rollouts.weight_age import Freshness
 from learner.run_folder.progress import Progress
@@ -30,10 +36,64 @@ log = logging.getLogger("millrace.learner")
 POLL_S = 0.1
 PULSE_S = 0.003  # a minibatch may take a tenth of it, and listening as long as a minibatch
 SAY_WAITING_EVERY_S = 10.0
-Look = Callable[["Hub"], None]
-"""Told of the hub whenever it has listened."""
-
 AWAY_S = 0.5  # a learner that has not listened for longer was busy, or stopped
+
+
+@dataclass(frozen=True)
+class HubSettings:
+    """The settings of a run that the hub needs, named as in `Config`."""
+
+    no_workers_timeout_s: float
+    stall_timeout_s: float
+    max_env_failures: int
+    weights_dtype: WeightsDtype = "float32"
+    """dtype in which parameters travel"""
+
+
+@dataclass(frozen=True)
+class HubSnapshot:
+    """What the hub knows at one moment, for metrics, checkpoints and status. Cheap to make."""
+
+    progress: Progress
+    """as of the last update"""
+    version: int
+    """of the newest weights; -1 before any"""
+    ledger: Ledger
+    """a copy"""
+    incarnations: list[int]
+    """the next incarnation of each lane"""
+    lags: list[int]
+    """of each rollout of the last `gather`"""
+    lag_counts: Mapping[int, int]
+    """how many rollouts were used, by lag, since this learner started"""
+    wait_s: float
+    """seconds spent waiting for rollouts since this learner started"""
+    members: tuple[CollectingMember, ...]
+    received: tuple[int, int]
+    """messages, bytes"""
+    sent: tuple[int, int]
+    """messages, bytes"""
+    refused_messages: int
+    """messages under keys that were revoked"""
+    refused_handshakes: int
+
+    def worker_stages(self) -> dict[int, Mapping[str, float]]:
+        """Seconds in each stage, by session, as the workers' last heartbeats said."""
+        return {member.session: member.heartbeat.stages for member in self.members if member.heartbeat is not None}
+
+    def worker_states(self) -> Counter[str]:
+        """How many workers are active, draining, or spare: active without a lane."""
+        return Counter(_state(member) for member in self.members)
+
+
+def _state(member: CollectingMember) -> str:
+    if member.standing is Standing.DRAINING:
+        return "draining"
+    return "active" if member.lanes else "spare"
+
+
+HubObserver = Callable[["Hub"], None]
+"""Called with the hub each time that it has listened to the workers."""
 
 
 class Hub:
@@ -43,37 +103,21 @@ class Hub:
         self,
         link: LearnerLink,
         roster: Roster,
-        *,
-        no_workers_timeout_s: float,
-        stall_timeout_s: float,
-        max_env_failures: int,
-        weights_dtype: WeightsDtype = "float32",
-        dead_workers: Callable[[], Iterable[tuple[str, str]]] = lambda: (),
-        watch: Callable[[], None] = lambda: None,
-        look: Look = lambda hub: None,
+        settings: HubSettings,
+        processes: WorkerProcesses | None = None,
+        check_interrupt: Callable[[], None] = lambda: None,
+        observer: HubObserver = lambda hub: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`weights_dtype`: as what parameters travel. `dead_workers` names local worker processes that have ended, and why.
-
-        `watch` is called while waiting, `look` whenever this has listened.
-        """
-        self.link, self.roster = link, roster
+        """`check_interrupt` is called while the hub waits: what it raises ends the wait."""
+        self.link, self.roster, self.settings = link, roster, settings
         link.room = rollout_bytes(roster.run)
-        self.no_workers_timeout_s = no_workers_timeout_s
-        self.stall_timeout_s = stall_timeout_s
-        self.max_env_failures = max_env_failures
-        self.weights_dtype: WeightsDtype = weights_dtype
-        self.wait_s = 0.0
-        """seconds spent waiting for rollouts since the run began"""
-        self.lags: list[int] = []
-        """lag of each rollout of the last `gather`"""
-        self.freshness = Freshness()
-        """of the weights that rollouts were acted on under"""
-        self.progress = Progress()
-        """of the run, for whoever asks: the journal keeps it"""
-        self.dead_workers, self.watch, self.look, self._clock = dead_workers, watch, look, clock
-        self.workers_alive: Callable[[], int] = lambda: len(roster.members)
-        """how many processes step the environment"""
+        self._processes = processes or WorkerProcesses()
+        self._check_interrupt, self._observer, self._clock = check_interrupt, observer, clock
+        self._wait_s = 0.0  # seconds spent waiting for rollouts
+        self._lags: list[int] = []  # lag of each rollout of the last `gather`
+        self._freshness = Freshness()
+        self._progress = Progress()
         self._lid = Lid(link, clock)
         self._doorkeeper = Doorkeeper(link)
         self._draining = False
@@ -88,12 +132,12 @@ class Hub:
 
     def wait_for(self, workers: int) -> None:
         """Wait until so many workers have joined. Raises `NoWorkers` after `no_workers_timeout_s`."""
-        deadline_s = self._clock() + self.no_workers_timeout_s
+        deadline_s = self._clock() + self.settings.no_workers_timeout_s
         start = f"python -m workers {self.link.address}{'' if self.link.keyring is None else ' --token FILE'}"
         while len(self.roster.members) < workers:
             if self._clock() > deadline_s:
                 raise NoWorkers(
-                    f"waited {self.no_workers_timeout_s:.0f} s for {workers} workers at {self.link.address}, "
+                    f"waited {self.settings.no_workers_timeout_s:.0f} s for {workers} workers at {self.link.address}, "
                     f"{len(self.roster.members)} came{self._because()}; start one: {start}"
                 )
             self._turn(POLL_S)
@@ -103,11 +147,11 @@ class Hub:
 
         Raises `RunError` if a parameter is too large for `weights_dtype`.
         """
-        travelling = narrowed(parameters, self.weights_dtype)
-        self.freshness.published(version, self._clock())
+        travelling = narrowed(parameters, self.settings.weights_dtype)
+        self._freshness.published(version, self._clock())
         self._send(self.roster.publish(version, travelling, buffers))
 
-    def gather(self) -> list[Rollout]:
+    def gather(self) -> list[ArrivedRollout]:
         """The rollouts of the next update. Raises `NoWorkers`, `Stalled` or `EnvironmentFailed`."""
         started_s = said_s = heard_s = self._clock()
         self._turn(0.0)
@@ -116,16 +160,16 @@ class Hub:
             taken = self.roster.take()
             self._send(self.roster.deal())
             if taken is not None:
-                self.wait_s += self._clock() - started_s
-                self.lags = [self.roster.version - rollout.version for rollout in taken]
-                self.freshness.used(self.lags)
+                self._wait_s += self._clock() - started_s
+                self._lags = [self.roster.version - arrived.rollout.version for arrived in taken]
+                self._freshness.used(self._lags)
                 return taken
             self._turn(POLL_S)
             now = self._clock()
             if len(self.roster.ready) > waiting:
                 heard_s = now
-            if now - heard_s > self.stall_timeout_s:
-                raise Stalled(f"no rollout came for {self.stall_timeout_s:.0f} s; {self.waiting_for()}")
+            if now - heard_s > self.settings.stall_timeout_s:
+                raise Stalled(f"no rollout came for {self.settings.stall_timeout_s:.0f} s; {self.waiting_for()}")
             if now - said_s > SAY_WAITING_EVERY_S:
                 said_s = now
                 log.warning("%s", self.waiting_for())
@@ -159,12 +203,49 @@ class Hub:
         have, need = len(roster.ready), roster.rollouts_per_update
         return f"waiting for rollouts: have {have} of {need}, outstanding with {', '.join(late) or 'nobody'}"
 
+    # ---------------------------------------------------------------- what others ask and tell
+
+    def report_progress(self, progress: Progress) -> None:
+        """How far the run is, for whoever asks for its status."""
+        self._progress = progress
+
+    def workers_alive(self) -> int:
+        """How many processes step the environment."""
+        count = self._processes.count
+        return len(self.roster.members) if count is None else count()
+
+    def lag_histogram(self) -> dict[str, int]:
+        """How many rollouts were used by lag, from the smallest; a JSON object has strings for keys."""
+        return self._freshness.histogram()
+
+    def first_use_s(self) -> dict[str, float]:
+        """Of each worker, the median of the seconds from publishing weights to its first rollout under them."""
+        return self._freshness.first_use_s()
+
+    def snapshot(self) -> HubSnapshot:
+        """What the hub knows now."""
+        link, roster = self.link, self.roster
+        return HubSnapshot(
+            progress=self._progress,
+            version=roster.version,
+            ledger=roster.ledger.copy(),
+            incarnations=roster.incarnations(),
+            lags=self._lags,
+            lag_counts=self._freshness.lags.copy(),
+            wait_s=self._wait_s,
+            members=tuple(roster.members.values()),
+            received=(link.received.messages, link.received.bytes),
+            sent=(link.sent.messages, link.sent.bytes),
+            refused_messages=link.refused_messages,
+            refused_handshakes=link.refused,
+        )
+
     # ---------------------------------------------------------------- inside
 
     def _turn(self, timeout_s: float) -> None:
         """One turn of waiting: listen, and see whether the run can go on."""
         self._listen(timeout_s)
-        self.watch()
+        self._check_interrupt()
         if self._failure is not None:
             raise self._failure
         self._judge()
@@ -180,7 +261,7 @@ class Hub:
         self._listened_s = now
         if now >= self._judge_s:
             self._send(self.roster.tick(now))
-        self.look(self)
+        self._observer(self)
 
     def _receive(self, timeout_s: float) -> None:
         if not self.link.poll(timeout_s):
@@ -194,7 +275,7 @@ class Hub:
                 case Rollout():
                     self._rollout(peer, message, now)
                 case Inquire():
-                    self.link.send(peer, encode(status(self.roster, self.progress, now)))
+                    self.link.send(peer, encode(status(self.roster, self._progress, now)))
                 case _:
                     self._send(self.roster.receive(peer, message, now))
 
@@ -206,7 +287,7 @@ class Hub:
             self._lid.complain(peer, why)
             self._send(self.roster.reject(peer, rollout, why, now))
         else:
-            self.freshness.arrived(name_of(peer).decode(errors="replace"), rollout.version, now)
+            self._freshness.arrived(name_of(peer).decode(errors="replace"), rollout.version, now)
             self._send(self.roster.receive(peer, rollout, now))
 
     def _shut_out(self) -> None:
@@ -214,7 +295,7 @@ class Hub:
             self._send(self.roster.revoke(peer, why))
 
     def _gone(self) -> None:
-        for worker, why in self.dead_workers():
+        for worker, why in self._processes.ended():
             self._send(self.roster.gone(worker, why))
 
     def _send(self, outs: Sequence[Out]) -> None:
@@ -240,8 +321,10 @@ class Hub:
                     self._refusal = why
                 case Broke(worker, host, _, error, traceback):
                     self._env_failures += 1
-                    if self._env_failures > self.max_env_failures:
-                        counted = f"that was failure {self._env_failures}, at most {self.max_env_failures} are borne"
+                    if self._env_failures > self.settings.max_env_failures:
+                        counted = (
+                            f"that was failure {self._env_failures}, at most {self.settings.max_env_failures} are borne"
+                        )
                         self._failure = EnvironmentFailed(f"worker {worker} ({host}): {error}; {counted}", traceback)
                 case _:
                     pass
@@ -254,8 +337,9 @@ class Hub:
         now = self._clock()
         if self._lonely_since_s is None:
             self._lonely_since_s = now
-        if now - self._lonely_since_s > self.no_workers_timeout_s:
-            raise NoWorkers(f"no worker for {self.no_workers_timeout_s:.0f} s at {self.link.address}{self._because()}")
+        timeout_s = self.settings.no_workers_timeout_s
+        if now - self._lonely_since_s > timeout_s:
+            raise NoWorkers(f"no worker for {timeout_s:.0f} s at {self.link.address}{self._because()}")
 
     def _because(self) -> str:
         if self._refusal:

@@ -46,6 +46,10 @@ class Ledger(msgspec.Struct, kw_only=True):
         dropped = self.transitions_stale + self.transitions_duplicate + self.transitions_late + self.transitions_invalid
         return self.transitions_received - self.transitions_used - dropped
 
+    def copy(self) -> Ledger:
+        """The same counts, which do not change any more."""
+        return msgspec.structs.replace(self)
+
     def counts(self) -> dict[str, int]:
         """All counts by name, the two derived ones included."""
         stored = {name: int(getattr(self, name)) for name in self.__struct_fields__}

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from learner.members.events import Broke, Event, Stale
 from learner.members.membership import Member, Membership, Out
 from learner.members.states import Rubbish, Standing
+from learner.rollouts.arrived_rollout import ArrivedRollout
 from learner.rollouts.lane_placement import Placing
 from learner.rollouts.lanes import Lane, Ticket, Turns
 from learner.rollouts.ledger import Ledger
@@ -81,11 +82,9 @@ class Roster:
         self.membership = Membership(run, CollectingMember, self._lost, first_session)
         self.lanes = [Lane(n, incarnations[n] if incarnations else 0) for n in range(run.lanes)]
         self.tickets: dict[int, Ticket] = {}
-        self.ready: list[Rollout] = []
+        self.ready: list[ArrivedRollout] = []
         self._placing, self._turns = Placing(self.lanes), Turns(self.lanes)
         self._oldest = version  # no rollout that is ready is older
-        self.lives: dict[int, int] = {}
-        """incarnation of the lane in which each rollout that is ready, or was taken last, was collected, by its ticket"""
         self._weights: Weights | None = None
 
     @property
@@ -172,16 +171,15 @@ class Roster:
         out = [out for member in self.membership.active() for out in self._offer(member)]
         return out + self._deal()
 
-    def take(self) -> list[Rollout] | None:
+    def take(self) -> list[ArrivedRollout] | None:
         """The rollouts of the next update, or None while there are too few. What is too stale is dropped and counted."""
         if self.version - self._oldest > self.max_lag:
             self._drop_stale()
         if len(self.ready) < self.rollouts_per_update:
             return None
-        self.lives = {rollout.ticket: self.lives[rollout.ticket] for rollout in self.ready}
         taken, self.ready = self.ready[: self.rollouts_per_update], self.ready[self.rollouts_per_update :]
         self.ledger.used += len(taken)
-        self.ledger.transitions_used += sum(rollout.env_steps for rollout in taken)
+        self.ledger.transitions_used += sum(arrived.rollout.env_steps for arrived in taken)
         return taken
 
     def deal(self) -> list[Out]:
@@ -206,9 +204,9 @@ class Roster:
         return welcome + self._offer(member) + self._deal()
 
     def _drop_stale(self) -> None:
-        stale = [rollout for rollout in self.ready if self.version - rollout.version > self.max_lag]
-        self.ready = [rollout for rollout in self.ready if self.version - rollout.version <= self.max_lag]
-        self._oldest = min((rollout.version for rollout in self.ready), default=self.version)
+        stale = [arrived.rollout for arrived in self.ready if self.version - arrived.rollout.version > self.max_lag]
+        self.ready = [arrived for arrived in self.ready if self.version - arrived.rollout.version <= self.max_lag]
+        self._oldest = min((arrived.rollout.version for arrived in self.ready), default=self.version)
         for rollout in stale:
             self.ledger.stale += 1
             self.ledger.transitions_stale += rollout.env_steps
@@ -236,9 +234,8 @@ class Roster:
         lane.outstanding.remove(ticket.number)
         lane.arrived(rollout.sequence)
         self._placing.ended(member)
-        self.ready.append(rollout)
+        self.ready.append(ArrivedRollout(rollout, ticket.incarnation))
         self._oldest = min(self._oldest, rollout.version)
-        self.lives[ticket.number] = ticket.incarnation
         return self._offer(member) + self._deal()
 
     def _heartbeat(self, member: CollectingMember, heartbeat: Heartbeat) -> list[Out]:

@@ -17,6 +17,7 @@ import zmq
 
 from learner.config.config import Config
 from learner.members.endpoint import Bind
+from learner.members.worker_processes import WorkerProcesses
 from learner.run import Run, Watch, looking
 from learner.vector_env.env import ZmqVectorEnv
 from millrace.launch.local_workers import StartFlags, flags_of, own_address
@@ -49,9 +50,18 @@ def train(
         stack.callback(link.close, 0.5)
         made: list[Run] = []
 
+        def ended() -> list[tuple[str, str]]:
+            if parts.nobody is not None:
+                nobody, parts.nobody = parts.nobody, None
+                raise nobody
+            return host.poll()
+
+        processes = WorkerProcesses(ended, lambda: env.workers)
+
         def begin() -> StartFlags:
-            env = EnvSpec.of(config.env if factory is None else factory, config.env_kwargs)
-            made.append(Run(config, env, link, resume, watch, stack.enter_context(looking(config))))
+            spec = EnvSpec.of(config.env if factory is None else factory, config.env_kwargs)
+            observer = stack.enter_context(looking(config))
+            made.append(Run(config, spec, link, resume, watch, observer, lambda folder: processes))
             return flags_of(config, made[0].folder.path)
 
         env = _vector_env(config, factory, elsewhere, begin)
@@ -67,15 +77,8 @@ def train(
         stack.callback(host.stop)
         stack.callback(host.ask_to_leave)  # and once more: at once, whatever it waits for
 
-        def ended() -> list[tuple[str, str]]:
-            if parts.nobody is not None:
-                nobody, parts.nobody = parts.nobody, None
-                raise nobody
-            return host.poll()
-
         run.journal.workers_expected = 0 if elsewhere else config.workers
-        run.hub.workers_alive = lambda: env.workers
-        run.go(1, ended)
+        run.go(1)
         return run.folder.path
 
 

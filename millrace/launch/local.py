@@ -12,6 +12,7 @@ from pathlib import Path
 import zmq
 
 from learner.config.config import Config
+from learner.members.worker_processes import WorkerProcesses
 from learner.run import Run, Watch, looking
 from millrace.launch.local_workers import flags_of, own_address, own_keys
 from protocol.errors import UsageError
@@ -40,15 +41,15 @@ def train(config: Config, resume: Path | None, watch: Watch, factory: Callable[.
         link = LearnerLink(address, context, keyring)
         stack.callback(link.close, 0.5)
         env = EnvSpec.of(config.env if factory is None else factory, config.env_kwargs)
-        hosts: list[Host] = []
 
-        def begin(folder: Path) -> None:
-            hosts.append(Host(_starter(config, link.address, token, context, folder), config.workers))
-            stack.callback(hosts[0].stop)
+        def begin(folder: Path) -> WorkerProcesses:
+            host = Host(_starter(config, link.address, token, context, folder), config.workers)
+            stack.callback(host.stop)
+            return WorkerProcesses(host.poll)
 
         run = Run(config, env, link, resume, watch, stack.enter_context(looking(config)), begin, config.workers)
         run.journal.workers_expected = config.workers
-        run.go(config.min_workers or config.workers, hosts[0].poll)
+        run.go(config.min_workers or config.workers)
         return run.folder.path
 
 

@@ -23,7 +23,7 @@ import learner.prometheus
 from learner.config.config import Config
 from learner.config.layers import resolve
 from learner.prometheus import EVERY_S, STAGES, Exposition, exposed
-from learner.rollouts.hub import PULSE_S, Hub
+from learner.rollouts.hub import PULSE_S, Hub, HubSettings
 from learner.run import looking
 from learner.run_folder.progress import Progress
 from millrace.launch import local
@@ -64,8 +64,8 @@ class Scraped:
         self.exposition = Exposition(Config(env="CartPole-v1"), lambda: self.now)
         asked = itertools.count()
         self.hub = Hub(
-            self.link, self.learner.roster, no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=0,
-            look=self.exposition.look, clock=lambda: 2 * PULSE_S * next(asked),
+            self.link, self.learner.roster, HubSettings(no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=0),
+            observer=self.exposition.look, clock=lambda: 2 * PULSE_S * next(asked),
         )  # fmt: skip
 
     def text(self) -> str:
@@ -106,7 +106,7 @@ def test_the_numbers_are_those_of_the_roster_and_the_ledger(scraped: Scraped) ->
     learning.publish(0)
     learning.deliver_all()
     assert learning.roster.take()
-    hub.freshness.used([0, 0, 3])
+    hub._freshness.used([0, 0, 3])
     learning.publish(1)
     learning.roster.gone("a", "was killed")
     learning.roster.reject(B, None, "rubbish", 0.0)
@@ -140,11 +140,11 @@ def test_a_worker_without_a_lane_is_a_spare(scraped: Scraped) -> None:
 
 
 def test_progress_is_that_of_the_last_update_and_updates_are_this_learners_own(scraped: Scraped) -> None:
-    scraped.hub.progress = Progress(updates=5)  # of a run that is resumed
+    scraped.hub.report_progress(Progress(updates=5))  # of a run that is resumed
     before = scraped.metrics()
     assert "millrace_episode_return_mean" not in {name for name, _ in before}  # not 0: no episode has ended
     assert before["millrace_update_seconds_count", ()] == 0
-    scraped.hub.progress = PROGRESS
+    scraped.hub.report_progress(PROGRESS)
     found = scraped.metrics()
     assert (found["millrace_update_seconds_count", ()], found["millrace_update_seconds_sum", ()]) == (2, 1.5)
     assert found["millrace_env_steps_total", ()] == 1_000
@@ -158,7 +158,7 @@ def test_progress_is_that_of_the_last_update_and_updates_are_this_learners_own(s
 
 def test_what_workers_call_themselves_and_their_stages_is_no_label(scraped: Scraped) -> None:
     scraped.learner.joins(b"my-secret")
-    scraped.hub.progress = PROGRESS
+    scraped.hub.report_progress(PROGRESS)
     scraped.metrics()
     assert "my-secret" not in scraped.text()
 
@@ -286,7 +286,7 @@ def test_prometheus_own_linter_finds_nothing(scraped: Scraped) -> None:
     promtool = shutil.which("promtool")
     if promtool is None:
         pytest.skip("promtool is not installed (Debian: apt-get install prometheus)")
-    scraped.hub.progress = PROGRESS
+    scraped.hub.report_progress(PROGRESS)
     scraped.metrics()
     done = subprocess.run(
         [promtool, "check", "metrics"], input=scraped.text(), capture_output=True, text=True, timeout=60, check=False

@@ -249,12 +249,13 @@ class World:
         if taken is None:
             return
         assert len(taken) == self.per_update
-        for rollout in taken:
+        rollouts = [arrived.rollout for arrived in taken]
+        for rollout in rollouts:
             assert rollout.ticket not in self.used, "a ticket was used twice"
             self.used.add(rollout.ticket)
             assert 0 <= self.roster.version - rollout.version <= self.max_lag
         if self.max_lag == 0 and self.per_update == self.run.lanes:
-            assert sorted(rollout.lane for rollout in taken) == list(range(self.run.lanes))
+            assert sorted(rollout.lane for rollout in rollouts) == list(range(self.run.lanes))
         self.updating = True
         roster = self.roster
 
@@ -325,7 +326,9 @@ class World:
         roster, ledger = self.roster, self.roster.ledger
         in_flight = len(roster.tickets) + len(roster.ready)
         assert ledger.issued == ledger.used + ledger.stale + ledger.lost + in_flight, "the ledger does not balance"
-        assert ledger.transitions_waiting == sum(r.env_steps for r in roster.ready), "transitions do not balance"
+        assert ledger.transitions_waiting == sum(arrived.rollout.env_steps for arrived in roster.ready), (
+            "transitions do not balance"
+        )
         bound = self.per_update * (roster.version + 1 + self.max_lag)
         assert ledger.used + in_flight <= bound, "more tickets than the bound allows"
         for lane in roster.lanes:

@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from learner.rollouts.hub import AWAY_S, POLL_S, PULSE_S, Hub
+from learner.rollouts.hub import AWAY_S, POLL_S, PULSE_S, Hub, HubSettings
 from learner.rollouts.roster import Roster
 from protocol.errors import RunError
 from protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello, ToLearner, Weights
@@ -56,10 +56,7 @@ def hub_with_a_worker(weights_dtype: WeightsDtype = "float32") -> tuple[FakeLink
     hub = Hub(
         cast(LearnerLink, link),
         roster,
-        no_workers_timeout_s=60.0,
-        stall_timeout_s=600.0,
-        max_env_failures=0,
-        weights_dtype=weights_dtype,
+        HubSettings(no_workers_timeout_s=60.0, stall_timeout_s=600.0, max_env_failures=0, weights_dtype=weights_dtype),
         clock=lambda: link.now,
     )
     link.inbox.append((b"w0", Hello(PROTOCOL_VERSION, "w0", "host", 1, 1, "fake", 1)))

@@ -115,7 +115,7 @@ class Learner:
         taken = self.roster.take()
         assert taken is not None
         self.balanced([])
-        return taken
+        return [arrived.rollout for arrived in taken]
 
     def update(self) -> list[Rollout]:
         """A whole synchronous update: everything delivered, taken, published."""
@@ -335,10 +335,14 @@ def test_in_a_synchronous_run_no_lane_gets_two_tickets_in_a_round_while_another_
     learner.joins(A)
     learner.delivers(learner.tickets()[0])  # lane 0 is done with its round
     learner.joins(B)  # a lane moves to B, at a rollout boundary
-    round_lanes = [r.lane for r in learner.roster.ready] + [t.lane for t in learner.roster.tickets.values()]
+    round_lanes = [arrived.rollout.lane for arrived in learner.roster.ready] + [
+        t.lane for t in learner.roster.tickets.values()
+    ]
     assert sorted(round_lanes) == [0, 1, 2]
     learner.says(A, Goodbye(learner.session(A), "bye", ()))
-    round_lanes = [r.lane for r in learner.roster.ready] + [t.lane for t in learner.roster.tickets.values()]
+    round_lanes = [arrived.rollout.lane for arrived in learner.roster.ready] + [
+        t.lane for t in learner.roster.tickets.values()
+    ]
     assert sorted(round_lanes) == [0, 1, 2]
 
 

@@ -15,7 +15,7 @@ import zmq
 from rich.console import Console
 
 from learner.members.events import Event, Left, Stale, Told, describe
-from learner.rollouts.hub import Hub
+from learner.rollouts.hub import Hub, HubSettings
 from learner.rollouts.status import status
 from learner.run_folder.json_log import JsonLines, progress_line
 from learner.run_folder.progress import Progress
@@ -110,8 +110,8 @@ def context() -> Iterator[zmq.Context[zmq.Socket[bytes]]]:
 def test_a_learner_answers_one_who_is_no_worker(context: zmq.Context[zmq.Socket[bytes]]) -> None:
     learner = Learner()
     link = LearnerLink("tcp://127.0.0.1:*", context)
-    hub = Hub(link, learner.roster, no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=0)
-    hub.progress = PROGRESS
+    hub = Hub(link, learner.roster, HubSettings(no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=0))
+    hub.report_progress(PROGRESS)
     asking = WorkerLink(link.address, observer_name(), context)
     found: list[Status] = []
     thread = threading.Thread(target=lambda: found.append(ask(asking, 10.0)))

@@ -15,7 +15,7 @@ import pytest
 import zmq
 
 from learner.members.membership import REMEMBERED_REFUSALS
-from learner.rollouts.hub import Hub
+from learner.rollouts.hub import Hub, HubSettings
 from learner.rollouts.roster import Roster
 from protocol.address import name_of
 from protocol.errors import BadMessage, RunError, UsageError
@@ -484,7 +484,7 @@ def roster(workers: int = 2) -> Roster:
 
 
 def hub_of(link: LearnerLink) -> Hub:
-    hub = Hub(link, roster(), no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=3)
+    hub = Hub(link, roster(), HubSettings(no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=3))
     hub.publish(0, PARAMETERS, BUFFERS)
     return hub
 

@@ -1,0 +1,16 @@
+"""What the learner asks about the worker processes that this program started. The program that starts them answers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class WorkerProcesses:
+    """The worker processes of this program; by default there are none."""
+
+    ended: Callable[[], Iterable[tuple[str, str]]] = lambda: ()
+    """names of the workers whose processes have ended since the last call, each with the reason; it may raise"""
+    count: Callable[[], int] | None = None
+    """how many processes step the environment; None: as many as there are members"""

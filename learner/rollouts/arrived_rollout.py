@@ -1,0 +1,16 @@
+"""A rollout on the learner's side, with what the learner knows about it and the wire does not carry. Plain data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from protocol.rollout import Rollout
+
+
+@dataclass(frozen=True, slots=True)
+class ArrivedRollout:
+    """A rollout that was accepted."""
+
+    rollout: Rollout
+    incarnation: int
+    """of its lane, when its ticket was dealt: the env copies start again with each incarnation"""
