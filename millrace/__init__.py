@@ -10,6 +10,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from millrace.import_conflict import check_imports
+
+check_imports()
+
 if TYPE_CHECKING:
     from gymnasium.vector import AutoresetMode
 
