@@ -56,7 +56,8 @@ BENCHMARKS = {
 def overview() -> str:
     """What there is."""
     lines = [f"  millrace bench {name:8}  {each.about}" for name, each in BENCHMARKS.items()]
-    return "\n".join([*lines, "", "Without a name: all of them, about ten minutes. NAME --help tells its flags."])
+    usage = ["usage: millrace bench [NAME [flags]]", "", "Run one benchmark, or all of them (ten minutes).", ""]
+    return "\n".join([*usage, *lines, "", "millrace bench NAME --help lists the flags of each."])
 
 
 def main(argv: list[str]) -> int:
@@ -97,4 +98,7 @@ if __name__ == "__main__":
     try:
         sys.exit(main(sys.argv[1:]))
     except UsageError as error:
-        sys.exit(f"bench: {error}")
+        print(f"millrace: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:  # `millrace bench` says so
+        sys.exit(130)

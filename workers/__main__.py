@@ -34,9 +34,9 @@ from workers.worker import Worker, identity, parent_is_gone
 log = logging.getLogger("millrace.worker")
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run one worker; the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m workers", description="Step an environment for a learner.")
+def main(argv: list[str] | None = None, prog: str = "python -m workers") -> int:
+    """Run one worker; the exit code. `prog` is the command that the help names."""
+    parser = argparse.ArgumentParser(prog=prog, description="Step an environment for a learner.")
     parser.add_argument("address", help="where the learner listens: ipc://PATH or tcp://HOST:PORT")
     parser.add_argument(
         "--name", default=f"{socket.gethostname()}-{os.getpid()}", help="this worker's name, unique in the run"

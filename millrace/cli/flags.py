@@ -26,25 +26,6 @@ class EvaluateFlags(msgspec.Struct, frozen=True, kw_only=True):
     """show the traceback of an error"""
 
 
-class StatusFlags(msgspec.Struct, frozen=True, kw_only=True):
-    """How a run is: its workers, their speed, memory and silence, and what was dropped."""
-
-    address: Positional[str]
-    """where the learner listens, as tcp://HOST:5555"""
-    watch: bool = False
-    """again every second, until Ctrl-C or the learner has gone"""
-    json: bool = False
-    """one line of JSON instead of a table"""
-    timeout_s: float = 5.0
-    """how long to wait for an answer"""
-    token: str = ""
-    """file of a join token (or MILLRACE_TOKEN), as a worker there needs it"""
-    insecure: bool = False
-    """ask without a token on another machine, and believe whoever answers"""
-    debug: bool = False
-    """show the traceback of an error"""
-
-
 class PlotFlags(msgspec.Struct, frozen=True, kw_only=True):
     """Learning curves as a PNG: a panel for each environment, a colour for each algorithm, seeds as a band."""
 
@@ -86,46 +67,6 @@ class ReportFlags(msgspec.Struct, frozen=True, kw_only=True):
     """the page; report.html in the first run folder if not given"""
     debug: bool = False
     """show the traceback of an error"""
-
-
-class KeysFlags(msgspec.Struct, frozen=True, kw_only=True):
-    """What every command about keys takes."""
-
-    keys: str = ""
-    """the key folder (or MILLRACE_KEYS); ~/.config/millrace/keys if not given"""
-    debug: bool = False
-    """show the traceback of an error"""
-
-
-class KeysNewFlags(KeysFlags, frozen=True, kw_only=True):
-    """Make a key for workers, allow it here, and write its join token into the key folder (0600)."""
-
-    name: Positional[str]
-    """what to call it: `millrace keys revoke NAME` shuts out all who use it, and nobody else"""
-    server: str = ""
-    """public key of a learner elsewhere: the token is for that one, which must then allow the key that is printed"""
-    print_token: bool = False
-    """print the token and nothing else, as for a secret store: whoever sees it can join"""
-
-
-class KeysShowFlags(KeysFlags, frozen=True, kw_only=True):
-    """The learner's public key, and the clients: names, public keys, dates, and whether they may connect."""
-
-
-class KeysAllowFlags(KeysFlags, frozen=True, kw_only=True):
-    """Allow a client that made its key itself (`millrace keys new NAME --server …`, on its machine)."""
-
-    public: Positional[str]
-    """its public key, 64 hexadecimal digits"""
-    name: Positional[str]
-    """what to call it"""
-
-
-class KeysRevokeFlags(KeysFlags, frozen=True, kw_only=True):
-    """Shut a client out: learners that run notice within a second or two and cut its workers off."""
-
-    name: Positional[str]
-    """of the client"""
 
 
 class LaunchFlags(msgspec.Struct, frozen=True, kw_only=True):

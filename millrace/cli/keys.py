@@ -1,49 +1,80 @@
-"""`millrace keys`: who may join the learners of this machine. Gives lines; the command line prints them.
+"""`millrace keys`: who may join the learners of this machine. Returns lines; the command line prints them.
 
 The law: a secret is printed only where it was asked for by name.
 """
 
 from __future__ import annotations
 
+from argparse import Namespace
 from collections.abc import Callable
 from datetime import UTC, datetime
+from typing import NamedTuple
 
 from learner.config.did_you_mean import did_you_mean
-from learner.config.flag_parser import parse_flags
-from millrace.cli.flags import KeysAllowFlags, KeysFlags, KeysNewFlags, KeysRevokeFlags, KeysShowFlags
+from millrace.cli.arguments import Arguments
 from protocol.errors import UsageError
-from protocol.keys.key_folder import KeyFolder, asked_folder
+from protocol.keys.key_folder import DEFAULT_FOLDER, FOLDER_VARIABLE, KeyFolder, asked_folder
 from protocol.keys.keys import public_key
 
 
+class Subcommand(NamedTuple):
+    """One of `millrace keys`."""
+
+    run: Callable[[list[str]], list[str]]
+    usage: str
+    about: str
+
+
 def keys(argv: list[str]) -> list[str]:
-    """What was done, in lines. Raises `UsageError`."""
-    command, *rest = argv or [""]
-    if command in ("-h", "--help"):
-        return [f"  millrace keys {usage:18} {what}" for usage, what in USAGE.items()]
-    if command not in COMMANDS:
-        said = f"keys {command}: no such command{did_you_mean(command, COMMANDS)};" if command else "keys: which command?"
-        raise UsageError(f"{said} expected one of {', '.join(COMMANDS)}")
-    return COMMANDS[command](rest)
+    """Run a subcommand; the lines to print. Raises `UsageError`."""
+    name, *rest = argv or [""]
+    if name in ("-h", "--help"):
+        return _help()
+    if name not in SUBCOMMANDS:
+        problem = f"keys {name}: no such command{did_you_mean(name, SUBCOMMANDS)};" if name else "keys: which command?"
+        raise UsageError(f"{problem} expected one of {', '.join(SUBCOMMANDS)}")
+    return SUBCOMMANDS[name].run(rest)
+
+
+def _help() -> list[str]:
+    return [
+        f"usage: millrace keys {'|'.join(SUBCOMMANDS)} …",
+        "",
+        "Who may join the learners of this machine from other machines.",
+        "",
+        *(f"  millrace keys {each.usage:18} {each.about}" for each in SUBCOMMANDS.values()),
+        "",
+        "millrace keys COMMAND --help lists the flags of each.",
+    ]
 
 
 def _new(argv: list[str]) -> list[str]:
-    flags = parse_flags(KeysNewFlags, argv, "keys new")
-    folder = _folder(flags)
-    if flags.server:
-        token, public = folder.foreign(flags.name, public_key(flags.server, "--server"))
-        lines = [f"token: {token}", f"on the learner's machine: millrace keys allow {public.hex()} {flags.name}"]
+    arguments = _arguments("new")
+    arguments.flag("name", metavar="NAME", help="name of the client: `millrace keys revoke NAME` shuts out all who use it")
+    arguments.flag(
+        "--server", default="", metavar="PUBLIC",
+        help="public key of a learner elsewhere: the token is for that learner, which must allow the key that is printed",
+    )  # fmt: skip
+    arguments.flag(
+        "--print-token", action="store_true",
+        help="print the token and nothing else, as for a secret store; whoever sees it can join",
+    )  # fmt: skip
+    values = arguments.parse(argv)
+    folder = _folder(values)
+    if values.server:
+        token, public = folder.foreign(values.name, public_key(values.server, "--server"))
+        lines = [f"token: {token}", f"on the learner's machine: millrace keys allow {public.hex()} {values.name}"]
     else:
-        token = folder.new(flags.name, _now())
+        token = folder.new(values.name, _now())
         lines = [
             f"token: {token}",
             "a worker on another machine joins with its own copy: millrace worker ADDRESS --token FILE",
         ]
-    return [token.read_text().strip()] if flags.print_token else lines
+    return [token.read_text().strip()] if values.print_token else lines
 
 
 def _show(argv: list[str]) -> list[str]:
-    folder = _folder(parse_flags(KeysShowFlags, argv, "keys show"))
+    folder = _folder(_arguments("show").parse(argv))
     allowed = folder.allowed()
     lines = [f"key folder: {folder.path}", f"learner: {folder.server().public.hex()}"]
     width = max((len(client.name) for client in allowed.clients), default=0)
@@ -54,30 +85,42 @@ def _show(argv: list[str]) -> list[str]:
 
 
 def _allow(argv: list[str]) -> list[str]:
-    flags = parse_flags(KeysAllowFlags, argv, "keys allow")
-    folder = _folder(flags)
-    folder.allow(flags.name, public_key(flags.public, "keys allow"), _now())
-    return [f"{flags.name} may connect"]
+    arguments = _arguments("allow")
+    arguments.flag("public", metavar="PUBLIC", help="public key of the client: 64 hexadecimal digits")
+    arguments.flag("name", metavar="NAME", help="name for the client")
+    values = arguments.parse(argv)
+    _folder(values).allow(values.name, public_key(values.public, "keys allow"), _now())
+    return [f"{values.name} may connect"]
 
 
 def _revoke(argv: list[str]) -> list[str]:
-    flags = parse_flags(KeysRevokeFlags, argv, "keys revoke")
-    _folder(flags).revoke(flags.name, _now())
-    return [f"{flags.name} is shut out; learners that run cut it off within a second or two"]
+    arguments = _arguments("revoke")
+    arguments.flag("name", metavar="NAME", help="name of the client")
+    values = arguments.parse(argv)
+    _folder(values).revoke(values.name, _now())
+    return [f"{values.name} is shut out; running learners cut it off within a second or two"]
 
 
-def _folder(flags: KeysFlags) -> KeyFolder:
-    return KeyFolder(asked_folder(flags.keys))
+def _arguments(name: str) -> Arguments:
+    arguments = Arguments(f"keys {name}", SUBCOMMANDS[name].about.capitalize() + ".")
+    arguments.flag(
+        "--keys", default="", metavar="FOLDER",
+        help=f"key folder; if not given, the one that {FOLDER_VARIABLE} names, or {DEFAULT_FOLDER}",
+    )  # fmt: skip
+    return arguments
+
+
+def _folder(values: Namespace) -> KeyFolder:
+    return KeyFolder(asked_folder(values.keys))
 
 
 def _now() -> datetime:
     return datetime.now(UTC).replace(microsecond=0)
 
 
-COMMANDS: dict[str, Callable[[list[str]], list[str]]] = {"new": _new, "show": _show, "allow": _allow, "revoke": _revoke}
-USAGE = {
-    "new NAME": "make a key and its join token, and allow it",
-    "show": "public halves, names, dates, state",
-    "allow PUBLIC NAME": "allow a key that was made elsewhere",
-    "revoke NAME": "shut a key out, at once",
+SUBCOMMANDS = {
+    "new": Subcommand(_new, "new NAME", "make a key for workers, allow it here, and write its join token to a file"),
+    "show": Subcommand(_show, "show", "list the learner's public key and the clients: names, public keys, dates, states"),
+    "allow": Subcommand(_allow, "allow PUBLIC NAME", "allow a client whose key was made on another machine"),
+    "revoke": Subcommand(_revoke, "revoke NAME", "shut a client out; running learners cut off its workers in seconds"),
 }

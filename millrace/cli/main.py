@@ -1,8 +1,8 @@
-"""The command line. Flags are the fields of the configuration, their help the texts under them; nothing is said twice.
+"""The command line: finds the command, runs it, and turns an error into one line and an exit code.
 
-The law: what a user did wrong is one line on stderr and exit code 2; what went wrong is one line (and the worker's own
-traceback, if there is one) and exit code 1; 130 after Ctrl-C; a traceback of ours with --debug alone. Imports wait until a
-command needs them, so that `--help` answers at once.
+The law: bad usage is one line on stderr and exit code 2. A run that failed is one line (and the worker's traceback below it,
+if there is one) and exit code 1. Ctrl-C is exit code 130. A traceback of millrace itself is shown with --debug only. Each
+command imports what it needs when it runs, so that `--help` answers at once.
 """
 
 from __future__ import annotations
@@ -18,42 +18,43 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 from protocol.errors import OurError, UsageError, first_line
 
-WHAT = "Worker processes step a gymnasium environment, one PyTorch learner learns."
+ABOUT = "Worker processes step copies of a gymnasium environment; one learner trains a policy in PyTorch."
+HELP_FLAGS = ("-h", "--help")
 
 
 class Command(NamedTuple):
-    """A subcommand."""
+    """A command of `millrace`."""
 
     run: Callable[[list[str]], int]
-    usage: str
-    help: str
+    arguments: str
+    about: str
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line; the exit code."""
     argv = sys.argv[1:] if argv is None else argv
     if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # last: a module of the user's own is found here, and hides none of those installed
+        sys.path.append(os.getcwd())  # last: a module of the user is found here and hides no installed module
     try:
         exit_code = _dispatch(argv)
         sys.stdout.flush()
         return exit_code
     except OurError as error:
-        _say(f"millrace: {error}")
+        _print_error(f"millrace: {error}")
         if error.detail:
-            _say(error.detail.rstrip())
-        return _trace(argv, error.exit_code)
+            _print_error(error.detail.rstrip())
+        return _failed(argv, error.exit_code)
     except KeyboardInterrupt as interrupt:
         run = getattr(interrupt, "run", None)
-        _say(f"millrace: interrupted{f'; go on with: millrace train --resume {run}' if run else ''}")
-        return _trace(argv, 130)
-    except BrokenPipeError:  # whoever read our output has gone: nobody is left to tell
+        _print_error(f"millrace: interrupted{f'; go on with: millrace train --resume {run}' if run else ''}")
+        return _failed(argv, 130)
+    except BrokenPipeError:  # the reader of our output (`| head`) has gone: a message would reach nobody
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except Exception as error:
         hint = "" if "--debug" in argv else "; --debug shows the traceback"
-        _say(f"millrace: internal error: {type(error).__name__}: {first_line(error)}{hint}")
-        return _trace(argv, 1)
+        _print_error(f"millrace: internal error: {type(error).__name__}: {first_line(error)}{hint}")
+        return _failed(argv, 1)
 
 
 def _dispatch(argv: list[str]) -> int:
@@ -74,9 +75,19 @@ def _dispatch(argv: list[str]) -> int:
 
 
 def _overview() -> str:
-    width = max(len(command.usage) for command in COMMANDS.values())
-    lines = [f"  millrace {command.usage:{width}}  {command.help}" for command in COMMANDS.values()]
-    return "\n".join([WHAT, "", *lines, "", "millrace COMMAND --help tells more; --debug shows tracebacks; --version."])
+    """The groups of commands, a line for each command."""
+    width = max(len(f"{name} {command.arguments}") for name, command in COMMANDS.items())
+    lines = ["usage: millrace COMMAND [arguments]", "", ABOUT]
+    for title, commands in GROUPS.items():
+        lines += ["", f"{title}:"]
+        lines += [f"  millrace {f'{name} {one.arguments}':{width}}  {one.about}" for name, one in commands.items()]
+    return "\n".join([*lines, "", "millrace COMMAND --help lists the flags; --debug shows tracebacks; --version."])
+
+
+def _print_usage(name: str, *more: str) -> None:
+    command = COMMANDS[name]
+    about = f"{command.about[0].upper()}{command.about[1:]}."
+    print(f"usage: millrace {name} {command.arguments}".rstrip(), "", about, *more, sep="\n")
 
 
 # ---------------------------------------------------------------------------------------------------------- commands
@@ -91,7 +102,7 @@ def _train(argv: list[str]) -> int:
 
     with watching("--log-json" in argv) as watch:
         run = local.train(config, resume, watch)
-    return _told(run)
+    return _print_result(run)
 
 
 def _learner(argv: list[str]) -> int:
@@ -107,11 +118,11 @@ def _learner(argv: list[str]) -> int:
             run = inference.train(config, resume, watch, elsewhere=True)
         else:
             run = serve(config, resume, watch)
-    return _told(run)
+    return _print_result(run)
 
 
-def _told(run: Path) -> int:
-    """How a run ended, and where it is."""
+def _print_result(run: Path) -> int:
+    """Print how a run ended, and its folder."""
     from learner.run_folder.run_folder import RunFolder
 
     summary = RunFolder(run).summary()
@@ -126,7 +137,7 @@ def _told(run: Path) -> int:
 def _worker(argv: list[str]) -> int:
     from workers.__main__ import main as work
 
-    return work([flag for flag in argv if flag != "--debug"])
+    return work([flag for flag in argv if flag != "--debug"], "millrace worker")
 
 
 def _evaluate(argv: list[str]) -> int:
@@ -188,47 +199,47 @@ def _plot(argv: list[str]) -> int:
 
 
 def _presets(argv: list[str]) -> int:
+    if argv and argv[0] in HELP_FLAGS:
+        _print_usage("presets")
+        return 0
     if argv:
         raise UsageError(f"presets: unexpected argument {argv[0]}")
     from learner.config.presets import algorithms_and_environments, named_presets
 
-    print("Taken by themselves, by environment and --algo:\n")
+    print("Used unless --preset says otherwise, by environment and algorithm:\n")
     for algo, env in algorithms_and_environments():
         print(f"  millrace train {env} --algo {algo}")
-    print("\nWhole runs by name:\n")
+    print("\nComplete runs, by name:\n")
     for name, preset in named_presets().items():
         print(f"  millrace train --preset {name:24}  {preset.about}")
     return 0
 
 
 def _status(argv: list[str]) -> int:
-    from learner.config.flag_parser import parse_flags
-    from millrace.cli.flags import StatusFlags
+    from millrace.cli.status import status
 
-    flags = parse_flags(StatusFlags, argv, "status")
-    from millrace.cli.status import observe, observer_name
-    from protocol.keys.key_folder import read_token
-    from protocol.wire.link import WorkerLink
-    from workers.code_trust import entry
-
-    token = entry(flags.address, read_token(flags.token), insecure=flags.insecure)
-    link = WorkerLink(flags.address, observer_name(), token=token)
-    try:
-        observe(link, flags)
-    finally:
-        link.close(linger_s=0)
+    status(argv, sys.stdout)
     return 0
 
 
 def _keys(argv: list[str]) -> int:
     from millrace.cli.keys import keys
 
-    for line in keys(argv):
-        print(line)
+    print(*keys(argv), sep="\n")
     return 0
 
 
 def _launch(argv: list[str]) -> int:
+    if argv and argv[0] in HELP_FLAGS:
+        launchers = [f"  millrace launch {name:10}  {about}" for name, about in LAUNCHERS.items()]
+        _print_usage(
+            "launch",
+            "",
+            *launchers,
+            "",
+            "Flags of `millrace learner` follow `--`. millrace launch NAME --help lists the flags of each.",
+        )
+        return 0
     from millrace.launch.cluster_flags import OURS, read
 
     launcher, *rest = argv or [""]
@@ -268,17 +279,24 @@ def _launch_ray(argv: list[str]) -> int:
 
     with watching("--log-json" in argv) as watch:
         run = launch(flags, learner, watch)
-    return _told(run)
+    return _print_result(run)
 
 
 def _bench(argv: list[str]) -> int:
-    import importlib.util
+    """Start the benchmarks as a process of their own: they use this package and are not installed with it."""
+    import subprocess
 
-    if importlib.util.find_spec("benchmarks") is None or importlib.util.find_spec("benchmarks.program") is None:
+    from millrace.import_conflict import INSTALLED_IN
+
+    clone = next((folder for folder in (INSTALLED_IN, Path.cwd()) if (folder / "benchmarks" / "program.py").is_file()), None)
+    if clone is None and argv and argv[0] in HELP_FLAGS:
+        _print_usage("bench")
+        return 0
+    if clone is None:
         raise UsageError("bench: not part of the installed package; run it in a clone of the repository (make bench)")
-    from benchmarks.program import main as run
-
-    return run([flag for flag in argv if flag != "--debug"])
+    path = os.pathsep.join(filter(None, [str(clone), os.environ.get("PYTHONPATH")]))
+    command = [sys.executable, "-P", "-m", "benchmarks.program", *(flag for flag in argv if flag != "--debug")]
+    return subprocess.run(command, env={**os.environ, "PYTHONPATH": path}, check=False).returncode
 
 
 def _at_least(name: str, value: int, least: int) -> None:
@@ -286,34 +304,45 @@ def _at_least(name: str, value: int, least: int) -> None:
         raise UsageError(f"{name} expected int >= {least}, got {value}")
 
 
-COMMANDS = {
-    "train": Command(_train, "train ENV [flags]", "train on this machine: the learner here, worker processes beside it"),
-    "learner": Command(
-        _learner, "learner ENV --bind ADDRESS [flags]", "the learner alone; waits for workers from elsewhere"
-    ),
-    "worker": Command(_worker, "worker ADDRESS [--token FILE] [--processes N]", "workers here that join a learner"),
-    "status": Command(_status, "status ADDRESS [--watch]", "how a run is: its workers, their speed, what was dropped"),
-    "keys": Command(_keys, "keys new|show|allow|revoke [NAME]", "who may join learners of this machine from others"),
-    "launch": Command(
-        _launch, "launch kubernetes|slurm|ray ENV [-- flags]", "the same on a cluster, placed by an engine that you have"
-    ),
-    "evaluate": Command(_evaluate, "evaluate RUN [--video] [flags]", "greedy episodes of a run's newest policy"),
-    "record": Command(_record, "record RUN --out DATASET [flags]", "episodes of a run's newest policy as a Minari dataset"),
-    "plot": Command(_plot, "plot RUN [RUN ...] [--out FILE]", "learning curves as a PNG"),
-    "presets": Command(_presets, "presets", "settings that are known to work, by environment and by name"),
-    "bench": Command(_bench, "bench [NAME] [flags]", "benchmarks: tables, JSON and pictures (in a clone of the repository)"),
-    "report": Command(_report, "report RUN [RUN ...] [--out FILE]", "runs side by side as one HTML page"),
+GROUPS = {
+    "Train": {
+        "train": Command(_train, "ENV [flags]", "train on this machine: a learner and its worker processes"),
+        "presets": Command(_presets, "", "list settings that are known to work"),
+    },
+    "Train with workers on other machines": {
+        "learner": Command(_learner, "ENV --bind ADDRESS [flags]", "start a learner alone; workers join it from elsewhere"),
+        "worker": Command(_worker, "ADDRESS [--token FILE] [flags]", "start workers that join a learner"),
+        "keys": Command(_keys, "new|show|allow|revoke [NAME]", "say who may join the learners of this machine"),
+        "status": Command(_status, "ADDRESS [--watch]", "show a run's workers, their speed, and what was dropped"),
+        "launch": Command(_launch, "kubernetes|slurm|ray ENV [flags]", "start a learner and workers on a cluster"),
+    },
+    "Look at runs": {
+        "evaluate": Command(_evaluate, "RUN [--video] [flags]", "play greedy episodes of a run's newest policy"),
+        "record": Command(_record, "RUN --out DATASET [flags]", "write its episodes as a Minari dataset"),
+        "plot": Command(_plot, "RUN [RUN ...] [--out FILE]", "draw learning curves as a PNG"),
+        "report": Command(_report, "RUN [RUN ...] [--out FILE]", "compare runs on one HTML page"),
+    },
+    "Measure millrace itself": {
+        "bench": Command(_bench, "[NAME [flags]]", "run the benchmarks (in a clone of the repository)"),
+    },
+}
+COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}
+LAUNCHERS = {
+    "kubernetes": "print a manifest: a Job for the learner, a Deployment for the workers",
+    "slurm": "print the script of one Slurm job",
+    "ray": "train: the learner here, each worker an actor of a Ray cluster",
 }
 
 
-# ---------------------------------------------------------------------------------------------------------- saying it
+# ------------------------------------------------------------------------------------------------------------ errors
 
 
-def _say(line: str) -> None:
+def _print_error(line: str) -> None:
     print(line, file=sys.stderr)
 
 
-def _trace(argv: list[str], exit_code: int) -> int:
+def _failed(argv: list[str], exit_code: int) -> int:
+    """Print the traceback if --debug was given; the exit code."""
     if "--debug" in argv:
         import traceback
 

@@ -1,29 +1,29 @@
-"""`millrace status ADDRESS`: ask a learner how its run is, and show it.
+"""`millrace status ADDRESS`: ask a learner how its run is, and print the answer. Needs only a worker's packages.
 
 The law: whoever may connect may ask, and asking changes nothing; a learner that does not answer within the deadline is an
-error, in one line.
+error of one line; nothing that a peer has named can control the terminal.
 """
 
 from __future__ import annotations
 
 import os
+import shutil
 import socket
 import time
 from collections.abc import Callable
+from typing import TextIO
 
 import msgspec
-from rich.console import Console, Group, RenderableType
-from rich.live import Live
-from rich.table import Table
-from rich.text import Text
 
-from millrace.cli.flags import StatusFlags
+from millrace.cli.arguments import Arguments
 from protocol.errors import Refused, RunError
+from protocol.keys.key_folder import TOKEN_VARIABLE, read_token
 from protocol.messages import Inquire, Status, WorkerStatus
 from protocol.wire.codec import encode
 from protocol.wire.link import WorkerLink
+from workers.code_trust import entry
 
-ASK_AGAIN_S = EVERY_S = 1.0
+ASK_AGAIN_S = WATCH_EVERY_S = 1.0
 DROPS = {
     "lost": "tickets of workers that were lost",
     "stale": "rollouts too old",
@@ -32,7 +32,40 @@ DROPS = {
     "transitions_invalid": "transitions that broke the law of a row",
     "messages_bad": "messages that could not be read",
 }
-LEFT = ("worker", "host", "lanes")  # columns of words; those of numbers stand to the right
+"""What was dropped, by its name in the ledger."""
+LEFT_ALIGNED = ("worker", "host", "lanes")  # columns of words; columns of numbers are right-aligned
+
+
+def status(argv: list[str], out: TextIO) -> None:
+    """Run the command. Raises `UsageError`, or `RunError` when the learner does not answer."""
+    arguments = Arguments("status", "Show the workers of a run: their speed, memory and silence, and what was dropped.")
+    arguments.flag("address", metavar="ADDRESS", help="where the learner listens, as in tcp://HOST:5555")
+    arguments.flag("--watch", action="store_true", help="ask again every second, until Ctrl-C or the end of the learner")
+    arguments.flag("--json", action="store_true", help="print one line of JSON instead of a table")
+    arguments.flag("--timeout-s", type=float, default=5.0, metavar="FLOAT", help="seconds to wait (default: 5)")
+    arguments.flag(
+        "--token", default="", metavar="FILE",
+        help=f"file of a join token, if workers need one; if not given, {TOKEN_VARIABLE}",
+    )  # fmt: skip
+    arguments.flag("--insecure", action="store_true", help="ask on another machine without a token, and trust the answer")
+    values = arguments.parse(argv)
+    token = entry(values.address, read_token(values.token), insecure=values.insecure)
+    link = WorkerLink(values.address, observer_name(), token=token)
+    try:
+        while True:
+            answer = ask(link, values.timeout_s)
+            text = in_json(answer) if values.json else as_table(answer)
+            if not values.watch:
+                out.write(f"{text}\n")
+                return
+            if values.json or not out.isatty():
+                out.write(f"{text}\n")
+                out.flush()
+            else:
+                redraw(text, out)
+            time.sleep(WATCH_EVERY_S)
+    finally:
+        link.close(linger_s=0)
 
 
 def observer_name() -> str:
@@ -55,54 +88,49 @@ def ask(link: WorkerLink, timeout_s: float, clock: Callable[[], float] = time.mo
     raise RunError(f"no learner answered within {timeout_s:g} s{trouble}")
 
 
-def observe(link: WorkerLink, flags: StatusFlags) -> None:
-    """Show one answer, or with --watch one every second. Raises `RunError` when the learner does not answer."""
-    console = Console()
-    if flags.json or not flags.watch or not console.is_terminal:
-        while True:
-            status = ask(link, flags.timeout_s)
-            if flags.json:
-                console.out(in_json(status), highlight=False)
-            else:
-                console.print(shown(status))
-            if not flags.watch:
-                return
-            time.sleep(EVERY_S)
-    with Live(console=console, auto_refresh=False) as live:
-        while True:
-            live.update(shown(ask(link, flags.timeout_s)), refresh=True)
-            time.sleep(EVERY_S)
-
-
 def in_json(status: Status) -> str:
-    """One line, fields by name, which the message itself leaves out."""
+    """One line of JSON. Every field has its name, which the message itself leaves out."""
     return msgspec.json.encode({"type": Status.__name__, **msgspec.structs.asdict(status)}).decode()
 
 
-def shown(status: Status) -> RenderableType:
-    """The run in two lines, its workers as a table, and what was dropped, by reason."""
+def as_table(status: Status) -> str:
+    """A line about the run, a table of its workers, and what was dropped, by reason."""
+    dropped = [f"{status.ledger[name]:,} {what}" for name, what in DROPS.items() if status.ledger.get(name)]
+    return "\n".join(
+        [
+            _run_line(status),
+            "",
+            *_table([_cells(worker, status.version) for worker in status.workers]),
+            "",
+            f"dropped: {', '.join(dropped) or 'nothing'}",
+        ]
+    )
+
+
+def redraw(text: str, out: TextIO) -> None:
+    """Clear the terminal and print as much of the text as fits."""
+    columns, rows = shutil.get_terminal_size()
+    lines = [line[:columns] for line in text.splitlines()[: rows - 1]]
+    out.write("\x1b[H\x1b[2J" + "\n".join(lines) + "\n")
+    out.flush()
+
+
+def _run_line(status: Status) -> str:
+    env = _printable(status.env)
+    if not status.total_steps:
+        return f"{env}, a vector environment: {status.env_steps:,} env steps, {status.steps_per_s:,.0f} steps/s"
     done = f"{status.env_steps:,} of {status.total_steps:,} env steps"
     score = "none yet" if status.return_mean is None else f"{status.return_mean:,.1f}"
     lag = f"lag {status.lag_mean:.1f} (max {status.lag_max})"
-    run = f"{status.env}: {done}, {status.steps_per_s:,.0f} steps/s, return {score}, update {max(status.version, 0)}, {lag}"
-    if not status.total_steps:
-        run = f"{status.env}, a vector environment: {status.env_steps:,} env steps, {status.steps_per_s:,.0f} steps/s"
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    rows = [_cells(worker, status.version) for worker in status.workers]
-    for name in rows[0] if rows else ():
-        table.add_column(name, justify="left" if name in LEFT else "right")
-    for row in rows:
-        table.add_row(*row.values())
-    dropped = [f"{status.ledger[name]:,} {what}" for name, what in DROPS.items() if status.ledger.get(name)]
-    workers = table if status.workers else Text("no worker is here", style="bold yellow")
-    return Group(Text(run, style="bold"), Text(""), workers, Text(""), Text(f"dropped: {', '.join(dropped) or 'nothing'}"))
+    return f"{env}: {done}, {status.steps_per_s:,.0f} steps/s, return {score}, update {max(status.version, 0)}, {lag}"
 
 
 def _cells(worker: WorkerStatus, version: int) -> dict[str, str]:
+    """A row of the table, by column."""
     behind = version - worker.version
     return {
-        "worker": worker.worker + (f" ({worker.strikes} strikes)" if worker.strikes else ""),
-        "host": worker.host,
+        "worker": _printable(worker.worker) + (f" ({worker.strikes} strikes)" if worker.strikes else ""),
+        "host": _printable(worker.host),
         "pid": str(worker.pid),
         "lanes": "draining" if worker.standing == "draining" else ",".join(map(str, worker.lanes)) or "spare",
         "tickets": str(worker.tickets),
@@ -111,3 +139,21 @@ def _cells(worker: WorkerStatus, version: int) -> dict[str, str]:
         "silent": f"{worker.silent_s:.1f} s",
         "memory": f"{worker.resident_bytes / 2**20:,.0f} MB" if worker.resident_bytes else "-",
     }
+
+
+def _table(rows: list[dict[str, str]]) -> list[str]:
+    """Lines: the names of the columns, then each row."""
+    if not rows:
+        return ["no worker is here"]
+    widths = {name: max(len(name), *(len(row[name]) for row in rows)) for name in rows[0]}
+
+    def line(row: dict[str, str]) -> str:
+        cells = (f"{row[name]:{'<' if name in LEFT_ALIGNED else '>'}{width}}" for name, width in widths.items())
+        return "  ".join(cells).rstrip()
+
+    return [line({name: name for name in widths}), *map(line, rows)]
+
+
+def _printable(text: str) -> str:
+    """A peer's text with control characters escaped."""
+    return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)

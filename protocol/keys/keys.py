@@ -160,10 +160,7 @@ class Allowed:
 
     def to_toml(self) -> str:
         """As text that `from_toml` reads."""
-        import tomli_w
-
-        plain = [{k: v for k, v in msgspec.structs.asdict(client).items() if v is not None} for client in self.clients]
-        return LIST_HEADER + "\n" + tomli_w.dumps({"client": plain})
+        return LIST_HEADER + "".join(f"\n{_toml_table(client)}" for client in self.clients)
 
     @staticmethod
     def from_toml(text: str, where: str) -> Allowed:
@@ -179,6 +176,14 @@ class Allowed:
             check_name(client.name, f"{where}: ")
             public_key(client.public, f"{where}: client {client.name}")
         return Allowed(clients)
+
+
+def _toml_table(client: Client) -> str:
+    """A client as a table of TOML. Names and public keys hold no character that TOML would escape."""
+    lines = [f'name = "{client.name}"', f'public = "{client.public}"', f"made = {client.made}"]
+    if client.revoked is not None:
+        lines.append(f"revoked = {client.revoked}")
+    return "\n".join(["[[client]]", *lines, ""])
 
 
 def _those(allowed: Allowed) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import importlib.util
 from pathlib import Path
 
 import pytest
@@ -24,19 +23,31 @@ def test_each_is_a_module_with_a_main(name: str) -> None:
     assert f"bench {name} " in overview()
 
 
-def test_an_unknown_one_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_one_is_refused(capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "speed"]) == 2
-    assert "bench speed: expected one of collect, vector" in capsys.readouterr().err
+    assert "bench speed: expected one of collect, vector" in capfd.readouterr().err
 
 
 def test_where_they_are_not_installed_a_line_says_so(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr("millrace.import_conflict.INSTALLED_IN", tmp_path)
+    monkeypatch.chdir(tmp_path)
     assert main(["bench"]) == 2
     assert capsys.readouterr().err.splitlines() == [
         "millrace: bench: not part of the installed package; run it in a clone of the repository (make bench)"
     ]
+    assert main(["bench", "--help"]) == 0
+    assert capsys.readouterr().out.startswith("usage: millrace bench ")
+
+
+def test_an_installed_millrace_finds_them_in_the_clone_that_is_the_current_folder(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setattr("millrace.import_conflict.INSTALLED_IN", tmp_path)
+    monkeypatch.chdir(ROOT)
+    assert main(["bench", "--help"]) == 0
+    assert capfd.readouterr().out == f"{overview()}\n"
 
 
 def test_what_is_written_tells_where_it_came_from() -> None:

@@ -486,6 +486,29 @@ def test_the_help_is_the_text_under_each_field_with_the_presets_defaults(capsys:
     assert "--env " not in both
 
 
+ALL_COMMANDS = [
+    *COMMANDS,
+    *(f"keys {name}" for name in ("new", "show", "allow", "revoke")),
+    *(f"launch {name}" for name in ("kubernetes", "slurm", "ray")),
+]
+
+
+@pytest.mark.parametrize("command", ALL_COMMANDS)
+def test_every_command_has_help_that_begins_with_its_usage_and_imports_no_torch(command: str) -> None:
+    asks = (
+        "import sys; from millrace.cli.main import main\n"
+        "try: code = main(sys.argv[1:])\n"
+        "except SystemExit as stop: code = stop.code\n"
+        "assert 'torch' not in sys.modules; sys.exit(code)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", asks, *command.split(), "--help"],
+        cwd=ROOT, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith(f"usage: millrace {command}")
+
+
 def test_a_reader_that_goes_away_is_no_error() -> None:
     reading, writing = os.pipe()
     os.close(reading)

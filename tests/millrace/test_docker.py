@@ -25,8 +25,8 @@ from tests.test_architecture import imported, sources
 
 ROOT = Path(__file__).parents[2]
 DOCKER = ROOT / "docker"
-# Imported where they are used: for policies that look at images; for key lists; for --compress; for --vector envpool.
-NOT_FOR_WORKERS = {"torch", "tomli_w", "zstandard", "envpool"}
+# Imported where they are used: for policies that process images; for --compress; for --vector envpool.
+NOT_FOR_WORKERS = {"torch", "zstandard", "envpool"}
 
 
 def names(file: Path) -> set[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import logging
 import threading
@@ -12,14 +11,13 @@ from typing import Any
 
 import pytest
 import zmq
-from rich.console import Console
 
 from learner.members.events import Event, Left, Stale, Told, describe
 from learner.rollouts.hub import Hub, HubSettings
 from learner.rollouts.status import status
 from learner.run_folder.json_log import JsonLines, progress_line
 from learner.run_folder.progress import Progress
-from millrace.cli.status import ask, in_json, observer_name, shown
+from millrace.cli.status import as_table, ask, in_json, observer_name
 from millrace.terminal import watching
 from protocol.errors import RunError
 from protocol.messages import Goodbye, Heartbeat, Inquire, Status
@@ -137,13 +135,6 @@ def test_nobody_there_is_said_at_the_deadline(context: zmq.Context[zmq.Socket[by
 # ------------------------------------------------------------------------------------------------ as it is shown
 
 
-def as_text(found: Status) -> str:
-    console = Console(file=io.StringIO(), width=140)
-    console.print(shown(found))
-    assert isinstance(console.file, io.StringIO)
-    return console.file.getvalue()
-
-
 def test_it_is_shown_as_a_table() -> None:
     learner = Learner(lanes=2)
     learner.joins(b"w0")
@@ -152,7 +143,7 @@ def test_it_is_shown_as_a_table() -> None:
     for name in (b"w2",):
         learner.joins(name)
     learner.says(b"w1", Goodbye(learner.session(b"w1"), "told to stop", ()))
-    text = as_text(told(learner))
+    text = as_table(told(learner))
     assert "1,000 of 10,000 env steps, 50 steps/s, return 12.5" in text
     assert "50 MB" in text
     assert "w2" in text
@@ -170,7 +161,7 @@ def test_in_json_every_field_has_its_name() -> None:
 
 
 def test_a_run_without_workers_says_so() -> None:
-    text = as_text(told(Learner()))
+    text = as_table(told(Learner()))
     assert "no worker is here" in text
     assert "silent" not in text
     assert "dropped: nothing" in text
@@ -251,9 +242,9 @@ def test_what_is_unusual_about_a_worker_is_shown() -> None:
     for name in (b"w0", b"w1"):
         learner.joins(name)
     learner.roster.reject(b"w1", None, "rubbish", learner.now)
-    text = as_text(told(learner))
+    text = as_table(told(learner))
     assert "spare" in text
     assert "w1 (1 strikes)" in text
     assert "none" in text
     learner.roster.drain("done")
-    assert "draining" in as_text(told(learner))
+    assert "draining" in as_table(told(learner))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import logging
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -17,11 +16,10 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.wrappers import vector as wrappers
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rich.console import Console
 
 import millrace
 from learner.vector_env.env import ZmqVectorEnv
-from millrace.cli.status import ask, observer_name, shown
+from millrace.cli.status import as_table, ask, observer_name
 from protocol.errors import EnvironmentFailed, UsageError
 from protocol.wire.link import WorkerLink
 from tests.support.bit_equality import alike
@@ -220,9 +218,7 @@ def test_whoever_asks_how_it_is_is_answered_while_it_steps() -> None:
         ("w0", (0,)),
         ("w1", (1,)),
     ]
-    console = Console(width=120, file=io.StringIO(), record=True)
-    console.print(shown(status))
-    assert "CartPole-v1, a vector environment: " in console.export_text()
+    assert "CartPole-v1, a vector environment: " in as_table(status)
 
 
 @pytest.mark.parametrize(
