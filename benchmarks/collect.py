@@ -40,7 +40,8 @@ from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.envs.vectorized import make_native
 from protocol.errors import UsageError
 from protocol.policy.distributions import distribution
-from protocol.policy.policy import Policy, buffer_size, layout, make_policy, size
+from protocol.policy.layout import acting_size, buffer_size
+from protocol.policy.policy import Policy, make_policy
 from protocol.specs import EnvSpec, ImagesDtype, PolicySpec, RunSpec
 from workers.collect.collector import Collector
 from workers.session import Assignment
@@ -167,7 +168,7 @@ def ours(kind: str, lanes: int, images: ImagesDtype, spec: EnvSpec, copies: int,
 
         torch.set_num_threads(1)
     collector = Collector(run, policy)
-    parameters = 0.01 * np.random.default_rng(0).standard_normal(size(layout(about)[0]), np.float32)
+    parameters = 0.01 * np.random.default_rng(0).standard_normal(acting_size(about), np.float32)
     collector.load(parameters, np.zeros(buffer_size(about), np.float32))
     mine = range(number * lanes, (number + 1) * lanes)
     sequence = 0

@@ -22,7 +22,8 @@ from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation
 from benchmarks.simulated import canned, run_spec
 from protocol.keys.key_folder import Keyring
 from protocol.keys.keys import Allowed, Key, Token
-from protocol.policy.policy import layout, make_policy, size
+from protocol.policy.layout import acting_size
+from protocol.policy.policy import make_policy
 from protocol.rollout import Rollout, rollout_bytes
 from protocol.specs import ActionSpec, EnvSpec, Leaf, PolicySpec, RunSpec
 from protocol.wire.codec import MAX_FRAME_BYTES, decode_to_learner, encode
@@ -88,7 +89,7 @@ def cartpole(copies: int, steps: int) -> Rollout:
     """What a worker collects with weights of 0."""
     run = msgspec.structs.replace(run_spec(1), env=EnvSpec("CartPole-v1"), copies=copies, rollout_steps=steps)
     policy = make_policy(run.policy)
-    policy.load(np.zeros(size(layout(run.policy)[0]), np.float32), np.zeros(0, np.float32))
+    policy.load(np.zeros(acting_size(run.policy), np.float32), np.zeros(0, np.float32))
     return Collector(run, policy).collect([Assignment(0, 0, 0, 0)], 0, 0, lambda: None)[0]
 
 

@@ -31,7 +31,7 @@ from benchmarks.simulated import POLICY, VERSIONS, run_spec, simulate, table
 from benchmarks.writing import write
 from learner.rollouts.hub import Hub, HubSettings
 from learner.rollouts.roster import Roster
-from protocol.policy.policy import buffer_size, layout, size
+from protocol.policy.layout import acting_size, buffer_size
 from protocol.rollout import stack
 from protocol.wire.link import LearnerLink
 
@@ -74,7 +74,7 @@ def learn(workers: int, seconds: float, transport: str, folder: Path, told: Conn
     link = LearnerLink(f"ipc://{folder}/learner" if transport == "ipc" else "tcp://127.0.0.1:*")
     roster = Roster(run, rollouts_per_update=workers, max_lag=0, worker_timeout_s=10, first_session=1)
     hub = Hub(link, roster, HubSettings(no_workers_timeout_s=60, stall_timeout_s=30, max_env_failures=0))
-    parameters = np.zeros(size(layout(POLICY)[0]), np.float32)
+    parameters = np.zeros(acting_size(POLICY), np.float32)
     buffers = np.zeros(buffer_size(POLICY), np.float32)
     published_s: list[float] = []
 

@@ -22,7 +22,7 @@ from learner.config.layers import resolve
 from learner.rollouts.hub import Hub, HubSettings
 from learner.rollouts.roster import Roster
 from learner.run import run_spec
-from protocol.policy.policy import buffer_size, layout, size
+from protocol.policy.layout import buffer_size, parameter_layout, total_size
 from protocol.specs import EnvSpec
 from protocol.wire.link import LearnerLink
 from workers.host import Process
@@ -36,12 +36,12 @@ CASES = {
 def start_one(env: EnvSpec) -> tuple[float, float]:
     """Seconds from exec to the first rollout, and resident megabytes after it."""
     run = run_spec(resolve(env.id, lanes=1, envs=8, rollout_steps=128), env)
-    acting, _ = layout(run.policy)
+    acting, _ = parameter_layout(run.policy)
     with tempfile.TemporaryDirectory() as folder:
         link = LearnerLink(f"ipc://{folder}/learner")
         roster = Roster(run, rollouts_per_update=1, max_lag=0, worker_timeout_s=60, first_session=1)
         hub = Hub(link, roster, HubSettings(no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=0))
-        hub.publish(0, np.zeros(size(acting), np.float32), np.zeros(buffer_size(run.policy), np.float32))
+        hub.publish(0, np.zeros(total_size(acting), np.float32), np.zeros(buffer_size(run.policy), np.float32))
         began_s = time.perf_counter()
         worker = Process(link.address, "w0", Path(folder) / "log")
         hub.gather()

@@ -18,7 +18,7 @@ FORBIDDEN = {
 }
 MAY_PRINT = {"millrace/cli/main.py", "millrace/terminal.py"}
 MAY_UNPICKLE = {"protocol/specs.py"}
-MAY_IMPORT_TORCH = {"protocol/policy/encoder.py", "protocol/policy/networks.py"}
+MAY_IMPORT_TORCH = {f"protocol/policy/{name}.py" for name in ("encoder", "networks", "torch_distributions", "torch_policy")}
 
 
 def sources(*folders: str) -> list[str]:

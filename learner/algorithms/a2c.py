@@ -56,7 +56,7 @@ class A2C:
         return parts.metrics([measured]) | {"train/explained_variance": explained}
 
     def weights(self) -> tuple[Floats, Floats]:
-        """Copies of the acting parameters [P] and of the buffers, as `protocol.policy.policy` lays them out."""
+        """Copies of the acting parameters [P] and of the buffers, as `protocol.policy.layout` lays them out."""
         return self.parts.weights()
 
     def state_dict(self) -> dict[str, Any]:

@@ -24,8 +24,9 @@ from learner.algorithms.normalization import ObservationNormaliser, RewardScaler
 from learner.config.hyperparameters import ActorCriticHyperparameters, RecurrentHyperparameters
 from protocol.arrays import Array, Bools, Floats
 from protocol.errors import RunError
-from protocol.policy.networks import ActorCriticNetwork, RecurrentInput, log_prob_and_entropy
-from protocol.policy.policy import features, normalized
+from protocol.policy.features import features, normalize
+from protocol.policy.networks import ActorCriticNetwork, RecurrentInput
+from protocol.policy.torch_distributions import log_prob_and_entropy
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
@@ -148,7 +149,7 @@ class Parts:
     def see(self, batch: Batch) -> Seen:
         """Observations as the workers saw them."""
         raw = features(self.policy, batch.obs)
-        x = normalized(raw, *np.split(self._buffers, 2)) if self.policy.normalize_observations else raw
+        x = normalize(raw, *np.split(self._buffers, 2)) if self.policy.normalize_observations else raw
         images = [array for leaf, array in zip(self.policy.observation, batch.obs, strict=True) if leaf.is_image]
         carried = np.concatenate([np.ones((1, raw.shape[1]), bool), batch.valid]).astype(np.float32)
         recurrent = RecurrentInput(self._to_device(batch.state), self._to_device(carried))
@@ -336,7 +337,7 @@ class Parts:
     # ---------------------------------------------------------------- what leaves, and comes back
 
     def weights(self) -> tuple[Floats, Floats]:
-        """Copies of the acting parameters [P] and of the buffers, as `protocol.policy.policy` lays them out."""
+        """Copies of the acting parameters [P] and of the buffers, as `protocol.policy.layout` lays them out."""
         return self.net.flat[: self.net.acting_size].cpu().numpy().copy(), self._buffers.copy()
 
     def state_dict(self) -> dict[str, Any]:

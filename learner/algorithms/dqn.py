@@ -25,8 +25,8 @@ from learner.algorithms.replay import Replay, Sample
 from learner.config.hyperparameters import DQNConfig
 from protocol.arrays import Array, Floats
 from protocol.errors import RunError, UsageError
+from protocol.policy.features import features, normalize
 from protocol.policy.networks import QNetwork
-from protocol.policy.policy import features, normalized
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
@@ -161,7 +161,7 @@ class DQN:
         """Features [B, D], normalised by the present statistics, and images [B, *leaf] uint8."""
         x = features(self.policy, leaves)
         if self.policy.normalize_observations:
-            x = normalized(x, *np.split(self._statistics, 2))
+            x = normalize(x, *np.split(self._statistics, 2))
         return x, [array for leaf, array in zip(self.policy.observation, leaves, strict=True) if leaf.is_image]
 
     def _check(self, measured: Measured) -> None:

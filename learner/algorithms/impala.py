@@ -73,7 +73,7 @@ class Impala:
         return parts.rows(batch, seen, advantage, target), told
 
     def weights(self) -> tuple[Floats, Floats]:
-        """Copies of the acting parameters [P] and of the buffers, as `protocol.policy.policy` lays them out."""
+        """Copies of the acting parameters [P] and of the buffers, as `protocol.policy.layout` lays them out."""
         return self.parts.weights()
 
     def state_dict(self) -> dict[str, Any]:

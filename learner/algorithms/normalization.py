@@ -13,7 +13,8 @@ import torch
 
 from learner.algorithms.returns import discounted_return
 from protocol.arrays import Doubles, Floats
-from protocol.policy.policy import buffer_size, measured_features
+from protocol.policy.features import box_feature_mask
+from protocol.policy.layout import buffer_size
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
 
@@ -60,7 +61,7 @@ class ObservationNormaliser:
 
     def __init__(self, spec: PolicySpec) -> None:
         self._on = spec.normalize_observations
-        self._measured = measured_features(spec)
+        self._measured = box_feature_mask(spec)
         self._moments = RunningMoments(self._measured.shape)
         assert not self._on or buffer_size(spec) == 2 * len(self._measured)
 

@@ -70,7 +70,7 @@ class REINFORCE:
         }
 
     def weights(self) -> tuple[Floats, Floats]:
-        """Copies of the acting parameters [P] and of the buffers, as `protocol.policy.policy` lays them out."""
+        """Copies of the acting parameters [P] and of the buffers, as `protocol.policy.layout` lays them out."""
         return self.parts.weights()
 
     def state_dict(self) -> dict[str, Any]:

@@ -30,7 +30,7 @@ from learner.run_folder.results import Summary
 from learner.run_folder.run_format import RUN_FILE, check_format, write_format
 from protocol.arrays import Floats
 from protocol.errors import RunError, UsageError
-from protocol.policy.policy import Field, buffer_fields, layout, size, views
+from protocol.policy.layout import Field, buffer_layout, named_views, parameter_layout, total_size
 from protocol.specs import EnvSpec, PolicySpec, Scalar
 
 if TYPE_CHECKING:
@@ -129,15 +129,15 @@ class RunFolder:
         """The arrays and policy.json. `parameters` starts with the acting part; the critic's is left out."""
         from safetensors.numpy import save
 
-        acting, _ = layout(spec)
-        arrays = views(parameters[: size(acting)], acting) | views(buffers, buffer_fields(spec))
+        acting, _ = parameter_layout(spec)
+        arrays = named_views(parameters[: total_size(acting)], acting) | named_views(buffers, buffer_layout(spec))
         card = PolicyCard(
             format=POLICY_FORMAT,
             env=env.id,
             env_kwargs=env.kwargs,
             policy=spec,
             arrays=_array_cards(acting),
-            buffers=tuple(views(buffers, buffer_fields(spec))),
+            buffers=tuple(named_views(buffers, buffer_layout(spec))),
         )
         self._write(POLICY_ARRAYS[which], save({name: np.ascontiguousarray(array) for name, array in arrays.items()}))
         self._write(POLICY_CARD, msgspec.json.format(msgspec.json.encode(card), indent=2) + b"\n")
@@ -156,9 +156,9 @@ class RunFolder:
             raise UsageError(f"policy of run {self.path} cannot be read: {error}") from error
         if card.format != POLICY_FORMAT:
             raise UsageError(f"policy of run {self.path}: expected format {POLICY_FORMAT}, got {card.format}")
-        acting, _ = layout(card.policy)
+        acting, _ = parameter_layout(card.policy)
         wanted = {field.name: field.shape for field in acting}
-        wanted |= {field.name: field.shape for field in buffer_fields(card.policy)}
+        wanted |= {field.name: field.shape for field in buffer_layout(card.policy)}
         for name in sorted(arrays.keys() | wanted.keys()):
             shape = arrays[name].shape if name in arrays else "nothing"
             if name not in wanted or shape != wanted[name] or arrays[name].dtype != np.float32:
@@ -201,7 +201,7 @@ def sanitised(env: str) -> str:
 
 
 def _array_cards(fields: tuple[Field, ...]) -> tuple[ArrayCard, ...]:
-    starts = [size(fields[:i]) for i in range(len(fields))]
+    starts = [total_size(fields[:i]) for i in range(len(fields))]
     return tuple(ArrayCard(field.name, field.shape, start) for field, start in zip(fields, starts, strict=True))
 
 

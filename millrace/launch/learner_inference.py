@@ -86,7 +86,7 @@ def acting(spec: PolicySpec, device: str, images: ImagesDtype) -> Policy:
     """What acts: as on a worker, to the same bits, where that is numpy on the CPU; else torch on the device, in one pass."""
     if device == "cpu" and not spec.needs_torch:
         return make_policy(spec)
-    from protocol.policy.networks import TorchPolicy
+    from protocol.policy.torch_policy import TorchPolicy
 
     return TorchPolicy(spec, device, together=True, images=images)
 

@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 import torch
 
 from protocol.errors import UsageError, first_line
-from protocol.policy.policy import feature_size
+from protocol.policy.features import feature_size
 from protocol.specs import ActionSpec, EncoderSpec, Leaf, NamedShape, PolicySpec
 
 

@@ -16,7 +16,7 @@ from learner.evaluate import COPIES, evaluate, load_policy
 from learner.run_folder.run_folder import RunFolder
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import EnvironmentFailed, UsageError
-from protocol.policy.policy import buffer_size, layout, size
+from protocol.policy.layout import acting_size, buffer_size
 from protocol.specs import EnvSpec, PolicySpec
 
 Array = np.ndarray[Any, Any]
@@ -156,7 +156,7 @@ def test_a_run_folder_is_enough_to_act_again(tmp_path: Path, env_id: str) -> Non
     )
     rng = np.random.default_rng(0)
     folder = RunFolder.create(resolve(env_id, run_dir=str(tmp_path)))
-    parameters = rng.standard_normal(size(layout(spec)[0]), dtype=np.float32)
+    parameters = rng.standard_normal(acting_size(spec), dtype=np.float32)
     folder.write_policy(spec, env, parameters, rng.random(buffer_size(spec), dtype=np.float32) + 0.5)
     policy, found_spec, found_env = load_policy(folder.path)
     assert (found_spec, found_env) == (spec, env)

@@ -24,7 +24,7 @@ from learner.run_folder.run_folder import Interrupted, RunFolder
 from millrace.cli.main import COMMANDS, main
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import EnvironmentFailed, NoWorkers
-from protocol.policy.policy import layout, size
+from protocol.policy.layout import acting_size
 from protocol.specs import EnvSpec, PolicySpec
 
 ROOT = Path(__file__).parents[2]
@@ -370,7 +370,7 @@ def a_run_that_acts(tmp_path: Path, env_id: str = "CartPole-v1") -> Path:
     env = EnvSpec(env_id)
     made = env.make()
     spec = PolicySpec(observation_leaves(made.observation_space), action_spec(made.action_space), net=(4,))
-    run.write_policy(spec, env, np.zeros(size(layout(spec)[0]), np.float32), np.zeros(0, np.float32))
+    run.write_policy(spec, env, np.zeros(acting_size(spec), np.float32), np.zeros(0, np.float32))
     return run.path
 
 

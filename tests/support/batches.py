@@ -9,7 +9,7 @@ import numpy as np
 
 from protocol.arrays import Array
 from protocol.policy.distributions import distribution
-from protocol.policy.policy import NumpyPolicy
+from protocol.policy.numpy_policy import NumpyPolicy
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 

@@ -14,7 +14,8 @@ from gymnasium.vector import SyncVectorEnv
 from learner.config.layers import resolve
 from millrace.launch.local import train
 from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.policy.policy import Policy, buffer_size, layout, make_policy, size
+from protocol.policy.layout import acting_size, buffer_size
+from protocol.policy.policy import Policy, make_policy
 from protocol.rollout import Rollout, validate
 from protocol.specs import EnvSpec, PolicySpec, RunSpec
 from workers.collect.collector import Collector, OpenCopies, copies_of
@@ -53,7 +54,7 @@ def random_policy(spec: PolicySpec) -> Policy:
     """A policy with random weights, the same ones each time."""
     generator = np.random.default_rng(5)
     policy = make_policy(spec)
-    parameters = generator.normal(0, 0.3, size(layout(spec)[0])).astype(np.float32)
+    parameters = generator.normal(0, 0.3, acting_size(spec)).astype(np.float32)
     policy.load(parameters, generator.uniform(0.5, 1.5, buffer_size(spec)).astype(np.float32))
     return policy
 

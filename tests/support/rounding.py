@@ -17,8 +17,8 @@ import numpy as np
 import torch
 
 from protocol.arrays import Array
-from protocol.policy.networks import log_prob_and_entropy
-from protocol.policy.policy import hidden_names, layout, size, views
+from protocol.policy.layout import hidden_names, named_views, parameter_layout, total_size
+from protocol.policy.torch_distributions import log_prob_and_entropy
 from protocol.specs import PolicySpec
 
 UNIT = 2.0**-24
@@ -38,8 +38,9 @@ def sums_of_absolute_values(
     `flat` [P], `x` [B, D] and `by_outputs` (gradients by log-probability, entropy and value, [B] each) are float64. A
     backward pass over absolute values gives the sums. The policy has no shared trunk.
     """
-    weights, found = views(flat, sum(layout(spec), ())), np.zeros(size(sum(layout(spec), ())))
-    grads = views(found, sum(layout(spec), ()))
+    fields = sum(parameter_layout(spec), ())
+    weights, found = named_views(flat, fields), np.zeros(total_size(fields))
+    grads = named_views(found, fields)
     by_log_prob, by_entropy, by_value = map(np.abs, by_outputs)
 
     def trunk(names: list[str]) -> list[Array]:

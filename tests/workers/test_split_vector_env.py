@@ -13,8 +13,8 @@ from gymnasium.vector import SyncVectorEnv
 
 from learner.recording.episodes import EpisodeAssembler
 from protocol.errors import NoWorkers
-from protocol.policy.networks import TorchPolicy
-from protocol.policy.policy import buffer_size, layout, size
+from protocol.policy.layout import acting_size, buffer_size
+from protocol.policy.torch_policy import TorchPolicy
 from protocol.specs import RunSpec
 from tests.support.collectors import TOY, a_collector, bits, collect, no_pulse, random_policy, run_of
 from workers.collect.collector import Collector
@@ -148,7 +148,7 @@ def test_a_step_that_was_lost_is_in_no_valid_row(at: int) -> None:
 def test_one_pass_for_all_lanes_says_what_a_pass_for_each_says(policy: dict[str, Any]) -> None:
     spec = run_of(f"{TOY}Spaces-v0", **policy).policy
     generator = np.random.default_rng(0)
-    parameters = generator.normal(0, 0.3, size(layout(spec)[0])).astype(np.float32)
+    parameters = generator.normal(0, 0.3, acting_size(spec)).astype(np.float32)
     buffers = generator.uniform(0.5, 1.5, buffer_size(spec)).astype(np.float32)
     leaves = [generator.integers(0, 2, (LANES, 4, *leaf.shape)).astype(leaf.dtype) for leaf in spec.observation]
     for array, leaf in zip(leaves, spec.observation, strict=True):

@@ -24,7 +24,7 @@ from protocol.messages import (
     Weights,
     Welcome,
 )
-from protocol.policy.policy import buffer_size, layout, size
+from protocol.policy.layout import acting_size, buffer_size
 from protocol.rollout import rollout_bytes
 from protocol.specs import RunSpec
 from protocol.wire.codec import Buffer, decode_to_learner, decode_to_worker, encode
@@ -68,7 +68,7 @@ def work(link: FakeLink) -> Leave:
     return Worker(cast(WorkerLink, link), Session(identity("w0"), 0.0), clock=lambda: 0.0).run()
 
 
-PARAMETERS = np.random.default_rng(0).normal(0, 0.1, size(layout(RUN.policy)[0])).astype(np.float32)
+PARAMETERS = np.random.default_rng(0).normal(0, 0.1, acting_size(RUN.policy)).astype(np.float32)
 BUFFERS = np.ones(buffer_size(RUN.policy), np.float32)
 
 

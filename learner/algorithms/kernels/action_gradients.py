@@ -1,7 +1,7 @@
 """Log-probabilities and entropies of actions, and their gradients by hand, for the update without a graph.
 
-The law: they are those of `log_prob_and_entropy` (`protocol.policy.networks`) and autograd, to rounding. Parameters are
-[P, B], a column for each of B rows; actions are [B, k]. Forward keeps what backward needs.
+The law: they are those of `log_prob_and_entropy` (`protocol.policy.torch_distributions`) and autograd, to
+rounding. Parameters are [P, B], a column for each of B rows; actions are [B, k]. Forward keeps what backward needs.
 """
 
 from __future__ import annotations

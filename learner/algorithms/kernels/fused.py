@@ -15,7 +15,8 @@ import numpy as np
 from learner.algorithms.kernels.action_gradients import Actions, actions
 from learner.algorithms.kernels.mlp import Head, Layers, Linear
 from protocol.arrays import Array
-from protocol.policy.policy import feature_size, hidden_names, layout, size, views
+from protocol.policy.features import feature_size
+from protocol.policy.layout import hidden_names, named_views, parameter_layout, total_size
 from protocol.specs import PolicySpec
 
 MOST_ROWS = 16_384  # of a minibatch: what is kept of one takes memory
@@ -31,7 +32,7 @@ class FusedActorCritic:
     """`ActorCriticNetwork` on the same flat parameters and gradients."""
 
     def __init__(self, spec: PolicySpec, flat: Array, flat_grad: Array) -> None:
-        """`flat`, `flat_grad`: [P] as `protocol.policy.policy.layout` says, changed in place by others and by `backward`."""
+        """`flat`, `flat_grad`: [P] as `protocol.policy.layout` says, changed in place by others and by `backward`."""
         values, grads = _views(spec, flat), _views(spec, flat_grad)
         trunks = [hidden_names(spec)] if spec.shared_net else [hidden_names(spec), hidden_names(spec, "critic")]
         hidden = [Linear.of(names, values, grads) for names in zip(*trunks, strict=True)]
@@ -64,7 +65,7 @@ class FusedQ:
     """`QNetwork` on the same flat parameters and gradients."""
 
     def __init__(self, spec: PolicySpec, flat: Array, flat_grad: Array) -> None:
-        """`flat`, `flat_grad`: [P] as `protocol.policy.policy.layout` says, changed in place by others and by `backward`."""
+        """`flat`, `flat_grad`: [P] as `protocol.policy.layout` says, changed in place by others and by `backward`."""
         values, grads = _views(spec, flat), _views(spec, flat_grad)
         hidden = [Linear.of([name], values, grads) for name in hidden_names(spec)]
         names = ("q.out", "q.value") if spec.dueling else ("q.out",)
@@ -94,6 +95,6 @@ def _mean(array: Array) -> Array:
 
 
 def _views(spec: PolicySpec, flat: Array) -> dict[str, Array]:
-    fields: Sequence[Any] = sum(layout(spec), ())
-    assert len(flat) == size(fields)
-    return views(flat, fields)
+    fields: Sequence[Any] = sum(parameter_layout(spec), ())
+    assert len(flat) == total_size(fields)
+    return named_views(flat, fields)

@@ -18,7 +18,7 @@ from learner.algorithms.impala import Impala
 from learner.algorithms.reinforce import REINFORCE
 from learner.config.hyperparameters import HYPERPARAMETERS
 from protocol.errors import RunError
-from protocol.policy.policy import layout, size
+from protocol.policy.layout import acting_size
 from protocol.specs import PolicySpec
 from tests.support.batches import (
     COPIES,
@@ -69,7 +69,7 @@ def test_each_is_an_algorithm_with_the_policy_of_its_settings(name: str) -> None
     spec = algorithm_class(name).policy_spec(config, DISCRETE.observation, DISCRETE.action)
     assert (spec.shared_net, spec.net, spec.normalize_observations) == (True, (8,), True)
     algorithm: Algorithm = algorithm_class(name)(config, spec, total_steps=1, seed=0)
-    assert algorithm.weights()[0].shape == (size(layout(spec)[0]),)
+    assert algorithm.weights()[0].shape == (acting_size(spec),)
 
 
 @pytest.mark.parametrize("name", NAMES)

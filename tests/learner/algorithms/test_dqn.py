@@ -20,7 +20,9 @@ from learner.config.hyperparameters import DQNConfig
 from protocol.arrays import Array, Floats, Ints
 from protocol.errors import RunError, UsageError
 from protocol.policy.distributions import distribution
-from protocol.policy.policy import NumpyPolicy, make_policy, views
+from protocol.policy.layout import named_views
+from protocol.policy.numpy_policy import NumpyPolicy
+from protocol.policy.policy import make_policy
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf
 
@@ -116,7 +118,7 @@ def chain(**settings: Any) -> DQN:
     made = DQN(config, spec, total_steps=1000, seed=0)
     for net, table in ((made.net, Q), (made.target, Q_TARGET)):
         net.flat.zero_()
-        views(net.flat.numpy(), net.fields)["q.out.weight"][:] = table
+        named_views(net.flat.numpy(), net.fields)["q.out.weight"][:] = table
     return made
 
 
@@ -168,7 +170,7 @@ def test_a_step_moves_the_value_of_the_action_taken_towards_its_target() -> None
     drawn = made.replay.sample(50)
     before = made.net.flat.clone().numpy()
     made.step(drawn)
-    moved = views(made.net.flat.numpy() - before, made.net.fields)["q.out.weight"]
+    moved = named_views(made.net.flat.numpy() - before, made.net.fields)["q.out.weight"]
     assert moved[1, 0] > 0  # Q(0, 1) = 3 → 26
     assert moved[0, 1] < 0  # Q(1, 0) = 5 → 3
     moved[1, 0] = moved[0, 1] = 0

@@ -21,8 +21,9 @@ from learner.algorithms.kernels.fused import FusedActorCritic, applies
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
 from protocol.arrays import Array
-from protocol.policy.networks import ActorCriticNetwork, log_prob_and_entropy
-from protocol.policy.policy import layout, size
+from protocol.policy.layout import parameter_layout, total_size
+from protocol.policy.networks import ActorCriticNetwork
+from protocol.policy.torch_distributions import log_prob_and_entropy
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 from tests.protocol.policy.test_networks import ACTIONS
 from tests.support.batches import DISCRETE, GAUSSIAN, IMAGE, batch, no_pulse, normal, recurrent, shared
@@ -110,7 +111,7 @@ def test_the_gradient_is_the_slope_in_float64(
     monkeypatch.setattr(layers, "LARGE", large)
     generator = np.random.default_rng(3)
     spec = PolicySpec(BOX, ACTIONS[action], (5, 3), activation, shared_net=shared_net)
-    flat = generator.normal(0, 0.5, sum(map(size, layout(spec))))
+    flat = generator.normal(0, 0.5, sum(map(total_size, parameter_layout(spec))))
     grad = np.full_like(flat, np.nan)
     fused = FusedActorCritic(spec, flat, grad)
     x, taken = generator.normal(size=(6, 4)), some_actions(spec.action, 6, generator)
@@ -131,7 +132,7 @@ PPO_LOSSES = ("clipped surrogate", "policy gradient"), ("squared", "clipped"), (
 def test_the_gradient_of_every_loss_is_its_slope_in_float64(policy_loss: str, value_loss: str, ent_coef: float) -> None:
     generator, rows = np.random.default_rng(4), 8
     spec = PolicySpec(BOX, ACTIONS["discrete"], (5, 3))
-    flat = generator.normal(0, 0.5, sum(map(size, layout(spec))))
+    flat = generator.normal(0, 0.5, sum(map(total_size, parameter_layout(spec))))
     grad = np.full_like(flat, np.nan)
     fused = FusedActorCritic(spec, flat, grad)
     x, taken = generator.normal(size=(rows, 4)), some_actions(spec.action, rows, generator)

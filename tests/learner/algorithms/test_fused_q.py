@@ -21,8 +21,8 @@ from learner.algorithms.kernels.fused import FusedQ
 from learner.algorithms.replay import Sample
 from learner.config.hyperparameters import DQNConfig
 from protocol.arrays import Array
+from protocol.policy.layout import parameter_layout, total_size
 from protocol.policy.networks import QNetwork
-from protocol.policy.policy import layout, size
 from protocol.specs import PolicySpec
 from tests.learner.algorithms.test_dqn import batch
 from tests.support.batches import BOX, DISCRETE, IMAGE, no_pulse
@@ -94,7 +94,7 @@ def test_the_gradient_is_the_slope_of_the_loss_in_float64(
     monkeypatch.setattr(layers, "LARGE", large)
     generator, rows = np.random.default_rng(5), 9
     spec = policy((5, 3), activation, dueling)
-    flat = generator.normal(0, 0.5, sum(map(size, layout(spec))))
+    flat = generator.normal(0, 0.5, sum(map(total_size, parameter_layout(spec))))
     grad = np.full_like(flat, np.nan)
     without = FusedQ(spec, flat, grad)
     x, action = generator.normal(size=(rows, 4)), generator.integers(0, 4, rows)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from learner.algorithms.normalization import ObservationNormaliser, RewardScaler, RunningMoments
 from protocol.arrays import Array
-from protocol.policy.policy import buffer_size
+from protocol.policy.layout import buffer_size
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 

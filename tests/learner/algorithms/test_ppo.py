@@ -16,7 +16,7 @@ from learner.algorithms.actor_critic import Minibatch
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import PPOConfig
 from protocol.errors import RunError
-from protocol.policy.policy import layout, size
+from protocol.policy.layout import acting_size
 from protocol.specs import PolicySpec
 from tests.support.batches import (
     COPIES,
@@ -103,7 +103,7 @@ def test_a_saved_state_does_not_change_with_the_algorithm() -> None:
 def test_weights_are_snapshots_of_the_acting_part() -> None:
     algorithm = ppo(spec=normal(GAUSSIAN))
     parameters, buffers = algorithm.weights()
-    assert parameters.shape == (size(layout(GAUSSIAN)[0]),)
+    assert parameters.shape == (acting_size(GAUSSIAN),)
     assert buffers.tolist() == [0.0] * 4 + [1.0] * 4
     before = parameters.copy(), buffers.copy()
     algorithm.update(batch(algorithm, 0), no_pulse)

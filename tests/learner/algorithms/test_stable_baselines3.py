@@ -28,8 +28,9 @@ from learner.config.hyperparameters import DQNConfig, PPOConfig
 from learner.run_folder.run_folder import RunFolder
 from protocol.envs.spaces import action_spec, observation_leaves, writer
 from protocol.policy.distributions import distribution
-from protocol.policy.networks import ActorCriticNetwork, log_prob_and_entropy
+from protocol.policy.networks import ActorCriticNetwork
 from protocol.policy.policy import make_policy
+from protocol.policy.torch_distributions import log_prob_and_entropy
 from protocol.specs import EnvSpec, PolicySpec
 from tests.support.batches import batch, no_pulse
 

@@ -21,7 +21,7 @@ from learner.recording.record import Player, record
 from learner.run_folder.run_folder import RunFolder
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import EnvironmentFailed, OurError, RunError, UsageError
-from protocol.policy.policy import buffer_size, layout, size
+from protocol.policy.layout import acting_size, buffer_size
 from protocol.rollout import Rollout
 from protocol.specs import EnvSpec, PolicySpec
 
@@ -213,7 +213,10 @@ def a_run(folder: Path, env: EnvSpec) -> Path:
     run = RunFolder.create(resolve(env.id, run_dir=str(folder)))
     rng = np.random.default_rng(0)
     run.write_policy(
-        spec, env, 0.1 * rng.standard_normal(size(layout(spec)[0]), np.float32), np.zeros(buffer_size(spec), np.float32)
+        spec,
+        env,
+        0.1 * rng.standard_normal(acting_size(spec), np.float32),
+        np.zeros(buffer_size(spec), np.float32),
     )
     return run.path
 

@@ -19,7 +19,7 @@ from learner.run_folder.results import Evaluation, Summary
 from learner.run_folder.run_folder import RunFolder, sanitised
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import RunError, UsageError
-from protocol.policy.policy import buffer_size, layout, size
+from protocol.policy.layout import acting_size, buffer_size, parameter_layout, total_size
 from protocol.rollout import Episode
 from protocol.specs import EnvSpec, PolicySpec
 
@@ -40,10 +40,10 @@ def pendulum_like(bound: float) -> PolicySpec:
 
 
 def weights(spec: PolicySpec) -> tuple[np.ndarray, np.ndarray]:
-    acting, critic = layout(spec)
+    acting, critic = parameter_layout(spec)
     rng = np.random.default_rng(0)
     return (
-        rng.standard_normal(size(acting) + size(critic), dtype=np.float32),
+        rng.standard_normal(total_size(acting) + total_size(critic), dtype=np.float32),
         rng.random(buffer_size(spec), dtype=np.float32),
     )
 
@@ -85,7 +85,7 @@ def test_a_policy_comes_back_as_it_was(tmp_path: Path, bound: float) -> None:
     folder.write_policy(spec, EnvSpec("Mine-v0", {"g": 9.8}), parameters, buffers)
     card, acting, normal = folder.read_policy()
     assert (card.policy, card.env, card.env_kwargs) == (spec, "Mine-v0", {"g": 9.8})
-    assert acting.tobytes() == parameters[: size(layout(spec)[0])].tobytes()
+    assert acting.tobytes() == parameters[: acting_size(spec)].tobytes()
     assert normal.tobytes() == buffers.tobytes()
 
 

@@ -18,7 +18,7 @@ from learner.run_folder.run_folder import RunFolder
 from learner.run_folder.run_format import RUN_FILE, RUN_FORMAT, check_format
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import UsageError
-from protocol.policy.policy import layout, size
+from protocol.policy.layout import acting_size
 from protocol.specs import EnvSpec, PolicySpec
 
 
@@ -29,7 +29,7 @@ def run(tmp_path: Path) -> Path:
     env = EnvSpec("CartPole-v1")
     made = env.make()
     spec = PolicySpec(observation_leaves(made.observation_space), action_spec(made.action_space), net=(4,))
-    folder.write_policy(spec, env, np.zeros(size(layout(spec)[0]), np.float32), np.zeros(0, np.float32))
+    folder.write_policy(spec, env, np.zeros(acting_size(spec), np.float32), np.zeros(0, np.float32))
     log = MetricsLog(folder.path)
     for steps in (100, 200):
         log.write(Progress(env_steps=steps, return_mean=1.0), {})

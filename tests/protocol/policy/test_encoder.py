@@ -18,8 +18,10 @@ from learner.run import run_spec
 from learner.run_folder.run_folder import RunFolder
 from protocol.errors import UsageError
 from protocol.policy.encoder import describe_encoder, make_encoder
-from protocol.policy.networks import ActorCriticNetwork, QNetwork, TorchPolicy
-from protocol.policy.policy import layout, make_policy, size
+from protocol.policy.layout import acting_size
+from protocol.policy.networks import ActorCriticNetwork, QNetwork
+from protocol.policy.policy import make_policy
+from protocol.policy.torch_policy import TorchPolicy
 from protocol.specs import Code, EnvSpec, NamedShape, PolicySpec
 from tests.support.batches import DISCRETE, IMAGE, batch, no_pulse, recurrent
 
@@ -63,7 +65,7 @@ def test_it_learns_with_the_rest(name: str) -> None:
     for field, tensor in algorithm.net.parameters.items():
         if not field.endswith(".bias"):
             assert not torch.equal(tensor, before[field]), field
-    assert algorithm.weights()[0].shape == (size(layout(spec)[0]),)
+    assert algorithm.weights()[0].shape == (acting_size(spec),)
 
 
 @pytest.mark.parametrize("spec", [DISCRETE, recurrent(DISCRETE, "gru"), msgspec.structs.replace(DISCRETE, head="q")])

@@ -15,10 +15,13 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from protocol.arrays import Array
-from protocol.policy import policy as acting
 from protocol.policy.distributions import distribution
-from protocol.policy.networks import MLP, ActorCriticNetwork, TorchPolicy, log_prob_and_entropy
-from protocol.policy.policy import NumpyPolicy, buffer_size, features, layout, normalized, size
+from protocol.policy.features import features, normalize
+from protocol.policy.layout import buffer_size, convolutions, parameter_layout, total_size
+from protocol.policy.networks import MLP, ActorCriticNetwork
+from protocol.policy.numpy_policy import NumpyPolicy
+from protocol.policy.torch_distributions import log_prob_and_entropy
+from protocol.policy.torch_policy import TorchPolicy
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
 BOX = Leaf("x", "box", (2, 3), "float32")
@@ -84,7 +87,7 @@ def test_numpy_and_torch_agree(
     numpy_net.load(parameters, buffers)
     obs = leaves(spec.observation, (1, 7), generator)
     x = features(spec, obs)
-    x = normalized(x, *np.split(buffers, 2)) if normal else x
+    x = normalize(x, *np.split(buffers, 2)) if normal else x
     expected = numpy_net(obs)[0]
     params, value = torch_net.forward(torch.tensor(x[0]))
     np.testing.assert_allclose(params.detach(), expected, atol=1e-5, rtol=1e-5)
@@ -124,7 +127,7 @@ def plain(net: ActorCriticNetwork, x: Tensor, images: list[Tensor]) -> tuple[Ten
     parts, waiting = [x], list(images)
     for i, leaf in enumerate(spec.observation):
         if leaf.is_image:
-            stack, shape, _ = acting.convolutions(leaf)
+            stack, shape, _ = convolutions(leaf)
             image = waiting.pop(0).to(x.dtype) / 255
             h = image if leaf.shape == shape else image.movedim(-1, 1)
             for j, conv in enumerate(stack):
@@ -171,9 +174,9 @@ def test_every_parameter_and_gradient_is_a_view_of_one_flat_tensor() -> None:
     spec = PolicySpec((BOX, *IMAGES["channels last"]), ACTIONS["box"])
     net = ActorCriticNetwork(spec)
     assert net.flat.grad is net.flat_grad
-    acting_fields, critic_fields = layout(spec)
+    acting_fields, critic_fields = parameter_layout(spec)
     assert list(net.parameters) == [field.name for field in (*acting_fields, *critic_fields)]
-    assert net.acting_size == size(acting_fields)
+    assert net.acting_size == total_size(acting_fields)
     net.flat.copy_(torch.arange(len(net.flat)))
     net.flat_grad.copy_(torch.arange(len(net.flat)))
     at = 0
@@ -250,7 +253,7 @@ def test_torch_policy_gives_each_lane_the_bits_it_gets_alone(observation: tuple[
     assert together.dtype == np.float32
     for lane in range(3):
         np.testing.assert_array_equal(together[lane], it.policy([array[lane : lane + 1] for array in obs])[0])
-    x = torch.tensor(normalized(features(it.spec, obs), *np.split(it.buffers, 2)).reshape(15, -1))
+    x = torch.tensor(normalize(features(it.spec, obs), *np.split(it.buffers, 2)).reshape(15, -1))
     images = [torch.tensor(a.reshape(15, *leaf.shape)) for leaf, a in zip(observation, obs, strict=True) if leaf.is_image]
     np.testing.assert_allclose(together.reshape(15, 8), it.net.params(x, images).detach(), atol=1e-5, rtol=1e-5)
 

@@ -19,9 +19,12 @@ from learner.recording.record import Player
 from protocol.arrays import Array
 from protocol.errors import BadRollout
 from protocol.policy.distributions import distribution
-from protocol.policy.networks import ActorCriticNetwork, RecurrentInput, TorchPolicy
-from protocol.policy.policy import NumpyPolicy, buffer_size, make_policy
+from protocol.policy.layout import buffer_size
+from protocol.policy.networks import ActorCriticNetwork, RecurrentInput
+from protocol.policy.numpy_policy import NumpyPolicy
+from protocol.policy.policy import make_policy
 from protocol.policy.recurrent import advance, zero_state
+from protocol.policy.torch_policy import TorchPolicy
 from protocol.rollout import Rollout, stack, validate
 from protocol.specs import EnvSpec, PolicySpec, RunSpec
 from tests.support.batches import DISCRETE, GAUSSIAN, IMAGE, batch, no_pulse, normal, recurrent, shared

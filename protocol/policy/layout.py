@@ -1,0 +1,153 @@
+"""Where each parameter stands in the flat buffer. Pure; imports no torch.
+
+All parameters of a policy live in one flat float32 buffer. Those needed to act come first, so that publishing copies one
+prefix and loading makes views of the received frame. `parameter_layout` is the only place that says where each array stands;
+the torch modules of `protocol.policy.networks` are views of the same layout.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from protocol.arrays import Array
+from protocol.policy.distributions import distribution
+from protocol.policy.features import feature_size
+from protocol.policy.recurrent import core_shapes
+from protocol.specs import Leaf, PolicySpec
+
+IMAGE_FEATURES = 128  # width of the layer between the convolutions of one image and the rest
+
+
+class Field(NamedTuple):
+    """One array of the flat buffer."""
+
+    name: str
+    shape: tuple[int, ...]
+    gain: float
+    """of the orthogonal initialization; 0: starts at zero (biases, log standard deviations), or as its encoder sets it"""
+
+
+class Conv(NamedTuple):
+    """One convolution: channels out, kernel size, stride."""
+
+    channels: int
+    kernel: int
+    stride: int
+
+
+NATURE = (Conv(32, 8, 4), Conv(64, 4, 2), Conv(64, 3, 1))  # Mnih et al. 2015
+SMALL = (Conv(16, 3, 1), Conv(32, 3, 2))
+
+
+def convolutions(leaf: Leaf) -> tuple[tuple[Conv, ...], tuple[int, int, int], int]:
+    """For an image: its convolutions, its shape as (channels, height, width), and the size of the flattened output.
+
+    The last dimension holds the channels unless it is larger than the first. Images of 36 pixels and more get the network
+    of Mnih et al. (2015), smaller ones two 3 x 3 convolutions.
+    """
+    first, _, last = leaf.shape
+    chw = (last, *leaf.shape[:2]) if last <= first else leaf.shape
+    stack = NATURE if min(chw[1:]) >= 36 else SMALL
+    height, width = chw[1:]
+    for conv in stack:
+        height, width = ((side - conv.kernel) // conv.stride + 1 for side in (height, width))
+    return stack, (chw[0], chw[1], chw[2]), stack[-1].channels * max(height, 0) * max(width, 0)
+
+
+def parameter_layout(spec: PolicySpec) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
+    """The fields needed to act, and those of the critic, which follow. Linear weights are [out, in]."""
+    acting: list[Field] = []
+    width = feature_size(spec)
+    if spec.encoder is not None:
+        acting += [Field(f"encoder.{array.name}", array.shape, 0) for array in spec.encoder.arrays]
+        width = spec.encoder.size
+    for i, leaf in enumerate(spec.observation):
+        if not leaf.is_image or spec.encoder is not None:
+            continue
+        stack, (channels, _, _), flattened = convolutions(leaf)
+        for j, conv in enumerate(stack):
+            weight = (conv.channels, channels, conv.kernel, conv.kernel)
+            acting += [
+                Field(f"image{i}.{j}.weight", weight, math.sqrt(2)),
+                Field(f"image{i}.{j}.bias", (conv.channels,), 0),
+            ]
+            channels = conv.channels
+        acting += _linear(f"image{i}.out", flattened, IMAGE_FEATURES, math.sqrt(2))
+        width += IMAGE_FEATURES
+    if spec.core is not None:
+        from_input, from_state = core_shapes(spec, width)
+        acting += [*_linear("core.input", *from_input[::-1], 1.0), *_linear("core.state", *from_state[::-1], 1.0)]
+        width = spec.core_size
+    hidden, last = _hidden(_trunk(spec), width, spec.net)
+    acting += hidden
+    action = spec.action
+    if spec.head == "q":
+        if spec.dueling:
+            acting += _linear("q.value", last, 1, 1.0)
+        return tuple(acting + _linear("q.out", last, action.sizes[0], 1.0)), ()
+    outputs = math.prod(action.shape) if action.kind == "box" else distribution(spec).params_size
+    acting += _linear("actor.out", last, outputs, 0.01)
+    if action.kind == "box":
+        acting.append(Field("actor.log_std", (outputs,), 0))
+    critic, last = ([], last) if spec.shared_net else _hidden("critic", width, spec.net)
+    return tuple(acting), (*critic, *_linear("critic.out", last, 1, 1.0))
+
+
+def _trunk(spec: PolicySpec) -> str:
+    """Name prefix of the hidden layers that are needed to act."""
+    return "q" if spec.head == "q" else "shared" if spec.shared_net else "actor"
+
+
+def hidden_names(spec: PolicySpec, name: str = "") -> list[str]:
+    """Names of the hidden layers that are needed to act, or of those of `name` (`critic`)."""
+    return [f"{name or _trunk(spec)}.{i}" for i in range(len(spec.net))]
+
+
+def _hidden(name: str, width: int, sizes: Sequence[int]) -> tuple[list[Field], int]:
+    """The fields of the hidden layers, and the width of the last one."""
+    fields: list[Field] = []
+    for i, total_size in enumerate(sizes):
+        fields += _linear(f"{name}.{i}", width, total_size, math.sqrt(2))
+        width = total_size
+    return fields, width
+
+
+def _linear(name: str, inputs: int, outputs: int, gain: float) -> list[Field]:
+    return [Field(f"{name}.weight", (outputs, inputs), gain), Field(f"{name}.bias", (outputs,), 0)]
+
+
+def acting_size(spec: PolicySpec) -> int:
+    """Length of `Weights.parameters`: the fields needed to act."""
+    return total_size(parameter_layout(spec)[0])
+
+
+def total_size(fields: Sequence[Field]) -> int:
+    """How many numbers these fields hold together."""
+    return sum(math.prod(field.shape) for field in fields)
+
+
+def named_views(flat: Array, fields: Sequence[Field]) -> dict[str, Array]:
+    """A view of each field of a flat array, by name."""
+    found, at = {}, 0
+    for field in fields:
+        count = math.prod(field.shape)
+        found[field.name] = flat[at : at + count].reshape(field.shape)
+        at += count
+    return found
+
+
+def buffer_layout(spec: PolicySpec) -> tuple[Field, ...]:
+    """The fields of `Weights.buffers`: observation mean and standard deviation if they are normalized; ε for Q-values."""
+    fields: list[Field] = []
+    if spec.normalize_observations:
+        fields += [Field(name, (feature_size(spec),), 0) for name in ("observation_mean", "observation_std")]
+    if spec.head == "q":
+        fields.append(Field("epsilon", (1,), 0))
+    return tuple(fields)
+
+
+def buffer_size(spec: PolicySpec) -> int:
+    """Length of `Weights.buffers`."""
+    return total_size(buffer_layout(spec))

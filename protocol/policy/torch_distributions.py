@@ -1,0 +1,34 @@
+"""Log-probabilities and entropies of actions in torch, for the learner; `distributions.py` has the same in numpy."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from protocol.policy.distributions import LOG_SQRT_2PI
+from protocol.specs import ActionSpec
+
+
+def log_prob_and_entropy(spec: ActionSpec, params: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+    """Log π(action) [B] and the entropy of π [B], for params [B, P] and actions [B, *action]; see `distributions`."""
+    match spec.kind:
+        case "discrete":
+            return _categorical(params, action)
+        case "multidiscrete":
+            parts = zip(params.split_with_sizes(spec.sizes, -1), action.reshape(len(params), -1).unbind(-1), strict=True)
+            log_probs, entropies = zip(*(_categorical(logits, choice) for logits, choice in parts), strict=True)
+            return torch.stack(log_probs).sum(0), torch.stack(entropies).sum(0)
+        case "multibinary":
+            bits = action.reshape(params.shape).to(params.dtype)
+            softplus = F.softplus(params)
+            return (bits * params - softplus).sum(-1), (softplus - params * torch.sigmoid(params)).sum(-1)
+        case "box":
+            mean, log_std = params.chunk(2, -1)
+            z = (action.reshape(mean.shape) - mean) * torch.exp(-log_std)
+            return (-0.5 * z * z - log_std - LOG_SQRT_2PI).sum(-1), (log_std + (0.5 + LOG_SQRT_2PI)).sum(-1)
+
+
+def _categorical(logits: Tensor, choice: Tensor) -> tuple[Tensor, Tensor]:
+    log_probs = F.log_softmax(logits, -1)
+    return log_probs.gather(-1, choice[:, None])[:, 0], -(log_probs.exp() * log_probs).sum(-1)

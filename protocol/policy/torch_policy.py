@@ -1,0 +1,70 @@
+"""The forward pass in torch of policies that need it (images, custom encoders), with which workers act."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from protocol.arrays import Array, Floats
+from protocol.policy.features import features, normalize
+from protocol.policy.layout import buffer_layout, buffer_size, named_views
+from protocol.policy.networks import ActorCriticNetwork, QNetwork
+from protocol.policy.recurrent import zero_state
+from protocol.specs import ImagesDtype, PolicySpec
+
+
+class TorchPolicy:
+    """Acts like `NumpyPolicy`, with images and encoders. Lanes pass one by one, so each gets the bits it would get alone."""
+
+    def __init__(
+        self, spec: PolicySpec, device: str = "cpu", *, together: bool = False, images: ImagesDtype = "float32"
+    ) -> None:
+        """`together`: pass all lanes at once, for a caller that always has all of them. `images`: precision for images."""
+        self.spec = spec
+        self._images_dtype = images
+        self._device, self._together = device, together
+        self._net = QNetwork(spec, device) if spec.head == "q" else ActorCriticNetwork(spec, device)
+        self._buffers: dict[str, Floats] = {}
+
+    def load(self, parameters: Floats, buffers: Floats) -> None:
+        """Copy these weights and use them from now on. Raises ValueError if their sizes do not fit the spec."""
+        count = self._net.acting_size
+        if parameters.shape != (count,) or buffers.shape != (buffer_size(self.spec),):
+            raise ValueError(
+                f"weights expected {count} parameters and {buffer_size(self.spec)} buffers, "
+                f"got {parameters.shape} and {buffers.shape}"
+            )
+        self._net.flat[:count].copy_(torch.tensor(parameters))
+        if self._images_dtype == "bfloat16":
+            self._net.use_bfloat16_convolutions()
+        self._buffers = named_views(buffers, buffer_layout(self.spec))
+
+    def __call__(self, leaves: Sequence[Array], state: Floats | None = None) -> Floats:
+        """Distribution parameters [L, N, P] of the actions in these observations [L, N, *leaf]; see `Policy`."""
+        x = features(self.spec, leaves)
+        if self.spec.normalize_observations:
+            x = normalize(x, self._buffers["observation_mean"], self._buffers["observation_std"])
+        images = [array for leaf, array in zip(self.spec.observation, leaves, strict=True) if leaf.is_image]
+        state = zero_state(self.spec, *x.shape[:-1]) if state is None else state
+        if self._together:
+            L, N = x.shape[:2]
+            flat_state = state.reshape(L * N, -1)
+            flat = self._lane(x.reshape(L * N, -1), [image.reshape(L * N, *image.shape[2:]) for image in images], flat_state)
+            out, state[...] = flat.reshape(L, N, -1), flat_state.reshape(state.shape)
+        else:
+            out = np.stack([self._lane(x[lane], [image[lane] for image in images], state[lane]) for lane in range(len(x))])
+        if self.spec.head != "q":
+            return out
+        return np.concatenate([out, np.broadcast_to(self._buffers["epsilon"], (*out.shape[:-1], 1))], -1)
+
+    def _lane(self, x: Floats, images: Sequence[Array], state: Floats) -> Floats:
+        """Distribution parameters [N, P] of one lane, for x [N, D], images [N, *leaf] and state [N, S], updated in place."""
+        inputs = torch.tensor(x, device=self._device), [torch.tensor(image, device=self._device) for image in images]
+        with torch.no_grad():
+            if isinstance(self._net, QNetwork):
+                return np.asarray(self._net.params(*inputs).cpu().numpy())
+            params, after = self._net.act(*inputs, torch.tensor(state, device=self._device))
+        state[:] = after.cpu().numpy()
+        return np.asarray(params.cpu().numpy())
