@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from learner.run_folder.progress import Progress
     from learner.vector_env.env import ZmqVectorEnv
-    from learner.vector_env.spec import Env
+    from learner.vector_env.settings import EnvLike
 
 __all__ = ["__version__", "make_vec", "train"]
 
@@ -54,7 +54,7 @@ def train(
 
 
 def make_vec(
-    env: Env | Sequence[Env],
+    env: EnvLike | Sequence[EnvLike],
     num_envs: int | None = None,
     *,
     workers: int | None = None,
@@ -90,22 +90,25 @@ def make_vec(
     an environment raises is raised here, with the worker's traceback. Raises `OurError`.
     """
     from learner.members.endpoint import Bind
+    from learner.vector_env.settings import VectorEnvSettings
     from millrace.launch import vector
 
     return vector.make_vec(
-        env,
-        num_envs,
-        workers=workers,
-        lanes=lanes,
-        where=Bind(bind, keys, insecure, advertise),
-        transport=transport,
-        shared_memory=shared_memory,
-        autoreset_mode=autoreset_mode,
-        on_worker_loss=on_worker_loss,
-        timeout_s=timeout,
-        copy=copy,
-        render_mode=render_mode,
-        kwargs=kwargs,
+        VectorEnvSettings(
+            env,
+            num_envs,
+            workers=workers,
+            lanes=lanes,
+            listen=Bind(bind, keys, insecure, advertise),
+            transport=transport,
+            shared_memory=shared_memory,
+            autoreset_mode=autoreset_mode,
+            on_worker_loss=on_worker_loss,
+            timeout_s=timeout,
+            copy=copy,
+            render_mode=render_mode,
+            kwargs=kwargs,
+        )
     )
 
 

@@ -14,14 +14,14 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 import millrace
 from learner.vector_env.env import ZmqVectorEnv
-from learner.vector_env.spec import Env
+from learner.vector_env.settings import EnvLike
 from protocol.arrays import Array
 
 Indices = int | Iterable[int] | None
 
 
 def make_vec_env(
-    env_id: Env | Sequence[Env],
+    env_id: EnvLike | Sequence[EnvLike],
     n_envs: int | None = None,
     seed: int | None = None,
     *,

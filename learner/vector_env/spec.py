@@ -1,25 +1,23 @@
-"""A vector environment described: which copies, in which lanes, in which spaces. Makes one env copy to learn the spaces."""
+"""Describe a vector environment: its env copies, its lanes and its spaces. Makes one env copy to learn the spaces."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import gymnasium
 from gymnasium.vector import AutoresetMode
 
+from learner.vector_env.settings import VectorEnvSettings
 from protocol.envs.spaces import exact_leaves
 from protocol.errors import UsageError
-from protocol.specs import EnvSpec, Scalar, StepSpec
-
-Env = str | Callable[..., gymnasium.Env[Any, Any]]
+from protocol.specs import EnvSpec, Leaf, StepSpec
 
 
 @dataclass(frozen=True)
-class Described:
-    """What the workers are told, and what the vector environment shows of one copy."""
+class VectorEnvDescription:
+    """What workers need to know, and what the vector environment shows of a single env copy."""
 
     step: StepSpec
     observation_space: gymnasium.Space[Any]
@@ -27,57 +25,54 @@ class Described:
     metadata: dict[str, Any]
     render_mode: str | None
     spec: Any
-    """gymnasium's, if all copies are of one id"""
+    """gymnasium's `EnvSpec` if all copies have the same registered id, else None"""
 
 
-def describe(
-    env: Env | Sequence[Env],
-    num_envs: int | None,
-    lanes: int,
-    autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-    render_mode: str | None = None,
-    kwargs: dict[str, Scalar] | None = None,
-    learner_timeout_s: float = math.inf,
-) -> Described:
-    """From one environment and how many copies, or a list with one for each copy. Raises `UsageError` in one line."""
-    listed = [env] * (1 if num_envs is None else num_envs) if isinstance(env, str) or callable(env) else list(env)
-    if not listed or (num_envs is not None and num_envs != len(listed)):
-        raise UsageError(f"num_envs expected at least 1, and as many as the listed environments, got {num_envs}")
-    if not 1 <= lanes <= len(listed):
-        raise UsageError(f"lanes expected 1 to num_envs ({len(listed)}), got {lanes}; each lives with one worker")
-    made = {one: EnvSpec.of(one, kwargs) for one in dict.fromkeys(listed)}
-    different = list({(spec.id, spec.factory): spec for spec in made.values()}.values())
-    places = {(spec.id, spec.factory): n for n, spec in enumerate(different)}
-    copy = different[0].make(render_mode)
+def describe(settings: VectorEnvSettings, learner_timeout_s: float = math.inf) -> VectorEnvDescription:
+    """Describe the vector environment that the settings ask for.
+
+    `learner_timeout_s`: a worker that hears nothing from the learner for this long joins again. Raises `UsageError`.
+    """
+    envs, lanes = settings.envs, settings.lane_count
+    N = len(envs)
+    if not envs or (settings.num_envs is not None and settings.num_envs != N):
+        raise UsageError(
+            f"num_envs expected at least 1, and the number of environments if a list is given, got {settings.num_envs}"
+        )
+    if not 1 <= lanes <= N:
+        raise UsageError(f"lanes expected 1 to num_envs ({N}), got {lanes}; each lane lives in one worker")
+    env_specs = {env: EnvSpec.of(env, settings.kwargs) for env in dict.fromkeys(envs)}
+    different = list({(spec.id, spec.factory): spec for spec in env_specs.values()}.values())
+    index = {(spec.id, spec.factory): n for n, spec in enumerate(different)}
+    copy = different[0].make(settings.render_mode)
     try:
-        N = len(listed)
         step = StepSpec(
             envs=tuple(different),
-            copies=tuple(places[made[one].id, made[one].factory] for one in listed),
+            copies=tuple(index[env_specs[env].id, env_specs[env].factory] for env in envs),
             lanes=tuple(N // lanes + (lane < N % lanes) for lane in range(lanes)),
             observation=exact_leaves(copy.observation_space),
-            action=_actions(copy.action_space),
-            autoreset=_mode(autoreset_mode),
-            render_mode=render_mode,
+            action=_action_leaves(copy.action_space),
+            autoreset=_autoreset_mode(settings.autoreset_mode),
+            render_mode=settings.render_mode,
             learner_timeout_s=learner_timeout_s,
         )
         metadata = {**copy.metadata, "autoreset_mode": AutoresetMode(step.autoreset)}
         spec = copy.spec if len(different) == 1 and different[0].factory is None else None
-        return Described(step, copy.observation_space, copy.action_space, metadata, copy.render_mode, spec)
+        return VectorEnvDescription(step, copy.observation_space, copy.action_space, metadata, copy.render_mode, spec)
     finally:
         copy.close()
 
 
-def _actions(space: gymnasium.Space[Any]) -> Any:
+def _action_leaves(space: gymnasium.Space[Any]) -> tuple[Leaf, ...]:
     try:
         return exact_leaves(space)
     except UsageError as error:
         raise UsageError(str(error).replace("observation space", "action space")) from error
 
 
-def _mode(mode: AutoresetMode | str) -> Literal["NextStep", "SameStep", "Disabled"]:
+def _autoreset_mode(mode: AutoresetMode | str) -> Literal["NextStep", "SameStep", "Disabled"]:
     try:
         return AutoresetMode(mode).value
     except ValueError as error:
-        modes = ", ".join(one.value for one in AutoresetMode)
+        modes = ", ".join(known.value for known in AutoresetMode)
         raise UsageError(f"autoreset_mode expected one of {modes}, got {mode!r}") from error

@@ -133,6 +133,20 @@ class LockstepHub:
         self._doorkeeper = Doorkeeper(link)
         self._listened_s = self._listening_since_s = clock()
 
+    @property
+    def address(self) -> str:
+        """The address that workers connect to."""
+        return self.link.address
+
+    @property
+    def worker_count(self) -> int:
+        """Number of workers that have joined."""
+        return len(self.lockstep.members)
+
+    def incarnation(self, lane: int) -> int:
+        """How many times the lane has been given new env copies."""
+        return self.lockstep.seats[lane].incarnation
+
     # ---------------------------------------------------------------- saying
 
     def say(self, makes: Mapping[int, Make]) -> None:

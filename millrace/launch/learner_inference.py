@@ -20,8 +20,9 @@ from learner.members.endpoint import Bind
 from learner.members.worker_processes import WorkerProcesses
 from learner.run import Run, Watch, looking
 from learner.vector_env.env import ZmqVectorEnv
-from millrace.launch.local_workers import StartFlags, flags_of, own_address
-from millrace.launch.vector import make_vec
+from learner.vector_env.settings import VectorEnvSettings
+from millrace.launch.local_workers import flags_of, own_address
+from millrace.launch.vector import listen
 from protocol.policy.policy import Policy, make_policy
 from protocol.specs import EnvSpec, ImagesDtype, PolicySpec, RunSpec
 from protocol.wire.link import LearnerLink
@@ -48,30 +49,24 @@ def train(
         stack.callback(context.term)
         link = LearnerLink(own_address("inproc", stack), context)
         stack.callback(link.close, 0.5)
-        made: list[Run] = []
-
         def ended() -> list[tuple[str, str]]:
-            if parts.nobody is not None:
-                nobody, parts.nobody = parts.nobody, None
+            if lanes.nobody is not None:
+                nobody, lanes.nobody = lanes.nobody, None
                 raise nobody
             return host.poll()
 
         processes = WorkerProcesses(ended, lambda: env.workers)
-
-        def begin() -> StartFlags:
-            spec = EnvSpec.of(config.env if factory is None else factory, config.env_kwargs)
-            observer = stack.enter_context(looking(config))
-            made.append(Run(config, spec, link, resume, watch, observer, lambda folder: processes))
-            return flags_of(config, made[0].folder.path)
-
-        env = _vector_env(config, factory, elsewhere, begin)
+        listening = listen(_settings(config, factory, elsewhere=elsewhere), stack.enter_context(ExitStack()))
+        env_spec = EnvSpec.of(config.env if factory is None else factory, config.env_kwargs)
+        observer = stack.enter_context(looking(config))
+        run = Run(config, env_spec, link, resume, watch, observer, lambda folder: processes)
+        env = listening.start(flags_of(config, run.folder.path))
         stack.callback(env.close)
-        (run,) = made
         workers = config.min_workers or (1 if elsewhere else min(config.workers, config.envs))
-        parts = SideBySide(env, config.lanes, _patience(env, workers, config.no_workers_timeout_s))
+        lanes = SideBySide(env, config.lanes, _before_waits(env, workers, config.no_workers_timeout_s))
 
         def collector(spec: RunSpec) -> Collector:
-            return Collector(spec, acting(spec.policy, run.device, spec.images_dtype), parts.open, parts.begin)
+            return Collector(spec, acting_policy(spec.policy, run.device, spec.images_dtype), lanes.open, lanes.begin)
 
         host = Host(lambda name: Thread(link.address, name, context, collector), 1, called="inference")
         stack.callback(host.stop)
@@ -82,8 +77,11 @@ def train(
         return run.folder.path
 
 
-def acting(spec: PolicySpec, device: str, images: ImagesDtype) -> Policy:
-    """What acts: as on a worker, to the same bits, where that is numpy on the CPU; else torch on the device, in one pass."""
+def acting_policy(spec: PolicySpec, device: str, images: ImagesDtype) -> Policy:
+    """The policy that acts: numpy on the CPU where it can, to the same bits as on a worker; else torch on the device.
+
+    Torch acts for all lanes in one pass.
+    """
     if device == "cpu" and not spec.needs_torch:
         return make_policy(spec)
     from protocol.policy.torch_policy import TorchPolicy
@@ -91,30 +89,24 @@ def acting(spec: PolicySpec, device: str, images: ImagesDtype) -> Policy:
     return TorchPolicy(spec, device, together=True, images=images)
 
 
-def _vector_env(
-    config: Config, factory: Callable[..., object] | None, elsewhere: bool, begin: Callable[[], StartFlags]
-) -> ZmqVectorEnv:
-    return make_vec(
+def _settings(config: Config, factory: Callable[..., object] | None, *, elsewhere: bool) -> VectorEnvSettings:
+    """The vector environment of a run; `elsewhere`: its workers are started elsewhere."""
+    return VectorEnvSettings(
         config.env if factory is None else factory,  # type: ignore[arg-type]  # what it returns is checked when it is made
         config.envs,
         workers=None if elsewhere else config.workers,
         lanes=config.lanes,
-        where=Bind(config.bind if elsewhere else "", config.keys, config.insecure, config.advertise),
+        listen=Bind(config.bind if elsewhere else "", config.keys, config.insecure, config.advertise),
         transport=config.transport,
-        shared_memory=True,
-        autoreset_mode="NextStep",
-        on_worker_loss="truncate",
-        # A worker of ours that hangs in one copy's step ends itself; one elsewhere may be gone without a word.
+        # A local worker ends itself when the step of one copy hangs. One elsewhere may vanish without a message.
         timeout_s=config.step_timeout_s * (1 if elsewhere else config.envs),
         copy=False,
-        render_mode=None,
         kwargs=config.env_kwargs,
-        begin=begin,
     )
 
 
-def _patience(env: ZmqVectorEnv, workers: int, timeout_s: float) -> Callable[[Pulse], None]:
-    """Before each wait: who is to be told that this thread is alive; and before the first, that all workers are there."""
+def _before_waits(env: ZmqVectorEnv, workers: int, timeout_s: float) -> Callable[[Pulse], None]:
+    """A function to call before each wait for `env`: it passes on the pulse; at first it waits until workers have joined."""
     waited = False
 
     def before(pulse: Pulse) -> None:

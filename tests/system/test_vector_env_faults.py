@@ -21,7 +21,7 @@ from gymnasium.vector import AutoresetMode
 
 import millrace
 from learner.vector_env.env import ZmqVectorEnv
-from learner.vector_env.spec import Env
+from learner.vector_env.settings import EnvLike
 from millrace.launch import vector
 from protocol.errors import EnvironmentFailed, NoWorkers, OurError, WorkerLost
 from protocol.keys.key_folder import KeyFolder
@@ -37,7 +37,7 @@ def shared(request: pytest.FixtureRequest) -> bool:
     return WAYS[request.param]
 
 
-def made(env: Env = "CartPole-v1", **keywords: Any) -> ZmqVectorEnv:
+def made(env: EnvLike = "CartPole-v1", **keywords: Any) -> ZmqVectorEnv:
     return millrace.make_vec(env, 4, **{"workers": 2, "timeout": 20.0, **keywords})
 
 

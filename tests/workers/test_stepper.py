@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from learner.vector_env.settings import VectorEnvSettings
 from learner.vector_env.spec import describe
 from protocol.messages import Call, Returned
 from protocol.wire.plain_values import pack, unpack
@@ -23,7 +24,7 @@ def call(stepper: Stepper, name: str, given: Any, *, assign: bool = False) -> Re
 @pytest.mark.parametrize("name", ["_k", "__class__", "_max_episode_steps"])
 @pytest.mark.parametrize("assign", [False, True])
 def test_nothing_private_is_opened_to_one_it_cannot_be_sure_of(name: str, assign: bool) -> None:
-    step = describe("workers.envs.toy:Countdown-v0", 2, 1, kwargs={"k": 3}).step
+    step = describe(VectorEnvSettings("workers.envs.toy:Countdown-v0", 2, lanes=1, kwargs={"k": 3})).step
     shut = Stepper(step, private=False)
     answer = call(shut, name, [4, 4] if assign else ((), {}), assign=assign)
     assert answer.error.startswith(f"UsageError: {name!r} begins with an underscore: this worker opens nothing private")
@@ -32,7 +33,7 @@ def test_nothing_private_is_opened_to_one_it_cannot_be_sure_of(name: str, assign
 
 
 def test_what_is_private_is_opened_to_a_learner_that_may_run_code() -> None:
-    stepper = Stepper(describe("workers.envs.toy:Countdown-v0", 2, 1, kwargs={"k": 3}).step)
+    stepper = Stepper(describe(VectorEnvSettings("workers.envs.toy:Countdown-v0", 2, lanes=1, kwargs={"k": 3})).step)
     assert call(stepper, "_k", [4, 5], assign=True).error == ""
     answer = call(stepper, "_k", ((), {}))
     assert (answer.error, unpack(answer.results.data)) == ("", [4, 5])

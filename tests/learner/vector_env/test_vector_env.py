@@ -193,7 +193,7 @@ def test_an_info_that_is_no_plain_data_comes_as_its_repr_and_is_told_once(caplog
             infos = env.step(action)[4]
         assert infos["odd"].tolist() == ["<odd>", "<odd>"]
     assert [record.message for record in caplog.records].count(
-        "info odd of copy 0 is no plain data: it comes as its repr, a string"
+        "info odd of copy 0 is no plain data: it arrives as its repr, a string"
     ) == 1
 
 
@@ -207,7 +207,7 @@ def test_whoever_asks_how_it_is_is_answered_while_it_steps() -> None:
     zeros = np.zeros(3, np.int64)
     with millrace.make_vec("CartPole-v1", 3, workers=2) as env, ThreadPoolExecutor(1) as pool:
         env.reset(seed=1)
-        link = WorkerLink(env._hub.link.address, observer_name())
+        link = WorkerLink(env.address, observer_name())
         asked = pool.submit(ask, link, 20.0)
         while not asked.done():
             env.step(zeros)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from learner.vector_env.settings import VectorEnvSettings
 from learner.vector_env.spec import describe
 from protocol.wire.shared_memory import MAY_SPIN, POSSIBLE, Awake, Bell, Memory, Rung
 
@@ -42,7 +43,7 @@ def test_ringing_never_waits_and_never_fails(bell: Bell) -> None:
 
 
 def test_who_is_done_last_sees_that_nobody_is_under_way() -> None:
-    spec = describe("CartPole-v1", 6, lanes=3).step
+    spec = describe(VectorEnvSettings("CartPole-v1", 6, lanes=3)).step
     here = Memory(spec)
     there = Memory(spec, os.dup(here.fd))
     for lane in range(3):

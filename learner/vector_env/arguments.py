@@ -1,0 +1,63 @@
+"""Arguments of `reset` and `step`: checked, and brought into one form. Pure.
+
+The errors are of the types that gymnasium's own vector environments raise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from protocol.arrays import Array, Bools
+from protocol.specs import Leaf
+
+
+def seed_list(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int | None]:
+    """The seed of each env copy. A single seed s gives s, s + 1, …. Raises `ValueError` for a wrong number of seeds."""
+    if seed is None:
+        return [None] * num_envs
+    if isinstance(seed, int | np.integer):
+        return [int(seed) + n for n in range(num_envs)]
+    seeds = [None if one is None else int(one) for one in seed]
+    if len(seeds) != num_envs:
+        raise ValueError(f"seed expected one for each of {num_envs} copies, got {len(seeds)}")
+    return seeds
+
+
+def take_reset_mask(options: dict[str, Any] | None, num_envs: int) -> tuple[Bools, dict[str, Any] | None]:
+    """The env copies to reset, and the options without the mask. Without a mask all copies are reset.
+
+    Raises `TypeError` for a mask that is no bool array, `ValueError` for a wrong shape or a mask without True.
+    """
+    if options is None or "reset_mask" not in options:
+        return np.ones(num_envs, bool), options
+    mask = options["reset_mask"]
+    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
+        raise TypeError(f"options['reset_mask'] expected an array of bool, got {getattr(mask, 'dtype', type(mask))}")
+    if mask.shape != (num_envs,) or not mask.any():
+        raise ValueError(f"options['reset_mask'] expected shape ({num_envs},) and at least one True, got {mask}")
+    return mask, {key: value for key, value in options.items() if key != "reset_mask"}
+
+
+def action_arrays(
+    actions: Any, read: Callable[[Any], tuple[Any, ...]], leaves: Sequence[Leaf], num_envs: int
+) -> tuple[list[Array], bool]:
+    """A batch of actions as arrays [num_envs, *leaf], and whether shared memory can hold them without rounding.
+
+    `read` takes the actions apart into one value for each of `leaves`. Raises `TypeError` for what are not numbers,
+    `ValueError` for a wrong number of actions.
+    """
+    arrays, fit = [], True
+    for leaf, value in zip(leaves, read(actions), strict=True):
+        array = np.asarray(value)
+        if array.ndim == 0 or len(array) != num_envs:
+            raise (ValueError if array.ndim else TypeError)(
+                f"actions expected one for each of {num_envs} copies, got shape {list(array.shape)}"
+            )
+        if array.dtype.kind not in "biuf":
+            raise TypeError(f"actions expected numbers, got {array.dtype}")
+        fit = fit and array.shape[1:] == leaf.shape and (array.dtype == leaf.dtype or np.can_cast(array.dtype, leaf.dtype))
+        arrays.append(array)
+    return arrays, fit

@@ -1,0 +1,45 @@
+"""Which rows of a batch belong to which lane. Pure.
+
+Row n of every array of a batch belongs to env copy n. A lane has consecutive rows; lane 0 has the first ones.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterable, Sequence
+from itertools import accumulate
+
+
+class BatchLayout:
+    """The rows of each lane."""
+
+    def __init__(self, lane_sizes: Sequence[int]) -> None:
+        """`lane_sizes`: the number of env copies of each lane."""
+        ends = list(accumulate(lane_sizes))
+        self.num_envs = ends[-1]
+        self.lanes = range(len(ends))
+        self.rows = [slice(end - size, end) for end, size in zip(ends, lane_sizes, strict=True)]
+        """By lane."""
+        self._firsts = [rows.start for rows in self.rows]
+
+    def copies(self, lane: int) -> range:
+        """The env copies of a lane, numbered as in the whole batch."""
+        return range(self.rows[lane].start, self.rows[lane].stop)
+
+    def size(self, lane: int) -> int:
+        """Number of env copies of a lane."""
+        return len(self.copies(lane))
+
+    def lane_of(self, copy: int) -> int:
+        """The lane of an env copy. Raises `IndexError` if there is no such copy."""
+        if not 0 <= copy < self.num_envs:
+            raise IndexError(f"copy expected 0 to {self.num_envs - 1}, got {copy}")
+        return bisect_right(self._firsts, copy) - 1
+
+    def by_lane(self, copies: Iterable[int]) -> dict[int, list[int]]:
+        """Env copies grouped by lane. Within a lane they are numbered from 0, in the given order."""
+        grouped: dict[int, list[int]] = {}
+        for copy in copies:
+            lane = self.lane_of(copy)
+            grouped.setdefault(lane, []).append(copy - self._firsts[lane])
+        return grouped

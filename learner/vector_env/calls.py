@@ -1,0 +1,58 @@
+"""`call`, `get_attr` and `set_attr`: what to send to each lane, and what its answer means. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from learner.vector_env.batch_layout import BatchLayout
+from learner.vector_env.lane_orders import call_order
+from learner.vector_env.step_roster import Make
+from protocol.errors import EnvironmentFailed
+from protocol.messages import Answer, Returned
+from protocol.wire.plain_values import unpack
+
+USE_INSTEAD = ("reset", "step", "close")
+"""Methods of an environment that only the vector environment may call."""
+
+
+def call_orders(
+    layout: BatchLayout, copies: Sequence[int], name: str, args: tuple[Any, ...], kwargs: dict[str, Any]
+) -> dict[int, Make]:
+    """Orders by lane that call, or get, the attribute of these copies. Raises `ValueError` for `reset`, `step`, `close`."""
+    if name in USE_INSTEAD:
+        raise ValueError(f"call of {name!r}: use {name}() of the vector environment")
+    return {
+        lane: call_order(chosen, name, (args, kwargs), assign=False)
+        for lane, chosen in layout.by_lane(sorted(copies)).items()
+    }
+
+
+def assign_orders(layout: BatchLayout, copies: Sequence[int], name: str, values: Sequence[Any]) -> dict[int, Make]:
+    """Orders by lane that assign one value to each of these copies, which are in ascending order."""
+    by_copy = dict(zip(copies, values, strict=True))
+    return {
+        lane: call_order(chosen, name, [by_copy[layout.copies(lane)[n]] for n in chosen], assign=True)
+        for lane, chosen in layout.by_lane(copies).items()
+    }
+
+
+def call_results(name: str, answers: Mapping[int, Answer]) -> tuple[Any, ...]:
+    """The results of all lanes, in the order of the copies. Raises what `call_error` says if an environment raised."""
+    results: list[Any] = []
+    for lane in sorted(answers):
+        answer = answers[lane]
+        assert isinstance(answer, Returned)
+        if answer.error:
+            raise call_error(name, lane, answer)
+        results += unpack(answer.results.data)
+    return tuple(results)
+
+
+def call_error(name: str, lane: int, answer: Returned) -> Exception:
+    """What a call raised, with the worker's traceback. An `AttributeError` keeps its type, as `hasattr` needs it."""
+    line = f"call of {name!r}, lane {lane}: {answer.error}"
+    missing = answer.error.startswith("AttributeError")
+    error: Exception = AttributeError(line) if missing else EnvironmentFailed(line, answer.traceback)
+    error.add_note(answer.traceback)
+    return error

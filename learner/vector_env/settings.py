@@ -1,0 +1,57 @@
+"""What a caller of `millrace.make_vec` asks for, as one record that is handed from the public function to its users."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import gymnasium
+from gymnasium.vector import AutoresetMode
+
+from learner.members.endpoint import Bind
+from protocol.specs import Scalar
+
+EnvLike = str | Callable[..., gymnasium.Env[Any, Any]]
+"""What `gymnasium.make` takes, or a callable that returns an environment."""
+
+
+@dataclass(frozen=True)
+class VectorEnvSettings:
+    """The arguments of `millrace.make_vec`, with the same meanings and defaults."""
+
+    env: EnvLike | Sequence[EnvLike]
+    num_envs: int | None = None
+    workers: int | None = None
+    lanes: int | None = None
+    listen: Bind = field(default_factory=Bind)
+    """The address for workers that are started elsewhere, and its keys. An empty address means local workers."""
+    transport: Literal["ipc", "tcp", "inproc"] = "ipc"
+    shared_memory: bool = True
+    autoreset_mode: AutoresetMode | str = "NextStep"
+    on_worker_loss: Literal["truncate", "raise"] = "truncate"
+    timeout_s: float = 60.0
+    copy: bool = True
+    render_mode: str | None = None
+    kwargs: dict[str, Scalar] = field(default_factory=dict)
+    """Keyword arguments of the environment."""
+
+    @property
+    def envs(self) -> list[EnvLike]:
+        """The environment of each copy: `num_envs` times the same one, or the given list."""
+        if isinstance(self.env, str) or callable(self.env):
+            return [self.env] * (1 if self.num_envs is None else self.num_envs)
+        return list(self.env)
+
+    @property
+    def local_workers(self) -> int:
+        """Number of worker processes to start on this machine; 0 if workers are started elsewhere."""
+        if self.listen.bind:
+            return 0
+        return min(self.workers if self.workers is not None else (os.cpu_count() or 1), len(self.envs))
+
+    @property
+    def lane_count(self) -> int:
+        """Number of lanes: by default one for each local worker."""
+        return self.lanes or max(self.local_workers, 1)
