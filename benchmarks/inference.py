@@ -1,7 +1,7 @@
-"""Where the policy acts: `python -m benchmarks.inference`. Runs of PPO with --inference workers and learner, in turn.
+"""Compare `--inference workers` with `--inference learner`: `python -m benchmarks.inference`. PPO runs of both, in turn.
 
-Env steps/s while collecting (the learner's waiting alone, updates left out), on two workers, and what a worker keeps in
-memory. The machine need not be idle: compare within a round.
+It measures env steps/s of two workers while the learner waits for rollouts, without updates, and the memory of a worker. The
+machine need not be idle, because the two are compared within a round.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from learner.config.layers import resolve
 from learner.run_folder.progress import Progress
 from millrace.launch.local import train
 
-WARM_UP = 2  # updates that do not count: copies are opened, torch is imported
+WARM_UP = 2  # updates that are not counted: env copies are opened and torch is imported meanwhile
 MODES = ("workers", "learner")
 
 
 class Frames(gymnasium.Env[Any, Any]):
-    """84×84×4 bytes, which change with every step and cost next to nothing."""
+    """An environment whose 84×84×4 uint8 frames change with every step and take almost no time to make."""
 
     def __init__(self) -> None:
         self.observation_space = gymnasium.spaces.Box(0, 255, (84, 84, 4), np.uint8)
@@ -61,13 +61,13 @@ CASES: dict[str, tuple[Callable[..., object] | None, dict[str, Any]]] = {
 
 
 def measure(case: str, mode: str, threads: int) -> tuple[float, float]:
-    """Env steps/s while collecting, and MB of one worker."""
+    """Env steps/s while the learner waits for rollouts, and the memory of one worker in MB."""
     factory, settings = CASES[case]
-    seen: list[tuple[int, float]] = []
+    waits: list[tuple[int, float]] = []  # env steps and seconds waited, after each update
     memory: list[float] = []
 
     def watch(progress: Progress) -> None:
-        seen.append((progress.env_steps, progress.stages["learner_wait"]))
+        waits.append((progress.env_steps, progress.stages["learner_wait"]))
         workers = [child for child in psutil.Process().children() if "workers" in child.cmdline()]
         memory.extend(worker.memory_info().rss / 1e6 for worker in workers)
 
@@ -81,20 +81,20 @@ def measure(case: str, mode: str, threads: int) -> tuple[float, float]:
             **settings,
         )
         train(config, None, watch, factory)
-    (steps, wait_s), (last_steps, last_wait_s) = seen[WARM_UP], seen[-1]
+    (steps, wait_s), (last_steps, last_wait_s) = waits[WARM_UP], waits[-1]
     return (last_steps - steps) / (last_wait_s - wait_s), statistics.median(memory)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="where the policy acts")
+    parser = argparse.ArgumentParser(description="compare --inference workers with --inference learner")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--torch-threads", type=int, default=2, help="of the learner; workers have one each")
+    parser.add_argument("--torch-threads", type=int, default=2, help="torch threads of the learner; each worker has one")
     arguments = parser.parse_args()
     rows: list[dict[str, object]] = []
     for case in CASES:
-        turns = [{mode: measure(case, mode, arguments.torch_threads) for mode in MODES} for _ in range(arguments.rounds)]
+        rounds = [{mode: measure(case, mode, arguments.torch_threads) for mode in MODES} for _ in range(arguments.rounds)]
         for mode in MODES:
-            rate, memory = (statistics.median(turn[mode][i] for turn in turns) for i in range(2))
+            rate, memory = (statistics.median(measured[mode][i] for measured in rounds) for i in range(2))
             rows.append({"case": case, "inference": mode, "env_steps_per_s": round(rate), "worker_mb": round(memory)})
     table = Table(title=f"PPO on two workers, collecting, medians of {arguments.rounds}")
     for column in rows[0]:

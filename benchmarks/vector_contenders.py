@@ -1,7 +1,7 @@
-"""Vector environments to be measured side by side, each behind one small face: `rate(seconds)`, `close()`.
+"""The vector environments that are measured side by side, each with the same interface: `rate(seconds)` and `close()`.
 
-Everybody steps the same env copies with actions drawn beforehand (TorchRL draws its own, in its own form), and resets a copy
-whose episode has ended, by itself or, where the library leaves that to its user (tianshou), by asking for it.
+All step the same env copies with actions that are sampled beforehand; only TorchRL samples its own, in its own format. All
+reset a copy whose episode has ended. tianshou leaves that to its user, so its step function here resets them.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ ASYNC = "gymnasium Async"
 
 
 class Task(NamedTuple):
-    """What is stepped."""
+    """The env copies to step."""
 
     title: str
     env: str
     copies: int
     workers: int
-    """processes of ours (and of TorchRL); the other peers take one for each copy"""
+    """processes of millrace and TorchRL; the other libraries start one for each copy"""
     kwargs: dict[str, Any] = {}
 
     def make(self) -> gymnasium.Env[Any, Any]:
@@ -46,14 +46,14 @@ class Task(NamedTuple):
 
 class Contender(Protocol):
     def rate(self, seconds: float) -> float:
-        """Env steps/s, stepping for so long."""
+        """Env steps/s, measured over this time."""
         ...
 
     def close(self) -> None: ...
 
 
-class Stepped:
-    """Something that goes on stepping as `step(actions)` says."""
+class Stepping:
+    """A contender whose copies are all stepped by `step(actions)`."""
 
     def __init__(self, task: Task, env: Any, step: Callable[[Any], Any] | None = None) -> None:
         self._env, self._copies, self._step = env, task.copies, step or env.step
@@ -70,13 +70,13 @@ class Stepped:
 
 
 def make(name: str, task: Task) -> Contender:
-    """Raises ImportError if its library is not installed."""
+    """Make a contender. Raises `ImportError` if its library is not installed."""
     copies, makers = task.copies, [task.make] * task.copies
     match name:
         case "gymnasium Sync" | "gymnasium Async":
             env: Any = (SyncVectorEnv if name == "gymnasium Sync" else AsyncVectorEnv)(makers)
             env.reset(seed=1)
-            return Stepped(task, env)
+            return Stepping(task, env)
         case "SB3 DummyVecEnv" | "SB3 SubprocVecEnv":
             vec_env = import_module("stable_baselines3.common.vec_env")
             with warnings.catch_warnings():
@@ -84,7 +84,7 @@ def make(name: str, task: Task) -> Contender:
                 env = (vec_env.DummyVecEnv if name == "SB3 DummyVecEnv" else vec_env.SubprocVecEnv)(makers)
             env.seed(1)
             env.reset()
-            return Stepped(task, env)
+            return Stepping(task, env)
         case "tianshou Shmem":
             return _tianshou(task, makers)
         case "TorchRL ParallelEnv":
@@ -94,7 +94,7 @@ def make(name: str, task: Task) -> Contender:
         case _:
             env = millrace.make_vec(task.env, copies, workers=task.workers, **OURS[name], **task.kwargs)
             env.reset(seed=1)
-            return Stepped(task, env)
+            return Stepping(task, env)
 
 
 def _tianshou(task: Task, makers: list[Callable[[], gymnasium.Env[Any, Any]]]) -> Contender:
@@ -106,7 +106,7 @@ def _tianshou(task: Task, makers: list[Callable[[], gymnasium.Env[Any, Any]]]) -
         if (ended := np.flatnonzero(terminated | truncated)).size:
             env.reset(ended)
 
-    return Stepped(task, env, step)
+    return Stepping(task, env, step)
 
 
 def _torchrl(task: Task) -> Contender:
@@ -124,16 +124,16 @@ def _torchrl(task: Task) -> Contender:
         nonlocal now
         _, now = env.step_and_maybe_reset(env.rand_action(now))
 
-    return Stepped(task, env, step)
+    return Stepping(task, env, step)
 
 
 def memory_mb(name: str, task: Task) -> tuple[int, float]:
-    """How many processes it started, and what they take together: proportional set size, MB; shared pages counted once."""
-    us = psutil.Process()
-    before = {process.pid for process in us.children(recursive=True)}
+    """The number of processes it started, and their memory together: proportional set size, in MB."""
+    this_process = psutil.Process()
+    before = {process.pid for process in this_process.children(recursive=True)}
     contender = make(name, task)
     contender.rate(1.0)
-    started = [process for process in us.children(recursive=True) if process.pid not in before]
+    started = [process for process in this_process.children(recursive=True) if process.pid not in before]
     try:
         return len(started), sum(_pss_kb(process.pid) for process in started) / 1e3
     finally:

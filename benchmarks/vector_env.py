@@ -1,10 +1,10 @@
-"""Vector environments under random actions, env steps/s, and their memory: `python -m benchmarks.vector_env`.
+"""Env steps/s and memory of vector environments under random actions: `python -m benchmarks.vector_env`.
 
-gymnasium's Sync and Async (shared memory), Stable-Baselines3's Dummy and Subproc, tianshou and TorchRL where they are
-installed, ours (through shared memory, and by messages over ipc and tcp), and the limit: two processes that each step half
-of the copies in a bare loop and answer nobody. On CartPole-v1 with two workers; on an environment that sleeps, with as many
-workers as the peers have processes; on frames. All take turns, and the order changes from round to round; medians of
-rounds, ratios within each round.
+The contenders are gymnasium's Sync and Async (shared memory), Stable-Baselines3's Dummy and Subproc, tianshou and TorchRL if
+they are installed, and millrace (through shared memory, and by messages over ipc and tcp). The upper limit is two processes
+that each step half of the copies in a bare loop and send nothing. The tasks are CartPole-v1 with two workers, an environment
+that sleeps, with as many workers as the other libraries have processes, and image frames. In each round all contenders run
+once, in an order that changes from round to round. Rates are medians over rounds; ratios are taken within a round.
 """
 
 from __future__ import annotations
@@ -34,41 +34,41 @@ TASKS: tuple[tuple[Task, tuple[str, ...]], ...] = (
 Rows = list[dict[str, object]]
 
 
-def stepping(task: Task, names: tuple[str, ...], rounds: int, seconds: float) -> Rows:
-    """A row for each contender: its rate and, by rounds, its share of gymnasium's Async and of the limit."""
+def measure(task: Task, names: tuple[str, ...], rounds: int, seconds: float) -> Rows:
+    """A row for each contender: its rate, and the median of its ratios to gymnasium's Async and to the limit."""
     contenders: dict[str, Contender] = {}
-    absent = []
+    missing = []
     for name in names:
         try:
             contenders[name] = make(name, task)
         except ImportError:
-            absent.append(name)
+            missing.append(name)
     for contender in contenders.values():
         contender.rate(0.2)  # warm up
-    turns = []
+    rates = []
     for number in range(rounds):
         first = number % len(contenders)
         order = [*contenders.items()]
-        turns.append({name: contender.rate(seconds) for name, contender in order[first:] + order[:first]})
+        rates.append({name: contender.rate(seconds) for name, contender in order[first:] + order[:first]})
     for contender in contenders.values():
         contender.close()
     about = {"task": task.title, "copies": task.copies, "workers": task.workers}
-    rows: Rows = [about | {"contender": name, "env_steps_per_s": None} for name in absent]
+    rows: Rows = [about | {"contender": name, "env_steps_per_s": None} for name in missing]
     for name in contenders:
         rows.append(
             about
             | {
                 "contender": name,
-                "env_steps_per_s": round(statistics.median(turn[name] for turn in turns)),
-                "of_async": statistics.median(turn[name] / turn[ASYNC] for turn in turns),
-                "of_limit": statistics.median(turn[name] / turn[LIMIT] for turn in turns) if LIMIT in names else None,
+                "env_steps_per_s": round(statistics.median(rate[name] for rate in rates)),
+                "of_async": statistics.median(rate[name] / rate[ASYNC] for rate in rates),
+                "of_limit": statistics.median(rate[name] / rate[LIMIT] for rate in rates) if LIMIT in names else None,
             }
         )
     return rows
 
 
 def memory() -> Rows:
-    """What 64 copies of CartPole-v1 take, beside this process."""
+    """Memory of the processes that 64 copies of CartPole-v1 need, without this process."""
     task = Task("CartPole-v1", "CartPole-v1", 64, 2)
     rows: Rows = []
     for name in (ASYNC, "SB3 SubprocVecEnv", "millrace"):
@@ -103,20 +103,20 @@ def show_memory(rows: Rows) -> Table:
 def main() -> None:
     parser = argparse.ArgumentParser(description="vector environments under random actions")
     parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--seconds", type=float, default=1.0, help="of each turn")
+    parser.add_argument("--seconds", type=float, default=1.0, help="of each measurement")
     arguments = parser.parse_args()
-    taken = memory()
+    memory_rows = memory()
     rows: Rows = []
     charts = []
     for task, names in TASKS:
-        found = stepping(task, names, arguments.rounds, arguments.seconds)
+        found = measure(task, names, arguments.rounds, arguments.seconds)
         rows += found
         title = f"{task.title}, env steps/s, {task.copies} copies, {task.workers} workers"
         charts.append((title, bars([row for row in found if row["env_steps_per_s"]], "contender", "env_steps_per_s")))
-    charts.append(("64 copies: MB, PSS", bars(taken, "contender", "pss_mb")))
+    charts.append(("64 copies: MB, PSS", bars(memory_rows, "contender", "pss_mb")))
     Console(width=120).print(show(rows, arguments.rounds))
-    Console().print(show_memory(taken))
-    write("vector_env", {"vector_env": rows, "memory": taken}, charts)
+    Console().print(show_memory(memory_rows))
+    write("vector_env", {"vector_env": rows, "memory": memory_rows}, charts)
 
 
 if __name__ == "__main__":

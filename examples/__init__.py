@@ -1,1 +1,1 @@
-"""Programs that use millrace as anybody would."""
+"""Example programs that use millrace as a user would."""

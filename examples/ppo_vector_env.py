@@ -1,8 +1,8 @@
 """PPO in one file over a millrace vector environment: `python examples/ppo_vector_env.py`.
 
-A loop in the style of single-file implementations: nothing of millrace but `make_vec`, which stands where
-`gymnasium.make_vec(..., vectorization_mode="async")` would. What such loops get wrong on gymnasium 1.x: in NEXT_STEP mode
-the step after an episode's end resets the copy. That row is no transition, and is left out of the loss (`valid`).
+The loop has the style of CleanRL's single-file implementations. It uses only `make_vec` of millrace, in the place of
+`gymnasium.make_vec(..., vectorization_mode="async")`. One detail of gymnasium 1.x is easily missed: in NEXT_STEP mode the
+step after the end of an episode resets the env copy. This row is not a transition, so the loss leaves it out (`valid`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import millrace
 
 @dataclass(frozen=True)
 class Settings:
-    """RL Zoo's for CartPole-v1."""
+    """Hyperparameters of RL Baselines3 Zoo for CartPole-v1."""
 
     env: str = "CartPole-v1"
     workers: int = 2
@@ -45,10 +45,10 @@ class Settings:
 
 
 def network(inputs: int, outputs: int, last_gain: float) -> nn.Sequential:
-    """Two hidden layers of 64, initialised orthogonally."""
+    """A network with two hidden layers of 64 units and orthogonal initialization."""
     layers: list[nn.Module] = []
-    for here, there, gain in ((inputs, 64, 2**0.5), (64, 64, 2**0.5), (64, outputs, last_gain)):
-        linear = nn.Linear(here, there)
+    for size_in, size_out, gain in ((inputs, 64, 2**0.5), (64, 64, 2**0.5), (64, outputs, last_gain)):
+        linear = nn.Linear(size_in, size_out)
         nn.init.orthogonal_(linear.weight, gain)
         nn.init.zeros_(linear.bias)
         layers += [linear, nn.Tanh()]
@@ -65,33 +65,37 @@ class Agent(nn.Module):
         self.critic = network(inputs, 1, 1.0)
 
     def distribution(self, obs: Tensor) -> Categorical:
-        """Over actions."""
+        """The distribution over actions, for each observation."""
         return Categorical(logits=self.actor(obs), validate_args=False)
 
     def value(self, obs: Tensor) -> Tensor:
-        """Of each observation: [...]."""
+        """The value of each observation: [*obs_batch]."""
         values: Tensor = self.critic(obs).squeeze(-1)
         return values
 
 
 def advantages(reward: Tensor, value: Tensor, done: Tensor, terminated: Tensor, gamma: float, lambda_: float) -> Tensor:
-    """GAE [T, N]; `value` [T+1, N]. Bootstraps unless the task ended, and adds nothing up across an episode's end."""
+    """Generalized advantage estimation (Schulman et al. 2016): [T, N]. `value` is [T+1, N].
+
+    It bootstraps unless the episode terminated, and it does not accumulate across the end of an episode.
+    """
     delta = reward + gamma * value[1:] * (1 - terminated) - value[:-1]
-    result, after = torch.zeros_like(reward), torch.zeros_like(reward[0])
+    result, next_advantage = torch.zeros_like(reward), torch.zeros_like(reward[0])
     for t in reversed(range(len(reward))):
-        result[t] = after = delta[t] + gamma * lambda_ * (1 - done[t]) * after
+        result[t] = next_advantage = delta[t] + gamma * lambda_ * (1 - done[t]) * next_advantage
     return result
 
 
 def train(settings: Settings = Settings(), *, quiet: bool = False) -> tuple[Agent, float]:
-    """The agent, and the mean return of its last 100 episodes."""
+    """Train. Returns the agent, and the mean return of its last 100 episodes."""
     s, T, N = settings, settings.rollout_steps, settings.copies
     torch.manual_seed(s.seed)
-    torch.set_num_threads(1)  # more make such small networks no faster
+    torch.set_num_threads(1)  # more threads do not make such small networks faster
     returns: deque[float] = deque(maxlen=100)
-    with closing(RecordEpisodeStatistics(millrace.make_vec(s.env, N, workers=s.workers))) as env:  # the one line
+    # Only this line is particular to millrace.
+    with closing(RecordEpisodeStatistics(millrace.make_vec(s.env, N, workers=s.workers))) as env:
         agent = Agent(env)
-        optimiser = torch.optim.Adam(agent.parameters(), eps=1e-5)
+        optimizer = torch.optim.Adam(agent.parameters(), eps=1e-5)
         shape = env.single_observation_space.shape or ()
         observed = torch.zeros(T + 1, N, *shape)
         action, log_prob = torch.zeros(T, N, dtype=torch.int64), torch.zeros(T, N)
@@ -102,14 +106,14 @@ def train(settings: Settings = Settings(), *, quiet: bool = False) -> tuple[Agen
         began = time.perf_counter()
         updates = s.env_steps // (T * N)
         for update in range(updates):
-            left = 1 - update / updates
+            remaining = 1 - update / updates
             observed[0] = observed[T]
             with torch.no_grad():
                 for t in range(T):
-                    drawn = agent.distribution(observed[t])
-                    action[t] = drawn.sample()  # type: ignore[no-untyped-call]
-                    log_prob[t] = drawn.log_prob(action[t])  # type: ignore[no-untyped-call]
-                    valid[t] = torch.as_tensor(~ended)  # a copy whose episode ended is reset by this step
+                    distribution = agent.distribution(observed[t])
+                    action[t] = distribution.sample()  # type: ignore[no-untyped-call]
+                    log_prob[t] = distribution.log_prob(action[t])  # type: ignore[no-untyped-call]
+                    valid[t] = torch.as_tensor(~ended)  # this step resets a copy whose episode ended
                     obs, rewards, terminations, truncations, infos = env.step(action[t].numpy())
                     ended = terminations | truncations
                     observed[t + 1], reward[t] = torch.as_tensor(obs), torch.as_tensor(rewards)
@@ -122,21 +126,21 @@ def train(settings: Settings = Settings(), *, quiet: bool = False) -> tuple[Agen
             rows = valid.flatten().nonzero().squeeze(-1)
             flat_obs, flat_action, flat_log_prob = observed[:T].flatten(0, 1), action.flatten(), log_prob.flatten()
             flat_advantage, flat_target = advantage.flatten(), target.flatten()
-            for group in optimiser.param_groups:
-                group["lr"] = left * s.learning_rate
-            clip = left * s.clip
+            for group in optimizer.param_groups:
+                group["lr"] = remaining * s.learning_rate
+            clip = remaining * s.clip
             for _ in range(s.epochs):
                 for batch in rows[torch.randperm(len(rows))].split(s.minibatch):  # type: ignore[no-untyped-call]
-                    now = agent.distribution(flat_obs[batch])
-                    ratio = (now.log_prob(flat_action[batch]) - flat_log_prob[batch]).exp()  # type: ignore[no-untyped-call]
+                    new = agent.distribution(flat_obs[batch])
+                    ratio = (new.log_prob(flat_action[batch]) - flat_log_prob[batch]).exp()  # type: ignore[no-untyped-call]
                     a = flat_advantage[batch]
                     a = (a - a.mean()) / (a.std(correction=0) + 1e-8)
                     actor_loss = -torch.min(ratio * a, ratio.clamp(1 - clip, 1 + clip) * a).mean()
                     critic_loss = (agent.value(flat_obs[batch]) - flat_target[batch]).square().mean()
-                    optimiser.zero_grad()
+                    optimizer.zero_grad()
                     (actor_loss + s.value_weight * critic_loss).backward()
                     nn.utils.clip_grad_norm_(agent.parameters(), s.max_grad_norm)
-                    optimiser.step()
+                    optimizer.step()
             if not quiet and (update + 1) % 20 == 0 and returns:
                 steps = (update + 1) * T * N
                 speed = steps / (time.perf_counter() - began)
@@ -144,16 +148,16 @@ def train(settings: Settings = Settings(), *, quiet: bool = False) -> tuple[Agen
     return agent, float(np.mean(returns)) if returns else 0.0
 
 
-def greedy(agent: Agent, settings: Settings, episodes: int = 100) -> float:
-    """The mean return of greedy episodes, one in each of as many copies."""
+def evaluate(agent: Agent, settings: Settings, episodes: int = 100) -> float:
+    """The mean return of greedy episodes. Each episode is played in an env copy of its own."""
     with millrace.make_vec(settings.env, episodes, workers=settings.workers) as env, torch.no_grad():
         obs, _ = env.reset(seed=1_000_000)
-        returns, going = np.zeros(episodes), np.ones(episodes, bool)
-        while going.any():
+        returns, running = np.zeros(episodes), np.ones(episodes, bool)
+        while running.any():
             action = agent.actor(torch.as_tensor(obs)).argmax(-1).numpy()
             obs, reward, terminated, truncated, _ = env.step(action)
-            returns += reward * going
-            going &= ~(terminated | truncated)
+            returns += reward * running
+            running &= ~(terminated | truncated)
     return float(returns.mean())
 
 
@@ -161,6 +165,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="PPO over worker processes")
     for name, value in vars(Settings()).items():
         parser.add_argument(f"--{name.rstrip('_').replace('_', '-')}", dest=name, type=type(value), default=value)
-    chosen = Settings(**vars(parser.parse_args()))
-    learned, _ = train(chosen)
-    print(f"greedy return {greedy(learned, chosen):.1f} over 100 episodes")
+    settings = Settings(**vars(parser.parse_args()))
+    trained, _ = train(settings)
+    print(f"greedy return {evaluate(trained, settings):.1f} over 100 episodes")

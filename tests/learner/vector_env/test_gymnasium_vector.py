@@ -1,4 +1,4 @@
-"""What gymnasium's own tests assert of its vector environments holds of ours: spaces, seeds, masks, calls, errors, ends."""
+"""What gymnasium's tests assert of its vector environments holds for ours: spaces, seeds, masks, calls, errors, closing."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SPACES = "workers.envs.toy:Spaces-v0"
 
 
 def inproc(env: Any, num_envs: int | None = 3, **keywords: Any) -> ZmqVectorEnv:
-    """With one worker, a thread: nothing here depends on the way."""
+    """With one worker that is a thread, because no test here depends on the transport."""
     return millrace.make_vec(env, num_envs, **{"workers": 1, "transport": "inproc", "timeout": 20.0, **keywords})
 
 
@@ -40,7 +40,7 @@ def space_cases() -> list[tuple[str, str]]:
 
 
 @pytest.mark.parametrize(("observation", "action"), space_cases())
-def test_of_every_space_there_is_a_batch(observation: str, action: str) -> None:
+def test_every_supported_space_is_batched(observation: str, action: str) -> None:
     theirs = sync(SPACES, 3, observation=observation, action=action)
     with inproc(SPACES, observation=observation, action=action) as env:
         assert env.observation_space == batch_space(env.single_observation_space, 3) == theirs.observation_space
@@ -77,17 +77,17 @@ def test_observations_of_half_precision(shared_memory: bool) -> None:
 
 
 class Sign(spaces.Space[str]):
-    """A space of somebody's own."""
+    """A space that gymnasium does not know."""
 
 
-def test_a_space_of_ones_own_is_refused_in_one_line() -> None:
-    def odd() -> gymnasium.Env[Any, Any]:
+def test_a_custom_space_is_refused_in_one_line() -> None:
+    def with_custom_space() -> gymnasium.Env[Any, Any]:
         env = gymnasium.make(SPACES)
         env.unwrapped.observation_space = Sign()
         return env.unwrapped
 
     with pytest.raises(UsageError, match=r"observation space .* is not supported") as raised:
-        inproc(odd)
+        inproc(with_custom_space)
     assert "\n" not in str(raised.value)
 
 
@@ -97,7 +97,7 @@ def test_copies_of_different_spaces_are_refused() -> None:
         env.reset()
 
 
-def test_the_metadata_of_the_environment_is_not_touched() -> None:
+def test_the_metadata_of_the_environment_is_not_changed() -> None:
     with inproc("CartPole-v1", autoreset_mode="NextStep") as a, inproc("CartPole-v1", autoreset_mode="SameStep") as b:
         assert a.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
         assert b.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
@@ -107,20 +107,20 @@ def test_the_metadata_of_the_environment_is_not_touched() -> None:
 # ---------------------------------------------------------------- reset and step
 
 
-@pytest.mark.parametrize("listed", [True, False])
-def test_what_a_step_gives(listed: bool) -> None:
+@pytest.mark.parametrize("as_list", [True, False])
+def test_types_and_shapes_of_a_step(as_list: bool) -> None:
     """Also for a list of single actions."""
     with inproc("CartPole-v1") as env:
         observation, infos = env.reset()
         assert (observation.dtype, observation.shape, type(infos)) == (np.float32, (3, 4), dict)
-        actions = [env.single_action_space.sample() for _ in range(3)] if listed else env.action_space.sample()
+        actions = [env.single_action_space.sample() for _ in range(3)] if as_list else env.action_space.sample()
         observation, reward, terminated, truncated, infos = env.step(actions)
         assert (observation.dtype, observation.shape, type(infos)) == (np.float32, (3, 4), dict)
         assert [array.dtype for array in (reward, terminated, truncated)] == [np.float64, np.bool_, np.bool_]
         assert {array.shape for array in (reward, terminated, truncated)} == {(3,)}
 
 
-def test_the_seeds_of_the_copies_differ_and_stay() -> None:
+def test_each_copy_has_its_own_seed_and_keeps_it() -> None:
     with inproc("CartPole-v1") as env:
         assert len(set(env.np_random_seed)) == 3, "before the first reset"
         first, _ = env.reset(seed=42)
@@ -128,12 +128,12 @@ def test_the_seeds_of_the_copies_differ_and_stay() -> None:
         assert len({row.tobytes() for row in first}) == 3
         again, _ = env.reset()
         assert env.np_random_seed == (42, 43, 44)
-        assert (again != first).all(), "a reset without a seed goes on with the generator"
+        assert (again != first).all(), "a reset without a seed continues with the same generator"
         assert (env.reset(seed=[42, None, 7])[0][0] == first[0]).all()
         assert env.np_random_seed == (42, 43, 7)
 
 
-def test_some_copies_are_reset_and_the_others_stay_where_they_are() -> None:
+def test_a_reset_mask_leaves_the_other_copies_unchanged() -> None:
     with inproc("CartPole-v1", autoreset_mode="Disabled") as env:
         env.reset(options={"reset_mask": np.array([True, False, True])})
         with pytest.raises(UsageError, match=r"step before reset of copies \[1\]"):
@@ -143,9 +143,9 @@ def test_some_copies_are_reset_and_the_others_stay_where_they_are() -> None:
             stepped = env.step(np.zeros(3, np.int64))[0]
         mask = np.array([True, True, False])
         options = {"reset_mask": mask}
-        found, _ = env.reset(seed=[0, 1, 0], options=options)
-        assert (found[:2] == first[:2]).all()
-        assert (found[2] == stepped[2]).all()
+        after, _ = env.reset(seed=[0, 1, 0], options=options)
+        assert (after[:2] == first[:2]).all()
+        assert (after[2] == stepped[2]).all()
         for wrong, error in (
             (np.array([True]), ValueError),
             (np.array([True, True, False, False]), ValueError),
@@ -163,7 +163,7 @@ def test_some_copies_are_reset_and_the_others_stay_where_they_are() -> None:
 
 
 @pytest.mark.parametrize("mode", AutoresetMode, ids=lambda mode: mode.value)
-def test_what_is_told_of_an_episodes_end(mode: AutoresetMode) -> None:
+def test_the_end_of_an_episode_in_each_autoreset_mode(mode: AutoresetMode) -> None:
     zeros = np.zeros(2, np.int64)
     with inproc("workers.envs.toy:Countdown-v0", 2, k=2, autoreset_mode=mode) as env:
         env.reset(seed=1)
@@ -173,7 +173,7 @@ def test_what_is_told_of_an_episodes_end(mode: AutoresetMode) -> None:
         assert reward.tolist() == [1.0, 1.0]
         if mode is AutoresetMode.SAME_STEP:
             assert observation.tolist() == [[1.0], [1.0]]
-            assert [last.tolist() for last in infos["final_obs"]] == [[0.0], [0.0]]
+            assert [final.tolist() for final in infos["final_obs"]] == [[0.0], [0.0]]
             assert infos["_final_obs"].tolist() == infos["_final_info"].tolist() == [True, True]
             assert infos["final_info"] == {}
             return
@@ -188,8 +188,8 @@ def test_what_is_told_of_an_episodes_end(mode: AutoresetMode) -> None:
                 env.step(zeros)
 
 
-def test_what_reset_raises_comes_with_its_own_traceback() -> None:
-    class Picky(gymnasium.Env[Any, Any]):
+def test_an_error_in_reset_has_the_traceback_of_the_worker() -> None:
+    class RaisesInReset(gymnasium.Env[Any, Any]):
         observation_space, action_space = spaces.Discrete(2), spaces.Discrete(2)
 
         def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
@@ -197,7 +197,7 @@ def test_what_reset_raises_comes_with_its_own_traceback() -> None:
                 raise ValueError("not this seed")
             return 0, {}
 
-    with inproc(Picky, 2, workers=1) as env:
+    with inproc(RaisesInReset, 2, workers=1) as env:
         assert env.reset(seed=[0, 0])[0].tolist() == [0, 0]
         with pytest.raises(EnvironmentFailed, match=r"copy 1, reset: its environment raised ValueError: not this seed") as e:
             env.reset(seed=[0, 1])
@@ -207,7 +207,7 @@ def test_what_reset_raises_comes_with_its_own_traceback() -> None:
 # ---------------------------------------------------------------- calls
 
 
-def test_attributes_are_set_before_the_first_reset_and_of_another_number_not_at_all() -> None:
+def test_attributes_can_be_set_before_the_first_reset_but_not_with_a_wrong_number_of_values() -> None:
     with inproc("CartPole-v1", 4) as env:
         env.set_attr("gravity", [9.81, 3.72, 8.87, 1.62])
         assert env.get_attr("gravity") == (9.81, 3.72, 8.87, 1.62)
@@ -227,9 +227,9 @@ def test_lists_of_frames_are_rendered() -> None:
         assert [[frame.shape for frame in frames] for frames in images] == [[(400, 600, 3)]] * 2
 
 
-# ---------------------------------------------------------------- the end
+# ---------------------------------------------------------------- pending and closed
 
-DOINGS: dict[str, Callable[[ZmqVectorEnv], object]] = {
+METHODS: dict[str, Callable[[ZmqVectorEnv], object]] = {
     "reset": lambda env: env.reset(),
     "step": lambda env: env.step(np.zeros(3, np.int64)),
     "step_async": lambda env: env.step_async(np.zeros(3, np.int64)),
@@ -241,19 +241,19 @@ DOINGS: dict[str, Callable[[ZmqVectorEnv], object]] = {
 }
 
 
-def test_while_a_step_is_pending_nothing_else_is_done() -> None:
+def test_while_a_step_is_pending_other_calls_are_refused() -> None:
     with inproc("CartPole-v1") as env:
         env.reset(seed=1)
         env.step_async(np.zeros(3, np.int64))
-        for doing, do in DOINGS.items():
-            if doing != "step_wait":
+        for name, method in METHODS.items():
+            if name != "step_wait":
                 with pytest.raises(AlreadyPendingCallError, match="a step is pending"):
-                    do(env)
-        assert env.step_wait()[1].tolist() == [1.0] * 3, "and the step is not lost by it"
+                    method(env)
+        assert env.step_wait()[1].tolist() == [1.0] * 3, "the refused calls must not disturb the step"
 
 
 @pytest.mark.parametrize("pending", [False, True])
-def test_after_its_end_nothing_is_done(pending: bool) -> None:
+def test_after_close_every_call_is_refused(pending: bool) -> None:
     env = inproc("CartPole-v1")
     env.reset(seed=1)
     if pending:
@@ -261,6 +261,6 @@ def test_after_its_end_nothing_is_done(pending: bool) -> None:
     env.close()
     env.close()
     assert env.closed
-    for do in DOINGS.values():
+    for method in METHODS.values():
         with pytest.raises(ClosedEnvironmentError, match=r"after close\(\)"):
-            do(env)
+            method(env)

@@ -1,4 +1,4 @@
-"""The vector environment is, to the bit, gymnasium's SyncVectorEnv, whichever way the steps travel."""
+"""The results of the vector environment are bit for bit those of gymnasium's SyncVectorEnv, for every transport."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from protocol.wire.link import WorkerLink
 from tests.support.bit_equality import alike
 
 MODES = tuple(AutoresetMode)
-WAYS: dict[str, dict[str, Any]] = {
+TRANSPORTS: dict[str, dict[str, Any]] = {
     "shared": {},
     "ipc": {"shared_memory": False},
     "tcp": {"shared_memory": False, "transport": "tcp"},
@@ -42,11 +42,13 @@ CASES: dict[str, dict[str, Any]] = {
 
 @contextmanager
 def both(
-    env: str, num_envs: int, mode: AutoresetMode, way: str, workers: int = 2, **kwargs: Any
+    env: str, num_envs: int, mode: AutoresetMode, transport: str, workers: int = 2, **kwargs: Any
 ) -> Iterator[tuple[ZmqVectorEnv, SyncVectorEnv[Any, Any]]]:
-    """Ours, and gymnasium's own in this process."""
+    """Our vector environment, and gymnasium's SyncVectorEnv in this process."""
     with ExitStack() as stack:
-        ours = millrace.make_vec(env, num_envs, workers=workers, autoreset_mode=mode, timeout=20, **WAYS[way], **kwargs)
+        ours = millrace.make_vec(
+            env, num_envs, workers=workers, autoreset_mode=mode, timeout=20, **TRANSPORTS[transport], **kwargs
+        )
         stack.callback(ours.close)
         theirs = SyncVectorEnv(
             [lambda: gymnasium.make(env, disable_env_checker=True, **kwargs) for _ in range(num_envs)], autoreset_mode=mode
@@ -56,7 +58,7 @@ def both(
 
 
 def play(ours: ZmqVectorEnv, theirs: SyncVectorEnv[Any, Any], steps: int, mode: AutoresetMode) -> None:
-    """The same seeds and actions to both."""
+    """Step both with the same seeds and actions, and compare the results."""
     assert alike(ours.reset(seed=7), theirs.reset(seed=7))
     theirs.action_space.seed(3)
     for t in range(steps):
@@ -65,25 +67,25 @@ def play(ours: ZmqVectorEnv, theirs: SyncVectorEnv[Any, Any], steps: int, mode: 
         assert alike(mine, wanted), f"step {t}: {mine} is not {wanted}"
         ended = wanted[2] | wanted[3]
         if mode is AutoresetMode.DISABLED and ended.any():
-            given = [{"reset_mask": ended.copy()} for _ in range(2)]
-            assert alike(ours.reset(options=given[0]), theirs.reset(options=given[1]))
+            options = [{"reset_mask": ended.copy()} for _ in range(2)]
+            assert alike(ours.reset(options=options[0]), theirs.reset(options=options[1]))
 
 
 @pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.value)
 @pytest.mark.parametrize("env", CASES)
-def test_through_shared_memory_it_is_gymnasiums_own(env: str, mode: AutoresetMode) -> None:
+def test_results_through_shared_memory_equal_those_of_sync_vector_env(env: str, mode: AutoresetMode) -> None:
     with both(env, 5, mode, "shared", **CASES[env]) as (ours, theirs):
         play(ours, theirs, 2000 if env == "CartPole-v1" else 200, mode)
 
 
 @pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.value)
-@pytest.mark.parametrize("way", ["ipc", "tcp", "inproc"])
-def test_by_messages_it_is_gymnasiums_own(way: str, mode: AutoresetMode) -> None:
-    with both("workers.envs.toy:Informs-v0", 5, mode, way) as (ours, theirs):
+@pytest.mark.parametrize("transport", ["ipc", "tcp", "inproc"])
+def test_results_by_messages_equal_those_of_sync_vector_env(transport: str, mode: AutoresetMode) -> None:
+    with both("workers.envs.toy:Informs-v0", 5, mode, transport) as (ours, theirs):
         play(ours, theirs, 150, mode)
 
 
-def test_its_face_is_gymnasiums_own() -> None:
+def test_its_attributes_equal_those_of_sync_vector_env() -> None:
     with both("CartPole-v1", 3, AutoresetMode.SAME_STEP, "inproc") as (ours, theirs):
         assert isinstance(ours, VectorEnv)
         for name in ("num_envs", "observation_space", "action_space", "single_observation_space", "single_action_space"):
@@ -113,10 +115,10 @@ def test_calls_and_attributes() -> None:
             ours.call("reset")
         theirs.action_space.seed(3)
         action = theirs.action_space.sample()
-        assert alike(ours.step(action), theirs.step(action))  # no call has hurt it
+        assert alike(ours.step(action), theirs.step(action))  # the calls did not disturb it
 
 
-def test_frames_are_rendered_where_the_copies_are() -> None:
+def test_workers_render_frames() -> None:
     with millrace.make_vec("CartPole-v1", 2, workers=1, render_mode="rgb_array") as env:
         env.reset(seed=1)
         frames = env.render()
@@ -125,27 +127,27 @@ def test_frames_are_rendered_where_the_copies_are() -> None:
 
 
 def test_a_callable_and_a_list_of_environments() -> None:
-    def made(k: int) -> Any:
+    def countdown(k: int) -> Any:
         return lambda: gymnasium.make("workers.envs.toy:Countdown-v0", k=k)
 
-    with millrace.make_vec([made(2), made(3), "workers.envs.toy:Countdown-v0"], workers=2) as env:
+    with millrace.make_vec([countdown(2), countdown(3), "workers.envs.toy:Countdown-v0"], workers=2) as env:
         assert env.num_envs == 3
         env.reset()
         ended = [env.step(np.zeros(3, np.int64))[2].tolist() for _ in range(3)]
         assert ended == [[False, False, False], [True, False, False], [False, True, False]]
 
 
-def test_actions_of_another_dtype_reach_the_environment_as_they_are() -> None:
-    """A float64 action in a float32 space: rounding it would change the bits of what follows."""
+def test_actions_of_another_dtype_are_not_converted() -> None:
+    """For a float64 action in a float32 space, rounding would change the bits of all later observations."""
     with both("Pendulum-v1", 3, AutoresetMode.NEXT_STEP, "shared") as (ours, theirs):
         ours.reset(seed=1), theirs.reset(seed=1)
-        draw = np.random.default_rng(1)
+        rng = np.random.default_rng(1)
         for _ in range(20):
-            action = draw.uniform(-2, 2, (3, 1))
+            action = rng.uniform(-2, 2, (3, 1))
             assert alike(ours.step(action), theirs.step(action))
 
 
-def test_observations_are_copies_unless_that_is_turned_off() -> None:
+def test_observations_are_copies_unless_copy_is_false() -> None:
     zeros = np.zeros(2, np.int64)
     with millrace.make_vec("CartPole-v1", 2, workers=1) as env:
         first, _ = env.reset(seed=1)
@@ -160,7 +162,7 @@ def test_observations_are_copies_unless_that_is_turned_off() -> None:
         assert (first != kept).any()
 
 
-def test_gymnasiums_wrappers_stand_over_it() -> None:
+def test_gymnasium_vector_wrappers_work_on_it() -> None:
     def wrapped(env: VectorEnv[Any, Any, Any]) -> VectorEnv[Any, Any, Any]:
         env = wrappers.RecordEpisodeStatistics(env)
         env = wrappers.NormalizeObservation(env)
@@ -182,7 +184,7 @@ def test_gymnasiums_wrappers_stand_over_it() -> None:
         assert ended > 10
 
 
-def test_an_info_that_is_no_plain_data_comes_as_its_repr_and_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_info_that_is_no_plain_data_arrives_as_its_repr_with_one_warning(caplog: pytest.LogCaptureFixture) -> None:
     with (
         caplog.at_level(logging.WARNING, "millrace.learner"),
         millrace.make_vec("workers.envs.toy:Informs-v0", 2, workers=1, odd=True) as env,
@@ -197,22 +199,22 @@ def test_an_info_that_is_no_plain_data_comes_as_its_repr_and_is_told_once(caplog
     ) == 1
 
 
-def test_infos_too_long_for_shared_memory_travel_as_a_message() -> None:
+def test_infos_too_long_for_shared_memory_are_sent_as_a_message() -> None:
     with both("workers.envs.toy:Informs-v0", 2, AutoresetMode.NEXT_STEP, "shared", wordy=1_000_000) as (ours, theirs):
         play(ours, theirs, 5, AutoresetMode.NEXT_STEP)
         assert len(ours.step(ours.action_space.sample())[4]["word"][0]) > 1_000_000
 
 
-def test_whoever_asks_how_it_is_is_answered_while_it_steps() -> None:
+def test_a_status_request_is_answered_while_it_steps() -> None:
     zeros = np.zeros(3, np.int64)
     with millrace.make_vec("CartPole-v1", 3, workers=2) as env, ThreadPoolExecutor(1) as pool:
         env.reset(seed=1)
         link = WorkerLink(env.address, observer_name())
-        asked = pool.submit(ask, link, 20.0)
-        while not asked.done():
+        reply = pool.submit(ask, link, 20.0)
+        while not reply.done():
             env.step(zeros)
         link.close(0)
-        status = asked.result()
+        status = reply.result()
     assert (status.env, status.total_steps) == ("CartPole-v1", 0)
     assert [(worker.worker, worker.lanes) for worker in sorted(status.workers, key=lambda one: one.worker)] == [
         ("w0", (0,)),
@@ -222,7 +224,7 @@ def test_whoever_asks_how_it_is_is_answered_while_it_steps() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "says"),
+    ("wrong", "message"),
     [
         ({"num_envs": 0}, "num_envs expected at least 1"),
         ({"lanes": 9}, "lanes expected 1 to num_envs"),
@@ -237,12 +239,12 @@ def test_whoever_asks_how_it_is_is_answered_while_it_steps() -> None:
         ({"env": "workers.envs.toy:Spaces-v0", "observation": "text"}, "is not supported"),
     ],
 )
-def test_what_cannot_be_is_said_in_one_line(wrong: dict[str, Any], says: str) -> None:
-    with pytest.raises(UsageError, match=says):
+def test_wrong_arguments_are_refused_in_one_line(wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
         millrace.make_vec(**{"env": "CartPole-v1", "num_envs": 2, "workers": 1, **wrong})
 
 
-def test_the_order_of_calls_is_gymnasiums() -> None:
+def test_calls_in_the_wrong_order_raise_the_errors_of_gymnasium() -> None:
     zeros = np.zeros(2, np.int64)
     with millrace.make_vec("CartPole-v1", 2, transport="inproc", autoreset_mode="Disabled") as env:
         with pytest.raises(UsageError, match="call reset"):
@@ -289,13 +291,13 @@ calls = st.lists(
 )
 
 
-def test_any_sequence_of_calls_gives_the_same() -> None:
-    """Through shared memory and by messages, in each mode: whatever comes back is compared, after every call."""
+def test_any_sequence_of_calls_gives_the_results_of_sync_vector_env() -> None:
+    """Through shared memory and by messages, in each autoreset mode; results are compared after every call."""
     with ExitStack() as stack:
         pairs = {
-            (mode, way): stack.enter_context(both("workers.envs.toy:Informs-v0", 3, mode, way))
+            (mode, transport): stack.enter_context(both("workers.envs.toy:Informs-v0", 3, mode, transport))
             for mode in MODES
-            for way in ("shared", "inproc")
+            for transport in ("shared", "inproc")
         }
 
         @settings(max_examples=120, deadline=None)
@@ -336,9 +338,9 @@ def play_sequence(
                 same("reset", seed=value[0], options=value[1])
                 ended[:] = False
             case "mask":
-                given, told, chosen = value
-                same("reset", seed=given, options={"reset_mask": np.array(chosen), **(told or {})})
-                ended &= ~np.array(chosen)
+                seed_argument, other_options, mask = value
+                same("reset", seed=seed_argument, options={"reset_mask": np.array(mask), **(other_options or {})})
+                ended &= ~np.array(mask)
             case "call":
                 same("call", "shout", value[0], times=value[1])
             case "set_attr":
@@ -349,10 +351,10 @@ def play_sequence(
                 same("render")
 
 
-def test_lanes_that_are_more_than_workers_move_in_at_once() -> None:
-    """Nobody waits for a worker that is not to come: only a lane whose worker died waits for its successor."""
+def test_with_more_lanes_than_workers_all_lanes_are_placed_at_once() -> None:
+    """Only a lane whose worker died waits for the restarted worker."""
     env = millrace.make_vec("CartPole-v1", 4, workers=1, lanes=4, timeout=5)
-    env.reset(seed=1)  # within the deadline, which is shorter than a lane's patience
+    env.reset(seed=1)  # within the deadline, which is shorter than that wait
     assert env.step(np.zeros(4, np.int64))[1].tolist() == [1.0] * 4
     assert env.workers == 1
     env.close()

@@ -1,4 +1,4 @@
-"""gymnasium's own vector wrappers over ours give what they give over `SyncVectorEnv`, to the bit."""
+"""gymnasium's vector wrappers give the same results on our vector environment as on `SyncVectorEnv`, bit for bit."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from tests.support.bit_equality import alike
 Env = VectorEnv[Any, Any, Any]
 
 
-def shifted(env: Env) -> Env:
+def shift_observation(env: Env) -> Env:
     return wrappers.TransformObservation(
         env, lambda obs: obs + np.float32(1), env.observation_space, env.single_observation_space
     )
 
 
-def informed(env: Env) -> Env:
+def list_infos(env: Env) -> Env:
     return wrappers.DictInfoToList(wrappers.RecordEpisodeStatistics(env))
 
 
@@ -33,8 +33,8 @@ WRAPPERS: dict[str, tuple[str, Callable[[Env], Env]]] = {
     "NormalizeReward": ("CartPole-v1", lambda env: wrappers.NormalizeReward(env, gamma=0.9)),
     "ClipReward": ("CartPole-v1", lambda env: wrappers.ClipReward(env, -0.5, 0.5)),
     "TransformReward": ("CartPole-v1", lambda env: wrappers.TransformReward(env, lambda reward: 2 * reward)),
-    "TransformObservation": ("CartPole-v1", shifted),
-    "DictInfoToList": ("CartPole-v1", informed),
+    "TransformObservation": ("CartPole-v1", shift_observation),
+    "DictInfoToList": ("CartPole-v1", list_infos),
     "DtypeObservation": ("CartPole-v1", lambda env: wrappers.DtypeObservation(env, np.float64)),
     "FlattenObservation": ("workers.envs.toy:Frames-v0", wrappers.FlattenObservation),
     "ClipAction": ("Pendulum-v1", wrappers.ClipAction),
@@ -46,7 +46,7 @@ WRAPPERS: dict[str, tuple[str, Callable[[Env], Env]]] = {
 
 
 @pytest.mark.parametrize("name", WRAPPERS)
-def test_a_wrapper_cannot_tell(name: str) -> None:
+def test_a_wrapper_gives_the_same_results(name: str) -> None:
     env_id, wrap = WRAPPERS[name]
     theirs: Env = SyncVectorEnv([lambda: gymnasium.make(env_id)] * 4, autoreset_mode=AutoresetMode.NEXT_STEP)
     ours = millrace.make_vec(env_id, 4, workers=2)
@@ -61,7 +61,7 @@ def test_a_wrapper_cannot_tell(name: str) -> None:
             action = mine.action_space.sample()
             (*row, info), (*their_row, their_info) = mine.step(action), other.step(action)
             assert alike(row, their_row)
-            assert alike(_untimed(info), _untimed(their_info))
+            assert alike(_without_seconds(info), _without_seconds(their_info))
             ended += int(np.sum(row[2] | row[3]))
         assert ended >= 4
     finally:
@@ -69,9 +69,9 @@ def test_a_wrapper_cannot_tell(name: str) -> None:
         theirs.close()
 
 
-def _untimed(info: Any) -> Any:
-    """Without the seconds that an episode took."""
+def _without_seconds(info: Any) -> Any:
+    """The info without the duration of an episode."""
     if isinstance(info, list):
-        return [_untimed(one) for one in info]
-    timeless = {key: value for key, value in info.items() if key not in ("t", "_t")}
-    return timeless | ({"episode": _untimed(info["episode"])} if "episode" in info else {})
+        return [_without_seconds(one) for one in info]
+    kept = {key: value for key, value in info.items() if key not in ("t", "_t")}
+    return kept | ({"episode": _without_seconds(info["episode"])} if "episode" in info else {})
