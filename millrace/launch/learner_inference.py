@@ -49,6 +49,7 @@ def train(
         stack.callback(context.term)
         link = LearnerLink(own_address("inproc", stack), context)
         stack.callback(link.close, 0.5)
+
         def ended() -> list[tuple[str, str]]:
             if lanes.nobody is not None:
                 nobody, lanes.nobody = lanes.nobody, None
