@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from examples.ppo_vector_env import Settings, greedy, train
+from examples.ppo_vector_env import Settings, evaluate, train
 
 
 @pytest.mark.learning
@@ -13,4 +13,4 @@ from examples.ppo_vector_env import Settings, greedy, train
 def test_it_solves_cartpole(seed: int) -> None:
     settings = Settings(seed=seed)
     agent, _ = train(settings, quiet=True)
-    assert greedy(agent, settings) >= 475
+    assert evaluate(agent, settings) >= 475
