@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import math
-import os
 import re
 import shutil
 import subprocess
@@ -22,7 +21,7 @@ log = logging.getLogger("millrace.cluster")
 
 BASE, PROMETHEUS, GRAFANA = "millrace-base", "millrace-prometheus", "millrace-grafana"
 USER = 1_000
-"""whoever types the commands: not root"""
+"""the user of the containers, where .env does not name another"""
 BUILD_S = 900.0
 LOOK_EVERY_S = 1.0  # Prometheus asks the learner every 5 s
 
@@ -90,7 +89,6 @@ class Cluster:
         for wheel in stock.wheels():
             shutil.copy(wheel, self.folder / "docker" / "wheels")
         self.docker_folder = self.folder / "docker"
-        os.chown(self.docker_folder, USER, USER)
         self.typed: set[str] = set()
         """all commands so far, in the plugin's spelling"""
         self.project = f"millrace-{program.name.lower()}"
@@ -111,11 +109,6 @@ class Cluster:
         self.typed.add(" ".join(("docker compose", *arguments)))
         command = [*self.program.value, "--project-name", self.project, *arguments]
         return run(command, within_s=within_s, env=self._environment, where=self.docker_folder)
-
-    def shell(self, line: str) -> None:
-        """A line for the shell, in docker/, by a user who is not root."""
-        as_user = ["setpriv", f"--reuid={USER}", f"--regid={USER}", "--clear-groups"]
-        run([*as_user, "sh", "-c", line], where=self.docker_folder)
 
     def set_flags(self, flags: str) -> None:
         """The learner's, from the next `up` on."""

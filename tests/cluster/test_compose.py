@@ -26,6 +26,7 @@ pytestmark = [pytest.mark.cluster, pytest.mark.timeout(3_600)]
 log = logging.getLogger("millrace.cluster")
 
 WORKER_MB = 300  # on a slim base
+SHORT = "--steps 4096 --eval-episodes 1"
 STEPS = "--steps 10000000 --checkpoint-every-s 2"  # the test says when it is over
 TARGET = f"{STEPS} --target-return 475 --eval-episodes 20 --eval-every 5000"
 DASHBOARD = ROOT / "docker/grafana/dashboards/millrace.json"
@@ -65,41 +66,39 @@ def cluster(engine: Engine, request: pytest.FixtureRequest, tmp_path: Path) -> I
         shutil.rmtree(made.folder)
 
 
-def documented() -> dict[str, set[str]]:
-    """What a reader is told to type: commands of compose, and lines that make .env."""
+def documented() -> set[str]:
+    """The commands of compose that a reader is told to type."""
     text = "\n".join((ROOT / file).read_text() for file in ("README.md", "docs/docker.md", "docker/compose.yaml"))
     commands = re.findall(r"docker compose [^`#\n]*", text)
-    lines = re.findall(r"printf [^#\n]* > \.env", text)
     assert len(commands) > 10
-    return {"compose": {command.strip() for command in commands}, "shell": set(lines)}
+    return {command.strip() for command in commands}
 
 
 def test_it_trains_changes_its_size_and_comes_back(cluster: Cluster) -> None:
-    told = documented()
-    for line in told["shell"]:
-        cluster.shell(line)
-    cluster.compose("build", within_s=1_800)
+    cluster.set_flags(SHORT)
+    cluster.compose("up", "--build", within_s=1_800)  # all that it takes; it ends with the run
+    assert [state["ExitCode"] for name in ("keys", "learner", "worker") for state in cluster.state(name)] == [0] * 3
     the_images_hold_what_they_need(cluster)
-    cluster.compose("run", "--rm", "keys")
-    assert {path.stat().st_uid for path in (cluster.docker_folder / "keys").iterdir()} == {USER}
 
     cluster.set_flags(STEPS)
     cluster.up(3)
     cluster.compose(*OBSERVE, "up", "-d", "--scale", "worker=3")
     cluster.sees(WORKERS, lambda count: count == 3)
     cluster.trains()
+    keys = the_keys(cluster)
     for workers in (5, 1, 3):
         cluster.up(workers)
         cluster.sees(WORKERS, lambda count, workers=workers: count == workers)  # type: ignore[misc]
         cluster.trains()
         assert len(cluster.containers("worker")) == workers
 
+    assert the_keys(cluster) == keys, "other keys were made in place of those that were there"
     a_worker_that_is_killed_comes_back(cluster)
     the_learner_that_is_killed_comes_back(cluster)
     the_dashboard_has_data(cluster)
     the_metrics_are_well_formed(cluster)
     every_part_says_that_it_is_well(cluster)
-    a_key_that_leaked_lets_nobody_in(cluster)
+    a_token_that_leaked_lets_nobody_in(cluster)
 
     cluster.compose("stop")
     assert {state["ExitCode"] for state in cluster.state("learner")} == {130}
@@ -115,7 +114,7 @@ def test_it_trains_changes_its_size_and_comes_back(cluster: Cluster) -> None:
     cluster.compose(*OBSERVE, "down", "--volumes")
     assert cluster.engine.is_empty()
     not_known = set() if cluster.program is Program.V2 else {"docker compose cp learner:/runs ./runs"}
-    assert told["compose"] - cluster.typed == not_known, "what a reader is told to type, and nobody has tried"
+    assert documented() - cluster.typed == not_known, "what a reader is told to type, and nobody has tried"
 
 
 def the_images_hold_what_they_need(cluster: Cluster) -> None:
@@ -198,15 +197,33 @@ def every_part_says_that_it_is_well(cluster: Cluster) -> None:
         assert "apiVersion: 1" in cluster.engine.fetch(f"{given}/etc/grafana/provisioning/{kind}/{file}.yaml")
 
 
-def a_key_that_leaked_lets_nobody_in(cluster: Cluster) -> None:
-    cluster.compose("run", "--rm", "keys", "keys", "revoke", "default", "--keys", "/here/keys")
+def the_keys(cluster: Cluster) -> dict[str, str]:
+    """Checksum by file: the learner's key and the token, as the learner and a worker read them. Checks owner and mode."""
+    (learner,) = cluster.containers("learner")
+    worker, *_ = cluster.containers("worker")
+    found = {}
+    for container, path in (
+        (learner, "/keys/own/server.key"),
+        (learner, "/keys/own/default.token"),
+        (worker, "/token/default.token"),
+    ):
+        assert cluster.engine.docker("exec", container, "stat", "--format=%u %a", path) == f"{USER} 600"
+        found[path] = cluster.engine.docker("exec", container, "sha256sum", path).split()[0]
+    assert found["/keys/own/default.token"] == found["/token/default.token"]
+    assert cluster.engine.docker("exec", worker, "sh", "-c", "ls -d /keys* || true") == "", "a worker has the learner's key"
+    return found
+
+
+def a_token_that_leaked_lets_nobody_in(cluster: Cluster) -> None:
+    keys = the_keys(cluster)
+    cluster.compose("run", "--rm", "--entrypoint", "millrace", "keys", "keys", "revoke", "default")
     cluster.sees(WORKERS, lambda count: count == 0)
-    shutil.rmtree(cluster.docker_folder / "keys")
-    cluster.compose("run", "--rm", "keys")
     cluster.up(3, "--force-recreate")
     cluster.sees(WORKERS, lambda count: count == 3)
     cluster.trains()
-    log.info("a key was revoked and there is a new one")
+    after = the_keys(cluster)
+    assert {path for path in keys if keys[path] != after[path]} == {"/keys/own/default.token", "/token/default.token"}
+    log.info("a token was revoked and there is a new one")
 
 
 def the_run_is_one_and_its_ledger_balances(cluster: Cluster) -> None:

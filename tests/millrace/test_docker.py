@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
 import shutil
+import stat
 import subprocess
 import sys
+from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -21,6 +24,7 @@ from learner.config.config import Config
 from learner.prometheus import Exposition, Snapshot
 from learner.rollouts.ledger import Ledger
 from learner.run_folder.progress import Progress
+from protocol.keys.key_folder import KeyFolder
 from tests.test_architecture import imported, sources
 
 ROOT = Path(__file__).parents[2]
@@ -127,10 +131,49 @@ def test_the_ports_of_the_parts_fit_each_other(compose: dict[str, Any]) -> None:
 
 
 def test_a_worker_has_the_token_and_not_the_learners_key(compose: dict[str, Any]) -> None:
-    worker = compose["services"]["worker"]
-    assert worker["secrets"] == ["token"]
-    assert "volumes" not in worker
-    assert compose["secrets"]["token"]["file"].endswith("default.token")
+    services = compose["services"]
+    assert services["worker"]["volumes"] == ["token:/token:ro"]
+    assert services["worker"]["environment"]["MILLRACE_TOKEN"] == "/token/default.token"
+    assert {name for name, service in services.items() if "keys" in volumes(service)} == {"keys", "learner"}
+    assert {name for name, service in services.items() if "token" in volumes(service)} == {"keys", "worker"}
+    assert "keys:/keys:ro" in services["learner"]["volumes"]
+    assert services["keys"]["environment"]["MILLRACE_KEYS"] == services["learner"]["environment"]["MILLRACE_KEYS"]
+
+
+def volumes(service: dict[str, Any]) -> set[str]:
+    """Names of the volumes, and paths of the files, that a service mounts."""
+    return {mount.partition(":")[0] for mount in service.get("volumes", [])}
+
+
+def test_the_keys_are_made_before_anything_else_starts(compose: dict[str, Any]) -> None:
+    completed = {"condition": "service_completed_successfully"}
+    for name in ("learner", "worker"):
+        assert compose["services"][name]["depends_on"]["keys"] == completed
+    assert "build" in compose["services"]["keys"], "docker-compose 1 would look for the image in a registry"
+    assert "profiles" not in compose["services"]["keys"]
+
+
+def test_the_script_that_makes_the_keys_keeps_what_is_there(compose: dict[str, Any], tmp_path: Path) -> None:
+    (script,) = compose["services"]["keys"]["command"]
+    for folder in ("keys", "token"):
+        (tmp_path / folder).mkdir()
+        script = script.replace(f"/{folder}/", f"{tmp_path}/{folder}/")
+    script = script.replace("millrace keys", f"{sys.executable} -m millrace keys")
+    variables = {"PATH": os.defpath, "PYTHONPATH": str(ROOT), "MILLRACE_KEYS": str(tmp_path / "keys" / "own")}
+    own, token = tmp_path / "keys" / "own", tmp_path / "token" / "default.token"
+
+    def run() -> tuple[bytes, bytes]:
+        subprocess.run(["sh", "-euc", script], cwd=ROOT, env=variables, capture_output=True, timeout=60, check=True)
+        assert token.read_bytes() == (own / "default.token").read_bytes()
+        assert stat.S_IMODE(token.stat().st_mode) == 0o600
+        return (own / "server.key").read_bytes(), token.read_bytes()
+
+    first = run()
+    assert run() == first
+    KeyFolder(own).revoke("default", datetime.now(UTC).replace(microsecond=0))
+    server_key, after = run()
+    assert server_key == first[0]
+    assert after != first[1], "the token of a key that was revoked was kept"
 
 
 def test_every_service_comes_back_and_those_of_ours_are_confined(compose: dict[str, Any]) -> None:
