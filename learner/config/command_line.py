@@ -7,26 +7,31 @@ from pathlib import Path
 from typing import Any
 
 from learner.config.config import Config
+from learner.config.flag_help import show_help
 from learner.config.flag_parser import parse_flags
-from learner.config.hyperparameters import algorithms_with
+from learner.config.hyperparameters import HYPERPARAMETERS, algorithms_with
 from learner.config.layers import lower_layers, override
 from learner.config.validation import validate
 from learner.run_folder.resume import AUTO, newest_run
 
 
 class RunFlags(Config, frozen=True, kw_only=True):
-    """Train a policy. Settings that are not given here come from --config, then the preset of ENV, then the defaults."""
+    """All settings of a run, and where their defaults come from."""
 
     config: Path | None = None
-    """a TOML file of settings; a run folder's config.toml repeats that run"""
+    """TOML file of settings. The config.toml of a run folder repeats that run."""
     preset: str = "auto"
-    """a whole run by name (millrace presets lists them), the environment whose preset to take, or none"""
+    """The name of a whole run (`millrace presets` lists them), the environment whose preset to take, auto (the preset of
+    ENV, if there is one) or none.
+    """
     resume: Path | None = None
-    """a run folder to go on with, from its newest checkpoint; auto: the newest of this ENV, algo and seed, or a new one"""
+    """Run folder to continue from its newest checkpoint. auto: the newest run of this ENV, algo and seed in run_dir; a new
+    run if there is none.
+    """
     log_json: bool = False
-    """say what happens as JSON, one event a line, on stderr; and nothing else"""
+    """Log to stderr as JSON, one event per line, instead of text."""
     debug: bool = False
-    """show the traceback of an error"""
+    """Show the traceback of an error."""
 
 
 def read_config(command: str, argv: list[str]) -> tuple[Config, Path | None]:
@@ -44,6 +49,7 @@ def _read_layers(command: str, argv: list[str], resumed: Path | None = None) -> 
     The settings of a resumed run lie below the flags. The flags are parsed more than once, because the layers below them
     depend on some of them (--config, --preset, --resume, --algo, ENV).
     """
+    argv = _none_as_tyro_wants_it(argv)
     without_help = [flag for flag in argv if flag not in ("-h", "--help")]
     parse = functools.partial(parse_flags, RunFlags, command=command, hint=algorithms_with)
     first = parse(without_help, default=RunFlags(algo=""), ignore_unknown=True)
@@ -55,9 +61,21 @@ def _read_layers(command: str, argv: list[str], resumed: Path | None = None) -> 
         first = parse(without_help, default=RunFlags(algo="", algorithm=algorithm), ignore_unknown=True)
     base = below(first.env)
     default = RunFlags(**{**_fields(base), "env_kwargs": {}})
-    flags = parse(argv if without_help == argv else ["--help"], default=default)
+    if without_help != argv:
+        show_help(default, command)
+    flags = parse(argv, default=default)
     config = Config(**_fields(flags))
     return validate(override(config, {"env_kwargs": base.env_kwargs | config.env_kwargs}, "")), flags.resume
+
+
+def _none_as_tyro_wants_it(argv: list[str]) -> list[str]:
+    """`--core none`, as it stands in a TOML file, becomes `--core None`; likewise all settings whose default may be None."""
+    records = [Config(), *(kind() for kind in HYPERPARAMETERS.values())]
+    optional = {f"--{name}" for record in records for name in record.__struct_fields__ if getattr(record, name) is None}
+    return [
+        "None" if word == "none" and before.replace("-", "_").replace("__", "--", 1) in optional else word
+        for before, word in zip(["", *argv], argv, strict=False)
+    ]
 
 
 def _fields(config: Config) -> dict[str, Any]:

@@ -26,108 +26,133 @@ Seconds = Annotated[float, Meta(gt=0)]
 
 
 class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Everything that decides how a run goes."""
+    """All settings of a run."""
+
+    # ------------------------------------------------------------------------------------------------------------ basics
 
     env: Positional[str] = ""
-    """anything gymnasium.make takes: CartPole-v1, ALE/Pong-v5, my_package.envs:MyEnv-v0"""
+    """Environment id for gymnasium.make, as CartPole-v1, ALE/Pong-v5 or my_package.envs:MyEnv-v0."""
     env_kwargs: dict[str, Scalar] = {}
-    """keyword arguments of gymnasium.make: name value name value …"""
+    """Keyword arguments for gymnasium.make: NAME VALUE NAME VALUE ..."""
     algo: str = "ppo"
-    """the algorithm: one of those in learner/config/hyperparameters.py"""
+    """Learning algorithm. `--algo NAME --help` shows its settings."""
     algorithm: Hyperparameters = PPOConfig()
-    """the algorithm's own settings"""
-
+    """Settings of the algorithm."""
     steps: Count = 100_000
-    """env steps to train for, all copies together: it ends when one more update would pass them"""
+    """Env steps to train for, summed over all env copies. Training ends before an update that would exceed them."""
     seed: Natural = 1
-    """everything random follows from it"""
+    """Seed of all random numbers of the run."""
     workers: Count = 2
-    """worker processes on this machine"""
+    """Number of worker processes on this machine."""
     envs: Count = 8
-    """env copies, all workers together; a multiple of lanes"""
-    lanes: Count = 4
-    """groups into which the env copies are divided; workers share out the lanes, and results do not depend on the workers"""
-    max_lag: Natural = 0
-    """how many versions old the weights behind a rollout may be; 0 is synchronous"""
-    vector: Literal["auto", "loop", "native", "envpool"] = "auto"
-    """how a lane's env copies are stepped: one after another (loop), or at once by the environment's own vectorised form
-    (native) or by envpool's (pip install 'millrace-rl[envpool]'), with other random numbers; auto is loop, wherever it runs
-    """
-
-    inference: Literal["workers", "learner"] = "workers"
-    """where the policy acts: in each worker, or beside the learner, for all env copies at once, so that workers only step"""
-
-    transport: Literal["inproc", "ipc", "tcp"] = "ipc"
-    """how local workers are reached: threads of this process, local sockets, or loopback TCP"""
-    compress: Literal["none", "zstd"] = "none"
-    """how workers compress their rollouts: not at all, or by Zstandard, which pays for images, on almost any network
-    (pip install 'millrace-rl[compress]', here and with every worker)
-    """
-    weights_dtype: WeightsDtype = "float32"
-    """as what weights travel to workers: rounded, as bfloat16 or float16, they are half as many bytes. Workers act under the
-    rounded ones, of which their log-probabilities are; the learner's own stay float32
-    """
-    images_dtype: ImagesDtype = "float32"
-    """as what the acting policy looks at images; in bfloat16 half the work on a CPU with matrix units (AMX), more on one
-    without. Log-probabilities are those of the actions as they were drawn; the learner's own stay float32
-    """
-    bind: str = "tcp://127.0.0.1:5555"
-    """where `millrace learner` listens for workers; tcp://0.0.0.0:5555 is for other machines, and needs keys"""
-    advertise: str = ""
-    """the host that workers on other machines are told; if not given, this machine's name"""
-    keys: str = ""
-    """folder of keys (or MILLRACE_KEYS): then loopback TCP needs keys too; if not given, ~/.config/millrace/keys"""
-    insecure: bool = False
-    """let other machines connect without keys: whoever reaches the port can read the run, spoil it and stop it"""
+    """Number of env copies, summed over all workers. Must be a multiple of lanes."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """where the learner learns"""
-    torch_threads: Count | None = None
-    """threads of PyTorch in the learner; none: 1 for a small MLP, else as many as there are cores that no worker needs
-    meanwhile (with max_lag 0 all). Their number changes results in the last bits
-    """
+    """Device of the learner. auto: cuda if PyTorch finds a GPU, else cpu."""
     run_dir: str = "runs"
-    """where run folders go"""
+    """Folder in which the run folder is made."""
+
+    # -------------------------------------------------------------------------------------------- evaluation and targets
 
     eval_episodes: Count = 100
-    """greedy episodes of an evaluation"""
+    """Number of greedy episodes in an evaluation."""
     eval_every: Natural = 0
-    """env steps between greedy evaluations while training; 0: only the one at the end"""
+    """Env steps between evaluations during training. 0: evaluate only at the end."""
     target_return: float | None = None
-    """stop as soon as a greedy evaluation averages at least this"""
+    """Stop as soon as the mean return of an evaluation is at least this. Needs eval_every."""
     target_mean_return: float | None = None
-    """stop as soon as the last 100 training episodes average at least this"""
-    checkpoint_every_s: Seconds = 60.0
-    """seconds between checkpoints"""
-    checkpoint_every_episodes: Natural = 0
-    """episodes between checkpoints, besides those by time; 0: by time alone"""
-    checkpoint_every_updates: Natural = 0
-    """updates between checkpoints, besides those by time; 0: by time alone"""
-    keep_checkpoints: Count = 3
-    """how many of the newest checkpoints stay"""
+    """Stop as soon as the mean return of the last 100 training episodes is at least this."""
 
-    metrics_bind: str = ""
-    """where Prometheus finds the metrics, as 127.0.0.1:9464; 0.0.0.0:9464 lets everybody read them; if not given, nowhere"""
+    # ------------------------------------------------------------------------------------------------------------ workers
 
-    record: str = ""
-    """id of a Minari dataset of every whole training episode, as cartpole/ppo-v0 (pip install 'millrace-rl[record]')"""
-
-    min_workers: Natural = 0
-    """start when so many workers have joined; 0: all local workers, or the first one"""
-    heartbeat_s: Seconds = 1.0
-    """seconds between a worker's accounts of itself"""
-    worker_timeout_s: Seconds = 5.0
-    """a worker silent for so many seconds is given up, and its lanes go elsewhere"""
-    no_workers_timeout_s: Seconds = 60.0
-    """end the run, after a checkpoint, when no worker has been here for so many seconds"""
-    step_timeout_s: Seconds = 120.0
-    """a local worker process that takes so many seconds for a step of one env copy is ended, and started again"""
+    lanes: Count = 4
+    """Number of groups of env copies. The copies of a lane are stepped together, on one worker at a time. Lanes are
+    distributed over the workers. Results depend on lanes and envs, not on the number of workers.
+    """
+    max_lag: Natural = 0
+    """Largest lag of a rollout: how many versions its weights may be older than the learner's. 0: workers and learner take
+    turns, and results are reproducible. Above 0: both run at the same time; impala and dqn are made for that.
+    """
+    vector: Literal["auto", "loop", "native", "envpool"] = "auto"
+    """How the env copies of a lane are stepped. loop: one after another. native: by the environment's own vector version.
+    envpool: by envpool (pip install 'millrace-rl[envpool]'). auto: loop. The others use other random numbers.
+    """
+    inference: Literal["workers", "learner"] = "workers"
+    """Where the policy acts. workers: in each worker. learner: in one place beside the learner, for all env copies at once;
+    workers then only step the environments.
+    """
+    images_dtype: ImagesDtype = "float32"
+    """Precision in which the acting policy processes images. bfloat16 halves the work on CPUs with AMX and is slower
+    elsewhere. The learner always computes in float32.
+    """
+    torch_threads: Count | None = None
+    """Number of PyTorch threads in the learner. none: 1 for small MLPs, else the number of cores, less one for each local
+    worker if max_lag is above 0. Another number changes the last bits of results.
+    """
     pin_workers: bool | None = None
-    """each local worker process keeps to one core; none: it does where workers and learner take turns (max_lag 0) and there
-    are as many workers as cores, or twice as many, ..."""
+    """Keep each local worker process on one core. none: do so if max_lag is 0 and the number of workers is a multiple of the
+    number of cores.
+    """
+    min_workers: Natural = 0
+    """Start training when this many workers have joined. 0: wait for all local workers (train), for one worker (learner)."""
+
+    # ------------------------------------------------------------------------------------------------------------ network
+
+    transport: Literal["inproc", "ipc", "tcp"] = "ipc"
+    """How local workers are connected. inproc: as threads of this process. ipc: local sockets. tcp: TCP on 127.0.0.1."""
+    bind: str = "tcp://127.0.0.1:5555"
+    """Address at which `millrace learner` listens for workers. With tcp://0.0.0.0:5555 other machines can join; this needs
+    keys.
+    """
+    advertise: str = ""
+    """Host name or IP address at which workers on other machines reach this one. Default: the name of this machine."""
+    keys: str = ""
+    """Key folder. Default: MILLRACE_KEYS, else ~/.config/millrace/keys. If a folder is named here or in MILLRACE_KEYS, TCP
+    connections on this machine need keys too.
+    """
+    insecure: bool = False
+    """Accept workers of other machines without keys. Whoever reaches the port can then read, disturb and stop the run."""
+    compress: Literal["none", "zstd"] = "none"
+    """Compression of rollouts. zstd reduces the size of images, which pays on almost any network
+    (pip install 'millrace-rl[compress]' for the learner and every worker).
+    """
+    weights_dtype: WeightsDtype = "float32"
+    """Precision of the weights that are sent to workers. bfloat16 and float16 halve the bytes. Workers act with the rounded
+    weights; the learner's stay float32.
+    """
+
+    # ---------------------------------------------------------------------------------------------- timeouts and failures
+
+    heartbeat_s: Seconds = 1.0
+    """Seconds between two heartbeats of a worker."""
+    worker_timeout_s: Seconds = 5.0
+    """A worker that has been silent for this many seconds is given up, and other workers take over its lanes."""
+    no_workers_timeout_s: Seconds = 60.0
+    """Write a checkpoint and end the run if there has been no worker for this many seconds."""
+    step_timeout_s: Seconds = 120.0
+    """A local worker process is restarted if one step of an env copy takes longer than this many seconds."""
     stall_timeout_s: Seconds = 600.0
-    """end the run, after a checkpoint, when nothing has arrived for so many seconds"""
+    """Write a checkpoint and end the run if no rollout has arrived for this many seconds."""
     max_env_failures: Natural = 3
-    """end the run when the environment has raised more often than this"""
+    """End the run if the environment has raised more exceptions than this."""
+
+    # -------------------------------------------------------------------------------------------------------------- files
+
+    checkpoint_every_s: Seconds = 60.0
+    """Seconds between checkpoints."""
+    checkpoint_every_episodes: Natural = 0
+    """Also write a checkpoint after this many training episodes. 0: do not."""
+    checkpoint_every_updates: Natural = 0
+    """Also write a checkpoint after this many updates. 0: do not."""
+    keep_checkpoints: Count = 3
+    """Number of checkpoints to keep, the newest ones."""
+    record: str = ""
+    """Write all whole training episodes into the Minari dataset of this id, as cartpole/ppo-v0
+    (pip install 'millrace-rl[record]').
+    """
+    metrics_bind: str = ""
+    """HOST:PORT at which Prometheus can read the metrics, as 127.0.0.1:9464. With 0.0.0.0:9464 everybody in the network can
+    read them. Default: nowhere.
+    """
 
     def stop_rule(self) -> StopRule:
         """When training ends."""

@@ -1,6 +1,6 @@
-"""Each algorithm's settings: their names, meanings, bounds and defaults. The texts are the help of the command line.
+"""The settings (hyperparameters) of each algorithm. The texts under the fields are the help of the command line.
 
-Plain data, apart from the algorithms so that reading a command line needs no torch.
+Plain data, apart from the algorithms, so that reading a command line needs no torch.
 """
 
 from __future__ import annotations
@@ -11,188 +11,204 @@ import msgspec
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
-Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
+Fraction = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 Schedule = Literal["constant", "linear"]
 Optimizer = Literal["rmsprop", "adam"]
 
 
 class Hyperparameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What every algorithm has."""
+    """Settings that every algorithm has."""
 
     rollout_steps: Count = 128
-    """T, steps of each env copy in a rollout"""
+    """T, the steps of each env copy in a rollout."""
     net: tuple[Count, ...] = (64, 64)
-    """hidden layers of the actor, and of the critic; or of the action values"""
+    """Sizes of the hidden layers: of the actor and of the critic each, or of the Q-network."""
     activation: Literal["tanh", "relu"] = "tanh"
-    """of the hidden layers"""
+    """Activation function of the hidden layers."""
     encoder: str | None = None
-    """a torch module of your own before all other layers, my_package.networks:factory; see protocol/policy/encoder.py"""
+    """A torch module of your own in front of the hidden layers, as my_package.networks:factory.
+    See protocol/policy/encoder.py.
+    """
     normalize_observations: bool = False
-    """subtract the running mean, divide by the running standard deviation, clip to ±10 (not images)"""
-    gamma: Share = 0.99
-    """discount"""
+    """Normalize observations, except images: subtract the running mean, divide by the running standard deviation, clip to
+    ±10.
+    """
+    gamma: Fraction = 0.99
+    """Discount factor."""
 
 
 class ActorCriticHyperparameters(Hyperparameters, frozen=True):
-    """What every algorithm with an actor and a critic has."""
+    """Settings of every algorithm with an actor and a critic."""
 
     shared_net: bool = False
-    """actor and critic share their hidden layers"""
+    """Let actor and critic share their hidden layers."""
     learning_rate: Positive = 3e-4
-    """step size of the optimiser"""
+    """Learning rate of the optimizer."""
     learning_rate_schedule: Schedule = "constant"
-    """linear: falls to zero over the run"""
+    """linear: the learning rate falls to zero over the run."""
     ent_coef: NotNegative = 0.0
-    """weight of the entropy bonus"""
+    """Weight of the entropy bonus in the loss."""
     vf_coef: NotNegative = 0.5
-    """weight of the value loss"""
+    """Weight of the value loss in the loss."""
     max_grad_norm: Positive = 0.5
-    """longer gradients are shortened to this"""
+    """Clip the norm of the gradient to this."""
     log_std_init: float = 0.0
-    """logarithm of the first standard deviation of Box actions"""
+    """Initial logarithm of the standard deviation of continuous (Box) actions."""
     normalize_rewards: bool = False
-    """divide rewards by the running standard deviation of the discounted return"""
+    """Divide rewards by the running standard deviation of the discounted return."""
 
 
 class RecurrentHyperparameters(ActorCriticHyperparameters, frozen=True):
-    """What every algorithm has whose policy can remember: it learns from rows in their order."""
+    """Settings of every algorithm that can train a recurrent policy."""
 
     core: Literal["lstm", "gru"] | None = None
-    """what remembers the episode so far, before the hidden layers; minibatches are then whole columns of env copies"""
+    """Recurrent layer in front of the hidden layers. Minibatches then consist of whole sequences: all T steps of some env
+    copies.
+    """
     core_size: Count = 64
-    """units of the core"""
+    """Number of units of the recurrent layer."""
 
 
 class PPOConfig(RecurrentHyperparameters, frozen=True):
-    """Proximal policy optimisation."""
+    """Proximal policy optimization (Schulman et al. 2017)."""
 
     batch_size: Count = 64
-    """rows of a minibatch, at most"""
+    """Largest number of rows (steps of one env copy) in a minibatch."""
     n_epochs: Count = 10
-    """times each row is used in an update"""
-    gae_lambda: Share = 0.95
-    """λ of the advantage estimate: 1 is the Monte-Carlo return, 0 one step"""
+    """Number of epochs: how often an update uses each row."""
+    gae_lambda: Fraction = 0.95
+    """λ of generalized advantage estimation. 1: Monte Carlo return. 0: one-step TD error."""
     clip_range: Positive = 0.2
-    """how far the probability of an action may move in an update: its ratio is clipped to 1 ± this"""
+    """ε of the clipped objective: the ratio of new to old action probability is clipped to 1 ± ε."""
     clip_range_schedule: Schedule = "constant"
-    """linear: falls to zero over the run"""
+    """linear: clip_range falls to zero over the run."""
     clip_range_vf: Positive | None = None
-    """how far a value may move in an update, in units of (scaled) reward; none: any distance"""
+    """Clip the change of a value in an update to this, in units of (normalized) reward. none: no clipping."""
     normalize_advantage: bool = True
-    """advantages of a minibatch get mean 0 and standard deviation 1"""
+    """Normalize the advantages of each minibatch to mean 0 and standard deviation 1."""
     target_kl: Positive | None = None
-    """stop the update once the policy moved further than 1.5 times this"""
+    """End an update when the KL divergence from the old policy exceeds 1.5 times this. none: never."""
 
 
 class A2CConfig(RecurrentHyperparameters, frozen=True):
-    """Advantage actor-critic: one gradient step on each batch."""
+    """Advantage actor-critic: one gradient step on each batch (Mnih et al. 2016)."""
 
     rollout_steps: Count = 8
-    """T, steps of each env copy in a rollout"""
+    """T, the steps of each env copy in a rollout."""
     learning_rate: Positive = 7e-4
-    """step size of the optimiser"""
+    """Learning rate of the optimizer."""
     optimizer: Optimizer = "rmsprop"
-    """rmsprop (α 0.99) or adam; ε is 1e-5"""
-    gae_lambda: Share = 1.0
-    """λ of the advantage estimate: 1 is the Monte-Carlo return, 0 one step"""
+    """Optimizer: rmsprop (α = 0.99) or adam, each with ε = 1e-5."""
+    gae_lambda: Fraction = 1.0
+    """λ of generalized advantage estimation. 1: Monte Carlo return. 0: one-step TD error."""
     normalize_advantage: bool = False
-    """advantages of a batch get mean 0 and standard deviation 1"""
+    """Normalize the advantages of each batch to mean 0 and standard deviation 1."""
 
 
 class ImpalaConfig(RecurrentHyperparameters, frozen=True):
-    """Actor-critic with V-trace: learns from rollouts of older weights too (max_lag above 0)."""
+    """Actor-critic with V-trace, which corrects for rollouts of older weights, max_lag above 0 (Espeholt et al. 2018)."""
 
     rollout_steps: Count = 32
-    """T, steps of each env copy in a rollout"""
+    """T, the steps of each env copy in a rollout."""
     learning_rate: Positive = 7e-4
-    """step size of the optimiser"""
+    """Learning rate of the optimizer."""
     optimizer: Optimizer = "rmsprop"
-    """rmsprop (α 0.99) or adam; ε is 1e-5"""
+    """Optimizer: rmsprop (α = 0.99) or adam, each with ε = 1e-5."""
     n_epochs: Count = 1
-    """times each row is used in an update; V-trace is computed anew each time"""
+    """Number of epochs: how often an update uses each row. V-trace is computed anew in each epoch."""
     minibatches: Count = 1
-    """gradient steps of an epoch, each on its own share of the rows"""
-    vtrace_lambda: Share = 1.0
-    """λ of V-trace: 1 is the paper's, 0 one step"""
+    """Number of minibatches (gradient steps) in an epoch."""
+    vtrace_lambda: Fraction = 1.0
+    """λ of V-trace. 1: as in the paper. 0: one step."""
     rho_bar: Positive = 1.0
-    """importance weights of rewards are clipped to this: infinity would fit the values of the newest policy"""
+    """ρ̄ of V-trace: importance weights of TD errors are clipped to this. It decides of which policy values are learned:
+    without clipping, of the newest one.
+    """
     c_bar: Positive = 1.0
-    """importance weights of traces are clipped to this: how far back a surprise is told"""
+    """c̄ of V-trace: importance weights of traces are clipped to this. It decides how far back a TD error has effect."""
 
 
 class REINFORCEConfig(ActorCriticHyperparameters, frozen=True):
-    """Monte-Carlo policy gradient on whole episodes."""
+    """Monte Carlo policy gradient on whole episodes (Williams 1992)."""
 
     rollout_steps: Count = 1001
-    """T, steps of each env copy in a rollout: more than an episode can have"""
+    """T, the steps of each env copy in a rollout. Must be longer than any episode."""
     learning_rate: Positive = 2e-3
-    """step size of the optimiser"""
+    """Learning rate of the optimizer."""
     normalize_rewards: bool = True
-    """divide rewards by the running standard deviation of the discounted return; else the baseline drowns the gradient"""
+    """Divide rewards by the running standard deviation of the discounted return. Otherwise the loss of the baseline
+    dominates the gradient.
+    """
     optimizer: Optimizer = "adam"
-    """rmsprop (α 0.99) or adam; ε is 1e-5"""
+    """Optimizer: rmsprop (α = 0.99) or adam, each with ε = 1e-5."""
     baseline: bool = True
-    """subtract the critic's value from the return"""
+    """Subtract the value that the critic predicts from the return."""
     normalize_returns: bool = True
-    """returns, less the baseline, get mean 0 and standard deviation 1 over the batch"""
+    """Normalize the returns of each batch (less the baseline) to mean 0 and standard deviation 1."""
 
 
 class DQNConfig(Hyperparameters, frozen=True):
-    """Deep Q-learning."""
+    """Deep Q-learning (Mnih et al. 2015), with the usual extensions."""
 
     rollout_steps: Count = 32
-    """T, steps of each env copy in a rollout"""
+    """T, the steps of each env copy in a rollout."""
     activation: Literal["tanh", "relu"] = "relu"
-    """of the hidden layers"""
+    """Activation function of the hidden layers."""
     learning_rate: Positive = 3e-4
-    """step size of the optimiser"""
+    """Learning rate of the optimizer."""
     learning_rate_schedule: Schedule = "constant"
-    """linear: falls to zero over the run"""
+    """linear: the learning rate falls to zero over the run."""
     optimizer: Literal["adam", "adamw"] = "adam"
-    """adamw: also lets weights decay, by 0.01 of the learning rate"""
+    """Optimizer. adamw: Adam with a decoupled weight decay of 0.01."""
     amsgrad: bool = False
-    """divide by the largest second moment so far instead of the present one"""
+    """Use the AMSGrad variant of the optimizer."""
     batch_size: Count = 64
-    """transitions of a gradient step"""
+    """Number of transitions in a gradient step."""
     gradient_steps: Count = 64
-    """gradient steps of an update, that is for envs x rollout_steps env steps: the replay ratio, however many the workers"""
+    """Number of gradient steps in an update. There is one update for every envs x rollout_steps env steps, so this sets the
+    replay ratio.
+    """
     learning_starts: Annotated[int, msgspec.Meta(ge=0)] = 1000
-    """env steps before the first gradient step"""
+    """Number of env steps before the first gradient step."""
     replay_size: Count = 100_000
-    """transitions kept, the newest (the final observation of a truncated episode takes the place of one)"""
+    """Capacity of the replay buffer in transitions; the newest are kept. The final observation of a truncated episode takes
+    the place of one.
+    """
     replay: Literal["uniform", "prioritized"] = "uniform"
-    """prioritized: transitions are drawn by the size of their last error"""
-    priority_alpha: Share = 0.6
-    """how much priorities count: 0 is uniform, 1 in proportion to the error"""
-    priority_beta: Share = 0.4
-    """how far losses are weighted against what priorities distort; grows to 1, all of it, over the run"""
+    """How transitions are drawn from the replay buffer. prioritized: by their last TD error."""
+    priority_alpha: Fraction = 0.6
+    """α of prioritized replay. 0: uniform. 1: in proportion to the TD error."""
+    priority_beta: Fraction = 0.4
+    """Initial β of prioritized replay: how far importance weights correct the bias. It grows to 1 (fully) over the run."""
     n_step: Count = 1
-    """steps of reward before the target bootstraps"""
+    """Number of rewards in a target before it bootstraps."""
     double: bool = True
-    """the network chooses the next action, the target network values it"""
+    """Double Q-learning: the network chooses the next action, and the target network values it."""
     dueling: bool = False
-    """action values are a state's value and each action's advantage over the mean"""
+    """Dueling network: an action value is the state's value plus the action's advantage over the mean."""
     target: Literal["polyak", "hard"] = "hard"
-    """the target network follows a little at each gradient step, or is a copy made now and then"""
+    """How the target network is updated. polyak: a little in each gradient step. hard: a copy every target_every steps."""
     tau: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.005
-    """how far a polyak target follows at each gradient step"""
+    """τ of the polyak update: the fraction by which the target network moves in each gradient step."""
     target_every: Count = 250
-    """gradient steps between two copies of a hard target"""
-    epsilon_start: Share = 1.0
-    """chance of a random action at first"""
-    epsilon_end: Share = 0.05
-    """and at last"""
+    """Number of gradient steps between two hard updates of the target network."""
+    epsilon_start: Fraction = 1.0
+    """Initial probability ε of a random action."""
+    epsilon_end: Fraction = 0.05
+    """Final probability ε of a random action."""
     epsilon_schedule: Literal["linear", "exponential"] = "linear"
-    """how it falls: straight, or by the same share in every step"""
+    """How ε falls from its initial to its final value."""
     epsilon_steps: Count = 10_000
-    """env steps, all copies together, until it has fallen (exponential: until the distance has fallen to 1/e)"""
+    """Number of env steps, summed over all env copies, over which ε falls. exponential: until its distance to the final
+    value is 1/e of the initial distance.
+    """
     loss: Literal["huber", "squared"] = "huber"
-    """of the error of an action value; huber is linear beyond 1"""
+    """Loss of the TD error. huber: squared up to 1 and linear beyond."""
     max_grad_norm: Positive | None = None
-    """longer gradients are shortened to this; none: as they are"""
+    """Clip the norm of the gradient to this. none: no clipping."""
     max_grad_value: Positive | None = None
-    """larger entries of a gradient are cut to this, before it is shortened; none: as they are"""
+    """Clip each entry of the gradient to ± this, before its norm is clipped. none: no clipping."""
 
 
 HYPERPARAMETERS: dict[str, type[Hyperparameters]] = {

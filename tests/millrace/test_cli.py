@@ -479,9 +479,9 @@ def test_the_help_is_the_text_under_each_field_with_the_presets_defaults(capsys:
             main(argv)
         assert stop.value.code == 0
     both = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "--gae-lambda FLOAT λ of the advantage estimate" in both
+    assert "--gae-lambda FLOAT λ of generalized advantage estimation" in both
     assert both.count("(default: 0.8)") == 1  # of the preset, once the environment is named
-    assert both.count("[ENV] anything gymnasium.make takes") == 2
+    assert both.count("[ENV] Environment id for gymnasium.make") == 2
     assert both.count("(default: CartPole-v1)") == 1
     assert "--env " not in both
 
