@@ -240,7 +240,7 @@ def _launch(argv: list[str]) -> int:
             "Flags of `millrace learner` follow `--`. millrace launch NAME --help lists the flags of each.",
         )
         return 0
-    from millrace.launch.cluster_flags import OURS, read
+    from millrace.launch.launcher_flags import SET_BY_LAUNCHER, read_flags
 
     launcher, *rest = argv or [""]
     match launcher:
@@ -250,13 +250,13 @@ def _launch(argv: list[str]) -> int:
             from millrace.cli.flags import KubernetesFlags
             from millrace.launch.kubernetes import manifest
 
-            flags, learner = read(KubernetesFlags, rest, launcher, (*OURS, "metrics-bind"))
+            flags, learner = read_flags(KubernetesFlags, rest, launcher, (*SET_BY_LAUNCHER, "metrics-bind"))
             print(manifest(flags, learner, datetime.now(UTC).replace(microsecond=0)), end="")
         case "slurm":
             from millrace.cli.flags import SlurmFlags
             from millrace.launch.slurm import script
 
-            print(script(*read(SlurmFlags, rest, launcher)), end="")
+            print(script(*read_flags(SlurmFlags, rest, launcher)), end="")
         case "ray":
             return _launch_ray(rest)
         case _:
@@ -266,9 +266,9 @@ def _launch(argv: list[str]) -> int:
 
 def _launch_ray(argv: list[str]) -> int:
     from millrace.cli.flags import RayFlags
-    from millrace.launch.cluster_flags import read
+    from millrace.launch.launcher_flags import read_flags
 
-    flags, learner = read(RayFlags, argv, "ray", ("bind", "advertise", "insecure"))
+    flags, learner = read_flags(RayFlags, argv, "ray", ("bind", "advertise", "insecure"))
     try:
         from millrace.launch.ray import launch
     except ModuleNotFoundError as error:

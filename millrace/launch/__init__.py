@@ -1,1 +1,1 @@
-"""Launchers: where a run's processes are placed. Thin: each composes a learner and workers, which know nothing of it."""
+"""Launchers: each starts a learner and workers somewhere. Learner and workers know nothing of it."""

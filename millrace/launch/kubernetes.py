@@ -1,7 +1,7 @@
-"""`millrace launch kubernetes`: a learner and workers as a manifest. Pure but for reading a key folder; no scheduler logic.
+"""`millrace launch kubernetes`: a manifest with a learner and workers. Pure, except that it reads a key folder.
 
-The learner is a Job: it ends, and if its pod is lost another goes on from the newest checkpoint. The workers are a
-Deployment: any number, at any time. Secrets are part of the manifest only where a key folder was named.
+The learner is a Job, which ends with the run. If its pod is lost, another resumes from the newest checkpoint. The workers
+are a Deployment, whose size may change at any time. The manifest contains secrets only if a key folder was named.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from datetime import datetime
 from pathlib import Path
 
 from millrace.cli.flags import KubernetesFlags
-from millrace.launch.cluster_flags import METRICS_PORT, learner_flags
+from millrace.launch.launcher_flags import METRICS_PORT, learner_flags
 from protocol.keys.key_folder import FIRST_CLIENT, KeyFolder
 
 PORT = 5555
@@ -21,21 +21,17 @@ TOKEN = f"{FIRST_CLIENT}.token"
 
 
 def manifest(flags: KubernetesFlags, rest: Sequence[str], now: datetime) -> str:
-    """Documents of YAML. `rest` are the learner's own flags. Raises `UsageError`."""
+    """The manifest: YAML documents. `rest` are the user's flags for the learner. Raises `UsageError`."""
     keys = [_secret(flags.name, KeyFolder(Path(flags.keys).expanduser()), now)] if flags.keys else []
     parts = [*keys, _service(flags), _storage(flags), _learner(flags, rest), _workers(flags), _budget(flags)]
-    return _head(flags) + "---\n" + "---\n".join(parts)
+    return _comments(flags) + "---\n" + "---\n".join(parts)
 
 
-def _head(flags: KubernetesFlags) -> str:
+def _comments(flags: KubernetesFlags) -> str:
     secret = f"kubectl create secret generic {flags.name}-keys --from-file=KEYS"
     lines = [
-        f"A learner and {flags.workers} workers. docs/kubernetes.md tells more.",
-        *(
-            ["This file holds keys: keep it as secret as they are."]
-            if flags.keys
-            else ["millrace keys new default --keys KEYS", secret]
-        ),
+        f"A learner and {flags.workers} workers. See docs/kubernetes.md.",
+        *(["This file holds keys: keep it secret."] if flags.keys else ["millrace keys new default --keys KEYS", secret]),
         "kubectl apply -f THIS_FILE",
         f"kubectl logs -f job/{flags.name}-learner",
         f"kubectl scale deployment/{flags.name}-worker --replicas=8",
@@ -104,7 +100,7 @@ spec:
     rules:
       - action: FailJob  # bad usage: it would fail again
         onExitCodes: {{containerName: learner, operator: In, values: [2]}}
-      - action: Ignore  # its node was drained, or needed by others
+      - action: Ignore  # the node was drained or preempted
         onPodConditions: [{{type: DisruptionTarget, status: "True"}}]
   template:
     metadata:
@@ -112,10 +108,10 @@ spec:
       annotations: {{prometheus.io/scrape: "true", prometheus.io/port: "{METRICS_PORT}"}}
     spec:
       restartPolicy: Never
-      terminationGracePeriodSeconds: 60  # the update in hand, a checkpoint, the workers' last rollouts
+      terminationGracePeriodSeconds: 60  # for the current update, a checkpoint, and the workers' last rollouts
 {_pod()}
       initContainers:
-        - name: keys  # a key that others can read is refused: copies of its own, which nobody else can
+        - name: keys  # the learner refuses keys that others can read, so it gets copies of its own
           image: {image}
           imagePullPolicy: IfNotPresent
           command: [sh, -c, "umask 077; mkdir -p /keys/own; cp /secret/* /keys/own"]
@@ -130,7 +126,7 @@ spec:
           args: {_args(args)}
           env:
             - {{name: MILLRACE_KEYS, value: /keys/own}}
-            - {{name: MILLRACE_TOKEN, value: /keys/own/{TOKEN}}}  # for the probes, which ask like anybody else
+            - {{name: MILLRACE_TOKEN, value: /keys/own/{TOKEN}}}  # the probes need a token, as every client does
           ports:
             - {{name: workers, containerPort: {PORT}}}
             - {{name: metrics, containerPort: {METRICS_PORT}}}
@@ -166,15 +162,15 @@ spec:
     metadata:
       labels: {{app.kubernetes.io/name: {flags.name}, app.kubernetes.io/component: worker}}
     spec:
-      terminationGracePeriodSeconds: 30  # the rollout in hand
+      terminationGracePeriodSeconds: 30  # for the current rollout
 {_pod()}
       containers:
-        - name: worker  # no probe: it ends by itself when a step hangs, or nobody answers, and is started again
+        - name: worker  # no probe: a worker ends by itself when a step hangs or no learner answers
           image: {json.dumps(flags.worker_image)}
           imagePullPolicy: IfNotPresent
           args: {_args(args)}
           env:
-            - name: MILLRACE_TOKEN  # the text, not a file: a Secret's files can be read by the pod's group
+            - name: MILLRACE_TOKEN  # as text: the files of a Secret can be read by the pod's group
               valueFrom: {{secretKeyRef: {{name: {flags.name}-keys, key: {TOKEN}}}}}
 {_container(flags.worker_cpu, flags.worker_memory)}
           volumeMounts:
@@ -192,14 +188,14 @@ metadata:
   name: {flags.name}-worker
   labels: {{app.kubernetes.io/name: {flags.name}}}
 spec:
-  maxUnavailable: 50%  # training goes on with the others
+  maxUnavailable: 50%  # training continues with the others
   selector:
     matchLabels: {{app.kubernetes.io/name: {flags.name}, app.kubernetes.io/component: worker}}
 """
 
 
 def _pod() -> str:
-    """What every pod is not allowed to do."""
+    """The restrictions of every pod."""
     return """\
       automountServiceAccountToken: false
       enableServiceLinks: false
@@ -208,7 +204,7 @@ def _pod() -> str:
 
 
 def _container(cpu: str, memory: str) -> str:
-    """What a container gets, and is not allowed to do."""
+    """The resources and restrictions of a container."""
     return f"""\
           resources:
             requests: {{cpu: {json.dumps(cpu)}, memory: {json.dumps(memory)}}}
@@ -218,5 +214,5 @@ def _container(cpu: str, memory: str) -> str:
 
 
 def _args(args: Sequence[str]) -> str:
-    """A list in YAML; Kubernetes puts variables in place of $(NAME), and here is none."""
+    """A list in YAML, with $( escaped: Kubernetes would replace $(NAME) by a variable."""
     return json.dumps([arg.replace("$(", "$$(") for arg in args])

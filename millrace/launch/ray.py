@@ -1,7 +1,7 @@
-"""`millrace launch ray`: the learner here, on a node of a Ray cluster; each worker host an actor.
+"""`millrace launch ray`: the learner runs in this process, on a node of a Ray cluster; the workers run in Ray actors.
 
-The law: what an actor runs is the worker program. Ray's own restarts and retries are all that brings it back, and Ray's
-resources all that says where; when the learner has ended, the actors have too.
+The law: an actor runs the worker program and nothing else. Ray alone restarts actors and chooses their nodes. When the
+learner has ended, so have the actors.
 """
 
 from __future__ import annotations
@@ -18,33 +18,32 @@ from learner.config.command_line import read_config
 from learner.members.endpoint import keyring_for
 from learner.run import Watch, serve
 from millrace.cli.flags import RayFlags
-from millrace.launch.cluster_flags import learner_flags
-from millrace.launch.ray_actor import WorkerHost
+from millrace.launch.launcher_flags import learner_flags
+from millrace.launch.ray_worker import WorkerHost
 from protocol.errors import UsageError, first_line
 from protocol.keys.key_folder import Keyring, read_token
 
 
 def launch(flags: RayFlags, rest: Sequence[str], watch: Watch) -> Path:
-    """Train; the run folder. `rest` are the learner's own flags. Raises `OurError`."""
+    """Train; the run folder. `rest` are the user's flags for the learner. Raises `OurError`."""
     for name in ("processes", "port"):
         if getattr(flags, name) < 1:
             raise UsageError(f"{name} expected int >= 1, got {getattr(flags, name)}")
-    with _cluster(flags.address) as host:
+    with _ray_cluster(flags.address) as host:
         bind = f"tcp://{f'[{host}]' if ':' in host else host}:{flags.port}"
         config, resume = read_config("learner", learner_flags(flags.env, rest, bind, "runs"))
-        token = _token(keyring_for(config, datetime.now(UTC).replace(microsecond=0)))
+        token = _token_text(keyring_for(config, datetime.now(UTC).replace(microsecond=0)))
         actor = ray.remote(
             num_cpus=flags.processes, max_restarts=-1, max_task_retries=-1, scheduling_strategy="SPREAD"
         )(WorkerHost)  # fmt: skip
         actors = [actor.options(name=f"{flags.name}-{number}").remote() for number in range(flags.workers)]
         for each in actors:
-            run = each.run.options(retry_exceptions=True)
-            run.remote(config.bind, token, flags.processes)
+            each.run.options(retry_exceptions=True).remote(config.bind, token, flags.processes)
         return serve(config, resume, watch)
 
 
-def _token(keyring: Keyring | None) -> str:
-    """What lets the actors in: the text of the first token that is in the key folder; empty where nobody needs one."""
+def _token_text(keyring: Keyring | None) -> str:
+    """The first join token in the key folder, as text; empty if the learner needs no keys. Raises `UsageError`."""
     if keyring is None or keyring.folder is None:
         return ""
     files = [keyring.folder.token_path(name) for name in keyring.allowed.names()]
@@ -55,8 +54,8 @@ def _token(keyring: Keyring | None) -> str:
 
 
 @contextmanager
-def _cluster(address: str) -> Iterator[str]:
-    """The address of this node of the cluster, as its other nodes know it."""
+def _ray_cluster(address: str) -> Iterator[str]:
+    """Connect to the cluster. Gives the IP address of this node, as the other nodes know it."""
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.WARNING)
     except (ConnectionError, RuntimeError, ValueError) as error:

@@ -1,0 +1,46 @@
+"""The command line of a launcher: its own flags, and behind `--` the flags of the learner that it starts.
+
+The law: what a cluster would refuse later is refused here, before anything is written or started.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from typing import TypeVar
+
+from learner.config.command_line import read_config
+from learner.config.flag_parser import parse_flags
+from millrace.cli.flags import LaunchFlags
+from protocol.errors import UsageError
+
+Flags = TypeVar("Flags", bound=LaunchFlags)
+
+METRICS_PORT = 9464
+SET_BY_LAUNCHER = ("bind", "advertise", "run-dir", "resume", "keys", "insecure")
+"""Flags of the learner that a launcher sets, so that the user must not."""
+DNS_LABEL = re.compile(r"[a-z]([-a-z0-9]{0,38}[a-z0-9])?")
+
+
+def read_flags(
+    kind: type[Flags], argv: Sequence[str], launcher: str, set_by_launcher: Sequence[str] = SET_BY_LAUNCHER
+) -> tuple[Flags, list[str]]:
+    """The launcher's flags, and the user's flags for the learner. Raises `UsageError` if either cannot work."""
+    words = list(argv)
+    separator = words.index("--") if "--" in words else len(words)
+    flags, rest = parse_flags(kind, words[:separator], f"launch {launcher}"), words[separator + 1 :]
+    if flags.workers < 1:
+        raise UsageError(f"workers expected int >= 1, got {flags.workers}")
+    if not DNS_LABEL.fullmatch(flags.name):
+        raise UsageError(f"name {flags.name!r}: expected small letters, digits and dashes, at most 40, as in my-run")
+    for flag in rest:
+        if flag.partition("=")[0].removeprefix("--").replace("_", "-") in set_by_launcher:
+            raise UsageError(f"launch {launcher}: {flag} is the launcher's to set; leave it out")
+    read_config("learner", learner_flags(flags.env, rest, bind="tcp://0.0.0.0:5555", runs=os.devnull))
+    return flags, rest
+
+
+def learner_flags(env: str, rest: Sequence[str], bind: str, runs: str) -> list[str]:
+    """The flags of a learner on a cluster. It resumes the newest run, and waits ten minutes for workers to be started."""
+    return [env, "--bind", bind, "--run-dir", runs, "--resume", "auto", "--no-workers-timeout-s", "600", *rest]

@@ -1,0 +1,25 @@
+"""What runs in a Ray actor for `millrace launch ray`: the worker program. Imports neither Ray nor torch."""
+
+from __future__ import annotations
+
+import os
+
+from protocol.keys.key_folder import TOKEN_VARIABLE
+from workers.__main__ import main as run_worker
+
+FINAL_EXIT_CODES = (0, 2)  # it was told to leave, or refused; after any other code it is started again
+
+
+class WorkerHost:
+    """The actor."""
+
+    def run(self, address: str, token: str, processes: int) -> int:
+        """Run the worker program until it leaves; its exit code. `token` may be empty.
+
+        Raises `RuntimeError` if the program failed, so that Ray runs it again.
+        """
+        os.environ[TOKEN_VARIABLE] = token  # the program removes the variable when it has read it
+        code = run_worker([address, "--processes", str(processes), "--join-timeout-s", "600"])
+        if code not in FINAL_EXIT_CODES:
+            raise RuntimeError(f"the worker program ended with exit code {code}")
+        return code
