@@ -72,22 +72,40 @@ def make_vec(
     render_mode: str | None = None,
     **kwargs: bool | int | float | str,
 ) -> ZmqVectorEnv:
-    """A `gymnasium.vector.VectorEnv` whose copies live in worker processes.
+    """Make a `gymnasium.vector.VectorEnv` whose env copies live in worker processes.
 
-    `env` is anything `gymnasium.make` takes, a callable that returns an environment, or a list with one of these for each
-    copy; `kwargs` are passed on to it. The copies are shared evenly among `workers` processes of this machine (one for each
-    core), started and ended with the vector environment; with a `bind` address, among `lanes` workers that are started
-    elsewhere, as the line says that is printed (`millrace worker ADDRESS`). Observations and actions go through shared
-    memory, unless that is turned off, or a worker is elsewhere; what comes out is the same. `keys`, `insecure` and
-    `advertise` are as in `millrace learner`: an address that other machines can reach needs keys, which are made by
-    themselves, and a callable goes over TCP with keys only.
+    Its results are, bit for bit, those of `gymnasium.vector.SyncVectorEnv` for the same seeds and actions.
 
-    Whoever does not answer within `timeout` seconds is given up; a worker elsewhere that gives no sign of life for 5 s while
-    it is waited for, at once (a long step is no silence, unless it keeps Python's lock all the while). Between two calls you
-    may think as long as you like: workers of this machine wait as long as this process lives, those elsewhere for ten
-    minutes, after which they join anew, and their copies are lost. The copies of a worker that is lost come back truncated,
-    on another or a new one, and the info says `worker_lost`; or, with `on_worker_loss="raise"`, `WorkerLost` is raised. What
-    an environment raises is raised here, with the worker's traceback. Raises `OurError`.
+    Args:
+        env: anything `gymnasium.make` takes, a callable that returns an environment, or a list with one of these for each
+            env copy. A callable is sent over TCP only to workers that have a key.
+        num_envs: number of env copies; by default 1, or the length of the list.
+        workers: number of worker processes to start on this machine; by default one for each core, at most `num_envs`.
+            They end with the vector environment.
+        lanes: number of groups of env copies. A group lives in one worker. By default there is one for each worker.
+        bind: an address for workers that are started elsewhere with `millrace worker ADDRESS`. The default is local workers.
+        keys: the folder of the keys. An address that other machines can reach needs keys; they are made if there are none.
+        insecure: use no keys.
+        advertise: the host name by which other machines reach this one.
+        transport: how messages travel to local workers. With `inproc` the worker is a thread of this process.
+        shared_memory: local workers get actions and return results through shared memory. It is faster; results are equal.
+        autoreset_mode: as in gymnasium: "NextStep", "SameStep" or "Disabled".
+        on_worker_loss: "truncate" returns the env copies of a lost worker as truncated, with `worker_lost` in their infos,
+            and continues with new copies on another worker. "raise" raises `WorkerLost`.
+        timeout: seconds that a worker may take to answer; then it is given up.
+        copy: return copies of the observations. Without it the next step overwrites them.
+        render_mode: passed on to the environment.
+        kwargs: passed on to the environment.
+
+    A worker elsewhere is also given up if it sends no heartbeat for 5 s while this process waits for it. A long step does
+    not stop heartbeats, unless it holds Python's global interpreter lock. The time between two calls is not limited for
+    local workers. Workers elsewhere wait for ten minutes; then they join again, and their env copies are lost.
+
+    Raises:
+        UsageError: an argument is wrong.
+        NoWorkers: too few workers joined in time.
+        EnvironmentFailed: an environment raised; the error has the worker's traceback.
+        WorkerLost: see `on_worker_loss`.
     """
     from learner.members.endpoint import Bind
     from learner.vector_env.settings import VectorEnvSettings

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from tests.support.bit_equality import alike
+from tests.support.bit_equality import bit_equal
 
 sb3 = pytest.importorskip("stable_baselines3")
 
@@ -30,12 +30,12 @@ def test_it_is_the_dummy_vec_env_to_the_bit(env: str) -> None:
     ours = make_vec_env(env, 3, monitor=False, workers=2, env_kwargs={"max_episode_steps": 15})
     try:
         ours.seed(5), theirs.seed(5)
-        assert alike(ours.reset(), theirs.reset())
+        assert bit_equal(ours.reset(), theirs.reset())
         draw = np.random.default_rng(2)
         for _ in range(100):
             action = draw.integers(0, theirs.action_space.n, 3)
             (*mine, infos), (*wanted, their_infos) = ours.step(action), theirs.step(action)
-            assert alike(mine, wanted)
+            assert bit_equal(mine, wanted)
             for info, other in zip(infos, their_infos, strict=True):
                 assert info.keys() == other.keys()
                 assert all(np.array_equal(info[key], other[key]) for key in info)

@@ -1,4 +1,4 @@
-"""Equality to the bit: value, type and dtype, all the way down."""
+"""Bit equality of values, types and dtypes, also of those inside lists, tuples, dicts and arrays."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from typing import Any
 import numpy as np
 
 
-def alike(a: Any, b: Any) -> bool:
-    """Whether nobody could tell them apart."""
+def bit_equal(a: Any, b: Any) -> bool:
+    """Whether both have the same type and the same bits."""
     if type(a) is not type(b):
         return False
     match a:
         case dict():
-            return list(a) == list(b) and all(alike(a[key], b[key]) for key in a)
+            return list(a) == list(b) and all(bit_equal(a[key], b[key]) for key in a)
         case list() | tuple():
-            return len(a) == len(b) and all(map(alike, a, b))
+            return len(a) == len(b) and all(map(bit_equal, a, b))
         case np.ndarray() if a.dtype.kind == "O":
             return bool(a.shape == b.shape and b.dtype.kind == "O") and all(
-                map(alike, a.ravel().tolist(), b.ravel().tolist())
+                map(bit_equal, a.ravel().tolist(), b.ravel().tolist())
             )
         case np.ndarray() | np.generic():
             return bool(a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes())

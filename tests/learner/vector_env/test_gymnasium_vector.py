@@ -16,7 +16,7 @@ from gymnasium.vector.utils import batch_space
 import millrace
 from learner.vector_env.env import ZmqVectorEnv
 from protocol.errors import EnvironmentFailed, OurError, UsageError
-from tests.support.bit_equality import alike
+from tests.support.bit_equality import bit_equal
 from workers.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_ACTIONS, UNSUPPORTED_OBSERVATIONS
 
 SPACES = "workers.envs.toy:Spaces-v0"
@@ -48,13 +48,13 @@ def test_every_supported_space_is_batched(observation: str, action: str) -> None
         first, infos = env.reset(seed=3)
         assert first in env.observation_space
         assert infos == {}
-        assert alike(first, theirs.reset(seed=3)[0])
+        assert bit_equal(first, theirs.reset(seed=3)[0])
         theirs.action_space.seed(1)
         for _ in range(6):
             actions = theirs.action_space.sample()
             row = env.step(actions)
             assert row[0] in env.observation_space
-            assert alike(row, theirs.step(actions))
+            assert bit_equal(row, theirs.step(actions))
     theirs.close()
 
 
@@ -73,7 +73,7 @@ def test_observations_of_half_precision(shared_memory: bool) -> None:
 
     with millrace.make_vec(Half, 2, workers=1, shared_memory=shared_memory) as env:
         for observation, value in (env.reset()[0], 0.1), (env.step(np.zeros(2, np.int64))[0], 0.2):
-            assert alike(observation, np.full((2, 3), value, np.float16))
+            assert bit_equal(observation, np.full((2, 3), value, np.float16))
 
 
 class Sign(spaces.Space[str]):

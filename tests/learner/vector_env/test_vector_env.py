@@ -22,7 +22,7 @@ from learner.vector_env.env import ZmqVectorEnv
 from millrace.cli.status import as_table, ask, observer_name
 from protocol.errors import EnvironmentFailed, UsageError
 from protocol.wire.link import WorkerLink
-from tests.support.bit_equality import alike
+from tests.support.bit_equality import bit_equal
 
 MODES = tuple(AutoresetMode)
 TRANSPORTS: dict[str, dict[str, Any]] = {
@@ -59,16 +59,16 @@ def both(
 
 def play(ours: ZmqVectorEnv, theirs: SyncVectorEnv[Any, Any], steps: int, mode: AutoresetMode) -> None:
     """Step both with the same seeds and actions, and compare the results."""
-    assert alike(ours.reset(seed=7), theirs.reset(seed=7))
+    assert bit_equal(ours.reset(seed=7), theirs.reset(seed=7))
     theirs.action_space.seed(3)
     for t in range(steps):
         action = theirs.action_space.sample()
         mine, wanted = ours.step(action), theirs.step(action)
-        assert alike(mine, wanted), f"step {t}: {mine} is not {wanted}"
+        assert bit_equal(mine, wanted), f"step {t}: {mine} is not {wanted}"
         ended = wanted[2] | wanted[3]
         if mode is AutoresetMode.DISABLED and ended.any():
             options = [{"reset_mask": ended.copy()} for _ in range(2)]
-            assert alike(ours.reset(options=options[0]), theirs.reset(options=options[1]))
+            assert bit_equal(ours.reset(options=options[0]), theirs.reset(options=options[1]))
 
 
 @pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.value)
@@ -102,10 +102,10 @@ def test_calls_and_attributes() -> None:
         for env in (ours, theirs):
             env.reset(seed=1)
             env.set_attr("level", [1, 2, 3, 4, 5])
-        assert alike(ours.get_attr("level"), theirs.get_attr("level"))
+        assert bit_equal(ours.get_attr("level"), theirs.get_attr("level"))
         assert ours.call("shout", "hm", times=2) == theirs.call("shout", "hm", times=2)
         assert ours.call_some([1, 4], "level") == (2, 5)
-        assert alike(ours.np_random_seed, theirs.np_random_seed)
+        assert bit_equal(ours.np_random_seed, theirs.np_random_seed)
         with pytest.raises(AttributeError, match="no_such_thing"):
             ours.get_attr("no_such_thing")
         with pytest.raises(EnvironmentFailed, match="expected plain data") as raised:
@@ -115,7 +115,7 @@ def test_calls_and_attributes() -> None:
             ours.call("reset")
         theirs.action_space.seed(3)
         action = theirs.action_space.sample()
-        assert alike(ours.step(action), theirs.step(action))  # the calls did not disturb it
+        assert bit_equal(ours.step(action), theirs.step(action))  # the calls did not disturb it
 
 
 def test_workers_render_frames() -> None:
@@ -144,7 +144,7 @@ def test_actions_of_another_dtype_are_not_converted() -> None:
         rng = np.random.default_rng(1)
         for _ in range(20):
             action = rng.uniform(-2, 2, (3, 1))
-            assert alike(ours.step(action), theirs.step(action))
+            assert bit_equal(ours.step(action), theirs.step(action))
 
 
 def test_observations_are_copies_unless_copy_is_false() -> None:
@@ -172,12 +172,12 @@ def test_gymnasium_vector_wrappers_work_on_it() -> None:
     with both("CartPole-v1", 4, AutoresetMode.NEXT_STEP, "shared") as (ours, theirs):
         mine, other = wrapped(ours), wrapped(theirs)
         a, b = mine.reset(seed=2), other.reset(seed=2)
-        assert alike(a[0], b[0])
+        assert bit_equal(a[0], b[0])
         ended = 0
         for t in range(200):
             action = np.random.default_rng(t).integers(0, 2, 4)
             (*row, infos), (*their_row, their_infos) = mine.step(action), other.step(action)
-            assert alike(row, their_row)
+            assert bit_equal(row, their_row)
             returns = [info.get("episode", {}).get("r") for info in infos]  # type: ignore[attr-defined]
             assert returns == [info.get("episode", {}).get("r") for info in their_infos]  # type: ignore[attr-defined]
             ended += sum(one is not None for one in returns)
@@ -313,7 +313,7 @@ def play_sequence(
 ) -> None:
     def same(name: str, *args: Any, **keywords: Any) -> Any:
         mine, wanted = (getattr(env, name)(*args, **deepcopy(keywords)) for env in (ours, theirs))
-        assert alike(mine, wanted), f"{name}: {mine} is not {wanted}"
+        assert bit_equal(mine, wanted), f"{name}: {mine} is not {wanted}"
         return wanted
 
     theirs.action_space.seed(seed)
@@ -330,7 +330,7 @@ def play_sequence(
                     if kind == "step_async":
                         ours.step_async(action)
                         mine, wanted = ours.step_wait(), theirs.step(action)
-                        assert alike(mine, wanted), f"{mine} is not {wanted}"
+                        assert bit_equal(mine, wanted), f"{mine} is not {wanted}"
                     else:
                         wanted = same("step", action)
                     ended = wanted[2] | wanted[3]

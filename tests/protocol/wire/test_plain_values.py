@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 
 from protocol.errors import BadMessage
 from protocol.wire.plain_values import MAX_DEPTH, Shown, pack, shown_keys, unpack
-from tests.support.bit_equality import alike
+from tests.support.bit_equality import bit_equal
 
 scalars = hnp.arrays(
     st.one_of(hnp.scalar_dtypes(), hnp.byte_string_dtypes(), hnp.unicode_string_dtypes()).filter(
@@ -39,12 +39,12 @@ values = st.recursive(
 
 @given(values)
 def test_plain_values_come_back_with_their_types(value: Any) -> None:
-    assert alike(unpack(pack(value)), value)
+    assert bit_equal(unpack(pack(value)), value)
 
 
 def test_arrays_of_objects_come_back() -> None:
     array = np.array([None, "a", 3], dtype=object).reshape(3, 1)
-    assert alike(unpack(pack(array)), array)
+    assert bit_equal(unpack(pack(array)), array)
 
 
 class Odd:

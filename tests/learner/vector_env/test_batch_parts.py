@@ -1,0 +1,71 @@
+"""The pure parts of the vector environment: the layout of a batch, infos, lost lanes and the record of settings."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+
+import pytest
+
+import millrace
+from learner.vector_env.batch_layout import BatchLayout
+from learner.vector_env.infos import unpack_infos
+from learner.vector_env.lost_lanes import UNKNOWN_REASON, LostLanes, replacement_seeds
+from learner.vector_env.settings import VectorEnvSettings
+from protocol.errors import BadMessage
+from protocol.wire.plain_values import pack
+
+
+def test_lanes_have_consecutive_rows() -> None:
+    layout = BatchLayout((3, 1, 2))
+    assert layout.num_envs == 6
+    assert [layout.lane_of(copy) for copy in range(6)] == [0, 0, 0, 1, 2, 2]
+    assert [list(layout.copies(lane)) for lane in layout.lanes] == [[0, 1, 2], [3], [4, 5]]
+    assert layout.by_lane([0, 2, 5]) == {0: [0, 2], 2: [1]}
+    for wrong in (-1, 6):
+        with pytest.raises(IndexError, match=f"copy expected 0 to 5, got {wrong}"):
+            layout.lane_of(wrong)
+
+
+def test_infos_get_the_number_of_their_env_copy() -> None:
+    assert unpack_infos(pack([[0, {"a": 1}], [1, {}], [2, {"b": 1}]]), range(4, 6)) == {4: {"a": 1}, 5: {}}
+
+
+@pytest.mark.parametrize("value", [7, [7], [[0]], [[0, 1, 2]], [[0, "text"]], [[0.0, {}]], [[True, {}]]])
+def test_what_is_not_infos_is_refused(value: object) -> None:
+    with pytest.raises(BadMessage):
+        unpack_infos(pack(value), range(2))
+
+
+def test_each_loss_is_reported_once_and_then_the_lane_awaits_a_reset() -> None:
+    lanes = LostLanes()
+    lanes.add({1: "worker w1 was killed"})
+    assert lanes.report([0, 1]) == {0: UNKNOWN_REASON, 1: "worker w1 was killed"}
+    assert not lanes.unreported
+    assert lanes.awaiting_reset == {0, 1}
+    lanes.answered({1})
+    assert lanes.awaiting_reset == {0}
+
+
+def test_a_lane_that_was_lost_after_it_answered_is_reported_in_the_next_step() -> None:
+    lanes = LostLanes()
+    lanes.add({1: "worker w1 was killed"})
+    assert lanes.report([]) == {}
+    assert lanes.unreported == {1: "worker w1 was killed"}
+    assert lanes.report([1]) == {1: "worker w1 was killed"}
+
+
+def test_replacement_seeds_differ_from_the_old_ones_and_are_reproducible() -> None:
+    seeds = replacement_seeds((1, None, 2), incarnation=1)
+    assert seeds[1] is None
+    assert len({1, 2, seeds[0], seeds[2]}) == 4
+    assert seeds == replacement_seeds((1, None, 2), incarnation=1)
+    assert seeds != replacement_seeds((1, None, 2), incarnation=2)
+
+
+def test_the_record_of_settings_has_the_defaults_of_make_vec() -> None:
+    public = {name: parameter.default for name, parameter in inspect.signature(millrace.make_vec).parameters.items()}
+    record = {field.name: field.default for field in dataclasses.fields(VectorEnvSettings)}
+    assert record.pop("timeout_s") == public["timeout"]
+    for name in record.keys() - {"env", "listen", "kwargs"}:
+        assert record[name] == public[name], name
