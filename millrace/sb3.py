@@ -1,4 +1,6 @@
-"""A Stable-Baselines3 `VecEnv` whose copies live in worker processes: `SubprocVecEnv`, generalised. Needs the extra `peers`.
+"""A Stable-Baselines3 `VecEnv` whose env copies live in worker processes. It needs the extra `peers`.
+
+It replaces `SubprocVecEnv`: a process steps many env copies, and it may run on another machine.
 
 from millrace.sb3 import make_vec_env
 model = PPO("MlpPolicy", make_vec_env("CartPole-v1", n_envs=8, workers=2))
@@ -29,9 +31,10 @@ def make_vec_env(
     env_kwargs: dict[str, Any] | None = None,
     **keywords: Any,
 ) -> VecEnv:
-    """As `stable_baselines3.common.env_util.make_vec_env`; `keywords` are those of `millrace.make_vec`.
+    """Make a vector environment, as `stable_baselines3.common.env_util.make_vec_env` does.
 
-    `monitor`: record each episode's return and length, as SB3's Monitor does, for `rollout/ep_rew_mean`.
+    `env_kwargs` go to the environment, `keywords` to `millrace.make_vec`. `monitor` records the return and length of each
+    episode, as SB3's `VecMonitor` does, for `rollout/ep_rew_mean`. Raises the errors of `millrace.make_vec`.
     """
     from stable_baselines3.common.vec_env import VecMonitor
 
@@ -42,88 +45,89 @@ def make_vec_env(
 
 
 class Sb3VecEnv(VecEnv):
-    """SB3's face of a vector environment that resets in the ending step."""
+    """The SB3 interface of a vector environment whose autoreset mode is `SameStep`."""
 
     def __init__(self, env: ZmqVectorEnv) -> None:
         self.env = env
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> Any:
-        """Begin episodes in all copies, with the seeds and options that were set."""
+        """Begin episodes in all env copies, with the seeds and options that were set. Returns the observations."""
         seeds = self._seeds if any(seed is not None for seed in self._seeds) else None
         options = self._options[0] or None
-        if any(one != self._options[0] for one in self._options):
+        if any(options_of_copy != self._options[0] for options_of_copy in self._options):
             raise ValueError("set_options expected the same options for every copy")
         observation, infos = self.env.reset(seed=seeds, options=options)
-        self.reset_infos = self._listed(infos)
+        self.reset_infos = self._info_list(infos)
         self._reset_seeds()
         self._reset_options()
         return observation
 
     def step_async(self, actions: Array) -> None:
-        """Tell every copy to step."""
+        """Order every env copy to step."""
         self.env.step_async(actions)
 
     def step_wait(self) -> Any:
-        """Observations, rewards, dones and a list of infos."""
+        """Observations, rewards (float32), dones and a list with one info for each env copy."""
         observation, reward, terminated, truncated, infos = self.env.step_wait()
         done = terminated | truncated
         if not infos and not done.any():
             return observation, reward.astype(np.float32), done, [{"TimeLimit.truncated": False} for _ in done]
-        listed = self._listed(infos)
-        for n, info in enumerate(listed):
+        info_list = self._info_list(infos)
+        for n, info in enumerate(info_list):
             if done[n]:
-                last, after = info.pop("final_info", {}), dict(info)
-                terminal = after.pop("final_obs")
-                self.reset_infos[n] = after
+                final_info, reset_info = info.pop("final_info", {}), dict(info)
+                terminal_observation = reset_info.pop("final_obs")
+                self.reset_infos[n] = reset_info
                 info.clear()
-                info.update(last, terminal_observation=terminal)
+                info.update(final_info, terminal_observation=terminal_observation)
             info["TimeLimit.truncated"] = bool(truncated[n] and not terminated[n])
-        return observation, reward.astype(np.float32), done, listed
+        return observation, reward.astype(np.float32), done, info_list
 
     def close(self) -> None:
-        """End the workers."""
+        """Close the vector environment; its local workers end."""
         self.env.close()
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """An attribute of each copy."""
-        return self._each(indices, attr_name)
+        """An attribute of each env copy."""
+        return self._call_each(indices, attr_name)
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        """Set an attribute of each copy."""
+        """Set an attribute of each env copy to the same value."""
         copies = sorted(self._get_indices(indices))
         self.env.assign_some(copies, attr_name, [value] * len(copies))
 
     def env_method(self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any) -> list[Any]:
-        """Call a method of each copy."""
-        return self._each(indices, method_name, *method_args, **method_kwargs)
+        """Call a method of each env copy."""
+        return self._call_each(indices, method_name, *method_args, **method_kwargs)
 
     def env_is_wrapped(self, wrapper_class: type, indices: Indices = None) -> list[bool]:
-        """Never, as far as this process can see: wrappers stand where the copies are, and classes do not travel."""
+        """Always False: this process does not see the wrappers, which are in the workers."""
         return [False for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[Array | None]:
-        """A frame of each copy."""
+        """A rendered frame of each env copy, or None."""
         return self.env.render() if self.render_mode == "rgb_array" else [None] * self.num_envs
 
-    def _each(self, indices: Indices, name: str, *args: Any, **kwargs: Any) -> list[Any]:
-        """What each copy gives, in the order of `indices`."""
+    def _call_each(self, indices: Indices, name: str, *args: Any, **kwargs: Any) -> list[Any]:
+        """The result of each env copy, in the order of `indices`."""
         copies = list(self._get_indices(indices))
-        found = dict(zip(sorted(set(copies)), self.env.call_some(sorted(set(copies)), name, *args, **kwargs), strict=True))
-        return [found[n] for n in copies]
+        ascending = sorted(set(copies))
+        results = dict(zip(ascending, self.env.call_some(ascending, name, *args, **kwargs), strict=True))
+        return [results[n] for n in copies]
 
-    def _listed(self, infos: dict[str, Any]) -> list[dict[str, Any]]:
-        """Gymnasium's dict of arrays, as a list of dicts."""
-        return [_of_copy(infos, n) for n in range(self.num_envs)]
+    def _info_list(self, infos: dict[str, Any]) -> list[dict[str, Any]]:
+        """Gymnasium's dict of arrays as a list of dicts, one for each env copy."""
+        return [_info_of_copy(infos, n) for n in range(self.num_envs)]
 
 
-def _of_copy(infos: dict[str, Any], n: int) -> dict[str, Any]:
-    """One copy's own info, again: of each key with a mask that is true for it."""
-    own = {}
+def _info_of_copy(infos: dict[str, Any], n: int) -> dict[str, Any]:
+    """The info of env copy `n`: it has the keys whose mask is true for this copy."""
+    info = {}
     for key, values in infos.items():
         if key.startswith("_") and key[1:] in infos:
             continue
         mask = infos.get(f"_{key}")
         if mask is None or mask[n]:
-            own[key] = _of_copy(values, n) if isinstance(values, dict) else values[n]
-    return own
+            info[key] = _info_of_copy(values, n) if isinstance(values, dict) else values[n]
+    return info

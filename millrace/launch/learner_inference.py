@@ -1,8 +1,8 @@
-"""`--inference learner`: worker processes only step env copies; the policy acts here, in one pass for all of them at once.
+"""Run with `--inference learner`: workers only step env copies; the policy acts in this process, for all copies at once.
 
-What the loop gathers from is one worker, in a thread of this process; the env copies that it collects on are those of a
-vector environment, whose workers are processes of their own. So tickets, ledger, the law of a row, checkpoints and errors
-are those of every run, and a lane gets the seeds and the random numbers that it would get anywhere.
+The learner collects from a single worker, which is a thread of this process. The env copies of this worker belong to a
+vector environment, whose workers are processes. So tickets, ledger, rows, checkpoints and errors are those of every run, and
+a lane gets the same seeds and random numbers as with `--inference workers`.
 
 The law: whatever happens, no worker, thread, socket file or folder of ours is left behind.
 """
@@ -40,9 +40,10 @@ def train(
     *,
     elsewhere: bool = False,
 ) -> Path:
-    """A whole run; its folder. `factory` makes the environment, if its id does not; `elsewhere`: workers come from there.
+    """Train until the run is done. Returns the run folder.
 
-    Raises `OurError`, or `Interrupted` when the user stopped it.
+    `factory` makes the environment if it has no id. `elsewhere`: the workers are started elsewhere and join at
+    `config.bind`. Raises `OurError`, or `Interrupted` if the user stopped the run.
     """
     with ExitStack() as stack:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
@@ -71,7 +72,7 @@ def train(
 
         host = Host(lambda name: Thread(link.address, name, context, collector), 1, called="inference")
         stack.callback(host.stop)
-        stack.callback(host.ask_to_leave)  # and once more: at once, whatever it waits for
+        stack.callback(host.ask_to_leave)  # asked a second time, it leaves at once
 
         run.journal.workers_expected = 0 if elsewhere else config.workers
         run.go(1)

@@ -1,4 +1,4 @@
-"""Runs whose policy acts beside the learner: the same weights as where workers act, and the same end under faults."""
+"""Runs with `--inference learner`: the same weights as with `--inference workers`, and the same results of faults."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from tests.system.test_local_run import assert_balanced, run, start, summary, wo
 
 SMALL: dict[str, Any] = {"n_epochs": 2, "eval_episodes": 2}
 TOY = "workers.envs.toy:"
-HERE: dict[str, Any] = {"inference": "learner"}
+IN_LEARNER: dict[str, Any] = {"inference": "learner"}
 
 
 def policy_of(folder: Path) -> bytes:
     return (folder / "policy.safetensors").read_bytes()
 
 
-# ---------------------------------------------------------------- the same
+# ---------------------------------------------------------------- the same weights
 
 
 @pytest.mark.parametrize(
@@ -50,37 +50,39 @@ def policy_of(folder: Path) -> bytes:
     ],
     ids=["ppo", "gaussian", "lstm", "a2c", "dqn", "reinforce", "impala"],
 )
-def test_the_weights_are_those_of_workers_that_act(tmp_path: Path, env: str, settings: dict[str, Any]) -> None:
-    """To the bit: every lane has its seeds and its random numbers, wherever its copies are and whoever acts."""
-    there = run(tmp_path, env, seed=3, workers=2, eval_episodes=1, **settings)
-    here = run(tmp_path, env, seed=3, workers=2, eval_episodes=1, **settings, **HERE)
-    assert policy_of(here) == policy_of(there)
+def test_the_weights_equal_those_of_inference_workers(tmp_path: Path, env: str, settings: dict[str, Any]) -> None:
+    """Bit for bit: a lane has its own seeds and random numbers, wherever its copies are and wherever the policy acts."""
+    in_workers = run(tmp_path, env, seed=3, workers=2, eval_episodes=1, **settings)
+    in_learner = run(tmp_path, env, seed=3, workers=2, eval_episodes=1, **settings, **IN_LEARNER)
+    assert policy_of(in_learner) == policy_of(in_workers)
     for name in ("updates", "env_steps", "ledger", "return_mean_100", "evaluation", "lags"):
-        assert summary(here)[name] == summary(there)[name]
-    assert summary(here)["updates"] >= 3
-    assert_balanced(summary(here)["ledger"])
-    curves = [[row["rollout/ep_rew_mean"] for row in read_rows(folder / "metrics.jsonl")] for folder in (here, there)]
+        assert summary(in_learner)[name] == summary(in_workers)[name]
+    assert summary(in_learner)["updates"] >= 3
+    assert_balanced(summary(in_learner)["ledger"])
+    curves = [
+        [row["rollout/ep_rew_mean"] for row in read_rows(folder / "metrics.jsonl")] for folder in (in_learner, in_workers)
+    ]
     assert curves[0] == curves[1]
 
 
 def test_the_weights_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
-    found = {}
-    for workers, transport in ((1, "ipc"), (2, "tcp"), (3, "inproc"), (5, "ipc")):  # of five, one has no lane
-        settings: dict[str, Any] = {"workers": workers, "transport": transport, "steps": 2_500, **SMALL, **HERE}
-        found[workers] = policy_of(run(tmp_path, "CartPole-v1", seed=3, **settings))
-    assert len(set(found.values())) == 1
-    other: dict[str, Any] = {"steps": 2_500, **SMALL, **HERE}
-    assert policy_of(run(tmp_path, "CartPole-v1", seed=4, **other)) != found[1], "the seed changes nothing"
+    policies = {}
+    for workers, transport in ((1, "ipc"), (2, "tcp"), (3, "inproc"), (5, "ipc")):  # of five workers one has no lane
+        settings: dict[str, Any] = {"workers": workers, "transport": transport, "steps": 2_500, **SMALL, **IN_LEARNER}
+        policies[workers] = policy_of(run(tmp_path, "CartPole-v1", seed=3, **settings))
+    assert len(set(policies.values())) == 1
+    other: dict[str, Any] = {"steps": 2_500, **SMALL, **IN_LEARNER}
+    assert policy_of(run(tmp_path, "CartPole-v1", seed=4, **other)) != policies[1], "the seed changes nothing"
 
 
 def test_it_learns(tmp_path: Path) -> None:
-    folder = run(tmp_path, "CartPole-v1", steps=60_000, target_mean_return=150.0, eval_episodes=10, **HERE)
+    folder = run(tmp_path, "CartPole-v1", steps=60_000, target_mean_return=150.0, eval_episodes=10, **IN_LEARNER)
     assert summary(folder)["stop_reason"] == "mean return 150 of the last episodes reached"
     assert summary(folder)["evaluation"]["return_mean"] > 150
 
 
-def test_a_resumed_run_goes_on_as_one_where_workers_act(tmp_path: Path) -> None:
-    """The lanes begin anew in both, with the same seeds; optimiser, normaliser and counters go on."""
+def test_a_resumed_run_equals_one_with_inference_workers(tmp_path: Path) -> None:
+    """In both the lanes start again with the same seeds; optimizer, normalization and counters continue."""
     settings: dict[str, Any] = {"seed": 3, "normalize_observations": True, "normalize_rewards": True, **SMALL}
     policies = []
     for inference in ("workers", "learner"):
@@ -110,50 +112,63 @@ def test_every_whole_episode_is_recorded(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_an_environment_may_be_a_callable(tmp_path: Path) -> None:
-    def light(gravity: float = 9.8) -> gymnasium.Env[Any, Any]:
+    def low_gravity(gravity: float = 9.8) -> gymnasium.Env[Any, Any]:
         env = gymnasium.make("CartPole-v1")
         env.unwrapped.gravity = gravity  # type: ignore[attr-defined]
         return env
 
-    settings: dict[str, Any] = {"steps": 1_000, "run_dir": str(tmp_path), "env_kwargs": {"gravity": 5.0}, **SMALL, **HERE}
-    assert summary(millrace.train(light, **settings))["env"] == "light"
+    settings: dict[str, Any] = {
+        "steps": 1_000,
+        "run_dir": str(tmp_path),
+        "env_kwargs": {"gravity": 5.0},
+        **SMALL,
+        **IN_LEARNER,
+    }
+    assert summary(millrace.train(low_gravity, **settings))["env"] == "low_gravity"
     with pytest.raises(UsageError, match="an environment factory is code"):
-        millrace.train(light, transport="tcp", **settings)
+        millrace.train(low_gravity, transport="tcp", **settings)
 
 
 # ---------------------------------------------------------------- thin workers
 
 
 @pytest.mark.parametrize("inference", ["workers", "learner"])
-def test_workers_that_only_step_need_no_torch_for_images(tmp_path: Path, inference: str) -> None:
+def test_workers_that_only_step_do_not_import_torch_for_images(tmp_path: Path, inference: str) -> None:
     with_torch: list[bool] = []
 
-    def look(progress: Progress) -> None:
+    def watch(progress: Progress) -> None:
         maps = [Path(f"/proc/{worker.pid}/maps").read_text() for worker in worker_processes()]
         with_torch.extend("libtorch" in text for text in maps)
 
     settings: dict[str, Any] = {"env_kwargs": {"observation": "image"}, "rollout_steps": 16, "steps": 400}
-    folder = run(tmp_path, f"{TOY}Spaces-v0", look, inference=inference, **settings, **SMALL)
+    folder = run(tmp_path, f"{TOY}Spaces-v0", watch, inference=inference, **settings, **SMALL)
     assert summary(folder)["updates"] >= 2
     assert with_torch
     assert set(with_torch) == {inference == "workers"}
 
 
-def test_a_policy_of_torch_is_the_same_whatever_the_number_of_workers(tmp_path: Path) -> None:
-    settings: dict[str, Any] = {"env_kwargs": {"observation": "image"}, "rollout_steps": 16, "steps": 600, **SMALL, **HERE}
-    found = {policy_of(run(tmp_path, f"{TOY}Spaces-v0", workers=workers, **settings)) for workers in (1, 2)}
-    assert len(found) == 1
+def test_a_torch_policy_does_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
+    settings: dict[str, Any] = {
+        "env_kwargs": {"observation": "image"},
+        "rollout_steps": 16,
+        "steps": 600,
+        **SMALL,
+        **IN_LEARNER,
+    }
+    policies = {policy_of(run(tmp_path, f"{TOY}Spaces-v0", workers=workers, **settings)) for workers in (1, 2)}
+    assert len(policies) == 1
 
 
 @pytest.mark.parametrize("inference", ["workers", "learner"])
-def test_images_are_looked_at_as_the_run_says(tmp_path: Path, inference: str) -> None:
+def test_images_dtype_changes_how_images_are_processed(tmp_path: Path, inference: str) -> None:
     settings: dict[str, Any] = {"env_kwargs": {"observation": "image"}, "rollout_steps": 16, "steps": 300, **SMALL}
     settings |= {"inference": inference}
-    found = {policy_of(run(tmp_path, f"{TOY}Spaces-v0", images_dtype=as_, **settings)) for as_ in ("float32", "bfloat16")}
-    assert len(found) == 2
+    dtypes = ("float32", "bfloat16")
+    policies = {policy_of(run(tmp_path, f"{TOY}Spaces-v0", images_dtype=dtype, **settings)) for dtype in dtypes}
+    assert len(policies) == 2
 
 
-def test_a_policy_that_sees_no_images_takes_no_dtype_for_them(tmp_path: Path) -> None:
+def test_images_dtype_is_refused_for_a_policy_without_images(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="images_dtype bfloat16: expected float32"):
         run(tmp_path, f"{TOY}Spaces-v0", images_dtype="bfloat16", steps=300, **SMALL)
 
@@ -161,11 +176,9 @@ def test_a_policy_that_sees_no_images_takes_no_dtype_for_them(tmp_path: Path) ->
 # ---------------------------------------------------------------- faults
 
 
-def test_a_killed_worker_costs_its_copies_their_episodes_and_no_more(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    killed: list[int] = []
-    back: list[int] = []
+def test_a_killed_worker_costs_only_the_episodes_of_its_copies(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    killed: list[int] = []  # pids
+    restored: list[int] = []  # updates with both workers after the kill
 
     def watch(progress: Progress) -> None:
         if progress.updates == 5:
@@ -173,68 +186,68 @@ def test_a_killed_worker_costs_its_copies_their_episodes_and_no_more(
             killed.append(victim.pid)
             victim.kill()
         if killed and progress.updates > 6 and progress.workers_alive == 2:
-            back.append(progress.updates)
+            restored.append(progress.updates)
 
     with caplog.at_level(logging.WARNING):
-        folder = run(tmp_path, "CartPole-v1", watch, steps=20_000, **SMALL, **HERE)
-    found = summary(folder)
+        folder = run(tmp_path, "CartPole-v1", watch, steps=20_000, **SMALL, **IN_LEARNER)
+    result = summary(folder)
     assert killed
-    assert back, "the killed worker never came back"
-    assert found["stop_reason"] == "all steps done"
+    assert restored, "the killed worker was not replaced"
+    assert result["stop_reason"] == "all steps done"
     assert "was killed by SIGKILL" in caplog.text
     assert caplog.text.count("comes back truncated") == 2  # it had two of the four lanes
-    assert found["ledger"]["lost"] == 0
-    assert_balanced(found["ledger"])
+    assert result["ledger"]["lost"] == 0
+    assert_balanced(result["ledger"])
 
 
-def test_an_environment_that_raises_ends_the_run_with_its_own_traceback(tmp_path: Path) -> None:
+def test_an_environment_that_raises_ends_the_run_with_the_traceback_of_the_worker(tmp_path: Path) -> None:
     with pytest.raises(EnvironmentFailed, match="that was failure 2, at most 1 are borne") as failure:
-        run(tmp_path, f"{TOY}Raises-v0", max_env_failures=1, **SMALL, **HERE)
+        run(tmp_path, f"{TOY}Raises-v0", max_env_failures=1, **SMALL, **IN_LEARNER)
     assert "toy.py" in failure.value.detail, "the traceback is not the worker's"
     assert "\n" not in str(failure.value)
     assert "its environment raised ValueError" in str(failure.value)
 
 
-def test_an_environment_that_raises_once_is_borne(tmp_path: Path) -> None:
+def test_one_failure_of_an_environment_is_tolerated(tmp_path: Path) -> None:
     kwargs: dict[str, Any] = {"once": str(tmp_path / "raised"), "after": 30}
-    folder = run(tmp_path, f"{TOY}Raises-v0", env_kwargs=kwargs, workers=1, steps=2_000, **SMALL, **HERE)
-    found = summary(folder)
+    folder = run(tmp_path, f"{TOY}Raises-v0", env_kwargs=kwargs, workers=1, steps=2_000, **SMALL, **IN_LEARNER)
+    result = summary(folder)
     assert Path(kwargs["once"]).exists()
-    assert found["stop_reason"] == "all steps done"
-    assert found["ledger"]["lost"] == 4  # the rollouts in hand, one of each lane: dealt again
-    assert_balanced(found["ledger"])
+    assert result["stop_reason"] == "all steps done"
+    assert result["ledger"]["lost"] == 4  # the unfinished rollouts, one of each lane; their tickets are issued again
+    assert_balanced(result["ledger"])
 
 
 @pytest.mark.parametrize(("env", "what"), [("NaNObservation", "observation"), ("NaNReward", "reward")])
-def test_nan_ends_the_run_naming_where(tmp_path: Path, env: str, what: str) -> None:
+def test_nan_ends_the_run_with_an_error_that_says_where(tmp_path: Path, env: str, what: str) -> None:
     with pytest.raises(EnvironmentFailed, match=rf"lane \d.*{what}.*nan at step \d+, copy \d+"):
-        run(tmp_path, f"{TOY}{env}-v0", max_env_failures=0, **SMALL, **HERE)
+        run(tmp_path, f"{TOY}{env}-v0", max_env_failures=0, **SMALL, **IN_LEARNER)
 
 
 def test_an_environment_that_hangs_is_given_up(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     kwargs = {"once": str(tmp_path / "hung"), "after": 30}
-    settings: dict[str, Any] = {"steps": 2_000, "step_timeout_s": 1.0, "env_kwargs": kwargs, **SMALL, **HERE}
+    settings: dict[str, Any] = {"steps": 2_000, "step_timeout_s": 1.0, "env_kwargs": kwargs, **SMALL, **IN_LEARNER}
     with caplog.at_level(logging.WARNING):
         folder = run(tmp_path, f"{TOY}Hangs-v0", **settings)
     assert summary(folder)["stop_reason"] == "all steps done"
     assert "a step of its environment took too long (--step-timeout-s)" in caplog.text
 
 
-def test_nobody_comes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_worker_joins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("workers.host.sys.executable", "/bin/false")
     began_s = time.monotonic()
     with pytest.raises(NoWorkers, match="waited 1 s for 2 workers"):
-        run(tmp_path, "CartPole-v1", no_workers_timeout_s=1.0, **SMALL, **HERE)
+        run(tmp_path, "CartPole-v1", no_workers_timeout_s=1.0, **SMALL, **IN_LEARNER)
     assert time.monotonic() - began_s < 20
 
 
-def test_ctrl_c_while_an_environment_hangs_drains_saves_and_leaves_nobody(tmp_path: Path) -> None:
+def test_ctrl_c_while_an_environment_hangs_drains_saves_and_ends_all_workers(tmp_path: Path) -> None:
     learner = start(tmp_path, "--inference", "learner")
     wait_for(lambda: any(len(read_rows(path)) > 10 for path in tmp_path.glob("runs/*/metrics.jsonl")))
     workers = psutil.Process(learner.pid).children()
     assert len(workers) == 2
     for worker in workers:
-        worker.suspend()  # no step is answered any more
+        worker.suspend()  # no step is answered from now on
     learner.send_signal(signal.SIGINT)
     _, stderr = learner.communicate(timeout=40)
     assert learner.returncode == 130
@@ -248,7 +261,7 @@ def test_ctrl_c_while_an_environment_hangs_drains_saves_and_leaves_nobody(tmp_pa
 # ---------------------------------------------------------------- workers elsewhere, refusals
 
 
-def test_workers_from_elsewhere_step_for_a_learner_that_acts(tmp_path: Path) -> None:
+def test_workers_elsewhere_step_while_the_policy_acts_in_the_learner(tmp_path: Path) -> None:
     stage = Stage(tmp_path / "stage")
     address = f"tcp://127.0.0.1:{free_port()}"
     flags = [
@@ -289,9 +302,9 @@ def test_an_occupied_port_leaves_no_folder(tmp_path: Path) -> None:
     assert not (tmp_path / "runs").exists()
 
 
-def test_what_it_cannot_do_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_unsupported_settings_are_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="inference learner: max_lag expected 0, got 1"):
-        resolve("CartPole-v1", max_lag=1, **HERE)
+        resolve("CartPole-v1", max_lag=1, **IN_LEARNER)
     with pytest.raises(UsageError, match="inference expected one of workers, learner, got 'gpu'"):
         resolve("CartPole-v1", inference="gpu")
     command = [sys.executable, "-m", "learner", "CartPole-v1", "--inference", "learner", "--run-dir", str(tmp_path / "runs")]
@@ -302,6 +315,6 @@ def test_what_it_cannot_do_is_refused_in_one_line(tmp_path: Path) -> None:
 
 
 def test_no_thread_is_left(tmp_path: Path) -> None:
-    run(tmp_path, "CartPole-v1", steps=600, **SMALL, **HERE)
+    run(tmp_path, "CartPole-v1", steps=600, **SMALL, **IN_LEARNER)
     json.loads((next(tmp_path.glob("runs*/*")) / "summary.json").read_text())
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("inference")]

@@ -1,4 +1,4 @@
-"""Workers killed, environments that raise, hang or die: the vector environment says so in time and leaves nothing behind."""
+"""Workers are killed; environments raise, hang or die. The vector environment reports it in time and leaves nothing open."""
 
 from __future__ import annotations
 
@@ -25,47 +25,47 @@ from learner.vector_env.settings import EnvLike
 from millrace.launch import vector
 from protocol.errors import EnvironmentFailed, NoWorkers, OurError, WorkerLost
 from protocol.keys.key_folder import KeyFolder
-from tests.system.processes import free_port
+from tests.system.processes import START_S, free_port
 
-WAYS = {"shared": True, "messages": False}
+SHARED_MEMORY = {"shared": True, "messages": False}
 ZEROS = np.zeros(4, np.int64)
 CLOSES_WITHIN_S = 8.0
 
 
-@pytest.fixture(params=WAYS)
-def shared(request: pytest.FixtureRequest) -> bool:
-    return WAYS[request.param]
+@pytest.fixture(params=SHARED_MEMORY)
+def shared_memory(request: pytest.FixtureRequest) -> bool:
+    return SHARED_MEMORY[request.param]
 
 
-def made(env: EnvLike = "CartPole-v1", **keywords: Any) -> ZmqVectorEnv:
+def make(env: EnvLike = "CartPole-v1", **keywords: Any) -> ZmqVectorEnv:
     return millrace.make_vec(env, 4, **{"workers": 2, "timeout": 20.0, **keywords})
 
 
-def workers_here() -> list[psutil.Process]:
-    """Our children that are worker processes, in the order of their names."""
+def local_workers() -> list[psutil.Process]:
+    """Worker processes that are children of this process, in the order of their names."""
     found = [(child.cmdline(), child) for child in psutil.Process().children() if child.status() != psutil.STATUS_ZOMBIE]
     named = [(line[line.index("--name") + 1], child) for line, child in found if "--name" in line]
     return [child for _, child in sorted(named, key=lambda pair: pair[0])]
 
 
-def closed_cleanly(env: ZmqVectorEnv) -> None:
-    """Close it, twice; no child, descriptor or folder is left."""
+def close_and_check(env: ZmqVectorEnv) -> None:
+    """Close it twice, in time; no worker process is left."""
     began = time.monotonic()
     env.close()
     env.close()
     assert time.monotonic() - began < CLOSES_WITHIN_S
-    assert workers_here() == []
+    assert local_workers() == []
 
 
-def descriptors() -> int:
+def open_descriptors() -> int:
     return psutil.Process().num_fds()
 
 
-def test_a_worker_killed_between_steps_comes_back_truncated(shared: bool) -> None:
-    env = made(shared_memory=shared)
+def test_a_worker_killed_between_steps_comes_back_truncated(shared_memory: bool) -> None:
+    env = make(shared_memory=shared_memory)
     env.reset(seed=1)
     before = env.step(ZEROS)[0]
-    workers_here()[1].kill()
+    local_workers()[1].kill()
     obs, reward, terminated, truncated, infos = env.step(ZEROS)
     assert truncated.tolist() == [False, False, True, True]
     assert not terminated.any()
@@ -73,34 +73,34 @@ def test_a_worker_killed_between_steps_comes_back_truncated(shared: bool) -> Non
     assert (obs[2:] == before[2:]).all()
     assert (obs[:2] != before[:2]).any()
     assert infos["worker_lost"].tolist() == [False, False, True, True]
-    obs, reward, terminated, truncated, infos = env.step(ZEROS)  # as a reset would
+    obs, reward, terminated, truncated, infos = env.step(ZEROS)  # this step resets the lost copies
     assert reward.tolist() == [1.0, 1.0, 0.0, 0.0]
     assert not truncated.any()
     assert "worker_lost" not in infos
     assert (np.abs(obs[2:]) <= 0.05).all()
     assert env.step(ZEROS)[1].tolist() == [1.0] * 4
-    closed_cleanly(env)
+    close_and_check(env)
 
 
-def test_infos_too_long_for_shared_memory_do_not_hide_a_lost_lane() -> None:
-    env = made("workers.envs.toy:Informs-v0", wordy=1_000_000)
+def test_a_loss_is_reported_beside_infos_too_long_for_shared_memory() -> None:
+    env = make("workers.envs.toy:Informs-v0", wordy=1_000_000)
     env.reset(seed=1)
     action = env.action_space.sample()
     assert "worker_lost" not in env.step(action)[4]
-    workers_here()[1].kill()
+    local_workers()[1].kill()
     infos = env.step(action)[4]
     assert infos["worker_lost"].tolist() == [False, False, True, True]
     assert [len(word or "") > 1_000_000 for word in infos["word"]] == [True, True, False, False]
     assert "worker_lost" not in env.step(action)[4]
-    closed_cleanly(env)
+    close_and_check(env)
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.DISABLED])
 def test_a_lost_worker_in_the_other_modes(mode: AutoresetMode) -> None:
-    env = made(autoreset_mode=mode)
+    env = make(autoreset_mode=mode)
     env.reset(seed=1)
     before = env.step(ZEROS)[0]
-    workers_here()[0].kill()
+    local_workers()[0].kill()
     obs, _, _, truncated, infos = env.step(ZEROS)
     assert truncated.tolist() == [True, True, False, False]
     if mode is AutoresetMode.SAME_STEP:
@@ -111,79 +111,79 @@ def test_a_lost_worker_in_the_other_modes(mode: AutoresetMode) -> None:
         assert (obs[:2] == before[:2]).all()
         env.reset(options={"reset_mask": truncated})
     assert env.step(ZEROS)[1].tolist() == [1.0] * 4
-    closed_cleanly(env)
+    close_and_check(env)
 
 
-def test_a_worker_that_dies_in_mid_step_is_noticed_at_once(tmp_path: Path, shared: bool) -> None:
-    env = made("workers.envs.toy:Dies-v0", after=2, once=str(tmp_path / "once"), k=50, shared_memory=shared)
+def test_a_worker_that_dies_during_a_step_is_noticed_at_once(tmp_path: Path, shared_memory: bool) -> None:
+    env = make("workers.envs.toy:Dies-v0", after=2, once=str(tmp_path / "once"), k=50, shared_memory=shared_memory)
     env.reset(seed=1)
     began = time.monotonic()
     truncated = [env.step(ZEROS)[3] for _ in range(4)]
     assert time.monotonic() - began < 10.0
     assert sum(int(row.any()) for row in truncated) == 1
     assert truncated[2].sum() == 2
-    closed_cleanly(env)
+    close_and_check(env)
 
 
-def test_a_lane_that_had_answered_before_its_worker_died_is_told_of_in_the_next_step(tmp_path: Path) -> None:
+def test_a_lane_that_answered_before_its_worker_died_is_reported_in_the_next_step(tmp_path: Path) -> None:
     once = str(tmp_path / "once")
-    env = made("workers.envs.toy:Dies-v0", after=2, once=once, k=50, only_seed=3, workers=1, lanes=2)
-    env.reset(seed=1)  # copy 2 has seed 3: the second lane dies when the first one has stepped
-    told = [env.step(ZEROS) for _ in range(6)]
-    assert [step[3].tolist() for step in told[:3]] == [[False] * 4, [False] * 4, [False, False, True, True]]
-    assert [step[3][:2].all() for step in told] == [False, False, False, True, False, False]
-    left = np.array([step[0][:, 0] for step in told])  # counts down by 1/50, unless an end was told one or two steps before
+    env = make("workers.envs.toy:Dies-v0", after=2, once=once, k=50, only_seed=3, workers=1, lanes=2)
+    env.reset(seed=1)  # copy 2 has seed 3: its lane, the second, dies after the first lane has stepped
+    results = [env.step(ZEROS) for _ in range(6)]
+    assert [step[3].tolist() for step in results[:3]] == [[False] * 4, [False] * 4, [False, False, True, True]]
+    assert [step[3][:2].all() for step in results] == [False, False, False, True, False, False]
+    remaining = np.array([step[0][:, 0] for step in results])  # falls by 1/50, unless the episode ended 1 or 2 steps before
     for n in range(4):
         for t in range(1, 6):
-            if not any(step[3][n] for step in told[max(0, t - 1) : t + 1]):
-                assert left[t, n] == pytest.approx(left[t - 1, n] - 0.02), "an episode began that nobody was told of"
-    closed_cleanly(env)
+            if not any(step[3][n] for step in results[max(0, t - 1) : t + 1]):
+                assert remaining[t, n] == pytest.approx(remaining[t - 1, n] - 0.02), "an episode began without a report"
+    close_and_check(env)
 
 
-def test_a_loss_is_raised_where_that_is_asked_for(shared: bool) -> None:
-    env = made(on_worker_loss="raise", shared_memory=shared)
+def test_a_loss_is_raised_with_on_worker_loss_raise(shared_memory: bool) -> None:
+    env = make(on_worker_loss="raise", shared_memory=shared_memory)
     env.reset(seed=1)
-    workers_here()[1].kill()
+    local_workers()[1].kill()
     with pytest.raises(WorkerLost, match=r"worker w1 \(.*\) was killed by SIGKILL: lane 1 \(copies 2 to 3\) is lost"):
         env.step(ZEROS)
     with pytest.raises(WorkerLost, match="call reset"):
         env.step(ZEROS)
     env.reset(seed=1)
     assert env.step(ZEROS)[1].tolist() == [1.0] * 4
-    closed_cleanly(env)
+    close_and_check(env)
 
 
-def test_an_environment_that_raises_shows_its_own_traceback() -> None:
-    env = made("workers.envs.toy:Raises-v0", after=2)
+def test_an_error_of_an_environment_has_the_traceback_of_the_worker() -> None:
+    env = make("workers.envs.toy:Raises-v0", after=2)
     env.reset(seed=1)
     with pytest.raises(EnvironmentFailed, match=r"lane \d, copy 0, step 2: its environment raised ValueError") as raised:
         for _ in range(4):
             env.step(ZEROS)
     assert "the toy is broken, as it was asked to be" in raised.value.detail
     assert "in fault" in "".join(raised.value.__notes__)
-    env.reset(seed=1)  # on new copies
+    env.reset(seed=1)  # makes new copies
     assert env.step(ZEROS)[1].tolist() == [1.0] * 4
-    closed_cleanly(env)
+    close_and_check(env)
 
 
 def test_an_environment_that_cannot_be_made_in_a_worker_says_why() -> None:
-    home = os.getpid()
+    this_process = os.getpid()
 
     def only_here() -> gymnasium.Env[Any, Any]:
-        if os.getpid() != home:
+        if os.getpid() != this_process:
             raise OSError("no licence on this machine")
         return gymnasium.make("CartPole-v1")
 
-    env = made(only_here)
+    env = make(only_here)
     with pytest.raises(EnvironmentFailed, match="no licence on this machine"):
         env.reset(seed=1)
-    closed_cleanly(env)
+    close_and_check(env)
 
 
 @pytest.mark.parametrize("loss", ["truncate", "raise"])
 def test_an_environment_that_hangs_is_given_up_at_the_deadline(tmp_path: Path, loss: str) -> None:
     once = str(tmp_path / "once")
-    env = made("workers.envs.toy:Hangs-v0", after=1, once=once, timeout=1.5, on_worker_loss=loss)
+    env = make("workers.envs.toy:Hangs-v0", after=1, once=once, timeout=1.5, on_worker_loss=loss)
     env.reset(seed=1)
     env.step(ZEROS)
     began = time.monotonic()
@@ -195,57 +195,57 @@ def test_an_environment_that_hangs_is_given_up_at_the_deadline(tmp_path: Path, l
         with pytest.raises(WorkerLost, match="did not answer"):
             env.step(ZEROS)
     assert 1.0 < time.monotonic() - began < 8.0
-    closed_cleanly(env)
+    close_and_check(env)
 
 
 def test_closing_while_an_environment_hangs() -> None:
-    env = made("workers.envs.toy:Hangs-v0", after=0)
+    env = make("workers.envs.toy:Hangs-v0", after=0)
     env.reset(seed=1)
     env.step_async(ZEROS)
-    closed_cleanly(env)
+    close_and_check(env)
 
 
 def test_a_stopped_worker_is_given_up_at_the_deadline() -> None:
-    env = made(timeout=1.0)
+    env = make(timeout=1.0)
     env.reset(seed=1)
-    workers_here()[0].send_signal(signal.SIGSTOP)
+    local_workers()[0].send_signal(signal.SIGSTOP)
     assert env.step(ZEROS)[3].tolist() == [True, True, False, False]
     env.timeout_s = 20.0
     assert not env.step(ZEROS)[3].any()
-    closed_cleanly(env)
+    close_and_check(env)
 
 
-def test_a_loss_during_reset_is_made_good() -> None:
-    env = made()
+def test_a_reset_is_repeated_when_workers_are_lost() -> None:
+    env = make()
     env.reset(seed=1)
-    for worker in workers_here():
+    for worker in local_workers():
         worker.kill()
     obs, _ = env.reset(seed=1)
     theirs = gymnasium.make_vec("CartPole-v1", 4, vectorization_mode="sync")
     assert (obs == theirs.reset(seed=1)[0]).all()
     theirs.close()
     assert env.step(ZEROS)[1].tolist() == [1.0] * 4
-    closed_cleanly(env)
+    close_and_check(env)
 
 
-def test_nothing_is_left_open_after_many() -> None:
-    def one() -> None:
-        with made() as env:
+def test_nothing_stays_open_after_many_environments() -> None:
+    def use_one() -> None:
+        with make() as env:
             env.reset(seed=1)
             env.step(ZEROS)
 
-    one()
-    before, in_memory = descriptors(), set(os.listdir("/dev/shm"))
+    use_one()
+    descriptors, shared_files = open_descriptors(), set(os.listdir("/dev/shm"))
     for _ in range(3):
-        one()
-    assert descriptors() <= before
-    assert set(os.listdir("/dev/shm")) <= in_memory
+        use_one()
+    assert open_descriptors() <= descriptors
+    assert set(os.listdir("/dev/shm")) <= shared_files
 
 
-def test_nobody_comes() -> None:
+def test_no_worker_joins() -> None:
     env: ZmqVectorEnv | None = None
     with pytest.raises(NoWorkers, match=r"waited 0.5 s for 2 workers at tcp://127.0.0.1:\d+, 0 are there; start one"):
-        env = made(workers=0, lanes=2, bind="tcp://127.0.0.1:*", timeout=0.5)
+        env = make(workers=0, lanes=2, bind="tcp://127.0.0.1:*", timeout=0.5)
     assert env is None
 
 
@@ -261,13 +261,13 @@ if __name__ == "__main__":
 ENDS = {
     "at interpreter exit": "pass",
     "after an exception": "raise SystemExit(3)",
-    "when it is forgotten": "del env",
+    "when it is deleted": "del env",
     "killed": "os.kill(os.getpid(), 9)",
 }
 
 
 @pytest.mark.parametrize("end", ENDS)
-def test_nothing_outlives_its_learner(end: str, tmp_path: Path) -> None:
+def test_no_process_outlives_the_learner(end: str, tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(SCRIPT.format(end=ENDS[end]))
     env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
@@ -285,7 +285,7 @@ def test_nothing_outlives_its_learner(end: str, tmp_path: Path) -> None:
 
 
 def test_workers_elsewhere_join_by_tcp_and_come_back() -> None:
-    """Started by hand, over tcp; one is killed and another takes its place."""
+    """They are started by hand, over tcp; one is killed and another takes its place."""
 
     def start(address: str, name: str) -> subprocess.Popen[bytes]:
         root = Path(__file__).parents[2]
@@ -294,7 +294,8 @@ def test_workers_elsewhere_join_by_tcp_and_come_back() -> None:
     address = f"tcp://127.0.0.1:{free_port()}"
     started = [start(address, "a"), start(address, "b")]
     try:
-        env = made(workers=0, lanes=2, bind=address, timeout=3.0)
+        env = make(workers=0, lanes=2, bind=address, timeout=START_S)
+        env.timeout_s = 3.0
         env.reset(seed=1)
         assert env.step(ZEROS)[1].tolist() == [1.0] * 4
         started.append(start(address, "c"))
@@ -311,24 +312,24 @@ def test_workers_elsewhere_join_by_tcp_and_come_back() -> None:
                 process.wait()
 
 
-# ---------------------------------------------------------------- keys, trust and hangs, of workers elsewhere
+# ---------------------------------------------------------------- workers elsewhere: keys, code and hangs
 
 
 class Elsewhere:
-    """Workers started by hand, which say what they have to say into a file."""
+    """Workers that are started by hand; their stderr goes to a file."""
 
     def __init__(self, folder: Path) -> None:
         self.address = f"tcp://127.0.0.1:{free_port()}"
         self.started: list[subprocess.Popen[bytes]] = []
-        self._said_in = folder / "said"
+        self._stderr = folder / "stderr"
 
     def start(self, name: str, *flags: str) -> None:
         command = [sys.executable, "-m", "workers", self.address, "--name", name, *flags]
-        with self._said_in.open("ab") as said:
-            self.started.append(subprocess.Popen(command, cwd=Path(__file__).parents[2], stderr=said))
+        with self._stderr.open("ab") as stderr:
+            self.started.append(subprocess.Popen(command, cwd=Path(__file__).parents[2], stderr=stderr))
 
-    def said(self) -> str:
-        return self._said_in.read_text()
+    def stderr(self) -> str:
+        return self._stderr.read_text()
 
 
 @pytest.fixture
@@ -339,17 +340,17 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Elsew
     elsewhere = Elsewhere(tmp_path)
     yield elsewhere
     for process in elsewhere.started:
-        process.send_signal(signal.SIGCONT)  # one that a failed test left stopped
+        process.send_signal(signal.SIGCONT)  # a failed test may have left it stopped
         process.terminate()
     for process in elsewhere.started:
         process.wait(10)
 
 
-def test_under_keys_a_callable_travels_and_a_revoked_key_is_a_lost_worker(elsewhere: Elsewhere, tmp_path: Path) -> None:
+def test_with_keys_a_callable_is_sent_and_a_revoked_key_is_a_lost_worker(elsewhere: Elsewhere, tmp_path: Path) -> None:
     folder = KeyFolder(tmp_path / "keys")
     for name in ("a", "b"):
         elsewhere.start(name, "--token", str(folder.new(name, datetime.now(UTC))))
-    with made(
+    with make(
         lambda: gymnasium.make("CartPole-v1"),
         workers=None,
         lanes=2,
@@ -367,13 +368,13 @@ def test_under_keys_a_callable_travels_and_a_revoked_key_is_a_lost_worker(elsewh
         assert row[4]["worker_lost"].tolist() == [False, False, True, True]
         assert not env.step(ZEROS)[3].any()
     assert [process.wait(10) for process in elsewhere.started] == [0, 2]
-    assert "revoked" in elsewhere.said()
+    assert "revoked" in elsewhere.stderr()
 
 
-def test_a_worker_elsewhere_that_falls_silent_is_given_up_long_before_the_deadline(elsewhere: Elsewhere) -> None:
+def test_a_silent_worker_elsewhere_is_given_up_long_before_the_deadline(elsewhere: Elsewhere) -> None:
     for name in ("a", "b"):
         elsewhere.start(name)
-    with made(workers=None, lanes=2, bind=elsewhere.address, timeout=60.0) as env:
+    with make(workers=None, lanes=2, bind=elsewhere.address, timeout=60.0) as env:
         env.reset(seed=1)
         assert env.step(ZEROS)[1].tolist() == [1.0] * 4
         elsewhere.started[1].send_signal(signal.SIGSTOP)
@@ -386,8 +387,8 @@ def test_a_worker_elsewhere_that_falls_silent_is_given_up_long_before_the_deadli
         assert env.reset(seed=1)[0].shape == (4, 4)
 
 
-def test_a_slow_step_is_no_silence(elsewhere: Elsewhere, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nor is a caller that thinks for longer than a worker may be silent."""
+def test_a_slow_step_or_a_slow_caller_is_no_silence(elsewhere: Elsewhere, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both take longer than the time after which a silent worker is given up."""
     monkeypatch.setattr(vector, "WORKER_TIMEOUT_S", 2.0)
     elsewhere.start("a")
     with millrace.make_vec("workers.envs.toy:Slow-v0", 1, bind=elsewhere.address, seconds=3.0, timeout=60.0) as env:
@@ -398,28 +399,28 @@ def test_a_slow_step_is_no_silence(elsewhere: Elsewhere, monkeypatch: pytest.Mon
         assert "worker_lost" not in env.step(np.zeros(1, np.int64))[4]
 
 
-def test_one_without_a_token_is_not_let_in(elsewhere: Elsewhere, tmp_path: Path) -> None:
+def test_a_worker_without_a_token_is_refused(elsewhere: Elsewhere, tmp_path: Path) -> None:
     elsewhere.start("a")
     with pytest.raises(NoWorkers, match=r"0 are there \(\d+ were not let in.*start one: .* --token FILE"):
-        made(workers=None, bind=elsewhere.address, keys=str(tmp_path / "keys"), timeout=5.0)
+        make(workers=None, bind=elsewhere.address, keys=str(tmp_path / "keys"), timeout=5.0)
 
 
-def test_what_other_machines_can_reach_has_keys_made_by_itself(elsewhere: Elsewhere, tmp_path: Path) -> None:
+def test_keys_are_made_for_an_address_that_other_machines_can_reach(elsewhere: Elsewhere, tmp_path: Path) -> None:
     with pytest.raises(NoWorkers, match="--token FILE"):
-        made(workers=None, bind="tcp://0.0.0.0:*", timeout=0.2)
+        make(workers=None, bind="tcp://0.0.0.0:*", timeout=0.2)
     assert (tmp_path / ".config" / "millrace" / "keys" / "default.token").is_file()
 
 
-def test_a_worker_that_runs_no_code_declines_and_that_is_said(elsewhere: Elsewhere) -> None:
+def test_a_worker_that_runs_no_code_refuses_and_says_why(elsewhere: Elsewhere) -> None:
     elsewhere.start("a", "--no-code")
     with pytest.raises(OurError, match=r"workers\.envs\.toy:Countdown-v0 imports a module, which this worker does not do"):
-        made("workers.envs.toy:Countdown-v0", workers=None, bind=elsewhere.address, timeout=5.0).reset()
+        make("workers.envs.toy:Countdown-v0", workers=None, bind=elsewhere.address, timeout=5.0).reset()
     assert elsewhere.started[0].wait(10) == 2
 
 
-def test_a_worker_whose_step_hangs_ends_itself_and_another_takes_its_lane(elsewhere: Elsewhere, tmp_path: Path) -> None:
+def test_a_worker_whose_step_hangs_ends_itself_and_another_gets_its_lane(elsewhere: Elsewhere, tmp_path: Path) -> None:
     elsewhere.start("h", "--processes", "2", "--step-timeout-s", "3")
-    with made("workers.envs.toy:Hangs-v0", workers=None, lanes=2, bind=elsewhere.address, after=1, once=str(tmp_path / "o"),
+    with make("workers.envs.toy:Hangs-v0", workers=None, lanes=2, bind=elsewhere.address, after=1, once=str(tmp_path / "o"),
               timeout=60.0) as env:  # fmt: skip
         env.reset(seed=1)
         env.step(ZEROS)
@@ -428,4 +429,4 @@ def test_a_worker_whose_step_hangs_ends_itself_and_another_takes_its_lane(elsewh
         assert truncated.sum() == 2
         assert time.monotonic() - began < 30.0, "long before the deadline"
         assert env.step(ZEROS)[1][~truncated].tolist() == [1.0, 1.0]
-    assert "Timeout (" in elsewhere.said()
+    assert "Timeout (" in elsewhere.stderr()
