@@ -27,7 +27,7 @@ from protocol.wire.link import WorkerLink
 from protocol.wire.shared_memory import Handed
 from protocol.wire.weight_dtypes import widened
 from workers.collect.collector import Collector
-from workers.collect.lane import EnvironmentBroke
+from workers.env_errors import LaneFailed
 from workers.heartbeat_thread import Breath
 from workers.session import Begin, Close, Effect, Identity, Leave, Say, Session, Task
 from workers.step.stepper import Stepper
@@ -201,7 +201,7 @@ class Worker:
     def _broke(self, error: Exception) -> None:
         """The environment's code raised, or ours on its data: the learner must hear of either."""
         detail = error.detail if isinstance(error, OurError) else traceback.format_exc()
-        lane = error.lane if isinstance(error, EnvironmentBroke) else None
+        lane = error.lane if isinstance(error, LaneFailed) else None
         log.error("%s\n%s", error, detail)
         self._do(self._session.broke(_line(error), detail[-MAX_TRACEBACK:], lane))
 

@@ -27,8 +27,8 @@ from protocol.policy.policy import Policy, make_policy
 from protocol.specs import EnvSpec, ImagesDtype, PolicySpec, RunSpec
 from protocol.wire.link import LearnerLink
 from workers.collect.collector import Collector
-from workers.collect.env_copies import Pulse
 from workers.collect.split_vector_env import SideBySide
+from workers.env_loop import Pulse
 from workers.host import Host, Thread
 
 

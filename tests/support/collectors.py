@@ -19,7 +19,7 @@ from protocol.policy.policy import Policy, make_policy
 from protocol.rollout import Rollout, validate
 from protocol.specs import EnvSpec, PolicySpec, RunSpec
 from workers.collect.collector import Collector, OpenCopies, copies_of
-from workers.collect.env_copies import CopyLoop, VectorCopies
+from workers.collect.env_copies import LoopedCopies, VectorCopies
 from workers.session import Assignment
 
 TOY = "workers.envs.toy:"
@@ -66,7 +66,7 @@ def a_collector(run: RunSpec, open_copies: OpenCopies = copies_of) -> Collector:
 
 def over_copies_of(makes: Sequence[Callable[[], gymnasium.Env[Any, Any]]]) -> OpenCopies:
     """A loop over these copies, one of each."""
-    return lambda run, lane, pulse: CopyLoop(iter([make() for make in makes]).__next__, len(makes), pulse)
+    return lambda run, lane, pulse: LoopedCopies(makes, pulse)
 
 
 def over_sync(makes: Sequence[Callable[[], gymnasium.Env[Any, Any]]]) -> OpenCopies:

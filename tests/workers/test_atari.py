@@ -17,8 +17,8 @@ from protocol.envs.vectorized import make_native
 from protocol.errors import UsageError
 from protocol.specs import EnvSpec, RunSpec
 from tests.support.collectors import a_collector, bits, collect, no_pulse
-from workers.collect.env_copies import Copies, CopyLoop, VectorCopies, copy_seeds
-from workers.collect.envpool_copies import PoolCopies
+from workers.collect.env_copies import EnvCopies, LoopedCopies, VectorCopies, copy_seeds
+from workers.collect.envpool_copies import EnvpoolCopies
 from workers.envs import atari
 
 envpool = pytest.mark.skipif(find_spec("envpool") is None, reason="envpool is not here: pip install 'millrace-rl[envpool]'")
@@ -27,10 +27,10 @@ pytestmark = pytest.mark.skipif(
 )
 
 KINDS = ["loop", "native", pytest.param("envpool", marks=envpool)]
-OPEN: dict[str, Callable[[EnvSpec, int], Copies]] = {
-    "loop": lambda env, N: CopyLoop(env.make, N, no_pulse),
+OPEN: dict[str, Callable[[EnvSpec, int], EnvCopies]] = {
+    "loop": lambda env, N: LoopedCopies([env.make] * N, no_pulse),
     "native": lambda env, N: VectorCopies(make_native(env, N)),
-    "envpool": lambda env, N: PoolCopies(pool_of(env), N),
+    "envpool": lambda env, N: EnvpoolCopies(pool_of(env), N),
 }
 BREAKOUT = EnvSpec("millrace/Atari-v0", {"game": "Breakout"})
 

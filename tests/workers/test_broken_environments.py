@@ -12,14 +12,14 @@ import pytest
 from protocol.errors import UsageError
 from protocol.specs import RunSpec
 from tests.support.collectors import TOY, a_collector, collect, over_copies_of, over_sync, run_around, run_of, with_env
-from workers.collect.env_copies import CopyLoop
-from workers.collect.lane import EnvironmentBroke
+from workers.collect.env_copies import LoopedCopies
+from workers.env_errors import LaneFailed
 from workers.envs.toy import Countdown
 
 
-def broken(run: RunSpec, lanes: tuple[int, ...] = (2, 5)) -> EnvironmentBroke:
+def broken(run: RunSpec, lanes: tuple[int, ...] = (2, 5)) -> LaneFailed:
     """What a collector says of this run's environment."""
-    with pytest.raises(EnvironmentBroke) as caught:
+    with pytest.raises(LaneFailed) as caught:
         collect(a_collector(run), run, lanes=lanes)
     assert "\n" not in str(caught.value)
     return caught.value
@@ -41,14 +41,14 @@ def test_the_lane_and_copy_that_raise_are_named() -> None:
             raise OSError("no display")
 
     run = run_of(f"{TOY}Countdown-v0", N=3)
-    with pytest.raises(EnvironmentBroke, match="lane 5, copy 2, first reset: its environment raised OSError: no display"):
+    with pytest.raises(LaneFailed, match="lane 5, copy 2, first reset: its environment raised OSError: no display"):
         collect(a_collector(run, over_copies_of([Countdown, Countdown, Third])), run, lanes=(5,))
 
 
 def test_an_environment_that_breaks_once_is_mended_by_a_new_life(tmp_path: Path) -> None:
     run = run_of(f"{TOY}Raises-v0", kwargs={"once": str(tmp_path / "broke")})
     collector = a_collector(run)
-    with pytest.raises(EnvironmentBroke):
+    with pytest.raises(LaneFailed):
         collect(collector, run)
     collect(collector, run, incarnation=1)
 
@@ -58,13 +58,13 @@ def test_an_environment_that_cannot_be_made_is_named() -> None:
         raise RuntimeError("no licence\nfound")
 
     run = run_of(f"{TOY}Countdown-v0")
-    with pytest.raises(EnvironmentBroke, match=r"lane 0, copy 0, made: .* RuntimeError: no licence$"):
-        collect(a_collector(run, lambda r, lane, pulse: CopyLoop(make, 2, pulse)), run)
+    with pytest.raises(LaneFailed, match=r"lane 0, copy 0, made: .* RuntimeError: no licence$"):
+        collect(a_collector(run, lambda r, lane, pulse: LoopedCopies([make] * 2, pulse)), run)
 
 
 def test_a_vector_environment_that_raises_is_named() -> None:
     run = run_of(f"{TOY}Raises-v0", N=2)
-    with pytest.raises(EnvironmentBroke, match="lane 0, step 3: its environment raised ValueError: the toy"):
+    with pytest.raises(LaneFailed, match="lane 0, step 3: its environment raised ValueError: the toy"):
         collect(a_collector(run, over_sync([run.env.make] * 2)), run)
 
 
@@ -102,7 +102,7 @@ def answer(good: int, observation: Any, reward: Any = 1.0, space: Any = None) ->
     """What is said of an environment that answers this after `good` rows."""
     env = Answers(good, observation, reward, space)
     run = run_around(env, T=6)
-    with pytest.raises(EnvironmentBroke) as caught:
+    with pytest.raises(LaneFailed) as caught:
         collect(a_collector(run, over_copies_of([lambda: env])), run)
     return str(caught.value)
 

@@ -279,7 +279,7 @@ def test_a_lane_released_by_a_pulse_is_closed_after_the_collection() -> None:
 
 
 def test_a_slow_copy_does_not_keep_the_pulse_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("workers.collect.env_copies.PULSE_S", -1.0)  # any step is a slow one
+    monkeypatch.setattr("workers.env_loop.PULSE_S", -1.0)  # any step is a slow one
     run = run_of(f"{TOY}Countdown-v0", T=3, N=5)
     pulses: list[int] = []
     a_collector(run).collect([Assignment(0, 0, 0, 0)], 0, 0, lambda: pulses.append(1))

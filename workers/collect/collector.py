@@ -23,26 +23,28 @@ from protocol.policy.distributions import distribution
 from protocol.policy.policy import Policy
 from protocol.rollout import Rollout
 from protocol.specs import RunSpec
-from workers.collect.env_copies import Copies, CopyLoop, CopyRaised, Pulse, VectorCopies
-from workers.collect.envpool_copies import PoolCopies
-from workers.collect.lane import EnvironmentBroke, Lane, environment_raised
+from workers.collect.collected_lane import CollectedLane
+from workers.collect.env_copies import EnvCopies, LoopedCopies, VectorCopies
+from workers.collect.envpool_copies import EnvpoolCopies
+from workers.env_errors import CopyRaised, LaneFailed, lane_failed
+from workers.env_loop import Pulse
 from workers.session import Assignment
 
-OpenCopies = Callable[[RunSpec, int, Pulse], Copies]
+OpenCopies = Callable[[RunSpec, int, Pulse], EnvCopies]
 """The copies of the lane of this number."""
 Begin = Callable[[Sequence[int], Array, Pulse], None]
 """Told the numbers of L lanes and their actions [L, N, *action], before the first of them is stepped."""
 
 
-def copies_of(run: RunSpec, lane: int, pulse: Pulse) -> Copies:
+def copies_of(run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
     """The copies of one lane, as the run says: what a worker opens unless it is told otherwise."""
     match run.vector:
         case "native":
             return VectorCopies(make_native(run.env, run.copies))
         case "envpool":
-            return PoolCopies(pool_of(run.env), run.copies)
+            return EnvpoolCopies(pool_of(run.env), run.copies)
         case "loop":
-            return CopyLoop(run.env.make, run.copies, pulse)
+            return LoopedCopies([run.env.make] * run.copies, pulse)
 
 
 def each_by_itself(lanes: Sequence[int], actions: Array, pulse: Pulse) -> None:
@@ -83,8 +85,8 @@ class Collector:
         self._open_copies, self._begin = open_copies, begin
         self._distribution = distribution(run.policy)
         self._write = writer(run.policy.action)
-        self._lanes: dict[int, Lane] = {}
-        self._leaving: list[Lane] = []  # closed by a pulse, while their copies may be in mid-step
+        self._lanes: dict[int, CollectedLane] = {}
+        self._leaving: list[CollectedLane] = []  # closed by a pulse, while their copies may be in mid-step
         self._collecting = False
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
@@ -94,7 +96,7 @@ class Collector:
     def collect(self, assignments: Sequence[Assignment], version: int, session: int, pulse: Pulse) -> list[Rollout]:
         """One rollout for each assignment, in their order; each is of another lane.
 
-        `pulse` is called at every step and may raise. Whatever raises, it or an environment (`EnvironmentBroke`), these
+        `pulse` is called at every step and may raise. Whatever raises, it or an environment (`LaneFailed`), these
         lanes are closed: half a rollout is nobody's.
         """
         if len({assignment.lane for assignment in assignments}) < len(assignments):
@@ -105,7 +107,7 @@ class Collector:
             rows = self._new_rows(lanes)
             try:
                 self._fill(rows, lanes, pulse)
-            except (EnvironmentBroke, EnvironmentFailed, IndexError):  # a nonsensical row explains what came of it
+            except (LaneFailed, EnvironmentFailed, IndexError):  # a nonsensical row explains what came of it
                 done = len(rows.clock)
                 for i, lane in enumerate(lanes):
                     lane.check_sense([array[i, : done + 1] for array in rows.obs], rows.reward[i, :done])
@@ -131,7 +133,7 @@ class Collector:
         """Let go of every lane."""
         self.close(list(self._lanes))
 
-    def _living(self, assignment: Assignment, pulse: Pulse) -> Lane:
+    def _living(self, assignment: Assignment, pulse: Pulse) -> CollectedLane:
         """The lane in this incarnation, opened if need be."""
         lane = self._lanes.get(assignment.lane)
         if lane is not None and lane.incarnation == assignment.incarnation:
@@ -141,13 +143,13 @@ class Collector:
         try:
             copies = self._open_copies(self._run, assignment.lane, pulse)
         except CopyRaised as error:
-            raise environment_raised(assignment.lane, "made", error) from error
-        lane = self._lanes[assignment.lane] = Lane(self._run, assignment.lane, assignment.incarnation, copies)
+            raise lane_failed(assignment.lane, "made", error) from error
+        lane = self._lanes[assignment.lane] = CollectedLane(self._run, assignment.lane, assignment.incarnation, copies)
         lane.reset(pulse)
         self.stages["open"] += perf_counter() - began
         return lane
 
-    def _new_rows(self, lanes: Sequence[Lane]) -> _Rows:
+    def _new_rows(self, lanes: Sequence[CollectedLane]) -> _Rows:
         L, T, N = len(lanes), self._run.rollout_steps, self._run.copies
         action = self._run.policy.action
         obs = tuple(np.empty((L, T + 1, N, *leaf.shape), leaf.dtype) for leaf in self._run.policy.observation)
@@ -166,7 +168,7 @@ class Collector:
             clock=[],
         )
 
-    def _fill(self, rows: _Rows, lanes: Sequence[Lane], pulse: Pulse) -> None:
+    def _fill(self, rows: _Rows, lanes: Sequence[CollectedLane], pulse: Pulse) -> None:
         """Step all lanes T times."""
         remembers = rows.state.size > 0
         resets = np.stack([lane.ended for lane in lanes])  # [L, N] row t is not valid
@@ -194,9 +196,7 @@ class Collector:
                     for array, leaf in zip(obs, leaves, strict=True):
                         array[t + 1] = leaf
                 except (TypeError, ValueError) as error:
-                    raise EnvironmentBroke(
-                        lane.number, f"step {t}: its environment gave what cannot be kept: {error}"
-                    ) from error
+                    raise LaneFailed(lane.number, f"step {t}: its environment gave what cannot be kept: {error}") from error
                 if lost is not None:
                     _cut_short(rows, i, lane, t, lost)
             if remembers:
@@ -207,7 +207,7 @@ class Collector:
             stages["act"] += acted - began
             stages["step"] += over - acted
 
-    def _rollout(self, rows: _Rows, i: int, lane: Lane, about: Assignment, version: int, session: int) -> Rollout:
+    def _rollout(self, rows: _Rows, i: int, lane: CollectedLane, about: Assignment, version: int, session: int) -> Rollout:
         """Lane `i` of the rows, as views."""
         valid, episodes = lane.finish(rows.reward[i], rows.terminated[i] | rows.truncated[i], rows.clock)
         obs = tuple(array[i] for array in rows.obs)
@@ -235,7 +235,7 @@ class Collector:
         )
 
 
-def _cut_short(rows: _Rows, i: int, lane: Lane, t: int, lost: npt.NDArray[np.bool_]) -> None:
+def _cut_short(rows: _Rows, i: int, lane: CollectedLane, t: int, lost: npt.NDArray[np.bool_]) -> None:
     """Lane `i` lost these copies [N] in step `t`: their episodes end, truncated, with the last step that was made.
 
     Rows `t` and `t + 1` are then not valid: nothing is made up for the step that was not.

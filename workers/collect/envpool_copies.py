@@ -17,10 +17,12 @@ from gymnasium.vector import VectorEnv
 from protocol.arrays import Array
 from protocol.envs.envpool import Pool
 from protocol.envs.spaces import reader
-from workers.collect.env_copies import CopyRaised, Leaves, Pulse, Row
+from workers.collect.env_copies import Leaves, StepResult
+from workers.env_errors import CopyRaised
+from workers.env_loop import Pulse
 
 
-class PoolCopies:
+class EnvpoolCopies:
     """N copies in one pool, made at the first reset: envpool takes its seeds only then."""
 
     def __init__(self, pool: Pool, copies: int) -> None:
@@ -40,7 +42,7 @@ class PoolCopies:
         except Exception as error:
             raise CopyRaised(None, "reset") from error
 
-    def step(self, actions: Array, pulse: Pulse) -> Row:
+    def step(self, actions: Array, pulse: Pulse) -> StepResult:
         """Step all copies at once; those that were cut are reset."""
         try:
             row, elapsed = self._step_beside_cut(actions) if self._cut.any() else self._step(actions)
@@ -50,12 +52,12 @@ class PoolCopies:
         self._cut = over & ~row.terminated & ~row.truncated
         return row._replace(truncated=row.truncated | over)
 
-    def _step(self, actions: Array, copies: Array | None = None) -> tuple[Row, Array]:
+    def _step(self, actions: Array, copies: Array | None = None) -> tuple[StepResult, Array]:
         """Of these copies, or all: what they gave, and how many steps [n] their episodes have had."""
         observation, reward, terminated, truncated, infos = self._env.step(actions, copies)  # type: ignore[union-attr,call-arg]
-        return Row(self._read(observation), reward, terminated, truncated), infos["elapsed_step"]
+        return StepResult(self._read(observation), reward, terminated, truncated), infos["elapsed_step"]
 
-    def _step_beside_cut(self, actions: Array) -> tuple[Row, Array]:
+    def _step_beside_cut(self, actions: Array) -> tuple[StepResult, Array]:
         cut, rest = np.flatnonzero(self._cut), np.flatnonzero(~self._cut)
         first = self._read(self._env.reset(cut)[0])  # type: ignore[union-attr,arg-type,call-arg]
         row, elapsed = self._step(actions[rest], rest)
@@ -66,7 +68,7 @@ class PoolCopies:
             return array
 
         leaves = [whole(later, begun) for later, begun in zip(row.leaves, first, strict=True)]
-        return Row(leaves, whole(row.reward), whole(row.terminated), whole(row.truncated)), whole(elapsed)
+        return StepResult(leaves, whole(row.reward), whole(row.terminated), whole(row.truncated)), whole(elapsed)
 
     def close(self) -> None:
         """Let go of it, whatever it says; its thread ends with it."""

@@ -16,7 +16,8 @@ from protocol.arrays import Array
 from protocol.envs.spaces import reader
 from protocol.errors import NoWorkers
 from protocol.specs import RunSpec
-from workers.collect.env_copies import Copies, Leaves, Pulse, Row
+from workers.collect.env_copies import EnvCopies, Leaves, StepResult
+from workers.env_loop import Pulse
 
 
 class SideBySide:
@@ -31,9 +32,9 @@ class SideBySide:
         """why nobody steps the copies any more"""
         self._lanes, self._before = lanes, before
         self._read = reader(env.single_observation_space)
-        self._row: Row | None = None
+        self._row: StepResult | None = None
 
-    def open(self, run: RunSpec, lane: int, pulse: Pulse) -> Copies:
+    def open(self, run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
         """The copies of this lane: for `Collector`."""
         return _Part(self, slice(lane * run.copies, (lane + 1) * run.copies))
 
@@ -44,14 +45,14 @@ class SideBySide:
             raise ValueError(f"lanes expected all {self._lanes} of the vector environment at once, got {sorted(lanes)}")
         each = actions[order].reshape(-1, *actions.shape[2:])  # [L · N, *action]
         observation, reward, terminated, truncated, infos = self.wait(lambda: self.env.step(each), pulse)
-        self._row = Row(self._read(observation), reward, terminated, truncated, infos.get("worker_lost"))
+        self._row = StepResult(self._read(observation), reward, terminated, truncated, infos.get("worker_lost"))
 
-    def row(self, copies: slice) -> Row:
+    def row(self, copies: slice) -> StepResult:
         """What these copies gave in the last step."""
         assert self._row is not None
         leaves, reward, terminated, truncated, lost = self._row
         lost = None if lost is None else lost[copies]
-        return Row([leaf[copies] for leaf in leaves], reward[copies], terminated[copies], truncated[copies], lost)
+        return StepResult([leaf[copies] for leaf in leaves], reward[copies], terminated[copies], truncated[copies], lost)
 
     def reset(self, copies: slice, seeds: Sequence[int], pulse: Pulse) -> Leaves:
         """Begin episodes in these copies."""
@@ -85,7 +86,7 @@ class _Part:
         """Begin: one seed for each copy."""
         return self._whole.reset(self._copies, seeds, pulse)
 
-    def step(self, actions: Array, pulse: Pulse) -> Row:
+    def step(self, actions: Array, pulse: Pulse) -> StepResult:
         """What `begin` stepped."""
         return self._whole.row(self._copies)
 

@@ -20,9 +20,9 @@ from protocol.messages import Answer, Array, Call, Order, Reset, Returned, Step,
 from protocol.specs import StepSpec
 from protocol.wire.plain_values import pack, unpack
 from protocol.wire.shared_memory import MAY_SPIN, SPIN_S, Awake, Bell, Handed, Memory, Rung
-from workers.collect.env_copies import CopyRaised, Pulse
-from workers.collect.lane import environment_raised
-from workers.step.lane import Infos, Rows, SteppedLane, new_rows
+from workers.env_errors import CopyRaised, lane_failed
+from workers.env_loop import Infos, Pulse
+from workers.step.stepped_lane import Rows, SteppedLane, new_rows
 
 MAX_TRACEBACK = 20_000  # characters
 
@@ -47,7 +47,7 @@ class Stepper:
         self._spin_s = 0.0  # how long to wait awake for the next order
 
     def obey(self, order: Order, pulse: Pulse) -> Answer:
-        """What comes of it. Raises `EnvironmentBroke`, and what `pulse` raises: then the lane is closed."""
+        """What comes of it. Raises `LaneFailed`, and what `pulse` raises: then the lane is closed."""
         try:
             lane = self._living(order.lane, order.incarnation, pulse)
             match order:
@@ -61,7 +61,7 @@ class Stepper:
                     return _call(order, lane, self._private)
         except CopyRaised as error:
             self.close([order.lane])
-            raise environment_raised(order.lane, error.doing, error) from error
+            raise lane_failed(order.lane, error.doing, error) from error
         except BaseException:
             self.close([order.lane])
             raise
@@ -109,7 +109,7 @@ class Stepper:
             infos = pack_infos(self._step(lane, [array.copy() for array in memory.lanes[number].actions], pulse))
         except CopyRaised as error:
             self.close([number])
-            raise environment_raised(number, error.doing, error) from error
+            raise lane_failed(number, error.doing, error) from error
         if not memory.answer(number, order, infos):
             step = Step(session, -order, number, lane.incarnation, ())
             say(_stepped(step, lane.rows, infos))

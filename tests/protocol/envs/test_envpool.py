@@ -21,8 +21,8 @@ from protocol.envs.envpool import pool_of
 from protocol.errors import UsageError
 from protocol.specs import EnvSpec, RunSpec
 from tests.support.collectors import TOY, a_collector, bits, collect, no_pulse, run_of, trained
-from workers.collect.env_copies import CopyLoop, Row, copy_seeds
-from workers.collect.envpool_copies import PoolCopies
+from workers.collect.env_copies import LoopedCopies, StepResult, copy_seeds
+from workers.collect.envpool_copies import EnvpoolCopies
 from workers.envs.toy import Countdown
 
 here = pytest.mark.skipif(find_spec("envpool") is None, reason="envpool is not here: pip install 'millrace-rl[envpool]'")
@@ -32,11 +32,11 @@ def pooled(run: RunSpec) -> RunSpec:
     return msgspec.structs.replace(run, vector="envpool")
 
 
-def cartpoles(N: int, limit: int) -> PoolCopies:
-    return PoolCopies(pool_of(EnvSpec("CartPole-v1", {"max_episode_steps": limit})), N)
+def cartpoles(N: int, limit: int) -> EnvpoolCopies:
+    return EnvpoolCopies(pool_of(EnvSpec("CartPole-v1", {"max_episode_steps": limit})), N)
 
 
-def observations(row: Row) -> Any:
+def observations(row: StepResult) -> Any:
     return np.asarray(row.leaves[0])
 
 
@@ -48,7 +48,7 @@ def test_it_steps_as_the_loop_does_from_the_same_states() -> None:
     """CartPole's dynamics, rewards and ends; the row in which a copy that ended only resets, whatever it was told to do."""
     N, env = 16, EnvSpec("CartPole-v1", {"max_episode_steps": 40})
     loop_envs = [env.make() for _ in range(N)]
-    one, other = cartpoles(N, 40), CopyLoop(iter(loop_envs).__next__, N, no_pulse)
+    one, other = cartpoles(N, 40), LoopedCopies([iter(loop_envs).__next__] * N, no_pulse)
     obs = np.asarray(one.reset(copy_seeds(1, 0, 0, N), no_pulse)[0])
     other.reset(range(N), no_pulse)
     generator, began, ended = np.random.default_rng(2), np.ones(N, bool), {"terminated": 0, "truncated": 0}

@@ -19,7 +19,7 @@ from protocol.envs.vectorized import make_native
 from protocol.errors import UsageError
 from protocol.specs import EnvSpec, RunSpec
 from tests.support.collectors import TOY, a_collector, bits, collect, no_pulse, run_of, trained
-from workers.collect.env_copies import CopyLoop, VectorCopies, copy_seeds
+from workers.collect.env_copies import LoopedCopies, VectorCopies, copy_seeds
 from workers.envs.toy import Countdown
 
 SHORT = {"max_episode_steps": 7}  # CartPole cannot fall so soon: every episode ends by the clock
@@ -38,7 +38,7 @@ def test_it_steps_as_the_loop_does_from_the_same_states() -> None:
     seeds, generator = copy_seeds(1, 0, 0, N), np.random.default_rng(2)
     together = make_native(env, N)
     loop_envs = [env.make() for _ in range(N)]
-    one, other = VectorCopies(together), CopyLoop(iter(loop_envs).__next__, N, no_pulse)
+    one, other = VectorCopies(together), LoopedCopies([iter(loop_envs).__next__] * N, no_pulse)
     one.reset(seeds, no_pulse)
     other.reset(seeds, no_pulse)
     began, ended = np.ones(N, bool), {"terminated": 0, "truncated": 0}

@@ -8,39 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from time import perf_counter
-from traceback import format_exception
 
 import numpy as np
 
 from protocol.arrays import Array, Bools
 from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import RunError, UsageError, first_line
+from protocol.errors import UsageError
 from protocol.policy.recurrent import zero_state
 from protocol.rollout import Episode, first_not_finite
 from protocol.specs import Leaf, RunSpec
-from workers.collect.env_copies import Copies, CopyRaised, Leaves, Pulse, Row, copy_seeds
+from workers.collect.env_copies import EnvCopies, Leaves, StepResult, copy_seeds
+from workers.env_errors import CopyRaised, LaneFailed, lane_failed
+from workers.env_loop import Pulse
 
 
-class EnvironmentBroke(RunError):
-    """The environment raised, or gave what no rollout can hold; `detail` is its traceback, if it raised."""
-
-    def __init__(self, lane: int, line: str, detail: str = "") -> None:
-        super().__init__(f"lane {lane}, {line}", detail)
-        self.lane = lane
-
-
-def environment_raised(lane: int, when: str, error: CopyRaised) -> EnvironmentBroke:
-    """The environment's own exception, in one line and with its traceback."""
-    cause = error.__cause__ or error
-    where = when if error.copy is None else f"copy {error.copy}, {when}"
-    line = f"{where}: its environment raised {type(cause).__name__}: {first_line(cause, '')}"
-    return EnvironmentBroke(lane, line, "".join(format_exception(cause)))
-
-
-class Lane:
+class CollectedLane:
     """A numbered group of N env copies that are stepped together."""
 
-    def __init__(self, run: RunSpec, number: int, incarnation: int, copies: Copies) -> None:
+    def __init__(self, run: RunSpec, number: int, incarnation: int, copies: EnvCopies) -> None:
         self.number = number
         self.incarnation = incarnation
         self.copies = copies
@@ -68,18 +53,18 @@ class Lane:
         try:
             leaves = self.copies.reset(self._seeds, pulse)
         except CopyRaised as error:
-            raise environment_raised(self.number, "first reset", error) from error
+            raise lane_failed(self.number, "first reset", error) from error
         self._check_fit(leaves, "first reset")
         for array, leaf in zip(self.obs, leaves, strict=True):
             array[:] = leaf
         self._began = [perf_counter()] * len(self._began)
 
-    def step(self, actions: Array, t: int, pulse: Pulse) -> Row:
+    def step(self, actions: Array, t: int, pulse: Pulse) -> StepResult:
         """Step `t` of a rollout, with actions [N, *action]."""
         try:
             row = self.copies.step(actions, pulse)
         except CopyRaised as error:
-            raise environment_raised(self.number, f"step {t}", error) from error
+            raise lane_failed(self.number, f"step {t}", error) from error
         if not self._proven:
             self._check_fit(row.leaves, f"step {t}")
             self._proven = True
@@ -102,7 +87,7 @@ class Lane:
                     or not np.can_cast(array.dtype, wanted, "same_kind")
                     or (wanted.kind in "iu" and (array.astype(wanted) != array).any())
                 ):
-                    raise EnvironmentBroke(
+                    raise LaneFailed(
                         self.number,
                         f"copy {n}, {when}: {_name(leaf)} expected {wanted}{list(leaf.shape)} as its space says, "
                         f"got {array.dtype}{list(array.shape)}; mend the environment or its observation_space",
@@ -112,16 +97,16 @@ class Lane:
         """Raise, naming step and copy, if observations [rows, N, *leaf] or rewards [rows, N] cannot be right."""
         for leaf, array in zip(self._run.policy.observation, obs, strict=True):
             if array.dtype.kind == "f" and not np.isfinite(array).all():
-                raise EnvironmentBroke(self.number, f"{_name(leaf)}: {first_not_finite(array)}")
+                raise LaneFailed(self.number, f"{_name(leaf)}: {first_not_finite(array)}")
             if leaf.sizes:
                 start, size = (np.reshape(values, leaf.shape) for values in (leaf.start, leaf.sizes))
                 wrong = (array < start) | (array >= start + size)
                 if wrong.any():
                     t, n = np.argwhere(wrong)[0][:2]
                     line = f"{_name(leaf)}: expected a value of its space, got {array[t, n]} at step {t}, copy {n}"
-                    raise EnvironmentBroke(self.number, line)
+                    raise LaneFailed(self.number, line)
         if not np.isfinite(reward).all():
-            raise EnvironmentBroke(self.number, f"reward: {first_not_finite(reward)}")
+            raise LaneFailed(self.number, f"reward: {first_not_finite(reward)}")
 
     def finish(self, reward: Array, done: Bools, clock: Sequence[float]) -> tuple[Bools, tuple[Episode, ...]]:
         """Close the account of T rows: which are valid [T, N], and the episodes that ended, oldest first.

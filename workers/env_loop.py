@@ -1,0 +1,126 @@
+"""The loop over the env copies of a lane. The collector and the stepper of a vector environment both use it.
+
+Autoreset is gymnasium's (`gymnasium.vector.AutoresetMode`). NextStep: the step after an episode's end ignores the action and
+resets that copy. SameStep: the step that ends an episode resets the copy, and returns the last observation and info inside
+the new info, as `final_obs` and `final_info`. Disabled: the caller resets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from time import perf_counter
+from typing import Any, Literal, Protocol
+
+import gymnasium
+
+from protocol.errors import UsageError
+from workers.env_errors import CopyRaised
+
+Autoreset = Literal["NextStep", "SameStep", "Disabled"]
+Infos = list[tuple[int, dict[str, Any]]]
+"""(number of the copy, its info), where the info is not empty"""
+Pulse = Callable[[], None]
+"""Called now and then during long work, so that the worker can answer the learner. It may raise to end the work."""
+
+PULSE_S = 0.05  # a loop over slow copies calls `pulse` this often
+
+
+class ObservationSink(Protocol):
+    """Takes the observation of copy n: a list of observations, or an array [N, *leaf]."""
+
+    def __setitem__(self, copy: Any, observation: Any, /) -> None:
+        """Store it."""
+        ...
+
+
+class EnvLoop:
+    """N environments that are stepped one after the other. Whatever they raise arrives as `CopyRaised`."""
+
+    def __init__(
+        self,
+        makes: Iterable[Callable[[], gymnasium.Env[Any, Any]]],
+        pulse: Pulse,
+        autoreset: Autoreset = "NextStep",
+        *,
+        ended: bool = False,
+    ) -> None:
+        """Make the copies, and reset none. `ended`: they count as truncated, so the first step with NextStep resets them."""
+        self.envs: list[gymnasium.Env[Any, Any]] = []
+        for n, make in enumerate(makes):
+            pulse()
+            try:
+                self.envs.append(make())
+            except UsageError:
+                self.close()
+                raise
+            except Exception as error:
+                self.close()
+                raise CopyRaised(n, "make") from error
+        self.steps = 0
+        """how often `step` stepped the copies"""
+        self.reward: list[Any] = [0.0] * len(self.envs)
+        """[N] of the last step"""
+        self.terminated: list[Any] = [False] * len(self.envs)
+        """[N] of the last step"""
+        self.truncated: list[Any] = [ended] * len(self.envs)
+        """[N] of the last step"""
+        self._step_functions = [env.step for env in self.envs]
+        self._next_step, self._same_step = autoreset == "NextStep", autoreset == "SameStep"
+
+    def reset(
+        self,
+        copies: Iterable[int],
+        seeds: Sequence[int | None],
+        into: ObservationSink,
+        pulse: Pulse,
+        keywords: Mapping[str, Any] | None = None,
+    ) -> Infos:
+        """Start episodes in these copies, a seed for each. `keywords` are further arguments of `gymnasium.Env.reset`."""
+        infos: Infos = []
+        for n, seed in zip(copies, seeds, strict=True):
+            pulse()
+            try:
+                into[n], info = self.envs[n].reset(seed=seed, **(keywords or {}))
+            except Exception as error:
+                raise CopyRaised(n, "reset") from error
+            self.reward[n], self.terminated[n], self.truncated[n] = 0.0, False, False
+            if info:
+                infos.append((n, info))
+        return infos
+
+    def step(self, actions: Iterable[Any], into: ObservationSink, pulse: Pulse) -> Infos:
+        """Step every copy with its action, or reset it. The rest of the result is in `reward`, `terminated`, `truncated`."""
+        reward, terminated, truncated = self.reward, self.terminated, self.truncated
+        next_step, same_step = self._next_step, self._same_step
+        infos: Infos = []
+        pulse_due_s = perf_counter() + PULSE_S
+        for n, (step, action) in enumerate(zip(self._step_functions, actions, strict=True)):
+            resets = next_step and (terminated[n] or truncated[n])
+            try:
+                if resets:
+                    observation, info = self.envs[n].reset()
+                    reward[n], terminated[n], truncated[n] = 0.0, False, False
+                else:
+                    observation, reward[n], terminated[n], truncated[n], info = step(action)
+                    if same_step and (terminated[n] or truncated[n]):
+                        resets = True
+                        last = {"final_obs": observation, "final_info": info}
+                        observation, info = self.envs[n].reset()
+                        info = last | info
+                into[n] = observation
+            except Exception as error:
+                raise CopyRaised(n, "reset" if resets else f"step {self.steps}") from error
+            if info:
+                infos.append((n, info))
+            if perf_counter() > pulse_due_s:
+                pulse()
+                pulse_due_s = perf_counter() + PULSE_S
+        self.steps += 1
+        return infos
+
+    def close(self) -> None:
+        """Close every copy. What a copy raises is ignored."""
+        for env in self.envs:
+            with suppress(Exception):
+                env.close()
