@@ -31,7 +31,7 @@ from protocol.wire.compression import Packing
 from protocol.wire.link import LearnerLink, WorkerLink
 from protocol.wire.weight_dtypes import WeightsDtype, narrowed, widened
 from workers.collect.collector import Collector
-from workers.session import Assignment
+from workers.collect.held_rollouts import Assignment
 
 ATARI = RunSpec(
     EnvSpec("ALE/Pong-v5"),

@@ -22,7 +22,7 @@ from protocol.messages import ToLearner
 from protocol.rollout import Rollout
 from protocol.specs import ActionSpec, EnvSpec, Leaf, PolicySpec, RunSpec
 from protocol.wire.codec import decode_to_worker, encode
-from workers.session import Effect, Identity, Leave, Say, Session, Task
+from workers.session import Effect, Identity, Leave, Send, Session, Task
 
 POLICY = PolicySpec((Leaf("", "box", (4,), "float32"),), ActionSpec("discrete", (), "int64", (2,), (0,)))
 STEPS, COPIES = 32, 8  # T, N: 9 KB
@@ -121,7 +121,7 @@ class Simulated:
 
     def _do(self, effects: Sequence[Effect]) -> None:
         for effect in effects:
-            if isinstance(effect, Say):
+            if isinstance(effect, Send):
                 self._say(effect.message)
             elif isinstance(effect, Leave):
                 self.left = True

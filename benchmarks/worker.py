@@ -25,7 +25,7 @@ from learner.run import run_spec
 from protocol.policy.layout import buffer_size, parameter_layout, total_size
 from protocol.specs import EnvSpec
 from protocol.wire.link import LearnerLink
-from workers.host import Process
+from workers.host import WorkerCommand, WorkerProcess
 
 CASES = {
     "MLP, CartPole-v1": EnvSpec("CartPole-v1"),
@@ -43,7 +43,7 @@ def start_one(env: EnvSpec) -> tuple[float, float]:
         hub = Hub(link, roster, HubSettings(no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=0))
         hub.publish(0, np.zeros(total_size(acting), np.float32), np.zeros(buffer_size(run.policy), np.float32))
         began_s = time.perf_counter()
-        worker = Process(link.address, "w0", Path(folder) / "log")
+        worker = WorkerProcess(WorkerCommand(link.address, "w0", Path(folder) / "log"))
         hub.gather()
         took_s = time.perf_counter() - began_s
         resident = psutil.Process(worker.pid).memory_info().rss / 2**20

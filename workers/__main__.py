@@ -1,6 +1,6 @@
-"""`python -m workers ADDRESS`: one worker process. Imports no torch unless the policy looks at images.
+"""The worker program: `python -m workers ADDRESS` or `millrace worker ADDRESS`. Imports torch only for an image policy.
 
-Exit codes: 0 drained, told to stop, or its host is gone; 1 broke, or no learner answered; 2 refused or bad usage.
+Exit codes: 0 drained, asked to leave, or its host has ended; 1 failed, or no learner answered; 2 refused, or bad usage.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(_variable, "1")  # before numpy: workers share the cores by being many
+    os.environ.setdefault(_variable, "1")  # before numpy is imported: there is a worker for each core
 
 import argparse
 import logging
@@ -25,104 +25,138 @@ from protocol.keys.keys import Token
 from protocol.specs import Code
 from protocol.wire.link import WorkerLink
 from protocol.wire.shared_memory import Handed
-from workers.code_trust import entry, trusted
-from workers.host import NOBODY, Host, Process, keeping_to
+from workers.host import EXIT_NO_LEARNER, Host, WorkerCommand, WorkerProcess, core_flags
+from workers.security import allowed_code, checked_token
 from workers.session import NO_LEARNER, Session
 from workers.watchdog import Watchdog
-from workers.worker import Worker, identity, parent_is_gone
+from workers.worker import Worker, WorkerOptions, identity, parent_is_gone
 
 log = logging.getLogger("millrace.worker")
 
 
 def main(argv: list[str] | None = None, prog: str = "python -m workers") -> int:
-    """Run one worker; the exit code. `prog` is the command that the help names."""
-    parser = argparse.ArgumentParser(prog=prog, description="Step an environment for a learner.")
-    parser.add_argument("address", help="where the learner listens: ipc://PATH or tcp://HOST:PORT")
-    parser.add_argument(
-        "--name", default=f"{socket.gethostname()}-{os.getpid()}", help="this worker's name, unique in the run"
+    """Run one worker, or with --processes many; the exit code. `prog` is the name of the program in its usage text."""
+    flags = _parser(prog).parse_args(argv)
+    logging.basicConfig(level=logging.INFO, format=f"%(asctime)s worker {flags.name}: %(message)s", stream=sys.stderr)
+    try:
+        token = checked_token(flags.address, read_token(flags.token), insecure=flags.insecure)
+        if flags.processes != 1:
+            return _host(flags, token)
+        link = WorkerLink(flags.address, flags.name, token=token)
+    except OurError as error:
+        sys.stderr.write(f"worker {flags.name}: {error}\n")
+        return error.exit_code
+    return _work(flags, link, Code.REGISTERED if flags.no_code else allowed_code(flags.address, token))
+
+
+def _parser(prog: str) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=prog, description="Start a worker: it steps environments for the learner at ADDRESS until the learner is done."
     )
-    parser.add_argument("--parent", type=int, default=0, help="leave when the process of this pid is no longer the parent")
-    parser.add_argument("--join-timeout-s", type=float, default=60.0, help="leave when no learner has answered for so long")
-    parser.add_argument(
-        "--token", default="", help=f"file of the join token; or {TOKEN_VARIABLE}, which holds a file or a token"
-    )
-    parser.add_argument(
-        "--insecure", action="store_true", help="believe whoever answers on another machine; no code of theirs"
-    )
-    parser.add_argument(
-        "--no-code", action="store_true", help="only environments registered here: no pickled callables, no modules"
-    )
-    parser.add_argument(
-        "--step-timeout-s", type=float, default=120.0, help="end when a step of one env copy takes longer; 0: however long"
-    )
-    parser.add_argument("--core", type=int, help="run on this core alone")
-    parser.add_argument(
+    parser.add_argument("address", metavar="ADDRESS", help="address of the learner: ipc://PATH or tcp://HOST:PORT")
+
+    basic = parser.add_argument_group("basic")
+    basic.add_argument(
         "--processes",
         type=int,
         default=1,
-        help="so many workers, each in a process of its own, restarted when it breaks",
+        metavar="N",
+        help="start N workers, one process each; one that fails is restarted",
     )
-    parser.add_argument("--pin", action="store_true", help="with --processes: each keeps to one core")
-    parser.add_argument("--handed", default="", help=argparse.SUPPRESS)  # descriptors of shared memory, from its host
-    options = parser.parse_args(argv)
-    logging.basicConfig(level=logging.INFO, format=f"%(asctime)s worker {options.name}: %(message)s", stream=sys.stderr)
-    try:
-        token = entry(options.address, read_token(options.token), insecure=options.insecure)
-        if options.processes != 1:
-            return _host(options, token)
-        link = WorkerLink(options.address, options.name, token=token)
-    except OurError as error:
-        sys.stderr.write(f"worker {options.name}: {error}\n")
-        return error.exit_code
-    if options.core is not None:
-        os.sched_setaffinity(0, {options.core})
-    watchdog = Watchdog(options.step_timeout_s) if options.step_timeout_s else None
-    stops = _count_signals()
-    session = Session(identity(options.name), time.monotonic(), join_timeout_s=options.join_timeout_s)
-    worker = Worker(
-        link,
-        session,
-        told_to_stop=lambda: len(stops) or int(bool(options.parent) and parent_is_gone(options.parent)),
-        alive=watchdog.feed if watchdog else lambda now: None,
-        handed=Handed(*map(int, options.handed.split(","))) if options.handed else None,
-        code=Code.REGISTERED if options.no_code else trusted(options.address, token),
+    basic.add_argument(
+        "--name",
+        default=f"{socket.gethostname()}-{os.getpid()}",
+        help="name of this worker, unique in the run (default: host name and process id)",
     )
-    left = worker.run()
+
+    network = parser.add_argument_group("workers and network")
+    network.add_argument(
+        "--token", default="", metavar="FILE", help=f"file with the join token; or set {TOKEN_VARIABLE} to a file or a token"
+    )
+    network.add_argument(
+        "--insecure",
+        action="store_true",
+        help="connect to a learner on another machine without a token; anybody may answer, so no code is accepted",
+    )
+    network.add_argument(
+        "--no-code",
+        action="store_true",
+        help="accept only environments that are registered here: no pickled callables, and no modules to import",
+    )
+    network.add_argument("--core", type=int, metavar="CORE", help="run only on this CPU core")
+    network.add_argument("--pin", action="store_true", help="with --processes: pin each worker to one CPU core")
+
+    faults = parser.add_argument_group("faults")
+    faults.add_argument(
+        "--join-timeout-s",
+        type=float,
+        default=60.0,
+        metavar="S",
+        help="leave when no learner has answered for S seconds (default: %(default)g)",
+    )
+    faults.add_argument(
+        "--step-timeout-s",
+        type=float,
+        default=120.0,
+        metavar="S",
+        help="exit when a step of one env copy takes longer than S seconds; 0: no limit (default: %(default)g)",
+    )
+    faults.add_argument(
+        "--parent", type=int, default=0, metavar="PID", help="leave when the process PID is no longer the parent"
+    )
+    parser.add_argument("--handed", default="", help=argparse.SUPPRESS)  # file descriptors of shared memory, from its host
+    return parser
+
+
+def _work(flags: argparse.Namespace, link: WorkerLink, code: Code) -> int:
+    """Run one worker in this process; the exit code."""
+    if flags.core is not None:
+        os.sched_setaffinity(0, {flags.core})
+    watchdog = Watchdog(flags.step_timeout_s) if flags.step_timeout_s else None
+    signals = _count_signals()
+    session = Session(identity(flags.name), time.monotonic(), join_timeout_s=flags.join_timeout_s)
+    options = WorkerOptions(
+        code=code,
+        stop_requests=lambda: len(signals) or int(bool(flags.parent) and parent_is_gone(flags.parent)),
+        feed_watchdog=watchdog.feed if watchdog else lambda now: None,
+        shared_memory=Handed(*map(int, flags.handed.split(","))) if flags.handed else None,
+    )
+    left = Worker(link, session, options).run()
     if watchdog:
         watchdog.stop()
-    if options.parent and parent_is_gone(options.parent):
-        _tidy_up_after(options.address)
+    if flags.parent and parent_is_gone(flags.parent):
+        _remove_socket_of_killed_host(flags.address)
     if left.exit_code:
-        sys.stderr.write(f"worker {options.name}: {_advice(left.reason, link)}\n")
-    return NOBODY if options.parent and left.reason.startswith(NO_LEARNER) else left.exit_code
+        sys.stderr.write(f"worker {flags.name}: {_explained(left.reason, link)}\n")
+    return EXIT_NO_LEARNER if flags.parent and left.reason.startswith(NO_LEARNER) else left.exit_code
 
 
-def _host(options: argparse.Namespace, token: Token | None) -> int:
-    """Many workers, and this process to look after them."""
-    if options.processes < 1:
-        raise UsageError(f"processes expected int >= 1, got {options.processes}")
-    cores = sorted(os.sched_getaffinity(0)) if options.pin else []
-    flags = ["--join-timeout-s", str(options.join_timeout_s), "--step-timeout-s", str(options.step_timeout_s)]
-    flags += [flag for flag, given in (("--insecure", options.insecure), ("--no-code", options.no_code)) if given]
+def _host(flags: argparse.Namespace, token: Token | None) -> int:
+    """Run many workers, each in a process of its own, and watch them here; the exit code."""
+    if flags.processes < 1:
+        raise UsageError(f"processes expected int >= 1, got {flags.processes}")
+    cores = sorted(os.sched_getaffinity(0)) if flags.pin else []
+    passed = ["--join-timeout-s", str(flags.join_timeout_s), "--step-timeout-s", str(flags.step_timeout_s)]
+    passed += [flag for flag, is_set in (("--insecure", flags.insecure), ("--no-code", flags.no_code)) if is_set]
 
-    def start(name: str) -> Process:
-        return Process(options.address, f"{options.name}-{name}", None, token, [*flags, *keeping_to(cores, name)])
+    def start(name: str) -> WorkerProcess:
+        own_flags = [*passed, *core_flags(cores, name)]
+        return WorkerProcess(WorkerCommand(flags.address, f"{flags.name}-{name}", token=token, flags=own_flags))
 
-    stops = _count_signals()
-    host = Host(start, options.processes)
-    return host.keep(lambda: len(stops), lambda line: log.warning("%s", line))
+    signals = _count_signals()
+    return Host(start, flags.processes).run(lambda: len(signals), lambda line: log.warning("%s", line))
 
 
 def _count_signals() -> list[int]:
-    """SIGTERM and SIGINT ask to leave: the first after the rollout in hand, the second at once."""
+    """SIGTERM and SIGINT ask to leave: the first after the rollout in progress, the second at once."""
     received: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda signum, frame: received.append(signum))
     return received
 
 
-def _tidy_up_after(address: str) -> None:
-    """A host that was killed could not remove its socket and the folder that it had made for it."""
+def _remove_socket_of_killed_host(address: str) -> None:
+    """Remove the socket, and the folder that the host made for it: a killed host could not."""
     scheme, _, path = address.partition("://")
     if scheme == "ipc" and Path(path).parent.name.startswith("millrace-"):
         Path(path).unlink(missing_ok=True)
@@ -130,7 +164,8 @@ def _tidy_up_after(address: str) -> None:
             Path(path).parent.rmdir()
 
 
-def _advice(reason: str, link: WorkerLink) -> str:
+def _explained(reason: str, link: WorkerLink) -> str:
+    """The reason for leaving, and if no learner answered, the likely cause."""
     if not reason.startswith(NO_LEARNER):
         return reason
     if link.trouble is not None:

@@ -1,7 +1,7 @@
-"""Signs of life from a second thread while the environment's code has the first: a step may take minutes, and is no silence.
+"""Heartbeats from a second thread while the first thread runs the environment's code, where a step may take minutes.
 
-The law: link and session have one user at a time. The first thread has them, but for the time that it is away, in the code
-of the environment; then the second has them for a moment, now and then.
+The law: only one thread at a time uses the link and the session. The first thread holds their lock, and releases it only
+while it runs the environment's code; meanwhile the second thread acquires it now and then, for a moment.
 """
 
 from __future__ import annotations
@@ -10,52 +10,52 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-EVERY_S = 0.25  # a Heartbeat that is due is said so much later at most
+INTERVAL_S = 0.25  # between two calls of the second thread: a Heartbeat is at most so much late
 
 
-class Breath:
-    """The second thread, and the lock between the two."""
+class HeartbeatThread:
+    """The second thread, and the lock between the two threads."""
 
-    def __init__(self, breathe: Callable[[], None]) -> None:
-        """`breathe` says what is due; it is called by the second thread, after `start`."""
-        self._breathe = breathe
-        self._ours = threading.Lock()  # whoever has it may use link and session
-        self._ours.acquire()
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="breath", daemon=True)
+    def __init__(self, heartbeat: Callable[[], None]) -> None:
+        """`heartbeat` sends the Heartbeat that is due. The second thread calls it, once `start` was called."""
+        self._heartbeat = heartbeat
+        self._lock = threading.Lock()  # its holder may use link and session
+        self._lock.acquire()
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
 
     def start(self) -> None:
-        """From now on, whenever the first thread is away; harmless when said again."""
+        """Start the second thread, if it has not started yet."""
         if self._thread.ident is None:
             self._thread.start()
 
     @contextmanager
-    def away(self) -> Iterator[None]:
-        """The first thread runs the environment's code."""
-        self._ours.release()
+    def lock_released(self) -> Iterator[None]:
+        """The first thread runs the environment's code and does not use the link or the session."""
+        self._lock.release()
         try:
             yield
         finally:
-            self._ours.acquire()
+            self._lock.acquire()
 
     @contextmanager
-    def back(self) -> Iterator[None]:
-        """It is back for a moment, out of that code."""
-        self._ours.acquire()
+    def lock_reacquired(self) -> Iterator[None]:
+        """Within `lock_released`, the first thread uses the link and the session again for a moment."""
+        self._lock.acquire()
         try:
             yield
         finally:
-            self._ours.release()
+            self._lock.release()
 
     def stop(self) -> None:
-        """No more of it; the first thread keeps link and session."""
-        self._ended.set()
+        """End the second thread. The first thread keeps the lock."""
+        self._stopped.set()
         if self._thread.ident is not None:
-            with self.away():
+            with self.lock_released():
                 self._thread.join()
 
     def _run(self) -> None:
-        while not self._ended.wait(EVERY_S):
-            with self._ours:
-                if not self._ended.is_set():
-                    self._breathe()
+        while not self._stopped.wait(INTERVAL_S):
+            with self._lock:
+                if not self._stopped.is_set():
+                    self._heartbeat()

@@ -1,14 +1,13 @@
 """The worker's half of the conversation. Pure: messages and `now` in, effects out; no socket, clock, thread or environment.
 
-The law: a ticket is collected once and its rollout is kept until the learner says it has it; asked again for it, the same
-rollout is said again. A rollout starts only under weights at least as new as its ticket asks for. Whatever is lost on the
-way is repaired by the next Heartbeat, because it lists all that this worker holds.
+The law: a rollout starts only under weights at least as new as its ticket asks for. A message that is lost does no harm,
+because the next Heartbeat lists all tickets that this worker holds, and the learner sends again what is missing. What a
+worker holds is in `collect/held_rollouts.py` and `step/held_orders.py`.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from protocol.messages import (
@@ -24,7 +23,6 @@ from protocol.messages import (
     Hello,
     LaneLife,
     Order,
-    Permit,
     Received,
     Refuse,
     Rejoin,
@@ -38,30 +36,30 @@ from protocol.messages import (
     Welcome,
 )
 from protocol.specs import RunSpec, StepSpec
-from workers.states import TABLE, Broke, Emptied, Silence, State, Terminate
-from workers.step.orders import Orders
+from workers.collect.held_rollouts import Assignment, HeldRollouts
+from workers.states import TABLE, LearnerSilent, State, StopRequested, WorkerFailed, WorkFinished
+from workers.step.held_orders import HeldOrders
 
 HELLO_FIRST_S, HELLO_MOST_S = 0.25, 4.0
 NO_LEARNER = "no learner answered"
-REMEMBERED_TICKETS = 64  # finished ones, so that a late repeat of their Collect is known for what it is
 
 
 @dataclass(frozen=True)
-class Say:
-    """Effect: send this."""
+class Send:
+    """Effect: send this message."""
 
     message: ToLearner
 
 
 @dataclass(frozen=True)
-class Begin:
-    """Effect: a new session; forget every env copy of the last one."""
+class StartSession:
+    """Effect: a new session starts; close every env copy of the last one."""
 
     run: RunSpec | StepSpec
 
 
 @dataclass(frozen=True)
-class Close:
+class CloseLanes:
     """Effect: close the env copies of these lanes."""
 
     lanes: tuple[LaneLife, ...]
@@ -69,29 +67,18 @@ class Close:
 
 @dataclass(frozen=True)
 class Leave:
-    """Effect: the conversation is over."""
+    """Effect: the conversation is over; end with this exit code."""
 
     exit_code: int
     reason: str
 
 
-Effect = Say | Begin | Close | Leave
-
-
-@dataclass(frozen=True)
-class Assignment:
-    """One rollout to collect."""
-
-    ticket: int
-    lane: int
-    incarnation: int
-    """if it is not the one that lives here, the lane begins afresh"""
-    sequence: int
+Effect = Send | StartSession | CloseLanes | Leave
 
 
 @dataclass(frozen=True)
 class Task:
-    """Rollouts to collect side by side, all under these weights."""
+    """Rollouts to collect together, all under these weights."""
 
     session: int
     weights: Weights
@@ -106,37 +93,49 @@ class Identity:
     host: str
     pid: int
     life: int
-    """drawn at random: no two processes, or threads, have the same"""
+    """random number that tells this process, or thread, from any other of the same name"""
     software: str
 
 
-@dataclass
-class _Lane:
-    incarnation: int
-    sequence: int = 0
-    held: dict[int, int] = field(default_factory=dict)  # ticket -> oldest version that will do
-    kept: dict[int, Rollout] = field(default_factory=dict)  # ticket -> finished, and not known to have arrived
-    done: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED_TICKETS))
+@dataclass(frozen=True)
+class Statistics:
+    """Figures that a Heartbeat reports."""
+
+    steps: int = 0
+    """env steps since the worker started"""
+    stages: Mapping[str, float] = field(default_factory=dict)
+    """seconds in each stage"""
+    resident_bytes: int = 0
+    """resident memory of this process"""
 
 
 @dataclass
-class _Stay:
-    """What is held within one session; nothing of it outlives the session."""
+class _SessionState:
+    """All that belongs to one session. A new session starts with a new one."""
 
-    lanes: dict[int, _Lane] = field(default_factory=dict)
-    orders: Orders = field(default_factory=Orders)
+    rollouts: HeldRollouts = field(default_factory=HeldRollouts)
+    orders: HeldOrders = field(default_factory=HeldOrders)
     weights: Weights | None = None
-    in_hand: tuple[int, ...] = ()  # tickets being collected
-    replies: int = 0
-    said_version: int = -1  # newest version that a message of ours has named
+    in_progress: tuple[int, ...] = ()  # tickets
+    replies: int = 0  # number of the last HeartbeatReply
+    acknowledged_version: int = -1  # newest version that a message of this worker has named
 
     @property
     def version(self) -> int:
+        """Version of the weights; -1 before the first."""
         return -1 if self.weights is None else self.weights.version
+
+    def unfinished(self) -> tuple[int, ...]:
+        """Tickets that are not yet collected or executed."""
+        return (*self.rollouts.tickets(), *self.orders.tickets())
+
+    def lanes(self) -> tuple[LaneLife, ...]:
+        """The lanes of this worker."""
+        return (*self.rollouts.lanes(), *self.orders.lanes())
 
 
 class Session:
-    """One worker's side, from its first Hello to its last word."""
+    """State machine of one worker, from its first Hello until it leaves."""
 
     def __init__(
         self, identity: Identity, now: float, *, join_timeout_s: float = 60.0, rejoin_timeout_s: float = 600.0
@@ -145,31 +144,26 @@ class Session:
         self.state = State.JOINING
         self.run: RunSpec | StepSpec | None = None
         self.session = 0
-        self.steps = 0
-        """env steps since the worker started; the shell keeps it"""
-        self.stages: dict[str, float] = {}
-        """seconds in each stage; the shell keeps it"""
-        self.resident_bytes = 0
-        """memory of this process; the shell keeps it"""
-        self._patience_s = join_timeout_s
+        self._statistics = Statistics()
+        self._join_timeout_s = join_timeout_s
         self._rejoin_timeout_s = rejoin_timeout_s
         self._attempt = 0
-        self._heard_s = self._due_s = self._joining_s = now
+        self._last_heard_s = self._due_s = self._joining_s = now
         self._backoff_s = HELLO_FIRST_S
         self._reason = ""
-        self._stay = _Stay()
+        self._current = _SessionState()
         self._join(now)
 
-    # ---------------------------------------------------------------- in
+    # ---------------------------------------------------------------- messages and time
 
     def handle(self, message: ToWorker, now: float) -> list[Effect]:
-        """What the learner said."""
-        if isinstance(message, Drain):  # said again to one that drains already: a sign of life
-            self._heard_s = now
+        """Handle a message of the learner."""
+        if isinstance(message, Drain):  # a Drain also answers the heartbeats of a worker that drains already
+            self._last_heard_s = now
         if type(message) not in TABLE[self.state]:
             return []
         if not isinstance(message, Welcome) and getattr(message, "session", self.session) != self.session:
-            return []  # said to an earlier session of ours
+            return []  # it belongs to an earlier session of this worker
         match message:
             case Welcome():
                 return self._welcome(message, now)
@@ -179,104 +173,102 @@ class Session:
                 return self._drain(message, reason)
             case Rejoin():
                 return self._rejoin(message, "the learner does not know this session", now)
-        self._heard_s = now
+        self._last_heard_s = now
         match message:
             case Weights(version):
-                if version > self._stay.version:
-                    self._stay.weights = message
+                if version > self._current.version:
+                    self._current.weights = message
             case Collect(_, version, permits, received) if isinstance(self.run, RunSpec):
-                closed = self._arrived(received)
-                return closed + [effect for permit in permits for effect in self._permit(permit, version)]
+                closed = self._received(received)
+                again = [self._current.rollouts.take(permit, version) for permit in permits]
+                return closed + [Send(rollout) for rollout in again if rollout is not None]
             case Reset() | Step() | Call() if isinstance(self.run, StepSpec):
-                return [Say(answer) for answer in self._stay.orders.take(message)]
+                answer = self._current.orders.take(message)
+                return [] if answer is None else [Send(answer)]
             case Release(_, lanes):
                 return self._release(lanes)
             case HeartbeatReply(_, number, received):
-                self._stay.replies = max(number, self._stay.replies)
-                return self._arrived(received)
+                self._current.replies = max(number, self._current.replies)
+                return self._received(received)
         return []
 
     def tick(self, now: float) -> list[Effect]:
-        """What is due: Hello, Heartbeat (also to acknowledge new weights), or giving up on a silent learner."""
+        """Do what is due: Hello, Heartbeat (also to acknowledge new weights), or giving up on a silent learner."""
         match self.state:
             case State.LEFT:
                 return []
             case State.JOINING:
-                if now - self._joining_s > self._patience_s:
-                    return self._leave(Silence(), 1, f"{NO_LEARNER} for {self._patience_s:g} s")
+                if now - self._joining_s > self._join_timeout_s:
+                    return self._leave(LearnerSilent(), 1, f"{NO_LEARNER} for {self._join_timeout_s:g} s")
                 if now < self._due_s:
                     return []
                 self._due_s = now + self._backoff_s
                 self._backoff_s = min(2 * self._backoff_s, HELLO_MOST_S)
                 who = self.identity
-                return [Say(Hello(PROTOCOL_VERSION, who.worker, who.host, who.pid, who.life, who.software, self._attempt))]
+                return [Send(Hello(PROTOCOL_VERSION, who.worker, who.host, who.pid, who.life, who.software, self._attempt))]
         assert self.run is not None
-        if now - self._heard_s > self.run.learner_timeout_s:
-            return self._rejoin(Silence(), f"the learner was silent for {self.run.learner_timeout_s:.0f} s", now)
-        return self.breathe(now)
+        if now - self._last_heard_s > self.run.learner_timeout_s:
+            return self._rejoin(LearnerSilent(), f"the learner was silent for {self.run.learner_timeout_s:.0f} s", now)
+        return self.heartbeat_if_due(now)
 
-    def breathe(self, now: float) -> list[Effect]:
-        """A Heartbeat, if one is due; nothing else comes of it, so that it may be said in the middle of anything."""
+    def heartbeat_if_due(self, now: float) -> list[Effect]:
+        """A Heartbeat, if one is due. It changes nothing else, so it may be sent at any moment."""
         if self.run is None or self.state not in (State.READY, State.DRAINING):
             return []
-        if now < self._due_s and self._stay.said_version == self._stay.version:
+        if now < self._due_s and self._current.acknowledged_version == self._current.version:
             return []
         self._due_s = now + self.run.heartbeat_s
-        self._stay.said_version = self._stay.version
-        return [Say(self._heartbeat())]
+        self._current.acknowledged_version = self._current.version
+        return [Send(self._heartbeat())]
+
+    def update_statistics(self, statistics: Statistics) -> None:
+        """The next Heartbeat reports these."""
+        self._statistics = statistics
 
     def next_due_s(self) -> float:
-        """When `tick` wants to be called at the latest."""
+        """Time at which `tick` must be called at the latest."""
         return self._due_s
 
-    def terminate(self) -> list[Effect]:
-        """Leave: after the rollout in hand, or at once when asked twice."""
-        return [] if self.state is State.LEFT else self._drain(Terminate(), "told to stop")
+    def stop(self) -> list[Effect]:
+        """Leave: after the work in progress, or at once when called twice."""
+        return [] if self.state is State.LEFT else self._drain(StopRequested(), "told to stop")
 
-    def broke(self, error: str, traceback: str, lane: int | None) -> list[Effect]:
-        """The environment, or this worker, raised: tell the learner, and leave."""
-        told: list[Effect] = []
+    def fail(self, error: str, traceback: str, lane: int | None) -> list[Effect]:
+        """The environment, or this worker, raised: report it to the learner, and leave."""
+        effects: list[Effect] = []
         if self.state in (State.READY, State.DRAINING):
-            told.append(Say(Failure(self.session, error, traceback, lane)))
-        return [] if self.state is State.LEFT else told + self._leave(Broke(), 1, error)
+            effects.append(Send(Failure(self.session, error, traceback, lane)))
+        return [] if self.state is State.LEFT else effects + self._leave(WorkerFailed(), 1, error)
 
     def decline(self, reason: str) -> list[Effect]:
-        """Leave a run that this worker will not take part in."""
-        return [Say(Goodbye(self.session, reason, ())), *self._leave(Broke(), 2, reason)]
+        """Leave a run in which this worker cannot take part."""
+        return [Send(Goodbye(self.session, reason, ())), *self._leave(WorkerFailed(), 2, reason)]
 
-    def turned_away(self, reason: str) -> list[Effect]:
-        """The learner's end does not let this worker in, and will not."""
+    def refused(self, reason: str) -> list[Effect]:
+        """Leave, because the learner's endpoint rejects this worker for good."""
         return [] if self.state is State.LEFT else self._leave(Refuse(reason), 2, reason)
 
     # ---------------------------------------------------------------- collecting
 
     def next_task(self) -> Task | None:
-        """The oldest startable ticket of every lane, to be collected together; None when there is none."""
-        if self.state is not State.READY or self._stay.weights is None or self._stay.in_hand:
+        """The oldest ticket of every lane that can start, to be collected together. None when there is none."""
+        if self.state is not State.READY or self._current.weights is None or self._current.in_progress:
             return None
-        chosen = []
-        for number, lane in sorted(self._stay.lanes.items()):
-            startable = [ticket for ticket, version in lane.held.items() if version <= self._stay.version]
-            if startable:
-                chosen.append(Assignment(min(startable), number, lane.incarnation, lane.sequence))
-        if not chosen:
+        assignments = self._current.rollouts.startable(self._current.version)
+        if not assignments:
             return None
-        self._stay.in_hand = tuple(assignment.ticket for assignment in chosen)
-        return Task(self.session, self._stay.weights, tuple(chosen))
+        self._current.in_progress = tuple(assignment.ticket for assignment in assignments)
+        return Task(self.session, self._current.weights, assignments)
 
     def finished(self, rollouts: Sequence[Rollout]) -> list[Effect]:
-        """The task in hand is done."""
-        self._stay.in_hand = ()
+        """The task in progress has ended with these rollouts."""
+        self._current.in_progress = ()
         effects: list[Effect] = []
         for rollout in rollouts:
-            lane = self._stay.lanes.get(rollout.lane)
-            if rollout.session != self.session or lane is None or rollout.ticket not in lane.held:
+            if rollout.session != self.session or not self._current.rollouts.keep(rollout):
                 continue  # the session ended, or the lane was released, while it was collected
-            del lane.held[rollout.ticket]
-            lane.kept[rollout.ticket] = rollout
-            lane.sequence += 1
-            self._stay.said_version = max(self._stay.said_version, rollout.version)
-            effects.append(Say(rollout))
+            self._current.acknowledged_version = max(self._current.acknowledged_version, rollout.version)
+            effects.append(Send(rollout))
         if self.state is State.DRAINING:
             effects += self._goodbye()
         return effects
@@ -284,119 +276,91 @@ class Session:
     # ---------------------------------------------------------------- stepping in lock-step
 
     def next_order(self) -> Order | None:
-        """The oldest order that is not obeyed yet; it is in hand until `answered`."""
-        if self.state is not State.READY or self._stay.in_hand:
+        """The oldest order that is not yet executed. It is in progress until `answered`."""
+        if self.state is not State.READY or self._current.in_progress:
             return None
-        order = self._stay.orders.next()
-        self._stay.in_hand = () if order is None else (order.ticket,)
+        order = self._current.orders.next()
+        self._current.in_progress = () if order is None else (order.ticket,)
         return order
 
     def answered(self, answer: Answer) -> list[Effect]:
-        """The order in hand is obeyed."""
-        self._stay.in_hand = ()
-        said: list[Effect] = [Say(answer)] if answer.session == self.session and self._stay.orders.obeyed(answer) else []
-        return said + (self._goodbye() if self.state is State.DRAINING else [])
+        """The order in progress was executed with this answer."""
+        self._current.in_progress = ()
+        is_wanted = answer.session == self.session and self._current.orders.keep(answer)
+        effects: list[Effect] = [Send(answer)] if is_wanted else []
+        return effects + (self._goodbye() if self.state is State.DRAINING else [])
 
     def abandoned(self, session: int) -> bool:
-        """True when nobody wants any more what was asked for in this session."""
+        """True when the work of this session is no longer wanted."""
         return self.state in (State.JOINING, State.LEFT) or session != self.session
 
-    def in_memory(self) -> int:
-        """How many tickets and rollouts are held: at most what the learner has outstanding, so memory is bounded."""
-        return sum(len(lane.held) + len(lane.kept) for lane in self._stay.lanes.values())
+    def held_count(self) -> int:
+        """Number of tickets and rollouts that this worker holds."""
+        return len(self._current.rollouts)
 
     # ---------------------------------------------------------------- inside
 
     def _join(self, now: float) -> None:
-        """Begin to join, as if for the first time."""
+        """Start to join, as if for the first time."""
         self._attempt += 1
         self._joining_s = self._due_s = now
         self._backoff_s = HELLO_FIRST_S
-        self._stay = _Stay()
+        self._current = _SessionState()
 
     def _welcome(self, message: Welcome, now: float) -> list[Effect]:
         if message.attempt != self._attempt or (self.state is State.READY and message.session == self.session):
-            return []  # an answer to an earlier Hello, or a repeat
-        self._become(message)
-        self._stay = _Stay()
+            return []  # the answer to an earlier Hello, or a repeat
+        self._transition(message)
+        self._current = _SessionState()
         self.run, self.session = message.run, message.session
-        self._heard_s = now
+        self._last_heard_s = now
         self._due_s = now + message.run.heartbeat_s
-        self._patience_s = self._rejoin_timeout_s
-        return [Begin(message.run)]
+        self._join_timeout_s = self._rejoin_timeout_s
+        return [StartSession(message.run)]
 
     def _rejoin(self, event: object, reason: str, now: float) -> list[Effect]:
-        self._become(event)
+        self._transition(event)
         if self.state is State.LEFT:
             return [Leave(1, reason)]
-        closing = tuple(LaneLife(number, lane.incarnation) for number, lane in self._stay.lanes.items())
-        closing += self._stay.orders.lives()
+        lanes = self._current.lanes()
         self._join(now)
-        return [Close(closing), *self.tick(now)]
+        return [CloseLanes(lanes), *self.tick(now)]
 
-    def _permit(self, permit: Permit, version: int) -> list[Effect]:
-        lane = self._stay.lanes.get(permit.lane)
-        if lane is None or permit.incarnation > lane.incarnation:
-            lane = self._stay.lanes[permit.lane] = _Lane(permit.incarnation)
-        if permit.incarnation < lane.incarnation or permit.ticket in lane.held or permit.ticket in lane.done:
-            return []
-        if permit.ticket in lane.kept:
-            return [Say(lane.kept[permit.ticket])]
-        lane.held[permit.ticket] = version
-        return []
-
-    def _arrived(self, received: Sequence[Received]) -> list[Effect]:
-        """Let go of the rollouts that the learner has, and of lanes that live elsewhere (a Release was lost)."""
-        for theirs in received:
-            lane = self._stay.lanes.get(theirs.lane)
-            if lane is None or lane.incarnation != theirs.incarnation:
-                continue
-            for ticket, rollout in list(lane.kept.items()):
-                if rollout.sequence < theirs.below or rollout.sequence in theirs.ahead:
-                    del lane.kept[ticket]
-                    lane.done.append(ticket)
-        mine = {theirs.lane for theirs in received}
-        here = [LaneLife(number, lane.incarnation) for number, lane in self._stay.lanes.items()]
-        return self._release([life for life in (*here, *self._stay.orders.lives()) if life.lane not in mine])
+    def _received(self, received: Sequence[Received]) -> list[Effect]:
+        """Drop the rollouts that the learner has received, and the lanes that it does not list: their Release was lost."""
+        self._current.rollouts.forget_received(received)
+        listed = {of_lane.lane for of_lane in received}
+        return self._release([life for life in self._current.lanes() if life.lane not in listed])
 
     def _release(self, lives: Sequence[LaneLife]) -> list[Effect]:
-        gone = []
-        for life in lives:
-            lane = self._stay.lanes.get(life.lane)
-            if lane is not None and lane.incarnation <= life.incarnation:
-                del self._stay.lanes[life.lane]
-                gone.append(LaneLife(life.lane, lane.incarnation))
-        gone += self._stay.orders.release(lives)
-        return [Close(tuple(gone))] if gone else []
+        released = (*self._current.rollouts.release(lives), *self._current.orders.release(lives))
+        return [CloseLanes(released)] if released else []
 
     def _heartbeat(self) -> Heartbeat:
         return Heartbeat(
             session=self.session,
-            replies=self._stay.replies,
-            version=self._stay.version,
-            tickets=self._unfinished(),
-            steps=self.steps,
-            stages=dict(self.stages),
-            resident_bytes=self.resident_bytes,
+            replies=self._current.replies,
+            version=self._current.version,
+            tickets=self._current.unfinished(),
+            steps=self._statistics.steps,
+            stages=dict(self._statistics.stages),
+            resident_bytes=self._statistics.resident_bytes,
         )
 
     def _drain(self, event: object, reason: str) -> list[Effect]:
-        self._become(event)
+        self._transition(event)
         self._reason = reason
         if self.state is State.LEFT:
             return [Leave(0, reason)]
-        return [] if self._stay.in_hand else self._goodbye()
+        return [] if self._current.in_progress else self._goodbye()
 
     def _goodbye(self) -> list[Effect]:
-        said = Say(Goodbye(self.session, self._reason, self._unfinished()))
-        return [said, *self._leave(Emptied(), 0, self._reason)]
-
-    def _unfinished(self) -> tuple[int, ...]:
-        return (*(ticket for lane in self._stay.lanes.values() for ticket in lane.held), *self._stay.orders.held())
+        goodbye = Send(Goodbye(self.session, self._reason, self._current.unfinished()))
+        return [goodbye, *self._leave(WorkFinished(), 0, self._reason)]
 
     def _leave(self, event: object, exit_code: int, reason: str) -> list[Effect]:
-        self._become(event)
+        self._transition(event)
         return [Leave(exit_code, reason)]
 
-    def _become(self, event: object) -> None:
+    def _transition(self, event: object) -> None:
         self.state = TABLE[self.state][type(event)]

@@ -1,4 +1,4 @@
-"""Where a worker stands in the conversation, as a table: what each message, or event, makes of each state. Plain data."""
+"""State machine of a worker, as a table: the next state for each state and each message or event. Plain data."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from protocol.messages import (
 
 
 class State(Enum):
-    """Where a worker stands."""
+    """State of a worker in the conversation."""
 
     JOINING = "joining"
     READY = "ready"
@@ -28,31 +28,31 @@ class State(Enum):
     LEFT = "left"
 
 
-class Silence:
+class LearnerSilent:
     """Event: the learner has said nothing for `learner_timeout_s` (or, while joining, for too long)."""
 
 
-class Terminate:
-    """Event: this worker was asked to leave (SIGTERM)."""
+class StopRequested:
+    """Event: this worker was asked to leave, for example by SIGTERM."""
 
 
-class Emptied:
-    """Event: nothing is in hand any more."""
+class WorkFinished:
+    """Event: a draining worker has finished its work in progress."""
 
 
-class Broke:
+class WorkerFailed:
     """Event: the environment, or this worker, raised."""
 
 
-# What each state becomes; a message that is not listed is ignored in that state.
+# The next state. A message that is not listed is ignored in that state.
 TABLE: dict[State, dict[type, State]] = {
     State.JOINING: {
         Welcome: State.READY,
         Refuse: State.LEFT,
         Drain: State.LEFT,
-        Silence: State.LEFT,
-        Terminate: State.LEFT,
-        Broke: State.LEFT,
+        LearnerSilent: State.LEFT,
+        StopRequested: State.LEFT,
+        WorkerFailed: State.LEFT,
     },
     State.READY: {
         Weights: State.READY,
@@ -66,19 +66,19 @@ TABLE: dict[State, dict[type, State]] = {
         Rejoin: State.JOINING,
         Refuse: State.LEFT,
         Drain: State.DRAINING,
-        Silence: State.JOINING,
-        Terminate: State.DRAINING,
-        Broke: State.LEFT,
+        LearnerSilent: State.JOINING,
+        StopRequested: State.DRAINING,
+        WorkerFailed: State.LEFT,
     },
     State.DRAINING: {
         Weights: State.DRAINING,
         HeartbeatReply: State.DRAINING,
         Rejoin: State.LEFT,
         Refuse: State.LEFT,
-        Silence: State.LEFT,
-        Terminate: State.LEFT,
-        Emptied: State.LEFT,
-        Broke: State.LEFT,
+        LearnerSilent: State.LEFT,
+        StopRequested: State.LEFT,
+        WorkFinished: State.LEFT,
+        WorkerFailed: State.LEFT,
     },
     State.LEFT: {},
 }

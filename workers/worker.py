@@ -1,8 +1,8 @@
-"""The shell round a session: link + session + collector or stepper + signals. All decisions are the session's.
+"""Runs a session: connects it with the link, the collector or stepper, and signals. All decisions are the session's.
 
-The law: the inbox is emptied before a rollout starts, and looked into between env steps, so a worker answers while it
-collects and acts under the newest weights it holds. Whatever the environment does, the learner is told. In the lock-step of
-a vector environment, whose steps may take as long as the caller allows, a second thread says that this worker lives.
+The law: the worker reads all messages before a rollout starts, and again between env steps, so it answers while it collects
+and acts under the newest weights that it holds. Every failure of the environment is reported to the learner. In a vector
+environment, where one step may take as long as the caller allows, a second thread sends the heartbeats.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import socket
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -28,29 +28,50 @@ from protocol.wire.shared_memory import Handed
 from protocol.wire.weight_dtypes import widened
 from workers.collect.collector import Collector
 from workers.env_errors import LaneFailed
-from workers.heartbeat_thread import Breath
-from workers.session import Begin, Close, Effect, Identity, Leave, Say, Session, Task
-from workers.step.stepper import Stepper
+from workers.heartbeat_thread import HeartbeatThread
+from workers.session import CloseLanes, Effect, Identity, Leave, Send, Session, StartSession, Statistics, Task
+from workers.step.stepper import MAX_TRACEBACK, Stepper
 
 log = logging.getLogger("millrace.worker")
 
-PULSE_S = 0.05  # how often the inbox is looked into while collecting
-IDLE_S = 0.5  # longest sleep while idle, so that a signal or a dead parent is noticed
-MAX_TRACEBACK = 20_000  # characters
-ON_ITS_WAY_S = 0.02  # a message is announced by a bell, which is faster
+PULSE_S = 0.05  # time between two looks for messages while environments are stepped
+IDLE_S = 0.5  # longest wait while idle, so that a signal or the end of the parent process is noticed
+AFTER_BELL_S = 0.02  # longest wait for a message after the bell in shared memory, which is faster than the message
 STATM = Path("/proc/self/statm")  # pages: all, resident, …
-
 
 MakeCollector = Callable[[RunSpec], Collector]
 
 
-def acting_by_itself(run: RunSpec) -> Collector:
-    """Copies of its own, one lane after another, and a policy of its own."""
+def make_local_collector(run: RunSpec) -> Collector:
+    """A collector that has env copies and a policy of its own."""
     return Collector(run, make_policy(run.policy, run.images_dtype))
 
 
 class _Abandoned(Exception):
-    """Nobody wants the rollouts in hand any more."""
+    """The rollouts in progress are no longer wanted."""
+
+
+def _no_stop_requests() -> int:
+    return 0
+
+
+def _no_watchdog(now: float) -> None: ...
+
+
+@dataclass(frozen=True)
+class WorkerOptions:
+    """How a worker depends on its process."""
+
+    code: Code = Code.MODULES
+    """how much code the learner may make it run"""
+    stop_requests: Callable[[], int] = _no_stop_requests
+    """counts the requests to leave"""
+    feed_watchdog: Callable[[float], None] = _no_watchdog
+    """called now and then with the time, unless the environment hangs"""
+    shared_memory: Handed | None = None
+    """shared memory and bells, for a vector environment on this machine"""
+    make_collector: MakeCollector = make_local_collector
+    """what collects in a run, and how it acts"""
 
 
 class Worker:
@@ -60,30 +81,20 @@ class Worker:
         self,
         link: WorkerLink,
         session: Session,
-        *,
-        told_to_stop: Callable[[], int] = lambda: 0,
-        alive: Callable[[float], None] = lambda now: None,
-        code: Code = Code.MODULES,
-        handed: Handed | None = None,
-        make_collector: MakeCollector = acting_by_itself,
+        options: WorkerOptions | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`told_to_stop` counts the requests to leave; `alive` is called now and then, unless the environment hangs;
-        `code`: how much the learner may have it run; `handed`: shared memory and bells, for a vector environment of this
-        machine; `make_collector`: what collects in a run, and how it acts.
-        """
         self._link, self._session, self._clock = link, session, clock
-        self._told_to_stop, self._code = told_to_stop, code
-        self._alive = alive
-        self._stops_heeded = 0
-        self._handed, self._make_collector = handed, make_collector
+        self._options = options or WorkerOptions()
+        self._handled_stop_requests = 0
         self._collector: Collector | None = None
         self._stepper: Stepper | None = None
         self._loaded: Weights | None = None
         self._packing = link.packing
         self._pulse_due_s = 0.0
+        self._resident_bytes = 0
         self._left: Leave | None = None
-        self._breath = Breath(lambda: self._do(self._session.breathe(self._clock())))
+        self._heartbeats = HeartbeatThread(lambda: self._do(self._session.heartbeat_if_due(self._clock())))
         self._waited_s = 0.0
 
     def run(self) -> Leave:
@@ -93,35 +104,35 @@ class Worker:
                 self._do(self._session.tick(self._clock()))
                 if self._left is None:
                     idle_s = min(IDLE_S, max(0.0, self._session.next_due_s() - self._clock()))
-                    self._listen(self._serve(idle_s))
+                    self._listen(self._serve_shared_memory(idle_s))
                 while self._left is None and (task := self._session.next_task()) is not None:
                     self._collect(task)
                     self._listen(0.0)
                 while self._left is None and (order := self._session.next_order()) is not None:
-                    self._obey(order)
+                    self._execute(order)
                     self._listen(0.0)
         finally:
-            self._breath.stop()
+            self._heartbeats.stop()
             self._close_all()
             self._link.close()
         return self._left
 
     def _listen(self, timeout_s: float) -> None:
-        """Heed signals, then everything that has arrived."""
+        """Handle signals, then all messages that have arrived."""
         began_s = self._clock()
-        self._alive(began_s)
+        self._options.feed_watchdog(began_s)
         arrived = self._link.poll(timeout_s)
         self._waited_s += self._clock() - began_s
-        while self._stops_heeded < self._told_to_stop():
-            self._stops_heeded += 1
-            self._do(self._session.terminate())
+        while self._handled_stop_requests < self._options.stop_requests():
+            self._handled_stop_requests += 1
+            self._do(self._session.stop())
         if (trouble := self._link.trouble) is not None and trouble.final:
-            self._do(self._session.turned_away(trouble.line))
+            self._do(self._session.refused(trouble.line))
         if not arrived:
             return
         for message in self._link.receive():
             if isinstance(message, BadMessage):
-                log.warning("the learner sent what cannot be read: %s", message)
+                log.warning("the learner sent an unreadable message: %s", message)
             else:
                 self._do(self._session.handle(message, self._clock()))
 
@@ -140,115 +151,119 @@ class Worker:
         except _Abandoned:
             rollouts = []
         except Exception as error:
-            self._broke(error)
+            self._fail(error)
             return
-        self._account()
+        self._update_statistics()
         self._do(self._session.finished(rollouts))
 
-    def _obey(self, order: Order) -> None:
+    def _execute(self, order: Order) -> None:
         stepper = self._stepper
         assert stepper is not None
         try:
-            with self._breath.away():
-                answer = stepper.obey(order, lambda: self._pulse_back(order.session))
+            with self._heartbeats.lock_released():
+                answer = stepper.execute(order, lambda: self._pulse_from_env_code(order.session))
         except _Abandoned:
             return
         except Exception as error:
-            self._broke(error)
+            self._fail(error)
             return
         self._do(self._session.answered(answer))
 
-    def _serve(self, timeout_s: float) -> float:
-        """Step what shared memory asks for, if there is any, until there may be a message: how long to wait for it."""
+    def _serve_shared_memory(self, timeout_s: float) -> float:
+        """Execute the orders in shared memory, if it is used, until a message may have arrived. How long to wait for it."""
         stepper, session = self._stepper, self._session.session
-        if stepper is None or not stepper.shares:
+        if stepper is None or not stepper.uses_shared_memory:
             return timeout_s
-        rung = False
+        message_announced = False
         began_s, stepped_s = self._clock(), stepper.stages["step"]
         try:
-            with self._breath.away():
-                rung = stepper.serve(min(timeout_s, PULSE_S), lambda: self._pulse_back(session), session, self._say_back)
+            with self._heartbeats.lock_released():
+                message_announced = stepper.serve_shared_memory(
+                    min(timeout_s, PULSE_S), lambda: self._pulse_from_env_code(session), session, self._send_from_env_code
+                )
         except _Abandoned:
             pass
         except Exception as error:
-            self._broke(error)
+            self._fail(error)
         self._waited_s += self._clock() - began_s - (stepper.stages["step"] - stepped_s)
-        self._account()
-        return ON_ITS_WAY_S if rung else 0.0
+        self._update_statistics()
+        return AFTER_BELL_S if message_announced else 0.0
 
     def _pulse(self, session: int) -> None:
-        """Show, now and then, that this worker is alive. Raises `_Abandoned` once nobody wants what it does."""
+        """Every `PULSE_S`, handle messages and send what is due. Raises `_Abandoned` once the work is no longer wanted."""
         now = self._clock()
         if now >= self._pulse_due_s:
             self._pulse_due_s = now + PULSE_S
-            self._account()
-            self._session.resident_bytes = _resident_bytes()
+            self._resident_bytes = _resident_bytes()
+            self._update_statistics()
             self._listen(0.0)
             self._do(self._session.tick(now))
             if self._session.abandoned(session):
                 raise _Abandoned
 
-    def _pulse_back(self, session: int) -> None:
-        """The same, out of the midst of orders."""
+    def _pulse_from_env_code(self, session: int) -> None:
+        """The same, called while an order is executed."""
         if self._clock() >= self._pulse_due_s:
-            with self._breath.back():
+            with self._heartbeats.lock_reacquired():
                 self._pulse(session)
 
-    def _say_back(self, answer: Stepped) -> None:
-        with self._breath.back():
-            self._do([Say(answer)])
+    def _send_from_env_code(self, answer: Stepped) -> None:
+        with self._heartbeats.lock_reacquired():
+            self._do([Send(answer)])
 
-    def _broke(self, error: Exception) -> None:
-        """The environment's code raised, or ours on its data: the learner must hear of either."""
+    def _fail(self, error: Exception) -> None:
+        """The environment's code raised, or ours on its data: report it to the learner."""
         detail = error.detail if isinstance(error, OurError) else traceback.format_exc()
         lane = error.lane if isinstance(error, LaneFailed) else None
         log.error("%s\n%s", error, detail)
-        self._do(self._session.broke(_line(error), detail[-MAX_TRACEBACK:], lane))
+        self._do(self._session.fail(_line(error), detail[-MAX_TRACEBACK:], lane))
 
-    def _account(self) -> None:
-        if (busy := self._collector or self._stepper) is not None:
-            self._session.steps = busy.steps
-            self._session.stages = {**busy.stages, "wait": self._waited_s}
+    def _update_statistics(self) -> None:
+        if (source := self._collector or self._stepper) is not None:
+            stages = {**source.stages, "wait": self._waited_s}
+            self._session.update_statistics(Statistics(source.steps, stages, self._resident_bytes))
 
     def _do(self, effects: list[Effect]) -> None:
         for effect in effects:
             match effect:
-                case Say(message):
+                case Send(message):
                     self._link.send(encode(message, self._packing))
-                case Begin(run):
-                    self._begin(run)
-                case Close(lanes):
-                    if (busy := self._collector or self._stepper) is not None:
-                        busy.close([life.lane for life in lanes])
+                case StartSession(run):
+                    self._start_session(run)
+                case CloseLanes(lanes):
+                    if (owner := self._collector or self._stepper) is not None:
+                        owner.close([life.lane for life in lanes])
                 case Leave():
                     self._left = effect
 
-    def _begin(self, run: RunSpec | StepSpec) -> None:
-        """A new session: a new collector or stepper, and nothing of the old one."""
+    def _start_session(self, run: RunSpec | StepSpec) -> None:
+        """Make a new collector or stepper; nothing of the old one is kept."""
         self._close_all()
         self._collector = self._stepper = None
-        if why := run.why_not(self._code):
+        if why := run.why_not(self._options.code):
             self._do(self._session.decline(why))
             return
         try:
             match run:
                 case RunSpec():
-                    self._collector = self._make_collector(run)
+                    self._collector = self._options.make_collector(run)
                     self._packing = replace(self._link.packing, zstd=run.compress == "zstd")
                 case StepSpec():
-                    self._stepper = Stepper(run, self._handed, private=self._code is not Code.REGISTERED)
-                    self._breath.start()
+                    self._stepper = Stepper(
+                        run, self._options.shared_memory, allow_private_names=self._options.code is not Code.REGISTERED
+                    )
+                    self._heartbeats.start()
             self._loaded = None
         except (OurError, ImportError, ValueError) as error:
-            self._do(self._session.broke(_line(error), traceback.format_exc(), None))
+            self._do(self._session.fail(_line(error), traceback.format_exc(), None))
 
     def _close_all(self) -> None:
-        if (busy := self._collector or self._stepper) is not None:
-            busy.close_all()
+        if (owner := self._collector or self._stepper) is not None:
+            owner.close_all()
 
 
 def _resident_bytes() -> int:
-    """Memory of this process; 0 where the system does not tell it so. As long as five steps of CartPole: ask rarely."""
+    """Resident memory of this process; 0 on a system without /proc. It takes as long as five steps of CartPole."""
     try:
         return int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except OSError:
@@ -262,7 +277,7 @@ def _line(error: Exception) -> str:
 
 
 def identity(name: str) -> Identity:
-    """Who this process (or thread of it) is."""
+    """Identity of this process, or of a thread of it."""
     try:
         software = f"millrace {version('millrace-rl')}"
     except PackageNotFoundError:

@@ -21,7 +21,7 @@ from protocol.keys.key_folder import TOKEN_VARIABLE, read_token
 from protocol.messages import Inquire, Status, WorkerStatus
 from protocol.wire.codec import encode
 from protocol.wire.link import WorkerLink
-from workers.code_trust import entry
+from workers.security import checked_token
 
 ASK_AGAIN_S = WATCH_EVERY_S = 1.0
 DROPS = {
@@ -49,7 +49,7 @@ def status(argv: list[str], out: TextIO) -> None:
     )  # fmt: skip
     arguments.flag("--insecure", action="store_true", help="ask on another machine without a token, and trust the answer")
     values = arguments.parse(argv)
-    token = entry(values.address, read_token(values.token), insecure=values.insecure)
+    token = checked_token(values.address, read_token(values.token), insecure=values.insecure)
     link = WorkerLink(values.address, observer_name(), token=token)
     try:
         while True:

@@ -29,7 +29,7 @@ from protocol.wire.link import LearnerLink
 from workers.collect.collector import Collector
 from workers.collect.split_vector_env import SideBySide
 from workers.env_loop import Pulse
-from workers.host import Host, Thread
+from workers.host import Host, WorkerThread
 
 
 def train(
@@ -70,7 +70,7 @@ def train(
         def collector(spec: RunSpec) -> Collector:
             return Collector(spec, acting_policy(spec.policy, run.device, spec.images_dtype), lanes.open, lanes.begin)
 
-        host = Host(lambda name: Thread(link.address, name, context, collector), 1, called="inference")
+        host = Host(lambda name: WorkerThread(link.address, name, context, collector), 1, prefix="inference")
         stack.callback(host.stop)
         stack.callback(host.ask_to_leave)  # asked a second time, it leaves at once
 

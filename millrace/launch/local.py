@@ -19,7 +19,7 @@ from protocol.errors import UsageError
 from protocol.keys.keys import Token
 from protocol.specs import EnvSpec
 from protocol.wire.link import LearnerLink
-from workers.host import Host, Process, Running, Thread
+from workers.host import Host, Running, WorkerCommand, WorkerProcess, WorkerThread
 
 
 def train(config: Config, resume: Path | None, watch: Watch, factory: Callable[..., object] | None = None) -> Path:
@@ -57,11 +57,11 @@ def _starter(
     config: Config, address: str, token: Token | None, context: zmq.Context[zmq.Socket[bytes]], run: Path
 ) -> Callable[[str], Running]:
     if config.transport == "inproc":
-        return lambda name: Thread(address, name, context)
+        return lambda name: WorkerThread(address, name, context)
     flags = flags_of(config, run)
 
-    def start(name: str) -> Process:
+    def start(name: str) -> WorkerProcess:
         own, log = flags(name)
-        return Process(address, name, log, token, own)
+        return WorkerProcess(WorkerCommand(address, name, log, token, own))
 
     return start

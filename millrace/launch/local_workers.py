@@ -19,7 +19,7 @@ from learner.members.endpoint import throwaway
 from protocol.errors import UsageError
 from protocol.keys.key_folder import Keyring, asked_folder
 from protocol.keys.keys import Token
-from workers.host import keeping_to
+from workers.host import core_flags
 
 StartFlags = Callable[[str], tuple[list[str], Path | None]]
 """By a worker's name: the flags that its process is started with, and the file that its stderr goes to."""
@@ -53,7 +53,7 @@ def flags_of(config: Config, run: Path) -> StartFlags:
     cores = cores_for(config)
 
     def flags(name: str) -> tuple[list[str], Path]:
-        return ["--step-timeout-s", str(config.step_timeout_s), *keeping_to(cores, name)], logs / f"{name}.log"
+        return ["--step-timeout-s", str(config.step_timeout_s), *core_flags(cores, name)], logs / f"{name}.log"
 
     return flags
 

@@ -28,7 +28,7 @@ from protocol.keys.key_folder import Keyring
 from protocol.keys.keys import Token
 from protocol.wire.link import LearnerLink
 from protocol.wire.shared_memory import POSSIBLE, SPIN_S, Bell, Handed, Memory
-from workers.host import Host, Process, Running, Thread
+from workers.host import Host, Running, WorkerCommand, WorkerProcess, WorkerThread
 
 log = logging.getLogger("millrace.learner")
 
@@ -98,15 +98,15 @@ class ListeningVectorEnv:
     def _starter(self, flags: StartFlags) -> Callable[[str], Running]:
         """A function that starts the local worker of a name."""
         if self.settings.transport == "inproc":
-            return lambda name: Thread(self.link.address, name, self.context)
+            return lambda name: WorkerThread(self.link.address, name, self.context)
 
-        def start(name: str) -> Process:
+        def start(name: str) -> WorkerProcess:
             handed = None
             if self.shared is not None:
                 to_worker, to_learner = self.shared.bells[name]
                 handed = Handed(self.shared.memory.fd, to_worker.hears, to_learner.rings)
             worker_flags, log_file = flags(name)
-            return Process(self.link.address, name, log_file, self.token, worker_flags, handed)
+            return WorkerProcess(WorkerCommand(self.link.address, name, log_file, self.token, worker_flags, handed))
 
         return start
 

@@ -23,7 +23,7 @@ from protocol.policy.policy import make_policy
 from protocol.rollout import Batch, Rollout, stack
 from protocol.specs import EnvSpec, RunSpec
 from workers.collect.collector import Collector
-from workers.session import Assignment
+from workers.collect.held_rollouts import Assignment
 
 
 def ppo(config: Config) -> PPOConfig:

@@ -28,6 +28,7 @@ from protocol.messages import PROTOCOL_VERSION, Collect, Hello, Permit, Received
 from protocol.wire import codec, link
 from protocol.wire import compression as packing
 from workers import session, states
+from workers.collect import held_rollouts
 
 DOCUMENT = Path(__file__).parents[2] / "protocol" / "README.md"
 BEGIN, END = "<!-- generated {name}: `make docs` writes what follows -->", "<!-- end of {name} -->"
@@ -93,7 +94,7 @@ LIMITS: Mapping[tuple[ModuleType, str], str] = {
     (packing, "LEAST_FRAME_BYTES"): "bytes of a frame of such a stack, at least",
     (session, "HELLO_FIRST_S"): "seconds from the first Hello to the second; each wait is twice the last",
     (session, "HELLO_MOST_S"): "seconds between two Hello at most",
-    (session, "REMEMBERED_TICKETS"): "finished tickets of a lane that a worker remembers, to know a late repeat",
+    (held_rollouts, "REMEMBERED_TICKETS"): "finished tickets of a lane that a worker remembers, to know a late repeat",
     (roster, "STRIKES"): "messages or rollouts that cannot be used, after which a worker is refused",
     (membership, "REMEMBERED_REFUSALS"): "refused processes that the learner remembers, so that they do not come back",
     (handshake, "HANDSHAKE_MS"): "milliseconds that a connection may take to say who it is",
@@ -281,7 +282,7 @@ def test_every_record_that_travels_is_described() -> None:
 
 
 def test_every_limit_is_in_the_document() -> None:
-    for module in (codec, link, packing, session, roster, messages, rollout, specs):
+    for module in (codec, link, packing, session, held_rollouts, roster, messages, rollout, specs):
         for name in re.findall(r"^(MAX_\w+) = ", inspect.getsource(module), re.MULTILINE):
             assert (module, name) in LIMITS, f"say in LIMITS what {name} bounds"
 

@@ -20,7 +20,7 @@ from protocol.rollout import Rollout, validate
 from protocol.specs import EnvSpec, PolicySpec, RunSpec
 from workers.collect.collector import Collector, OpenCopies, copies_of
 from workers.collect.env_copies import LoopedCopies, VectorCopies
-from workers.session import Assignment
+from workers.collect.held_rollouts import Assignment
 
 TOY = "workers.envs.toy:"
 VERSION, SESSION = 7, 3

@@ -19,7 +19,7 @@ from learner.rollouts.ledger import Ledger
 from learner.rollouts.roster import Out, Roster
 from protocol.messages import Rollout, ToLearner, ToWorker
 from protocol.specs import ActionSpec, EnvSpec, Leaf, PolicySpec, RunSpec
-from workers.session import Effect, Identity, Leave, Say, Session, Task
+from workers.session import Effect, Identity, Leave, Send, Session, Task
 
 PARAMETERS = np.zeros(1, np.float32)
 BUFFERS = np.zeros(0, np.float32)
@@ -156,7 +156,7 @@ class World:
     def say(self, worker: FakeWorker, effects: list[Effect]) -> None:
         for effect in effects:
             match effect:
-                case Say(message):
+                case Send(message):
                     self.carry((worker.name, "up"), lambda m=message: self._hears(worker.name, m))  # type: ignore[misc]
                 case Leave():
                     self.workers.pop(worker.name, None)
@@ -318,7 +318,7 @@ class World:
         running = [worker for worker in self.workers.values() if not worker.frozen]
         if len(running) > 1:
             worker = self.random.choice(sorted(running, key=lambda worker: worker.name))
-            self.say(worker, worker.session.terminate())
+            self.say(worker, worker.session.stop())
 
     # ------------------------------------------------------------ the rules
 
@@ -340,5 +340,5 @@ class World:
             assert roster.lanes[ticket.lane].owner == ticket.peer, "a ticket of a lane that its worker does not own"
         if self.epoch == 0:
             for worker in self.workers.values():
-                holds = worker.session.in_memory()
+                holds = worker.session.held_count()
                 assert holds <= self.per_update * (1 + self.max_lag), f"{worker.name!r} holds {holds} rollouts"

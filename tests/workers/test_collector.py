@@ -30,8 +30,8 @@ from tests.support.collectors import (
 )
 from workers.collect.collector import Collector
 from workers.collect.env_copies import copy_seeds
+from workers.collect.held_rollouts import Assignment
 from workers.envs.toy import Countdown, Scripted
-from workers.session import Assignment
 
 # ------------------------------------------------------------------------------------------------ the same bits
 

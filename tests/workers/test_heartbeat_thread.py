@@ -6,26 +6,26 @@ import threading
 
 import pytest
 
-from workers import heartbeat_thread as breath
-from workers.heartbeat_thread import Breath
+from workers import heartbeat_thread
+from workers.heartbeat_thread import HeartbeatThread
 
 SOON_S = 10.0
 
 
 @pytest.fixture(autouse=True)
 def often(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(breath, "EVERY_S", 0.001)
+    monkeypatch.setattr(heartbeat_thread, "INTERVAL_S", 0.001)
 
 
 def test_it_breathes_while_the_first_thread_is_away() -> None:
     breathed = threading.Event()
-    made = Breath(breathed.set)
+    made = HeartbeatThread(breathed.set)
     made.start()
     made.start()
-    with made.away():
+    with made.lock_released():
         assert breathed.wait(SOON_S)
     made.stop()
-    assert not any(thread.name == "breath" for thread in threading.enumerate())
+    assert not any(thread.name == "heartbeat" for thread in threading.enumerate())
 
 
 def test_it_holds_its_breath_while_the_first_thread_is_here_or_back() -> None:
@@ -37,15 +37,15 @@ def test_it_holds_its_breath_while_the_first_thread_is_here_or_back() -> None:
             meetings.append("both")
         breathed.set()
 
-    made = Breath(breathe)
+    made = HeartbeatThread(breathe)
     inside.set()
     made.start()
     for _ in range(100):
         inside.clear()
-        with made.away():
+        with made.lock_released():
             breathed.clear()
             assert breathed.wait(SOON_S)
-            with made.back():
+            with made.lock_reacquired():
                 inside.set()
                 breathed.clear()
                 assert not breathed.wait(0.002)
@@ -57,8 +57,8 @@ def test_it_holds_its_breath_while_the_first_thread_is_here_or_back() -> None:
 
 def test_what_the_environment_raises_brings_the_first_thread_back() -> None:
     breathed = threading.Event()
-    made = Breath(breathed.set)
-    with pytest.raises(KeyError), made.away():
+    made = HeartbeatThread(breathed.set)
+    with pytest.raises(KeyError), made.lock_released():
         raise KeyError
     made.start()
     assert not breathed.wait(0.01)
@@ -66,4 +66,4 @@ def test_what_the_environment_raises_brings_the_first_thread_back() -> None:
 
 
 def test_one_that_never_started_can_be_stopped() -> None:
-    Breath(lambda: None).stop()
+    HeartbeatThread(lambda: None).stop()

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from workers.host import BACKOFF_FIRST_S, BACKOFF_MOST_S, HEALTHY_S, LEAVE_WITHIN_S, NOBODY, POLL_S, Host
+from workers.host import BACKOFF_FIRST_S, BACKOFF_MOST_S, EXIT_NO_LEARNER, HEALTHY_S, LEAVE_WITHIN_S, POLL_S, Host
 
 
 @dataclass
@@ -74,7 +74,7 @@ def test_a_worker_that_was_healthy_starts_anew() -> None:
     assert machine.pause_s() == pytest.approx(BACKOFF_FIRST_S, abs=0.11)
 
 
-@pytest.mark.parametrize("code", [0, 2, NOBODY])
+@pytest.mark.parametrize("code", [0, 2, EXIT_NO_LEARNER])
 def test_one_that_left_on_purpose_or_was_refused_stays_away(code: int) -> None:
     machine = Machine()
     assert machine.die(code) == [("w0", "why")]
@@ -99,14 +99,21 @@ def test_stopping_asks_all_waits_for_all_and_starts_nobody() -> None:
 
 
 @pytest.mark.parametrize(
-    ("codes", "expected"), [([0, 0], 0), ([0, NOBODY], 1), ([2, NOBODY], 2), ([0, 2], 2), ([NOBODY, NOBODY], 1)]
+    ("codes", "expected"),
+    [
+        ([0, 0], 0),
+        ([0, EXIT_NO_LEARNER], 1),
+        ([2, EXIT_NO_LEARNER], 2),
+        ([0, 2], 2),
+        ([EXIT_NO_LEARNER, EXIT_NO_LEARNER], 1),
+    ],
 )
 def test_a_host_that_nobody_is_left_on_says_what_became_of_them(codes: list[int], expected: int) -> None:
     machine = Machine(workers=2)
     for (_, running), code in zip(machine.started, codes, strict=True):
         running.end = (code, f"ended with {code}")
     said: list[str] = []
-    assert machine.host.keep(lambda: 0, said.append) == expected
+    assert machine.host.run(lambda: 0, said.append) == expected
     assert said == [f"w0 ended with {codes[0]}", f"w1 ended with {codes[1]}"]
 
 
@@ -124,7 +131,7 @@ def test_every_request_to_stop_is_passed_on_and_patience_has_an_end(monkeypatch:
             worker.end = (-9, "was killed")
 
     monkeypatch.setattr("workers.host.time.sleep", sleeps)
-    assert machine.host.keep(lambda: requests, lambda line: None) == 1
+    assert machine.host.run(lambda: requests, lambda line: None) == 1
     assert worker.asked == ["stop", "stop", "stop", "wait"]
     assert machine.now == pytest.approx(1 + LEAVE_WITHIN_S, abs=5 * POLL_S)
     assert len(machine.started) == 1

@@ -35,16 +35,18 @@ from protocol.messages import (
     Welcome,
 )
 from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollouts, run_spec
+from workers.collect.held_rollouts import REMEMBERED_TICKETS
 from workers.session import (
     HELLO_FIRST_S,
     HELLO_MOST_S,
-    Begin,
-    Close,
+    CloseLanes,
     Effect,
     Identity,
     Leave,
-    Say,
+    Send,
     Session,
+    StartSession,
+    Statistics,
     Task,
 )
 from workers.states import TABLE, State
@@ -59,7 +61,7 @@ JOIN_S, REJOIN_S = 60.0, 600.0
 
 def said(effects: Sequence[Effect], kind: type[M]) -> list[M]:
     """The messages of this kind among the effects."""
-    return [effect.message for effect in effects if isinstance(effect, Say) and isinstance(effect.message, kind)]
+    return [effect.message for effect in effects if isinstance(effect, Send) and isinstance(effect.message, kind)]
 
 
 def weights(version: int) -> Weights:
@@ -151,7 +153,7 @@ def test_a_new_joining_raises_the_attempt_and_begins_the_backoff_again() -> None
 def test_welcome_begins_a_session() -> None:
     session = joining()
     session.tick(0.0)
-    assert session.handle(Welcome(SESSION, 1, RUN), 0.1) == [Begin(RUN)]
+    assert session.handle(Welcome(SESSION, 1, RUN), 0.1) == [StartSession(RUN)]
     assert (session.state, session.session, session.run) == (State.READY, SESSION, RUN)
 
 
@@ -160,20 +162,20 @@ def test_welcome_for_an_older_attempt_is_ignored() -> None:
     session.handle(Rejoin(SESSION), 1.0)
     assert session.handle(Welcome(12, 1, RUN), 1.1) == []
     assert session.state is State.JOINING
-    assert session.handle(Welcome(13, 2, RUN), 1.2) == [Begin(RUN)]
+    assert session.handle(Welcome(13, 2, RUN), 1.2) == [StartSession(RUN)]
 
 
 def test_a_repeated_welcome_is_ignored() -> None:
     session = ready(collect((0, 0)))
     assert session.handle(Welcome(SESSION, 1, RUN), 0.1) == []
-    assert session.in_memory() == 1
+    assert session.held_count() == 1
 
 
 def test_welcome_to_another_session_of_the_same_attempt_begins_afresh() -> None:
     """The learner gave this worker up, then heard a late Hello of it."""
     session = ready(collect((0, 0)))
-    assert session.handle(Welcome(12, 1, RUN), 0.1) == [Begin(RUN)]
-    assert (session.session, session.in_memory()) == (12, 0)
+    assert session.handle(Welcome(12, 1, RUN), 0.1) == [StartSession(RUN)]
+    assert (session.session, session.held_count()) == (12, 0)
 
 
 def test_whatever_else_is_said_while_joining_is_ignored() -> None:
@@ -181,7 +183,7 @@ def test_whatever_else_is_said_while_joining_is_ignored() -> None:
     session.tick(0.0)
     for message in (weights(0), collect((0, 0)), HeartbeatReply(0, 1, ()), Release(0, (LaneLife(0, 0),)), Rejoin(0)):
         assert session.handle(message, 0.1) == []
-    assert (session.state, session.in_memory()) == (State.JOINING, 0)
+    assert (session.state, session.held_count()) == (State.JOINING, 0)
 
 
 def test_joining_for_too_long_is_given_up_with_exit_code_1() -> None:
@@ -206,7 +208,7 @@ def test_one_that_had_joined_waits_longer_for_a_learner_to_come_back() -> None:
 
 def test_a_repeated_collect_is_collected_once() -> None:
     session = ready(collect((0, 0)), collect((0, 0)))
-    assert session.in_memory() == 1
+    assert session.held_count() == 1
     assert len(collected(session)) == 1
     assert session.next_task() is None
 
@@ -231,9 +233,9 @@ def test_a_rollout_is_kept_until_received_says_that_it_has_arrived_and_then_forg
     session = ready(collect((0, 0)))
     collected(session)
     session.handle(HeartbeatReply(SESSION, 1, lanes(0, below=0)), 1.0)
-    assert session.in_memory() == 1
+    assert session.held_count() == 1
     session.handle(HeartbeatReply(SESSION, 2, lanes(0, below=1)), 2.0)
-    assert session.in_memory() == 0
+    assert session.held_count() == 0
 
 
 def test_a_rollout_that_arrived_ahead_of_a_lost_one_is_forgotten_and_the_lost_one_kept() -> None:
@@ -241,7 +243,7 @@ def test_a_rollout_that_arrived_ahead_of_a_lost_one_is_forgotten_and_the_lost_on
     first, second = collected(session) + collected(session)
     assert (first.sequence, second.sequence) == (0, 1)
     session.handle(HeartbeatReply(SESSION, 1, lanes(0, below=0, ahead=(1,))), 1.0)
-    assert session.in_memory() == 1
+    assert session.held_count() == 1
     assert said(session.handle(collect((0, 0)), 1.0), Rollout) == [first]
 
 
@@ -249,14 +251,14 @@ def test_collect_too_says_what_has_arrived() -> None:
     session = ready(collect((0, 0)))
     collected(session)
     session.handle(collect((1, 0), received=lanes(0, below=1)), 0.1)
-    assert session.in_memory() == 1  # the new ticket
+    assert session.held_count() == 1  # the new ticket
 
 
 def test_received_of_another_life_of_the_lane_forgets_nothing() -> None:
     session = ready(collect((0, 0), incarnation=1))
     collected(session)
     session.handle(HeartbeatReply(SESSION, 1, lanes(0, below=9, incarnation=0)), 1.0)
-    assert session.in_memory() == 1
+    assert session.held_count() == 1
 
 
 def test_a_late_repeat_of_a_ticket_whose_rollout_has_arrived_is_known_for_what_it_is() -> None:
@@ -322,11 +324,11 @@ def test_what_is_in_memory_is_bounded_by_what_the_learner_has_outstanding() -> N
         fresh = [(issued + n, 0) for n in range(5)]
         session.handle(collect(*fresh, received=lanes(0, below=arrived)), 0.1)
         issued += 5
-        assert session.in_memory() <= 5
+        assert session.held_count() <= 5
         while session.next_task() is not None:
             session.finished([])
             arrived += len(collected(session))
-            assert session.in_memory() <= 5
+            assert session.held_count() <= 5
     assert arrived == issued == 500
 
 
@@ -335,7 +337,7 @@ def test_what_is_remembered_of_old_tickets_is_bounded() -> None:
     for ticket in range(200):
         session.handle(collect((ticket, 0), received=lanes(0, below=ticket)), 0.1)
         collected(session)
-    assert len(session._stay.lanes[0].done) <= 64
+    assert len(session._current.rollouts._lanes[0].finished) <= REMEMBERED_TICKETS == 64
 
 
 # -------------------------------------------------------------------- acknowledging
@@ -360,7 +362,7 @@ def test_a_rollout_acknowledges_the_weights_it_was_acted_under() -> None:
 def test_a_heartbeat_every_heartbeat_s_says_all_that_is_held() -> None:
     session = ready(collect((7, 0), (8, 1), version=9))
     session.handle(HeartbeatReply(SESSION, 4, lanes(0, 1)), 0.5)
-    session.steps, session.stages = 120, {"env": 0.5}
+    session.update_statistics(Statistics(120, {"env": 0.5}, 0))
     assert session.tick(0.9) == []
     (heartbeat,) = said(session.tick(1.0), Heartbeat)
     assert heartbeat == Heartbeat(SESSION, 4, 0, (7, 8), 120, {"env": 0.5}, 0)
@@ -388,7 +390,7 @@ def test_a_higher_incarnation_starts_the_lane_afresh_with_sequence_0() -> None:
     session = ready(collect((0, 0), (1, 0)))
     collected(session)
     session.handle(collect((2, 0), incarnation=1), 0.1)
-    assert session.in_memory() == 1  # the old life's ticket and rollout are gone
+    assert session.held_count() == 1  # the old life's ticket and rollout are gone
     (assignment,) = task_of(session).assignments
     assert (assignment.ticket, assignment.incarnation, assignment.sequence) == (2, 1, 0)
 
@@ -396,22 +398,22 @@ def test_a_higher_incarnation_starts_the_lane_afresh_with_sequence_0() -> None:
 def test_a_ticket_of_an_older_life_is_ignored() -> None:
     session = ready(collect((2, 0), incarnation=1))
     session.handle(collect((1, 0), received=lanes(0, incarnation=1)), 0.1)
-    assert session.in_memory() == 1
+    assert session.held_count() == 1
     assert task_of(session).assignments[0].ticket == 2
 
 
 def test_release_closes_the_lane_and_forgets_what_was_held_for_it() -> None:
     session = ready(collect((0, 0), (1, 1)))
     collected(session)
-    assert session.handle(Release(SESSION, (LaneLife(0, 0),)), 0.1) == [Close((LaneLife(0, 0),))]
-    assert session.in_memory() == 1
+    assert session.handle(Release(SESSION, (LaneLife(0, 0),)), 0.1) == [CloseLanes((LaneLife(0, 0),))]
+    assert session.held_count() == 1
     assert session.handle(Release(SESSION, (LaneLife(0, 0),)), 0.2) == []  # a repeat
 
 
 def test_a_late_release_does_not_close_a_later_life() -> None:
     session = ready(collect((0, 0), incarnation=2))
     assert session.handle(Release(SESSION, (LaneLife(0, 1),)), 0.1) == []
-    assert session.in_memory() == 1
+    assert session.held_count() == 1
 
 
 @pytest.mark.parametrize(
@@ -421,7 +423,7 @@ def test_a_late_release_does_not_close_a_later_life() -> None:
 )
 def test_a_lane_missing_from_received_is_closed(message: ToWorker) -> None:
     session = ready(collect((0, 0), (1, 1)))
-    assert session.handle(message, 1.0) == [Close((LaneLife(0, 0),))]
+    assert session.handle(message, 1.0) == [CloseLanes((LaneLife(0, 0),))]
 
 
 def test_a_rollout_of_a_lane_that_was_released_while_it_was_collected_is_not_said() -> None:
@@ -440,10 +442,10 @@ def test_nothing_of_a_session_outlives_it() -> None:
     session.finished(rollouts)
     session.handle(HeartbeatReply(SESSION, 9, lanes(0, 1)), 0.1)
     closed, *_ = session.handle(Rejoin(SESSION), 1.0)
-    assert closed == Close((LaneLife(0, 0), LaneLife(1, 0)))
-    assert session.in_memory() == 0
+    assert closed == CloseLanes((LaneLife(0, 0), LaneLife(1, 0)))
+    assert session.held_count() == 0
     session.handle(Welcome(12, 2, RUN), 1.1)
-    assert session.in_memory() == 0
+    assert session.held_count() == 0
     assert session.next_task() is None
     (heartbeat,) = said(session.tick(2.2), Heartbeat)
     assert (heartbeat.session, heartbeat.replies, heartbeat.version, heartbeat.tickets) == (12, 0, -1, ())
@@ -459,7 +461,7 @@ def test_a_task_of_an_ended_session_is_abandoned_and_its_rollouts_are_not_said()
     assert session.abandoned(task.session)
     session.handle(msgspec.structs.replace(collect((0, 0)), session=12), 1.2)  # the same ticket number again
     assert session.finished(fake_rollouts(task)) == []
-    assert session.in_memory() == 1
+    assert session.held_count() == 1
 
 
 def test_a_message_of_another_session_is_ignored() -> None:
@@ -472,7 +474,7 @@ def test_a_message_of_another_session_is_ignored() -> None:
         Rejoin(other),
     ):
         assert session.handle(message, 1.0) == []
-    assert (session.state, session.in_memory()) == (State.READY, 1)
+    assert (session.state, session.held_count()) == (State.READY, 1)
     assert said(session.tick(1.0), Heartbeat)[0].replies == 0
 
 
@@ -480,7 +482,7 @@ def test_rejoin_is_answered_by_hello_at_once() -> None:
     session = ready(collect((0, 0)))
     effects = session.handle(Rejoin(SESSION), 3.0)
     assert session.state is State.JOINING
-    assert effects[0] == Close((LaneLife(0, 0),))
+    assert effects[0] == CloseLanes((LaneLife(0, 0),))
     assert hello_attempt(effects) == 2
 
 
@@ -488,7 +490,7 @@ def test_a_silent_learner_is_joined_anew() -> None:
     session = ready(collect((0, 0)))
     assert said(session.tick(6.0), Heartbeat)
     assert hello_attempt(session.tick(6.1)) == 2
-    assert (session.state, session.in_memory()) == (State.JOINING, 0)
+    assert (session.state, session.held_count()) == (State.JOINING, 0)
 
 
 @pytest.mark.parametrize(
@@ -509,33 +511,33 @@ def test_any_message_of_the_session_is_a_sign_of_life(message: ToWorker) -> None
 def test_sigterm_finishes_the_rollout_in_hand_and_hands_back_the_rest_in_goodbye() -> None:
     session = ready(collect((0, 0), (1, 0), (2, 1)))
     task = task_of(session)  # tickets 0 and 2
-    assert session.terminate() == []
+    assert session.stop() == []
     assert session.state is State.DRAINING
     assert not session.abandoned(task.session)
     *rollouts, goodbye, leave = session.finished(fake_rollouts(task))
     assert [rollout.ticket for rollout in said(rollouts, Rollout)] == [0, 2]
-    assert goodbye == Say(Goodbye(SESSION, "told to stop", (1,)))
+    assert goodbye == Send(Goodbye(SESSION, "told to stop", (1,)))
     assert leave == Leave(0, "told to stop")
 
 
 def test_sigterm_with_nothing_in_hand_leaves_at_once() -> None:
     session = ready(collect((0, 0)))
-    assert session.terminate() == [Say(Goodbye(SESSION, "told to stop", (0,))), Leave(0, "told to stop")]
+    assert session.stop() == [Send(Goodbye(SESSION, "told to stop", (0,))), Leave(0, "told to stop")]
     assert session.state is State.LEFT
 
 
 def test_sigterm_while_joining_leaves_at_once() -> None:
     session = joining()
-    assert session.terminate() == [Leave(0, "told to stop")]
+    assert session.stop() == [Leave(0, "told to stop")]
 
 
 def test_sigterm_twice_leaves_at_once() -> None:
     session = ready(collect((0, 0)))
     task = task_of(session)
-    session.terminate()
-    assert session.terminate() == [Leave(0, "told to stop")]
+    session.stop()
+    assert session.stop() == [Leave(0, "told to stop")]
     assert session.abandoned(task.session)
-    assert session.terminate() == []
+    assert session.stop() == []
 
 
 def test_drain_finishes_the_rollout_in_hand_and_then_leaves() -> None:
@@ -545,12 +547,12 @@ def test_drain_finishes_the_rollout_in_hand_and_then_leaves() -> None:
     assert session.next_task() is None
     effects = session.finished(fake_rollouts(task))
     assert len(said(effects, Rollout)) == 1
-    assert effects[-2:] == [Say(Goodbye(SESSION, "finished", (1,))), Leave(0, "finished")]
+    assert effects[-2:] == [Send(Goodbye(SESSION, "finished", (1,))), Leave(0, "finished")]
 
 
 def test_drain_with_nothing_in_hand_leaves_at_once() -> None:
     session = ready()
-    assert session.handle(Drain("finished"), 0.1) == [Say(Goodbye(SESSION, "finished", ())), Leave(0, "finished")]
+    assert session.handle(Drain("finished"), 0.1) == [Send(Goodbye(SESSION, "finished", ())), Leave(0, "finished")]
 
 
 def test_drain_while_joining_leaves_with_exit_code_0() -> None:
@@ -561,7 +563,7 @@ def test_drain_while_joining_leaves_with_exit_code_0() -> None:
 def test_no_ticket_is_taken_while_draining() -> None:
     session = ready(collect((0, 0)))
     task = task_of(session)
-    session.terminate()
+    session.stop()
     assert session.handle(collect((1, 0)), 0.1) == []
     effects = session.finished(fake_rollouts(task))
     assert said(effects, Goodbye)[0].tickets == ()
@@ -570,7 +572,7 @@ def test_no_ticket_is_taken_while_draining() -> None:
 def test_heartbeats_go_on_while_draining() -> None:
     session = ready(collect((0, 0)))
     task_of(session)
-    session.terminate()
+    session.stop()
     assert said(session.tick(1.0), Heartbeat)
     session.handle(HeartbeatReply(SESSION, 1, lanes(0)), 5.0)
     assert said(session.tick(10.0), Heartbeat)
@@ -588,7 +590,7 @@ def test_the_drain_that_answers_its_heartbeats_is_a_sign_of_life_to_a_draining_w
 def test_a_silent_learner_is_not_waited_for_while_draining() -> None:
     session = ready(collect((0, 0)))
     task_of(session)
-    session.terminate()
+    session.stop()
     (leave,) = session.tick(6.1)
     assert isinstance(leave, Leave)
     assert "silent" in leave.reason
@@ -597,7 +599,7 @@ def test_a_silent_learner_is_not_waited_for_while_draining() -> None:
 def test_rejoin_while_draining_leaves() -> None:
     session = ready(collect((0, 0)))
     task_of(session)
-    session.terminate()
+    session.stop()
     (leave,) = session.handle(Rejoin(SESSION), 0.1)
     assert isinstance(leave, Leave)
 
@@ -612,34 +614,34 @@ def test_refuse_leaves_with_exit_code_2_in_every_state(state: State) -> None:
 def test_a_failure_is_told_with_its_traceback_and_leaves_with_exit_code_1() -> None:
     session = ready(collect((0, 3)))
     task_of(session)
-    effects = session.broke("ValueError: bad action", "Traceback: …", 3)
+    effects = session.fail("ValueError: bad action", "Traceback: …", 3)
     assert effects == [
-        Say(Failure(SESSION, "ValueError: bad action", "Traceback: …", 3)),
+        Send(Failure(SESSION, "ValueError: bad action", "Traceback: …", 3)),
         Leave(1, "ValueError: bad action"),
     ]
 
 
 def test_a_failure_before_any_session_has_nobody_to_be_told_to() -> None:
-    assert joining().broke("no such environment", "", None) == [Leave(1, "no such environment")]
+    assert joining().fail("no such environment", "", None) == [Leave(1, "no such environment")]
 
 
 def test_a_run_that_it_will_not_take_part_in_is_left_with_exit_code_2_and_a_word() -> None:
-    assert ready().decline("no code") == [Say(Goodbye(SESSION, "no code", ())), Leave(2, "no code")]
+    assert ready().decline("no code") == [Send(Goodbye(SESSION, "no code", ())), Leave(2, "no code")]
 
 
 def test_one_whose_key_is_refused_leaves_with_exit_code_2_whatever_it_was_doing() -> None:
     for state in (State.JOINING, State.READY, State.DRAINING):
         session = in_state(state)
-        assert session.turned_away("refused") == [Leave(2, "refused")]
+        assert session.refused("refused") == [Leave(2, "refused")]
         assert session.state is State.LEFT
-        assert session.turned_away("refused") == []
+        assert session.refused("refused") == []
 
 
 def test_one_that_has_left_says_nothing_more() -> None:
     session = in_state(State.LEFT)
     for message in EVERY_MESSAGE:
         assert session.handle(message, 1.0) == []
-    assert session.tick(1e6) == session.terminate() == session.broke("x", "", None) == []
+    assert session.tick(1e6) == session.stop() == session.fail("x", "", None) == []
     assert session.next_task() is None
 
 
@@ -667,9 +669,9 @@ def in_state(state: State) -> Session:
     session = ready(collect((0, 0)))
     task_of(session)
     if state in (State.DRAINING, State.LEFT):
-        session.terminate()
+        session.stop()
     if state is State.LEFT:
-        session.terminate()
+        session.stop()
     assert session.state is state
     return session
 
@@ -682,10 +684,10 @@ def test_every_message_to_a_worker_is_tried() -> None:
 @pytest.mark.parametrize("message", EVERY_MESSAGE, ids=lambda message: type(message).__name__)
 def test_a_message_that_the_table_does_not_list_changes_nothing(state: State, message: ToWorker) -> None:
     session = in_state(state)
-    held = session.in_memory()
+    held = session.held_count()
     effects = session.handle(message, 0.1)
     if type(message) not in TABLE[state]:
-        assert (effects, session.state, session.in_memory()) == ([], state, held)
+        assert (effects, session.state, session.held_count()) == ([], state, held)
 
 
 @pytest.mark.parametrize("state", State)
@@ -699,8 +701,8 @@ def test_the_table_names_the_state_that_follows(state: State, message: ToWorker)
 def test_all_that_a_worker_says_can_be_said_to_a_learner() -> None:
     kinds = set(ToLearner.__args__)
     session = ready(collect((0, 0)))
-    effects = session.finished(fake_rollouts(task_of(session))) + session.tick(1.0) + session.terminate()
-    assert {type(effect.message) for effect in effects if isinstance(effect, Say)} <= kinds
+    effects = session.finished(fake_rollouts(task_of(session))) + session.tick(1.0) + session.stop()
+    assert {type(effect.message) for effect in effects if isinstance(effect, Send)} <= kinds
 
 
 def test_weights_are_held_and_not_copied() -> None:

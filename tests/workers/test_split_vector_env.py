@@ -18,8 +18,8 @@ from protocol.policy.torch_policy import TorchPolicy
 from protocol.specs import RunSpec
 from tests.support.collectors import TOY, a_collector, bits, collect, no_pulse, random_policy, run_of
 from workers.collect.collector import Collector
+from workers.collect.held_rollouts import Assignment
 from workers.collect.split_vector_env import SideBySide
-from workers.session import Assignment
 
 LANES = 3
 RUNS = {

@@ -16,7 +16,7 @@ from workers.step.stepper import Stepper
 
 def call(stepper: Stepper, name: str, given: Any, *, assign: bool = False) -> Returned:
     packed = np.frombuffer(pack(given), np.uint8)
-    answer = stepper.obey(Call(1, 1, 0, 0, (0, 1), name, assign, packed), lambda: None)
+    answer = stepper.execute(Call(1, 1, 0, 0, (0, 1), name, assign, packed), lambda: None)
     assert isinstance(answer, Returned)
     return answer
 
@@ -25,9 +25,11 @@ def call(stepper: Stepper, name: str, given: Any, *, assign: bool = False) -> Re
 @pytest.mark.parametrize("assign", [False, True])
 def test_nothing_private_is_opened_to_one_it_cannot_be_sure_of(name: str, assign: bool) -> None:
     step = describe(VectorEnvSettings("workers.envs.toy:Countdown-v0", 2, lanes=1, kwargs={"k": 3})).step
-    shut = Stepper(step, private=False)
+    shut = Stepper(step, allow_private_names=False)
     answer = call(shut, name, [4, 4] if assign else ((), {}), assign=assign)
-    assert answer.error.startswith(f"UsageError: {name!r} begins with an underscore: this worker opens nothing private")
+    assert answer.error.startswith(
+        f"UsageError: {name!r} begins with an underscore: this worker gives private attributes only to"
+    )
     assert "\n" not in answer.error
     shut.close_all()
 

@@ -26,9 +26,9 @@ from protocol.specs import RunSpec
 from workers.collect.collected_lane import CollectedLane
 from workers.collect.env_copies import EnvCopies, LoopedCopies, VectorCopies
 from workers.collect.envpool_copies import EnvpoolCopies
+from workers.collect.held_rollouts import Assignment
 from workers.env_errors import CopyRaised, LaneFailed, lane_failed
 from workers.env_loop import Pulse
-from workers.session import Assignment
 
 OpenCopies = Callable[[RunSpec, int, Pulse], EnvCopies]
 """The copies of the lane of this number."""

@@ -1,7 +1,7 @@
-"""A worker's part of a vector environment: the lanes that live here, and their orders obeyed, one at a time.
+"""A worker's part of a vector environment: it owns lanes of env copies and executes their orders, one at a time.
 
-Orders come as messages; those to step may come through shared memory instead, if this process was handed it, and then what
-the step gave is laid there, too. It is the same lane either way.
+Orders come as messages. Orders to step may come through shared memory instead, if this process inherited it; the results are
+then written there, too. Both ways step the same lanes.
 """
 
 from __future__ import annotations
@@ -28,28 +28,31 @@ MAX_TRACEBACK = 20_000  # characters
 
 
 class Stepper:
-    """Env copies, lane by lane, made when their first order comes."""
+    """Executes orders on lanes of env copies, which are made when their first order comes."""
 
-    def __init__(self, spec: StepSpec, handed: Handed | None = None, *, private: bool = True) -> None:
-        """`handed`: shared memory and bells; `private`: a Call may reach names that begin with an underscore."""
+    def __init__(self, spec: StepSpec, shared_memory: Handed | None = None, *, allow_private_names: bool = True) -> None:
+        """`shared_memory`: descriptors of shared memory and bells, if this process inherited them.
+
+        `allow_private_names`: a Call may use names that begin with an underscore.
+        """
         self.steps = 0
         """env steps made"""
         self.stages = {"open": 0.0, "step": 0.0}
         """seconds spent making and resetting copies, and stepping them"""
-        self._spec, self._private = spec, private
+        self._spec, self._allow_private_names = spec, allow_private_names
         self._lanes: dict[int, SteppedLane] = {}
-        self._seen: dict[int, int] = {}  # lane -> the newest order through shared memory that is obeyed
-        self._memory = None if handed is None else Memory(spec, handed.memory)
-        self._called = None if handed is None else Bell(hears=handed.to_worker)
-        self._calls = None if handed is None else Bell(rings=handed.to_learner)
+        self._executed: dict[int, int] = {}  # lane -> number of the newest order through shared memory that was executed
+        self._memory = None if shared_memory is None else Memory(spec, shared_memory.memory)
+        self._bell_in = None if shared_memory is None else Bell(hears=shared_memory.to_worker)
+        self._bell_out = None if shared_memory is None else Bell(rings=shared_memory.to_learner)
         self._cores = cores()
         self._awake = Awake()
-        self._spin_s = 0.0  # how long to wait awake for the next order
+        self._spin_s = 0.0  # how long to spin before the next wait for the bell
 
-    def obey(self, order: Order, pulse: Pulse) -> Answer:
-        """What comes of it. Raises `LaneFailed`, and what `pulse` raises: then the lane is closed."""
+    def execute(self, order: Order, pulse: Pulse) -> Answer:
+        """The answer to the order. Raises `LaneFailed`, and what `pulse` raises; the lane is then closed."""
         try:
-            lane = self._living(order.lane, order.incarnation, pulse)
+            lane = self._lane_for(order.lane, order.incarnation, pulse)
             match order:
                 case Reset():
                     began = perf_counter()
@@ -58,7 +61,7 @@ class Stepper:
                 case Step():
                     infos = self._step(lane, order.actions, pulse)
                 case Call():
-                    return _call(order, lane, self._private)
+                    return _call(order, lane, self._allow_private_names)
         except CopyRaised as error:
             self.close([order.lane])
             raise lane_failed(order.lane, error.doing, error) from error
@@ -67,57 +70,57 @@ class Stepper:
             raise
         return _stepped(order, lane.rows, pack_infos(infos))
 
-    def serve(self, timeout_s: float, pulse: Pulse, session: int, say: Callable[[Stepped], None]) -> bool:
-        """Step whichever lanes shared memory asks for, until `timeout_s` have passed; True if it was rung for a message.
+    def serve_shared_memory(self, timeout_s: float, pulse: Pulse, session: int, send: Callable[[Stepped], None]) -> bool:
+        """Execute the orders in shared memory until `timeout_s` have passed; True if the bell announced a message.
 
-        Waiting awake is quicker, but of all workers only so many may that the learner has a core for itself. They are those
-        that were done first: so the last one's core is free, and awake, when the learner is rung for.
+        Spinning is faster than waiting for the bell. At most `cores - 1` workers spin, so that the learner keeps one core:
+        those that finished first. So the core of the last worker is free, and not asleep, when it rings for the learner.
         """
         assert self._memory is not None
-        assert self._called is not None
+        assert self._bell_in is not None
         until = perf_counter() + timeout_s
         while True:
-            served = [self._serve_lane(lane, pulse, session, say) for lane in list(self._lanes)]
-            if any(served):
+            stepped = [self._serve_lane(lane, pulse, session, send) for lane in list(self._lanes)]
+            if any(stepped):
                 if perf_counter() > until:
                     return False
-                self._awake.wait(self._asked, self._spin_s)
+                self._awake.wait(self._has_order, self._spin_s)
                 continue
-            rung = self._called.wait(max(0.0, until - perf_counter()))
-            if rung is not Rung.STEP:
-                return rung is Rung.MESSAGE
+            announced = self._bell_in.wait(max(0.0, until - perf_counter()))
+            if announced is not Rung.STEP:
+                return announced is Rung.MESSAGE
 
     @property
-    def shares(self) -> bool:
-        """Whether `serve` has something to wait for."""
+    def uses_shared_memory(self) -> bool:
+        """Whether `serve_shared_memory` has lanes to serve."""
         return self._memory is not None and bool(self._lanes)
 
-    def _asked(self) -> bool:
+    def _has_order(self) -> bool:
         assert self._memory is not None
-        return any(self._memory.ordered(lane) != seen for lane, seen in self._seen.items())
+        return any(self._memory.ordered(lane) != executed for lane, executed in self._executed.items())
 
-    def _serve_lane(self, number: int, pulse: Pulse, session: int, say: Callable[[Stepped], None]) -> bool:
+    def _serve_lane(self, number: int, pulse: Pulse, session: int, send: Callable[[Stepped], None]) -> bool:
         memory, lane = self._memory, self._lanes[number]
         assert memory is not None
-        assert self._calls is not None
+        assert self._bell_out is not None
         order = memory.ordered(number)
-        if order == self._seen[number]:
+        if order == self._executed[number]:
             return False
-        self._seen[number] = order
+        self._executed[number] = order
         try:
-            # A copy of the actions: an environment may keep what it is given.
+            # A copy of the actions, because an environment may keep its action.
             infos = pack_infos(self._step(lane, [array.copy() for array in memory.lanes[number].actions], pulse))
         except CopyRaised as error:
             self.close([number])
             raise lane_failed(number, error.doing, error) from error
         if not memory.answer(number, order, infos):
             step = Step(session, -order, number, lane.incarnation, ())
-            say(_stepped(step, lane.rows, infos))
-        left = memory.under_way()
-        if not left or not MAY_SPIN:
-            self._calls.ring()
-        done_before = len(memory.lanes) - len(self._lanes) - left
-        self._spin_s = SPIN_S if done_before < self._cores - 1 else 0.0
+            send(_stepped(step, lane.rows, infos))
+        pending = memory.under_way()
+        if not pending or not MAY_SPIN:
+            self._bell_out.ring()
+        finished_before = len(memory.lanes) - len(self._lanes) - pending
+        self._spin_s = SPIN_S if finished_before < self._cores - 1 else 0.0
         return True
 
     def _step(self, lane: SteppedLane, actions: Iterable[Array], pulse: Pulse) -> Infos:
@@ -127,8 +130,8 @@ class Stepper:
         self.stages["step"] += perf_counter() - began
         return infos
 
-    def _living(self, number: int, incarnation: int, pulse: Pulse) -> SteppedLane:
-        """The lane in this life, made if need be."""
+    def _lane_for(self, number: int, incarnation: int, pulse: Pulse) -> SteppedLane:
+        """The lane in this incarnation. It is made if it does not exist."""
         lane = self._lanes.get(number)
         if lane is not None and lane.incarnation == incarnation:
             return lane
@@ -137,7 +140,7 @@ class Stepper:
         lane = SteppedLane(self._spec, number, incarnation, self._rows(number), pulse)
         self._lanes[number] = lane
         if self._memory is not None:
-            self._seen[number] = self._memory.ordered(number)
+            self._executed[number] = self._memory.ordered(number)
         self.stages["open"] += perf_counter() - began
         return lane
 
@@ -148,19 +151,19 @@ class Stepper:
         return Rows(memory.obs, memory.reward, memory.terminated, memory.truncated)
 
     def close(self, lanes: Iterable[int]) -> None:
-        """Let go of these lanes, those that are here."""
+        """Close these lanes, if they are here."""
         for number in lanes:
             if (lane := self._lanes.pop(number, None)) is not None:
                 lane.close()
-                self._seen.pop(number, None)
+                self._executed.pop(number, None)
 
     def close_all(self) -> None:
-        """Let go of every lane."""
+        """Close every lane."""
         self.close(list(self._lanes))
 
 
 def pack_infos(infos: Infos) -> bytes:
-    """Bytes; none for no infos."""
+    """The infos as bytes; no bytes if there are none."""
     return pack(infos, show=True) if infos else b""
 
 
@@ -169,7 +172,7 @@ def _array(data: bytes) -> npt.NDArray[np.uint8]:
 
 
 def _stepped(order: Reset | Step, rows: Rows, infos: bytes) -> Stepped:
-    """The answer, of arrays of its own: it may be said again."""
+    """The answer, with its own copies of the arrays, because it may be sent again."""
     return Stepped(
         session=order.session,
         ticket=order.ticket,
@@ -183,21 +186,21 @@ def _stepped(order: Reset | Step, rows: Rows, infos: bytes) -> Stepped:
     )
 
 
-def _call(order: Call, lane: SteppedLane, private: bool) -> Returned:
-    """What the attribute gave, or the exception that it raised: that is an answer, too."""
+def _call(order: Call, lane: SteppedLane, allow_private_names: bool) -> Returned:
+    """The attribute's values or results. If it raises, the answer holds the exception."""
     results: list[Any] = []
     error = detail = ""
     try:
-        if order.name.startswith("_") and not private:
+        if order.name.startswith("_") and not allow_private_names:
             raise UsageError(
-                f"{order.name[:40]!r} begins with an underscore: this worker opens nothing private to a learner that it "
-                "cannot be sure of; give it a token (and not --no-code)"
+                f"{order.name[:40]!r} begins with an underscore: this worker gives private attributes only to a learner "
+                "that it trusts; start the worker with a token, and without --no-code"
             )
-        given = unpack(order.given.data)
+        arguments = unpack(order.given.data)
         if order.assign:
-            lane.assign(order.copies, order.name, given)
+            lane.assign(order.copies, order.name, arguments)
         else:
-            results = lane.call(order.copies, order.name, *given)
+            results = lane.call(order.copies, order.name, *arguments)
         packed = pack(results)
     except Exception as raised:
         packed, error, detail = (

@@ -16,7 +16,7 @@ from protocol.errors import UsageError
 from protocol.keys.key_folder import KeyFolder
 from protocol.keys.keys import Allowed, Key, Token
 from protocol.specs import Code, EnvSpec, StepSpec
-from workers.code_trust import entry, trusted
+from workers.security import allowed_code, checked_token
 
 NOW = datetime(2026, 11, 21, 10, tzinfo=UTC)
 TOKEN = Token(Key.new().public, Key.new())
@@ -116,23 +116,23 @@ def test_throwaway_keys_fit_each_other_and_no_others() -> None:
 @pytest.mark.parametrize("address", ["tcp://192.168.0.1:5555", "tcp://host:5555", "tcp://[2001:db8::1]:5555"])
 def test_a_worker_does_not_speak_with_just_anybody(address: str) -> None:
     with pytest.raises(UsageError, match=r"expected --token FILE \(or MILLRACE_TOKEN\), made there by `millrace keys new"):
-        entry(address, None, insecure=False)
-    assert entry(address, TOKEN, insecure=False) is TOKEN
-    assert entry(address, None, insecure=True) is None
+        checked_token(address, None, insecure=False)
+    assert checked_token(address, TOKEN, insecure=False) is TOKEN
+    assert checked_token(address, None, insecure=True) is None
     with pytest.raises(UsageError, match="got both"):
-        entry(address, TOKEN, insecure=True)
+        checked_token(address, TOKEN, insecure=True)
 
 
 @pytest.mark.parametrize("address", LOOPBACK)
 def test_on_loopback_a_token_is_used_if_there_is_one(address: str) -> None:
-    assert entry(address, None, insecure=False) is None
-    assert entry(address, TOKEN, insecure=False) is TOKEN
+    assert checked_token(address, None, insecure=False) is None
+    assert checked_token(address, TOKEN, insecure=False) is TOKEN
 
 
 @pytest.mark.parametrize("address", INSIDE)
 def test_a_socket_file_needs_no_token(address: str) -> None:
-    assert entry(address, None, insecure=False) is None
-    assert entry(address, TOKEN, insecure=False) is None, "the environment may hold one for other learners"
+    assert checked_token(address, None, insecure=False) is None
+    assert checked_token(address, TOKEN, insecure=False) is None, "the environment may hold one for other learners"
 
 
 MODULE, CALLABLE = EnvSpec("os:Env-v0"), EnvSpec("mine", factory=b"pickle")
@@ -145,9 +145,12 @@ def steps(*envs: EnvSpec) -> StepSpec:
 
 
 def test_a_worker_runs_as_much_code_as_it_is_sure_of_its_learner() -> None:
-    levels = {trusted("tcp://host:5555", None): (False, False), trusted("tcp://127.0.0.1:5555", None): (True, False)}
-    levels |= {trusted(address, TOKEN): (True, True) for address in (*PUBLIC, *LOOPBACK)}
-    levels |= {trusted(address, None): (True, True) for address in INSIDE}
+    levels = {
+        allowed_code("tcp://host:5555", None): (False, False),
+        allowed_code("tcp://127.0.0.1:5555", None): (True, False),
+    }
+    levels |= {allowed_code(address, TOKEN): (True, True) for address in (*PUBLIC, *LOOPBACK)}
+    levels |= {allowed_code(address, None): (True, True) for address in INSIDE}
     assert set(levels) == set(Code)
     for code, (modules, callables) in levels.items():
         assert (MODULE.why_not(code) == "") is modules

@@ -182,7 +182,7 @@ def test_what_envpool_cannot_stand_for_is_refused_in_one_line(env: EnvSpec, why:
 
 def test_where_envpool_is_not_installed_a_line_says_how_to(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "envpool", None)
-    with pytest.raises(UsageError, match=r"vector envpool needs envpool .*; pip install 'millrace\[envpool\]'"):
+    with pytest.raises(UsageError, match=r"vector envpool needs envpool .*; pip install 'millrace-rl\[envpool\]'"):
         run_spec(Config(env="CartPole-v1", vector="envpool"), EnvSpec("CartPole-v1"))
 
 

@@ -30,8 +30,8 @@ from protocol.specs import EnvSpec, PolicySpec, RunSpec
 from tests.support.batches import DISCRETE, GAUSSIAN, IMAGE, batch, no_pulse, normal, recurrent, shared
 from tests.support.collectors import TOY, a_collector, collect, random_policy, run_of
 from workers.collect.collector import Collector
+from workers.collect.held_rollouts import Assignment
 from workers.envs.toy import Scripted
-from workers.session import Assignment
 
 Core = Literal["lstm", "gru"]
 CORES: tuple[Core, Core] = ("lstm", "gru")
