@@ -24,7 +24,8 @@ from rich.table import Table
 
 import millrace
 from benchmarks.writing import RESULTS, write
-from learner.report.learning_curves import COLOURS, DPI, GREY, Curve, common_grid, read_curve
+from learner.report.curve import Curve, common_grid
+from learner.report.learning_curves import COLORS, DPI, GREY, read_curve
 from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.run_folder import RunFolder
 
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 PNG = Path(__file__).parents[1] / "docs" / "off_policy.png"
-ALGORITHMS = {"a2c": COLOURS[1], "impala": COLOURS[0]}
+ALGORITHMS = {"a2c": COLORS[1], "impala": COLORS[0]}
 LAGS = (0, 8)
 SEEDS = 5
 SETTINGS: dict[str, Any] = {

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from learner.report.learning_curves import COLOURS, DPI, GREY
+from learner.report.learning_curves import COLORS, DPI, GREY
 from learner.run_folder.versions import versions
 
 RESULTS = Path(__file__).parent / "results"
@@ -66,7 +66,7 @@ def _draw(charts: Sequence[Bars], out: Path) -> None:
     panels = figure.subplots(len(charts), 1, squeeze=False, height_ratios=heights)[:, 0]
     for panel, (title, bars) in zip(panels, charts, strict=True):
         ours = [label for label in bars if label.startswith(("millrace", "ours"))] or list(bars)
-        colours = [COLOURS[0] if label in ours else "#bbbbbb" for label in bars]
+        colours = [COLORS[0] if label in ours else "#bbbbbb" for label in bars]
         drawn = panel.barh(list(bars), list(bars.values()), color=colours)
         panel.bar_label(drawn, [_figure(length) for length in bars.values()], padding=3, fontsize=8, color=GREY)
         panel.set_title(title, fontsize=10, fontweight="bold", loc="left")

@@ -1,31 +1,31 @@
-"""Small parts of which the page's sections are made, as HTML text. Pure."""
+"""Building blocks of the page's sections, as HTML text. Pure."""
 
 from __future__ import annotations
 
 from html import escape
 
-from learner.report.charts import COLOURS, MINUS
-from learner.report.runs import Line
+from learner.report.charts import COLORS, MINUS
+from learner.report.runs import RunGroup
 
 
 def section(name: str, about: str, content: str) -> str:
-    """A card of the page."""
-    said = f"<p>{escape(about)}</p>" if about else ""
-    return f"<section><h2>{escape(name)}</h2>{said}{content}</section>"
+    """A section of the page with a heading. `content` is HTML; `name` and `about` are text."""
+    introduction = f"<p>{escape(about)}</p>" if about else ""
+    return f"<section><h2>{escape(name)}</h2>{introduction}{content}</section>"
 
 
-def dot(line: Line) -> str:
-    """A dot in the colour of a line."""
-    return f'<i class="dot c{line.colour % COLOURS}"></i>'
+def color_dot(group: RunGroup) -> str:
+    """A dot in the color of a group."""
+    return f'<i class="dot c{group.color % COLORS}"></i>'
 
 
 def return_text(value: float) -> str:
-    """To a tenth, with a minus as long as a plus."""
+    """A return with one decimal and a typographic minus sign."""
     return f"{value:,.1f}".replace("-", MINUS)
 
 
 def time_text(seconds: float) -> str:
-    """Seconds as people say them."""
+    """A duration in s, min or h."""
     if seconds < 100:
         return f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)

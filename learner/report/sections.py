@@ -1,4 +1,7 @@
-"""The sections of the page, as HTML text. Pure but for reading the films that it holds; text from run folders is escaped."""
+"""The sections of the page, as HTML text: results, curves, videos, settings. Pure but for reading the videos.
+
+The law: text from run folders is escaped.
+"""
 
 from __future__ import annotations
 
@@ -8,35 +11,36 @@ from html import escape
 
 import numpy as np
 
-from learner.report.charts import Trace, chart
-from learner.report.html_parts import dot, return_text, section, time_text
-from learner.report.learning_curves import common_grid
-from learner.report.runs import Line, Told, differing
+from learner.report.charts import Series, chart
+from learner.report.curve import common_grid
+from learner.report.html_parts import color_dot, return_text, section, time_text
+from learner.report.runs import ReportData, RunGroup, differing_settings
 from learner.run_folder.episode_window import WINDOW_EPISODES
 
 WIDE, NARROW = (1080, 360), (540, 320)
-FILM_BYTES, ALL_FILMS_BYTES = 4 * 2**20, 24 * 2**20
+MOST_VIDEO_BYTES, MOST_BYTES_OF_ALL_VIDEOS = 4 * 2**20, 24 * 2**20
 
 
-def title(told: Told) -> str:
-    """What the page is about."""
-    return told.envs[0] if len(told.envs) == 1 else f"{', '.join(told.envs[:-1])} and {told.envs[-1]}"
+def title(report: ReportData) -> str:
+    """The environments of the page."""
+    return report.envs[0] if len(report.envs) == 1 else f"{', '.join(report.envs[:-1])} and {report.envs[-1]}"
 
 
-def head(told: Told) -> str:
+def head(report: ReportData) -> str:
     """Title and totals."""
-    numbers = [run.numbers for _, run in told.runs]
-    seeds = f"{len(numbers)} runs" if len(numbers) > 1 else "1 run"
+    results = [run.results for _, run in report.runs]
     facts = [
-        seeds,
-        f"{sum(number.env_steps for number in numbers):,} env steps",
-        f"{time_text(sum(number.wall_s for number in numbers))} of training",
+        f"{len(results)} runs" if len(results) > 1 else "1 run",
+        f"{sum(result.env_steps for result in results):,} env steps",
+        f"{time_text(sum(result.wall_s for result in results))} of training",
     ]
-    return f'<header><p class="kicker">millrace report</p><h1>{escape(title(told))}</h1><p>{" · ".join(facts)}</p></header>'
+    return (
+        f'<header><p class="kicker">millrace report</p><h1>{escape(title(report))}</h1><p>{" · ".join(facts)}</p></header>'
+    )
 
 
-def headlines(told: Told) -> str:
-    """A row for each run, under the line it belongs to."""
+def results(report: ReportData) -> str:
+    """The table of results: a row for each run, under its group."""
     columns = (
         "Run",
         "Greedy return",
@@ -47,138 +51,146 @@ def headlines(told: Told) -> str:
         "Versions",
         "Ended",
     )
-    heads = "".join(f'<th scope="col" class="{_side(name)}">{escape(name)}</th>' for name in columns)
-    bodies = "".join(_line_of_runs(line) for line in told.lines)
+    heads = "".join(f'<th scope="col" class="{_column_class(name)}">{escape(name)}</th>' for name in columns)
+    bodies = "".join(_rows_of_group(group) for group in report.groups)
     table = f'<table class="runs"><thead><tr>{heads}</tr></thead>{bodies}</table>'
     return section("Runs", "", f'<div class="scroll">{table}</div>')
 
 
-def _side(column: str) -> str:
+def _column_class(column: str) -> str:
     return "text" if column in ("Run", "Ended") else "number"
 
 
-def _line_of_runs(line: Line) -> str:
+def _rows_of_group(group: RunGroup) -> str:
     rows = []
-    for run in line.runs:
-        n = run.numbers
-        if n.evaluation is None:
+    for run in group.runs:
+        results = run.results
+        if results.evaluation is None:
             greedy = '<strong class="none">–</strong><small>not evaluated</small>'
         else:
-            spread = f"± {n.evaluation.return_std:,.1f}, {n.evaluation.episodes} episodes"
-            cut = f", {n.evaluation.cut} cut" if n.evaluation.cut else ""
-            greedy = f"<strong>{return_text(n.evaluation.return_mean)}</strong><small>{escape(spread + cut)}</small>"
-        mean = "" if n.return_mean_100 is None else return_text(n.return_mean_100)
-        cells = [greedy, mean, f"{n.env_steps:,}", f"{n.env_steps_per_s:,.0f}", time_text(n.wall_s), f"{n.updates:,}"]
+            spread = f"± {results.evaluation.return_std:,.1f}, {results.evaluation.episodes} episodes"
+            cut = f", {results.evaluation.cut} cut" if results.evaluation.cut else ""
+            greedy = f"<strong>{return_text(results.evaluation.return_mean)}</strong><small>{escape(spread + cut)}</small>"
+        mean = "" if results.return_mean_100 is None else return_text(results.return_mean_100)
+        cells = [
+            greedy,
+            mean,
+            f"{results.env_steps:,}",
+            f"{results.env_steps_per_s:,.0f}",
+            time_text(results.wall_s),
+            f"{results.updates:,}",
+        ]
         numbers = "".join(f'<td class="number">{cell}</td>' for cell in cells)
         where = f'<th scope="row" title="{escape(str(run.path))}">seed {run.seed}</th>'
-        rows.append(f'<tr>{where}{numbers}<td class="text">{escape(n.ended)}</td></tr>')
-    name = f"{dot(line)}<b>{escape(line.env)}</b> {escape(line.name)}"
-    if line.differs:
-        name += f"<span>{escape(line.differs)}</span>"
-    found = [run.numbers.evaluation.return_mean for run in line.runs if run.numbers.evaluation is not None]
-    if len(found) > 1:
-        mean, worst, best = map(return_text, (sum(found) / len(found), min(found), max(found)))
+        rows.append(f'<tr>{where}{numbers}<td class="text">{escape(results.stop_reason)}</td></tr>')
+    name = f"{color_dot(group)}<b>{escape(group.env)}</b> {escape(group.name)}"
+    if group.differences:
+        name += f"<span>{escape(group.differences)}</span>"
+    returns = [run.results.evaluation.return_mean for run in group.runs if run.results.evaluation is not None]
+    if len(returns) > 1:
+        mean, worst, best = map(return_text, (sum(returns) / len(returns), min(returns), max(returns)))
         name += f"<span>greedy {mean} on average, {worst} to {best}</span>"
     return f'<tbody><tr class="line"><th scope="rowgroup" colspan="8">{name}</th></tr>{"".join(rows)}</tbody>'
 
 
-def curves(told: Told) -> str:
-    """A panel for each environment, a colour for each line, seeds as a band."""
-    size = WIDE if len(told.envs) == 1 else NARROW
+def curves(report: ReportData) -> str:
+    """Learning curves: a panel for each environment, a color for each group, and a band over its seeds."""
+    size = WIDE if len(report.envs) == 1 else NARROW
     panels = []
-    for env in told.envs:
-        lines = [line for line in told.lines if line.env == env]
-        traces = [trace for line in lines for trace in _traces(line)]
-        legend = "".join(f"<li>{dot(line)}{escape(_legend(line))}</li>" for line in lines)
-        if any(trace.kind == "dots" for trace in traces):
+    for env in report.envs:
+        groups = [group for group in report.groups if group.env == env]
+        all_series = [series for group in groups for series in _series(group)]
+        legend = "".join(f"<li>{color_dot(group)}{escape(_legend(group))}</li>" for group in groups)
+        if any(series.kind == "dots" for series in all_series):
             legend += '<li><i class="ring"></i>greedy evaluations</li>'
-        drawn = chart(traces, *size, "env steps", f"Learning curves of {env}") if traces else ""
+        drawn = chart(all_series, *size, "env steps", f"Learning curves of {env}") if all_series else ""
         panels.append(f'<figure><h3>{escape(env)}</h3><ul class="legend">{legend}</ul>{drawn}</figure>')
     about = f"Return, mean of the last {WINDOW_EPISODES} training episodes."
-    if any(len(line.curves) > 1 for line in told.lines):
+    if any(len(group.curves) > 1 for group in report.groups):
         about += " Bold: the mean over seeds. Band: from the worst to the best. Thin: each seed."
-    return section("Learning curves", about, f'<div class="panels n{min(len(told.envs), 2)}">{"".join(panels)}</div>')
+    return section("Learning curves", about, f'<div class="panels n{min(len(report.envs), 2)}">{"".join(panels)}</div>')
 
 
-def _legend(line: Line) -> str:
-    name = f"{line.name} ({line.differs})" if line.differs else line.name
-    found = line.curves
-    if not found:
+def _legend(group: RunGroup) -> str:
+    name = f"{group.name} ({group.differences})" if group.differences else group.name
+    curves = group.curves
+    if not curves:
         return f"{name}: no episode has ended yet"
-    if len(found) == 1:
-        return f"{name}, seed {found[0].seed}"
-    kind = "seeds" if len({curve.seed for curve in found}) == len(found) else "runs"
-    return f"{name}, {len(found)} {kind}"
+    if len(curves) == 1:
+        return f"{name}, seed {curves[0].seed}"
+    kind = "seeds" if len({curve.seed for curve in curves}) == len(curves) else "runs"
+    return f"{name}, {len(curves)} {kind}"
 
 
-def _traces(line: Line) -> Iterable[Trace]:
-    found = line.curves
-    for curve in found:
+def _series(group: RunGroup) -> Iterable[Series]:
+    curves = group.curves
+    for curve in curves:
         last = f"{return_text(float(curve.returns[-1]))} at {curve.env_steps[-1]:,.0f} env steps"
-        says = f"{line.name}, seed {curve.seed}: {last}"
-        yield Trace("thin" if len(found) > 1 else "line", line.colour, curve.env_steps, curve.returns, says)
-    for run in line.runs:
+        tooltip = f"{group.name}, seed {curve.seed}: {last}"
+        yield Series("thin" if len(curves) > 1 else "line", group.color, curve.env_steps, curve.returns, tooltip)
+    for run in group.runs:
         if len(run.evaluations):
             steps, returns = run.evaluations.T
-            yield Trace("dots", line.colour, steps, returns, f"{line.name}, seed {run.seed}: greedy evaluations")
-    if len(found) > 1:
-        grid, returns = common_grid(found)
+            yield Series("dots", group.color, steps, returns, f"{group.name}, seed {run.seed}: greedy evaluations")
+    if len(curves) > 1:
+        grid, returns = common_grid(curves)
         if grid.size:
             band = np.column_stack([returns.min(0), returns.max(0)])
-            yield Trace("band", line.colour, grid, band)
-            yield Trace("line", line.colour, grid, returns.mean(0), f"{line.name}: mean of {len(found)}")
+            yield Series("band", group.color, grid, band)
+            yield Series("line", group.color, grid, returns.mean(0), f"{group.name}: mean of {len(curves)}")
 
 
-def films(told: Told) -> str:
-    """The newest film of each run, if it is small enough to be part of the page."""
-    figures, left = [], ALL_FILMS_BYTES
-    for name, (line, run) in zip(told.short_names(), told.runs, strict=True):
-        if not run.films:
+def videos(report: ReportData) -> str:
+    """The newest video of each run. Large ones are named instead of shown."""
+    figures, bytes_left = [], MOST_BYTES_OF_ALL_VIDEOS
+    for name, (group, run) in zip(report.short_names(), report.runs, strict=True):
+        if not run.videos:
             continue
-        newest = max(run.films, key=lambda path: (path.stat().st_mtime_ns, path.name))
+        newest = max(run.videos, key=lambda path: (path.stat().st_mtime_ns, path.name))
         size = newest.stat().st_size
-        caption = f"<figcaption>{dot(line)}{escape(name)}<span>{escape(newest.name)}</span></figcaption>"
-        if size > min(FILM_BYTES, left):
+        caption = f"<figcaption>{color_dot(group)}{escape(name)}<span>{escape(newest.name)}</span></figcaption>"
+        if size > min(MOST_VIDEO_BYTES, bytes_left):
             shown = f'<p class="none">{size / 2**20:.1f} MiB, too large for this page:<br>{escape(str(newest))}</p>'
         else:
-            left -= size
+            bytes_left -= size
             data = base64.b64encode(newest.read_bytes()).decode()
             shown = f'<video controls muted loop playsinline src="data:video/mp4;base64,{data}"></video>'
         figures.append(f"<figure>{shown}{caption}</figure>")
     if not figures:
         return ""
-    return section("Films", "Greedy episodes.", f'<div class="films">{"".join(figures)}</div>')
+    return section("Videos", "Greedy episodes.", f'<div class="films">{"".join(figures)}</div>')
 
 
-def settings(told: Told) -> str:
-    """What differs first, a column for each line; the rest folded."""
-    runs = [run for _, run in told.runs]
-    differ = differing(runs)
+def settings(report: ReportData) -> str:
+    """Settings: first those that differ, with a column for each group; the others are folded."""
+    runs = [run for _, run in report.runs]
+    differ = differing_settings(runs)
     same = {name: value for name, value in runs[0].settings.items() if name not in differ}
     folded = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in same.items())
-    said = f"{len(same)} settings are the same in all runs" if len(runs) > 1 else f"{len(same)} settings"
-    rest = f'<details><summary>{said}</summary><dl class="same">{folded}</dl></details>'
+    summary = f"{len(same)} settings are the same in all runs" if len(runs) > 1 else f"{len(same)} settings"
+    rest = f'<details><summary>{summary}</summary><dl class="same">{folded}</dl></details>'
     if not differ:
         return section("Settings", "", rest)
     heads = "".join(
-        f'<th scope="col">{dot(line)}<b>{escape(line.env)}</b><br>{escape(line.name)}</th>' for line in told.lines
+        f'<th scope="col">{color_dot(group)}<b>{escape(group.env)}</b><br>{escape(group.name)}</th>'
+        for group in report.groups
     )
-    rows = "".join(_setting(name, told) for name in differ)
+    rows = "".join(_setting(name, report) for name in differ)
     head = f'<thead><tr><th scope="col">What differs</th>{heads}</tr></thead>'
     table = f'<table class="settings">{head}<tbody>{rows}</tbody></table>'
     return section("Settings", "", f'<div class="scroll">{table}</div>{rest}')
 
 
-def _setting(name: str, told: Told) -> str:
-    """Its value in each line: one, but for the seeds."""
+def _setting(name: str, report: ReportData) -> str:
+    """A row of the table: the value of a setting in each group. Only the seed has several values in a group."""
     cells = []
-    for line in told.lines:
-        values = dict.fromkeys(run.settings[name] for run in line.runs if name in run.settings)
+    for group in report.groups:
+        values = dict.fromkeys(run.settings[name] for run in group.runs if name in run.settings)
         cells.append(f"<td>{escape(', '.join(values))}</td>" if values else '<td class="none">–</td>')
     return f'<tr><th scope="row"><code>{escape(name)}</code></th>{"".join(cells)}</tr>'
 
 
-def foot(told: Told) -> str:
-    """Where all this was read."""
-    paths = "".join(f"<li><code>{escape(str(run.path))}</code></li>" for _, run in told.runs)
+def foot(report: ReportData) -> str:
+    """The paths of the run folders."""
+    paths = "".join(f"<li><code>{escape(str(run.path))}</code></li>" for _, run in report.runs)
     return f"<footer><details><summary>Run folders</summary><ul>{paths}</ul></details></footer>"

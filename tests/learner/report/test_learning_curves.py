@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from learner.config.layers import resolve
-from learner.report.learning_curves import Curve, common_grid, plot, read_curve
+from learner.report.curve import Curve, common_grid
+from learner.report.learning_curves import plot, read_curve
 from learner.run_folder.metrics_log import MetricsLog
 from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import RunFolder

@@ -16,10 +16,10 @@ import tomli_w
 
 from learner.config.layers import resolve
 from learner.report import sections
-from learner.report.charts import MINUS, Trace, chart, engineering, ticks
+from learner.report.charts import MINUS, Series, chart, ticks, with_si_prefix
 from learner.report.html_parts import time_text
 from learner.report.page import page, write_page
-from learner.report.runs import Told, group, read_run
+from learner.report.runs import ReportData, group_runs, read_run
 from learner.run_folder.metrics_log import MetricsLog
 from learner.run_folder.progress import Progress
 from learner.run_folder.results import Evaluation, Summary
@@ -93,8 +93,8 @@ class Reader(HTMLParser):
         return " ".join(" ".join(self.said).split())
 
 
-def told(*runs: Path) -> Told:
-    return group([read_run(run) for run in runs])
+def report_data(*runs: Path) -> ReportData:
+    return group_runs([read_run(run) for run in runs])
 
 
 def text_of(section: str) -> str:
@@ -134,7 +134,7 @@ def test_text_from_a_run_is_text_and_not_markup(tmp_path: Path) -> None:
 
 
 def test_each_run_has_its_headline(tmp_path: Path) -> None:
-    said = text_of(sections.headlines(told(a_run(tmp_path, seed=1), a_run(tmp_path, seed=3))))
+    said = text_of(sections.results(report_data(a_run(tmp_path, seed=1), a_run(tmp_path, seed=3))))
     assert "CartPole-v1 PPO greedy −1,232.6 on average, −1,233.6 to −1,231.6" in said
     assert "seed 1 −1,233.6 ± 7.5, 100 episodes 99.5 123,456 4,321 61.0 s 789 all steps done" in said
     assert said.index("seed 1") < said.index("seed 3")
@@ -142,7 +142,7 @@ def test_each_run_has_its_headline(tmp_path: Path) -> None:
 
 def test_a_run_that_goes_on_is_told_as_far_as_it_got(tmp_path: Path) -> None:
     run = a_run(tmp_path, finished=False)
-    assert "seed 1 – not evaluated 101.0 2,000 50 40.0 s 20 not finished" in text_of(sections.headlines(told(run)))
+    assert "seed 1 – not evaluated 101.0 2,000 50 40.0 s 20 not finished" in text_of(sections.results(report_data(run)))
     assert "30 = 20 + 4 + 5 + 1 balances" in Reader(page([run])).text
     new = a_run(tmp_path, seed=2, finished=False, length=1)
     text = Reader(page([new])).text
@@ -164,7 +164,7 @@ def test_the_ledger_balances_or_says_by_how_much_it_does_not(tmp_path: Path) -> 
 
 def test_settings_that_differ_come_first_and_the_rest_is_folded(tmp_path: Path) -> None:
     runs = [a_run(tmp_path, seed=seed) for seed in (1, 2)] + [a_run(tmp_path, seed=3, gamma=0.5, env_kwargs={"g": 1.5})]
-    differing, _, folded = sections.settings(told(*runs)).partition("<details>")
+    differing, _, folded = sections.settings(report_data(*runs)).partition("<details>")
     said = re.sub(r"<[^>]+>", " ", differing)
     assert " ".join(said.split()) == (
         "Settings What differs CartPole-v1 PPO A CartPole-v1 PPO B seed 1, 2 3 gamma 0.98 0.5 env_kwargs.g – 1.5"
@@ -172,47 +172,47 @@ def test_settings_that_differ_come_first_and_the_rest_is_folded(tmp_path: Path) 
     assert "<dt>gae_lambda</dt><dd>0.8</dd>" in folded
     assert "<dt>gamma</dt>" not in folded
     assert f"{folded.count('<dt>')} settings are the same in all runs" in folded
-    alone = sections.settings(told(runs[0]))
+    alone = sections.settings(report_data(runs[0]))
     assert "<table" not in alone
     assert "<dt>gamma</dt><dd>0.98</dd>" in alone
 
 
 def test_runs_that_differ_in_their_seeds_alone_are_one_line(tmp_path: Path) -> None:
-    found = told(
+    found = report_data(
         a_run(tmp_path, seed=2),
         a_run(tmp_path, "Pendulum-v1", seed=1),
         a_run(tmp_path / "elsewhere", seed=1),
         a_run(tmp_path, seed=4, gamma=0.5, n_epochs=3, clip_range=0.3, learning_rate=0.5, workers=1),
     )
-    assert [(line.env, line.name, [run.seed for run in line.runs]) for line in found.lines] == [
+    assert [(group.env, group.name, [run.seed for run in group.runs]) for group in found.groups] == [
         ("CartPole-v1", "PPO A", [1, 2]),
         ("CartPole-v1", "PPO B", [4]),
         ("Pendulum-v1", "PPO", [1]),
     ]
-    assert found.lines[2].differs == ""
-    assert found.lines[1].differs.endswith(", 2 more")
-    assert "workers" not in found.lines[1].differs  # the algorithm's own say more
+    assert found.groups[2].differences == ""
+    assert found.groups[1].differences.endswith(", 2 more")
+    assert "workers" not in found.groups[1].differences  # the algorithm's own say more
     assert found.short_names() == [
         "CartPole-v1, PPO A, seed 1", "CartPole-v1, PPO A, seed 2", "CartPole-v1, PPO B, seed 4", "Pendulum-v1, seed 1",
     ]  # fmt: skip
-    (first,) = {line.env: line.runs[0].path for line in found.lines if line.env == "Pendulum-v1"}.values()
-    twice = told(first, a_run(tmp_path / "again", "Pendulum-v1", seed=1))
+    (first,) = {group.env: group.runs[0].path for group in found.groups if group.env == "Pendulum-v1"}.values()
+    twice = report_data(first, a_run(tmp_path / "again", "Pendulum-v1", seed=1))
     assert twice.short_names() == ["seed 1 (1)", "seed 1 (2)"]
     assert Reader(page([first, first])).text == Reader(page([first])).text
 
 
 def test_curves_are_a_line_each_with_a_mean_and_a_band_and_dots_for_evaluations(tmp_path: Path) -> None:
-    drawn = sections.curves(told(*[a_run(tmp_path, seed=seed) for seed in (1, 2, 3)]))
+    drawn = sections.curves(report_data(*[a_run(tmp_path, seed=seed) for seed in (1, 2, 3)]))
     assert [drawn.count(f'class="{kind} c0"') for kind in ("thin", "line", "band", "dots")] == [3, 1, 1, 3]
     assert "PPO, 3 seeds" in drawn
     assert "PPO, seed 2: 102.0 at 2,000 env steps" in drawn
-    alone = sections.curves(told(a_run(tmp_path, seed=4)))
+    alone = sections.curves(report_data(a_run(tmp_path, seed=4)))
     assert [alone.count(f'class="{kind} c0"') for kind in ("thin", "line", "band")] == [0, 1, 0]
 
 
 def test_a_curve_is_drawn_where_it_was_measured() -> None:
     x, y = np.array([0.0, 50.0, 100.0]), np.array([-10.0, 0.0, 10.0])
-    drawn = chart([Trace("line", 2, x, y)], 200, 100, "env steps", "a & b")
+    drawn = chart([Series("line", 2, x, y)], 200, 100, "env steps", "a & b")
     assert 'aria-label="a &amp; b"' in drawn
     (path,) = re.findall(r'<path class="line c2" d="M([^"]*)"', drawn)
     points = np.array([point.split() for point in path.split("L")], float)
@@ -221,7 +221,7 @@ def test_a_curve_is_drawn_where_it_was_measured() -> None:
     assert points[0, 1] > points[2, 1]
     assert f">{MINUS}10</text>" in drawn
     long = np.arange(10_000.0)
-    (path,) = re.findall(r' d="([^"]*)"', chart([Trace("line", 0, long, long)], 200, 100, "", ""))
+    (path,) = re.findall(r' d="([^"]*)"', chart([Series("line", 0, long, long)], 200, 100, "", ""))
     assert 400 < path.count("L") <= 501
     assert path.endswith(path.split("L")[-1])
     assert path.split("L")[-1].split()[0] == "186.0"  # the last point is among them
@@ -232,7 +232,14 @@ def test_ticks_are_round_and_within() -> None:
     assert ticks(-1290, -140, 5) == [-1200, -1000, -800, -600, -400, -200]
     assert ticks(0.1, 0.9, 4) == pytest.approx([0.2, 0.4, 0.6, 0.8])
     assert ticks(3, 3, 5) == [3]
-    assert [engineering(x) for x in (0, 0.25, 500, 2e4, -1200, 1.5e6)] == ["0", "0.25", "500", "20k", f"{MINUS}1.2k", "1.5M"]
+    assert [with_si_prefix(x) for x in (0, 0.25, 500, 2e4, -1200, 1.5e6)] == [
+        "0",
+        "0.25",
+        "500",
+        "20k",
+        f"{MINUS}1.2k",
+        "1.5M",
+    ]
     assert [time_text(s) for s in (0.04, 99.96, 119.8, 3599.0, 7260.0)] == [
         "0.0 s", "100.0 s", "2 min 0 s", "59 min 59 s", "2 h 1 min",
     ]  # fmt: skip
@@ -246,17 +253,17 @@ def test_stages_are_shares_of_a_bar(tmp_path: Path) -> None:
 
 def test_the_newest_film_is_on_the_page_if_it_is_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = a_run(tmp_path)
-    assert sections.films(told(run)) == ""
+    assert sections.videos(report_data(run)) == ""
     (run / "videos").mkdir()
     for age, name in ((200, "b.mp4"), (100, "a.mp4"), (300, "c.mp4")):
         (run / "videos" / name).write_bytes(name.encode())
         os.utime(run / "videos" / name, (10_000 - age, 10_000 - age))
-    shown = sections.films(told(run))
+    shown = sections.videos(report_data(run))
     assert "base64,YS5tcDQ=" in shown
     assert shown.count("<video") == 1
-    monkeypatch.setattr(sections, "FILM_BYTES", 3)
-    assert "<video" not in sections.films(told(run))
-    assert "too large for this page" in sections.films(told(run))
+    monkeypatch.setattr(sections, "MOST_VIDEO_BYTES", 3)
+    assert "<video" not in sections.videos(report_data(run))
+    assert "too large for this page" in sections.videos(report_data(run))
 
 
 def test_what_cannot_be_reported_is_one_line(tmp_path: Path) -> None:
@@ -270,10 +277,10 @@ def test_what_cannot_be_reported_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"is a folder; expected the file to write"):
         write_page([run], tmp_path)
     (run / "metrics.jsonl").write_text("not json\n")
-    with pytest.raises(UsageError, match="cannot be reported on"):
+    with pytest.raises(UsageError, match="it is damaged, there is nothing to report on"):
         page([run])
     (run / "config.toml").write_text("env = ")
-    with pytest.raises(UsageError, match="cannot be reported on"):
+    with pytest.raises(UsageError, match="it is damaged, there is nothing to report on"):
         page([run])
 
 

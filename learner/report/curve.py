@@ -1,0 +1,73 @@
+"""What a report or a plot reads from a run folder: its configuration, its metrics, and the learning curve. Reads files."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import msgspec
+import numpy as np
+
+from learner.run_folder.metrics_log import METRICS_FILE, read_rows
+from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
+from learner.run_folder.run_format import check_format
+from protocol.arrays import Doubles
+from protocol.errors import UsageError
+
+GRID_POINTS = 400
+
+
+class Curve(NamedTuple):
+    """The learning curve of one run."""
+
+    env: str
+    algo: str
+    seed: int
+    env_steps: Doubles  # [K] rising
+    returns: Doubles  # [K] mean return of the last 100 training episodes
+
+
+class RunFiles(NamedTuple):
+    """The configuration (config.toml) and the rows of metrics of one run folder."""
+
+    env: str
+    algo: str
+    seed: int
+    config: dict[str, Any]
+    rows: list[dict[str, Any]]
+
+    def points(self, key: str) -> list[tuple[float, float]]:
+        """Env steps and value of this metric, where there is one."""
+        return [(row[ENV_STEPS_KEY], row[key]) for row in self.rows if row.get(key) is not None]
+
+    def curve(self) -> Curve | None:
+        """The learning curve, or None before the first episode has ended."""
+        points = self.points(RETURN_KEY)
+        return Curve(self.env, self.algo, self.seed, *np.asarray(points, np.float64).T) if points else None
+
+
+def read_run_files(run: Path, purpose: Literal["plot", "report on"]) -> RunFiles:
+    """Read a run folder. Raises `UsageError` in one line, which names the purpose."""
+    check_format(run)
+    try:
+        config = tomllib.loads((run / "config.toml").read_text())
+        env, algo, seed = str(config["env"]), str(config["algo"]), int(config["seed"])
+        return RunFiles(env, algo, seed, config, read_rows(run / METRICS_FILE))
+    except FileNotFoundError as error:
+        missing = f"no {Path(error.filename).name}" if run.is_dir() else "no such folder"
+        raise UsageError(f"run {run}: expected a run folder to {purpose}, got {missing}") from error
+    except (OSError, ValueError, KeyError, TypeError, msgspec.MsgspecError) as error:
+        raise UsageError(f"run {run}: it is damaged, there is nothing to {purpose}: {error}") from error
+
+
+def common_grid(curves: Sequence[Curve]) -> tuple[Doubles, Doubles]:
+    """Put curves on common env steps by linear interpolation.
+
+    Returns the env steps [G], which all curves cover, and the returns [curves, G]. Mean and band over them end where the
+    shortest curve ends, so that no curve is extrapolated.
+    """
+    first, last = max(curve.env_steps[0] for curve in curves), min(curve.env_steps[-1] for curve in curves)
+    grid = np.linspace(first, last, GRID_POINTS) if last > first else np.zeros(0)
+    return grid, np.stack([np.interp(grid, curve.env_steps, curve.returns) for curve in curves])
