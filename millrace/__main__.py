@@ -1,4 +1,4 @@
-"""`python -m millrace`, and `millrace`: the command line as a process of its own."""
+"""`python -m millrace` and the command `millrace`: run the command line and end the process."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from millrace.cli.main import main
 
 
 def command() -> NoReturn:
-    """`main`, and the end of the process."""
+    """Run the command line and exit."""
     code = main()
-    gc.freeze()  # else the interpreter looks for garbage among torch's objects before it ends: a tenth of a short run
+    gc.freeze()  # skips the garbage collection of torch's objects at exit, which is a tenth of a short run
     sys.exit(code)
 
 

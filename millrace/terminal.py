@@ -1,7 +1,7 @@
-"""How a run looks while it goes on: one live block on a terminal, a line now and then anywhere else.
+"""Shows the progress of a run: as a live block on a terminal, as a line every few seconds elsewhere, or as JSON.
 
-The law: it never slows the run (at most five redraws a second), the last state is always shown, and a reader that went away
-(`| head`) does not end the run. What the log says is shown above the block.
+The law: it never slows the run (at most five redraws a second), the last progress is always shown, and a reader that has
+gone (`| head`) does not end the run. Warnings of the log are shown above the block.
 """
 
 from __future__ import annotations
@@ -27,112 +27,114 @@ REDRAW_EVERY_S = 0.2
 LINE_EVERY_S = 5.0
 
 
-class Screen(Protocol):
-    """Where progress is shown."""
+class ProgressView(Protocol):
+    """A way to show progress."""
 
     def show(self, progress: Progress) -> None:
-        """Show this state now."""
+        """Show this progress now."""
         ...
 
-    def say(self, line: str) -> None:
-        """Show a line that stays."""
+    def print_line(self, line: str) -> None:
+        """Print a line that stays."""
         ...
 
     def close(self) -> None:
-        """Leave the terminal as it should be."""
+        """Restore the terminal."""
         ...
 
 
 @contextmanager
-def watching(log_json: bool = False, clock: Callable[[], float] = time.monotonic) -> Iterator[Callable[[Progress], None]]:
-    """A function to call with each progress; what the log of millrace says meanwhile is shown too."""
-    block = sys.stdout.isatty() and not log_json
-    screen: Screen = Block(Console()) if block else Events() if log_json else Lines()
-    pace = Pace(screen, REDRAW_EVERY_S if block else LINE_EVERY_S, clock)
-    handler = _events_handler() if log_json else _Said(screen)
+def progress_view(
+    log_json: bool = False, clock: Callable[[], float] = time.monotonic
+) -> Iterator[Callable[[Progress], None]]:
+    """Gives a function to call with each progress. Meanwhile the log of millrace is shown too."""
+    live = sys.stdout.isatty() and not log_json
+    view: ProgressView = LiveBlock(Console()) if live else JsonEvents() if log_json else PlainLines()
+    limited = RateLimitedView(view, REDRAW_EVERY_S if live else LINE_EVERY_S, clock)
+    handler = _json_log_handler() if log_json else _WarningHandler(view)
     logger = logging.getLogger("millrace")
     level = logger.level
     logger.addHandler(handler)
     if log_json:
         logger.setLevel(logging.INFO)
     try:
-        yield pace
+        yield limited
     finally:
-        pace.close()
-        screen.close()
+        limited.close()
+        view.close()
         logger.removeHandler(handler)
         logger.setLevel(level)
 
 
-class Pace:
-    """Passes on the first progress, then at most one in `every_s`, and the last one. A new note is said at once."""
+class RateLimitedView:
+    """Shows the first progress, then at most one in `every_s`, and the last one. A new note is printed at once."""
 
-    def __init__(self, screen: Screen, every_s: float, clock: Callable[[], float]) -> None:
-        self._screen, self._every_s, self._clock = screen, every_s, clock
+    def __init__(self, view: ProgressView, every_s: float, clock: Callable[[], float]) -> None:
+        self._view, self._every_s, self._clock = view, every_s, clock
         self._shown_s = -every_s
         self._waiting: Progress | None = None
         self._note = ""
 
     def __call__(self, progress: Progress) -> None:
-        """A new state of the run."""
+        """Take a new progress of the run."""
         if progress.note and progress.note != self._note:
-            self._screen.say(progress.note)
+            self._view.print_line(progress.note)
         self._note = progress.note
         self._waiting = progress
         if self._clock() - self._shown_s >= self._every_s:
             self._show()
 
     def close(self) -> None:
-        """Show what has not been shown yet."""
+        """Show the last progress, if it was not shown yet."""
         self._show()
 
     def _show(self) -> None:
         if self._waiting is not None:
-            self._screen.show(self._waiting)
+            self._view.show(self._waiting)
             self._waiting, self._shown_s = None, self._clock()
 
 
-class Lines:
-    """Plain lines: for logs, pipes and batch systems."""
+class PlainLines:
+    """Plain lines, for logs, pipes and batch systems."""
 
     def show(self, progress: Progress) -> None:
-        """One line."""
-        parts = [f"{progress.env_steps:,} of {progress.total_steps:,} env steps", *figures(progress).values()]
-        self.say(" | ".join(parts))
+        """Print one line."""
+        parts = [f"{progress.env_steps:,} of {progress.total_steps:,} env steps", *main_figures(progress).values()]
+        self.print_line(" | ".join(parts))
 
-    def say(self, line: str) -> None:
-        """The line."""
+    def print_line(self, line: str) -> None:
+        """Print the line."""
         try:
             print(line, flush=True)
-        except BrokenPipeError:  # nobody reads any more; the run goes on, and Python's exit must not stumble either
+        except BrokenPipeError:  # the reader has gone; the run continues, and Python must be able to flush at its exit
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
     def close(self) -> None:
         """Nothing to do."""
 
 
-class Events:
-    """JSON lines on stderr, for machines."""
+class JsonEvents:
+    """JSON lines on stderr, for programs."""
 
     def show(self, progress: Progress) -> None:
-        """One line."""
+        """Print one line."""
         sys.stderr.write(f"{progress_line(progress, time.time())}\n")
 
-    def say(self, line: str) -> None:
-        """Nothing: notes stand in the progress, and what the log says is a line of its own."""
+    def print_line(self, line: str) -> None:
+        """Do nothing: notes are part of the progress, and the log has a handler of its own."""
 
     def close(self) -> None:
         """Nothing to do."""
 
 
-def _events_handler() -> logging.Handler:
+def _json_log_handler() -> logging.Handler:
     handler = logging.StreamHandler()
     handler.setFormatter(JsonLines())
     return handler
 
 
-class Block:
-    """The live block."""
+class LiveBlock:
+    """A block that is redrawn in place on a terminal."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -141,19 +143,19 @@ class Block:
 
     def show(self, progress: Progress) -> None:
         """Redraw the block."""
-        self._live.update(block(progress), refresh=True)
+        self._live.update(render_block(progress), refresh=True)
 
-    def say(self, line: str) -> None:
-        """The line, above the block."""
+    def print_line(self, line: str) -> None:
+        """Print the line above the block."""
         self._console.print(line, markup=False, highlight=False)
 
     def close(self) -> None:
-        """Leave the block as it is and give the cursor back."""
+        """Leave the block as it is and show the cursor again."""
         self._live.stop()
 
 
-def figures(progress: Progress) -> dict[str, str]:
-    """What matters most of a progress, in words."""
+def main_figures(progress: Progress) -> dict[str, str]:
+    """The most important figures, as text by name."""
     expected = progress.workers_expected
     score = "none yet" if progress.return_mean is None else f"{progress.return_mean:,.1f}"
     return {
@@ -165,27 +167,27 @@ def figures(progress: Progress) -> dict[str, str]:
     }
 
 
-def block(progress: Progress) -> RenderableType:
-    """The block: a bar, the figures, where time goes, what became of tickets and transitions, the run folder."""
+def render_block(progress: Progress) -> RenderableType:
+    """A progress bar, the main figures, where the time goes, what became of tickets and transitions, the run folder."""
     done = min(1.0, progress.env_steps / progress.total_steps) if progress.total_steps else 0.0
     bar = Table.grid(padding=(0, 1))
     bar.add_row(
         ProgressBar(total=1.0, completed=done, width=34, complete_style="cyan", finished_style="green"),
         Text(f"{done:4.0%}", style="bold"),
         Text(f"{progress.env_steps:,} of {progress.total_steps:,} env steps"),
-        Text(_left(progress, done), style="dim"),
+        Text(_elapsed_and_left(progress, done), style="dim"),
     )
-    head = Text("   ").join(_emphasised(name, text, progress) for name, text in figures(progress).items())
+    head = Text("   ").join(_styled(name, text, progress) for name, text in main_figures(progress).items())
     rows = Table.grid(padding=(0, 2))
     rows.add_column(style="dim", no_wrap=True)
     rows.add_column(overflow="fold")
-    for name, text in details(progress).items():
+    for name, text in detail_rows(progress).items():
         rows.add_row(name, text)
     return Group(bar, head, rows)
 
 
-def details(progress: Progress) -> dict[str, str]:
-    """The smaller print of a progress: stages as shares of their owner's time, counts that are not zero, the folder."""
+def detail_rows(progress: Progress) -> dict[str, str]:
+    """The details, as text by name: each stage's share of the time, counts that are not zero, the run folder."""
     rows = {}
     for owner in ("learner", "worker"):
         seconds = {name.removeprefix(f"{owner}_"): s for name, s in progress.stages.items() if name.startswith(owner)}
@@ -199,12 +201,12 @@ def details(progress: Progress) -> dict[str, str]:
 
 
 def _kind(name: str) -> str:
-    """What a count of the ledger counts; plain names count tickets."""
+    """What a count of the ledger counts: transitions or messages by its prefix, else tickets."""
     first, _, rest = name.partition("_")
     return first if rest and first in ("transitions", "messages") else "tickets"
 
 
-def _left(progress: Progress, done: float) -> str:
+def _elapsed_and_left(progress: Progress, done: float) -> str:
     steps = progress.total_steps - progress.env_steps
     if done >= 1 or not progress.steps_per_s:
         return f"{_clock_time(progress.wall_s)} in all"
@@ -217,19 +219,19 @@ def _clock_time(seconds: float) -> str:
     return f"{hours}:{m:02}:{s:02}" if hours else f"{m}:{s:02}"
 
 
-def _emphasised(name: str, text: str, progress: Progress) -> Text:
+def _styled(name: str, text: str, progress: Progress) -> Text:
     running = progress.env_steps < progress.total_steps
     missing = name == "workers" and running and progress.workers_alive < progress.workers_expected
     return Text(text, style={"return": "bold green"}.get(name, "bold yellow" if missing else "bold"))
 
 
-class _Said(logging.Handler):
-    """What the log says, on the screen."""
+class _WarningHandler(logging.Handler):
+    """Prints warnings and errors of the log in the view."""
 
-    def __init__(self, screen: Screen) -> None:
+    def __init__(self, view: ProgressView) -> None:
         super().__init__(logging.WARNING)
-        self._screen = screen
+        self._view = view
 
     def emit(self, record: logging.LogRecord) -> None:
-        """One record."""
-        self._screen.say(f"{record.levelname.lower()}: {record.getMessage()}")
+        """Print one record."""
+        self._view.print_line(f"{record.levelname.lower()}: {record.getMessage()}")

@@ -1,4 +1,4 @@
-"""The flags of the commands that look at runs, or edit keys."""
+"""The flags of the commands that look at runs, and of the launchers. tyro makes command lines of these records."""
 
 from __future__ import annotations
 
@@ -10,122 +10,122 @@ from tyro.conf import Positional
 
 
 class EvaluateFlags(msgspec.Struct, frozen=True, kw_only=True):
-    """Greedy episodes of a run's newest policy: mean and standard deviation of the return."""
+    """Play greedy episodes of a run's newest policy; print mean and standard deviation of the return."""
 
     run: Positional[Path]
-    """the run folder"""
+    """run folder"""
     episodes: int | None = None
-    """how many; if not given 100, and 3 with --video"""
+    """number of episodes; if not given 100, or 3 with --video"""
     seed: int = 1_000_000
-    """of the episodes; another seed, other episodes"""
+    """seed of the episodes"""
     best: bool = False
-    """of the policy that did best in the run's own evaluations (--eval-every), instead of the newest"""
+    """use the policy with the best evaluation during the run (--eval-every), instead of the newest"""
     video: bool = False
-    """film them: an mp4 of each in the run's videos folder (pip install 'millrace-rl[video]')"""
+    """film the episodes: an mp4 of each in the folder videos of the run (pip install 'millrace-rl[video]')"""
     debug: bool = False
     """show the traceback of an error"""
 
 
 class PlotFlags(msgspec.Struct, frozen=True, kw_only=True):
-    """Learning curves as a PNG: a panel for each environment, a colour for each algorithm, seeds as a band."""
+    """Draw learning curves as a PNG: a panel for each environment, a color for each algorithm, a band for several seeds."""
 
     runs: Positional[tuple[Path, ...]]
     """run folders"""
     out: Path | None = None
-    """the PNG; curves.png in the first run folder if not given"""
+    """file to write; if not given, curves.png in the first run folder"""
     debug: bool = False
     """show the traceback of an error"""
 
 
 class RecordFlags(msgspec.Struct, frozen=True, kw_only=True):
-    """A Minari dataset of a run's newest policy: whole episodes, raw rewards (pip install 'millrace-rl[record]')."""
+    """Write a Minari dataset: episodes of a run's newest policy, with raw rewards (pip install 'millrace-rl[record]')."""
 
     run: Positional[Path]
-    """the run folder"""
+    """run folder"""
     out: str
-    """the dataset's id, as in cartpole/expert-v0; it is written where MINARI_DATASETS_PATH says, or to ~/.minari/datasets"""
+    """id of the dataset, as cartpole/expert-v0; it is written to MINARI_DATASETS_PATH, or to ~/.minari/datasets"""
     steps: int = 50_000
-    """env steps; the last episode is finished, and cut only where that would double them"""
+    """number of env steps; the last episode is finished, unless that would take more than twice as many"""
     best: bool = False
-    """the policy that did best in the run's own evaluations (--eval-every), instead of the newest"""
+    """use the policy with the best evaluation during the run (--eval-every), instead of the newest"""
     npy: Path | None = None
-    """also write this file: an array of rows [observation, action], float32, flattened, one for each step"""
+    """also write this .npy file: a float32 array with a row [observation, action], flattened, for each step"""
     stochastic: bool = False
-    """draw actions from the policy, as in training, instead of taking the most probable"""
+    """sample actions from the policy, as in training, instead of taking the most probable ones"""
     seed: int = 2_000_000
-    """of the episodes and of the drawn actions"""
+    """seed of the episodes and of the sampled actions"""
     debug: bool = False
     """show the traceback of an error"""
 
 
 class ReportFlags(msgspec.Struct, frozen=True, kw_only=True):
-    """One HTML page about runs side by side: results, learning curves, settings, ledger, stages, films."""
+    """Compare runs on one HTML page: results, learning curves, settings, tickets, where the time went, videos."""
 
     runs: Positional[tuple[Path, ...]]
     """run folders"""
     out: Path | None = None
-    """the page; report.html in the first run folder if not given"""
+    """file to write; if not given, report.html in the first run folder"""
     debug: bool = False
     """show the traceback of an error"""
 
 
 class LaunchFlags(msgspec.Struct, frozen=True, kw_only=True):
-    """What every launcher takes. Flags of `millrace learner` stand behind `--`: millrace launch … -- --steps 1000000."""
+    """Flags of every launcher. Flags of `millrace learner` follow `--`: millrace launch … -- --steps 1000000."""
 
     env: Positional[str]
     """anything gymnasium.make takes"""
     workers: int = 4
-    """worker processes; of Ray, actors"""
+    """number of worker processes; with Ray, of actors"""
     name: str = "millrace"
-    """of all that belongs to this run: small letters, digits and dashes"""
+    """name of the run on the cluster: small letters, digits and dashes"""
     debug: bool = False
     """show the traceback of an error"""
 
 
 class KubernetesFlags(LaunchFlags, frozen=True, kw_only=True):
-    """A learner and workers as Kubernetes knows them, on stdout: millrace launch kubernetes ENV > k8s.yaml."""
+    """Print a Kubernetes manifest with a learner and workers: millrace launch kubernetes ENV > k8s.yaml."""
 
     keys: str = ""
-    """a key folder: its learner's key and join token become a Secret of the manifest, which is then itself secret"""
+    """key folder to write into the manifest as a Secret; the manifest is then secret itself"""
     learner_image: str = "millrace-learner"
-    """docker/Dockerfile, target learner; where the cluster finds it"""
+    """image built from docker/Dockerfile, target learner, as the cluster finds it"""
     worker_image: str = "millrace-worker"
-    """docker/Dockerfile, target worker"""
+    """image built from docker/Dockerfile, target worker, as the cluster finds it"""
     storage: str = "10Gi"
-    """for run folders"""
+    """size of the volume for run folders"""
     learner_cpu: str = "2"
-    """cores"""
+    """CPU cores of the learner"""
     learner_memory: str = "4Gi"
-    """its bound"""
+    """memory limit of the learner"""
     worker_cpu: str = "1"
-    """cores of each worker"""
+    """CPU cores of each worker"""
     worker_memory: str = "512Mi"
-    """of each worker, its bound"""
+    """memory limit of each worker"""
 
 
 class SlurmFlags(LaunchFlags, frozen=True, kw_only=True):
-    """A learner and workers as one Slurm job, on stdout: millrace launch slurm ENV > run.sbatch; sbatch run.sbatch."""
+    """Print the script of one Slurm job with a learner and workers: millrace launch slurm ENV > run.sbatch."""
 
     folder: Path = Path()
-    """a folder that all nodes share: runs, keys and logs go there; the current one if not given"""
+    """folder that all nodes share, for runs, keys and logs; if not given, the current folder"""
     time: str = "24:00:00"
-    """the job's time limit"""
+    """time limit of the job"""
     save_s: int = 120
-    """so long before the time limit the run is saved, and the job queued again to go on"""
+    """this many seconds before the time limit, the run is saved and the job is queued again to continue"""
     cpus: int = 1
-    """cores of each worker, and of the learner"""
+    """CPU cores of each worker, and of the learner"""
     partition: str = ""
-    """of the cluster; its own default if not given"""
+    """partition of the cluster; if not given, the cluster's default"""
     python: Path = Path(sys.executable)
-    """the Python that has millrace, on every node"""
+    """the Python interpreter that has millrace, on every node"""
 
 
 class RayFlags(LaunchFlags, frozen=True, kw_only=True):
-    """The learner here, its workers as actors of the Ray cluster of this machine (pip install 'millrace-rl[ray]')."""
+    """Train with workers on a Ray cluster: the learner here, each worker in an actor (pip install 'millrace-rl[ray]')."""
 
     address: str = "auto"
-    """of the cluster, as HOST:PORT; if not given, RAY_ADDRESS or the one that runs here"""
+    """address of the cluster, as HOST:PORT; auto is the environment variable RAY_ADDRESS, or the cluster of this machine"""
     processes: int = 1
-    """worker processes of each actor, which takes so many of Ray's cores"""
+    """worker processes in each actor; the actor takes as many of Ray's cores"""
     port: int = 5555
-    """where the learner listens, on the address of this node"""
+    """port where the learner listens, on the address of this node"""

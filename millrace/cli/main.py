@@ -98,9 +98,9 @@ def _train(argv: list[str]) -> int:
 
     config, resume = read_config("train", argv)
     from millrace.launch import local
-    from millrace.terminal import watching
+    from millrace.terminal import progress_view
 
-    with watching("--log-json" in argv) as watch:
+    with progress_view("--log-json" in argv) as watch:
         run = local.train(config, resume, watch)
     return _print_result(run)
 
@@ -111,9 +111,9 @@ def _learner(argv: list[str]) -> int:
     config, resume = read_config("learner", argv)
     from learner.run import serve
     from millrace.launch import learner_inference as inference
-    from millrace.terminal import watching
+    from millrace.terminal import progress_view
 
-    with watching("--log-json" in argv) as watch:
+    with progress_view("--log-json" in argv) as watch:
         if config.inference == "learner":
             run = inference.train(config, resume, watch, elsewhere=True)
         else:
@@ -275,9 +275,9 @@ def _launch_ray(argv: list[str]) -> int:
         if error.name != "ray":
             raise
         raise UsageError("launch ray: Ray is not installed; pip install 'millrace-rl[ray]'") from None
-    from millrace.terminal import watching
+    from millrace.terminal import progress_view
 
-    with watching("--log-json" in argv) as watch:
+    with progress_view("--log-json" in argv) as watch:
         run = launch(flags, learner, watch)
     return _print_result(run)
 

@@ -1,4 +1,4 @@
-"""What a run looks like: never too often, the last state always, and nothing that breaks the run."""
+"""How progress is shown: not too often, the last one always, and without breaking the run."""
 
 import io
 import logging
@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from learner.run_folder.progress import Progress
-from millrace.terminal import Block, Lines, Pace, block, details, watching
+from millrace.terminal import LiveBlock, PlainLines, RateLimitedView, detail_rows, progress_view, render_block
 
 PROGRESS = Progress(
     run="runs/CartPole-v1-ppo-s1", env_steps=62_208, total_steps=100_000, updates=243, wall_s=14.8, steps_per_s=4210.3,
@@ -20,45 +20,45 @@ PROGRESS = Progress(
 )  # fmt: skip
 
 
-class Seen:
+class RecordingView:
     def __init__(self) -> None:
         self.shown: list[int] = []
-        self.said: list[str] = []
+        self.lines: list[str] = []
 
     def show(self, progress: Progress) -> None:
         self.shown.append(progress.env_steps)
 
-    def say(self, line: str) -> None:
-        self.said.append(line)
+    def print_line(self, line: str) -> None:
+        self.lines.append(line)
 
     def close(self) -> None:
         pass
 
 
-def test_the_first_at_once_then_now_and_then_and_the_last_always() -> None:
+def test_the_first_progress_is_shown_at_once_then_a_few_and_the_last_always() -> None:
     now = [0.0]
-    seen = Seen()
-    pace = Pace(seen, 5.0, lambda: now[0])
+    view = RecordingView()
+    limited = RateLimitedView(view, 5.0, lambda: now[0])
     for steps in range(1, 13):
-        pace(Progress(env_steps=steps))
+        limited(Progress(env_steps=steps))
         now[0] += 1.0
-    assert seen.shown == [1, 6, 11]
-    pace.close()
-    assert seen.shown == [1, 6, 11, 12]
-    pace.close()
-    assert seen.shown == [1, 6, 11, 12]
+    assert view.shown == [1, 6, 11]
+    limited.close()
+    assert view.shown == [1, 6, 11, 12]
+    limited.close()
+    assert view.shown == [1, 6, 11, 12]
 
 
-def test_a_note_is_said_once_and_at_once() -> None:
-    seen = Seen()
-    pace = Pace(seen, 5.0, lambda: 0.0)
+def test_a_note_is_printed_once_and_at_once() -> None:
+    view = RecordingView()
+    limited = RateLimitedView(view, 5.0, lambda: 0.0)
     for note in ("", "greedy return 9.0", "greedy return 9.0", "", "greedy return 9.0"):
-        pace(Progress(note=note))
-    assert seen.said == ["greedy return 9.0", "greedy return 9.0"]
+        limited(Progress(note=note))
+    assert view.lines == ["greedy return 9.0", "greedy return 9.0"]
 
 
-def test_a_plain_line_says_what_matters(capsys: pytest.CaptureFixture[str]) -> None:
-    Lines().show(PROGRESS)
+def test_a_plain_line_has_the_main_figures(capsys: pytest.CaptureFixture[str]) -> None:
+    PlainLines().show(PROGRESS)
     assert capsys.readouterr().out == (
         "62,208 of 100,000 env steps | 4,210 steps/s | return 231.4 | lag 0.5 (max 1) | workers 1 of 2 | update 243\n"
     )
@@ -66,7 +66,7 @@ def test_a_plain_line_says_what_matters(capsys: pytest.CaptureFixture[str]) -> N
 
 def test_the_block_has_everything() -> None:
     console = Console(file=io.StringIO(), width=100, force_terminal=True, color_system=None)
-    console.print(block(PROGRESS))
+    console.print(render_block(PROGRESS))
     assert isinstance(console.file, io.StringIO)
     lines = [line.rstrip() for line in console.file.getvalue().splitlines()]
     assert lines[0].endswith("62% 62,208 of 100,000 env steps 0:15, 0:09 left")
@@ -82,17 +82,17 @@ def test_the_block_has_everything() -> None:
 
 
 def test_an_empty_progress_is_shown_too() -> None:
-    assert details(Progress()) == {"run": ""}
-    Console(file=io.StringIO()).print(block(Progress()))
+    assert detail_rows(Progress()) == {"run": ""}
+    Console(file=io.StringIO()).print(render_block(Progress()))
 
 
-def test_the_live_block_redraws_and_lets_go_of_the_terminal() -> None:
+def test_the_live_block_redraws_and_restores_the_terminal() -> None:
     console = Console(file=io.StringIO(), width=100, force_terminal=True)
-    screen = Block(console)
-    screen.show(Progress(env_steps=1, total_steps=10))
-    screen.say("a [line] that stays")
-    screen.show(Progress(env_steps=7, total_steps=10))
-    screen.close()
+    view = LiveBlock(console)
+    view.show(Progress(env_steps=1, total_steps=10))
+    view.print_line("a [line] that stays")
+    view.show(Progress(env_steps=7, total_steps=10))
+    view.close()
     assert isinstance(console.file, io.StringIO)
     drawn = console.file.getvalue()
     assert "a [line] that stays" in drawn
@@ -100,9 +100,9 @@ def test_the_live_block_redraws_and_lets_go_of_the_terminal() -> None:
     assert drawn.count("\x1b[?25l") == drawn.count("\x1b[?25h") == 1  # the cursor comes back
 
 
-def test_the_log_is_shown_while_a_run_is_watched(capsys: pytest.CaptureFixture[str]) -> None:
+def test_warnings_of_the_log_are_shown_meanwhile(capsys: pytest.CaptureFixture[str]) -> None:
     logger = logging.getLogger("millrace.learner")
-    with watching() as watch:
+    with progress_view() as watch:
         watch(Progress(total_steps=5))
         logger.warning("worker w1 is gone")
         logger.info("not so important")
@@ -114,11 +114,11 @@ def test_the_log_is_shown_while_a_run_is_watched(capsys: pytest.CaptureFixture[s
     assert not logger.parent.handlers
 
 
-def test_a_reader_that_goes_away_does_not_end_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reader_that_has_gone_does_not_end_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     reading, writing = os.pipe()
     os.close(reading)
     with os.fdopen(writing, "w") as pipe:
         monkeypatch.setattr("sys.stdout", pipe)
         for _ in range(3):
-            Lines().show(PROGRESS)
+            PlainLines().show(PROGRESS)
         monkeypatch.undo()

@@ -18,7 +18,7 @@ from learner.rollouts.status import status
 from learner.run_folder.json_log import JsonLines, progress_line
 from learner.run_folder.progress import Progress
 from millrace.cli.status import as_table, ask, in_json, observer_name
-from millrace.terminal import watching
+from millrace.terminal import progress_view
 from protocol.errors import RunError
 from protocol.messages import Goodbye, Heartbeat, Inquire, Status
 from protocol.wire.codec import encode
@@ -224,7 +224,7 @@ def test_any_other_line_and_the_progress_are_lines_of_json_too() -> None:
 
 def test_a_run_that_is_watched_by_a_machine_says_nothing_but_json(capsys: pytest.CaptureFixture[str]) -> None:
     logger = logging.getLogger("millrace.learner")
-    with watching(log_json=True) as watch:
+    with progress_view(log_json=True) as watch:
         watch(Progress(total_steps=5, note="saved"))
         logger.info("worker w1 joined")
     logger.info("nobody listens any more")
