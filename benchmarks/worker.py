@@ -21,7 +21,7 @@ from benchmarks.writing import write
 from learner.config.layers import resolve
 from learner.rollouts.hub import Hub, HubSettings
 from learner.rollouts.roster import Roster
-from learner.run import run_spec
+from learner.run_spec import run_spec
 from protocol.policy.layout import buffer_size, parameter_layout, total_size
 from protocol.specs import EnvSpec
 from protocol.wire.link import LearnerLink

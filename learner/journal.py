@@ -1,4 +1,4 @@
-"""What a run writes while it goes on: metrics, checkpoints, the policy, the summary; and what a resumed run reads back.
+"""What a run writes while it goes on: metrics, checkpoints, the policy, the summary.
 
 The law: a checkpoint is written between two updates, never within one, and holds everything that the next update depends
 on. A disk that is full costs a warning, never the run.
@@ -9,66 +9,26 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
-
-import msgspec
 
 from learner.algorithms import Algorithm
 from learner.config.config import Config
-from learner.evaluate import evaluate
+from learner.evaluations import Evaluations, warn_on_error
 from learner.recording.record import TrainingRecorder
 from learner.rollouts.arrived_rollout import ArrivedRollout
-from learner.rollouts.hub import Hub, HubSnapshot
-from learner.rollouts.ledger import Ledger
+from learner.rollouts.hub import HubSnapshot
 from learner.run_folder import checkpoint
 from learner.run_folder.episode_window import EpisodeWindow
 from learner.run_folder.metrics_log import MetricsLog
 from learner.run_folder.progress import Progress
-from learner.run_folder.results import Best, Evaluation, Summary
+from learner.run_folder.results import Best, Summary
 from learner.run_folder.run_folder import RunFolder
 from learner.run_folder.versions import versions
-from protocol.arrays import Floats
-from protocol.errors import CheckpointError, RunError, UsageError
-from protocol.policy.policy import make_policy
+from learner.run_state import RunState
+from learner.service import RolloutService
 from protocol.rollout import Batch
 from protocol.specs import RunSpec
 
 log = logging.getLogger("millrace.learner")
-
-
-EVALUATION_SEED, CONFIRMATION_SEED = 1_000_000, 2_000_000  # far from the seeds of training, and from each other
-
-
-class Past(msgspec.Struct, kw_only=True):
-    """Where a run stands: zero at its start, from a checkpoint when it is resumed."""
-
-    version: int = 0
-    env_steps: int = 0
-    wall_s: float = 0.0
-    ledger: Ledger = msgspec.field(default_factory=Ledger)
-    incarnations: list[int] = []
-    episodes: list[Any] = []
-    best: list[float] | None = None
-    """mean return and env steps of the best evaluation; its policy lies in the run folder"""
-
-
-def recall(folder: RunFolder, algorithm: Algorithm) -> Past:
-    """Load the newest whole checkpoint into the algorithm. Raises `CheckpointError` when there is none."""
-    found, warnings = checkpoint.newest(folder.path)
-    for line in warnings:
-        log.warning("%s", line)
-    try:
-        past = msgspec.convert(found.state["past"], Past)
-        algorithm.load_state_dict(found.state["algorithm"])
-    except (KeyError, ValueError, TypeError, RuntimeError) as error:
-        raise CheckpointError(
-            f"checkpoint {found.path}: expected the state of this configuration, got another ({error}); "
-            "resume it with the settings it was made with"
-        ) from error
-    # The tickets that were outstanding died with the learner that dealt them, and so did the rollouts not yet used.
-    past.ledger.lost += past.ledger.outstanding
-    past.ledger.transitions_late += past.ledger.transitions_waiting
-    return past
 
 
 class Journal:
@@ -80,164 +40,100 @@ class Journal:
         folder: RunFolder,
         spec: RunSpec,
         algorithm: Algorithm,
-        hub: Hub,
-        past: Past,
+        service: RolloutService,
+        state: RunState,
         watch: Callable[[Progress], None],
     ) -> None:
-        self.config, self.folder, self.spec = config, folder, spec
-        self.algorithm, self.hub = algorithm, hub
-        self.version, self.env_steps = past.version, past.env_steps
-        self.evaluation: Evaluation | None = None
-        self.stages = {"update": 0.0, "other": 0.0}
-        self.workers_expected = 0
-        """how many workers there should be; 0: any number"""
-        self._window = EpisodeWindow.from_state(past.episodes)
-        self._metrics = MetricsLog(folder.path, past.env_steps)
-        self._watch = watch
-        self._wall_before_s, self._steps_before = past.wall_s, past.env_steps
-        self._began_s = self._saved_s = time.monotonic()
-        self._evaluated_version = -1
-        self._evaluate_at = past.env_steps + config.eval_every
-        self._note = ""
+        """`state`: where the run stands. `watch` is called with the progress after each update."""
+        self.version, self.env_steps = state.version, state.env_steps
+        self._config, self._folder, self._spec = config, folder, spec
+        self._algorithm, self._service, self._watch = algorithm, service, watch
+        self._stop_rule, self._checkpoints = config.stop_rule(), config.checkpoint_policy()
+        settings = config.evaluation_settings()
+        self._evaluations = Evaluations(settings, folder, spec, algorithm, service, state.best, state.env_steps)
         self._confirmed: Best | None = None
-        self._recorder: TrainingRecorder | None = None
-        if config.record:
-            about = f"All whole training episodes of millrace run {folder.path.resolve().name}, as acted."
-            self._recorder = TrainingRecorder(config.record, spec.env, spec.policy, about)
+        self._window = EpisodeWindow.from_state(state.episodes)
+        self._metrics = MetricsLog(folder.path, state.env_steps)
+        self._recorder = _recorder(config, folder, spec)
+        self._stages_s = {"update": 0.0, "other": 0.0}
+        self._worker_stages_s: dict[int, Mapping[str, float]] = {}  # by session; workers that have left count too
+        self._wall_before_s, self._steps_before = state.wall_s, state.env_steps
+        self._started_s = self._saved_s = time.monotonic()
+        self._episodes_since_save = 0
         self._workers_alive = 0
-        self._best = past.best
-        self._episodes_until_save = config.checkpoint_every_episodes
-        self._worker_stages: dict[int, Mapping[str, float]] = {}  # by session: those of workers that have left count too
-        hub.report_progress(self.progress())
+        service.report(self.progress())
 
     # ---------------------------------------------------------------- what the loop calls
 
     def stop_reason(self) -> str | None:
         """Why the run should end now, or None."""
-        target, evaluation = self.config.target_return, self.evaluation
-        if target is not None and evaluation is not None and evaluation.return_mean >= target:
-            return f"target return {target:g} reached"
-        target = self.config.target_mean_return
-        if target is not None and self._window.full and (self._window.return_mean or 0.0) >= target:
-            return f"mean return {target:g} of the last episodes reached"
-        one_more = self.spec.rollout_steps * self.config.envs
-        enough = self.version > 0 and self.env_steps + one_more > self.config.steps
-        return "all steps done" if enough else None
+        newest = self._evaluations.newest
+        steps_per_update = self._spec.rollout_steps * self._config.envs
+        return self._stop_rule.reason_to_stop(
+            env_steps_after_next_update=self.env_steps + steps_per_update if self.version else 0,
+            evaluation_return=None if newest is None else newest.return_mean,
+            training_return=self._window.return_mean if self._window.full else None,
+        )
 
     def gathered(self, rollouts: Sequence[ArrivedRollout]) -> None:
-        """Rollouts that are about to be learned from: keep their episodes, if they are to be recorded."""
+        """Record the episodes of these rollouts, if the run records episodes. An update will use them next."""
         if self._recorder is not None:
             self._recorder.add(rollouts)
 
     def updated(self, batch: Batch, metrics: Mapping[str, float], update_s: float) -> None:
-        """An update was made and published: count, write, and now and then evaluate and checkpoint."""
+        """An update was made and published: count it, evaluate and write what is due."""
         began_s = time.monotonic()
         self.version += 1
         self.env_steps += batch.env_steps
-        self._workers_alive = self.hub.workers_alive()
-        self.stages["update"] += update_s
+        self._workers_alive = self._service.workers_alive()
+        self._stages_s["update"] += update_s
         self._window.extend(batch.episodes)
-        extra: dict[str, float] = {}
-        if self.config.eval_every and self.env_steps >= self._evaluate_at:
-            self._evaluate_at += self.config.eval_every
-            found = self.evaluate()
-            extra = found.metrics()
-            self._keep_if_best(found)
+        evaluation = self._evaluations.evaluate_if_due(self.version, self.env_steps)
         progress = self.progress()
-        self._surely(lambda: self._metrics.write(progress, {**metrics, **extra}))
-        self.hub.report_progress(progress)
+        warn_on_error(lambda: self._metrics.write(progress, {**metrics, **evaluation}))
+        self._service.report(progress)
         self._watch(progress)
-        self._episodes_until_save -= len(batch.episodes)
-        every = self.config.checkpoint_every_updates
-        by_episodes = self.config.checkpoint_every_episodes and self._episodes_until_save <= 0
-        if by_episodes or (every and self.version % every == 0) or began_s - self._saved_s > self.config.checkpoint_every_s:
+        self._episodes_since_save += len(batch.episodes)
+        if self._checkpoints.is_due(
+            since_last_s=began_s - self._saved_s, episodes_since_last=self._episodes_since_save, updates=self.version
+        ):
             self.save()
-        self.stages["other"] += time.monotonic() - began_s
-
-    def evaluate(self) -> Evaluation:
-        """Greedy episodes of the newest policy; the workers are answered meanwhile."""
-        if self.evaluation is None or self._evaluated_version != self.version:
-            self.evaluation = self._evaluated(*self.algorithm.weights(), EVALUATION_SEED)
-            self._evaluated_version = self.version
-            self._note = f"{self.env_steps:,} env steps: greedy {self.evaluation}"
-        return self.evaluation
+        self._stages_s["other"] += time.monotonic() - began_s
 
     def save(self) -> None:
-        """A checkpoint and the policy; a disk that does not take them costs a warning."""
-        snapshot = self.hub.snapshot()
-        past = Past(
-            version=self.version,
-            env_steps=self.env_steps,
-            wall_s=self._wall_s(),
-            ledger=snapshot.ledger,
-            incarnations=snapshot.incarnations,
-            episodes=self._window.state(),
-            best=self._best,
-        )
-        state = {"past": msgspec.to_builtins(past), "algorithm": self.algorithm.state_dict()}
+        """Write a checkpoint and the policy."""
+        state = self._state().checkpoint(self._algorithm)
         self._saved_s = time.monotonic()
-        self._episodes_until_save = self.config.checkpoint_every_episodes
-        keep = self.config.keep_checkpoints
-        self._surely(lambda: checkpoint.save(self.folder.path, state, self.env_steps, keep))
-        self._surely(self._write_policy)
+        self._episodes_since_save = 0
+        warn_on_error(lambda: checkpoint.save(self._folder.path, state, self.env_steps, self._checkpoints.keep))
+        policy, env = self._spec.policy, self._spec.env
+        warn_on_error(lambda: self._folder.write_policy(policy, env, *self._algorithm.weights()))
 
     def conclude(self) -> None:
-        """Evaluate the final policy, and once more the best one, on episodes that it was not chosen by."""
-        found = self.evaluate()
-        if self.config.eval_every:
-            self._keep_if_best(found)
-        if self._best is not None:
-            chosen_by, env_steps = self._best
-            try:
-                _, parameters, buffers = self.folder.read_policy("best")
-            except UsageError as error:  # the disk did not take it
-                log.warning("%s", error)
-                return
-            again = self._evaluated(parameters, buffers, CONFIRMATION_SEED)
-            self._confirmed = Best(env_steps=int(env_steps), chosen_by=chosen_by, evaluation=again)
+        """Evaluate the final policy, and the best one."""
+        self._confirmed = self._evaluations.conclude(self.version, self.env_steps)
 
     def finish(self, reason: str) -> None:
-        """The summary."""
-        wall_s, snapshot = self._wall_s(), self.hub.snapshot()
-        self._surely(
-            lambda: self.folder.write_summary(
-                Summary(
-                    env=self.config.env,
-                    algo=self.config.algo,
-                    seed=self.config.seed,
-                    env_steps=self.env_steps,
-                    updates=self.version,
-                    wall_s=wall_s,
-                    env_steps_per_s=self.env_steps / wall_s if wall_s else 0.0,
-                    stop_reason=reason,
-                    return_mean_100=self._window.return_mean,
-                    evaluation=self.evaluation if self._evaluated_version == self.version else None,
-                    best=self._confirmed,
-                    ledger=snapshot.ledger.counts(),
-                    lags=self.hub.lag_histogram(),
-                    first_use_s=self.hub.first_use_s(),
-                    stages=self._stages(snapshot),
-                    versions=versions(),
-                )
-            )
-        )
+        """Write the summary."""
+        warn_on_error(lambda: self._folder.write_summary(self._summary(reason)))
         self._watch(self.progress())
 
     def close(self) -> None:
-        """Close the files, and the dataset if episodes were recorded: also when the run was cut short."""
+        """Close the metrics, and the dataset if episodes were recorded. Also for a run that was cut short."""
         self._metrics.close()
         if self._recorder is not None:
             log.warning("%s", self._recorder.close())
 
     def progress(self) -> Progress:
         """How far the run is."""
-        wall_s, snapshot = self._wall_s(), self.hub.snapshot()
+        snapshot = self._service.snapshot()
+        wall_s = self._wall_s()
         here_s = wall_s - self._wall_before_s
         lags = snapshot.lags or [0]
         return Progress(
-            run=str(self.folder.path),
+            run=str(self._folder.path),
             env_steps=self.env_steps,
-            total_steps=self.config.steps,
+            total_steps=self._config.steps,
             updates=self.version,
             wall_s=wall_s,
             steps_per_s=(self.env_steps - self._steps_before) / here_s if here_s else 0.0,
@@ -246,44 +142,62 @@ class Journal:
             lag_mean=sum(lags) / len(lags),
             lag_max=max(lags),
             workers_alive=self._workers_alive,
-            workers_expected=self.workers_expected,
+            workers_expected=self._service.workers_expected,
             ledger=snapshot.ledger.counts(),
             stages=self._stages(snapshot),
-            note=self._note,
+            note=self._evaluations.note,
         )
 
     # ---------------------------------------------------------------- inside
 
+    def _state(self) -> RunState:
+        snapshot = self._service.snapshot()
+        return RunState(
+            version=self.version,
+            env_steps=self.env_steps,
+            wall_s=self._wall_s(),
+            ledger=snapshot.ledger,
+            incarnations=snapshot.incarnations,
+            episodes=self._window.state(),
+            best=self._evaluations.best,
+        )
+
+    def _summary(self, reason: str) -> Summary:
+        wall_s, snapshot = self._wall_s(), self._service.snapshot()
+        return Summary(
+            env=self._config.env,
+            algo=self._config.algo,
+            seed=self._config.seed,
+            env_steps=self.env_steps,
+            updates=self.version,
+            wall_s=wall_s,
+            env_steps_per_s=self.env_steps / wall_s if wall_s else 0.0,
+            stop_reason=reason,
+            return_mean_100=self._window.return_mean,
+            evaluation=self._evaluations.of_version(self.version),
+            best=self._confirmed,
+            ledger=snapshot.ledger.counts(),
+            lags=self._service.lag_histogram(),
+            first_use_s=self._service.first_use_s(),
+            stages=self._stages(snapshot),
+            versions=versions(),
+        )
+
     def _stages(self, snapshot: HubSnapshot) -> dict[str, float]:
-        """Seconds: of the learner, and of all workers together (as their last heartbeats told)."""
-        stages = {"learner_wait": snapshot.wait_s} | {f"learner_{name}": s for name, s in self.stages.items()}
-        self._worker_stages |= snapshot.worker_stages()
-        for told in self._worker_stages.values():
-            for name, seconds in told.items():
+        """Seconds in each stage: of the learner, and of all workers together, as their last heartbeats said."""
+        stages = {"learner_wait": snapshot.wait_s} | {f"learner_{name}": s for name, s in self._stages_s.items()}
+        self._worker_stages_s |= snapshot.worker_stages()
+        for worker_stages in self._worker_stages_s.values():
+            for name, seconds in worker_stages.items():
                 stages[f"worker_{name}"] = stages.get(f"worker_{name}", 0.0) + seconds
         return stages
 
-    def _evaluated(self, parameters: Floats, buffers: Floats, seed: int) -> Evaluation:
-        policy = make_policy(self.spec.policy)
-        policy.load(parameters, buffers)
-        episodes, env = self.config.eval_episodes, self.spec.env
-        return evaluate(env, policy, self.spec.policy, episodes, seed + self.config.seed, self.hub.pulse)
-
-    def _keep_if_best(self, found: Evaluation) -> None:
-        """The first of equals stays: it needed the fewest steps."""
-        if self._best is None or found.return_mean > self._best[0]:
-            weights = self.algorithm.weights()
-            self._best = [found.return_mean, self.env_steps]
-            self._surely(lambda: self.folder.write_policy(self.spec.policy, self.spec.env, *weights, which="best"))
-
-    def _write_policy(self) -> None:
-        self.folder.write_policy(self.spec.policy, self.spec.env, *self.algorithm.weights())
-
     def _wall_s(self) -> float:
-        return self._wall_before_s + time.monotonic() - self._began_s
+        return self._wall_before_s + time.monotonic() - self._started_s
 
-    def _surely(self, write: Callable[[], object]) -> None:
-        try:
-            write()
-        except RunError as error:
-            log.warning("%s", error)
+
+def _recorder(config: Config, folder: RunFolder, spec: RunSpec) -> TrainingRecorder | None:
+    if not config.record:
+        return None
+    about = f"All whole training episodes of millrace run {folder.path.resolve().name}, as acted."
+    return TrainingRecorder(config.record, spec.env, spec.policy, about)

@@ -1,7 +1,7 @@
-"""THE loop. Everything else is called from here; `hub.gather` is the only place that waits.
+"""The training loop. Everything else is called from here; `service.gather` is the only place that waits for rollouts.
 
-`max_lag` 0: publish, collect, learn, in turn. `max_lag` 1: while the learner learns from one batch, the tickets dealt before
-let the workers collect the next. The loop is the same; the roster deals more or fewer tickets.
+With `max_lag` 0 the learner publishes weights, gathers rollouts and learns, one after the other. With `max_lag` 1 the
+workers already collect the next rollouts while the learner learns. The loop is the same: only the number of tickets differs.
 """
 
 from __future__ import annotations
@@ -10,36 +10,36 @@ import time
 
 from learner.algorithms import Algorithm
 from learner.journal import Journal
-from learner.rollouts.hub import Hub
 from learner.run_folder.run_folder import Interrupted
+from learner.service import RolloutService
 from protocol.errors import RunError
 from protocol.rollout import stack
 
 
-def train(algorithm: Algorithm, hub: Hub, journal: Journal, workers: int) -> str:
-    """Learn until the journal says stop; why it stopped. `workers`: how many to wait for before the first rollout.
+def train(algorithm: Algorithm, service: RolloutService, journal: Journal, workers: int) -> str:
+    """Learn until the journal gives a reason to stop; return that reason.
 
-    When the run cannot go on (nobody left, the environment raised too often, the user interrupted), the state after the last
-    whole update is saved, then the error goes on.
+    `workers`: how many to wait for before the first rollout. When the run cannot go on (no worker is left, the environment
+    raised too often, the user interrupted it), the state after the last whole update is saved before the error is raised.
     """
     journal.save()
     if journal.stop_reason() is None:
-        hub.wait_for(workers)
-        hub.publish(journal.version, *algorithm.weights())
+        service.wait_for_workers(workers)
+        service.publish(journal.version, *algorithm.weights())
     while (reason := journal.stop_reason()) is None:
         try:
-            arrived = hub.gather()
+            arrived = service.gather()
         except (RunError, Interrupted):
             journal.save()
             raise
         journal.gathered(arrived)
         began_s = time.monotonic()
         batch = stack([one.rollout for one in arrived])
-        metrics = algorithm.update(batch, hub.pulse)
-        hub.publish(journal.version + 1, *algorithm.weights())
+        metrics = algorithm.update(batch, service.pulse)
+        service.publish(journal.version + 1, *algorithm.weights())
         journal.updated(batch, metrics, time.monotonic() - began_s)
     journal.save()
-    hub.drain(reason)
+    service.drain(reason)
     journal.conclude()
     journal.finish(reason)
     return reason

@@ -14,3 +14,5 @@ class WorkerProcesses:
     """names of the workers whose processes have ended since the last call, each with the reason; it may raise"""
     count: Callable[[], int] | None = None
     """how many processes step the environment; None: as many as there are members"""
+    expected: int = 0
+    """how many processes the user asked for; 0: any number"""

@@ -104,9 +104,13 @@ class RunFolder:
         return RunFolder(path)
 
     def remove(self) -> None:
-        """As if it had not been made; nothing, if it was there before."""
+        """Remove the folder, and the parent folders made for it. Does nothing if it was there before, or after `keep`."""
         if self._made is not None:
             shutil.rmtree(self._made, ignore_errors=True)
+
+    def keep(self) -> None:
+        """The run has begun: `remove` does nothing from now on."""
+        self._made = None
 
     def write_config(self, config: Config) -> None:
         """Write config.toml and run.json: at the start, and again when a run is resumed, perhaps with other settings."""

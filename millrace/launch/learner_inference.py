@@ -18,7 +18,7 @@ import zmq
 from learner.config.config import Config
 from learner.members.endpoint import Bind
 from learner.members.worker_processes import WorkerProcesses
-from learner.run import Run, Watch, looking
+from learner.run import Run, Watch, prometheus_observer, set_up
 from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.settings import VectorEnvSettings
 from millrace.launch.local_workers import flags_of, own_address
@@ -50,6 +50,24 @@ def train(
         stack.callback(context.term)
         link = LearnerLink(own_address("inproc", stack), context)
         stack.callback(link.close, 0.5)
+        listening = listen(_settings(config, factory, elsewhere=elsewhere), stack.enter_context(ExitStack()))
+        observer = stack.enter_context(prometheus_observer(config))
+        env_spec = EnvSpec.of(config.env if factory is None else factory, config.env_kwargs)
+        setup = stack.enter_context(set_up(config, env_spec, resume))
+        env = listening.start(flags_of(config, setup.folder.path))
+        stack.callback(env.close)
+        workers = config.min_workers or (1 if elsewhere else min(config.workers, config.envs))
+        lanes = SideBySide(env, config.lanes, _before_waits(env, workers, config.no_workers_timeout_s))
+
+        def collector(spec: RunSpec) -> Collector:
+            from learner.torch_setup import torch_device
+
+            policy = acting_policy(spec.policy, torch_device(config), spec.images_dtype)
+            return Collector(spec, policy, lanes.open, lanes.begin)
+
+        host = Host(lambda name: WorkerThread(link.address, name, context, collector), 1, prefix="inference")
+        stack.callback(host.stop)
+        stack.callback(host.ask_to_leave)  # asked a second time, it leaves at once
 
         def ended() -> list[tuple[str, str]]:
             if lanes.nobody is not None:
@@ -57,25 +75,9 @@ def train(
                 raise nobody
             return host.poll()
 
-        processes = WorkerProcesses(ended, lambda: env.workers)
-        listening = listen(_settings(config, factory, elsewhere=elsewhere), stack.enter_context(ExitStack()))
-        env_spec = EnvSpec.of(config.env if factory is None else factory, config.env_kwargs)
-        observer = stack.enter_context(looking(config))
-        run = Run(config, env_spec, link, resume, watch, observer, lambda folder: processes)
-        env = listening.start(flags_of(config, run.folder.path))
-        stack.callback(env.close)
-        workers = config.min_workers or (1 if elsewhere else min(config.workers, config.envs))
-        lanes = SideBySide(env, config.lanes, _before_waits(env, workers, config.no_workers_timeout_s))
-
-        def collector(spec: RunSpec) -> Collector:
-            return Collector(spec, acting_policy(spec.policy, run.device, spec.images_dtype), lanes.open, lanes.begin)
-
-        host = Host(lambda name: WorkerThread(link.address, name, context, collector), 1, prefix="inference")
-        stack.callback(host.stop)
-        stack.callback(host.ask_to_leave)  # asked a second time, it leaves at once
-
-        run.journal.workers_expected = 0 if elsewhere else config.workers
-        run.go(1)
+        processes = WorkerProcesses(ended, lambda: env.workers, 0 if elsewhere else config.workers)
+        run = Run(setup, link, processes, watch, observer)
+        run.train(1)
         return run.folder.path
 
 

@@ -13,7 +13,7 @@ import zmq
 
 from learner.config.config import Config
 from learner.members.worker_processes import WorkerProcesses
-from learner.run import Run, Watch, looking
+from learner.run import Run, Watch, prometheus_observer, set_up
 from millrace.launch.local_workers import flags_of, own_address, own_keys
 from protocol.errors import UsageError
 from protocol.keys.keys import Token
@@ -40,16 +40,13 @@ def train(config: Config, resume: Path | None, watch: Watch, factory: Callable[.
         stack.callback(context.term)
         link = LearnerLink(address, context, keyring)
         stack.callback(link.close, 0.5)
+        observer = stack.enter_context(prometheus_observer(config))
         env = EnvSpec.of(config.env if factory is None else factory, config.env_kwargs)
-
-        def begin(folder: Path) -> WorkerProcesses:
-            host = Host(_starter(config, link.address, token, context, folder), config.workers)
-            stack.callback(host.stop)
-            return WorkerProcesses(host.poll)
-
-        run = Run(config, env, link, resume, watch, stack.enter_context(looking(config)), begin, config.workers)
-        run.journal.workers_expected = config.workers
-        run.go(config.min_workers or config.workers)
+        setup = stack.enter_context(set_up(config, env, resume))
+        host = Host(_starter(config, link.address, token, context, setup.folder.path), config.workers)
+        stack.callback(host.stop)
+        run = Run(setup, link, WorkerProcesses(host.poll, expected=config.workers), watch, observer)
+        run.train(config.min_workers or config.workers)
         return run.folder.path
 
 

@@ -24,7 +24,7 @@ from learner.config.config import Config
 from learner.config.layers import resolve
 from learner.prometheus import EVERY_S, STAGES, Exposition, exposed
 from learner.rollouts.hub import PULSE_S, Hub, HubSettings
-from learner.run import looking
+from learner.run import prometheus_observer
 from learner.run_folder.progress import Progress
 from millrace.launch import local
 from protocol.errors import UsageError
@@ -243,7 +243,7 @@ def test_it_is_scraped_while_a_run_goes_on_and_is_gone_with_it(
 
 def test_it_is_off_unless_asked_for(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "millrace.learner")
-    with looking(Config(env="CartPole-v1")):
+    with prometheus_observer(Config(env="CartPole-v1")):
         assert not [thread for thread in threading.enumerate() if thread.name == "metrics"]
     assert not caplog.messages
 

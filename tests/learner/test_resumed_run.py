@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -13,11 +12,11 @@ from learner.algorithms.ppo import PPO
 from learner.config.config import Config
 from learner.config.hyperparameters import PPOConfig
 from learner.config.layers import resolve
-from learner.journal import Past, recall
 from learner.rollouts.ledger import Ledger
-from learner.run import run_spec
 from learner.run_folder import checkpoint
 from learner.run_folder.run_folder import RunFolder
+from learner.run_spec import run_spec
+from learner.run_state import RunState, restore
 from protocol.errors import CheckpointError
 from protocol.policy.policy import make_policy
 from protocol.rollout import Batch, Rollout, stack
@@ -60,13 +59,12 @@ def test_the_next_update_is_the_same_as_without_a_stop(tmp_path: Path, env: str)
     folder = RunFolder.create(config)
     straight.update(first, lambda: None)
     straight.update(second, lambda: None)
-    state = {"past": msgspec.to_builtins(Past(version=2)), "algorithm": straight.state_dict()}
-    checkpoint.save(folder.path, state, env_steps=2, keep=3)
+    checkpoint.save(folder.path, RunState(version=2).checkpoint(straight), env_steps=2, keep=3)
     metrics = straight.update(third, lambda: None)
 
     resumed = algorithm()
-    past = recall(folder, resumed)
-    assert past.version == 2
+    state = restore(folder, resumed)
+    assert state.version == 2
     metrics_again = resumed.update(third, lambda: None)
     assert metrics_again == metrics
     for expected, got in zip(straight.weights(), resumed.weights(), strict=True):
@@ -81,10 +79,9 @@ def test_tickets_of_the_learner_that_died_are_lost_and_the_ledger_balances(tmp_p
     run = run_spec(config, EnvSpec("CartPole-v1"))
     algorithm = PPO(ppo(config), run.policy, total_steps=1, seed=1)
     folder = RunFolder.create(config)
-    past = Past(ledger=Ledger(issued=10, used=6, transitions_received=80, transitions_used=60))
-    state = {"past": msgspec.to_builtins(past), "algorithm": algorithm.state_dict()}
-    checkpoint.save(folder.path, state, env_steps=60, keep=1)
-    ledger = recall(folder, algorithm).ledger
+    state = RunState(ledger=Ledger(issued=10, used=6, transitions_received=80, transitions_used=60))
+    checkpoint.save(folder.path, state.checkpoint(algorithm), env_steps=60, keep=1)
+    ledger = restore(folder, algorithm).ledger
     assert (ledger.lost, ledger.outstanding, ledger.transitions_late, ledger.transitions_waiting) == (4, 0, 20, 0)
 
 
@@ -92,13 +89,10 @@ def test_a_checkpoint_of_another_network_is_refused_in_one_line(tmp_path: Path) 
     config = resolve("CartPole-v1", run_dir=str(tmp_path))
     run = run_spec(config, EnvSpec("CartPole-v1"))
     folder = RunFolder.create(config)
-    state = {
-        "past": msgspec.to_builtins(Past()),
-        "algorithm": PPO(ppo(config), run.policy, total_steps=1, seed=1).state_dict(),
-    }
-    checkpoint.save(folder.path, state, env_steps=0, keep=1)
+    narrower = PPO(ppo(config), run.policy, total_steps=1, seed=1)
+    checkpoint.save(folder.path, RunState().checkpoint(narrower), env_steps=0, keep=1)
     wider = resolve("CartPole-v1", net=(32, 32), run_dir=str(tmp_path))
     other = PPO(ppo(wider), run_spec(wider, EnvSpec("CartPole-v1")).policy, total_steps=1, seed=1)
     with pytest.raises(CheckpointError, match="expected the state of this configuration") as failure:
-        recall(folder, other)
+        restore(folder, other)
     assert "\n" not in str(failure.value)

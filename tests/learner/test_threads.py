@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from learner.config.layers import resolve
-from learner.run import threads
+from learner.torch_setup import threads
 from millrace.launch.local_workers import cores_for
 from protocol import cpu_cores as counting
 from protocol.cpu_cores import cores

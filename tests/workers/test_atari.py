@@ -11,7 +11,7 @@ import pytest
 
 from learner.config.config import Config
 from learner.config.hyperparameters import PPOConfig
-from learner.run import run_spec
+from learner.run_spec import run_spec
 from protocol.envs.envpool import pool_of
 from protocol.envs.vectorized import make_native
 from protocol.errors import UsageError

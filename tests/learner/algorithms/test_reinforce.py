@@ -14,7 +14,7 @@ from learner.algorithms.actor_critic import Minibatch
 from learner.algorithms.reinforce import REINFORCE
 from learner.config.hyperparameters import REINFORCEConfig
 from learner.config.layers import resolve
-from learner.run import run_spec
+from learner.run_spec import run_spec
 from protocol.errors import UsageError
 from protocol.rollout import Batch
 from protocol.specs import EnvSpec, PolicySpec

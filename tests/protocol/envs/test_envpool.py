@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from learner.config.config import Config
 from learner.config.layers import resolve
-from learner.run import run_spec
+from learner.run_spec import run_spec
 from protocol.envs.envpool import pool_of
 from protocol.errors import UsageError
 from protocol.specs import EnvSpec, RunSpec

@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 from learner.config.config import Config
 from learner.config.layers import resolve
-from learner.run import run_spec
+from learner.run_spec import run_spec
 from protocol.envs.vectorized import make_native
 from protocol.errors import UsageError
 from protocol.specs import EnvSpec, RunSpec

@@ -14,8 +14,8 @@ from learner.algorithms import algorithm_class
 from learner.config.hyperparameters import HYPERPARAMETERS
 from learner.config.layers import resolve
 from learner.evaluate import load_policy
-from learner.run import run_spec
 from learner.run_folder.run_folder import RunFolder
+from learner.run_spec import run_spec
 from protocol.errors import UsageError
 from protocol.policy.encoder import describe_encoder, make_encoder
 from protocol.policy.layout import acting_size

@@ -1,0 +1,68 @@
+"""What workers are told of a run: the environment's spaces, the policy that fits them, sizes and seed."""
+
+from __future__ import annotations
+
+import msgspec
+
+from learner.algorithms import algorithm_class
+from learner.config.config import Config
+from learner.env_spaces import EnvSpaces, env_spaces
+from protocol.envs.envpool import check_pool
+from protocol.envs.vectorized import check_native
+from protocol.errors import UsageError
+from protocol.policy.encoder import describe_encoder
+from protocol.specs import EnvSpec, PolicySpec, RunSpec
+from protocol.wire.compression import why_no_zstd
+
+
+def run_spec(config: Config, env: EnvSpec, spaces: EnvSpaces | None = None) -> RunSpec:
+    """The specification that `Welcome` carries. Raises `UsageError` if algorithm, settings and spaces do not fit together.
+
+    `spaces` are those of `env`; without them one env copy is made to read them.
+    """
+    if config.compress == "zstd" and (why := why_no_zstd()):
+        raise UsageError(why)
+    spaces = spaces or env_spaces(env)
+    vector = "loop" if config.vector == "auto" else config.vector
+    policy = _policy_spec(config, spaces)
+    if algorithm_class(config.algo).whole_episodes:
+        _check_room_for_whole_episodes(config, spaces.max_episode_steps)
+    match vector:
+        case "native":
+            check_native(env, spaces.observation, spaces.action)
+        case "envpool":
+            check_pool(env, spaces.observation, spaces.action)
+    return RunSpec(
+        env=env,
+        policy=policy,
+        rollout_steps=config.algorithm.rollout_steps,
+        copies=config.envs // config.lanes,
+        lanes=config.lanes,
+        seed=config.seed,
+        vector=vector,
+        compress=config.compress,
+        images_dtype=config.images_dtype,
+        heartbeat_s=config.heartbeat_s,
+    )
+
+
+def _policy_spec(config: Config, spaces: EnvSpaces) -> PolicySpec:
+    policy = algorithm_class(config.algo).policy_spec(config.algorithm, spaces.observation, spaces.action)
+    if config.algorithm.encoder is not None:
+        encoder = describe_encoder(config.algorithm.encoder, spaces.observation, spaces.action)
+        policy = msgspec.structs.replace(policy, encoder=encoder)
+    if config.images_dtype != "float32" and not policy.convolves:
+        raise UsageError(
+            f"images_dtype {config.images_dtype}: expected float32, for this policy has no convolutions of ours"
+        )
+    return policy
+
+
+def _check_room_for_whole_episodes(config: Config, max_episode_steps: int | None) -> None:
+    """A rollout must hold the longest episode and the row before it that resets the env copy."""
+    steps = config.algorithm.rollout_steps
+    if max_episode_steps is not None and steps <= max_episode_steps:
+        raise UsageError(
+            f"rollout_steps {steps}: {config.algo} learns from whole episodes, and those of {config.env} take up to "
+            f"{max_episode_steps} steps; expected at least {max_episode_steps + 1}"
+        )

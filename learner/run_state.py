@@ -1,0 +1,54 @@
+"""Where a run stands: what a checkpoint holds besides the algorithm's own state, and how a resumed run reads it back."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import msgspec
+
+from learner.algorithms import Algorithm
+from learner.rollouts.ledger import Ledger
+from learner.run_folder import checkpoint
+from learner.run_folder.run_folder import RunFolder
+from protocol.errors import CheckpointError
+
+log = logging.getLogger("millrace.learner")
+
+
+class RunState(msgspec.Struct, kw_only=True):
+    """All counters of a run. The defaults are those of a new run."""
+
+    version: int = 0
+    env_steps: int = 0
+    wall_s: float = 0.0
+    ledger: Ledger = msgspec.field(default_factory=Ledger)
+    incarnations: list[int] = []
+    """The next incarnation of each lane."""
+    episodes: list[Any] = []
+    """State of the `EpisodeWindow`."""
+    best: list[float] | None = None
+    """Mean return and env steps of the best evaluation. Its policy is in the run folder."""
+
+    def checkpoint(self, algorithm: Algorithm) -> dict[str, Any]:
+        """The content of a checkpoint: plain data and tensors."""
+        return {"past": msgspec.to_builtins(self), "algorithm": algorithm.state_dict()}
+
+
+def restore(folder: RunFolder, algorithm: Algorithm) -> RunState:
+    """Load the newest whole checkpoint into the algorithm. Raises `CheckpointError` if there is none or it does not fit."""
+    found, warnings = checkpoint.newest(folder.path)
+    for line in warnings:
+        log.warning("%s", line)
+    try:
+        state = msgspec.convert(found.state["past"], RunState)
+        algorithm.load_state_dict(found.state["algorithm"])
+    except (KeyError, ValueError, TypeError, RuntimeError) as error:
+        raise CheckpointError(
+            f"checkpoint {found.path}: expected the state of this configuration, got another ({error}); "
+            "resume it with the settings it was made with"
+        ) from error
+    # The learner that dealt the outstanding tickets is gone. So are these tickets, and the rollouts that were not yet used.
+    state.ledger.lost += state.ledger.outstanding
+    state.ledger.transitions_late += state.ledger.transitions_waiting
+    return state

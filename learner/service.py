@@ -1,0 +1,77 @@
+"""The workers as a training loop sees them: wait for workers, publish, gather, evaluate, drain, take a snapshot.
+
+This is all that `learner.train` knows of the rest. Who starts worker processes is not known here either: the launchers in
+`millrace` pass them in as `WorkerProcesses`.
+"""
+
+from __future__ import annotations
+
+from learner.evaluate import evaluate
+from learner.rollouts.arrived_rollout import ArrivedRollout
+from learner.rollouts.hub import Hub, HubSnapshot
+from learner.run_folder.progress import Progress
+from learner.run_folder.results import Evaluation
+from protocol.arrays import Floats
+from protocol.policy.policy import make_policy
+from protocol.specs import RunSpec
+
+
+class RolloutService:
+    """Rollouts of one run, from any number of workers."""
+
+    def __init__(self, hub: Hub, spec: RunSpec, workers_expected: int = 0) -> None:
+        """`workers_expected`: how many workers the user asked for; 0: any number."""
+        self.workers_expected = workers_expected
+        self._hub, self._spec = hub, spec
+
+    def wait_for_workers(self, count: int) -> None:
+        """Wait until so many workers have joined. Raises `NoWorkers` when they do not come in time."""
+        self._hub.wait_for(count)
+
+    def publish(self, version: int, parameters: Floats, buffers: Floats) -> None:
+        """Send new weights to all workers and deal the tickets that they allow. The arrays must not change afterwards.
+
+        Raises `RunError` if a parameter is too large for the dtype in which weights are sent.
+        """
+        self._hub.publish(version, parameters, buffers)
+
+    def gather(self) -> list[ArrivedRollout]:
+        """Wait for the rollouts of the next update. Raises `RunError` when the run cannot go on."""
+        return self._hub.gather()
+
+    def pulse(self) -> None:
+        """Answer the workers, during a long computation. Never waits, never raises."""
+        self._hub.pulse()
+
+    def evaluate(self, parameters: Floats, buffers: Floats, episodes: int, seed: int) -> Evaluation:
+        """Play greedy episodes under these weights, and answer the workers meanwhile.
+
+        Raises `EnvironmentFailed` if the environment raises.
+        """
+        policy = make_policy(self._spec.policy)
+        policy.load(parameters, buffers)
+        return evaluate(self._spec.env, policy, self._spec.policy, episodes, seed, self.pulse)
+
+    def drain(self, reason: str, timeout_s: float = 5.0) -> None:
+        """Ask every worker to leave, and wait for that at most `timeout_s`."""
+        self._hub.drain(reason, timeout_s)
+
+    def report(self, progress: Progress) -> None:
+        """Tell how far the run is: `millrace status` and Prometheus ask for it."""
+        self._hub.report_progress(progress)
+
+    def snapshot(self) -> HubSnapshot:
+        """What is known of workers, tickets and rollouts now."""
+        return self._hub.snapshot()
+
+    def workers_alive(self) -> int:
+        """How many processes step the environment."""
+        return self._hub.workers_alive()
+
+    def lag_histogram(self) -> dict[str, int]:
+        """How many rollouts were used, by their lag, since this learner started."""
+        return self._hub.lag_histogram()
+
+    def first_use_s(self) -> dict[str, float]:
+        """For each worker: median seconds from publishing weights to the arrival of its first rollout under them."""
+        return self._hub.first_use_s()
