@@ -35,14 +35,15 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.writing import bars, write
-from protocol.envs.envpool import pool_of
+from protocol.env_spec import EnvSpec
+from protocol.envs.envpool import envpool_spec
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.envs.vectorized import make_native
 from protocol.errors import UsageError
 from protocol.policy.distributions import distribution
 from protocol.policy.layout import acting_size, buffer_size
 from protocol.policy.policy import Policy, make_policy
-from protocol.specs import EnvSpec, ImagesDtype, PolicySpec, RunSpec
+from protocol.specs import ImagesDtype, PolicySpec, RunSpec
 from workers.collect.collector import Collector
 from workers.collect.held_rollouts import Assignment
 
@@ -122,7 +123,7 @@ def bare_vector(kind: str, spec: EnvSpec, copies: int, number: int) -> Turn:
         env = make_native(spec, copies)
         env.reset(seed=number)
     else:
-        env = pool_of(spec).make(range(number * copies, (number + 1) * copies))
+        env = envpool_spec(spec).make(range(number * copies, (number + 1) * copies))
         env.reset()
     rows = _drawn(env.single_action_space, copies, number)
 

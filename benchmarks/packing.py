@@ -20,16 +20,18 @@ import zmq
 from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation
 
 from benchmarks.simulated import canned, run_spec
+from protocol.env_spec import EnvSpec
 from protocol.keys.key_folder import Keyring
-from protocol.keys.keys import Allowed, Key, Token
+from protocol.keys.keys import ClientList, Key, Token
 from protocol.policy.layout import acting_size
 from protocol.policy.policy import make_policy
 from protocol.rollout import Rollout, rollout_bytes
-from protocol.specs import ActionSpec, EnvSpec, Leaf, PolicySpec, RunSpec
+from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
 from protocol.wire.codec import MAX_FRAME_BYTES, decode_to_learner, encode
 from protocol.wire.compression import Packing
-from protocol.wire.link import LearnerLink, WorkerLink
-from protocol.wire.weight_dtypes import WeightsDtype, narrowed, widened
+from protocol.wire.learner_link import LearnerLink
+from protocol.wire.weight_dtypes import WeightsDtype, to_float32, to_wire_dtype
+from protocol.wire.worker_link import WorkerLink
 from workers.collect.collector import Collector
 from workers.collect.held_rollouts import Assignment
 
@@ -141,7 +143,7 @@ def _send(address: str, token: Token, told: Connection) -> None:
 def encrypted(rounds: int) -> dict[str, float]:
     """Milliseconds of a rollout of frame stacks from before `encode` until after decoding, over CURVE and loopback TCP."""
     server, client = Key.new(), Key.new()
-    keyring = Keyring(server, Allowed().adding("w", client.public, datetime.now(UTC)))
+    keyring = Keyring(server, ClientList().adding("w", client.public, datetime.now(UTC)))
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     link = LearnerLink("tcp://127.0.0.1:*", context, keyring)
     link.room = rollout_bytes(STACKS)
@@ -176,9 +178,9 @@ def rounding(rounds: int) -> list[dict[str, object]]:
         times = []
         for _ in range(rounds):
             began_s = time.thread_time()
-            travelling = narrowed(parameters, dtype)
+            travelling = to_wire_dtype(parameters, dtype)
             rounded_s = time.thread_time()
-            widened(travelling)
+            to_float32(travelling)
             times.append((rounded_s - began_s, time.thread_time() - rounded_s))
         learner_ms, worker_ms = (np.median(times, axis=0) * 1e3).tolist()
         found.append({"dtype": dtype, "mb": travelling.nbytes / 1e6, "learner_ms": learner_ms, "worker_ms": worker_ms})

@@ -32,8 +32,8 @@ from benchmarks.writing import write
 from learner.rollouts.hub import Hub, HubSettings
 from learner.rollouts.roster import Roster
 from protocol.policy.layout import acting_size, buffer_size
-from protocol.rollout import stack
-from protocol.wire.link import LearnerLink
+from protocol.rollout import stack_rollouts
+from protocol.wire.learner_link import LearnerLink
 
 WORKERS = (10, 100, 1000)
 PROCESSES = 2
@@ -89,13 +89,13 @@ def learn(workers: int, seconds: float, transport: str, folder: Path, told: Conn
     join_s = time.monotonic() - began_s
     publish()
     for _ in range(WARM_UP):
-        stack([arrived.rollout for arrived in hub.gather()])
+        stack_rollouts([arrived.rollout for arrived in hub.gather()])
         publish()
     warm_mb = _resident_mb(me)
     first, bytes_before, used_before = len(published_s), link.received.bytes, roster.ledger.used
     cpu_s, python_s, began_s = time.process_time(), time.thread_time(), time.monotonic()
     while time.monotonic() - began_s < seconds and len(published_s) < VERSIONS:
-        stack([arrived.rollout for arrived in hub.gather()])
+        stack_rollouts([arrived.rollout for arrived in hub.gather()])
         publish()
     took_s = time.monotonic() - began_s
     cpu_s, python_s = time.process_time() - cpu_s, time.thread_time() - python_s

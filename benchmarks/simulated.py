@@ -18,9 +18,10 @@ import numpy as np
 import numpy.typing as npt
 import zmq
 
+from protocol.env_spec import EnvSpec
 from protocol.messages import ToLearner
 from protocol.rollout import Rollout
-from protocol.specs import ActionSpec, EnvSpec, Leaf, PolicySpec, RunSpec
+from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
 from protocol.wire.codec import decode_to_worker, encode
 from workers.session import Effect, Identity, Leave, Send, Session, Task
 

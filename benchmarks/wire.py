@@ -33,7 +33,8 @@ from protocol.rollout import Rollout, rollout_bytes, validate
 from protocol.specs import RunSpec
 from protocol.wire.codec import Buffer, encode
 from protocol.wire.compression import Packing
-from protocol.wire.link import LearnerLink, WorkerLink
+from protocol.wire.learner_link import LearnerLink
+from protocol.wire.worker_link import WorkerLink
 
 TRANSPORTS = ("ipc", "tcp")
 SHARE, PYTHON_US, OVERHEAD, FRAME = 0.8, 40, 1.02, 1.05  # targets

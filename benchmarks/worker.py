@@ -22,9 +22,9 @@ from learner.config.layers import resolve
 from learner.rollouts.hub import Hub, HubSettings
 from learner.rollouts.roster import Roster
 from learner.run_spec import run_spec
+from protocol.env_spec import EnvSpec
 from protocol.policy.layout import buffer_size, parameter_layout, total_size
-from protocol.specs import EnvSpec
-from protocol.wire.link import LearnerLink
+from protocol.wire.learner_link import LearnerLink
 from workers.host import WorkerCommand, WorkerProcess
 
 CASES = {

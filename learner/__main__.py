@@ -15,7 +15,7 @@ from learner.config.command_line import read_config
 from learner.run_folder.json_log import JsonLines
 from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import Interrupted
-from protocol.errors import OurError
+from protocol.errors import UserFacingError
 
 log = logging.getLogger("millrace.learner")
 
@@ -41,7 +41,7 @@ def main(argv: list[str]) -> int:
         from learner.run import serve  # torch: not before the flags are known to be right
 
         log.info("run folder: %s", serve(config, resume, watch))
-    except OurError as error:
+    except UserFacingError as error:
         sys.stderr.write("\n".join(filter(None, [f"learner: {error}", error.detail.rstrip()])) + "\n")
         return error.exit_code
     except Interrupted as interrupt:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.specs import ActionSpec, EnvSpec, Leaf
+from protocol.specs import ActionSpec, Leaf
 
 
 class EnvSpaces(NamedTuple):

@@ -16,12 +16,13 @@ import numpy as np
 
 from learner.run_folder.results import Evaluation
 from learner.run_folder.run_folder import RunFolder, Which
-from protocol.envs.spaces import observation_leaves, reader, writer
+from protocol.env_spec import EnvSpec
+from protocol.envs.spaces import make_action_converter, make_flatten, observation_leaves
 from protocol.errors import EnvironmentFailed, first_line
 from protocol.policy.distributions import distribution
 from protocol.policy.policy import Policy, make_policy
 from protocol.policy.recurrent import zero_state
-from protocol.specs import EnvSpec, PolicySpec
+from protocol.specs import PolicySpec
 
 COPIES = 20
 LONGEST_EPISODE = 100_000  # env steps; an environment without a time limit must not stop a run from ending
@@ -93,7 +94,7 @@ def _play(
     pulse: Callable[[], None],
 ) -> tuple[list[float], list[int], int]:
     space = envs[0].observation_space
-    read, write, mode = reader(space), writer(spec.action), distribution(spec).mode
+    read, write, mode = make_flatten(space), make_action_converter(spec.action), distribution(spec).mode
     dtypes = [leaf.dtype for leaf in observation_leaves(space)]
     seeds = np.random.SeedSequence(seed).generate_state(len(envs))
     quotas = [episodes // len(envs) + (i < episodes % len(envs)) for i in range(len(envs))]

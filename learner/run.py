@@ -27,9 +27,9 @@ from learner.rollouts.roster import Roster
 from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import Interrupted, RunFolder
 from learner.service import RolloutService
+from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
-from protocol.specs import EnvSpec
-from protocol.wire.link import LearnerLink
+from protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")
 

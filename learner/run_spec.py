@@ -7,11 +7,12 @@ import msgspec
 from learner.algorithms import algorithm_class
 from learner.config.config import Config
 from learner.env_spaces import EnvSpaces, env_spaces
-from protocol.envs.envpool import check_pool
+from protocol.env_spec import EnvSpec
+from protocol.envs.envpool import check_envpool
 from protocol.envs.vectorized import check_native
 from protocol.errors import UsageError
 from protocol.policy.encoder import describe_encoder
-from protocol.specs import EnvSpec, PolicySpec, RunSpec
+from protocol.specs import PolicySpec, RunSpec
 from protocol.wire.compression import why_no_zstd
 
 
@@ -31,7 +32,7 @@ def run_spec(config: Config, env: EnvSpec, spaces: EnvSpaces | None = None) -> R
         case "native":
             check_native(env, spaces.observation, spaces.action)
         case "envpool":
-            check_pool(env, spaces.observation, spaces.action)
+            check_envpool(env, spaces.observation, spaces.action)
     return RunSpec(
         env=env,
         policy=policy,

@@ -6,7 +6,7 @@ import torch
 
 from learner.algorithms.kernels.fused import applies
 from learner.config.config import Config
-from protocol.cpu_cores import cores
+from protocol.cpu_cores import usable_cores
 from protocol.errors import UsageError
 from protocol.specs import PolicySpec
 
@@ -28,4 +28,4 @@ def threads(config: Config, policy: PolicySpec, workers: int) -> int:
         return config.torch_threads
     if applies(policy):
         return 1
-    return max(1, cores() - (workers if config.max_lag else 0))
+    return max(1, usable_cores() - (workers if config.max_lag else 0))

@@ -13,7 +13,7 @@ from learner.journal import Journal
 from learner.run_folder.run_folder import Interrupted
 from learner.service import RolloutService
 from protocol.errors import RunError
-from protocol.rollout import stack
+from protocol.rollout import stack_rollouts
 
 
 def train(algorithm: Algorithm, service: RolloutService, journal: Journal, workers: int) -> str:
@@ -34,7 +34,7 @@ def train(algorithm: Algorithm, service: RolloutService, journal: Journal, worke
             raise
         journal.gathered(arrived)
         began_s = time.monotonic()
-        batch = stack([one.rollout for one in arrived])
+        batch = stack_rollouts([one.rollout for one in arrived])
         metrics = algorithm.update(batch, service.pulse)
         service.publish(journal.version + 1, *algorithm.weights())
         journal.updated(batch, metrics, time.monotonic() - began_s)

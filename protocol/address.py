@@ -72,7 +72,7 @@ def resolves(address: str) -> bool:
     return not _is_name(host) or _found(host, socket.AF_UNSPEC)
 
 
-def advertised(bound: str, advertise: str, machine: str) -> str:
+def advertised_address(bound: str, advertise: str, machine: str) -> str:
     """What others type to reach a learner that listens at `bound`.
 
     `advertise` is the host to name; without it that of the address, and for one that means every interface `machine`.
@@ -85,7 +85,7 @@ def advertised(bound: str, advertise: str, machine: str) -> str:
     return f"tcp://{f'[{named}]' if ':' in named and not named.startswith('[') else named}:{port}"
 
 
-def name_of(peer: bytes) -> bytes:
+def worker_name(peer: bytes) -> bytes:
     """The worker's name, with which its routing id begins; under a key a zero byte and more follow."""
     return peer.partition(b"\0")[0]
 

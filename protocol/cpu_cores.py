@@ -8,7 +8,7 @@ from pathlib import Path
 CPU_MAX = Path("/sys/fs/cgroup/cpu.max")  # control groups, version 2: microseconds of CPU in a period, or "max"; the period
 
 
-def cores() -> int:
+def usable_cores() -> int:
     """At least 1."""
     allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, min(allowed, int(_share(CPU_MAX, allowed))))

@@ -27,7 +27,7 @@ class MillraceError(Exception):
     """Base of all errors of millrace."""
 
 
-class OurError(MillraceError):
+class UserFacingError(MillraceError):
     """We cannot go on."""
 
     exit_code = 1
@@ -38,19 +38,19 @@ class OurError(MillraceError):
         self.detail = detail
 
 
-class UsageError(OurError):
+class UsageError(UserFacingError):
     """What the user asked for cannot be done; the text says what can."""
 
     exit_code = 2
 
 
-class Refused(OurError):
+class Refused(UserFacingError):
     """The learner told this worker to leave."""
 
     exit_code = 2
 
 
-class RunError(OurError):
+class RunError(UserFacingError):
     """The run cannot go on."""
 
 
@@ -74,13 +74,13 @@ class EnvironmentFailed(RunError):
     """The environment raised; `detail` is the traceback where it happened."""
 
 
-class TheirError(MillraceError):
+class PeerError(MillraceError):
     """A peer sent something wrong."""
 
 
-class BadMessage(TheirError):
+class BadMessage(PeerError):
     """Bytes that are not a message of ours."""
 
 
-class BadRollout(TheirError):
+class BadRollout(PeerError):
     """A rollout that breaks the law of a row or does not fit the run."""

@@ -100,7 +100,7 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
         if array.dtype.kind == "b" and array.size and array.view(np.uint8).max() > 1:
             raise BadRollout(f"{name} expected bytes 0 and 1, got {array.view(np.uint8).max()}")
         if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise BadRollout(f"{name} {first_not_finite(array)}")
+            raise BadRollout(f"{name} {describe_first_non_finite(array)}")
     if not 0 <= rollout.lane < run.lanes:
         raise BadRollout(f"lane expected 0 to {run.lanes - 1}, got {rollout.lane}")
     for leaf, array in zip(run.policy.observation, rollout.obs, strict=True):
@@ -128,7 +128,7 @@ def _named(leaf: Leaf) -> str:
     return f"obs {leaf.path}".strip()
 
 
-def first_not_finite(array: Array) -> str:
+def describe_first_non_finite(array: Array) -> str:
     """Where the first NaN or infinity of a [T, N, …] array stands, in words."""
     t, n = np.argwhere(~np.isfinite(array))[0][:2]
     value = array[t, n][~np.isfinite(array[t, n])] if array.ndim > 2 else array[t, n : n + 1]
@@ -164,7 +164,7 @@ class Batch(msgspec.Struct, frozen=True):
         return int(np.count_nonzero(self.valid))
 
 
-def stack(rollouts: Sequence[Rollout]) -> Batch:
+def stack_rollouts(rollouts: Sequence[Rollout]) -> Batch:
     """Copy rollouts into one writable batch [T, ΣN], in lane order; those of one lane stay in the order they came in."""
     rows = sorted(rollouts, key=lambda rollout: rollout.lane)
 

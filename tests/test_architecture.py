@@ -17,7 +17,7 @@ FORBIDDEN = {
     "millrace": set[str](),
 }
 MAY_PRINT = {"millrace/cli/main.py", "millrace/terminal.py"}
-MAY_UNPICKLE = {"protocol/specs.py"}
+MAY_UNPICKLE = {"protocol/env_spec.py"}
 MAY_IMPORT_TORCH = {f"protocol/policy/{name}.py" for name in ("encoder", "networks", "torch_distributions", "torch_policy")}
 
 

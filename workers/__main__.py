@@ -19,12 +19,12 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from protocol.errors import OurError, UsageError
+from protocol.env_spec import AllowedCode
+from protocol.errors import UsageError, UserFacingError
 from protocol.keys.key_folder import TOKEN_VARIABLE, read_token
 from protocol.keys.keys import Token
-from protocol.specs import Code
-from protocol.wire.link import WorkerLink
-from protocol.wire.shared_memory import Handed
+from protocol.wire.shared_memory import InheritedDescriptors
+from protocol.wire.worker_link import WorkerLink
 from workers.host import EXIT_NO_LEARNER, Host, WorkerCommand, WorkerProcess, core_flags
 from workers.security import allowed_code, checked_token
 from workers.session import NO_LEARNER, Session
@@ -43,10 +43,10 @@ def main(argv: list[str] | None = None, prog: str = "python -m workers") -> int:
         if flags.processes != 1:
             return _host(flags, token)
         link = WorkerLink(flags.address, flags.name, token=token)
-    except OurError as error:
+    except UserFacingError as error:
         sys.stderr.write(f"worker {flags.name}: {error}\n")
         return error.exit_code
-    return _work(flags, link, Code.REGISTERED if flags.no_code else allowed_code(flags.address, token))
+    return _work(flags, link, AllowedCode.REGISTERED if flags.no_code else allowed_code(flags.address, token))
 
 
 def _parser(prog: str) -> argparse.ArgumentParser:
@@ -108,7 +108,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     return parser
 
 
-def _work(flags: argparse.Namespace, link: WorkerLink, code: Code) -> int:
+def _work(flags: argparse.Namespace, link: WorkerLink, code: AllowedCode) -> int:
     """Run one worker in this process; the exit code."""
     if flags.core is not None:
         os.sched_setaffinity(0, {flags.core})
@@ -119,7 +119,7 @@ def _work(flags: argparse.Namespace, link: WorkerLink, code: Code) -> int:
         code=code,
         stop_requests=lambda: len(signals) or int(bool(flags.parent) and parent_is_gone(flags.parent)),
         feed_watchdog=watchdog.feed if watchdog else lambda now: None,
-        shared_memory=Handed(*map(int, flags.handed.split(","))) if flags.handed else None,
+        shared_memory=InheritedDescriptors(*map(int, flags.handed.split(","))) if flags.handed else None,
     )
     left = Worker(link, session, options).run()
     if watchdog:

@@ -21,11 +21,11 @@ from typing import Any, Protocol
 
 import zmq
 
+from protocol.env_spec import AllowedCode
 from protocol.keys.key_folder import TOKEN_VARIABLE
 from protocol.keys.keys import Token
-from protocol.specs import Code
-from protocol.wire.link import WorkerLink
-from protocol.wire.shared_memory import Handed
+from protocol.wire.shared_memory import InheritedDescriptors
+from protocol.wire.worker_link import WorkerLink
 from workers.session import Leave, Session
 from workers.watchdog import where_it_hung
 from workers.worker import MakeCollector, Worker, WorkerOptions, identity, make_local_collector
@@ -67,7 +67,7 @@ class WorkerCommand:
     token: Token | None = None
     flags: Sequence[str] = ()
     """further flags of `python -m workers`"""
-    shared_memory: Handed | None = None
+    shared_memory: InheritedDescriptors | None = None
     """file descriptors that it inherits, to step a vector environment through shared memory"""
 
 
@@ -153,7 +153,7 @@ class WorkerThread:
         session = Session(identity(name), time.monotonic())
         link = WorkerLink(address, name, context)
         options = WorkerOptions(
-            code=Code.CALLABLES, stop_requests=lambda: self._stop_requests, make_collector=self._make_collector
+            code=AllowedCode.CALLABLES, stop_requests=lambda: self._stop_requests, make_collector=self._make_collector
         )
         with suppress(zmq.ContextTerminated):  # the run has ended, and a thread could not be killed
             self._left = Worker(link, session, options).run()

@@ -7,10 +7,10 @@ this machine is trusted a little. Any other is not trusted, and the worker conne
 from __future__ import annotations
 
 from protocol.address import check_address, is_local
+from protocol.env_spec import AllowedCode
 from protocol.errors import UsageError
 from protocol.keys.key_folder import TOKEN_VARIABLE
 from protocol.keys.keys import Token
-from protocol.specs import Code
 
 
 def checked_token(address: str, token: Token | None, *, insecure: bool) -> Token | None:
@@ -28,8 +28,8 @@ def checked_token(address: str, token: Token | None, *, insecure: bool) -> Token
     return token
 
 
-def allowed_code(address: str, token: Token | None) -> Code:
+def allowed_code(address: str, token: Token | None) -> AllowedCode:
     """How much code the learner at this address may make this worker run."""
     if token is not None or not address.startswith("tcp://"):
-        return Code.CALLABLES
-    return Code.MODULES if is_local(address) else Code.REGISTERED
+        return AllowedCode.CALLABLES
+    return AllowedCode.MODULES if is_local(address) else AllowedCode.REGISTERED

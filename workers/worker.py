@@ -18,14 +18,15 @@ from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from protocol.errors import BadMessage, OurError, first_line
+from protocol.env_spec import AllowedCode
+from protocol.errors import BadMessage, UserFacingError, first_line
 from protocol.messages import Order, Stepped, Weights
 from protocol.policy.policy import make_policy
-from protocol.specs import Code, RunSpec, StepSpec
+from protocol.specs import RunSpec, StepSpec
 from protocol.wire.codec import encode
-from protocol.wire.link import WorkerLink
-from protocol.wire.shared_memory import Handed
-from protocol.wire.weight_dtypes import widened
+from protocol.wire.shared_memory import InheritedDescriptors
+from protocol.wire.weight_dtypes import to_float32
+from protocol.wire.worker_link import WorkerLink
 from workers.collect.collector import Collector
 from workers.env_errors import LaneFailed
 from workers.heartbeat_thread import HeartbeatThread
@@ -62,13 +63,13 @@ def _no_watchdog(now: float) -> None: ...
 class WorkerOptions:
     """How a worker depends on its process."""
 
-    code: Code = Code.MODULES
+    code: AllowedCode = AllowedCode.MODULES
     """how much code the learner may make it run"""
     stop_requests: Callable[[], int] = _no_stop_requests
     """counts the requests to leave"""
     feed_watchdog: Callable[[float], None] = _no_watchdog
     """called now and then with the time, unless the environment hangs"""
-    shared_memory: Handed | None = None
+    shared_memory: InheritedDescriptors | None = None
     """shared memory and bells, for a vector environment on this machine"""
     make_collector: MakeCollector = make_local_collector
     """what collects in a run, and how it acts"""
@@ -145,7 +146,7 @@ class Worker:
 
         try:
             if self._loaded is not task.weights:
-                collector.load(widened(task.weights.parameters), task.weights.buffers)
+                collector.load(to_float32(task.weights.parameters), task.weights.buffers)
                 self._loaded = task.weights
             rollouts = collector.collect(task.assignments, task.weights.version, task.session, pulse)
         except _Abandoned:
@@ -213,7 +214,7 @@ class Worker:
 
     def _fail(self, error: Exception) -> None:
         """The environment's code raised, or ours on its data: report it to the learner."""
-        detail = error.detail if isinstance(error, OurError) else traceback.format_exc()
+        detail = error.detail if isinstance(error, UserFacingError) else traceback.format_exc()
         lane = error.lane if isinstance(error, LaneFailed) else None
         log.error("%s\n%s", error, detail)
         self._do(self._session.fail(_line(error), detail[-MAX_TRACEBACK:], lane))
@@ -250,11 +251,13 @@ class Worker:
                     self._packing = replace(self._link.packing, zstd=run.compress == "zstd")
                 case StepSpec():
                     self._stepper = Stepper(
-                        run, self._options.shared_memory, allow_private_names=self._options.code is not Code.REGISTERED
+                        run,
+                        self._options.shared_memory,
+                        allow_private_names=self._options.code is not AllowedCode.REGISTERED,
                     )
                     self._heartbeats.start()
             self._loaded = None
-        except (OurError, ImportError, ValueError) as error:
+        except (UserFacingError, ImportError, ValueError) as error:
             self._do(self._session.fail(_line(error), traceback.format_exc(), None))
 
     def _close_all(self) -> None:
@@ -271,7 +274,7 @@ def _resident_bytes() -> int:
 
 
 def _line(error: Exception) -> str:
-    if isinstance(error, OurError):
+    if isinstance(error, UserFacingError):
         return first_line(error, type(error).__name__)[:1000]
     return f"{type(error).__name__}: {first_line(error, '')}".strip()[:1000]
 

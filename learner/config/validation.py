@@ -9,7 +9,7 @@ import msgspec
 
 from learner.config.config import Config
 from learner.config.hyperparameters import HYPERPARAMETERS
-from protocol.address import advertised, check_address
+from protocol.address import advertised_address, check_address
 from protocol.errors import UsageError
 
 
@@ -50,7 +50,7 @@ def validate(config: Config, where: str = "") -> Config:
             expected = "expected HOST:PORT, as in 127.0.0.1:9464"
             raise UsageError(f"{at}metrics_bind {config.metrics_bind}: {expected}") from None
     try:
-        check_address(advertised("tcp://*:1", config.advertise, "machine"))
+        check_address(advertised_address("tcp://*:1", config.advertise, "machine"))
     except UsageError:
         raise UsageError(
             f"{at}advertise {config.advertise}: expected a host name or an IP address, without a port"

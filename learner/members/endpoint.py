@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Protocol
 
-from protocol.address import advertised, is_local
+from protocol.address import advertised_address, is_local
 from protocol.errors import UsageError
-from protocol.keys.key_folder import KeyFolder, Keyring, asked_folder
-from protocol.keys.keys import Allowed, Key, Token
+from protocol.keys.key_folder import KeyFolder, Keyring, chosen_key_folder
+from protocol.keys.keys import ClientList, Key, Token
 
 log = logging.getLogger("millrace.learner")
 
@@ -64,7 +64,7 @@ def keyring_for(config: Listens, now: datetime) -> Keyring | None:
                 config.bind,
             )
         return None
-    asked = asked_folder(config.keys)
+    asked = chosen_key_folder(config.keys)
     if asked is None and is_local(config.bind):
         return None
     folder = KeyFolder(asked)
@@ -74,12 +74,12 @@ def keyring_for(config: Listens, now: datetime) -> Keyring | None:
 def throwaway(worker: str, now: datetime) -> tuple[Keyring, Token]:
     """Keys for one run on this machine, which no file holds."""
     server, client = Key.new(), Key.new()
-    return Keyring(server, Allowed().adding(worker, client.public, now)), Token(server.public, client)
+    return Keyring(server, ClientList().adding(worker, client.public, now)), Token(server.public, client)
 
 
 def join_lines(address: str, advertise: str, keyring: Keyring | None) -> list[str]:
     """How a worker joins the learner that listens at `address`, as lines for people."""
-    reach = advertised(address, advertise, socket.gethostname())
+    reach = advertised_address(address, advertise, socket.gethostname())
     if keyring is None:
         insecure = "" if is_local(reach) else " --insecure"
         return [f"waiting for workers; start one with: millrace worker {reach}{insecure}"]

@@ -14,7 +14,7 @@ from typing import Generic, TypeVar
 
 from learner.members.events import Event, Joined, Left, Told, Turned
 from learner.members.states import TABLE, Revoked, Silence, Standing
-from protocol.address import name_of
+from protocol.address import worker_name
 from protocol.messages import (
     PROTOCOL_VERSION,
     Drain,
@@ -107,7 +107,7 @@ class Membership(Generic[M]):
         if isinstance(message, Hello | Goodbye | Failure):
             return []
         late = message.env_steps if isinstance(message, Rollout) else 0
-        self.events.append(Told(name_of(peer).decode(errors="replace")[:40], message.session, late))
+        self.events.append(Told(worker_name(peer).decode(errors="replace")[:40], message.session, late))
         return [(peer, Rejoin(message.session))]
 
     def hello(self, peer: bytes, hello: Hello, now: float) -> tuple[list[Out], M | None]:
@@ -115,8 +115,8 @@ class Membership(Generic[M]):
         why = ""
         if hello.protocol != PROTOCOL_VERSION:
             why = f"protocol expected {PROTOCOL_VERSION}, got {hello.protocol}; install the learner's version of millrace"
-        elif hello.worker.encode() != name_of(peer):
-            why = f"name expected {name_of(peer)[:40]!r}, as in its routing id, got {hello.worker[:40]!r}"
+        elif hello.worker.encode() != worker_name(peer):
+            why = f"name expected {worker_name(peer)[:40]!r}, as in its routing id, got {hello.worker[:40]!r}"
         if why:
             self.events.append(Turned(hello.worker, why))
             return [(peer, Refuse(why))], None

@@ -8,9 +8,9 @@ import logging
 from collections.abc import Callable, Iterable
 
 from learner.members.events import Event, Told
-from protocol.keys.keys import Allowed
-from protocol.log_limit import Rarely, again
-from protocol.wire.link import LearnerLink
+from protocol.keys.keys import ClientList
+from protocol.log_rate_limiter import LogRateLimiter, suppressed_note
+from protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")
 
@@ -20,12 +20,12 @@ class Lid:
 
     def __init__(self, link: LearnerLink, clock: Callable[[], float]) -> None:
         self._link, self._clock = link, clock
-        self._rarely = Rarely()
+        self._rarely = LogRateLimiter()
 
     def complain(self, peer: bytes, line: str) -> None:
         """A line about what a peer sent, unless there was one a short while ago."""
         if (kept_back := self._rarely.due(self._link.speaker(peer), self._clock())) is not None:
-            log.warning("%s%s", line, again(kept_back))
+            log.warning("%s%s", line, suppressed_note(kept_back))
 
     def tell(self, level: int, event: Event, line: str) -> None:
         """A line about what has happened.
@@ -34,7 +34,7 @@ class Lid:
         """
         kept_back = self._rarely.due(f"told {event.worker}", self._clock()) if isinstance(event, Told) else 0
         if kept_back is not None:
-            log.log(level, "%s%s", line, again(kept_back), extra={"event": event})
+            log.log(level, "%s%s", line, suppressed_note(kept_back), extra={"event": event})
 
 
 class Doorkeeper:
@@ -42,7 +42,7 @@ class Doorkeeper:
 
     def __init__(self, link: LearnerLink) -> None:
         self._link = link
-        self._judged_by: Allowed | None = None
+        self._judged_by: ClientList | None = None
 
     def shut_out(self, members: Iterable[bytes]) -> list[tuple[bytes, str]]:
         """Those whose key was revoked, and why. Everybody is looked at once for each state of the list, not each time."""

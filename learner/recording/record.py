@@ -27,12 +27,13 @@ from learner.recording.minari import MinariDataset
 from learner.rollouts.arrived_rollout import ArrivedRollout
 from learner.run_folder.atomic_write import write_atomically
 from protocol.arrays import Array
-from protocol.envs.spaces import reader, writer
+from protocol.env_spec import EnvSpec
+from protocol.envs.spaces import make_action_converter, make_flatten
 from protocol.errors import EnvironmentFailed, RunError, UsageError, first_line
 from protocol.policy.distributions import distribution
 from protocol.policy.policy import Policy
 from protocol.policy.recurrent import zero_state
-from protocol.specs import EnvSpec, PolicySpec
+from protocol.specs import PolicySpec
 
 
 class Recorded(msgspec.Struct, frozen=True, kw_only=True):
@@ -99,7 +100,7 @@ class TrainingRecorder:
     def __init__(self, dataset_id: str, env_spec: EnvSpec, spec: PolicySpec, about: str) -> None:
         """Raises `UsageError` in one line where the dataset cannot be made."""
         self._env = env_spec.make()
-        self._assembler = EpisodeAssembler(writer(spec.action))
+        self._assembler = EpisodeAssembler(make_action_converter(spec.action))
         self._id = dataset_id
         self._episodes = 0
         try:
@@ -139,7 +140,7 @@ class Player:
         self._env, self._policy, self._spec, self._stochastic = env, policy, spec, stochastic
         self._seeds, self._generator = (np.random.default_rng([seed, i]) for i in range(2))
         self._distribution = distribution(spec)
-        self._read, self._write = reader(env.observation_space), writer(spec.action)
+        self._read, self._write = make_flatten(env.observation_space), make_action_converter(spec.action)
 
     def episode(self, longest: int) -> RecordedEpisode:
         """The next episode, of so many steps at most. Raises `EnvironmentFailed` if the environment raises."""

@@ -19,9 +19,10 @@ import numpy as np
 
 from learner.recording.record import Player
 from learner.run_folder.results import Evaluation
+from protocol.env_spec import EnvSpec
 from protocol.errors import EnvironmentFailed, RunError, UsageError
 from protocol.policy.policy import Policy
-from protocol.specs import EnvSpec, PolicySpec
+from protocol.specs import PolicySpec
 
 LONGEST_FILM = 1_500  # frames; all of them are held in memory until the film is written
 LONGEST_EPISODE = 20_000  # env steps

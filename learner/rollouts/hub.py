@@ -23,13 +23,13 @@ from learner.rollouts.roster import CollectingMember, Roster
 from learner.rollouts.status import status
 from learner.rollouts.weight_age import Freshness
 from learner.run_folder.progress import Progress
-from protocol.address import name_of
+from protocol.address import worker_name
 from protocol.errors import BadMessage, BadRollout, EnvironmentFailed, NoWorkers, Stalled
 from protocol.messages import Array, Inquire, Rollout, ToWorker, Weights
 from protocol.rollout import rollout_bytes, validate
 from protocol.wire.codec import Buffer, encode
-from protocol.wire.link import LearnerLink
-from protocol.wire.weight_dtypes import WeightsDtype, narrowed
+from protocol.wire.learner_link import LearnerLink
+from protocol.wire.weight_dtypes import WeightsDtype, to_wire_dtype
 
 log = logging.getLogger("millrace.learner")
 
@@ -147,7 +147,7 @@ class Hub:
 
         Raises `RunError` if a parameter is too large for `weights_dtype`.
         """
-        travelling = narrowed(parameters, self.settings.weights_dtype)
+        travelling = to_wire_dtype(parameters, self.settings.weights_dtype)
         self._freshness.published(version, self._clock())
         self._send(self.roster.publish(version, travelling, buffers))
 
@@ -270,7 +270,7 @@ class Hub:
             now = self._clock()
             match message:
                 case BadMessage():
-                    self._lid.complain(peer, f"message from {name_of(peer)[:40]!r}: {message}")
+                    self._lid.complain(peer, f"message from {worker_name(peer)[:40]!r}: {message}")
                     self._send(self.roster.reject(peer, None, str(message), now))
                 case Rollout():
                     self._rollout(peer, message, now)
@@ -283,11 +283,11 @@ class Hub:
         try:
             validate(rollout, self.roster.run)
         except BadRollout as error:
-            why = f"worker {name_of(peer).decode(errors='replace')}: rollout of ticket {rollout.ticket}: {error}"
+            why = f"worker {worker_name(peer).decode(errors='replace')}: rollout of ticket {rollout.ticket}: {error}"
             self._lid.complain(peer, why)
             self._send(self.roster.reject(peer, rollout, why, now))
         else:
-            self._freshness.arrived(name_of(peer).decode(errors="replace"), rollout.version, now)
+            self._freshness.arrived(worker_name(peer).decode(errors="replace"), rollout.version, now)
             self._send(self.roster.receive(peer, rollout, now))
 
     def _shut_out(self) -> None:

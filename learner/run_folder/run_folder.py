@@ -29,9 +29,10 @@ from learner.run_folder.atomic_write import write_atomically
 from learner.run_folder.results import Summary
 from learner.run_folder.run_format import RUN_FILE, check_format, write_format
 from protocol.arrays import Floats
+from protocol.env_spec import EnvSpec, Scalar
 from protocol.errors import RunError, UsageError
 from protocol.policy.layout import Field, buffer_layout, named_views, parameter_layout, total_size
-from protocol.specs import EnvSpec, PolicySpec, Scalar
+from protocol.specs import PolicySpec
 
 if TYPE_CHECKING:
     from learner.config.config import Config  # brings torch along, and reading a policy needs none

@@ -13,21 +13,21 @@ import numpy as np
 
 from learner.vector_env.batch_layout import BatchLayout
 from protocol.arrays import Array
-from protocol.envs.spaces import nester
+from protocol.envs.spaces import make_unflatten
 from protocol.messages import Stepped
 from protocol.specs import StepSpec
-from protocol.wire.shared_memory import Memory
+from protocol.wire.shared_memory import SharedMemory
 
 
 class BatchArrays:
     """The newest results of all env copies."""
 
     def __init__(
-        self, spec: StepSpec, layout: BatchLayout, observation_space: gymnasium.Space[Any], memory: Memory | None
+        self, spec: StepSpec, layout: BatchLayout, observation_space: gymnasium.Space[Any], memory: SharedMemory | None
     ) -> None:
         """`observation_space`: of a single env copy. `memory`: shared with local workers."""
         N = layout.num_envs
-        self._layout, self._nest = layout, nester(observation_space)
+        self._layout, self._nest = layout, make_unflatten(observation_space)
         self._observation: tuple[Array, ...]  # [num_envs, *leaf] each
         self.reward: Array  # [num_envs] float64
         self.terminated: Array  # [num_envs] bool

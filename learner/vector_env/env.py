@@ -28,11 +28,11 @@ from learner.vector_env.spec import VectorEnvDescription
 from learner.vector_env.step_hub import LockstepHub
 from learner.vector_env.step_roster import Make
 from protocol.arrays import Array
-from protocol.envs.spaces import reader
+from protocol.envs.spaces import make_flatten
 from protocol.errors import BadMessage, UsageError, WorkerLost
 from protocol.messages import Answer, Stepped
-from protocol.wire.plain_values import shown_keys
-from protocol.wire.shared_memory import Memory
+from protocol.wire.plain_values import repr_paths
+from protocol.wire.shared_memory import SharedMemory
 
 log = logging.getLogger("millrace.learner")
 
@@ -47,7 +47,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         description: VectorEnvDescription,
         hub: LockstepHub,
         *,
-        memory: Memory | None = None,
+        memory: SharedMemory | None = None,
         timeout_s: float = 60.0,
         on_worker_loss: Literal["truncate", "raise"] = "truncate",
         copy: bool = True,
@@ -71,7 +71,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self.timeout_s, self.on_worker_loss, self.copy = timeout_s, on_worker_loss, copy
         self._hub, self._memory = hub, memory
         self._autoreset, self._action_leaves = step.autoreset, step.action
-        self._read_actions = reader(self.single_action_space)
+        self._read_actions = make_flatten(self.single_action_space)
         self._layout = BatchLayout(step.lanes)
         self._batch = BatchArrays(step, self._layout, self.single_observation_space, memory)
         self._lost_lanes = LostLanes()
@@ -339,7 +339,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         infos: Infos = {}
         for n in sorted(by_copy):
             infos = self._add_info(infos, by_copy[n], n)
-            for key in shown_keys(by_copy[n]):
+            for key in repr_paths(by_copy[n]):
                 if key not in self._warned_infos:
                     self._warned_infos.add(key)
                     log.warning("info %s of copy %d is no plain data: it arrives as its repr, a string", key, n)

@@ -11,7 +11,7 @@ import gymnasium
 from gymnasium.vector import AutoresetMode
 
 from learner.members.endpoint import Bind
-from protocol.specs import Scalar
+from protocol.env_spec import Scalar
 
 EnvLike = str | Callable[..., gymnasium.Env[Any, Any]]
 """What `gymnasium.make` takes, or a callable that returns an environment."""

@@ -10,9 +10,10 @@ import gymnasium
 from gymnasium.vector import AutoresetMode
 
 from learner.vector_env.settings import VectorEnvSettings
-from protocol.envs.spaces import exact_leaves
+from protocol.env_spec import EnvSpec
+from protocol.envs.spaces import leaves_with_own_dtype
 from protocol.errors import UsageError
-from protocol.specs import EnvSpec, Leaf, StepSpec
+from protocol.specs import Leaf, StepSpec
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ def describe(settings: VectorEnvSettings, learner_timeout_s: float = math.inf) -
             envs=tuple(different),
             copies=tuple(index[env_specs[env].id, env_specs[env].factory] for env in envs),
             lanes=tuple(N // lanes + (lane < N % lanes) for lane in range(lanes)),
-            observation=exact_leaves(copy.observation_space),
+            observation=leaves_with_own_dtype(copy.observation_space),
             action=_action_leaves(copy.action_space),
             autoreset=_autoreset_mode(settings.autoreset_mode),
             render_mode=settings.render_mode,
@@ -65,7 +66,7 @@ def describe(settings: VectorEnvSettings, learner_timeout_s: float = math.inf) -
 
 def _action_leaves(space: gymnasium.Space[Any]) -> tuple[Leaf, ...]:
     try:
-        return exact_leaves(space)
+        return leaves_with_own_dtype(space)
     except UsageError as error:
         raise UsageError(str(error).replace("observation space", "action space")) from error
 

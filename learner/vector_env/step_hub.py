@@ -19,13 +19,14 @@ from learner.members.membership import Out
 from learner.members.peer_log import Doorkeeper, Lid
 from learner.rollouts.status import stepping_status
 from learner.vector_env.step_roster import Lockstep, Make
-from protocol.address import name_of
+from protocol.address import worker_name
 from protocol.errors import BadMessage, EnvironmentFailed, NoWorkers
 from protocol.messages import Answer, Inquire
 from protocol.specs import StepSpec
 from protocol.wire.codec import encode
-from protocol.wire.link import LearnerLink
-from protocol.wire.shared_memory import Awake, Bell, Memory, Rung
+from protocol.wire.learner_link import LearnerLink
+from protocol.wire.shared_memory import SharedMemory
+from protocol.wire.wake_up import SpinWait, WakePipe, WakeReason
 
 log = logging.getLogger("millrace.learner")
 
@@ -83,8 +84,8 @@ class Nobody:
 class Shared:
     """Shared memory and the bells of each worker that was handed it."""
 
-    memory: Memory
-    bells: Mapping[str, tuple[Bell, Bell]]
+    memory: SharedMemory
+    bells: Mapping[str, tuple[WakePipe, WakePipe]]
     """by name: rung for the worker, and by it"""
 
     def close(self) -> None:
@@ -116,7 +117,7 @@ class LockstepHub:
         self.lockstep = Lockstep(spec, first_session, worker_timeout_s)
         self.staff: Staff = staff or Nobody()
         self._shared, self._spin_s, self._clock = shared, spin_s, clock
-        self._awake = Awake()
+        self._awake = SpinWait()
         self._wanted: dict[int, Make] = {}  # lane -> an order that is said as soon as the lane is placed
         self._wanted_since_s = 0.0
         self._patience_s = PATIENCE_S
@@ -125,7 +126,7 @@ class LockstepHub:
         self.stepped: set[int] = set()
         """lanes whose last step, through shared memory, is done"""
         self._under_way: dict[int, int] = {}  # lane -> number of its order through shared memory
-        self._waits: dict[int, tuple[Bell, Bell] | None] = {}  # lane -> its worker's bells, if it may use them
+        self._waits: dict[int, tuple[WakePipe, WakePipe] | None] = {}  # lane -> its worker's bells, if it may use them
         self._listen_due_s = 0.0
         self._closing = False
         self._turned_away = ""  # what became of the last one that did not stay
@@ -256,7 +257,7 @@ class LockstepHub:
         deadline_s = self._clock() + (min(BUSY_S, timeout_s) if busy else timeout_s)
         self._send(self.lockstep.membership.drain("the vector environment was closed"))
         for bell, _ in self._shared.bells.values() if self._shared is not None else ():
-            bell.ring(Rung.MESSAGE)
+            bell.ring(WakeReason.MESSAGE)
         while self.lockstep.members and self._clock() < deadline_s:
             self._receive(POLL_S)
             for name, why in self.staff.poll():
@@ -309,7 +310,7 @@ class LockstepHub:
             for peer, message in self.link.receive():
                 match message:
                     case BadMessage():
-                        self._lid.complain(peer, f"message from {name_of(peer)[:40]!r}: {message}")
+                        self._lid.complain(peer, f"message from {worker_name(peer)[:40]!r}: {message}")
                         self._send(self.lockstep.reject(peer, str(message)))
                     case Inquire():
                         self.link.send(peer, encode(stepping_status(self.lockstep, self._clock())))
@@ -354,8 +355,8 @@ class LockstepHub:
         for peer, message in outs:
             if not self.link.send(peer, encode(message)):
                 continue  # it is gone, or does not read: its silence will tell
-            if self._shared is not None and (bells := self._shared.bells.get(name_of(peer).decode(errors="replace"))):
-                bells[0].ring(Rung.MESSAGE)  # it may be asleep beside its shared memory
+            if self._shared is not None and (bells := self._shared.bells.get(worker_name(peer).decode(errors="replace"))):
+                bells[0].ring(WakeReason.MESSAGE)  # it may be asleep beside its shared memory
 
     def _give_up(self, timeout_s: float) -> None:
         """The deadline has passed: whoever holds an order has had it."""

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from learner.config.did_you_mean import did_you_mean
 from millrace.cli.arguments import Arguments
 from protocol.errors import UsageError
-from protocol.keys.key_folder import DEFAULT_FOLDER, FOLDER_VARIABLE, KeyFolder, asked_folder
+from protocol.keys.key_folder import DEFAULT_FOLDER, FOLDER_VARIABLE, KeyFolder, chosen_key_folder
 from protocol.keys.keys import public_key
 
 
@@ -111,7 +111,7 @@ def _arguments(name: str) -> Arguments:
 
 
 def _folder(values: Namespace) -> KeyFolder:
-    return KeyFolder(asked_folder(values.keys))
+    return KeyFolder(chosen_key_folder(values.keys))
 
 
 def _now() -> datetime:

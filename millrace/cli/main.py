@@ -16,7 +16,7 @@ from typing import NamedTuple
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # before numpy; --torch-threads sets the learner's
 
-from protocol.errors import OurError, UsageError, first_line
+from protocol.errors import UsageError, UserFacingError, first_line
 
 ABOUT = "Worker processes step copies of a gymnasium environment; one learner trains a policy in PyTorch."
 HELP_FLAGS = ("-h", "--help")
@@ -39,7 +39,7 @@ def main(argv: list[str] | None = None) -> int:
         exit_code = _dispatch(argv)
         sys.stdout.flush()
         return exit_code
-    except OurError as error:
+    except UserFacingError as error:
         _print_error(f"millrace: {error}")
         if error.detail:
             _print_error(error.detail.rstrip())

@@ -23,9 +23,10 @@ from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.settings import VectorEnvSettings
 from millrace.launch.local_workers import flags_of, own_address
 from millrace.launch.vector import listen
+from protocol.env_spec import EnvSpec
 from protocol.policy.policy import Policy, make_policy
-from protocol.specs import EnvSpec, ImagesDtype, PolicySpec, RunSpec
-from protocol.wire.link import LearnerLink
+from protocol.specs import ImagesDtype, PolicySpec, RunSpec
+from protocol.wire.learner_link import LearnerLink
 from workers.collect.collector import Collector
 from workers.collect.split_vector_env import SideBySide
 from workers.env_loop import Pulse

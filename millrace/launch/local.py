@@ -15,10 +15,10 @@ from learner.config.config import Config
 from learner.members.worker_processes import WorkerProcesses
 from learner.run import Run, Watch, prometheus_observer, set_up
 from millrace.launch.local_workers import flags_of, own_address, own_keys
+from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
 from protocol.keys.keys import Token
-from protocol.specs import EnvSpec
-from protocol.wire.link import LearnerLink
+from protocol.wire.learner_link import LearnerLink
 from workers.host import Host, Running, WorkerCommand, WorkerProcess, WorkerThread
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from learner.config.config import Config
 from learner.members.endpoint import throwaway
 from protocol.errors import UsageError
-from protocol.keys.key_folder import Keyring, asked_folder
+from protocol.keys.key_folder import Keyring, chosen_key_folder
 from protocol.keys.keys import Token
 from workers.host import core_flags
 
@@ -42,7 +42,7 @@ def own_address(transport: str, stack: ExitStack) -> str:
 
 def own_keys(transport: str, keys: str, *, insecure: bool) -> tuple[Keyring | None, Token | None]:
     """Keys for this run alone, where loopback TCP is to have some: a key folder was named."""
-    sealed = transport == "tcp" and asked_folder(keys) is not None and not insecure
+    sealed = transport == "tcp" and chosen_key_folder(keys) is not None and not insecure
     return throwaway("local", datetime.now(UTC)) if sealed else (None, None)
 
 

@@ -21,13 +21,14 @@ from learner.vector_env.settings import VectorEnvSettings
 from learner.vector_env.spec import VectorEnvDescription, describe
 from learner.vector_env.step_hub import LockstepHub, Shared
 from millrace.launch.local_workers import StartFlags, own_address, own_keys
-from protocol.address import advertised, check_address
-from protocol.cpu_cores import cores
+from protocol.address import advertised_address, check_address
+from protocol.cpu_cores import usable_cores
 from protocol.errors import UsageError
 from protocol.keys.key_folder import Keyring
 from protocol.keys.keys import Token
-from protocol.wire.link import LearnerLink
-from protocol.wire.shared_memory import POSSIBLE, SPIN_S, Bell, Handed, Memory
+from protocol.wire.learner_link import LearnerLink
+from protocol.wire.shared_memory import SUPPORTED, InheritedDescriptors, SharedMemory
+from protocol.wire.wake_up import SPIN_S, WakePipe
 from workers.host import Host, Running, WorkerCommand, WorkerProcess, WorkerThread
 
 log = logging.getLogger("millrace.learner")
@@ -79,7 +80,7 @@ class ListeningVectorEnv:
             staff=host,
             shared=self.shared,
             worker_timeout_s=WORKER_TIMEOUT_S if settings.listen.bind else math.inf,
-            spin_s=SPIN_S if count < cores() else 0.0,  # only if a core is left for the learner
+            spin_s=SPIN_S if count < usable_cores() else 0.0,  # only if a core is left for the learner
         )
         self.resources.callback(hub.close, CLOSE_TIMEOUT_S)
         if host is None:
@@ -104,7 +105,7 @@ class ListeningVectorEnv:
             handed = None
             if self.shared is not None:
                 to_worker, to_learner = self.shared.bells[name]
-                handed = Handed(self.shared.memory.fd, to_worker.hears, to_learner.rings)
+                handed = InheritedDescriptors(self.shared.memory.fd, to_worker.hears, to_learner.rings)
             worker_flags, log_file = flags(name)
             return WorkerProcess(WorkerCommand(self.link.address, name, log_file, self.token, worker_flags, handed))
 
@@ -127,9 +128,9 @@ def listen(settings: VectorEnvSettings, resources: ExitStack) -> ListeningVector
     link = LearnerLink(address, context, keyring)
     resources.callback(link.close, 0.5)
     shared = None
-    if settings.shared_memory and POSSIBLE and count and transport != "inproc":
-        to_learner = Bell()  # one for all: the worker that finishes a step last rings it
-        shared = Shared(Memory(description.step), {f"w{n}": (Bell(), to_learner) for n in range(count)})
+    if settings.shared_memory and SUPPORTED and count and transport != "inproc":
+        to_learner = WakePipe()  # one for all: the worker that finishes a step last rings it
+        shared = Shared(SharedMemory(description.step), {f"w{n}": (WakePipe(), to_learner) for n in range(count)})
         resources.callback(shared.close)
     return ListeningVectorEnv(settings, description, link, context, keyring, token, shared, resources)
 
@@ -138,7 +139,7 @@ def _keys(where: Bind, transport: str) -> tuple[Keyring | None, Token | None]:
     """Who may connect, and the token of local workers."""
     if not where.bind:
         return own_keys(transport, where.keys, insecure=where.insecure)
-    check_address(advertised("tcp://*:1", where.advertise, "machine"))
+    check_address(advertised_address("tcp://*:1", where.advertise, "machine"))
     return keyring_for(where, datetime.now(UTC).replace(microsecond=0)), None
 
 

@@ -18,15 +18,16 @@ from gymnasium import spaces
 from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import VectorEnv
 
-from protocol.envs.vectorized import check_spaces, instead_of
+from protocol.env_spec import EnvSpec
+from protocol.envs.vectorized import check_spaces, vector_alternative
 from protocol.errors import UsageError
-from protocol.specs import ActionSpec, EnvSpec, Leaf
+from protocol.specs import ActionSpec, Leaf
 
 LONGEST = 2**31 - 1  # steps: envpool counts them in an int32
 _ALONE = threading.Lock()
 
 
-class Pool(NamedTuple):
+class EnvpoolSpec(NamedTuple):
     """How envpool makes copies of an environment."""
 
     task: str
@@ -58,7 +59,7 @@ def _quietly() -> Iterator[None]:
         yield
 
 
-def pool_of(env: EnvSpec) -> Pool:
+def envpool_spec(env: EnvSpec) -> EnvpoolSpec:
     """What envpool has for this id. Raises `UsageError`."""
     if env.factory is not None:
         raise UsageError(f"environment {env.id}: vector envpool expected an id that gymnasium registers, got a callable")
@@ -70,7 +71,7 @@ def pool_of(env: EnvSpec) -> Pool:
     known = env.registered()
     task, options = _named(env, known)
     if task not in envpool.list_all_envs():
-        raise UsageError(f"environment {env.id}: envpool has none of this name; {instead_of(env)}")
+        raise UsageError(f"environment {env.id}: envpool has none of this name; {vector_alternative(env)}")
     try:
         with _quietly():
             made = envpool.make_spec(task, **options)
@@ -81,7 +82,7 @@ def pool_of(env: EnvSpec) -> Pool:
         says = str(error).strip().removeprefix("Config.__new__() ")
         raise UsageError(f"environment {env.id}: envpool cannot make it: {says}; use --vector loop") from error
     limit = options.get("max_episode_steps") or known.max_episode_steps or made.config.max_episode_steps
-    return Pool(task, {**options, "max_episode_steps": min(limit + 1, LONGEST)}, limit, observation, action)
+    return EnvpoolSpec(task, {**options, "max_episode_steps": min(limit + 1, LONGEST)}, limit, observation, action)
 
 
 def _named(env: EnvSpec, known: gymnasium.envs.registration.EnvSpec) -> tuple[str, dict[str, Any]]:
@@ -97,7 +98,7 @@ def _named(env: EnvSpec, known: gymnasium.envs.registration.EnvSpec) -> tuple[st
     return known.id if of_gymnasium else "", dict(env.kwargs)
 
 
-def check_pool(env: EnvSpec, observation: tuple[Leaf, ...], action: ActionSpec) -> None:
+def check_envpool(env: EnvSpec, observation: tuple[Leaf, ...], action: ActionSpec) -> None:
     """Raises `UsageError` unless envpool's environment can stand for copies with these spaces."""
-    pool = pool_of(env)
+    pool = envpool_spec(env)
     check_spaces(env, "envpool's", pool.observation_space, pool.action_space, observation, action)

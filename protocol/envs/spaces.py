@@ -28,13 +28,13 @@ def observation_leaves(space: gymnasium.Space[Any]) -> tuple[Leaf, ...]:
     return tuple(_leaf("/".join(map(str, path)), leaf) for path, leaf in _walk(space, ()))
 
 
-def exact_leaves(space: gymnasium.Space[Any]) -> tuple[Leaf, ...]:
+def leaves_with_own_dtype(space: gymnasium.Space[Any]) -> tuple[Leaf, ...]:
     """The same of an observation or an action, each array in its space's own dtype. Raises `UsageError`."""
     leaves = zip(observation_leaves(space), _walk(space, ()), strict=True)
     return tuple(msgspec.structs.replace(leaf, dtype=np.dtype(inner.dtype).name) for leaf, (_, inner) in leaves)
 
 
-def nester(space: gymnasium.Space[Any]) -> Callable[[Sequence[Any]], Any]:
+def make_unflatten(space: gymnasium.Space[Any]) -> Callable[[Sequence[Any]], Any]:
     """The inverse of `reader`: a function from leaves, in order, to an observation or an action."""
     paths = [path for path, _ in _walk(space, ())]
     if paths == [()]:
@@ -99,7 +99,7 @@ def _ints(array: Array) -> tuple[int, ...]:
     return tuple(int(x) for x in array.ravel())
 
 
-def reader(space: gymnasium.Space[Any]) -> Callable[[Any], tuple[Any, ...]]:
+def make_flatten(space: gymnasium.Space[Any]) -> Callable[[Any], tuple[Any, ...]]:
     """A function from one observation (or a vector environment's batch of them) to its leaves, in order."""
     paths = [path for path, _ in _walk(space, ())]
     if paths == [()]:
@@ -117,7 +117,7 @@ def reader(space: gymnasium.Space[Any]) -> Callable[[Any], tuple[Any, ...]]:
     return read
 
 
-def writer(spec: ActionSpec) -> Callable[[Array], Array]:
+def make_action_converter(spec: ActionSpec) -> Callable[[Array], Array]:
     """A function from stored actions [N, *action] to what the environment takes: shifted by `start`, or clipped."""
     dtype = np.dtype(spec.dtype)
     if spec.kind == "box":

@@ -11,9 +11,10 @@ from typing import Any
 import gymnasium
 from gymnasium.vector import AutoresetMode, VectorEnv
 
+from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import UsageError
-from protocol.specs import ActionSpec, EnvSpec, Leaf
+from protocol.specs import ActionSpec, Leaf
 
 
 def make_native(env: EnvSpec, copies: int) -> VectorEnv[Any, Any, Any]:
@@ -60,11 +61,13 @@ def check_spaces(
 ) -> None:
     """Raises `UsageError` unless these spaces of a vectorised form say what one copy says."""
     if (observation_leaves(observed), action_spec(acted)) != (observation, action):
-        line = f"environment {env.id}: {whose} has other spaces than itself, {observed} and {acted}; {instead_of(env)}"
+        line = (
+            f"environment {env.id}: {whose} has other spaces than itself, {observed} and {acted}; {vector_alternative(env)}"
+        )
         raise UsageError(line)
 
 
-def instead_of(env: EnvSpec) -> str:
+def vector_alternative(env: EnvSpec) -> str:
     """What to do where the vectorised form of this id cannot serve."""
     if env.id.startswith("ALE/"):
         return f"take millrace/Atari-v0 --env-kwargs game {env.id[4:].partition('-')[0]}, or use --vector loop"

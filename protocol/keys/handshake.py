@@ -28,7 +28,7 @@ NOT_ALLOWED = 400  # ZAP's word for: this key, no
 
 
 @dataclass(frozen=True)
-class Trouble:
+class ConnectionProblem:
     """Why a worker is not connected."""
 
     line: str
@@ -36,31 +36,31 @@ class Trouble:
     """no retry can heal it: the learner has refused this key"""
 
 
-def trouble(event: int, value: int, address: str, token: Token | None) -> Trouble:
+def connection_problem(event: int, value: int, address: str, token: Token | None) -> ConnectionProblem:
     """What a failed handshake means to a worker."""
     if event == zmq.EVENT_HANDSHAKE_FAILED_AUTH and value == NOT_ALLOWED:
         key = fingerprint(token.client.public) if token else "none"
         advice = (
             "on the learner's machine: `millrace keys show` lists those that may, `millrace keys new NAME` makes another"
         )
-        return Trouble(
+        return ConnectionProblem(
             f"the learner at {address} refused this worker's key {key}: not allowed there, or revoked; {advice}", True
         )
     if event == zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL and value in (errno.EAGAIN, errno.ETIMEDOUT):
-        return Trouble(
+        return ConnectionProblem(
             f"{address} answers, but did not finish the handshake within {HANDSHAKE_MS // 1000} s; is it a millrace learner?"
         )
     if token is None:
         why = "perhaps it asks for a key: give this worker --token FILE (`millrace keys new NAME` on its machine makes one)"
     else:
         why = "perhaps this token is of another learner, or the learner was started without keys; then leave the token out"
-    return Trouble(f"{address} breaks off the handshake; {why}")
+    return ConnectionProblem(f"{address} breaks off the handshake; {why}")
 
 
 # ---------------------------------------------------------------- the learner's side
 
 
-def complaint(event: int, value: int, keys: bool) -> str:
+def handshake_failure(event: int, value: int, keys: bool) -> str:
     """What was wrong with a visitor's handshake, to a learner with or without keys."""
     match event, value:
         case zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, zmq.PROTOCOL_ERROR_ZMTP_CRYPTOGRAPHIC:
@@ -83,7 +83,7 @@ def complaint(event: int, value: int, keys: bool) -> str:
 NO_ZEROMQ = "it does not speak ZeroMQ, or left before it had said who it is"
 
 
-class Visitors:
+class PendingHandshakes:
     """Connections whose handshake is not over. Finds out whose handshake it was that failed.
 
     libzmq names a connection by its descriptor when it is accepted and when it ends, and not in between. A failure is
@@ -114,7 +114,7 @@ class Visitors:
                 host, failed = self._fresh.pop(value, None), self._failed
                 self._failed = None
                 if failed is not None and failed[0] != zmq.EVENT_HANDSHAKE_FAILED_AUTH:
-                    return host or "", complaint(*failed, self._keys)
+                    return host or "", handshake_failure(*failed, self._keys)
                 if failed is None and host is not None:
                     return host, NO_ZEROMQ
             case _:

@@ -19,7 +19,7 @@ from datetime import datetime
 from pathlib import Path
 
 from protocol.errors import UsageError
-from protocol.keys.keys import KEY_BYTES, Allowed, Key, Token, check_name
+from protocol.keys.keys import KEY_BYTES, ClientList, Key, Token, check_name
 
 log = logging.getLogger("millrace.cli.keys")
 
@@ -29,7 +29,7 @@ FIRST_CLIENT = "default"
 OTHERS = 0o077
 
 
-def asked_folder(flag: str) -> Path | None:
+def chosen_key_folder(flag: str) -> Path | None:
     """The key folder that the flag, or else the environment, names; None if neither does."""
     named = flag or os.environ.get(FOLDER_VARIABLE, "")
     return Path(named).expanduser() if named else None
@@ -65,11 +65,11 @@ class KeyFolder:
             raise UsageError(f"key {path} is damaged: expected {2 * KEY_BYTES} hexadecimal digits; restore it, or delete it")
         return Key.of_secret(secret)
 
-    def allowed(self) -> Allowed:
+    def allowed(self) -> ClientList:
         """The list of clients; empty if there is no list."""
-        return self._read_list() if self.list_path.exists() else Allowed()
+        return self._read_list() if self.list_path.exists() else ClientList()
 
-    def first(self, now: datetime) -> Allowed:
+    def first(self, now: datetime) -> ClientList:
         """The list, with a first client on it if there has never been a list."""
         self._open()
         if not self.list_path.exists():
@@ -109,7 +109,7 @@ class KeyFolder:
             _replace(self.list_path, self.allowed().revoking(name, now).to_toml())
             self.token_path(name).unlink(missing_ok=True)
 
-    def _read_list(self) -> Allowed:
+    def _read_list(self) -> ClientList:
         try:
             with self.list_path.open("rb") as file:
                 if stat.S_IMODE(os.fstat(file.fileno()).st_mode) & 0o022:
@@ -117,7 +117,7 @@ class KeyFolder:
                 text = file.read().decode()
         except (OSError, UnicodeDecodeError) as error:
             raise UsageError(f"list {self.list_path} cannot be read: {_says(error)}") from error
-        return Allowed.from_toml(text, f"list {self.list_path}")
+        return ClientList.from_toml(text, f"list {self.list_path}")
 
     def _open(self) -> None:
         """Make the folder if there is none. Raises `UsageError` if others can enter it."""
@@ -149,7 +149,7 @@ class KeyFolder:
 class Keyring:
     """The learner's key and who may connect, as it stands now. Read by two threads: what they read is replaced whole."""
 
-    def __init__(self, key: Key, allowed: Allowed, folder: KeyFolder | None = None) -> None:
+    def __init__(self, key: Key, allowed: ClientList, folder: KeyFolder | None = None) -> None:
         """Without a folder the list stays as it is."""
         self.key, self.allowed, self.folder = key, allowed, folder
         self.broken = ""

@@ -106,7 +106,7 @@ class Client(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
 
 
 @dataclass(frozen=True)
-class Allowed:
+class ClientList:
     """Who may connect: every client there ever was, with the revoked ones marked."""
 
     clients: tuple[Client, ...] = ()
@@ -138,7 +138,7 @@ class Allowed:
         """Of those that may connect."""
         return [client.name for client in self.clients if client.revoked is None]
 
-    def adding(self, name: str, public: bytes, made: datetime) -> Allowed:
+    def adding(self, name: str, public: bytes, made: datetime) -> ClientList:
         """With one more. Raises `UsageError` if the name is taken, or the key was there before."""
         check_name(name)
         if self.valid(name) is not None:
@@ -147,23 +147,23 @@ class Allowed:
         if known is not None:
             state = "is allowed already" if known.revoked is None else "was revoked, and stays so; make a new one"
             raise UsageError(f"public key {fingerprint(public)} ({known.name}) {state}")
-        return Allowed((*self.clients, Client(name, public.hex(), made)))
+        return ClientList((*self.clients, Client(name, public.hex(), made)))
 
-    def revoking(self, name: str, now: datetime) -> Allowed:
+    def revoking(self, name: str, now: datetime) -> ClientList:
         """Without this one. Raises `UsageError` if nobody of this name may connect."""
         victim = self.valid(name)
         if victim is None:
             before = any(client.name == name for client in self.clients)
             raise UsageError(f"key {name}: {'revoked already' if before else 'there is none of this name'}{_those(self)}")
         gone = msgspec.structs.replace(victim, revoked=now)
-        return Allowed(tuple(gone if client is victim else client for client in self.clients))
+        return ClientList(tuple(gone if client is victim else client for client in self.clients))
 
     def to_toml(self) -> str:
         """As text that `from_toml` reads."""
         return LIST_HEADER + "".join(f"\n{_toml_table(client)}" for client in self.clients)
 
     @staticmethod
-    def from_toml(text: str, where: str) -> Allowed:
+    def from_toml(text: str, where: str) -> ClientList:
         """From text. Raises `UsageError` that names `where`: a list that is not understood allows nobody."""
         try:
             table: dict[str, Any] = tomllib.loads(text)
@@ -175,7 +175,7 @@ class Allowed:
         for client in clients:
             check_name(client.name, f"{where}: ")
             public_key(client.public, f"{where}: client {client.name}")
-        return Allowed(clients)
+        return ClientList(clients)
 
 
 def _toml_table(client: Client) -> str:
@@ -186,7 +186,7 @@ def _toml_table(client: Client) -> str:
     return "\n".join(["[[client]]", *lines, ""])
 
 
-def _those(allowed: Allowed) -> str:
+def _those(allowed: ClientList) -> str:
     return f"; those that may connect: {', '.join(allowed.names()) or 'none'}"
 
 

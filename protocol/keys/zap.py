@@ -25,10 +25,10 @@ from contextlib import suppress
 import zmq
 
 from protocol.errors import UsageError
-from protocol.keys.handshake import WATCHED, Visitors
+from protocol.keys.handshake import WATCHED, PendingHandshakes
 from protocol.keys.key_folder import Keyring
 from protocol.keys.keys import KEY_BYTES, Key, Token
-from protocol.log_limit import Rarely, again
+from protocol.log_rate_limiter import LogRateLimiter, suppressed_note
 
 log = logging.getLogger("millrace.door")
 
@@ -71,7 +71,7 @@ def answer(request: Sequence[bytes], keyring: Keyring) -> tuple[list[bytes], str
     return ([b"1.0", number, b"200", b"OK", key.hex().encode(), b""], "") if not why else (refused, why)
 
 
-class Door(threading.Thread):
+class AuthenticatorThread(threading.Thread):
     """Stands at a learner's tcp port: answers ZAP if there are keys, counts those who do not get through, and says why."""
 
     def __init__(self, socket: Socket, keyring: Keyring | None) -> None:
@@ -81,8 +81,8 @@ class Door(threading.Thread):
         self.refused = 0
         """handshakes that failed"""
         self.keyring = keyring
-        self._lid = Rarely()
-        self._visitors = Visitors(keys=keyring is not None)
+        self._lid = LogRateLimiter()
+        self._visitors = PendingHandshakes(keys=keyring is not None)
         self._zap: Socket | None = None
         if keyring is not None:
             self._zap = context.socket(zmq.ROUTER)
@@ -172,7 +172,7 @@ class Door(threading.Thread):
         self.refused += 1
         kept_back = self._lid.due(f"{host} {why}", time.monotonic())
         if kept_back is not None:
-            log.warning("%s was not let in: %s%s", host or "somebody", why, again(kept_back))
+            log.warning("%s was not let in: %s%s", host or "somebody", why, suppressed_note(kept_back))
 
 
 def _pair(context: zmq.Context[Socket], name: str, *, bind: bool) -> Socket:

@@ -13,7 +13,7 @@ LARGEST = 32 << 20  # bytes of an allocation that comes from the heap at all: th
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 
 
-def keep_freed() -> bool:
+def keep_freed_memory() -> bool:
     """Of the whole process, from now on; whether the C library is one that can (glibc)."""
     try:
         mallopt = ctypes.CDLL(None).mallopt

@@ -23,7 +23,7 @@ from protocol.policy.layout import (
     parameter_layout,
     total_size,
 )
-from protocol.policy.malloc import keep_freed
+from protocol.policy.malloc import keep_freed_memory
 from protocol.specs import PolicySpec
 
 
@@ -121,7 +121,7 @@ class FlatNetwork:
         self._encoder = None if spec.encoder is None else self._adopt(make_encoder(spec, seed).to(device))
         self._images = self._convolutions()
         if spec.needs_torch:
-            keep_freed()
+            keep_freed_memory()
 
     def _adopt(self, encoder: torch.nn.Module) -> torch.nn.Module:
         """Move the encoder's parameters into the flat tensor; they keep their initial values."""

@@ -25,7 +25,7 @@ import numpy as np
 
 from protocol.errors import BadMessage
 from protocol.messages import Hello, Inquire, Refuse, Rollout, Status, ToLearner, ToObserver, ToWorker
-from protocol.wire.compression import Packing, as_it_lies, unpacked
+from protocol.wire.compression import Packing, raw_bytes, unpack_array
 
 Buffer = bytes | memoryview
 
@@ -65,7 +65,7 @@ def encode(message: ToLearner | Inquire | ToWorker | ToObserver, packing: Packin
             raise TypeError(f"{type(message).__name__} cannot carry an array of {value.dtype}")
         described: list[object] = [value.dtype.str, list(value.shape), len(frames)]
         if packing is None:
-            frames.append(as_it_lies(value))
+            frames.append(raw_bytes(value))
             return described
         frame, packings = packing.of(value)
         frames.append(frame)
@@ -122,7 +122,7 @@ def _decode(frames: Sequence[Buffer], kinds: Said, room: int = 0) -> Any:
                 raise BadMessage(f"packed arrays expected at most {room} bytes together, got {taken}")
             if size > MAX_FRAME_BYTES:
                 raise BadMessage(f"packed array expected at most {MAX_FRAME_BYTES} bytes, got {size}")
-            return unpacked(frame, packings, dtype, shape)
+            return unpack_array(frame, packings, dtype, shape)
         if size != len(frame):
             raise BadMessage(f"array {dtype.str}{shape} expected {size} bytes, got {len(frame)}")
         return np.ndarray(shape, dtype, frame if type(frame) is bytes else memoryview(frame).toreadonly())

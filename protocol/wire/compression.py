@@ -48,30 +48,30 @@ class Packing:
 
     def of(self, array: Array) -> tuple[Frame, list[str]]:
         """The array's frame and the names of its packings: none, if it goes as it lies."""
-        frame: Frame = as_it_lies(array)
+        frame: Frame = raw_bytes(array)
         packings: list[str] = []
-        if self.stack and (payload := stacked(array)) is not None:
+        if self.stack and (payload := pack_stack(array)) is not None:
             frame, packings = payload.data, ["stack"]
         if self.zstd and (compressed := _compressed(frame)) is not None:
             frame, packings = compressed, [*packings, "zstd"]
         return frame, packings
 
 
-def as_it_lies(array: Array) -> memoryview:
+def raw_bytes(array: Array) -> memoryview:
     """Its bytes, without a copy if they are C-ordered."""
     return array.ravel().view(np.uint8).data
 
 
-def unpacked(frame: Frame, packings: Sequence[object], dtype: np.dtype[Any], shape: Sequence[int]) -> Array:
+def unpack_array(frame: Frame, packings: Sequence[object], dtype: np.dtype[Any], shape: Sequence[int]) -> Array:
     """The array, read-only, that this frame stands for; it may be as large as it says. Raises `BadMessage`."""
     size = dtype.itemsize * math.prod(shape)
     match packings:
         case ["stack"]:
-            return unstacked(frame, dtype, shape)
+            return unpack_stack(frame, dtype, shape)
         case ["zstd"]:
             return np.ndarray(shape, dtype, _decompressed(frame, size, size))
         case ["stack", "zstd"]:
-            return unstacked(_decompressed(frame, 0, size + size // LEAST_FRAME_BYTES), dtype, shape)
+            return unpack_stack(_decompressed(frame, 0, size + size // LEAST_FRAME_BYTES), dtype, shape)
         case _:
             raise BadMessage(f"packings expected stack, zstd or both in this order, got {str(packings)[:80]}")
 
@@ -110,7 +110,7 @@ def _decompressed(frame: Frame, least: int, most: int) -> bytes:
         raise BadMessage(f"zstd: {' '.join(str(error).split())[:200]}") from error
 
 
-def stacked(array: Array) -> Bytes | None:
+def pack_stack(array: Array) -> Bytes | None:
     """The payload of a frame stack; None where that is not what the array is, or too little would be saved."""
     if not _may_be_stack(array.dtype, array.shape):
         return None
@@ -130,7 +130,7 @@ def stacked(array: Array) -> Bytes | None:
     return payload
 
 
-def unstacked(payload: Frame, dtype: np.dtype[Any], shape: Sequence[int]) -> Array:
+def unpack_stack(payload: Frame, dtype: np.dtype[Any], shape: Sequence[int]) -> Array:
     """The frame stack, read-only, that the payload stands for. Raises `BadMessage`."""
     if not _may_be_stack(dtype, shape):
         expected = f"uint8 [T+1, N, 2 to {MAX_STACK}, H, W, …] with frames of {LEAST_FRAME_BYTES} bytes or more"

@@ -23,7 +23,7 @@ MAX_REPR = 1000  # characters
 _TUPLE, _PAIRS, _ARRAY, _SCALAR, _OBJECTS, _INT, _COMPLEX, _SHOWN = range(1, 9)
 
 
-class Shown(str):
+class ReprString(str):
     """The `repr` of a value that is not plain."""
 
     __slots__ = ()
@@ -121,7 +121,7 @@ def _unfold(code: int, data: bytes, inner: Callable[[bytes], Any]) -> Any:
         case 7:
             return complex(*inner(data))
         case 8:
-            return Shown(data.decode())
+            return ReprString(data.decode())
         case _:
             raise BadMessage(f"plain value expected one of ours, got extension {code}")
 
@@ -133,16 +133,16 @@ def _dtype(name: object) -> np.dtype[Any]:
     return kind
 
 
-def shown_keys(value: object, where: str = "") -> list[str]:
+def repr_paths(value: object, where: str = "") -> list[str]:
     """Where in the value something stands as its `repr` only."""
     match value:
-        case Shown():
+        case ReprString():
             return [where]
         case dict():
-            return [at for key, inner in value.items() for at in shown_keys(inner, f"{where}.{key}" if where else str(key))]
+            return [at for key, inner in value.items() for at in repr_paths(inner, f"{where}.{key}" if where else str(key))]
         case list() | tuple():
-            return [at for inner in value for at in shown_keys(inner, where)]
+            return [at for inner in value for at in repr_paths(inner, where)]
         case np.ndarray() if value.dtype.kind == "O":
-            return [at for inner in value.ravel().tolist() for at in shown_keys(inner, where)]
+            return [at for inner in value.ravel().tolist() for at in repr_paths(inner, where)]
         case _:
             return []

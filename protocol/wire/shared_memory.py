@@ -10,13 +10,7 @@ from __future__ import annotations
 
 import mmap
 import os
-import platform
-import select
 import threading
-from collections.abc import Callable
-from contextlib import suppress
-from enum import IntEnum
-from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
@@ -24,19 +18,14 @@ import numpy as np
 from protocol.arrays import Array
 from protocol.specs import StepSpec
 
-POSSIBLE = hasattr(os, "memfd_create") and hasattr(os, "pipe2")
+SUPPORTED = hasattr(os, "memfd_create") and hasattr(os, "pipe2")
 LINE = 64  # bytes of a cache line: each lane's words have lines of their own
 WORDS = LINE // 8
 INFO_BYTES = 1 << 20  # of a lane, at least; what is longer travels as a message
 ELSEWHERE = -1  # in place of the number of bytes: the infos of this step travel as a message
-# x86 lets nobody see a later store before an earlier one. Elsewhere only a system call orders them: no spinning there.
-MAY_SPIN = platform.machine() in {"x86_64", "AMD64", "i686"}
-SPIN_S = 0.0002  # a learner that only looks into its next step is back by then; sleeping and waking costs 50 µs
-WANTED_S = 0.00005  # of one turn of waiting awake: somebody else ran meanwhile, who wants this core
-MOST_LEFT_OUT = 63  # waits between two tries to wait awake
 
 
-class Handed(NamedTuple):
+class InheritedDescriptors(NamedTuple):
     """What a worker process is given at its start: file descriptors that it inherits."""
 
     memory: int
@@ -46,7 +35,7 @@ class Handed(NamedTuple):
     """the end of a pipe where the worker rings"""
 
 
-class LaneMemory(NamedTuple):
+class LaneArrays(NamedTuple):
     """A lane's part of the memory, as views."""
 
     actions: tuple[Array, ...]  # [N, *leaf] each
@@ -57,7 +46,7 @@ class LaneMemory(NamedTuple):
     infos: memoryview  # bytes
 
 
-class Memory:
+class SharedMemory:
     """The memory of one vector environment, as one side sees it."""
 
     def __init__(self, spec: StepSpec, fd: int | None = None) -> None:
@@ -93,7 +82,7 @@ class Memory:
             actions, obs = (tuple(array[rows] for array in leaves) for leaves in (self.actions, self.obs))
             view = memoryview(memory)[infos : infos + self.info_bytes[lane]]
             reward, terminated, truncated = self.reward[rows], self.terminated[rows], self.truncated[rows]
-            self.lanes.append(LaneMemory(actions, obs, reward, terminated, truncated, view))
+            self.lanes.append(LaneArrays(actions, obs, reward, terminated, truncated, view))
             infos += self.info_bytes[lane]
 
     def _place(self, copies: int, shape: tuple[int, ...], dtype: str) -> tuple[int, tuple[int, ...], str]:
@@ -142,86 +131,3 @@ class Memory:
         if self.fd >= 0:
             os.close(self.fd)
             self.fd = -1
-
-
-class Rung(IntEnum):
-    """What a bell was rung for."""
-
-    NOT = 0
-    STEP = 1
-    MESSAGE = 2
-
-
-class Bell:
-    """A pipe: rung by one side, which writes, and heard by the other, which reads.
-
-    A pipe, for Linux takes it that who writes to one is about to wait: whom it wakes begins on the same core as soon as the
-    other sleeps. Whom an eventfd or a semaphore wakes may be made to wait for a core where a third one spins.
-    """
-
-    def __init__(self, *, hears: int = -1, rings: int = -1) -> None:
-        """A new one; or one of the ends, which was handed over."""
-        self.hears, self.rings = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC) if hears == rings == -1 else (hears, rings)
-        self._poll = select.poll()
-        if self.hears != -1:
-            self._poll.register(self.hears, select.POLLIN)
-
-    def ring(self, rung: Rung = Rung.STEP) -> None:
-        """Wake whoever waits, or will."""
-        with suppress(BlockingIOError, BrokenPipeError):  # full: it will wake; broken: nobody is left to
-            os.write(self.rings, _STROKES[rung])
-
-    def wait(self, timeout_s: float) -> Rung:
-        """Sleep until it is rung, at most `timeout_s`; of all that it was rung for, a message counts most.
-
-        Rung for a step that was seen without sleeping, it wakes the next sleeper for nothing.
-        """
-        if not self._poll.poll(timeout_s * 1000):
-            return Rung.NOT
-        try:
-            strokes = os.read(self.hears, 4096)
-        except BlockingIOError:
-            return Rung.NOT
-        return Rung(max(strokes, default=0))
-
-    def close(self) -> None:
-        """Let go of it."""
-        for fd in {self.hears, self.rings} - {-1}:
-            os.close(fd)
-        self.hears = self.rings = -1
-
-
-_STROKES = {rung: bytes([rung]) for rung in Rung}
-
-
-class Awake:
-    """Waiting awake for what is expected at once. While it does not come at once, this is tried less and less often.
-
-    Yielding is a request that Linux may decline for a while: only who sleeps surely makes room. So the first turn that takes
-    long, because somebody else wanted this core, ends it.
-    """
-
-    def __init__(self) -> None:
-        self._left_out = self._to_leave_out = 0
-
-    def wait(self, seen: Callable[[], bool], seconds: float) -> bool:
-        """Whether it was seen within `seconds`."""
-        if seen():
-            return True
-        if not MAY_SPIN or seconds <= 0:
-            return False
-        if self._to_leave_out:
-            self._to_leave_out -= 1
-            return False
-        now = perf_counter()
-        until = now + seconds
-        while now < until:
-            os.sched_yield()
-            before, now = now, perf_counter()
-            if seen():
-                self._left_out = 0
-                return True
-            if now - before > WANTED_S:
-                break
-        self._left_out = self._to_leave_out = min(2 * self._left_out + 1, MOST_LEFT_OUT)
-        return False

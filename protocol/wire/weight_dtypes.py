@@ -20,7 +20,7 @@ WeightsDtype = Literal["float32", "bfloat16", "float16"]
 BOUNDS = {"bfloat16": (2 - 2**-8) * 2.0**127, "float16": (2 - 2**-11) * 2.0**15}
 
 
-def narrowed(parameters: Floats, dtype: WeightsDtype) -> Array:
+def to_wire_dtype(parameters: Floats, dtype: WeightsDtype) -> Array:
     """The parameters [P] as they travel; float32 is not copied. Raises `RunError` if one of them does not fit."""
     if dtype == "float32" or parameters.size == 0:
         return parameters
@@ -41,7 +41,7 @@ def narrowed(parameters: Floats, dtype: WeightsDtype) -> Array:
     return rounded.view(np.uint16)[1::2].copy()
 
 
-def widened(parameters: Array) -> Floats:
+def to_float32(parameters: Array) -> Floats:
     """The float32 parameters [P] to act under, of those that arrived. Raises ValueError if nobody sends such."""
     match parameters.dtype.str:
         case "<f4":

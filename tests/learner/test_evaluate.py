@@ -14,10 +14,11 @@ from learner import evaluate as evaluate_module
 from learner.config.layers import resolve
 from learner.evaluate import COPIES, evaluate, load_policy
 from learner.run_folder.run_folder import RunFolder
+from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import EnvironmentFailed, UsageError
 from protocol.policy.layout import acting_size, buffer_size
-from protocol.specs import EnvSpec, PolicySpec
+from protocol.specs import PolicySpec
 
 Array = np.ndarray[Any, Any]
 

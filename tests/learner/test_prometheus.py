@@ -31,7 +31,7 @@ from protocol.errors import UsageError
 from protocol.messages import Drain
 from protocol.policy.policy import make_policy
 from protocol.wire.codec import encode
-from protocol.wire.link import LearnerLink
+from protocol.wire.learner_link import LearnerLink
 from tests.learner.rollouts.test_roster import A, B, C, Learner
 from tests.support.fake_ends import run_spec
 from workers.collect.collector import Collector

@@ -17,10 +17,11 @@ from learner.run_folder import checkpoint
 from learner.run_folder.run_folder import RunFolder
 from learner.run_spec import run_spec
 from learner.run_state import RunState, restore
+from protocol.env_spec import EnvSpec
 from protocol.errors import CheckpointError
 from protocol.policy.policy import make_policy
-from protocol.rollout import Batch, Rollout, stack
-from protocol.specs import EnvSpec, RunSpec
+from protocol.rollout import Batch, Rollout, stack_rollouts
+from protocol.specs import RunSpec
 from workers.collect.collector import Collector
 from workers.collect.held_rollouts import Assignment
 
@@ -39,7 +40,7 @@ def record(run: RunSpec, algorithm: PPO, batches: int) -> list[Batch]:
         lanes = [Assignment(sequence * run.lanes + lane, lane, 0, sequence) for lane in range(run.lanes)]
         recorded.append(collector.collect(lanes, 0, 1, lambda: None))
     collector.close_all()
-    return [stack(rollouts) for rollouts in recorded]
+    return [stack_rollouts(rollouts) for rollouts in recorded]
 
 
 @pytest.mark.parametrize("env", ["CartPole-v1", "Pendulum-v1"])

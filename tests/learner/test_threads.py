@@ -12,7 +12,7 @@ from learner.config.layers import resolve
 from learner.torch_setup import threads
 from millrace.launch.local_workers import cores_for
 from protocol import cpu_cores as counting
-from protocol.cpu_cores import cores
+from protocol.cpu_cores import usable_cores
 from protocol.errors import UsageError
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
@@ -22,7 +22,7 @@ CORES = {2, 3}
 @pytest.fixture(autouse=True)
 def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: CORES, raising=False)
-    monkeypatch.setattr(os, "sched_setaffinity", lambda pid, cores: None, raising=False)
+    monkeypatch.setattr(os, "sched_setaffinity", lambda pid, mask: None, raising=False)
 
 
 @pytest.mark.parametrize(
@@ -68,9 +68,9 @@ def test_a_container_has_its_share_of_the_cores(
 ) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(8)))
     monkeypatch.setattr(counting, "CPU_MAX", tmp_path / "cpu.max")
-    assert cores() == 8  # no container
+    assert usable_cores() == 8  # no container
     (tmp_path / "cpu.max").write_text(told)
-    assert cores() == count
+    assert usable_cores() == count
 
 
 ACTION = ActionSpec("discrete", (), "int64", (2,), (0,))

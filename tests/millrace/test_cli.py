@@ -22,10 +22,11 @@ from learner.run_folder.metrics_log import MetricsLog
 from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import Interrupted, RunFolder
 from millrace.cli.main import COMMANDS, main
+from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import EnvironmentFailed, NoWorkers
 from protocol.policy.layout import acting_size
-from protocol.specs import EnvSpec, PolicySpec
+from protocol.specs import PolicySpec
 
 ROOT = Path(__file__).parents[2]
 Captured = pytest.CaptureFixture[str]

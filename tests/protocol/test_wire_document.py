@@ -22,10 +22,10 @@ import pytest
 from learner.members import membership
 from learner.members import states as standing
 from learner.rollouts import roster
-from protocol import messages, rollout, specs
+from protocol import env_spec, messages, rollout, specs
 from protocol.keys import handshake
 from protocol.messages import PROTOCOL_VERSION, Collect, Hello, Permit, Received, Rollout, ToLearner, ToWorker, Weights
-from protocol.wire import codec, link
+from protocol.wire import codec, sockets
 from protocol.wire import compression as packing
 from workers import session, states
 from workers.collect import held_rollouts
@@ -42,7 +42,7 @@ RECORDS: tuple[type, ...] = (
     rollout.Episode,
     specs.RunSpec,
     specs.StepSpec,
-    specs.EnvSpec,
+    env_spec.EnvSpec,
     specs.PolicySpec,
     specs.EncoderSpec,
     specs.NamedShape,
@@ -98,7 +98,7 @@ LIMITS: Mapping[tuple[ModuleType, str], str] = {
     (roster, "STRIKES"): "messages or rollouts that cannot be used, after which a worker is refused",
     (membership, "REMEMBERED_REFUSALS"): "refused processes that the learner remembers, so that they do not come back",
     (handshake, "HANDSHAKE_MS"): "milliseconds that a connection may take to say who it is",
-    (link, "LINGER_MS"): "milliseconds for which a closing side still sends what is queued",
+    (sockets, "LINGER_MS"): "milliseconds for which a closing side still sends what is queued",
 }
 
 
@@ -282,7 +282,7 @@ def test_every_record_that_travels_is_described() -> None:
 
 
 def test_every_limit_is_in_the_document() -> None:
-    for module in (codec, link, packing, session, held_rollouts, roster, messages, rollout, specs):
+    for module in (codec, sockets, packing, session, held_rollouts, roster, messages, rollout, specs):
         for name in re.findall(r"^(MAX_\w+) = ", inspect.getsource(module), re.MULTILINE):
             assert (module, name) in LIMITS, f"say in LIMITS what {name} bounds"
 

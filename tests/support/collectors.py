@@ -13,11 +13,12 @@ from gymnasium.vector import SyncVectorEnv
 
 from learner.config.layers import resolve
 from millrace.launch.local import train
+from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.policy.layout import acting_size, buffer_size
 from protocol.policy.policy import Policy, make_policy
 from protocol.rollout import Rollout, validate
-from protocol.specs import EnvSpec, PolicySpec, RunSpec
+from protocol.specs import PolicySpec, RunSpec
 from workers.collect.collector import Collector, OpenCopies, copies_of
 from workers.collect.env_copies import LoopedCopies, VectorCopies
 from workers.collect.held_rollouts import Assignment

@@ -17,8 +17,9 @@ import numpy as np
 
 from learner.rollouts.ledger import Ledger
 from learner.rollouts.roster import Out, Roster
+from protocol.env_spec import EnvSpec
 from protocol.messages import Rollout, ToLearner, ToWorker
-from protocol.specs import ActionSpec, EnvSpec, Leaf, PolicySpec, RunSpec
+from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
 from workers.session import Effect, Identity, Leave, Send, Session, Task
 
 PARAMETERS = np.zeros(1, np.float32)

@@ -130,13 +130,13 @@ def test_frame_stacks_that_travel_packed_teach_what_those_do_that_lie_as_they_ar
 
     settings: dict[str, Any] = {"workers": 1, "lanes": 2, "envs": 4, "rollout_steps": 60, "steps": 480, "n_epochs": 1}
     over: list[dict[str, Any]] = [{"transport": "ipc"}, {"transport": "tcp", "keys": str(tmp_path / "keys")}]
-    policies, unpacked, unstacked = [], list[object](), packing.unstacked
+    policies, unpacked, unpack_stack = [], list[object](), packing.unpack_stack
 
     def unstacking(payload: Any, dtype: Any, shape: Any) -> Any:
         unpacked.append(shape)
-        return unstacked(payload, dtype, shape)
+        return unpack_stack(payload, dtype, shape)
 
-    monkeypatch.setattr(packing, "unstacked", unstacking)
+    monkeypatch.setattr(packing, "unpack_stack", unstacking)
     for number, way in enumerate(over):
         folder = millrace.train(stacks, run_dir=str(tmp_path / f"runs{number}"), eval_episodes=1, **settings, **way)
         policies.append((folder / "policy.safetensors").read_bytes())

@@ -23,7 +23,7 @@ import millrace
 from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.settings import EnvLike
 from millrace.launch import vector
-from protocol.errors import EnvironmentFailed, NoWorkers, OurError, WorkerLost
+from protocol.errors import EnvironmentFailed, NoWorkers, UserFacingError, WorkerLost
 from protocol.keys.key_folder import KeyFolder
 from tests.system.processes import START_S, free_port
 
@@ -307,7 +307,7 @@ def test_workers_elsewhere_join_by_tcp_and_come_back() -> None:
         assert [process.wait(10) for process in started] == [-9, 0, 0]
     finally:
         for process in started:
-            with suppress(OurError):
+            with suppress(UserFacingError):
                 process.kill()
                 process.wait()
 
@@ -413,7 +413,9 @@ def test_keys_are_made_for_an_address_that_other_machines_can_reach(elsewhere: E
 
 def test_a_worker_that_runs_no_code_refuses_and_says_why(elsewhere: Elsewhere) -> None:
     elsewhere.start("a", "--no-code")
-    with pytest.raises(OurError, match=r"workers\.envs\.toy:Countdown-v0 imports a module, which this worker does not do"):
+    with pytest.raises(
+        UserFacingError, match=r"workers\.envs\.toy:Countdown-v0 imports a module, which this worker does not do"
+    ):
         make("workers.envs.toy:Countdown-v0", workers=None, bind=elsewhere.address, timeout=5.0).reset()
     assert elsewhere.started[0].wait(10) == 2
 

@@ -12,10 +12,11 @@ import pytest
 from learner.config.config import Config
 from learner.config.hyperparameters import PPOConfig
 from learner.run_spec import run_spec
-from protocol.envs.envpool import pool_of
+from protocol.env_spec import EnvSpec
+from protocol.envs.envpool import envpool_spec
 from protocol.envs.vectorized import make_native
 from protocol.errors import UsageError
-from protocol.specs import EnvSpec, RunSpec
+from protocol.specs import RunSpec
 from tests.support.collectors import a_collector, bits, collect, no_pulse
 from workers.collect.env_copies import EnvCopies, LoopedCopies, VectorCopies, copy_seeds
 from workers.collect.envpool_copies import EnvpoolCopies
@@ -30,7 +31,7 @@ KINDS = ["loop", "native", pytest.param("envpool", marks=envpool)]
 OPEN: dict[str, Callable[[EnvSpec, int], EnvCopies]] = {
     "loop": lambda env, N: LoopedCopies([env.make] * N, no_pulse),
     "native": lambda env, N: VectorCopies(make_native(env, N)),
-    "envpool": lambda env, N: EnvpoolCopies(pool_of(env), N),
+    "envpool": lambda env, N: EnvpoolCopies(envpool_spec(env), N),
 }
 BREAKOUT = EnvSpec("millrace/Atari-v0", {"game": "Breakout"})
 

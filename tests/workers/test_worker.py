@@ -29,8 +29,8 @@ from protocol.rollout import rollout_bytes
 from protocol.specs import RunSpec
 from protocol.wire.codec import Buffer, decode_to_learner, decode_to_worker, encode
 from protocol.wire.compression import Packing
-from protocol.wire.link import WorkerLink
-from protocol.wire.weight_dtypes import WeightsDtype, narrowed, widened
+from protocol.wire.weight_dtypes import WeightsDtype, to_float32, to_wire_dtype
+from protocol.wire.worker_link import WorkerLink
 from tests.support.collectors import a_collector, bits, collect, run_of
 from workers.session import Leave, Session
 from workers.worker import Worker, identity
@@ -100,13 +100,13 @@ def test_a_worker_that_cannot_compress_leaves_at_once_and_says_why(monkeypatch: 
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16", "float16"])
 def test_a_worker_acts_under_the_weights_that_travelled(dtype: WeightsDtype) -> None:
-    travelling = narrowed(PARAMETERS, dtype)
+    travelling = to_wire_dtype(PARAMETERS, dtype)
     (welcome, weights, *rest) = said_to_a_worker(RUN, travelling)
     link = FakeLink([welcome, decode_to_worker(encode(weights)), *rest])
     assert work(link).exit_code == 0
     (rollout,) = (message for message in link.heard() if isinstance(message, Rollout))
     found = []
-    for parameters in (widened(travelling), PARAMETERS):
+    for parameters in (to_float32(travelling), PARAMETERS):
         collector = a_collector(RUN)
         collector.load(parameters, BUFFERS)
         found.append(bits(collect(collector, RUN)[0])["log_prob"])

@@ -15,7 +15,7 @@ from protocol.arrays import Array, Bools
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import UsageError
 from protocol.policy.recurrent import zero_state
-from protocol.rollout import Episode, first_not_finite
+from protocol.rollout import Episode, describe_first_non_finite
 from protocol.specs import Leaf, RunSpec
 from workers.collect.env_copies import EnvCopies, Leaves, StepResult, copy_seeds
 from workers.env_errors import CopyRaised, LaneFailed, lane_failed
@@ -97,7 +97,7 @@ class CollectedLane:
         """Raise, naming step and copy, if observations [rows, N, *leaf] or rewards [rows, N] cannot be right."""
         for leaf, array in zip(self._run.policy.observation, obs, strict=True):
             if array.dtype.kind == "f" and not np.isfinite(array).all():
-                raise LaneFailed(self.number, f"{_name(leaf)}: {first_not_finite(array)}")
+                raise LaneFailed(self.number, f"{_name(leaf)}: {describe_first_non_finite(array)}")
             if leaf.sizes:
                 start, size = (np.reshape(values, leaf.shape) for values in (leaf.start, leaf.sizes))
                 wrong = (array < start) | (array >= start + size)
@@ -106,7 +106,7 @@ class CollectedLane:
                     line = f"{_name(leaf)}: expected a value of its space, got {array[t, n]} at step {t}, copy {n}"
                     raise LaneFailed(self.number, line)
         if not np.isfinite(reward).all():
-            raise LaneFailed(self.number, f"reward: {first_not_finite(reward)}")
+            raise LaneFailed(self.number, f"reward: {describe_first_non_finite(reward)}")
 
     def finish(self, reward: Array, done: Bools, clock: Sequence[float]) -> tuple[Bools, tuple[Episode, ...]]:
         """Close the account of T rows: which are valid [T, N], and the episodes that ended, oldest first.

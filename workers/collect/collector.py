@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from protocol.arrays import Array, Floats
-from protocol.envs.envpool import pool_of
-from protocol.envs.spaces import writer
+from protocol.envs.envpool import envpool_spec
+from protocol.envs.spaces import make_action_converter
 from protocol.envs.vectorized import make_native
 from protocol.errors import EnvironmentFailed
 from protocol.policy.distributions import distribution
@@ -42,7 +42,7 @@ def copies_of(run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
         case "native":
             return VectorCopies(make_native(run.env, run.copies))
         case "envpool":
-            return EnvpoolCopies(pool_of(run.env), run.copies)
+            return EnvpoolCopies(envpool_spec(run.env), run.copies)
         case "loop":
             return LoopedCopies([run.env.make] * run.copies, pulse)
 
@@ -84,7 +84,7 @@ class Collector:
         self._policy = policy
         self._open_copies, self._begin = open_copies, begin
         self._distribution = distribution(run.policy)
-        self._write = writer(run.policy.action)
+        self._write = make_action_converter(run.policy.action)
         self._lanes: dict[int, CollectedLane] = {}
         self._leaving: list[CollectedLane] = []  # closed by a pulse, while their copies may be in mid-step
         self._collecting = False

@@ -17,7 +17,7 @@ from gymnasium.vector import VectorEnv
 from gymnasium.wrappers import OrderEnforcing
 
 from protocol.arrays import Array
-from protocol.envs.spaces import reader
+from protocol.envs.spaces import make_flatten
 from protocol.envs.vectorized import check_resets_next_step
 from protocol.errors import UsageError
 from workers.env_errors import CopyRaised
@@ -73,7 +73,7 @@ class LoopedCopies:
         self.observation_space = self._loop.envs[0].observation_space
         self.action_space = self._loop.envs[0].action_space
         self._nested = isinstance(self.observation_space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple)
-        self._read = reader(self.observation_space)
+        self._read = make_flatten(self.observation_space)
         self._observations: list[Any] = [None] * len(self._loop.envs)
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:
@@ -122,7 +122,7 @@ class VectorCopies:
         self._env = env
         self.observation_space = env.single_observation_space
         self.action_space = env.single_action_space
-        self._read = reader(self.observation_space)
+        self._read = make_flatten(self.observation_space)
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:
         """Start episodes in all copies, with a seed for each, or the first seed where the environment takes only one."""

@@ -15,8 +15,8 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 
 from protocol.arrays import Array
-from protocol.envs.envpool import Pool
-from protocol.envs.spaces import reader
+from protocol.envs.envpool import EnvpoolSpec
+from protocol.envs.spaces import make_flatten
 from workers.collect.env_copies import Leaves, StepResult
 from workers.env_errors import CopyRaised
 from workers.env_loop import Pulse
@@ -25,12 +25,12 @@ from workers.env_loop import Pulse
 class EnvpoolCopies:
     """N copies in one pool, made at the first reset: envpool takes its seeds only then."""
 
-    def __init__(self, pool: Pool, copies: int) -> None:
+    def __init__(self, pool: EnvpoolSpec, copies: int) -> None:
         self.observation_space = pool.observation_space
         self.action_space = pool.action_space
         self._pool = pool
         self._env: VectorEnv[Any, Any, Any] | None = None
-        self._read = reader(self.observation_space)
+        self._read = make_flatten(self.observation_space)
         self._cut = np.zeros(copies, bool)  # [N] truncated here: envpool does not know of it
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:

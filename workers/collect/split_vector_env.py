@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 
 from protocol.arrays import Array
-from protocol.envs.spaces import reader
+from protocol.envs.spaces import make_flatten
 from protocol.errors import NoWorkers
 from protocol.specs import RunSpec
 from workers.collect.env_copies import EnvCopies, Leaves, StepResult
@@ -31,7 +31,7 @@ class SideBySide:
         self.nobody: NoWorkers | None = None
         """why nobody steps the copies any more"""
         self._lanes, self._before = lanes, before
-        self._read = reader(env.single_observation_space)
+        self._read = make_flatten(env.single_observation_space)
         self._row: StepResult | None = None
 
     def open(self, run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:

@@ -15,7 +15,7 @@ import gymnasium
 import numpy as np
 
 from protocol.arrays import Array
-from protocol.envs.spaces import exact_leaves, nester, reader
+from protocol.envs.spaces import leaves_with_own_dtype, make_flatten, make_unflatten
 from protocol.errors import UsageError
 from protocol.specs import Leaf, StepSpec
 from workers.env_loop import EnvLoop, Infos, ObservationSink, Pulse
@@ -50,8 +50,8 @@ class SteppedLane:
         self._loop = EnvLoop(makes, pulse, spec.autoreset, ended=incarnation > 0)
         env = self._loop.envs[0]
         self._nested_actions = _is_nested(env.action_space)
-        self._nest = nester(env.action_space)
-        read = reader(env.observation_space)
+        self._nest = make_unflatten(env.action_space)
+        read = make_flatten(env.observation_space)
         self._fast_sink: ObservationSink = _LeafSink(read, rows.obs) if _is_nested(env.observation_space) else rows.obs[0]
         self._sink: ObservationSink = _CheckedLeafSink(read, rows.obs, spec.observation)
 
@@ -95,7 +95,10 @@ def _make_copy(spec: StepSpec, number: int, copy: int) -> gymnasium.Env[Any, Any
     """Copy `number` of the vector environment, which is `copy` of its lane. Raises `UsageError` if its spaces are others."""
     env = spec.envs[spec.copies[number]].make(spec.render_mode)
     try:
-        fits = (exact_leaves(env.observation_space), exact_leaves(env.action_space)) == (spec.observation, spec.action)
+        fits = (leaves_with_own_dtype(env.observation_space), leaves_with_own_dtype(env.action_space)) == (
+            spec.observation,
+            spec.action,
+        )
     except UsageError:
         fits = False
     if fits:

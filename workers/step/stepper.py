@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from protocol.cpu_cores import cores
+from protocol.cpu_cores import usable_cores
 from protocol.errors import UsageError, first_line
 from protocol.messages import Answer, Array, Call, Order, Reset, Returned, Step, Stepped
 from protocol.specs import StepSpec
 from protocol.wire.plain_values import pack, unpack
-from protocol.wire.shared_memory import MAY_SPIN, SPIN_S, Awake, Bell, Handed, Memory, Rung
+from protocol.wire.shared_memory import InheritedDescriptors, SharedMemory
+from protocol.wire.wake_up import CAN_SPIN, SPIN_S, SpinWait, WakePipe, WakeReason
 from workers.env_errors import CopyRaised, lane_failed
 from workers.env_loop import Infos, Pulse
 from workers.step.stepped_lane import Rows, SteppedLane, new_rows
@@ -30,7 +31,9 @@ MAX_TRACEBACK = 20_000  # characters
 class Stepper:
     """Executes orders on lanes of env copies, which are made when their first order comes."""
 
-    def __init__(self, spec: StepSpec, shared_memory: Handed | None = None, *, allow_private_names: bool = True) -> None:
+    def __init__(
+        self, spec: StepSpec, shared_memory: InheritedDescriptors | None = None, *, allow_private_names: bool = True
+    ) -> None:
         """`shared_memory`: descriptors of shared memory and bells, if this process inherited them.
 
         `allow_private_names`: a Call may use names that begin with an underscore.
@@ -42,11 +45,11 @@ class Stepper:
         self._spec, self._allow_private_names = spec, allow_private_names
         self._lanes: dict[int, SteppedLane] = {}
         self._executed: dict[int, int] = {}  # lane -> number of the newest order through shared memory that was executed
-        self._memory = None if shared_memory is None else Memory(spec, shared_memory.memory)
-        self._bell_in = None if shared_memory is None else Bell(hears=shared_memory.to_worker)
-        self._bell_out = None if shared_memory is None else Bell(rings=shared_memory.to_learner)
-        self._cores = cores()
-        self._awake = Awake()
+        self._memory = None if shared_memory is None else SharedMemory(spec, shared_memory.memory)
+        self._bell_in = None if shared_memory is None else WakePipe(hears=shared_memory.to_worker)
+        self._bell_out = None if shared_memory is None else WakePipe(rings=shared_memory.to_learner)
+        self._cores = usable_cores()
+        self._awake = SpinWait()
         self._spin_s = 0.0  # how long to spin before the next wait for the bell
 
     def execute(self, order: Order, pulse: Pulse) -> Answer:
@@ -87,8 +90,8 @@ class Stepper:
                 self._awake.wait(self._has_order, self._spin_s)
                 continue
             announced = self._bell_in.wait(max(0.0, until - perf_counter()))
-            if announced is not Rung.STEP:
-                return announced is Rung.MESSAGE
+            if announced is not WakeReason.STEP:
+                return announced is WakeReason.MESSAGE
 
     @property
     def uses_shared_memory(self) -> bool:
@@ -117,7 +120,7 @@ class Stepper:
             step = Step(session, -order, number, lane.incarnation, ())
             send(_stepped(step, lane.rows, infos))
         pending = memory.under_way()
-        if not pending or not MAY_SPIN:
+        if not pending or not CAN_SPIN:
             self._bell_out.ring()
         finished_before = len(memory.lanes) - len(self._lanes) - pending
         self._spin_s = SPIN_S if finished_before < self._cores - 1 else 0.0

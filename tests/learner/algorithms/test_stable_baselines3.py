@@ -26,12 +26,13 @@ from learner.algorithms.dqn import DQN
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import DQNConfig, PPOConfig
 from learner.run_folder.run_folder import RunFolder
-from protocol.envs.spaces import action_spec, observation_leaves, writer
+from protocol.env_spec import EnvSpec
+from protocol.envs.spaces import action_spec, make_action_converter, observation_leaves
 from protocol.policy.distributions import distribution
 from protocol.policy.networks import ActorCriticNetwork
 from protocol.policy.policy import make_policy
 from protocol.policy.torch_distributions import log_prob_and_entropy
-from protocol.specs import EnvSpec, PolicySpec
+from protocol.specs import PolicySpec
 from tests.support.batches import batch, no_pulse
 
 OBSERVATION = spaces.Box(-np.inf, np.inf, (4,))
@@ -134,7 +135,7 @@ def differences(spec: PolicySpec, net: ActorCriticNetwork, other: ActorCriticPol
     assert entropy is not None
     greedy, _ = other.predict(obs, deterministic=True)
     pairs = {
-        "greedy action": (np.stack(list(writer(spec.action)(over.mode(params)))), greedy),
+        "greedy action": (np.stack(list(make_action_converter(spec.action)(over.mode(params)))), greedy),
         "value": (our_value.numpy(), value[:, 0].numpy()),
         "log π, torch": (our_log_prob.numpy(), log_prob.numpy()),
         "log π, numpy": (over.log_prob(params, action), log_prob.numpy()),
@@ -246,7 +247,7 @@ def test_the_page_takes_a_run_to_stable_baselines3(tmp_path: Path, env: str, act
     RunFolder(tmp_path).write_policy(spec, EnvSpec(env), net.flat.numpy(), buffers)
     act = page_code()["stable_baselines3_actor"](tmp_path)
 
-    ours, over, write = make_policy(spec), distribution(spec), writer(spec.action)
+    ours, over, write = make_policy(spec), distribution(spec), make_action_converter(spec.action)
     ours.load(net.flat.numpy()[: net.acting_size], buffers)
     obs, _ = made.reset(seed=1)
     seen = set()

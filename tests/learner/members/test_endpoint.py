@@ -11,11 +11,12 @@ import pytest
 
 from learner.config.config import Config
 from learner.members.endpoint import join_lines, keyring_for, throwaway
-from protocol.address import advertised, check_address, is_local, needs_ipv6, resolves
+from protocol.address import advertised_address, check_address, is_local, needs_ipv6, resolves
+from protocol.env_spec import AllowedCode, EnvSpec
 from protocol.errors import UsageError
 from protocol.keys.key_folder import KeyFolder
-from protocol.keys.keys import Allowed, Key, Token
-from protocol.specs import Code, EnvSpec, StepSpec
+from protocol.keys.keys import ClientList, Key, Token
+from protocol.specs import StepSpec
 from workers.security import allowed_code, checked_token
 
 NOW = datetime(2026, 11, 21, 10, tzinfo=UTC)
@@ -107,7 +108,7 @@ def test_throwaway_keys_fit_each_other_and_no_others() -> None:
     assert not keyring.why_not_enter(token.client.public)
     assert keyring.why_not_enter(TOKEN.client.public)
     keyring.refresh()
-    assert keyring.allowed != Allowed()
+    assert keyring.allowed != ClientList()
 
 
 # ---------------------------------------------------------------- the worker
@@ -151,7 +152,7 @@ def test_a_worker_runs_as_much_code_as_it_is_sure_of_its_learner() -> None:
     }
     levels |= {allowed_code(address, TOKEN): (True, True) for address in (*PUBLIC, *LOOPBACK)}
     levels |= {allowed_code(address, None): (True, True) for address in INSIDE}
-    assert set(levels) == set(Code)
+    assert set(levels) == set(AllowedCode)
     for code, (modules, callables) in levels.items():
         assert (MODULE.why_not(code) == "") is modules
         assert (CALLABLE.why_not(code) == "") is callables
@@ -219,4 +220,4 @@ def test_ipv6_is_used_for_addresses_and_not_for_names_that_have_another() -> Non
     ],
 )
 def test_what_others_type_to_reach_it(bound: str, advertise: str, typed: str) -> None:
-    assert advertised(bound, advertise, "box") == typed
+    assert advertised_address(bound, advertise, "box") == typed

@@ -19,11 +19,12 @@ from learner.recording import minari as dataset_module
 from learner.recording.episodes import EpisodeAssembler, RecordedEpisode
 from learner.recording.record import Player, record
 from learner.run_folder.run_folder import RunFolder
+from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import EnvironmentFailed, OurError, RunError, UsageError
+from protocol.errors import EnvironmentFailed, RunError, UsageError, UserFacingError
 from protocol.policy.layout import acting_size, buffer_size
 from protocol.rollout import Rollout
-from protocol.specs import EnvSpec, PolicySpec
+from protocol.specs import PolicySpec
 
 Array = np.ndarray[Any, Any]
 
@@ -346,7 +347,7 @@ def everything(root: Path) -> set[str]:
     return {str(path.relative_to(root)) for path in root.rglob("*")} if root.exists() else set()
 
 
-def fails(run: Path, dataset_id: str, kind: type[OurError], says: str, npy: Path | None = None) -> OurError:
+def fails(run: Path, dataset_id: str, kind: type[UserFacingError], says: str, npy: Path | None = None) -> UserFacingError:
     with pytest.raises(kind, match=says) as caught:
         record(run, dataset_id, 40, seed=1, npy=npy)
     assert "\n" not in str(caught.value)

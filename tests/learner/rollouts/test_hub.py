@@ -15,8 +15,8 @@ from protocol.errors import RunError
 from protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello, ToLearner, Weights
 from protocol.rollout import rollout_bytes
 from protocol.wire.codec import Buffer, decode_to_worker
-from protocol.wire.link import LearnerLink
-from protocol.wire.weight_dtypes import WeightsDtype, widened
+from protocol.wire.learner_link import LearnerLink
+from protocol.wire.weight_dtypes import WeightsDtype, to_float32
 from tests.support.fake_ends import run_spec
 
 WORKER_TIMEOUT_S = 3.0
@@ -90,7 +90,8 @@ def test_weights_are_rounded_and_encoded_once_for_all_workers(dtype: WeightsDtyp
     assert isinstance(weights, Weights)
     assert weights.parameters.dtype.str == sent
     assert (
-        widened(weights.parameters).tobytes() == (parameters if sent == "<f4" else np.array([1, -2], np.float32)).tobytes()
+        to_float32(weights.parameters).tobytes()
+        == (parameters if sent == "<f4" else np.array([1, -2], np.float32)).tobytes()
     )
 
 

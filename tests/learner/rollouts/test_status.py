@@ -22,7 +22,8 @@ from millrace.terminal import progress_view
 from protocol.errors import RunError
 from protocol.messages import Goodbye, Heartbeat, Inquire, Status
 from protocol.wire.codec import encode
-from protocol.wire.link import LearnerLink, WorkerLink
+from protocol.wire.learner_link import LearnerLink
+from protocol.wire.worker_link import WorkerLink
 from tests.learner.rollouts.test_roster import Learner
 
 PROGRESS = Progress(env_steps=1_000, total_steps=10_000, steps_per_s=50.0, return_mean=12.5, lag_mean=0.5, lag_max=2)

@@ -17,11 +17,12 @@ from learner.run_folder.metrics_log import EVENTS_EVERY_S, MetricsLog, read_rows
 from learner.run_folder.progress import Progress
 from learner.run_folder.results import Evaluation, Summary
 from learner.run_folder.run_folder import RunFolder, sanitised
+from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import RunError, UsageError
 from protocol.policy.layout import acting_size, buffer_size, parameter_layout, total_size
 from protocol.rollout import Episode
-from protocol.specs import EnvSpec, PolicySpec
+from protocol.specs import PolicySpec
 
 STARTED_S = 1_700_000_000.0
 

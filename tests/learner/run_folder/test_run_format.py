@@ -16,10 +16,11 @@ from learner.run_folder.metrics_log import MetricsLog
 from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import RunFolder
 from learner.run_folder.run_format import RUN_FILE, RUN_FORMAT, check_format
+from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import UsageError
 from protocol.policy.layout import acting_size
-from protocol.specs import EnvSpec, PolicySpec
+from protocol.specs import PolicySpec
 
 
 @pytest.fixture

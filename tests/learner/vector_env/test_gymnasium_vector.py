@@ -15,7 +15,7 @@ from gymnasium.vector.utils import batch_space
 
 import millrace
 from learner.vector_env.env import ZmqVectorEnv
-from protocol.errors import EnvironmentFailed, OurError, UsageError
+from protocol.errors import EnvironmentFailed, UsageError, UserFacingError
 from tests.support.bit_equality import bit_equal
 from workers.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_ACTIONS, UNSUPPORTED_OBSERVATIONS
 
@@ -93,7 +93,7 @@ def test_a_custom_space_is_refused_in_one_line() -> None:
 
 def test_copies_of_different_spaces_are_refused() -> None:
     envs = ["CartPole-v1", "FrozenLake-v1"]
-    with inproc(envs, None) as env, pytest.raises(OurError, match="all copies must have the same"):
+    with inproc(envs, None) as env, pytest.raises(UserFacingError, match="all copies must have the same"):
         env.reset()
 
 

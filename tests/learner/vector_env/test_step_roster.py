@@ -9,6 +9,7 @@ import pytest
 from learner.members.events import Left, Turned
 from learner.rollouts.status import stepping_status
 from learner.vector_env.step_roster import Lockstep
+from protocol.env_spec import EnvSpec
 from protocol.messages import (
     PROTOCOL_VERSION,
     Answer,
@@ -24,7 +25,7 @@ from protocol.messages import (
     Step,
     Stepped,
 )
-from protocol.specs import EnvSpec, Leaf, StepSpec
+from protocol.specs import Leaf, StepSpec
 
 A, B = b"a", b"b"
 TIMEOUT_S = 5.0

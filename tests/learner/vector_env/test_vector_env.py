@@ -21,7 +21,7 @@ import millrace
 from learner.vector_env.env import ZmqVectorEnv
 from millrace.cli.status import as_table, ask, observer_name
 from protocol.errors import EnvironmentFailed, UsageError
-from protocol.wire.link import WorkerLink
+from protocol.wire.worker_link import WorkerLink
 from tests.support.bit_equality import bit_equal
 
 MODES = tuple(AutoresetMode)

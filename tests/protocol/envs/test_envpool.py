@@ -17,9 +17,10 @@ from hypothesis import strategies as st
 from learner.config.config import Config
 from learner.config.layers import resolve
 from learner.run_spec import run_spec
-from protocol.envs.envpool import pool_of
+from protocol.env_spec import EnvSpec
+from protocol.envs.envpool import envpool_spec
 from protocol.errors import UsageError
-from protocol.specs import EnvSpec, RunSpec
+from protocol.specs import RunSpec
 from tests.support.collectors import TOY, a_collector, bits, collect, no_pulse, run_of, trained
 from workers.collect.env_copies import LoopedCopies, StepResult, copy_seeds
 from workers.collect.envpool_copies import EnvpoolCopies
@@ -33,7 +34,7 @@ def pooled(run: RunSpec) -> RunSpec:
 
 
 def cartpoles(N: int, limit: int) -> EnvpoolCopies:
-    return EnvpoolCopies(pool_of(EnvSpec("CartPole-v1", {"max_episode_steps": limit})), N)
+    return EnvpoolCopies(envpool_spec(EnvSpec("CartPole-v1", {"max_episode_steps": limit})), N)
 
 
 def observations(row: StepResult) -> Any:

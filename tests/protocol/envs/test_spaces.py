@@ -9,7 +9,7 @@ from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
 from protocol.arrays import Array
-from protocol.envs.spaces import action_spec, observation_leaves, reader, writer
+from protocol.envs.spaces import action_spec, make_action_converter, make_flatten, observation_leaves
 from protocol.errors import BadRollout, UsageError
 from protocol.rollout import Episode, Rollout, validate
 from protocol.specs import RunSpec
@@ -64,7 +64,7 @@ def test_leaves_are_named_by_their_path_and_keep_the_order_of_the_space() -> Non
 @pytest.mark.parametrize("observation", SEEN)
 def test_a_batch_is_read_like_one_observation(observation: str) -> None:
     space = OBSERVATIONS[observation]
-    read, leaves = reader(space), observation_leaves(space)
+    read, leaves = make_flatten(space), observation_leaves(space)
     one, batch = read(space.sample()), read(batch_space(space, 5).sample())
     for leaf, single, several in zip(leaves, one, batch, strict=True):
         assert np.shape(single) == leaf.shape
@@ -82,7 +82,7 @@ def test_whatever_is_sampled_is_written_into_the_space(action: str) -> None:
     )
     stored = drawn.astype(spec.stored_dtype)
     before = stored.copy()
-    written = writer(spec)(stored)
+    written = make_action_converter(spec)(stored)
     assert written.dtype == space.dtype
     assert all(space.contains(np.asarray(row)) for row in written)
     assert (stored == before).all()
@@ -90,12 +90,12 @@ def test_whatever_is_sampled_is_written_into_the_space(action: str) -> None:
 
 def test_actions_are_shifted_to_where_the_space_starts() -> None:
     table = action_spec(ACTIONS["table"])
-    assert writer(table)(np.zeros((1, 2, 2), np.int64)).tolist() == [[[1, 0], [0, -2]]]
-    assert writer(action_spec(ACTIONS["offset"]))(np.array([0, 1, 2])).tolist() == [5, 6, 7]
+    assert make_action_converter(table)(np.zeros((1, 2, 2), np.int64)).tolist() == [[[1, 0], [0, -2]]]
+    assert make_action_converter(action_spec(ACTIONS["offset"]))(np.array([0, 1, 2])).tolist() == [5, 6, 7]
 
 
 def test_only_what_is_outside_is_clipped() -> None:
-    write = writer(action_spec(ACTIONS["half"]))  # from 0 up, and from 0 down
+    write = make_action_converter(action_spec(ACTIONS["half"]))  # from 0 up, and from 0 down
     assert write(np.array([[-3, -3], [3, 3], [0.5, -0.5]], np.float32)).tolist() == [[0, -3], [3, 0], [0.5, -0.5]]
 
 

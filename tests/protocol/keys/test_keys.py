@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protocol.errors import UsageError
-from protocol.keys.key_folder import TOKEN_VARIABLE, KeyFolder, Keyring, asked_folder, read_token
-from protocol.keys.keys import TOKEN_CHARACTERS, TOKEN_PREFIX, Allowed, Client, Key, Token, fingerprint, public_key
-from protocol.log_limit import Rarely
+from protocol.keys.key_folder import TOKEN_VARIABLE, KeyFolder, Keyring, chosen_key_folder, read_token
+from protocol.keys.keys import TOKEN_CHARACTERS, TOKEN_PREFIX, Client, ClientList, Key, Token, fingerprint, public_key
+from protocol.log_rate_limiter import LogRateLimiter
 
 NOW = datetime(2026, 11, 21, 10, tzinfo=UTC)
 LATER = datetime(2026, 11, 22, 10, tzinfo=UTC)
@@ -97,12 +97,12 @@ def test_a_public_key_is_that_of_its_secret() -> None:
 # ---------------------------------------------------------------- who may connect
 
 
-def both() -> Allowed:
-    return Allowed().adding("lab", LAB.public, NOW).adding("home", HOME.public, NOW)
+def both() -> ClientList:
+    return ClientList().adding("lab", LAB.public, NOW).adding("home", HOME.public, NOW)
 
 
 def test_who_is_not_on_the_list_may_nothing() -> None:
-    assert Allowed().why_not(LAB.public)
+    assert ClientList().why_not(LAB.public)
     assert both().why_not(LAB.public) == both().why_not(HOME.public) == ""
     assert both().why_not(SERVER.public) == f"its key {fingerprint(SERVER.public)} is not allowed here"
     for wrong in (b"", LAB.public[:-1], LAB.public + b"\0", LAB.secret):
@@ -122,7 +122,7 @@ def test_who_is_revoked_is_out_and_nobody_else() -> None:
 
 
 def test_a_key_that_stands_twice_is_out_if_it_was_revoked_once() -> None:
-    twice = Allowed((Client("a", LAB.public.hex(), NOW), Client("b", LAB.public.hex(), NOW, revoked=LATER)))
+    twice = ClientList((Client("a", LAB.public.hex(), NOW), Client("b", LAB.public.hex(), NOW, revoked=LATER)))
     assert "was revoked" in twice.why_not(LAB.public)
 
 
@@ -146,8 +146,8 @@ def test_a_name_is_part_of_a_file_name_and_no_path(name: str, tmp_path: Path) ->
 
 
 def test_the_list_is_text_and_back() -> None:
-    for allowed in (Allowed(), both(), both().revoking("lab", LATER)):
-        assert Allowed.from_toml(allowed.to_toml(), "") == allowed
+    for allowed in (ClientList(), both(), both().revoking("lab", LATER)):
+        assert ClientList.from_toml(allowed.to_toml(), "") == allowed
     assert LAB.secret.hex() not in both().to_toml()
 
 
@@ -165,7 +165,7 @@ def test_the_list_is_text_and_back() -> None:
 )
 def test_a_list_that_is_not_understood_is_no_list(text: str) -> None:
     with pytest.raises(UsageError, match=r"^list x"):
-        Allowed.from_toml(text, "list x")
+        ClientList.from_toml(text, "list x")
 
 
 # ---------------------------------------------------------------- files
@@ -383,17 +383,17 @@ def test_a_token_may_come_from_a_pipe() -> None:
 
 def test_the_flag_is_stronger_than_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("MILLRACE_KEYS", raising=False)
-    assert asked_folder("") is None
+    assert chosen_key_folder("") is None
     monkeypatch.setenv("MILLRACE_KEYS", str(tmp_path))
-    assert asked_folder("") == tmp_path
-    assert asked_folder("~/k") == Path.home() / "k"
+    assert chosen_key_folder("") == tmp_path
+    assert chosen_key_folder("~/k") == Path.home() / "k"
 
 
 # ---------------------------------------------------------------- the lid on the log
 
 
 def test_one_line_about_one_thing_in_a_while() -> None:
-    lid = Rarely(every_s=60.0, most=3)
+    lid = LogRateLimiter(every_s=60.0, most=3)
     assert lid.due("a", 0.0) == 0
     assert [lid.due("a", now) for now in (1.0, 30.0, 59.9)] == [None, None, None]
     assert lid.due("a", 60.0) == 3
@@ -401,7 +401,7 @@ def test_one_line_about_one_thing_in_a_while() -> None:
 
 
 def test_many_things_make_few_lines_and_little_memory() -> None:
-    lid = Rarely(every_s=60.0, most=3)
+    lid = LogRateLimiter(every_s=60.0, most=3)
     said = [lid.due(str(number), number * 0.001) for number in range(10_000)]
     assert said[:3] == [0, 0, 0]
     assert set(said[3:]) == {None}

@@ -17,11 +17,11 @@ import zmq
 from learner.members.membership import REMEMBERED_REFUSALS
 from learner.rollouts.hub import Hub, HubSettings
 from learner.rollouts.roster import Roster
-from protocol.address import name_of
+from protocol.address import worker_name
 from protocol.errors import BadMessage, RunError, UsageError
-from protocol.keys.handshake import NO_ZEROMQ, Trouble, Visitors, complaint, trouble
+from protocol.keys.handshake import NO_ZEROMQ, ConnectionProblem, PendingHandshakes, connection_problem, handshake_failure
 from protocol.keys.key_folder import KeyFolder, Keyring
-from protocol.keys.keys import Allowed, Key, Token
+from protocol.keys.keys import ClientList, Key, Token
 from protocol.keys.zap import DOMAIN, ZAP, answer
 from protocol.messages import (
     PROTOCOL_VERSION,
@@ -36,7 +36,8 @@ from protocol.messages import (
     Welcome,
 )
 from protocol.wire.codec import encode
-from protocol.wire.link import LearnerLink, WorkerLink
+from protocol.wire.learner_link import LearnerLink
+from protocol.wire.worker_link import WorkerLink
 from tests.support.fake_ends import BUFFERS, PARAMETERS, run_spec
 
 DEADLINE_S = 5.0  # within so long both sides must have said what is wrong
@@ -70,7 +71,7 @@ class Net:
         return link
 
     def keyed(self) -> LearnerLink:
-        allowed = Allowed().adding("lab", LAB.public, NOW).adding("home", HOME.public, NOW)
+        allowed = ClientList().adding("lab", LAB.public, NOW).adding("home", HOME.public, NOW)
         return self.learner(Keyring(SERVER, allowed))
 
     def worker(self, learner: LearnerLink | str, token: Token | None, name: str = "w0") -> WorkerLink:
@@ -136,7 +137,7 @@ def asked(key: bytes = LAB.public, domain: bytes = DOMAIN, mechanism: bytes = b"
     return [b"1.0", b"7", domain, b"10.0.0.7", b"", mechanism, key]
 
 
-KEYRING = Keyring(SERVER, Allowed().adding("lab", LAB.public, NOW))
+KEYRING = Keyring(SERVER, ClientList().adding("lab", LAB.public, NOW))
 
 
 def test_a_key_on_the_list_is_let_in_under_its_own_name() -> None:
@@ -185,7 +186,7 @@ def test_a_list_that_raises_lets_nobody_in(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_only_a_refused_key_is_final() -> None:
-    refused = trouble(zmq.EVENT_HANDSHAKE_FAILED_AUTH, 400, "tcp://h:1", token())
+    refused = connection_problem(zmq.EVENT_HANDSHAKE_FAILED_AUTH, 400, "tcp://h:1", token())
     assert refused.final
     assert LAB.public.hex()[:12] in refused.line
     for event, value in (
@@ -196,35 +197,35 @@ def test_only_a_refused_key_is_final() -> None:
         (zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, zmq.PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH),
     ):
         for mine in (None, token()):
-            assert not trouble(event, value, "tcp://h:1", mine).final
+            assert not connection_problem(event, value, "tcp://h:1", mine).final
 
 
 def test_every_complaint_is_a_line_of_its_own() -> None:
     said = {
-        complaint(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, zmq.PROTOCOL_ERROR_ZMTP_CRYPTOGRAPHIC, True),
-        complaint(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, zmq.PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH, True),
-        complaint(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, zmq.PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH, False),
-        complaint(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, 1, True),
-        complaint(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL, errno.EAGAIN, True),
-        complaint(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL, errno.EPIPE, True),
-        complaint(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL, errno.EFAULT, True),
+        handshake_failure(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, zmq.PROTOCOL_ERROR_ZMTP_CRYPTOGRAPHIC, True),
+        handshake_failure(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, zmq.PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH, True),
+        handshake_failure(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, zmq.PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH, False),
+        handshake_failure(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, 1, True),
+        handshake_failure(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL, errno.EAGAIN, True),
+        handshake_failure(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL, errno.EPIPE, True),
+        handshake_failure(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL, errno.EFAULT, True),
     }
     assert len(said) == 7
     assert not [line for line in said if "\n" in line]
 
 
 def test_a_failed_handshake_is_told_with_its_address_once_its_connection_ends() -> None:
-    visitors = Visitors(True, lambda fd: f"10.0.0.{fd}")
+    visitors = PendingHandshakes(True, lambda fd: f"10.0.0.{fd}")
     failed = (zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, zmq.PROTOCOL_ERROR_ZMTP_CRYPTOGRAPHIC)
     assert visitors.saw(zmq.EVENT_ACCEPTED, 5) is None
     assert visitors.saw(zmq.EVENT_ACCEPTED, 6) is None
     assert visitors.saw(*failed) is None
-    assert visitors.saw(zmq.EVENT_DISCONNECTED, 6) == ("10.0.0.6", complaint(*failed, True))
+    assert visitors.saw(zmq.EVENT_DISCONNECTED, 6) == ("10.0.0.6", handshake_failure(*failed, True))
     assert visitors.saw(zmq.EVENT_DISCONNECTED, 5) == ("10.0.0.5", NO_ZEROMQ)
 
 
 def test_a_worker_that_leaves_is_no_failed_handshake() -> None:
-    visitors = Visitors(True, lambda fd: f"10.0.0.{fd}")
+    visitors = PendingHandshakes(True, lambda fd: f"10.0.0.{fd}")
     for fd in (5, 6):
         visitors.saw(zmq.EVENT_ACCEPTED, fd)
     visitors.approved("10.0.0.6")
@@ -234,7 +235,7 @@ def test_a_worker_that_leaves_is_no_failed_handshake() -> None:
 
 
 def test_a_refused_key_is_counted_once_by_zap_alone() -> None:
-    visitors = Visitors(True, lambda fd: "10.0.0.7")
+    visitors = PendingHandshakes(True, lambda fd: "10.0.0.7")
     visitors.saw(zmq.EVENT_ACCEPTED, 5)
     visitors.saw(zmq.EVENT_HANDSHAKE_FAILED_AUTH, 400)
     assert visitors.saw(zmq.EVENT_DISCONNECTED, 5) is None
@@ -255,7 +256,7 @@ def test_who_has_a_token_is_heard_and_answered(net: Net) -> None:
     worker.send(encode(hello("wörker")))
     ((peer, message),) = heard(learner)
     assert message == hello("wörker")
-    assert name_of(peer) == "wörker".encode()
+    assert worker_name(peer) == "wörker".encode()
     assert learner.speaker(peer) == "lab"
     assert learner.why_not(peer) == ""
     assert learner.send(peer, encode(Rejoin(3)))
@@ -290,7 +291,7 @@ def test_both_sides_say_what_is_wrong(
     assert worker.trouble is not None
     assert worker_says in worker.trouble.line
     assert worker.trouble.final is final
-    (line, *_) = lines(caplog, "millrace.door")
+    (line, *_) = lines(caplog, "millrace.authenticator")
     assert "was not let in" in line
     assert any(says in line for says in learner_says.split("|"))
     assert not learner.poll(0.0)
@@ -311,7 +312,7 @@ def test_plain_bytes_are_counted_and_do_no_harm(net: Net, keys: bool, caplog: py
         got += [message for _, message in heard(learner)]
     assert not (keys and len(got) > 1), "what came without a key was read"
     assert {type(message) for message in got} <= {Hello, BadMessage}
-    assert "was not let in" in lines(caplog, "millrace.door")[0]
+    assert "was not let in" in lines(caplog, "millrace.authenticator")[0]
 
 
 def test_who_connects_and_says_nothing_is_shown_out(net: Net) -> None:
@@ -339,17 +340,19 @@ def test_a_worker_at_another_kind_of_server_says_so(net: Net) -> None:
 
 def test_a_worker_at_a_name_that_nobody_knows_says_so(net: Net) -> None:
     worker = net.worker("tcp://no.such.host.invalid:5555", token())
-    assert worker.trouble == Trouble("the host of tcp://no.such.host.invalid:5555 is not known here; is it spelt right?")
+    assert worker.trouble == ConnectionProblem(
+        "the host of tcp://no.such.host.invalid:5555 is not known here; is it spelt right?"
+    )
 
 
 def test_trouble_that_is_over_is_forgotten(net: Net) -> None:
-    first = net.learner(Keyring(STRANGER, Allowed()))
+    first = net.learner(Keyring(STRANGER, ClientList()))
     worker = net.worker(first, token())
     until(lambda: worker.trouble is not None, worker)
     address = first.address
     first.close(0.0)
     first.context.term()  # then the port is free
-    learner = net.learner(Keyring(SERVER, Allowed().adding("lab", LAB.public, NOW)), address)
+    learner = net.learner(Keyring(SERVER, ClientList().adding("lab", LAB.public, NOW)), address)
     worker.send(encode(hello()))
     until(lambda: worker.trouble is None, worker)
     assert [message for _, message in heard(learner)] == [hello()]
@@ -401,7 +404,7 @@ def test_whatever_goes_wrong_with_one_visitor_the_next_is_answered(net: Net, mon
     until(lambda: len(calls) == 1)
     worker = net.worker(learner, token())
     worker.send(encode(hello()))
-    assert (name_of(heard(learner)[0][0]), learner.poll(0.0)) == (b"w0", False)
+    assert (worker_name(heard(learner)[0][0]), learner.poll(0.0)) == (b"w0", False)
 
 
 def test_a_question_that_is_no_question_does_not_stop_the_door(net: Net) -> None:
@@ -419,7 +422,7 @@ def test_a_question_that_is_no_question_does_not_stop_the_door(net: Net) -> None
 def test_two_learners_with_keys_need_a_context_each(net: Net) -> None:
     first = net.keyed()
     with pytest.raises(UsageError, match="needs a ZeroMQ context of its own"):
-        LearnerLink("tcp://127.0.0.1:*", first.context, Keyring(SERVER, Allowed()))
+        LearnerLink("tcp://127.0.0.1:*", first.context, Keyring(SERVER, ClientList()))
 
 
 # ---------------------------------------------------------------- what an eavesdropper sees
@@ -546,7 +549,7 @@ def test_nobody_can_guess_a_routing_id_of_another_key(net: Net) -> None:
         worker.close(0.0)
     assert ids[0] == ids[2], "a worker that was started again does not take its own place"
     assert ids[0] != ids[1]
-    assert {name_of(one) for one in ids} == {b"w0"}
+    assert {worker_name(one) for one in ids} == {b"w0"}
 
 
 def test_two_workers_of_one_name_and_two_keys_do_not_disturb_each_other(net: Net) -> None:
@@ -566,7 +569,7 @@ def test_two_workers_of_one_name_and_two_keys_do_not_disturb_each_other(net: Net
 
 
 def test_the_table_of_who_spoke_last_stays_small(net: Net, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("protocol.wire.link.HOLDERS", 10)
+    monkeypatch.setattr("protocol.wire.learner_link.HOLDERS", 10)
     learner = net.keyed()
     for number in range(100):
         learner._held(b"%d" % number, LAB.public.hex())
@@ -609,7 +612,7 @@ def test_who_is_revoked_is_cut_off_at_once_and_told(net: Net, tmp_path: Path, ca
     serve(hub, lambda: again.trouble is not None, again)
     assert again.trouble is not None
     assert again.trouble.final
-    assert any("was revoked" in line for line in lines(caplog, "millrace.door"))
+    assert any("was revoked" in line for line in lines(caplog, "millrace.authenticator"))
 
 
 def test_revoking_is_noticed_while_the_learner_learns(net: Net, tmp_path: Path) -> None:
@@ -644,7 +647,7 @@ def test_strangers_make_few_lines(net: Net, caplog: pytest.LogCaptureFixture) ->
         with plain.create_connection(("127.0.0.1", port), timeout=DEADLINE_S) as stranger:
             stranger.sendall(b"GET / HTTP/1.1\r\n\r\n")
     until(lambda: learner.refused == 100, learner)
-    assert len(lines(caplog, "millrace.door")) <= 4
+    assert len(lines(caplog, "millrace.authenticator")) <= 4
 
 
 def test_who_comes_under_ever_new_names_does_not_fill_the_memory() -> None:
@@ -664,7 +667,7 @@ def test_who_comes_under_ever_new_names_does_not_fill_the_memory() -> None:
 def test_an_ipv6_address_works_with_and_without_keys(net: Net) -> None:
     if not plain.has_ipv6:
         pytest.skip("no IPv6 here")
-    for keyring, mine in ((None, None), (Keyring(SERVER, Allowed().adding("lab", LAB.public, NOW)), token())):
+    for keyring, mine in ((None, None), (Keyring(SERVER, ClientList().adding("lab", LAB.public, NOW)), token())):
         learner = net.learner(keyring, "tcp://[::1]:*")
         assert learner.address.startswith("tcp://[::1]:")
         worker = net.worker(learner, mine)

@@ -16,13 +16,14 @@ from learner.config.layers import resolve
 from learner.evaluate import load_policy
 from learner.run_folder.run_folder import RunFolder
 from learner.run_spec import run_spec
+from protocol.env_spec import AllowedCode, EnvSpec
 from protocol.errors import UsageError
 from protocol.policy.encoder import describe_encoder, make_encoder
 from protocol.policy.layout import acting_size
 from protocol.policy.networks import ActorCriticNetwork, QNetwork
 from protocol.policy.policy import make_policy
 from protocol.policy.torch_policy import TorchPolicy
-from protocol.specs import Code, EnvSpec, NamedShape, PolicySpec
+from protocol.specs import NamedShape, PolicySpec
 from tests.support.batches import DISCRETE, IMAGE, batch, no_pulse, recurrent
 
 HERE = "tests.support.custom_encoders"
@@ -141,6 +142,6 @@ def test_a_setting_names_it_and_a_run_folder_keeps_it(tmp_path: Path) -> None:
 
 def test_a_worker_that_cannot_be_sure_of_the_learner_imports_no_encoder() -> None:
     run = run_spec(resolve("CartPole-v1", encoder=f"{HERE}:mixer"), EnvSpec("CartPole-v1"))
-    assert "imports a module" in run.why_not(Code.REGISTERED)
-    assert run.why_not(Code.MODULES) == ""
-    assert msgspec.structs.replace(run, policy=DISCRETE).why_not(Code.REGISTERED) == ""
+    assert "imports a module" in run.why_not(AllowedCode.REGISTERED)
+    assert run.why_not(AllowedCode.MODULES) == ""
+    assert msgspec.structs.replace(run, policy=DISCRETE).why_not(AllowedCode.REGISTERED) == ""

@@ -7,7 +7,7 @@ import resource
 import numpy as np
 import pytest
 
-from protocol.policy.malloc import keep_freed
+from protocol.policy.malloc import keep_freed_memory
 from protocol.policy.networks import ActorCriticNetwork
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
@@ -23,7 +23,7 @@ def faults(megabytes: int, rounds: int) -> int:
 
 
 def test_freed_memory_is_used_again() -> None:
-    if not keep_freed():
+    if not keep_freed_memory():
         pytest.skip("the C library is not glibc")
     faults(8, 3)
     pages_a_round = 3 * 8 * 256
@@ -32,7 +32,7 @@ def test_freed_memory_is_used_again() -> None:
 
 def test_networks_that_look_at_images_keep_it_and_others_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
     kept: list[bool] = []
-    monkeypatch.setattr("protocol.policy.networks.keep_freed", lambda: kept.append(True))
+    monkeypatch.setattr("protocol.policy.networks.keep_freed_memory", lambda: kept.append(True))
     action = ActionSpec("discrete", (), "int64", (4,), (0,))
     ActorCriticNetwork(PolicySpec((Leaf("", "box", (4,), "float32"),), action))
     assert kept == []

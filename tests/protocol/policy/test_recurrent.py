@@ -17,6 +17,7 @@ from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
 from learner.evaluate import evaluate
 from learner.recording.record import Player
 from protocol.arrays import Array
+from protocol.env_spec import EnvSpec
 from protocol.errors import BadRollout
 from protocol.policy.distributions import distribution
 from protocol.policy.layout import buffer_size
@@ -25,8 +26,8 @@ from protocol.policy.numpy_policy import NumpyPolicy
 from protocol.policy.policy import make_policy
 from protocol.policy.recurrent import advance, zero_state
 from protocol.policy.torch_policy import TorchPolicy
-from protocol.rollout import Rollout, stack, validate
-from protocol.specs import EnvSpec, PolicySpec, RunSpec
+from protocol.rollout import Rollout, stack_rollouts, validate
+from protocol.specs import PolicySpec, RunSpec
 from tests.support.batches import DISCRETE, GAUSSIAN, IMAGE, batch, no_pulse, normal, recurrent, shared
 from tests.support.collectors import TOY, a_collector, collect, random_policy, run_of
 from workers.collect.collector import Collector
@@ -173,7 +174,7 @@ def test_rollouts_are_stacked_with_their_states() -> None:
     collector = a_collector(run)
     collect(collector, run, 0, (0, 1))
     later = collect(collector, run, 1, (0, 1))
-    rows = stack(later[::-1])
+    rows = stack_rollouts(later[::-1])
     np.testing.assert_array_equal(rows.state, np.concatenate([rollout.state for rollout in later]))
     assert (rows.state != 0).all()
 
@@ -266,7 +267,7 @@ def learned(name: str, core: Core | None, updates: int) -> float:
     for k in range(updates):
         collector.load(*algorithm.weights())
         rollouts = collector.collect([Assignment(k, lane, 0, k) for lane in range(lanes)], k, 1, no_pulse)
-        algorithm.update(stack(rollouts), no_pulse)
+        algorithm.update(stack_rollouts(rollouts), no_pulse)
     collector.close_all()
     policy = make_policy(spec)
     policy.load(*algorithm.weights())

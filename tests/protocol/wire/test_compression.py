@@ -19,11 +19,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from protocol.arrays import Bytes
+from protocol.env_spec import EnvSpec
 from protocol.errors import BadMessage
 from protocol.rollout import Rollout, rollout_bytes
-from protocol.specs import ActionSpec, EnvSpec, Leaf, PolicySpec, RunSpec
+from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
 from protocol.wire.codec import MAX_FRAME_BYTES, decode_to_learner, decode_to_worker, encode
-from protocol.wire.compression import Packing, stacked, unpacked, unstacked, why_no_zstd
+from protocol.wire.compression import Packing, pack_stack, unpack_array, unpack_stack, why_no_zstd
 from tests.support.collectors import a_collector, collect, over_copies_of, run_around, run_of
 
 U1 = np.dtype(np.uint8)
@@ -53,12 +54,12 @@ def test_a_frame_stack_comes_back_as_it_went(
     steps: int, copies: int, k: int, frame: tuple[int, ...], resets: float, seed: int
 ) -> None:
     obs = frame_stacks(steps, copies, k, frame, resets, seed)
-    payload = stacked(obs)
+    payload = pack_stack(obs)
     if payload is None:
         assert resets > 0 or k > 2 * steps or steps < 4
         return
     assert payload.size <= 0.76 * obs.size
-    back = unstacked(payload.data, obs.dtype, obs.shape)
+    back = unpack_stack(payload.data, obs.dtype, obs.shape)
     assert back.shape == obs.shape
     assert back.dtype == obs.dtype
     assert back.tobytes() == obs.tobytes()
@@ -68,7 +69,7 @@ def test_a_frame_stack_comes_back_as_it_went(
 def test_every_frame_is_sent_once() -> None:
     obs = frame_stacks(129, 4, 4, (12, 11))
     obs[70:, 2] = frame_stacks(59, 1, 4, (12, 11), seed=1)[:, 0]  # an episode begins
-    payload = stacked(obs)
+    payload = pack_stack(obs)
     assert payload is not None
     assert payload.size == 128 * 4 // 8 + (129 * 4 + 3 * 4 + 3) * 12 * 11
     moved = np.unpackbits(payload[:64], bitorder="little").reshape(4, 128)
@@ -98,16 +99,16 @@ def test_every_frame_is_sent_once() -> None:
     ids=["noise", "picture", "int8", "float32", "k=1", "k=17", "no image", "tiny", "a step", "nobody", "empty", "resets"],
 )
 def test_what_is_no_stack_goes_as_it_lies(array: npt.NDArray[Any]) -> None:
-    assert stacked(array) is None
+    assert pack_stack(array) is None
     frame, names = Packing(stack=True).of(array)
     assert (bytes(frame), names) == (array.tobytes(), [])
 
 
 def test_an_array_that_does_not_lie_in_order_is_packed_as_well() -> None:
     obs = frame_stacks(9, 3, 4, (8, 8)).swapaxes(0, 1).copy().swapaxes(0, 1)
-    payload = stacked(obs)
+    payload = pack_stack(obs)
     assert payload is not None
-    assert (unstacked(payload.tobytes(), U1, obs.shape) == obs).all()
+    assert (unpack_stack(payload.tobytes(), U1, obs.shape) == obs).all()
 
 
 class Dice(gymnasium.Env[Bytes, Any]):
@@ -137,11 +138,11 @@ def test_what_a_worker_collects_of_gymnasiums_frame_stacks_is_packed(padding: st
     run = msgspec.structs.replace(run_around(make(), 40), copies=3)
     (rollout,) = collect(a_collector(run, over_copies_of([make] * 3)), run)
     (obs,) = rollout.obs
-    payload = stacked(obs)
+    payload = pack_stack(obs)
     assert payload is not None
     moved = np.unpackbits(payload[:15], bitorder="little").reshape(3, 40).T.astype(bool)
     assert (moved == rollout.valid).all()  # the row that resets, and no other, shows frames of its own
-    assert (unstacked(payload.data, U1, obs.shape) == obs).all()
+    assert (unpack_stack(payload.data, U1, obs.shape) == obs).all()
 
 
 # ------------------------------------------------------------------------------------------------ in messages
@@ -249,8 +250,8 @@ SHAPE = [17, 2, 4, 8, 8]
 
 
 def test_the_hand_made_stack_is_a_good_one() -> None:
-    assert unpacked(payload_of(), ["stack"], U1, SHAPE).shape == (17, 2, 4, 8, 8)
-    assert unpacked(payload_of(0xFFFF_FFFE, 43), ["stack"], U1, SHAPE).shape == (17, 2, 4, 8, 8)
+    assert unpack_array(payload_of(), ["stack"], U1, SHAPE).shape == (17, 2, 4, 8, 8)
+    assert unpack_array(payload_of(0xFFFF_FFFE, 43), ["stack"], U1, SHAPE).shape == (17, 2, 4, 8, 8)
 
 
 @pytest.mark.parametrize(
@@ -285,7 +286,7 @@ def test_what_is_not_quite_a_packed_array_is_refused(
     payload: bytes, packings: list[Any], dtype: np.dtype[Any], shape: list[int], says: str
 ) -> None:
     with pytest.raises(BadMessage) as caught:
-        unpacked(payload, packings, dtype, shape)
+        unpack_array(payload, packings, dtype, shape)
     assert says in str(caught.value)
     assert len(str(caught.value)) < 300
 
@@ -304,7 +305,7 @@ def test_nothing_is_set_aside_for_a_promise() -> None:
     tracemalloc.start()
     for shape in ([2**16, 2**4, 16, 8, 8], [2**10, 2**10, 16, 8, 8], [2, 2**19, 16, 8, 8], [2, 1, 16, 2**13, 2**12]):
         with pytest.raises(BadMessage):
-            unpacked(payload_of(), ["stack"], U1, shape)
+            unpack_array(payload_of(), ["stack"], U1, shape)
     _, most = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert most < 100_000
@@ -338,7 +339,7 @@ def test_what_is_worth_it_is_compressed(obs: Bytes, stack: bool, names: list[str
     if names:
         assert len(frame) < obs.nbytes * (0.1 if "zstd" in names else 0.4)
         for received in (bytes(frame), memoryview(bytearray(frame))):
-            back = unpacked(received, packings, obs.dtype, obs.shape)
+            back = unpack_array(received, packings, obs.dtype, obs.shape)
             assert back.tobytes() == obs.tobytes()
             assert not back.flags.writeable
 
@@ -349,7 +350,7 @@ def test_arrays_of_any_kind_are_compressed_from_a_kilobyte_on(dtype: str) -> Non
     assert Packing(zstd=True).of(few)[1] == []
     frame, packings = Packing(zstd=True).of(many)
     assert packings == ["zstd"]
-    back = unpacked(frame, packings, many.dtype, many.shape)
+    back = unpack_array(frame, packings, many.dtype, many.shape)
     assert (back.dtype, back.shape) == (many.dtype, many.shape)
     assert (back == many).all()
 
@@ -376,9 +377,9 @@ ZEROS = zstandard.ZstdCompressor().compress(bytes(8704))
 
 def test_the_frame_made_by_hand_is_a_good_one() -> None:
     for frame in (runs_of_zeros(8704, 8704), ZEROS):
-        assert not unpacked(frame, ["zstd"], U1, SHAPE).any()
+        assert not unpack_array(frame, ["zstd"], U1, SHAPE).any()
     payload = zstandard.ZstdCompressor().compress(payload_of())
-    assert not unpacked(payload, ["stack", "zstd"], U1, SHAPE).any()
+    assert not unpack_array(payload, ["stack", "zstd"], U1, SHAPE).any()
 
 
 @pytest.mark.parametrize(
@@ -404,10 +405,10 @@ def test_the_frame_made_by_hand_is_a_good_one() -> None:
 def test_bombs_and_other_broken_frames_are_refused_before_memory_is_taken_for_them(frame: bytes, says: str) -> None:
     tracemalloc.start()
     with pytest.raises(BadMessage) as caught:
-        unpacked(frame, ["zstd"], U1, SHAPE)
+        unpack_array(frame, ["zstd"], U1, SHAPE)
     if says.startswith("got"):  # told by its own words; as a stack it may be smaller than the array
         with pytest.raises(BadMessage):
-            unpacked(frame, ["stack", "zstd"], U1, SHAPE)
+            unpack_array(frame, ["stack", "zstd"], U1, SHAPE)
     _, most = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert says in str(caught.value)
@@ -417,14 +418,14 @@ def test_bombs_and_other_broken_frames_are_refused_before_memory_is_taken_for_th
 def test_packings_are_undone_in_one_order_only() -> None:
     for packings in (["zstd", "stack"], ["zstd", "zstd"], ["stack", "zstd", "zstd"], []):
         with pytest.raises(BadMessage, match="packings expected"):
-            unpacked(ZEROS, packings, U1, SHAPE)
+            unpack_array(ZEROS, packings, U1, SHAPE)
 
 
 def test_a_learner_that_cannot_decompress_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "zstandard", None)
     assert "pip install 'millrace-rl[compress]'" in why_no_zstd()
     with pytest.raises(BadMessage, match="zstd was not asked for"):
-        unpacked(ZEROS, ["zstd"], U1, SHAPE)
+        unpack_array(ZEROS, ["zstd"], U1, SHAPE)
 
 
 @pytest.mark.parametrize("zstd", [False, True])

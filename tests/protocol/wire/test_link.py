@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import zmq
 
-import protocol.wire.link
+import protocol.wire.sockets
 from protocol.address import check_address, is_local
 from protocol.errors import BadMessage, UsageError
 from protocol.messages import (
@@ -46,8 +46,10 @@ from protocol.messages import (
 )
 from protocol.wire.codec import MAX_FRAMES, decode_to_worker, encode
 from protocol.wire.compression import Packing
-from protocol.wire.link import COPY_BELOW_BYTES, LearnerLink, WorkerLink
+from protocol.wire.learner_link import LearnerLink
 from protocol.wire.plain_values import pack
+from protocol.wire.sockets import COPY_BELOW_BYTES
+from protocol.wire.worker_link import WorkerLink
 from tests.support.fake_ends import fake_rollout, run_spec
 
 Context = zmq.Context[zmq.Socket[bytes]]
@@ -376,7 +378,7 @@ def test_a_worker_too_counts_the_frames(tcp: Ends) -> None:
 
 
 def test_a_frame_above_the_limit_is_not_received_and_the_learner_lives(tcp: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(protocol.wire.link, "MAX_FRAME_BYTES", 10_000)
+    monkeypatch.setattr(protocol.wire.sockets, "MAX_FRAME_BYTES", 10_000)
     learner = tcp.learner()
     worker = tcp.worker(learner)
     joined(learner, worker)

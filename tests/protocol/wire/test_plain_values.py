@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from protocol.errors import BadMessage
-from protocol.wire.plain_values import MAX_DEPTH, Shown, pack, shown_keys, unpack
+from protocol.wire.plain_values import MAX_DEPTH, ReprString, pack, repr_paths, unpack
 from tests.support.bit_equality import bit_equal
 
 scalars = hnp.arrays(
@@ -60,8 +60,8 @@ def test_what_is_not_plain_is_named() -> None:
 def test_what_is_not_plain_is_shown_if_asked_so_and_can_be_found() -> None:
     back = unpack(pack({"a": {"b": Odd()}, "c": "<odd>"}, show=True))
     assert back == {"a": {"b": "<odd>"}, "c": "<odd>"}
-    assert type(back["a"]["b"]) is Shown
-    assert shown_keys(back) == ["a.b"]
+    assert type(back["a"]["b"]) is ReprString
+    assert repr_paths(back) == ["a.b"]
 
 
 def test_what_is_too_deep_is_refused() -> None:

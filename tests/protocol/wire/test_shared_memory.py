@@ -9,34 +9,35 @@ import pytest
 
 from learner.vector_env.settings import VectorEnvSettings
 from learner.vector_env.spec import describe
-from protocol.wire.shared_memory import MAY_SPIN, POSSIBLE, Awake, Bell, Memory, Rung
+from protocol.wire.shared_memory import SUPPORTED, SharedMemory
+from protocol.wire.wake_up import CAN_SPIN, SpinWait, WakePipe, WakeReason
 
-pytestmark = pytest.mark.skipif(not POSSIBLE, reason="needs Linux")
+pytestmark = pytest.mark.skipif(not SUPPORTED, reason="needs Linux")
 
 
 @pytest.fixture
-def bell() -> Iterator[Bell]:
-    made = Bell()
+def bell() -> Iterator[WakePipe]:
+    made = WakePipe()
     yield made
     made.close()
 
 
-def test_a_bell_tells_a_message_from_a_step_and_forgets_what_it_told(bell: Bell) -> None:
-    assert bell.wait(0) is Rung.NOT
+def test_a_bell_tells_a_message_from_a_step_and_forgets_what_it_told(bell: WakePipe) -> None:
+    assert bell.wait(0) is WakeReason.NOT
     bell.ring()
-    bell.ring(Rung.MESSAGE)
+    bell.ring(WakeReason.MESSAGE)
     bell.ring()
-    assert bell.wait(0) is Rung.MESSAGE
-    assert bell.wait(0) is Rung.NOT
+    assert bell.wait(0) is WakeReason.MESSAGE
+    assert bell.wait(0) is WakeReason.NOT
     bell.ring()
-    assert bell.wait(0) is Rung.STEP
+    assert bell.wait(0) is WakeReason.STEP
 
 
-def test_ringing_never_waits_and_never_fails(bell: Bell) -> None:
+def test_ringing_never_waits_and_never_fails(bell: WakePipe) -> None:
     for _ in range(100_000):  # more than a pipe holds
         bell.ring()
-    assert bell.wait(0) is Rung.STEP
-    ours = Bell(rings=os.dup(bell.rings))
+    assert bell.wait(0) is WakeReason.STEP
+    ours = WakePipe(rings=os.dup(bell.rings))
     bell.close()
     ours.ring()  # nobody is left to hear it
     ours.close()
@@ -44,8 +45,8 @@ def test_ringing_never_waits_and_never_fails(bell: Bell) -> None:
 
 def test_who_is_done_last_sees_that_nobody_is_under_way() -> None:
     spec = describe(VectorEnvSettings("CartPole-v1", 6, lanes=3)).step
-    here = Memory(spec)
-    there = Memory(spec, os.dup(here.fd))
+    here = SharedMemory(spec)
+    there = SharedMemory(spec, os.dup(here.fd))
     for lane in range(3):
         here.order(lane, 7)
     left = []
@@ -57,9 +58,9 @@ def test_who_is_done_last_sees_that_nobody_is_under_way() -> None:
     there.close()
 
 
-@pytest.mark.skipif(not MAY_SPIN, reason="nobody waits awake on this kind of machine")
+@pytest.mark.skipif(not CAN_SPIN, reason="nobody waits awake on this kind of machine")
 def test_waiting_awake_is_tried_less_often_while_it_is_in_vain() -> None:
-    awake, looks = Awake(), 0
+    awake, looks = SpinWait(), 0
 
     def never() -> bool:
         nonlocal looks

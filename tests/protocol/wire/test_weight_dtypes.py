@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from protocol.arrays import Floats
 from protocol.errors import RunError
-from protocol.wire.weight_dtypes import BOUNDS, WeightsDtype, narrowed, widened
+from protocol.wire.weight_dtypes import BOUNDS, WeightsDtype, to_float32, to_wire_dtype
 
 HALVES: list[WeightsDtype] = ["bfloat16", "float16"]
 TORCHS = {"bfloat16": torch.bfloat16, "float16": torch.float16}
@@ -41,24 +41,24 @@ def test_rounding_is_torchs_to_the_bit(dtype: WeightsDtype) -> None:
     ties = [every_upper_half + low for low in (0, 1, 0x7FFF, 0x8000, 0x8001, 0xFFFF, 0x0FFF, 0x1000, 0x1001, 0x3000)]
     parameters = fitting(of_bits(np.concatenate(ties)), dtype)
     assert parameters.size > 100_000
-    travelling = narrowed(parameters, dtype)
+    travelling = to_wire_dtype(parameters, dtype)
     assert travelling.nbytes == parameters.nbytes // 2
-    assert same_bits(widened(travelling), as_torch_rounds(parameters, dtype))
+    assert same_bits(to_float32(travelling), as_torch_rounds(parameters, dtype))
 
 
 @settings(max_examples=200, deadline=None)
 @given(st.sampled_from(HALVES), st.lists(st.floats(width=32, allow_nan=False, allow_infinity=False)))
 def test_what_was_rounded_once_is_rounded(dtype: WeightsDtype, values: list[float]) -> None:
     parameters = fitting(np.array(values, np.float32), dtype)
-    once = widened(narrowed(parameters, dtype))
+    once = to_float32(to_wire_dtype(parameters, dtype))
     assert same_bits(once, as_torch_rounds(parameters, dtype))
-    assert same_bits(widened(narrowed(once, dtype)), once)
+    assert same_bits(to_float32(to_wire_dtype(once, dtype)), once)
     assert np.isfinite(once).all()
 
 
 def test_float32_travels_as_it_lies() -> None:
     parameters = of_bits([0x3F800001, 0x7F800000, 0x7FC00000, 0x80000000])
-    assert widened(narrowed(parameters, "float32")) is parameters
+    assert to_float32(to_wire_dtype(parameters, "float32")) is parameters
 
 
 @pytest.mark.parametrize("dtype", HALVES)
@@ -66,19 +66,19 @@ def test_what_would_become_infinite_is_refused_and_named(dtype: WeightsDtype) ->
     bound = np.float32(BOUNDS[dtype])
     below = np.nextafter(bound, np.float32(0))
     assert np.isinf(as_torch_rounds(np.array([bound]), dtype)).all()
-    kept = widened(narrowed(np.array([below, -below]), dtype))
+    kept = to_float32(to_wire_dtype(np.array([below, -below]), dtype))
     assert (kept == np.array([1, -1]) * float(torch.finfo(TORCHS[dtype]).max)).all()
     for wrong in (bound, -bound, np.float32(np.inf), -np.float32(np.inf), np.float32(np.nan)):
         with pytest.raises(RunError, match=rf"^weights_dtype {dtype}: parameter 2 expected less than .*, got .*; resume"):
-            narrowed(np.array([0, 1, wrong, 0], np.float32), dtype)
+            to_wire_dtype(np.array([0, 1, wrong, 0], np.float32), dtype)
 
 
 def test_no_parameters_are_no_trouble() -> None:
     for dtype in get_args(WeightsDtype):
-        assert widened(narrowed(np.zeros(0, np.float32), dtype)).shape == (0,)
+        assert to_float32(to_wire_dtype(np.zeros(0, np.float32), dtype)).shape == (0,)
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.int8, np.uint32, bool])
 def test_weights_of_another_kind_are_not_acted_under(dtype: Any) -> None:
     with pytest.raises(ValueError, match="weights expected float32, float16 or bfloat16 as uint16"):
-        widened(np.zeros(3, dtype))
+        to_float32(np.zeros(3, dtype))

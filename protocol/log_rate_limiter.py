@@ -6,7 +6,7 @@ The law: whoever causes the lines cannot make many of them, nor make this table 
 from __future__ import annotations
 
 
-class Rarely:
+class LogRateLimiter:
     """Says whether a line is due."""
 
     def __init__(self, every_s: float = 60.0, most: int = 20) -> None:
@@ -28,6 +28,6 @@ class Rarely:
         return said[1] if said is not None else 0
 
 
-def again(kept_back: int) -> str:
+def suppressed_note(kept_back: int) -> str:
     """What to put behind a line that is due."""
     return f" ({kept_back} more like this since the last line)" if kept_back else ""

@@ -1,0 +1,136 @@
+"""The environment of a run as plain data, how to make it, and how much code a learner may have a worker run.
+
+Only this file may unpickle, and only in `EnvSpec.make`: a factory that the *learner* sent to a worker which allows
+`AllowedCode.CALLABLES`. Nothing that a worker sends is ever unpickled.
+"""
+
+from __future__ import annotations
+
+import importlib
+import traceback
+from collections.abc import Callable
+from enum import Enum
+from importlib.util import find_spec
+from typing import Any, TypeVar
+
+import gymnasium
+import msgspec
+from gymnasium.envs.registration import VectorizeMode
+from gymnasium.vector import VectorEnv
+
+from protocol.errors import UsageError, first_line
+
+# The module that registers the ids of a namespace; gymnasium imports it as it imports the module in `module:EnvId`.
+REGISTERING_MODULES = {"millrace": "workers.envs", "ALE": "ale_py"}
+Scalar = bool | int | float | str
+_Made = TypeVar("_Made")
+
+
+class AllowedCode(Enum):
+    """How much code a learner may have a worker run, by how sure the worker is of who the learner is."""
+
+    REGISTERED = 0
+    """environments that are registered where the worker runs, by their ids alone, and of their attributes those whose names
+    do not begin with an underscore: anybody may have answered
+    """
+    MODULES = 1
+    """also `module:EnvId`, which imports the module: somebody on this machine has answered"""
+    CALLABLES = 2
+    """also pickled callables: the learner whose key is pinned, or one that only this user can be"""
+
+
+class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The environment: a gymnasium id, or a factory that was pickled by the learner."""
+
+    id: str
+    """anything `gymnasium.make` takes: `CartPole-v1`, `ALE/Pong-v5`, `my_package.envs:MyEnv-v0`"""
+    kwargs: dict[str, Scalar] = {}
+    """keyword arguments of `gymnasium.make`"""
+    factory: bytes | None = None
+    """a cloudpickled callable that returns one environment; `id` is then only its name"""
+
+    @staticmethod
+    def of(env: str | Callable[[], object], kwargs: dict[str, Scalar] | None = None) -> EnvSpec:
+        """From an id, or from a callable that takes `kwargs` and returns a `gymnasium.Env`."""
+        if isinstance(env, str):
+            return EnvSpec(env, kwargs or {})
+        import cloudpickle
+
+        return EnvSpec(getattr(env, "__name__", type(env).__name__), kwargs or {}, cloudpickle.dumps(env))
+
+    def why_not(self, code: AllowedCode) -> str:
+        """Why a worker that runs so much code cannot make it; empty if it can."""
+        if self.factory is not None and code is not AllowedCode.CALLABLES:
+            return (
+                f"environment {self.id} is a callable, which this worker does not unpickle; it may come over ipc, inproc or "
+                "with a token (and not with --no-code), else name it as my_module:MyEnv-v0"
+            )
+        if self.factory is None and ":" in self.id and code is AllowedCode.REGISTERED:
+            return (
+                f"environment {self.id} imports a module, which this worker does not do for a learner it cannot be sure of; "
+                "give it a token (and not --no-code)"
+            )
+        return ""
+
+    def make(self, render_mode: str | None = None) -> gymnasium.Env[object, object]:
+        """One env copy. Raises `UsageError` with what to do when the id is unknown or a package is missing."""
+        extra: dict[str, object] = {} if render_mode is None else {"render_mode": render_mode}
+        if self.factory is not None:
+            import cloudpickle
+
+            env = cloudpickle.loads(self.factory)(**self.kwargs, **extra)
+            if not isinstance(env, gymnasium.Env):
+                raise UsageError(f"env factory {self.id}: expected it to return a gymnasium.Env, got {type(env).__name__}")
+            return env
+        # The checker is left out: it costs a tenth of a CartPole step, and `Rollout.validate` checks every row.
+        return self._made(lambda env_id: gymnasium.make(env_id, disable_env_checker=True, **self.kwargs, **extra))  # type: ignore[arg-type]
+
+    def make_vectorised(self, copies: int) -> VectorEnv[Any, Any, Any]:
+        """So many copies as the environment's own vectorised form; `protocol.envs.vectorized` says which can serve."""
+        own, kwargs = VectorizeMode.VECTOR_ENTRY_POINT, dict[str, Any](self.kwargs)
+        return self._made(lambda env_id: gymnasium.make_vec(env_id, copies, own, **kwargs))
+
+    def registered(self) -> gymnasium.envs.registration.EnvSpec:
+        """What gymnasium knows of the id. Raises `UsageError`."""
+
+        def look_up(env_id: str) -> gymnasium.envs.registration.EnvSpec:
+            module, colon, name = env_id.partition(":")
+            if colon:
+                importlib.import_module(module)
+            return gymnasium.spec(name if colon else env_id)
+
+        return self._made(look_up)
+
+    def _made(self, make: Callable[[str], _Made]) -> _Made:
+        """What `make` makes of the id. Raises `UsageError`."""
+        registrar = REGISTERING_MODULES.get(self.id.partition("/")[0])
+        try:
+            return make(f"{registrar}:{self.id}" if registrar and find_spec(registrar) else self.id)
+        except (gymnasium.error.Error, ImportError, TypeError) as error:  # TypeError: keyword arguments it does not take
+            raise UsageError(_why_not_made(self.id, error)) from error
+        except Exception as error:  # its own constructor raised, whatever that may be
+            line = f"environment {self.id} cannot be made: {type(error).__name__}: {first_line(error)}"
+            raise UsageError(line, traceback.format_exc()) from error
+
+
+def _why_not_made(env_id: str, error: Exception) -> str:
+    """One line for an environment that is not known, or whose package is missing."""
+    module, colon, _ = env_id.partition(":")
+    says = first_line(error)
+    match error:
+        case gymnasium.error.NamespaceNotFound() if env_id.startswith("ALE/"):
+            return f"environment {env_id}: Atari games are an extra; pip install 'millrace-rl[atari]'"
+        case gymnasium.error.DependencyNotInstalled():
+            return f"environment {env_id}: {says}"
+        case ModuleNotFoundError() if colon and f"'{module.split('.')[0]}" in says:
+            return f"environment {env_id}: no module named {module}; is it installed, or its folder on PYTHONPATH?"
+        case ImportError():
+            return f"environment {env_id}: a package it needs is missing ({says}); pip install it, then try again"
+        case gymnasium.error.Error() if "vector entry point" in says:
+            return (
+                f"environment {env_id} has no vectorised form of its own (gymnasium's vector_entry_point); use --vector loop"
+            )
+        case gymnasium.error.UnregisteredEnv() if not colon:
+            return f"environment {env_id} is not registered: {says} One of your own is given as my_module:MyEnv-v0"
+        case _:
+            return f"environment {env_id} cannot be made: {says}"

@@ -1,0 +1,177 @@
+"""The learner's end of the connections: one ROUTER socket, many workers. The address chooses the transport.
+
+ROUTER_MANDATORY: without it a ROUTER silently drops messages at its high-water mark. ROUTER_HANDOVER: without it a worker
+that returns is locked out until its half-open connection times out. A link belongs to one thread.
+
+With keys, a peer is a routing id *and* the key that it uses, which libzmq proves for every message. A client that claims
+another's routing id with its own key is therefore another peer: it cannot speak in that worker's session, nor end it. It
+cannot even cut that worker's connection (a handover leaves the earlier connection open but unread), because a worker's
+routing id ends in a tag that only the holder of its key can make.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator, Sequence
+
+import zmq
+
+from protocol.address import check_address, worker_name
+from protocol.errors import BadMessage, RunError, UsageError
+from protocol.keys.key_folder import Keyring
+from protocol.keys.zap import AuthenticatorThread
+from protocol.log_rate_limiter import LogRateLimiter, suppressed_note
+from protocol.messages import Inquire, Refuse, ToLearner
+from protocol.wire.codec import Buffer, decode_to_learner, encode
+from protocol.wire.sockets import LINGER_MS, Traffic, receive_frames, send_frames, set_options
+
+log = logging.getLogger("millrace.link")
+
+MESSAGES_AT_ONCE = 10_000
+HOLDERS = 10_000
+
+
+class LearnerLink:
+    """The learner's end: many workers, one port."""
+
+    def __init__(
+        self, address: str, context: zmq.Context[zmq.Socket[bytes]] | None = None, keyring: Keyring | None = None
+    ) -> None:
+        """With a keyring (tcp alone) only those on it get in. There can be one such link in a context."""
+        check_address(address)
+        self.context = context or zmq.Context.instance()
+        self.keyring = keyring
+        self.received, self.sent = Traffic(), Traffic()
+        self.refused_messages = 0
+        """messages under keys that may speak no more"""
+        self.room = 0
+        """bytes to which the packed arrays of one message may come; 0: none may come packed"""
+        self._holders: dict[bytes, str] = {}  # routing id -> key under which it spoke last
+        self._lid = LogRateLimiter()
+        self._socket = self.context.socket(zmq.ROUTER)
+        set_options(self._socket, address, keyring is not None)
+        self._socket.router_mandatory = True
+        self._socket.router_handover = True
+        self._door: AuthenticatorThread | None = None
+        try:
+            if address.startswith("tcp://"):
+                self._door = AuthenticatorThread(self._socket, keyring)  # before the port is bound
+            self._socket.bind(address)
+        except UsageError:
+            self.close(linger_s=0.0)
+            raise
+        except zmq.ZMQError as error:
+            self.close(linger_s=0.0)
+            raise UsageError(_why_not_bound(address, error)) from error
+        self.address = bytes(self._socket.get(zmq.LAST_ENDPOINT)).decode().rstrip("\0")
+        """where workers connect: the port that was chosen, if it was `*`"""
+
+    @property
+    def refused(self) -> int:
+        """Handshakes that failed, of those who were not let in."""
+        return self._door.refused if self._door is not None else 0
+
+    def poll(self, timeout_s: float) -> bool:
+        """Wait until something arrives, at most `timeout_s`. Raises `RunError` if nobody stands at the door."""
+        if self._door is not None and not self._door.is_alive():
+            raise RunError(
+                f"the door of {self.address} is shut: its thread has ended, see the log; start again with --resume"
+            )
+        return bool(self._socket.poll(max(0, int(timeout_s * 1000))))
+
+    def receive(self) -> Iterator[tuple[bytes, ToLearner | Inquire | BadMessage]]:
+        """What has arrived, with its sender; what cannot be read comes as its error. At most MESSAGES_AT_ONCE."""
+        said_by: list[str] | None = None if self.keyring is None else []
+        for _ in range(MESSAGES_AT_ONCE):  # a flood must not keep the learner here
+            frames = receive_frames(self._socket, said_by)
+            if frames is None:
+                return
+            self.received.add(frames)
+            peer = bytes(frames[0])
+            if said_by is not None:
+                peer = self._held(peer, said_by[0])
+                if self._turned_away(peer):
+                    continue
+            try:
+                yield peer, decode_to_learner(frames[1:], self.room)
+            except BadMessage as error:
+                yield peer, error
+
+    def why_not(self, peer: bytes) -> str:
+        """Why this peer may speak no more; empty if it may."""
+        return "" if self.keyring is None else self.keyring.allowed.why_not(_key_of(peer))
+
+    def speaker(self, peer: bytes) -> str:
+        """Who answers for what this peer sends: the name of its key, or else its own."""
+        return (
+            worker_name(peer).decode(errors="replace")
+            if self.keyring is None
+            else self.keyring.allowed.name_of(_key_of(peer))
+        )
+
+    def _held(self, routing_id: bytes, key: str) -> bytes:
+        """The peer that speaks from this routing id now."""
+        self._holders.pop(routing_id, None)  # the one that spoke longest ago stands first
+        self._holders[routing_id] = key
+        if len(self._holders) > HOLDERS:
+            del self._holders[next(iter(self._holders))]
+        return b"%s\0%s" % (routing_id, key.encode())
+
+    def _turned_away(self, peer: bytes) -> bool:
+        """A message under a key that may speak no more is counted, answered and not read."""
+        why = self.why_not(peer)
+        if why:
+            self.refused_messages += 1
+            self.send(peer, encode(Refuse(why)))
+            if (kept_back := self._lid.due(why, time.monotonic())) is not None:
+                log.warning(
+                    "worker %s is not heard: %s%s",
+                    worker_name(peer).decode(errors="replace"),
+                    why,
+                    suppressed_note(kept_back),
+                )
+        return bool(why)
+
+    def send(self, peer: bytes, frames: Sequence[Buffer]) -> bool:
+        """Send; False if the peer is gone."""
+        if self.keyring is not None:
+            routing_id, _, key = peer.rpartition(b"\0")
+            if self._holders.get(routing_id) != key.decode():
+                return False  # another one speaks from there now
+            peer = routing_id
+        whole = [peer, *frames]
+        try:
+            send_frames(self._socket, whole)
+        except zmq.ZMQError as error:
+            if error.errno in (zmq.EHOSTUNREACH, zmq.EAGAIN):
+                return False
+            raise
+        self.sent.add(whole)
+        return True
+
+    def close(self, linger_s: float = LINGER_MS / 1000) -> None:
+        """Send what is queued, at most `linger_s`, and close."""
+        if self._door is not None and not self._socket.closed:
+            self._socket.disable_monitor()  # before its reader goes: libzmq would wait for one
+        self._socket.close(linger=int(linger_s * 1000))
+        if self._door is not None:
+            self._door.close()
+
+
+def _key_of(peer: bytes) -> bytes:
+    """The public key under which a peer speaks; empty, which nobody has, if there is none."""
+    try:
+        return bytes.fromhex(peer.rpartition(b"\0")[2].decode())
+    except ValueError:
+        return b""
+
+
+def _why_not_bound(address: str, error: zmq.ZMQError) -> str:
+    match error.errno:
+        case zmq.EADDRINUSE:
+            return f"address {address} is in use; choose another port, or tcp://127.0.0.1:* for any free one"
+        case _:
+            return (
+                f"address {address}: cannot bind ({error.strerror}); expected one of this machine, as tcp://127.0.0.1:5555"
+            )

@@ -1,0 +1,152 @@
+"""A worker's end of its connection: one DEALER socket. The address chooses the transport. A link belongs to one thread."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import struct
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from typing import TypeVar
+
+import zmq
+
+from protocol.address import check_address, is_local, resolves
+from protocol.errors import BadMessage, UsageError
+from protocol.keys.handshake import WATCHED_BY_WORKER, ConnectionProblem, connection_problem
+from protocol.keys.keys import Token
+from protocol.keys.zap import connect_with
+from protocol.log_rate_limiter import LogRateLimiter, suppressed_note
+from protocol.messages import ToObserver, ToWorker
+from protocol.wire.codec import Buffer, decode_to_observer, decode_to_worker
+from protocol.wire.compression import Packing
+from protocol.wire.sockets import LINGER_MS, receive_frames, send_frames, set_options
+
+Said = TypeVar("Said")
+
+log = logging.getLogger("millrace.link")
+
+TAG_CHARACTERS = 32
+
+
+class WorkerLink:
+    """A worker's end."""
+
+    def __init__(
+        self,
+        address: str,
+        name: str,
+        context: zmq.Context[zmq.Socket[bytes]] | None = None,
+        token: Token | None = None,
+    ) -> None:
+        """With a token (tcp alone) it speaks with that token's learner and nobody else."""
+        check_address(address)
+        longest = 255 - (TAG_CHARACTERS + 1)
+        if not 1 <= len(name.encode()) <= longest or "\0" in name:
+            raise UsageError(f"worker name {name[:40]!r}: expected 1 to {longest} bytes, got {len(name.encode())}")
+        self.address, self.token = address, token
+        self.trouble: ConnectionProblem | None = None
+        """why there is no connection, as far as that is known"""
+        self.packing = Packing(stack=token is not None or not is_local(address))
+        """of the rollouts that go over it: what is encrypted, or leaves this machine, is worth looking at first"""
+        self._connected = False
+        self._lid = LogRateLimiter()
+        self.context = context or zmq.Context.instance()
+        self._socket = self.context.socket(zmq.DEALER)
+        set_options(self._socket, address, token is not None)
+        self._socket.routing_id = _routing_id(name, token)
+        self._socket.reconnect_ivl = 100
+        self._socket.reconnect_ivl_max = 2000
+        self._monitor: zmq.Socket[bytes] | None = None
+        self._poller = zmq.Poller()
+        self._poller.register(self._socket, zmq.POLLIN)
+        if address.startswith("tcp://"):
+            self._watch()
+        if token is not None:
+            connect_with(self._socket, token)
+        try:
+            self._socket.connect(address)
+        except zmq.ZMQError as error:
+            self.close(linger_s=0.0)
+            raise UsageError(f"address {address}: cannot connect ({error.strerror})") from error
+        if not resolves(address):
+            self._say(ConnectionProblem(f"the host of {address} is not known here; is it spelt right?"))
+
+    def poll(self, timeout_s: float) -> bool:
+        """Wait until something arrives, at most `timeout_s`; also no longer than until the learner has refused our key."""
+        deadline_s = time.monotonic() + timeout_s
+        while True:
+            left_s = max(0.0, deadline_s - time.monotonic())
+            ready = dict(self._poller.poll(int(left_s * 1000)))
+            if self._monitor in ready:
+                self._look()
+            if self._socket in ready or left_s == 0.0 or (self.trouble is not None and self.trouble.final):
+                return self._socket in ready
+
+    def _watch(self) -> None:
+        name = f"inproc://millrace-worker-{os.urandom(6).hex()}"
+        self._socket.monitor(name, WATCHED_BY_WORKER)
+        self._monitor = self.context.socket(zmq.PAIR)
+        self._monitor.linger = 0
+        self._monitor.rcvhwm = 0  # libzmq waits where nobody reads, and an environment's step may take minutes
+        self._monitor.connect(name)
+        self._poller.register(self._monitor, zmq.POLLIN)
+
+    def _look(self) -> None:
+        """What became of the connection."""
+        assert self._monitor is not None
+        with suppress(zmq.Again):
+            while True:
+                event, value = struct.unpack("=HI", self._monitor.recv_multipart(zmq.NOBLOCK)[0])
+                if event == zmq.EVENT_DISCONNECTED:
+                    if not self._connected and self.trouble is None:
+                        self._say(
+                            ConnectionProblem(f"{self.address} closes the connection at once; is it a millrace learner?")
+                        )
+                    self._connected = False
+                elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+                    self._connected, self.trouble = True, None
+                else:
+                    self._say(connection_problem(event, value, self.address, self.token))
+
+    def _say(self, found: ConnectionProblem) -> None:
+        self.trouble = found
+        if not found.final and (kept_back := self._lid.due(found.line, time.monotonic())) is not None:
+            log.warning("%s%s", found.line, suppressed_note(kept_back))
+
+    def receive(self) -> Iterator[ToWorker | BadMessage]:
+        """All that has arrived; what cannot be read comes as its error."""
+        return self._received(decode_to_worker)
+
+    def answers(self) -> Iterator[ToObserver | BadMessage]:
+        """All that has arrived for an observer, who is no worker: answers to Inquire."""
+        return self._received(decode_to_observer)
+
+    def _received(self, decode: Callable[[Sequence[Buffer]], Said]) -> Iterator[Said | BadMessage]:
+        while (frames := receive_frames(self._socket)) is not None:
+            try:
+                yield decode(frames)
+            except BadMessage as error:
+                yield error
+
+    def send(self, frames: Sequence[Buffer]) -> None:
+        """Send, or queue while the learner is out of reach (the conversation repairs what is lost)."""
+        with suppress(zmq.Again):
+            send_frames(self._socket, frames)
+
+    def close(self, linger_s: float = LINGER_MS / 1000) -> None:
+        """Send what is queued, at most `linger_s`, and close."""
+        if self._monitor is not None and not self._socket.closed:
+            self._socket.disable_monitor()  # before its reader goes: libzmq would wait for one
+            self._monitor.close(linger=0)
+        self._socket.close(linger=int(linger_s * 1000))
+
+
+def _routing_id(name: str, token: Token | None) -> bytes:
+    """The name; under a key with a tag behind it that nobody can make who has another key."""
+    if token is None:
+        return name.encode()
+    tag = hashlib.blake2b(name.encode(), key=token.client.secret, digest_size=TAG_CHARACTERS // 2)
+    return b"%s\0%s" % (name.encode(), tag.hexdigest().encode())
