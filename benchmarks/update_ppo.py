@@ -15,8 +15,8 @@ import torch
 from torch import Tensor, nn
 
 from benchmarks.contest import Contest, repeated
-from learner.algorithms.actor_critic import Minibatch
 from learner.algorithms.kernels.fused import MOST_ROWS
+from learner.algorithms.minibatches import Minibatch
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import PPOConfig
 from protocol.specs import ActionSpec, Leaf, PolicySpec
@@ -55,7 +55,7 @@ def usual(rows: Minibatch, width: int) -> Callable[[Tensor], object]:
     optimizer = torch.optim.Adam(agent.parameters(), lr=CONFIG.learning_rate, eps=1e-5)
 
     def update(index: Tensor) -> object:
-        log_prob, entropy, value = agent.evaluate(rows.x[index], rows.action[index])
+        log_prob, entropy, value = agent.evaluate(rows.features[index], rows.action[index])
         advantage = rows.advantage[index]
         advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
         log_ratio = log_prob - rows.log_prob[index]
@@ -83,8 +83,8 @@ def ours(rows: Minibatch, policy: PolicySpec, graph: bool) -> Callable[[Tensor],
     in_numpy = rows.in_numpy()
 
     def update(index: Tensor) -> object:
-        numpy = not graph and len(index) <= MOST_ROWS  # as `Parts.minibatches` chooses
-        return algorithm.step(in_numpy.rows(index.numpy()) if numpy else rows.rows(index), CONFIG.clip_range)
+        numpy = not graph and len(index) <= MOST_ROWS  # as `ActorCritic.minibatches` chooses
+        return algorithm.step(in_numpy.select(index.numpy()) if numpy else rows.select(index))
 
     return update
 

@@ -19,8 +19,8 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from benchmarks.contest import Contest, repeated
 from learner.algorithms.a2c import A2C
-from learner.algorithms.action_values import WithGraph
 from learner.algorithms.dqn import DQN
+from learner.algorithms.kernels.action_values import WithGraph
 from learner.config.hyperparameters import A2CConfig, DQNConfig
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf
@@ -96,7 +96,7 @@ def a2c(steps: int, target: float) -> Contest:
     def ours(graph: bool) -> Callable[[], float]:
         made = A2C(config, A2C.policy_spec(config, OBSERVATION, ACTION), total_steps=NEVER, seed=0)
         if graph:
-            made.parts._fused = None
+            made._fused = None
         return lambda: repeated(lambda: made.update(batch, lambda: None), STEPS)
 
     theirs = TheirA2C("MlpPolicy", make_vec_env("CartPole-v1", COPIES), n_steps=steps, device="cpu")

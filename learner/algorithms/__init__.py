@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 from protocol.arrays import Floats
 from protocol.rollout import Batch
@@ -27,7 +27,7 @@ ALGORITHMS = {
 class Algorithm(Protocol):
     """What the training loop of `learner.train` needs of an algorithm."""
 
-    whole_episodes: bool
+    whole_episodes: ClassVar[bool]
     """True if the algorithm learns only from whole episodes: a run whose rollouts are too short for one is refused."""
 
     @staticmethod

@@ -11,20 +11,21 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import msgspec
 import numpy as np
 import torch
 
-from learner.algorithms import losses
-from learner.algorithms.action_values import action_values
-from learner.algorithms.kernels.optimizer_step import spare_the_compiler, take_step
-from learner.algorithms.normalization import ObservationNormaliser
+from learner.algorithms.kernels import loss_gradients
+from learner.algorithms.kernels.action_values import action_values
+from learner.algorithms.kernels.optimizer_step import avoid_compiler_import, take_step
+from learner.algorithms.normalization import ObservationNormalizer
 from learner.algorithms.replay import Replay, Sample
+from learner.algorithms.updates import check_finite, scheduled
 from learner.config.hyperparameters import DQNConfig
 from protocol.arrays import Array, Floats
-from protocol.errors import RunError, UsageError
+from protocol.errors import UsageError
 from protocol.policy.features import features, normalize
 from protocol.policy.networks import QNetwork
 from protocol.rollout import Batch
@@ -39,7 +40,7 @@ class Measured(NamedTuple):
     grad_norm: float  # before it was cut or shortened
 
 
-LOSSES = {"huber": losses.huber_loss, "squared": losses.squared_loss}
+LOSSES = {"huber": loss_gradients.huber_loss, "squared": loss_gradients.squared_loss}
 
 
 def exploration_rate(config: DQNConfig, env_steps: int) -> float:
@@ -51,7 +52,7 @@ def exploration_rate(config: DQNConfig, env_steps: int) -> float:
 class DQN:
     """Action values, those of the target, their optimiser, and the replay."""
 
-    whole_episodes = False
+    whole_episodes: ClassVar[bool] = False
 
     @staticmethod
     def policy_spec(config: DQNConfig, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
@@ -87,12 +88,12 @@ class DQN:
         self.version = 0  # updates made
         self.gradient_steps = 0  # what Stable-Baselines3 calls n_updates
         self._total_steps = total_steps
-        spare_the_compiler()
+        avoid_compiler_import()
         optimizer = torch.optim.Adam if config.optimizer == "adam" else torch.optim.AdamW
         self._optimizer = optimizer([self.net.flat], lr=config.learning_rate, amsgrad=config.amsgrad, fused=True)
         # The normaliser asks for the measured features alone, whichever head acts on them.
-        self._normaliser = ObservationNormaliser(msgspec.structs.replace(policy, head="actor_critic"))
-        self._statistics = self._normaliser.buffers()
+        self._normalizer = ObservationNormalizer(msgspec.structs.replace(policy, head="actor_critic"))
+        self._statistics = self._normalizer.buffers()
 
     def update(self, batch: Batch, pulse: Callable[[], None]) -> dict[str, float]:
         """Keep a batch and learn from the replay, calling `pulse` between gradient steps; gives the metrics.
@@ -100,13 +101,15 @@ class DQN:
         Raises `RunError` when a loss or a gradient is not finite, before it reaches the weights.
         """
         config = self.config
-        done = min(1.0, self.env_steps / self._total_steps)  # 0 in the first update, and below 1 in the last
-        learning_rate = config.learning_rate * (1 - done if config.learning_rate_schedule == "linear" else 1)
+        done = min(
+            1.0, self.env_steps / self._total_steps
+        )  # fraction of the run: 0 in the first update, below 1 in the last
+        learning_rate = scheduled(config.learning_rate, config.learning_rate_schedule, 1 - done)
         self._optimizer.param_groups[0]["lr"] = learning_rate
         beta = config.priority_beta + (1 - config.priority_beta) * done
         self.replay.add(batch)
-        self._normaliser.update(features(self.policy, batch.obs)[:-1], batch.valid)
-        self._statistics = self._normaliser.buffers()
+        self._normalizer.update(features(self.policy, batch.obs)[:-1], batch.valid)
+        self._statistics = self._normalizer.buffers()
         self.env_steps += batch.env_steps
         self.version += 1
         measured: list[Measured] = []
@@ -136,7 +139,7 @@ class DQN:
         loss, by_chosen = LOSSES[self.config.loss](error, values.array(sample.weight))
         values.backward(by_chosen)
         measured = Measured(*values.read(loss, chosen.sum() / len(chosen)))
-        self._check(measured)
+        check_finite(measured._asdict(), self.version, "a lower learning_rate, or normalize_observations")
         self._bound_gradient(measured.grad_norm)
         take_step(self._optimizer)
         self.gradient_steps += 1
@@ -164,14 +167,6 @@ class DQN:
             x = normalize(x, *np.split(self._statistics, 2))
         return x, [array for leaf, array in zip(self.policy.observation, leaves, strict=True) if leaf.is_image]
 
-    def _check(self, measured: Measured) -> None:
-        for name, number in measured._asdict().items():
-            if not math.isfinite(number):
-                raise RunError(
-                    f"learner: update {self.version}: {name} expected finite, got {number}; this step was not taken; "
-                    "try a lower learning_rate, or normalize_observations"
-                )
-
     def _bound_gradient(self, norm: float) -> None:
         config, gradient = self.config, self.net.flat_grad
         if config.max_grad_value is not None:
@@ -198,7 +193,7 @@ class DQN:
             "parameters": self.net.flat.clone(),
             "target": self.target.flat.clone(),
             "optimizer": copy.deepcopy(self._optimizer.state_dict()),
-            "observations": self._normaliser.state_dict(),
+            "observations": self._normalizer.state_dict(),
             "replay": self.replay.state_dict(),
             "env_steps": self.env_steps,
             "version": self.version,
@@ -210,8 +205,8 @@ class DQN:
         self.net.flat.copy_(state["parameters"])
         self.target.flat.copy_(state["target"])
         self._optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
-        self._normaliser.load_state_dict(state["observations"])
-        self._statistics = self._normaliser.buffers()
+        self._normalizer.load_state_dict(state["observations"])
+        self._statistics = self._normalizer.buffers()
         self.replay.load_state_dict(state["replay"])
         self.env_steps, self.version = state["env_steps"], state["version"]
         self.gradient_steps = state["gradient_steps"]

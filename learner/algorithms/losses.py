@@ -1,8 +1,8 @@
-"""Losses and what is measured of them. Pure: arrays [B] in, numbers (arrays of no dimension) out; B rows of a minibatch.
+"""Losses of ordinary autograd, and what is measured of them. Pure: tensors [B] in, tensors of no dimension out.
 
-Arrays are torch's, or numpy's where the update is fused: the formula is the same. Every row given is a valid one: masking is
-done where minibatches are made. A loss comes with its gradient, derived by hand (a test holds it equal to autograd's): a
-small minibatch spends more time on the graph than on the arithmetic.
+B is the number of rows of a minibatch. All of them are valid: rows are masked where minibatches are selected.
+`kernels.loss_gradients` has the same losses with gradients derived by hand. What both need also takes numpy arrays: `ratio`,
+`standardized`, `approx_kl`, `clip_fraction`.
 """
 
 from __future__ import annotations
@@ -17,109 +17,106 @@ from torch import Tensor
 
 from protocol.arrays import Floats
 
-A = TypeVar("A", Tensor, npt.NDArray[Any])
+TensorOrArray = TypeVar("TensorOrArray", Tensor, npt.NDArray[Any])
 
 
-def _of(array: object) -> Any:
-    """The library whose array it is."""
+def library(array: object) -> Any:
+    """Numpy for a numpy array, else torch."""
     return np if isinstance(array, np.ndarray) else torch
 
 
-def _mean(array: A) -> Any:
-    """Of [B]; numpy's own is several times slower where there are few."""
+def mean(array: TensorOrArray) -> Any:
+    """The mean of [B]. numpy's own `mean` is several times slower on short arrays."""
     return array.sum() / len(array)
 
 
-def _clip(array: A, low: float, high: float) -> A:
-    found: A = np.minimum(np.maximum(array, low), high) if isinstance(array, np.ndarray) else array.clamp(low, high)
-    return found
+# -------------------------------------------------------------------- of tensors and numpy arrays
 
 
-def ratio(log_prob: A, before: A) -> tuple[A, A]:
+def ratio(log_prob_now: TensorOrArray, log_prob: TensorOrArray) -> tuple[TensorOrArray, TensorOrArray]:
     """Log ρ and ρ = π(a) / π_old(a), [B] each."""
-    log_ratio = log_prob - before
-    return log_ratio, _of(log_ratio).exp(log_ratio)
+    log_ratio = log_prob_now - log_prob
+    return log_ratio, library(log_ratio).exp(log_ratio)
 
 
-def standardized(advantage: A) -> A:
-    """Advantages [B] less their mean, over their standard deviation; a single row has none and stays as it is."""
+def standardized(advantage: TensorOrArray) -> TensorOrArray:
+    """Advantages [B] with mean 0 and standard deviation 1. A single row has no standard deviation and stays as it is."""
     if len(advantage) < 2:
         return advantage
-    centred = advantage - _mean(advantage)
-    std = ((centred @ centred) / (len(centred) - 1)) ** 0.5
-    found: A = centred / (std + 1e-8)
+    centered = advantage - mean(advantage)
+    std = ((centered @ centered) / (len(centered) - 1)) ** 0.5
+    found: TensorOrArray = centered / (std + 1e-8)
     return found
 
 
-def clipped_surrogate(ratio: A, advantage: A, clip_range: float) -> tuple[A, A]:
-    """PPO's policy loss (Schulman et al. 2017, eq. 7), and its gradient [B] by log π(a).
-
-    L = −E[min(ρ A, clip(ρ, 1−ε, 1+ε) A)],  ρ = π(a) / π_old(a);    ∂L/∂log π(a) = −ρ A / B where ρ A is the lesser
-    """
-    plain, clipped = ratio * advantage, _clip(ratio, 1 - clip_range, 1 + clip_range) * advantage
-    return -_mean(_of(ratio).minimum(plain, clipped)), plain * (plain <= clipped) / -len(ratio)
-
-
-def policy_gradient(log_prob: A, advantage: A) -> tuple[A, A]:
-    """L = −E[A log π(a)] (Sutton et al. 1999), and its gradient [B] by log π(a)."""
-    return (log_prob @ advantage) / -len(advantage), advantage / -len(advantage)
-
-
-def value_loss(value: A, target: A) -> tuple[A, A]:
-    """Mean squared error (as Stable-Baselines3 has it, without the half that others put before it), and its gradient [B]."""
-    error = value - target
-    return (error @ error) / len(error), error * (2 / len(error))
-
-
-def clipped_value_loss(value: A, target: A, before: A, clip_range: float) -> tuple[A, A]:
-    """The value loss of OpenAI's PPO, and its gradient [B]: moving further than this from `before` earns nothing.
-
-    L = E[max((V − G)², (clip(V, V_old−ε, V_old+ε) − G)²)].  Stable-Baselines3 takes the second alone, which also lets go
-    of a value that went too far the wrong way.
-    """
-    moved, error = value - before, value - target
-    xp = _of(value)
-    held = xp.where(abs(moved) <= clip_range, value, before + _clip(moved, -clip_range, clip_range)) - target
-    plain, clipped = error * error, held * held
-    return _mean(xp.maximum(plain, clipped)), error * (plain >= clipped) * (2 / len(error))
-
-
-def huber_loss(error: A, weight: A) -> tuple[Any, A]:
-    """E[w (½ e² where |e| ≤ 1, else |e| − ½)] of errors [B] and weights [B], and its gradient [B] by the errors."""
-    held = _clip(error, -1, 1)
-    weighted = weight * held
-    return weighted @ (error - 0.5 * held) / len(error), weighted / len(error)
-
-
-def squared_loss(error: A, weight: A) -> tuple[Any, A]:
-    """E[w e²] of errors [B] and weights [B], and its gradient [B] by the errors."""
-    weighted = weight * error
-    return weighted @ error / len(error), weighted * (2 / len(error))
-
-
-def entropy_loss(entropy: A) -> tuple[A, A]:
-    """Minus the mean entropy, and its gradient [B]."""
-    return -_mean(entropy), _of(entropy).full_like(entropy, -1 / len(entropy))
-
-
-def approx_kl(log_ratio: A, ratio: A) -> A:
+def approx_kl(log_ratio: TensorOrArray, ratio: TensorOrArray) -> TensorOrArray:
     """KL(π_old ‖ π) estimated by E[(ρ − 1) − log ρ]: unbiased, never negative (Schulman 2020, "Approximating KL")."""
-    found: A = _mean(ratio - 1 - log_ratio)
+    found: TensorOrArray = mean(ratio - 1 - log_ratio)
     return found
 
 
-def clip_fraction(ratio: A, clip_range: float) -> A:
-    """The share of rows whose ratio left [1−ε, 1+ε]."""
-    found: A = _of(ratio).count_nonzero(abs(ratio - 1) > clip_range) / len(ratio)
+def clip_fraction(ratio: TensorOrArray, clip_range: float) -> TensorOrArray:
+    """The fraction of rows whose ratio is outside [1−ε, 1+ε]."""
+    found: TensorOrArray = library(ratio).count_nonzero(abs(ratio - 1) > clip_range) / len(ratio)
     return found
+
+
+# -------------------------------------------------------------------- losses
+
+
+def clipped_surrogate(ratio: Tensor, advantage: Tensor, clip_range: float) -> Tensor:
+    """PPO's policy loss (Schulman et al. 2017, eq. 7): L = −E[min(ρ A, clip(ρ, 1−ε, 1+ε) A)],  ρ = π(a) / π_old(a)."""
+    return -torch.minimum(ratio * advantage, ratio.clamp(1 - clip_range, 1 + clip_range) * advantage).mean()
+
+
+def policy_gradient(log_prob: Tensor, advantage: Tensor) -> Tensor:
+    """L = −E[A log π(a)] (Sutton et al. 1999)."""
+    return -(log_prob * advantage).mean()
+
+
+def value_loss(value: Tensor, target: Tensor) -> Tensor:
+    """Mean squared error, as in Stable-Baselines3: without the factor ½ that other libraries have."""
+    return (value - target).square().mean()
+
+
+def clipped_value_loss(value: Tensor, target: Tensor, old_value: Tensor, clip_range: float) -> Tensor:
+    """The value loss of OpenAI's PPO: a value gains nothing by moving further than `clip_range` from `old_value`.
+
+    L = E[max((V − G)², (clip(V, V_old−ε, V_old+ε) − G)²)].  Stable-Baselines3 takes only the second square. That has no
+    gradient for a value that moved too far in the wrong direction either.
+    """
+    clipped = old_value + (value - old_value).clamp(-clip_range, clip_range)
+    return torch.maximum((value - target).square(), (clipped - target).square()).mean()
+
+
+def entropy_loss(entropy: Tensor) -> Tensor:
+    """Minus the mean entropy."""
+    return -entropy.mean()
+
+
+def huber_loss(error: Tensor, weight: Tensor) -> Tensor:
+    """E[w (½ e² where |e| ≤ 1, else |e| − ½)] of errors [B] and weights [B]."""
+    size = error.abs()
+    return (weight * torch.where(size <= 1, 0.5 * error.square(), size - 0.5)).mean()
+
+
+def squared_loss(error: Tensor, weight: Tensor) -> Tensor:
+    """E[w e²] of errors [B] and weights [B]."""
+    return (weight * error.square()).mean()
+
+
+# -------------------------------------------------------------------- numpy
 
 
 def explained_variance(value: Floats, target: Floats) -> float:
-    """1 − Var(target − value) / Var(target): 1 is perfect, 0 no better than a constant; NaN where targets do not vary."""
-    variance = _variance(target)
+    """1 − Var(target − value) / Var(target): 1 is perfect, 0 is no better than a constant.
+
+    NaN where the targets do not vary, or where there are none.
+    """
+    variance = _variance(target) if len(target) else 0.0
     return 1 - _variance(target - value) / variance if variance > 0 else math.nan
 
 
 def _variance(array: Floats) -> float:
-    centred = array - _mean(array)
-    return float(centred @ centred) / len(array)
+    centered = array - mean(array)
+    return float(centered @ centered) / len(array)

@@ -56,7 +56,7 @@ class RunningMoments:
         self.mean, self._squares = state["mean"].numpy().copy(), state["squares"].numpy().copy()
 
 
-class ObservationNormaliser:
+class ObservationNormalizer:
     """Means and standard deviations of the measured features; one-hot and binary ones are left as they are."""
 
     def __init__(self, spec: PolicySpec) -> None:

@@ -1,73 +1,112 @@
-"""A step of torch's Adam, AdamW or RMSprop on one flat tensor, without the ceremony of `Optimizer.step`.
+"""A step of torch's Adam, AdamW or RMSprop on one flat tensor, without the overhead of `Optimizer.step`.
 
-The law: the same kernels on the same state, so the same bits (a test holds them equal). The state stays the optimiser's
-own, saved and loaded by it; but that denormal numbers are zero meanwhile. For a small network the ceremony takes longer than
-the kernel; and its first step, as making an optimiser, imports torch's compiler only to tell it to keep away: 0.8 s and
-70 MB, which a learner that compiles nothing does without.
+The law: the same kernels on the same state, so the same bits as `Optimizer.step`, with one exception: denormal numbers count
+as zero during the step. The state stays the optimizer's own: the optimizer saves and loads it.
 
-The moments of parameters that have no gradient any more, as those of a dead ReLU, fall to denormal numbers within 800 steps,
-and stay there: a step with them takes a CPU twelve times as long.
+For a small network the overhead of `Optimizer.step` takes longer than the kernel. Besides, making an optimizer and calling
+its first `step` import torch's compiler, only to exclude these methods from compilation. This costs 0.8 s and 70 MB, and a
+learner that compiles nothing does not need it.
+
+Why denormal numbers are flushed: the moments of parameters that get no gradient any more, as behind a dead ReLU, decay to
+denormal numbers within 800 steps and stay there. A step with them takes a CPU twelve times as long.
+
+This file uses private parts of torch: `torch._fused_adam_`, `torch._fused_adamw_`, `__dynamo_disable`. If this version of
+torch lacks such a function, or its function takes other arguments or does something else, we call `Optimizer.step`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache, partial
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.optim import Adam, AdamW, Optimizer, RMSprop
 
-MARK = "__dynamo_disable"
+COMPILER_MARK = "__dynamo_disable"
+
+State = dict[str, Tensor]
+Kernel = Callable[..., Any]
 
 
-def spare_the_compiler() -> None:
-    """Let optimisers be made, saved and loaded without importing it. Where torch does not mark functions so, it does.
+def avoid_compiler_import() -> None:
+    """Let optimizers be made, saved and loaded without importing torch's compiler.
 
-    torch keeps what the compiler made of such a function beside it; we keep the function itself there.
+    Some methods of `Optimizer` are wrapped: the wrapper asks the compiler for a version of the method that is excluded from
+    compilation, and keeps it beside the method. We put the method itself there. Where torch does not wrap these methods in
+    this way, nothing is changed.
     """
     for method in (Optimizer.add_param_group, Optimizer.state_dict, Optimizer.load_state_dict, Optimizer.zero_grad):
-        own = getattr(method, "__wrapped__", None)
-        if own is not None and not hasattr(own, MARK):
-            setattr(own, MARK, own)
+        wrapped = getattr(method, "__wrapped__", None)
+        if wrapped is not None and not hasattr(wrapped, COMPILER_MARK):
+            setattr(wrapped, COMPILER_MARK, wrapped)
 
 
 def take_step(optimizer: Optimizer) -> None:
-    """`optimizer.step()`: fused Adam and AdamW, plain RMSprop, of one tensor that is no leaf of a graph."""
+    """`optimizer.step()` for fused Adam, fused AdamW and plain RMSprop of one flat parameter tensor that has a gradient."""
     (group,) = optimizer.param_groups
     (flat,) = group["params"]
-    state = optimizer.state.get(flat) or _first(optimizer, flat, group)
-    if not state or not flat.is_cpu:
+    step = _step_of(optimizer)
+    if step is None or not flat.is_cpu:
         optimizer.step()
         return
+    state = optimizer.state.get(flat) or _initial_state(optimizer, flat, group)
     optimizer.state[flat] = state
     torch.set_flush_denormal(True)
     try:
-        match optimizer:
-            case AdamW():  # before Adam: in newer versions it is one
-                _adam(torch._fused_adamw_, flat, group, state)
-            case Adam():
-                _adam(torch._fused_adam_, flat, group, state)
-            case RMSprop():
-                _rmsprop(flat, group, state)
-            case _:
-                optimizer.step()
-    finally:  # environments that are evaluated in this thread, and numpy's, count on them
+        step(flat, group, state)
+    finally:  # numpy and environments evaluated in this thread depend on denormal numbers
         torch.set_flush_denormal(False)
 
 
-def _first(optimizer: Optimizer, flat: Tensor, group: dict[str, Any]) -> dict[str, Tensor]:
-    """The state before the first step; none of an optimiser that we do not know, which makes it itself."""
+def _step_of(optimizer: Optimizer) -> Callable[[Tensor, dict[str, Any], State], None] | None:
+    """The step of this kind of optimizer; None if we do not know it, or if this version of torch lacks its kernel."""
     match optimizer:
-        case Adam() | AdamW():
-            names = ["exp_avg", "exp_avg_sq", *(["max_exp_avg_sq"] if group["amsgrad"] else [])]
+        case AdamW():  # before Adam: in newer versions of torch AdamW is a subclass of it
+            return _adam_step("_fused_adamw_", decayed_parameter=0.85)
+        case Adam():
+            return _adam_step("_fused_adam_", decayed_parameter=0.9)
         case RMSprop():
-            names = ["square_avg"]
+            return _rmsprop
         case _:
-            return {}
+            return None
+
+
+def _adam_step(name: str, decayed_parameter: float) -> Callable[[Tensor, dict[str, Any], State], None] | None:
+    """The step by a private function of torch, if there is one of this name that does what we expect."""
+    kernel = getattr(torch, name, None)
+    return partial(_adam, kernel) if kernel is not None and _is_adam(kernel, decayed_parameter) else None
+
+
+@cache
+def _is_adam(kernel: Kernel, decayed_parameter: float) -> bool:
+    """Whether a first step of 0.1 from 1, with a gradient of 1 and a weight decay of 0.5, gives this parameter.
+
+    Adam adds the decay to the gradient, whose length does not matter in a first step: 1 - 0.1. AdamW shrinks the parameter
+    itself: (1 - 0.1 · 0.5) - 0.1.
+    """
+    flat = torch.ones(1)
+    flat.grad = torch.ones(1)
+    group = {"lr": 0.1, "betas": (0.9, 0.999), "eps": 1e-8, "weight_decay": 0.5, "amsgrad": False}
+    state = {"step": torch.zeros(()), "exp_avg": torch.zeros(1), "exp_avg_sq": torch.zeros(1)}
+    try:
+        _adam(kernel, flat, group, state)
+    except (TypeError, RuntimeError, NotImplementedError):  # what torch raises for arguments that it does not know
+        return False
+    return abs(flat.item() - decayed_parameter) < 1e-5
+
+
+def _initial_state(optimizer: Optimizer, flat: Tensor, group: dict[str, Any]) -> State:
+    """The optimizer's state before its first step, with torch's own names."""
+    if isinstance(optimizer, RMSprop):
+        names = ["square_avg"]
+    else:
+        names = ["exp_avg", "exp_avg_sq", *(["max_exp_avg_sq"] if group["amsgrad"] else [])]
     return {"step": torch.zeros(())} | {name: torch.zeros_like(flat) for name in names}
 
 
-def _adam(kernel: Any, flat: Tensor, group: dict[str, Any], state: dict[str, Tensor]) -> None:
+def _adam(kernel: Kernel, flat: Tensor, group: dict[str, Any], state: State) -> None:
     beta1, beta2 = group["betas"]
     state["step"] += 1
     kernel(
@@ -87,7 +126,7 @@ def _adam(kernel: Any, flat: Tensor, group: dict[str, Any], state: dict[str, Ten
     )
 
 
-def _rmsprop(flat: Tensor, group: dict[str, Any], state: dict[str, Tensor]) -> None:
+def _rmsprop(flat: Tensor, group: dict[str, Any], state: State) -> None:
     gradient = flat.grad
     assert gradient is not None
     state["step"] += 1

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from learner.algorithms.a2c import A2C
-from learner.algorithms.actor_critic import Minibatch
+from learner.algorithms.minibatches import Minibatch
 from learner.algorithms.ppo import PPO
 from learner.algorithms.reinforce import REINFORCE
 from learner.algorithms.returns import gae
@@ -44,20 +44,20 @@ def whole(rows: Batch) -> Batch:
 def test_an_update_is_one_step_on_all_valid_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     algorithm = a2c(gamma=0.9, gae_lambda=0.7)
     rows = batch(algorithm, 0)
-    values = algorithm.parts.values(algorithm.parts.see(rows), no_pulse)
+    values = algorithm.values(algorithm.observations(rows), no_pulse)
     expected = gae(rows.reward, values, rows.terminated, rows.truncated, rows.valid, 0.9, 0.7)
-    seen: list[Minibatch] = []
-    step = algorithm.parts.policy_gradient_step
+    assert algorithm.vf_coef > 0
+    minibatches: list[Minibatch] = []
+    step = algorithm.step
 
-    def watched(given: Minibatch, critic: bool = True) -> dict[str, float]:
-        assert critic
-        seen.append(given)
-        return step(given)
+    def recorded_step(minibatch: Minibatch) -> dict[str, float]:
+        minibatches.append(minibatch)
+        return step(minibatch)
 
-    monkeypatch.setattr(algorithm.parts, "policy_gradient_step", watched)
+    monkeypatch.setattr(algorithm, "step", recorded_step)
     algorithm.update(rows, no_pulse)
-    (only,) = seen
-    np.testing.assert_array_equal(only.x, rows.obs[0][:-1][rows.valid])
+    (only,) = minibatches
+    np.testing.assert_array_equal(only.features, rows.obs[0][:-1][rows.valid])
     np.testing.assert_array_equal(only.action, rows.action[rows.valid])
     np.testing.assert_array_equal(only.advantage, expected[rows.valid])
     np.testing.assert_array_equal(only.target, (expected + values[:-1])[rows.valid])

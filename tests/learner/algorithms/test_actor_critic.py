@@ -13,10 +13,11 @@ import torch
 
 from learner.algorithms import Algorithm, algorithm_class
 from learner.algorithms.a2c import A2C
-from learner.algorithms.actor_critic import Minibatch
 from learner.algorithms.impala import Impala
+from learner.algorithms.minibatches import LossInput, Minibatch
+from learner.algorithms.ppo import PPO
 from learner.algorithms.reinforce import REINFORCE
-from learner.config.hyperparameters import HYPERPARAMETERS
+from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
 from protocol.errors import RunError
 from protocol.policy.layout import acting_size
 from protocol.specs import PolicySpec
@@ -49,7 +50,7 @@ def _one_thread() -> Iterator[None]:
 
 def make(name: str, spec: PolicySpec = DISCRETE, seed: int = 0, **settings: Any) -> Any3:
     config = msgspec.convert(settings, HYPERPARAMETERS[name])
-    algorithm = algorithm_class(name)(config, spec, total_steps=10_000, seed=seed)
+    algorithm: Any = algorithm_class(name)(config, spec, total_steps=10_000, seed=seed)
     assert isinstance(algorithm, Any3)
     return algorithm
 
@@ -147,7 +148,7 @@ def test_the_learning_rate_follows_the_steps_used(name: str) -> None:
         rows = batch(algorithm, seed)
         metrics = algorithm.update(rows, no_pulse)
         assert metrics["train/learning_rate"] == pytest.approx(0.01 * left)
-        assert algorithm.parts.version == seed + 1
+        assert algorithm.version == seed + 1
         used += int(rows.valid.sum())
     assert 0 < left < 1
 
@@ -178,7 +179,10 @@ def test_a_loss_that_is_not_finite_is_named_and_stops_before_the_weights(name: s
 @pytest.mark.parametrize("spec", [DISCRETE, GAUSSIAN, shared(DISCRETE), shared(GAUSSIAN)])
 @pytest.mark.parametrize("critic", [True, False])
 def test_a_step_follows_the_gradient_of_the_usual_loss(spec: PolicySpec, critic: bool) -> None:
-    algorithm, generator = make("a2c", spec, vf_coef=0.7, ent_coef=0.3, max_grad_norm=1e9), torch.Generator().manual_seed(0)
+    algorithm, generator = (
+        make("a2c", spec, vf_coef=0.7 if critic else 0.0, ent_coef=0.3, max_grad_norm=1e9),
+        torch.Generator().manual_seed(0),
+    )
     x, advantage, target = (torch.randn(s, generator=generator) for s in [(30, 4), (30,), (30,)])
     params, value = algorithm.net.forward(x)
     if spec.action.kind == "discrete":
@@ -191,9 +195,46 @@ def test_a_step_follows_the_gradient_of_the_usual_loss(spec: PolicySpec, critic:
     value_loss = (value - target).square().mean() if critic else torch.zeros(())
     (policy_loss + 0.7 * value_loss - 0.3 * usual.entropy().mean()).backward()
     expected = algorithm.net.flat_grad.clone()
-    measured = algorithm.parts.policy_gradient_step(Minibatch(x, (), action, advantage, advantage, target), critic)
+    measured = algorithm.step(Minibatch(x, (), action, advantage, advantage, target))
     torch.testing.assert_close(algorithm.net.flat_grad, expected, atol=1e-5, rtol=1e-4)
     assert measured["policy_gradient_loss"] == pytest.approx(policy_loss.item(), rel=1e-4)
+
+
+def test_loss_gradients_are_used_only_for_the_loss_that_they_are_of() -> None:
+    """A subclass with a loss of its own gets autograd; a subclass without one keeps the kernels of its parent."""
+    plain = {"config": PPOConfig(), "policy": DISCRETE, "total_steps": 1, "seed": 0}
+
+    class OtherAdvantages(PPO):
+        def standardizes_advantages(self) -> bool:
+            return False
+
+    class OtherLoss(PPO):
+        def loss(self, rows: LossInput) -> Any:
+            return rows.value.square().mean(), {"penalty": 0.25, "value": rows.value.mean()}
+
+    class LossOfItsChild(OtherLoss):
+        pass
+
+    class BothOthers(OtherLoss):
+        def loss_gradients(self, rows: LossInput) -> Any:
+            zeros = 0 * rows.value
+            return {"approx_kl": 0 * zeros.sum()}, (zeros, zeros, zeros)
+
+    kinds: list[type[PPO]] = [PPO, OtherAdvantages, OtherLoss, LossOfItsChild, BothOthers]
+    made: dict[type[PPO], Any] = {kind: kind(**plain) for kind in kinds}  # type: ignore[arg-type]
+    assert [each._fused is not None for each in made.values()] == [True, True, False, False, True]
+    own = made[OtherLoss]
+    own.stops = lambda metrics: False
+    before = own.net.flat.clone()
+    x = torch.randn((30, 4), generator=torch.Generator().manual_seed(0))
+    value = own.net.value(x)
+    zeros = torch.zeros(30)
+    measured = own.step(Minibatch(x, (), zeros.long(), zeros, zeros, zeros))
+    assert measured["penalty"] == 0.25
+    assert measured["value"] == value.mean().item()
+    acting = own.net.acting_size
+    assert torch.equal(own.net.flat[:acting], before[:acting])
+    assert own.net.value(x).square().mean() < value.square().mean()
 
 
 @pytest.mark.parametrize("optimizer", ["rmsprop", "adam"])
@@ -210,13 +251,13 @@ def test_the_optimisers_are_torchs_on_each_array_of_the_network(optimizer: str) 
     for _ in range(5):
         x, advantage, target = (torch.randn(s, generator=generator) for s in [(30, 4), (30,), (30,)])
         rows = Minibatch(x, (), torch.randint(4, (30,), generator=generator), advantage, 3 * advantage, target)
-        log_prob, _, value = algorithm.parts.forward(rows)
-        loss = -(log_prob * rows.advantage).mean() + 0.5 * (value - target).square().mean()
+        now = algorithm.evaluate(rows)
+        loss = -(now.log_prob_now * rows.advantage).mean() + 0.5 * (now.value - target).square().mean()
         gradients = torch.autograd.grad(loss, list(algorithm.net.parameters.values()))
         for array, gradient in zip(usual, gradients, strict=True):
             array.grad = gradient
         assert torch.nn.utils.clip_grad_norm_(usual, 0.5) > 0.5
-        algorithm.parts.policy_gradient_step(rows)
+        algorithm.step(rows)
         reference.step()
         for array, expected in zip(algorithm.net.parameters.values(), usual, strict=True):
             torch.testing.assert_close(array, expected, atol=2e-5, rtol=1e-4)

@@ -15,9 +15,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from learner.algorithms import algorithm_class, losses
-from learner.algorithms.actor_critic import Minibatch
+from learner.algorithms.actor_critic import Estimates
+from learner.algorithms.kernels import loss_gradients
 from learner.algorithms.kernels import mlp as layers
 from learner.algorithms.kernels.fused import FusedActorCritic, applies
+from learner.algorithms.minibatches import Minibatch
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
 from protocol.arrays import Array
@@ -142,14 +144,14 @@ def test_the_gradient_of_every_loss_is_its_slope_in_float64(policy_loss: str, va
     def loss_and_gradients() -> tuple[float, tuple[Array, Array, Array]]:
         log_prob, entropy, value = fused.forward(x, taken)
         if policy_loss == "policy gradient":
-            first, by_log_prob = losses.policy_gradient(log_prob, advantage)
+            first, by_log_prob = loss_gradients.policy_gradient(log_prob, advantage)
         else:
-            first, by_log_prob = losses.clipped_surrogate(losses.ratio(log_prob, before)[1], advantage, 0.2)
+            first, by_log_prob = loss_gradients.clipped_surrogate(losses.ratio(log_prob, before)[1], advantage, 0.2)
         if value_loss == "squared":
-            second, by_value = losses.value_loss(value, target)
+            second, by_value = loss_gradients.value_loss(value, target)
         else:
-            second, by_value = losses.clipped_value_loss(value, target, value_before, 0.5)
-        third, by_entropy = losses.entropy_loss(entropy)
+            second, by_value = loss_gradients.clipped_value_loss(value, target, value_before, 0.5)
+        third, by_entropy = loss_gradients.entropy_loss(entropy)
         return float(first + 0.5 * second + ent_coef * third), (by_log_prob, ent_coef * by_entropy, 0.5 * by_value)
 
     fused.backward(*loss_and_gradients()[1])
@@ -201,20 +203,24 @@ SETTINGS: list[tuple[str, dict[str, Any]]] = [
 
 @pytest.mark.parametrize("spec", [DISCRETE, normal(GAUSSIAN)], ids=["discrete", "gaussian"])
 @pytest.mark.parametrize(("name", "changes"), SETTINGS)
-def test_an_update_is_the_same_either_way(
+def test_an_update_is_the_same_by_kernels_by_hand_derived_gradients_and_by_autograd(
     name: str, changes: dict[str, Any], spec: PolicySpec, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = msgspec.convert(changes, HYPERPARAMETERS[name])
     spec = shared(spec) if config.shared_net else spec  # type: ignore[attr-defined]
     found: list[tuple[Array, dict[str, float]]] = []
-    for most in (512, 0):
+    built_in: Any = algorithm_class(name)
+    of_its_own_loss: Any = type("OfItsOwnLoss", (built_in,), {"loss": built_in.loss})
+    for algorithm_type, most in ((built_in, 512), (built_in, 0), (of_its_own_loss, 512)):
         monkeypatch.setattr("learner.algorithms.actor_critic.MOST_ROWS", most)
-        algorithm: Any = algorithm_class(name)(config, spec, total_steps=1_000, seed=0)
+        algorithm = algorithm_type(config, spec, total_steps=1_000, seed=0)
+        assert algorithm._hand_derived == (algorithm_type is built_in)
         for seed in range(3):
             metrics = algorithm.update(batch(algorithm, seed, fresh=seed == 0), no_pulse)
         found.append((algorithm.net.flat.numpy().copy(), metrics))
-    np.testing.assert_allclose(found[0][0], found[1][0], atol=2e-5)
-    assert found[0][1] == pytest.approx(found[1][1], rel=1e-3, abs=1e-4, nan_ok=True)
+    for flat, metrics in found[1:]:
+        np.testing.assert_allclose(flat, found[0][0], atol=2e-5)
+        assert metrics == pytest.approx(found[0][1], rel=1e-3, abs=1e-4, nan_ok=True)
 
 
 def test_a_thousand_steps_stay_together() -> None:
@@ -228,11 +234,11 @@ def test_a_thousand_steps_stay_together() -> None:
         action = (x[:, 0] > 0) + 2 * (x[:, 1] > 0)
         target, advantage = x.sum(-1), generator.normal(size=64).astype(np.float32)
         rows = Minibatch(x, (), action, np.full(64, -1.386, np.float32), advantage, target)
-        first = one.step(rows, 0.2)
+        first = one.step(rows)
         tensors: list[Any] = [torch.tensor(part) if len(part) else () for part in rows[:6]]
-        second = other.step(Minibatch(*tensors), 0.2)
+        second = other.step(Minibatch(*tensors))
     assert float((one.net.flat - other.net.flat).abs().max()) < 1e-3
-    assert first._asdict() == pytest.approx(second._asdict(), rel=1e-2, abs=1e-3)
+    assert first == pytest.approx(second, rel=1e-2, abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -291,8 +297,9 @@ def test_large_minibatches_keep_the_graph(monkeypatch: pytest.MonkeyPatch) -> No
         monkeypatch.setattr("learner.algorithms.actor_critic.MOST_ROWS", most)
         algorithm = PPO(PPOConfig(batch_size=30, n_epochs=1), DISCRETE, total_steps=1, seed=0)
         rows = batch(algorithm, 0)
-        given_rows = algorithm.parts.rows(rows, algorithm.parts.see(rows), rows.reward, rows.reward)
+        estimates = Estimates(rows.reward, rows.reward, rows.reward, rows.valid, {})
+        all_rows = algorithm.rows(rows, algorithm.observations(rows), estimates)
         mask = np.zeros_like(rows.valid)
         mask.reshape(-1)[:60] = True
-        kinds.append(type(next(algorithm.parts.minibatches(given_rows, mask, 2)).x))
+        kinds.append(type(next(algorithm.minibatches(all_rows, mask, 2)).features))
     assert kinds == [np.ndarray, torch.Tensor]

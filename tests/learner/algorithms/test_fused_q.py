@@ -13,10 +13,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from learner.algorithms.action_values import WithGraph, WithoutGraph, action_values
 from learner.algorithms.dqn import DQN, LOSSES
 from learner.algorithms.kernels import fused
 from learner.algorithms.kernels import mlp as layers
+from learner.algorithms.kernels.action_values import WithGraph, WithoutGraph, action_values
 from learner.algorithms.kernels.fused import FusedQ
 from learner.algorithms.replay import Sample
 from learner.config.hyperparameters import DQNConfig

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from learner.algorithms.a2c import A2C
-from learner.algorithms.actor_critic import Minibatch
 from learner.algorithms.impala import Impala
+from learner.algorithms.minibatches import Minibatch
 from learner.config.hyperparameters import A2CConfig, ImpalaConfig
 from protocol.specs import PolicySpec
 from tests.learner.algorithms.test_returns import Rows
@@ -70,21 +70,24 @@ def test_on_rows_of_older_weights_it_follows_the_gradient_of_the_papers_loss(spe
 
 
 def watch(algorithm: Impala, monkeypatch: pytest.MonkeyPatch) -> list[Minibatch]:
-    seen: list[Minibatch] = []
-    step = algorithm.parts.policy_gradient_step
+    """The minibatches of each step that the algorithm makes from now on."""
+    assert algorithm.vf_coef > 0
+    minibatches: list[Minibatch] = []
+    step = algorithm.step
 
-    def watched(given: Minibatch, critic: bool = True) -> dict[str, float]:
-        assert critic
-        seen.append(given)
-        return step(given)
+    def recorded_step(minibatch: Minibatch) -> dict[str, float]:
+        minibatches.append(minibatch)
+        return step(minibatch)
 
-    monkeypatch.setattr(algorithm.parts, "policy_gradient_step", watched)
-    return seen
+    monkeypatch.setattr(algorithm, "step", recorded_step)
+    return minibatches
 
 
 def by_row(given: list[Minibatch]) -> list[tuple[float, ...]]:
     """Rows of minibatches, sorted: features, advantage, target."""
-    return sorted((*m.x[i].tolist(), float(m.advantage[i]), float(m.target[i])) for m in given for i in range(len(m.x)))
+    return sorted(
+        (*m.features[i].tolist(), float(m.advantage[i]), float(m.target[i])) for m in given for i in range(len(m.features))
+    )
 
 
 def test_vtrace_is_computed_in_time_order_before_rows_are_shared_out(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -96,10 +99,10 @@ def test_vtrace_is_computed_in_time_order_before_rows_are_shared_out(monkeypatch
     shared_out.update(rows, lambda: pulses.append(1))
     count = int(rows.valid.sum())
     assert len(once) == 1
-    assert {len(each.x) for each in parts} <= {count // 4, count // 4 + 1}
+    assert {len(each.features) for each in parts} <= {count // 4, count // 4 + 1}
     assert len(parts) == 4 < len(pulses)
     assert by_row(parts) == by_row(once)
-    assert parts[0].x.tolist() != sorted(parts[0].x.tolist())
+    assert parts[0].features.tolist() != sorted(parts[0].features.tolist())
 
 
 def test_vtrace_is_computed_anew_for_each_epoch(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -108,7 +111,7 @@ def test_vtrace_is_computed_anew_for_each_epoch(monkeypatch: pytest.MonkeyPatch)
     rows = batch(algorithm, 0)
     algorithm.update(rows, no_pulse)
     first, second = seen
-    assert sorted(first.x.tolist()) == sorted(second.x.tolist())
+    assert sorted(first.features.tolist()) == sorted(second.features.tolist())
     assert by_row([first]) != by_row([second])
 
 

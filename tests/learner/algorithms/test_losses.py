@@ -2,34 +2,59 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from learner.algorithms import losses
+from learner.algorithms.kernels import loss_gradients
+
+Case = Callable[[Any, Any, Callable[[Tensor], Any]], Any]
+
+GENERATOR = torch.Generator().manual_seed(0)
+X = 0.5 * torch.randn(50, generator=GENERATOR, dtype=torch.float64)
+ADVANTAGE, TARGET = torch.randn(2, 50, generator=GENERATOR, dtype=torch.float64)
+WEIGHT = torch.rand(50, generator=GENERATOR, dtype=torch.float64)
+
+CASES: dict[str, Case] = {  # (module that has the loss, x, conversion of the other arguments) -> what its function returns
+    "clipped surrogate": lambda of, x, to: of.clipped_surrogate(losses.ratio(x, 0 * x)[1], to(ADVANTAGE), 0.2),
+    "policy gradient": lambda of, x, to: of.policy_gradient(x, to(ADVANTAGE)),
+    "clipped value": lambda of, x, to: of.clipped_value_loss(x, to(TARGET), to(ADVANTAGE), 0.4),
+    "value": lambda of, x, to: of.value_loss(x, to(TARGET)),
+    "entropy": lambda of, x, to: of.entropy_loss(x),
+    "huber": lambda of, x, to: of.huber_loss(x, to(WEIGHT)),
+    "squared": lambda of, x, to: of.squared_loss(x, to(WEIGHT)),
+}
 
 
-def test_gradients_derived_by_hand_are_those_of_autograd() -> None:
-    generator = torch.Generator().manual_seed(0)
-    log_ratio = (0.5 * torch.randn(50, generator=generator, dtype=torch.float64)).requires_grad_()
-    advantage, target = torch.randn(2, 50, generator=generator, dtype=torch.float64)
-    ratio = log_ratio.exp()
-    cases = {
-        "policy": (losses.clipped_surrogate(ratio, advantage, 0.2), log_ratio),
-        "plain policy": (losses.policy_gradient(log_ratio, advantage), log_ratio),
-        "clipped value": (losses.clipped_value_loss(log_ratio, target, advantage, 0.4), log_ratio),
-        "value": (losses.value_loss(log_ratio, target), log_ratio),
-        "entropy": (losses.entropy_loss(log_ratio), log_ratio),
-    }
-    for name, ((loss, gradient), by) in cases.items():
-        (expected,) = torch.autograd.grad(loss, by, retain_graph=True)
-        torch.testing.assert_close(gradient.detach(), expected, msg=name)
-    assert (losses.clipped_surrogate(ratio, advantage, 0.2)[1] == 0).any()  # some rows are clipped
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("numpy", [False, True])
+def test_losses_with_gradients_derived_by_hand_are_those_of_autograd(name: str, numpy: bool) -> None:
+    """In float64, with torch tensors and with numpy arrays."""
+    x = (3 * X if name == "huber" else X).clone().requires_grad_()  # some errors beyond 1
+    loss = CASES[name](losses, x, lambda other: other)
+    (expected,) = torch.autograd.grad(loss, x)
+    if numpy:
+        found = CASES[name](loss_gradients, x.detach().numpy(), Tensor.numpy)
+    else:
+        found = CASES[name](loss_gradients, x.detach(), lambda other: other)
+    torch.testing.assert_close(torch.as_tensor(found[0]), loss.detach())
+    torch.testing.assert_close(torch.as_tensor(found[1]), expected)
+
+
+def test_the_cases_of_the_losses_reach_every_branch() -> None:
+    assert (loss_gradients.clipped_surrogate(X.exp(), ADVANTAGE, 0.2)[1] == 0).any()  # some rows are clipped
+    assert (loss_gradients.clipped_value_loss(X, TARGET, ADVANTAGE, 0.4)[1] == 0).any()
+    assert ((3 * X).abs() > 1).any()
 
 
 def test_surrogate_is_the_papers() -> None:
     ratio, advantage = torch.tensor([0.5, 0.5, 1.5, 1.5, 1.1]), torch.tensor([1.0, -1.0, 1.0, -1.0, 2.0])
-    loss, _ = losses.clipped_surrogate(ratio, advantage, 0.2)
+    loss = losses.clipped_surrogate(ratio, advantage, 0.2)
     torch.testing.assert_close(loss, -torch.tensor([0.5, -0.8, 1.2, -1.5, 2.2]).mean())
     assert losses.clip_fraction(ratio, 0.2).item() == pytest.approx(0.8)
 
@@ -37,7 +62,7 @@ def test_surrogate_is_the_papers() -> None:
 def test_a_clipped_value_earns_nothing_by_moving_further() -> None:
     """Before 0, clipped to ±1, target 5: at 0.5 it is drawn on, at 2 it has gone far enough, at −2 it is drawn back."""
     value, target = torch.tensor([0.5, 2.0, -2.0]), torch.tensor([5.0, 5.0, 5.0])
-    loss, gradient = losses.clipped_value_loss(value, target, torch.zeros(3), 1.0)
+    loss, gradient = loss_gradients.clipped_value_loss(value, target, torch.zeros(3), 1.0)
     torch.testing.assert_close(loss, torch.tensor([4.5**2, 4.0**2, 7.0**2]).mean())
     torch.testing.assert_close(gradient, torch.tensor([-9.0, 0.0, -14.0]) / 3)
 

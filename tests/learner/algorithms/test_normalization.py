@@ -12,7 +12,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from learner.algorithms.normalization import ObservationNormaliser, RewardScaler, RunningMoments
+from learner.algorithms.normalization import ObservationNormalizer, RewardScaler, RunningMoments
 from protocol.arrays import Array
 from protocol.policy.layout import buffer_size
 from protocol.rollout import Batch
@@ -64,10 +64,10 @@ def test_only_measured_features_of_valid_rows_are_counted() -> None:
     valid = np.ones((5, 4), bool)
     valid[2, 1] = valid[3, 3] = False
     x[~valid] = np.nan
-    normaliser = ObservationNormaliser(SPEC)
-    assert normaliser.buffers().tolist() == [0.0] * 6 + [1.0] * 6
-    normaliser.update(x, valid)
-    buffers = normaliser.buffers()
+    normalizer = ObservationNormalizer(SPEC)
+    assert normalizer.buffers().tolist() == [0.0] * 6 + [1.0] * 6
+    normalizer.update(x, valid)
+    buffers = normalizer.buffers()
     assert buffers.dtype == np.float32
     assert buffers.shape == (buffer_size(SPEC),)
     measured = [0, 1, 5]
@@ -187,9 +187,9 @@ def test_the_state_goes_through_a_file(steps: int) -> None:
     np.testing.assert_array_equal(again.scale(following), scaler.scale(following))
 
     x = np.random.default_rng(0).normal(size=(2, 3, 6)).astype(np.float32)
-    normaliser, restored = ObservationNormaliser(SPEC), ObservationNormaliser(SPEC)
-    normaliser.update(x, np.ones((2, 3), bool))
-    restored.load_state_dict(through_a_file(normaliser.state_dict()))
-    for each in (normaliser, restored):
+    normalizer, restored = ObservationNormalizer(SPEC), ObservationNormalizer(SPEC)
+    normalizer.update(x, np.ones((2, 3), bool))
+    restored.load_state_dict(through_a_file(normalizer.state_dict()))
+    for each in (normalizer, restored):
         each.update(x * 2, np.ones((2, 3), bool))
-    np.testing.assert_array_equal(restored.buffers(), normaliser.buffers())
+    np.testing.assert_array_equal(restored.buffers(), normalizer.buffers())

@@ -7,12 +7,15 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
 from torch import Tensor
 from torch.optim import SGD, Adam, AdamW, Optimizer, RMSprop
 
+from learner.algorithms.kernels import optimizer_step
 from learner.algorithms.kernels.optimizer_step import take_step
 
 KINDS: dict[str, Callable[[list[Tensor]], Optimizer]] = {
@@ -48,6 +51,55 @@ def test_bits_are_the_optimisers(kind: str) -> None:
     optimizers[0].step()
     take_step(resumed)
     assert torch.equal(*flats)
+
+
+class _TorchWith:
+    """torch as the module under test sees it, with other private functions, or with none."""
+
+    def __init__(self, private: Callable[..., None] | None) -> None:
+        self._private = private
+
+    def __getattr__(self, name: str) -> Any:
+        return self._private if name in {"_fused_adam_", "_fused_adamw_"} else getattr(torch, name)
+
+
+def _takes_other_arguments(*, parameters: list[Tensor]) -> None:
+    raise AssertionError(parameters)
+
+
+def _does_something_else(flats: list[Tensor], *_: object, **__: object) -> None:
+    flats[0].zero_()
+
+
+def _is_refused(*_: object, **__: object) -> None:
+    raise RuntimeError("torch does not know these arguments")
+
+
+@pytest.mark.parametrize("kind", ["adam", "amsgrad", "adamw", "adamw amsgrad"])
+@pytest.mark.parametrize("private", [None, _takes_other_arguments, _does_something_else, _is_refused])
+def test_without_torchs_private_functions_steps_are_the_optimizers_own(
+    kind: str, private: Callable[..., None] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Torch itself still has them here, so the bits are the same; from the first step or after steps by the kernel."""
+    generator = torch.Generator().manual_seed(0)
+    start, gradients = torch.randn(1001, generator=generator), torch.randn(6, 1001, generator=generator)
+    found = []
+    for kernel_steps in (6, 3, 0):
+        flat = start.clone()
+        optimizer = KINDS[kind]([flat])
+        own_step = Mock(wraps=optimizer.step)
+        monkeypatch.setattr(optimizer, "step", own_step)
+        for i, gradient in enumerate(gradients):
+            flat.grad = gradient.clone()
+            with pytest.MonkeyPatch.context() as patch:
+                if i >= kernel_steps:
+                    patch.setattr(optimizer_step, "torch", _TorchWith(private))
+                take_step(optimizer)
+        assert own_step.call_count == 6 - kernel_steps
+        found.append((flat, optimizer.state_dict()["state"]))
+    for flat, state in found[1:]:
+        assert torch.equal(flat, found[0][0])
+        torch.testing.assert_close(state, found[0][1], rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("kind", ["adam", "amsgrad", "adamw", "rmsprop"])

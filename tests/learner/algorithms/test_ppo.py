@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from learner.algorithms import Algorithm, algorithm_class
-from learner.algorithms.actor_critic import Minibatch
+from learner.algorithms.minibatches import Minibatch
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import PPOConfig
 from protocol.errors import RunError
@@ -149,11 +149,11 @@ def test_minibatches_hold_each_valid_row_once_an_epoch_in_nearly_equal_parts(mon
     seen: list[Minibatch] = []
     step = algorithm.step
 
-    def watched(rows: Minibatch, clip_range: float) -> Any:
-        seen.append(rows)
-        return step(rows, clip_range)
+    def recorded_step(minibatch: Minibatch) -> dict[str, float]:
+        seen.append(minibatch)
+        return step(minibatch)
 
-    monkeypatch.setattr(algorithm, "step", watched)
+    monkeypatch.setattr(algorithm, "step", recorded_step)
     rows = batch(algorithm, 0)
     pulses: list[int] = []
     algorithm.update(rows, lambda: pulses.append(1))
@@ -163,7 +163,7 @@ def test_minibatches_hold_each_valid_row_once_an_epoch_in_nearly_equal_parts(mon
     assert len(pulses) >= 2 * parts
     assert {len(each.target) for each in seen} <= {count // parts, count // parts + 1}
     expected = sorted(map(tuple, rows.obs[0][:-1][rows.valid].tolist()))
-    epochs = [np.concatenate([each.x for each in seen[at : at + parts]]).tolist() for at in (0, parts)]
+    epochs = [np.concatenate([each.features for each in seen[at : at + parts]]).tolist() for at in (0, parts)]
     assert epochs[0] != epochs[1]
     for epoch in epochs:
         assert sorted(map(tuple, epoch)) == expected
@@ -197,7 +197,7 @@ def test_schedules_follow_the_steps_used() -> None:
     algorithm = ppo(msgspec.structs.replace(EVERYTHING, learning_rate=1.0e-3, clip_range=0.2))
     found = []
     for seed in range(3):
-        left = 1 - algorithm.parts.env_steps / 10_000
+        left = 1 - algorithm.env_steps / 10_000
         metrics = algorithm.update(batch(algorithm, seed), no_pulse)
         assert metrics["train/learning_rate"] == pytest.approx(1e-3 * left)
         assert metrics["train/clip_range"] == pytest.approx(0.2 * left)
@@ -261,10 +261,10 @@ def test_a_step_follows_the_gradient_of_the_usual_loss(spec: PolicySpec) -> None
     policy_loss = -torch.min(ratio * a, ratio.clamp(0.9, 1.1) * a).mean()
     (policy_loss + 0.7 * (value - target).square().mean() - 0.3 * usual.entropy().mean()).backward()
     expected = algorithm.net.flat_grad.clone()
-    measured = algorithm.step(Minibatch(x, (), action, old, advantage, target), 0.1)
+    measured = algorithm.step(Minibatch(x, (), action, old, advantage, target))
     torch.testing.assert_close(algorithm.net.flat_grad, expected, atol=1e-5, rtol=1e-4)
-    assert measured.clip_fraction > 0
-    assert measured.policy_gradient_loss == pytest.approx(policy_loss.item(), rel=1e-4)
+    assert measured["clip_fraction"] > 0
+    assert measured["policy_gradient_loss"] == pytest.approx(policy_loss.item(), rel=1e-4)
 
 
 def test_clipped_values_move_less() -> None:
@@ -276,10 +276,10 @@ def test_clipped_values_move_less() -> None:
         )
         algorithm = ppo(config)
         rows = batch(algorithm, 0)
-        seen = algorithm.parts.see(rows)
-        before = algorithm.parts.values(seen, no_pulse)
+        seen = algorithm.observations(rows)
+        before = algorithm.values(seen, no_pulse)
         algorithm.update(rows, no_pulse)
-        moved.append(float(np.abs(algorithm.parts.values(seen, no_pulse) - before)[:-1][rows.valid].mean()))
+        moved.append(float(np.abs(algorithm.values(seen, no_pulse) - before)[:-1][rows.valid].mean()))
     assert moved[0] > 0.4
     assert moved[1] < 0.6 * moved[0]
 
@@ -297,7 +297,7 @@ def test_a_step_with_clipped_values_follows_the_gradient_of_the_usual_loss(befor
     clipped = old + (value - old).clamp(-0.5, 0.5)
     torch.maximum((value - target).square(), (clipped - target).square()).mean().backward()  # type: ignore[no-untyped-call]
     expected = algorithm.net.flat_grad.clone()[algorithm.net.acting_size :]
-    algorithm.step(Minibatch(x, (), torch.zeros(30, dtype=torch.int64), torch.zeros(30), target - old, target), 0.2)
+    algorithm.step(Minibatch(x, (), torch.zeros(30, dtype=torch.int64), torch.zeros(30), target - old, target))
     found = algorithm.net.flat_grad[algorithm.net.acting_size :]
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-4)
 

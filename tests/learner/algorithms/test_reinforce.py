@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from learner.algorithms.actor_critic import Minibatch
+from learner.algorithms.minibatches import LossInput, Minibatch
 from learner.algorithms.reinforce import REINFORCE
 from learner.config.hyperparameters import REINFORCEConfig
 from learner.config.layers import resolve
@@ -55,24 +55,24 @@ def test_it_learns_from_the_known_returns_alone(
 ) -> None:
     algorithm = reinforce(spec, baseline=baseline, normalize_returns=normalize)
     rows = batch(algorithm, 0)
-    values = algorithm.parts.values(algorithm.parts.see(rows), no_pulse)
+    values = algorithm.values(algorithm.observations(rows), no_pulse)
     expected = slow_returns(rows, values if baseline else None)
     assert 0 < len(expected) < rows.valid.sum()
     advantage = np.array([g - (values[t, n] if baseline else 0) for t, n, g in expected])
     if normalize:
         advantage = (advantage - advantage.mean()) / advantage.std(ddof=1)
-    seen: list[Minibatch] = []
-    step = algorithm.parts.policy_gradient_step
+    assert (algorithm.vf_coef > 0) == baseline
+    evaluated: list[tuple[Minibatch, LossInput]] = []
+    evaluate = algorithm.evaluate
 
-    def watched(given: Minibatch, critic: bool = True) -> dict[str, float]:
-        assert critic == baseline
-        seen.append(given)
-        return step(given, critic)
+    def recorded_evaluate(minibatch: Minibatch) -> LossInput:
+        evaluated.append((minibatch, evaluate(minibatch)))
+        return evaluated[-1][1]
 
-    monkeypatch.setattr(algorithm.parts, "policy_gradient_step", watched)
+    monkeypatch.setattr(algorithm, "evaluate", recorded_evaluate)
     metrics = algorithm.update(rows, no_pulse)
-    (only,) = seen
-    np.testing.assert_array_equal(only.x, [rows.obs[0][t, n] for t, n, _ in expected])
+    ((minibatch, only),) = evaluated
+    np.testing.assert_array_equal(minibatch.features, [rows.obs[0][t, n] for t, n, _ in expected])
     np.testing.assert_allclose(only.advantage, advantage, atol=1e-4)
     if baseline:
         np.testing.assert_allclose(only.target, [g for _, _, g in expected], atol=1e-4)
@@ -110,7 +110,7 @@ def test_a_batch_in_which_no_episode_ends_is_counted_and_changes_no_weight() -> 
     metrics = algorithm.update(rows, no_pulse)
     assert torch.equal(algorithm.net.flat, before)
     assert (metrics["train/rows_used"], metrics["train/rows_dropped"]) == (0, none.size)
-    assert (algorithm.parts.env_steps, algorithm.parts.version) == (none.size, 1)
+    assert (algorithm.env_steps, algorithm.version) == (none.size, 1)
 
 
 def spec_of(env: EnvSpec, steps: int, algo: str = "reinforce") -> int:

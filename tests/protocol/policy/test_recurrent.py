@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from learner.algorithms import algorithm_class
-from learner.algorithms.actor_critic import Minibatch
+from learner.algorithms.actor_critic import Estimates
+from learner.algorithms.minibatches import Minibatch
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
 from learner.evaluate import evaluate
@@ -204,15 +205,15 @@ def test_a_minibatch_is_whole_columns_and_every_valid_row_is_in_one(parts: int) 
     rows = batch(ppo, 0)
     count = np.arange(rows.valid.size, dtype=np.float32).reshape(rows.valid.shape)
     rows = msgspec.structs.replace(rows, state=np.repeat(np.arange(6, dtype=np.float32)[:, None], 8, 1))
-    given = ppo.parts.rows(rows, ppo.parts.see(rows), count, count)
-    found = list(ppo.parts.minibatches(given, rows.valid, parts))
+    given = ppo.rows(rows, ppo.observations(rows), Estimates(count, count, count, rows.valid, {}))
+    found = list(ppo.minibatches(given, rows.valid, parts))
     assert len(found) == min(parts, 6)
     assert sorted(torch.cat([each.target for each in found]).tolist()) == count[rows.valid].tolist()
     for each in found:
         assert each.recurrent is not None
         assert each.recurrent.output_rows is not None
         columns = each.recurrent.initial_state[:, 0].long()
-        x = each.x.view(len(rows.valid), len(columns), 4)
+        x = each.features.view(len(rows.valid), len(columns), 4)
         np.testing.assert_array_equal(x.numpy(), rows.obs[0][:-1][:, columns.numpy()])
         t, column = each.recurrent.output_rows // len(columns), columns[each.recurrent.output_rows % len(columns)]
         assert (each.target == (t * 6 + column).float()).all()  # each row is the one that the core is asked for
@@ -231,21 +232,20 @@ def test_what_a_copy_did_before_its_episode_changes_nothing(name: str, core: Cor
     other = batch(algorithm, 0)
     other.obs[0][: t + 1, n] += 1
     other.state[n] += 1
-    parts = algorithm.parts
-    values, others = (parts.values(parts.see(each), no_pulse) for each in (rows, other))
+    values, others = (algorithm.values(algorithm.observations(each), no_pulse) for each in (rows, other))
     assert (values[: t + 1, n] != others[: t + 1, n]).any()
     np.testing.assert_array_equal(values[t + 1 :, n], others[t + 1 :, n])
-    log_probs, others = (parts.log_probs(parts.see(each), each, no_pulse) for each in (rows, other))
+    log_probs, others = (algorithm.log_probs(algorithm.observations(each), each, no_pulse) for each in (rows, other))
     np.testing.assert_array_equal(log_probs[t + 1 :, n], others[t + 1 :, n])
     np.testing.assert_array_equal(np.delete(log_probs, n, 1), np.delete(others, n, 1))
 
 
-def test_values_are_the_same_however_many_columns_are_looked_at_together(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_values_are_the_same_however_many_columns_are_evaluated_together(monkeypatch: pytest.MonkeyPatch) -> None:
     ppo = PPO(PPOConfig(), recurrent(DISCRETE, "lstm"), total_steps=1000, seed=0)
     rows = batch(ppo, 0)
-    whole = ppo.parts.values(ppo.parts.see(rows), no_pulse)
-    monkeypatch.setattr("learner.algorithms.actor_critic.AT_ONCE", 45)
-    np.testing.assert_allclose(ppo.parts.values(ppo.parts.see(rows), no_pulse), whole, atol=1e-6)
+    whole = ppo.values(ppo.observations(rows), no_pulse)
+    monkeypatch.setattr("learner.algorithms.actor_critic.CHUNK_ROWS", 45)
+    np.testing.assert_allclose(ppo.values(ppo.observations(rows), no_pulse), whole, atol=1e-6)
 
 
 SETTINGS: dict[str, dict[str, Any]] = {

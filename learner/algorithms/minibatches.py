@@ -1,0 +1,100 @@
+"""Rows of a batch as the network takes them, and the selection of minibatches from them.
+
+A batch has T rows of each of ΣN env copies (columns); row and column numbers count them as one flat sequence of T · ΣN rows
+in time order. B is the number of rows of a minibatch, and C the number of its columns where the policy has a recurrent core.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from protocol.arrays import Floats
+from protocol.policy.networks import RecurrentInput
+
+Index = Tensor | slice
+
+
+class NetworkInput(NamedTuple):
+    """The arguments of an actor-critic network's forward pass."""
+
+    features: Tensor  # [B, D] float32, normalized
+    images: tuple[Tensor, ...]  # [B, *leaf] uint8 each
+    recurrent: RecurrentInput | None  # None without a core
+
+
+class Observations(NamedTuple):
+    """The T+1 observations of ΣN env copies, normalized by the statistics that the workers acted under."""
+
+    raw_features: Floats  # [T+1, ΣN, D], not normalized
+    features: Tensor  # [(T+1) · ΣN, D] float32, normalized
+    images: tuple[Tensor, ...]  # [(T+1) · ΣN, *leaf] uint8 each
+    recurrent: RecurrentInput  # for all T+1 steps; its state has size 0 without a core
+
+    def network_input(self, steps: int, columns: Index, rows: Index) -> NetworkInput:
+        """The input for `rows`, which must be the first `steps` steps of `columns` if the policy has a core."""
+        state, keep_state, _ = self.recurrent
+        recurrent = RecurrentInput(state[columns], keep_state[:steps, columns]) if state.shape[1] else None
+        return NetworkInput(self.features[rows], tuple(image[rows] for image in self.images), recurrent)
+
+
+class Minibatch(NamedTuple):
+    """B rows of a batch: tensors, or numpy arrays where the network is evaluated in numpy (`kernels.fused`)."""
+
+    features: Any  # [B, D] float32, normalized
+    images: tuple[Any, ...]  # [B, *leaf] uint8 each
+    action: Any  # [B, *action] int64, or float32 not clipped
+    log_prob: Any  # [B] float32, of the action under the policy that acted
+    advantage: Any  # [B] float32, not standardized
+    target: Any  # [B] float32, what the value is fitted to
+    recurrent: RecurrentInput | None = None  # with a core, features and images are [T · C, …], and it selects B of them
+
+    def in_numpy(self) -> Minibatch:
+        """The same memory as numpy arrays. Only for policies without images and without a core."""
+        features, _, action, log_prob, advantage, target, _ = self
+        return Minibatch(features.numpy(), (), action.numpy(), log_prob.numpy(), advantage.numpy(), target.numpy())
+
+    def select(self, rows: Any, input_rows: Tensor | None = None, recurrent: RecurrentInput | None = None) -> Minibatch:
+        """A copy of some rows. `input_rows`: the rows that the network takes, where a core needs more than these."""
+        input_rows = rows if input_rows is None else input_rows
+        return Minibatch(
+            self.features[input_rows],
+            tuple(image[input_rows] for image in self.images),
+            self.action[rows],
+            self.log_prob[rows],
+            self.advantage[rows],
+            self.target[rows],
+            recurrent,
+        )
+
+    def select_columns(self, columns: Tensor, mask: Tensor) -> Minibatch:
+        """The rows of whole columns, in time order, where `mask` [T, ΣN] is True; the core processes the other rows too."""
+        assert self.recurrent is not None
+        state, keep_state, _ = self.recurrent
+        rows = rows_of_columns(len(keep_state), keep_state.shape[1], columns)
+        selected = mask.flatten()[rows]
+        recurrent = RecurrentInput(state[columns], keep_state[:, columns], torch.nonzero(selected)[:, 0])
+        return self.select(rows[selected], rows, recurrent)
+
+
+class LossInput(NamedTuple):
+    """What a loss is computed from: B rows of a minibatch, and what the network says of them now.
+
+    Tensors for `ActorCritic.loss`; for `ActorCritic.loss_gradients` tensors or numpy arrays.
+    """
+
+    action: Any  # [B, *action]
+    log_prob: Any  # [B] log-probability of the action under the policy that acted
+    advantage: Any  # [B], standardized if the settings ask for it
+    raw_advantage: Any  # [B], not standardized
+    target: Any  # [B]
+    log_prob_now: Any  # [B] log-probability of the action under the present policy
+    entropy: Any  # [B], of the present policy
+    value: Any  # [B]
+
+
+def rows_of_columns(steps: int, columns: int, chosen: Tensor) -> Tensor:
+    """The numbers of all rows of the chosen columns, in time order, where there are `steps` times `columns` rows."""
+    return (torch.arange(steps, device=chosen.device)[:, None] * columns + chosen).flatten()
