@@ -20,6 +20,8 @@ from protocol.errors import UsageError, UserFacingError, first_line
 
 ABOUT = "Worker processes step copies of a gymnasium environment; one learner trains a policy in PyTorch."
 HELP_FLAGS = ("-h", "--help")
+NOT_IN_WORKERS = {"matplotlib", "prometheus_client", "rich", "safetensors", "tensorboard", "tomli_w", "torch", "tyro"}
+"""Packages that the learner needs and a worker does not: an installation for workers alone lacks them."""
 
 
 class Command(NamedTuple):
@@ -51,10 +53,16 @@ def main(argv: list[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output (`| head`) has gone: a message would reach nobody
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except ModuleNotFoundError as error:
+        if error.name not in NOT_IN_WORKERS:
+            return _internal_error(argv, error)
+        _print_error(
+            f"millrace: {argv[0]} needs {error.name}, which is not installed: worker, status and keys do without; "
+            "pip install millrace-rl installs the rest"
+        )
+        return _failed(argv, 2)
     except Exception as error:
-        hint = "" if "--debug" in argv else "; --debug shows the traceback"
-        _print_error(f"millrace: internal error: {type(error).__name__}: {first_line(error)}{hint}")
-        return _failed(argv, 1)
+        return _internal_error(argv, error)
 
 
 def _dispatch(argv: list[str]) -> int:
@@ -339,6 +347,12 @@ LAUNCHERS = {
 
 def _print_error(line: str) -> None:
     print(line, file=sys.stderr)
+
+
+def _internal_error(argv: list[str], error: Exception) -> int:
+    hint = "" if "--debug" in argv else "; --debug shows the traceback"
+    _print_error(f"millrace: internal error: {type(error).__name__}: {first_line(error)}{hint}")
+    return _failed(argv, 1)
 
 
 def _failed(argv: list[str], exit_code: int) -> int:

@@ -48,6 +48,20 @@ def thin(tmp_path: Path) -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])}
 
 
+def test_other_commands_say_what_is_missing(thin: dict[str, str]) -> None:
+    for command in ("train", "evaluate", "plot"):
+        done = subprocess.run(
+            [sys.executable, "-m", "millrace", command, "x"],
+            env=thin,
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+        assert done.returncode == 2
+        assert re.fullmatch(rf"millrace: {command} needs \w+, which is not installed: .*\n", done.stderr), done.stderr
+
+
 def millrace(thin: dict[str, str], *argv: str, exit_code: int = 0) -> str:
     done = subprocess.run(
         [sys.executable, "-m", "millrace", *argv], env=thin, capture_output=True, text=True, timeout=60, check=False
