@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks.peers import install
+from learner.config.layers import config_of_run
 from learner.run_folder.metrics_log import read_rows
-from learner.run_folder.run_folder import RunFolder
 
 ROOT = Path(__file__).parents[1]
 COMMON: dict[str, Any] = {"env": "CartPole-v1", "eval_every": 5000, "eval_episodes": 20}
@@ -169,7 +169,7 @@ def run(
             raise RuntimeError(f"{contender} ended with {process.returncode}: {out.read_text()[-500:]}")
         if each.ours:
             (table,) = Path(folder).rglob("metrics.jsonl")
-            config = RunFolder.open(table.parent).config()
+            config = config_of_run(table.parent)
             updates = [(int(row["time/total_timesteps"]), row["time/time_elapsed"]) for row in read_rows(table)]
             early = config.steps - updates[-1][0] > 2 * config.envs * config.algorithm.rollout_steps
             return Ran(wall_s if early else math.nan, updates)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import msgspec
 
 from learner.config.config import Config
-from learner.config.layers import resolve
+from learner.config.layers import config_of_run, resolve
 from learner.evaluate import evaluate, load_policy
 from learner.run_folder.results import Evaluation, Summary
 from learner.run_folder.run_folder import RunFolder, Which
@@ -57,7 +57,7 @@ class Run(NamedTuple):
 def read(path: Path) -> Run | None:
     """A run that ended, or None."""
     folder = RunFolder.open(path)
-    config, summary = folder.config(), folder.summary()
+    config, summary = config_of_run(path), folder.summary()
     if summary is None:
         return None
     best = _played(path, summary.best.evaluation if summary.best else None, "best")

@@ -41,6 +41,12 @@ def config_from_toml(text: str, where: str = "config.toml") -> Config:
     return validate(_override_from_toml(Config(), _parse_toml(text, where), where), where)
 
 
+def config_of_run(run: Path) -> Config:
+    """The settings of a run folder, from its config.toml. Raises `UsageError`."""
+    where = run / "config.toml"
+    return config_from_toml(where.read_text(), str(where))
+
+
 def lower_layers(
     env: str,
     *,

@@ -6,14 +6,13 @@ import re
 import tomllib
 from pathlib import Path
 
-from learner.config.config import Config
 from learner.run_folder.checkpoint import FOLDER, SUFFIX
-from learner.run_folder.run_folder import sanitised
+from learner.run_folder.run_folder import RunSettings, sanitised
 
 AUTO = Path("auto")
 
 
-def newest_run(config: Config) -> Path | None:
+def newest_run(config: RunSettings) -> Path | None:
     """The newest run folder in `run_dir` of this environment, algorithm and seed that holds a checkpoint, if there is one.
 
     A folder's name ends in the time when its run began, so the newest is the last by name.
@@ -24,7 +23,7 @@ def newest_run(config: Config) -> Path | None:
     return max((path for path in found if _is_of(path, config)), key=lambda path: path.name, default=None)
 
 
-def _is_of(path: Path, config: Config) -> bool:
+def _is_of(path: Path, config: RunSettings) -> bool:
     """A learner that was killed before its first checkpoint left nothing to go on with; nor does half a folder."""
     try:
         table = tomllib.loads((path / "config.toml").read_text())

@@ -20,7 +20,7 @@ import re
 import shutil
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal, Protocol
 
 import msgspec
 import numpy as np
@@ -33,9 +33,6 @@ from protocol.env_spec import EnvSpec, Scalar
 from protocol.errors import RunError, UsageError
 from protocol.policy.layout import Field, buffer_layout, named_views, parameter_layout, total_size
 from protocol.specs import PolicySpec
-
-if TYPE_CHECKING:
-    from learner.config.config import Config  # brings torch along, and reading a policy needs none
 
 POLICY_FORMAT = 1
 Which = Literal["final", "best"]
@@ -71,6 +68,34 @@ class PolicyCard(msgspec.Struct, frozen=True, kw_only=True):
     """arrays that are not parameters: the mean and standard deviation that observations are normalised with"""
 
 
+class RunSettings(Protocol):
+    """What a run folder needs of the settings of its run: `Config` has it."""
+
+    @property
+    def env(self) -> str:
+        """Environment id."""
+        ...
+
+    @property
+    def algo(self) -> str:
+        """Name of the algorithm."""
+        ...
+
+    @property
+    def seed(self) -> int:
+        """Seed of the run."""
+        ...
+
+    @property
+    def run_dir(self) -> str:
+        """The folder in which run folders are made."""
+        ...
+
+    def to_toml(self) -> str:
+        """All settings as TOML."""
+        ...
+
+
 class RunFolder:
     """The folder of one run."""
 
@@ -79,7 +104,7 @@ class RunFolder:
         self.path, self._made = path, made
 
     @staticmethod
-    def create(config: Config, started_s: float | None = None) -> RunFolder:
+    def create(config: RunSettings, started_s: float | None = None) -> RunFolder:
         """A new folder with its config.toml. Raises `UsageError` if it exists. `started_s` is wall-clock time."""
         stamp = time.strftime("%Y%m%d-%H%M%S", time.localtime(started_s))
         path = Path(config.run_dir) / f"{sanitised(config.env)}-{config.algo}-s{config.seed}-{stamp}"
@@ -113,20 +138,13 @@ class RunFolder:
         """The run has begun: `remove` does nothing from now on."""
         self._made = None
 
-    def write_config(self, config: Config) -> None:
+    def write_config(self, config: RunSettings) -> None:
         """Write config.toml and run.json: at the start, and again when a run is resumed, perhaps with other settings."""
         try:
             write_format(self.path)
         except OSError as error:
             raise RunError(f"{self.path / RUN_FILE} not written: {error.strerror}") from error
         self._write("config.toml", f"# Repeat this run: millrace train --config THIS_FILE\n{config.to_toml()}".encode())
-
-    def config(self) -> Config:
-        """The configuration of the run."""
-        from learner.config.layers import config_from_toml
-
-        where = self.path / "config.toml"
-        return config_from_toml(where.read_text(), str(where))
 
     def write_policy(
         self, spec: PolicySpec, env: EnvSpec, parameters: Floats, buffers: Floats, which: Which = "final"

@@ -11,7 +11,7 @@ import pytest
 from gymnasium import spaces
 
 from learner.config.config import Config
-from learner.config.layers import resolve
+from learner.config.layers import config_of_run, resolve
 from learner.run_folder.episode_window import EpisodeWindow
 from learner.run_folder.metrics_log import EVENTS_EVERY_S, MetricsLog, read_rows
 from learner.run_folder.progress import Progress
@@ -53,7 +53,7 @@ def test_a_run_has_a_folder_of_its_own(tmp_path: Path) -> None:
     folder = RunFolder.create(config(tmp_path), STARTED_S)
     assert folder.path.parent == tmp_path
     assert folder.path.name.startswith("CartPole-v1-ppo-s3-202311")
-    assert folder.config() == config(tmp_path)
+    assert config_of_run(folder.path) == config(tmp_path)
     (folder.path / "mine.txt").write_text("mine")
     with pytest.raises(UsageError, match=r"run folder .*CartPole-v1-ppo-s3-\S+ exists; .*--run-dir"):
         RunFolder.create(config(tmp_path), STARTED_S)

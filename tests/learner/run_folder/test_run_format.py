@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from learner.config.command_line import read_config
-from learner.config.layers import resolve
+from learner.config.layers import config_of_run, resolve
 from learner.evaluate import load_policy
 from learner.report.learning_curves import plot
 from learner.report.page import write_page
@@ -82,5 +82,5 @@ def test_a_damaged_format_is_said_in_one_line(run: Path) -> None:
 def test_a_resumed_folder_gets_the_current_format(run: Path) -> None:
     (run / RUN_FILE).unlink()
     folder = RunFolder.open(run)
-    folder.write_config(folder.config())
+    folder.write_config(config_of_run(run))
     assert check_format(run) == RUN_FORMAT
