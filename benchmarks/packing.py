@@ -146,7 +146,7 @@ def encrypted(rounds: int) -> dict[str, float]:
     keyring = Keyring(server, ClientList().adding("w", client.public, datetime.now(UTC)))
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     link = LearnerLink("tcp://127.0.0.1:*", context, keyring)
-    link.room = rollout_bytes(STACKS)
+    link.packed_bytes_limit = rollout_bytes(STACKS)
     spawn = multiprocessing.get_context("spawn")
     here, there = spawn.Pipe()
     sender = spawn.Process(target=_send, args=(link.address, Token(server.public, client), there))

@@ -86,7 +86,7 @@ def large(run: RunSpec, rounds: int) -> list[dict[str, object]]:
             address = f"ipc://{folder}/{way.replace(' ', '-')}" if way.endswith("ipc") else "tcp://127.0.0.1:*"
             if way.startswith("ours"):
                 links[way] = LearnerLink(address, zmq_context)
-                links[way].room = rollout_bytes(run)
+                links[way].packed_bytes_limit = rollout_bytes(run)
                 addresses[way] = links[way].address
             else:
                 sockets[way] = zmq_context.socket(zmq.ROUTER)

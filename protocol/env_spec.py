@@ -85,7 +85,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         # The checker is left out: it costs a tenth of a CartPole step, and `Rollout.validate` checks every row.
         return self._made(lambda env_id: gymnasium.make(env_id, disable_env_checker=True, **self.kwargs, **extra))  # type: ignore[arg-type]
 
-    def make_vectorised(self, copies: int) -> VectorEnv[Any, Any, Any]:
+    def make_vectorized(self, copies: int) -> VectorEnv[Any, Any, Any]:
         """So many copies as the environment's own vectorised form; `protocol.envs.vectorized` says which can serve."""
         own, kwargs = VectorizeMode.VECTOR_ENTRY_POINT, dict[str, Any](self.kwargs)
         return self._made(lambda env_id: gymnasium.make_vec(env_id, copies, own, **kwargs))

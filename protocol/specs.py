@@ -171,7 +171,7 @@ class StepSpec(msgspec.Struct, frozen=True, tag=True):
     steps, and nobody listens then; workers that end with the learner's process wait for ever (infinity)
     """
 
-    def first(self, lane: int) -> int:
+    def first_copy(self, lane: int) -> int:
         """Number of the lane's first copy."""
         return sum(self.lanes[:lane])
 

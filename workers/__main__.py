@@ -168,8 +168,8 @@ def _explained(reason: str, link: WorkerLink) -> str:
     """The reason for leaving, and if no learner answered, the likely cause."""
     if not reason.startswith(NO_LEARNER):
         return reason
-    if link.trouble is not None:
-        return f"{reason}: {link.trouble.line}"
+    if link.problem is not None:
+        return f"{reason}: {link.problem.line}"
     return f"{reason} at {link.address}; is the learner running, and is this its address?"
 
 

@@ -127,7 +127,7 @@ class Worker:
         while self._handled_stop_requests < self._options.stop_requests():
             self._handled_stop_requests += 1
             self._do(self._session.stop())
-        if (trouble := self._link.trouble) is not None and trouble.final:
+        if (trouble := self._link.problem) is not None and trouble.final:
             self._do(self._session.refused(trouble.line))
         if not arrived:
             return

@@ -68,7 +68,7 @@ def keyring_for(config: Listens, now: datetime) -> Keyring | None:
     if asked is None and is_local(config.bind):
         return None
     folder = KeyFolder(asked)
-    return Keyring(folder.server(), folder.first(now), folder)
+    return Keyring(folder.server(), folder.ensure_first_client(now), folder)
 
 
 def throwaway(worker: str, now: datetime) -> tuple[Keyring, Token]:

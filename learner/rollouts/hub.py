@@ -111,7 +111,7 @@ class Hub:
     ) -> None:
         """`check_interrupt` is called while the hub waits: what it raises ends the wait."""
         self.link, self.roster, self.settings = link, roster, settings
-        link.room = rollout_bytes(roster.run)
+        link.packed_bytes_limit = rollout_bytes(roster.run)
         self._processes = processes or WorkerProcesses()
         self._check_interrupt, self._observer, self._clock = check_interrupt, observer, clock
         self._wait_s = 0.0  # seconds spent waiting for rollouts

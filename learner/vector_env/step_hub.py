@@ -179,7 +179,7 @@ class LockstepHub:
         for lane in lanes:
             bells = self._waits[lane]
             assert bells is not None
-            bells[0].ring()
+            bells[0].wake()
 
     # ---------------------------------------------------------------- waiting
 
@@ -257,7 +257,7 @@ class LockstepHub:
         deadline_s = self._clock() + (min(BUSY_S, timeout_s) if busy else timeout_s)
         self._send(self.lockstep.membership.drain("the vector environment was closed"))
         for bell, _ in self._shared.bells.values() if self._shared is not None else ():
-            bell.ring(WakeReason.MESSAGE)
+            bell.wake(WakeReason.MESSAGE)
         while self.lockstep.members and self._clock() < deadline_s:
             self._receive(POLL_S)
             for name, why in self.staff.poll():
@@ -356,7 +356,7 @@ class LockstepHub:
             if not self.link.send(peer, encode(message)):
                 continue  # it is gone, or does not read: its silence will tell
             if self._shared is not None and (bells := self._shared.bells.get(worker_name(peer).decode(errors="replace"))):
-                bells[0].ring(WakeReason.MESSAGE)  # it may be asleep beside its shared memory
+                bells[0].wake(WakeReason.MESSAGE)  # it may be asleep beside its shared memory
 
     def _give_up(self, timeout_s: float) -> None:
         """The deadline has passed: whoever holds an order has had it."""

@@ -62,7 +62,7 @@ def _new(argv: list[str]) -> list[str]:
     values = arguments.parse(argv)
     folder = _folder(values)
     if values.server:
-        token, public = folder.foreign(values.name, public_key(values.server, "--server"))
+        token, public = folder.new_for_other_learner(values.name, public_key(values.server, "--server"))
         lines = [f"token: {token}", f"on the learner's machine: millrace keys allow {public.hex()} {values.name}"]
     else:
         token = folder.new(values.name, _now())

@@ -82,9 +82,9 @@ def ask(link: WorkerLink, timeout_s: float, clock: Callable[[], float] = time.mo
             for message in link.answers():
                 if isinstance(message, Status):
                     return message
-        if link.trouble is not None and link.trouble.final:
-            raise Refused(link.trouble.line)
-    trouble = f": {link.trouble.line}" if link.trouble else "; is it running, and is this its address?"
+        if link.problem is not None and link.problem.final:
+            raise Refused(link.problem.line)
+    trouble = f": {link.problem.line}" if link.problem else "; is it running, and is this its address?"
     raise RunError(f"no learner answered within {timeout_s:g} s{trouble}")
 
 

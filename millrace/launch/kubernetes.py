@@ -41,7 +41,7 @@ def _comments(flags: KubernetesFlags) -> str:
 
 def _secret(name: str, folder: KeyFolder, now: datetime) -> str:
     folder.server()
-    folder.first(now)
+    folder.ensure_first_client(now)
     files = [folder.path / "server.key", folder.list_path, folder.token_path(FIRST_CLIENT)]
     data = "".join(f"  {file.name}: {base64.b64encode(file.read_bytes()).decode()}\n" for file in files)
     return f"""\

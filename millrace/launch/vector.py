@@ -105,7 +105,7 @@ class ListeningVectorEnv:
             handed = None
             if self.shared is not None:
                 to_worker, to_learner = self.shared.bells[name]
-                handed = InheritedDescriptors(self.shared.memory.fd, to_worker.hears, to_learner.rings)
+                handed = InheritedDescriptors(self.shared.memory.fd, to_worker.read_fd, to_learner.write_fd)
             worker_flags, log_file = flags(name)
             return WorkerProcess(WorkerCommand(self.link.address, name, log_file, self.token, worker_flags, handed))
 

@@ -21,7 +21,7 @@ def make_native(env: EnvSpec, copies: int) -> VectorEnv[Any, Any, Any]:
     """So many copies, stepped at once by the environment's own code. Raises `UsageError`."""
     if env.factory is not None:
         raise UsageError(f"environment {env.id}: vector native expected an id that gymnasium registers, got a callable")
-    made = env.make_vectorised(copies)
+    made = env.make_vectorized(copies)
     try:
         check_resets_next_step(made)
     except UsageError:

@@ -69,7 +69,7 @@ class KeyFolder:
         """The list of clients; empty if there is no list."""
         return self._read_list() if self.list_path.exists() else ClientList()
 
-    def first(self, now: datetime) -> ClientList:
+    def ensure_first_client(self, now: datetime) -> ClientList:
         """The list, with a first client on it if there has never been a list."""
         self._open()
         if not self.list_path.exists():
@@ -86,7 +86,7 @@ class KeyFolder:
             _replace(self.list_path, after.to_toml())
         return self.token_path(name)
 
-    def foreign(self, name: str, server: bytes) -> tuple[Path, bytes]:
+    def new_for_other_learner(self, name: str, server: bytes) -> tuple[Path, bytes]:
         """Make a key for the learner of another machine; the file of its token, and the half that must be allowed there."""
         self._open()
         client = Key.new()

@@ -78,12 +78,12 @@ def encode(message: ToLearner | Inquire | ToWorker | ToObserver, packing: Packin
     return frames
 
 
-def decode_to_learner(frames: Sequence[Buffer], room: int = 0) -> ToLearner | Inquire:
+def decode_to_learner(frames: Sequence[Buffer], packed_bytes_limit: int = 0) -> ToLearner | Inquire:
     """What a worker said, or an observer. Raises `BadMessage`, whatever the bytes.
 
-    `room`: bytes to which its packed arrays may come, all together; 0: none may come packed.
+    `packed_bytes_limit`: bytes to which its packed arrays may come, all together; 0: none may come packed.
     """
-    message: ToLearner | Inquire = _decode(frames, TO_LEARNER, room)
+    message: ToLearner | Inquire = _decode(frames, TO_LEARNER, packed_bytes_limit)
     return message
 
 
@@ -99,7 +99,7 @@ def decode_to_observer(frames: Sequence[Buffer]) -> ToObserver:
     return message
 
 
-def _decode(frames: Sequence[Buffer], kinds: Said, room: int = 0) -> Any:
+def _decode(frames: Sequence[Buffer], kinds: Said, packed_bytes_limit: int = 0) -> Any:
     if not 1 <= len(frames) <= MAX_FRAMES:
         raise BadMessage(f"message expected 1 to {MAX_FRAMES} frames, got {len(frames)}")
     if len(frames[0]) > MAX_HEAD_BYTES:
@@ -118,8 +118,8 @@ def _decode(frames: Sequence[Buffer], kinds: Said, room: int = 0) -> Any:
         frame = frames[index]
         if packings is not None:
             taken += size
-            if taken > room or not room:
-                raise BadMessage(f"packed arrays expected at most {room} bytes together, got {taken}")
+            if taken > packed_bytes_limit or not packed_bytes_limit:
+                raise BadMessage(f"packed arrays expected at most {packed_bytes_limit} bytes together, got {taken}")
             if size > MAX_FRAME_BYTES:
                 raise BadMessage(f"packed array expected at most {MAX_FRAME_BYTES} bytes, got {size}")
             return unpack_array(frame, packings, dtype, shape)

@@ -45,7 +45,7 @@ class LearnerLink:
         self.received, self.sent = Traffic(), Traffic()
         self.refused_messages = 0
         """messages under keys that may speak no more"""
-        self.room = 0
+        self.packed_bytes_limit = 0
         """bytes to which the packed arrays of one message may come; 0: none may come packed"""
         self._holders: dict[bytes, str] = {}  # routing id -> key under which it spoke last
         self._lid = LogRateLimiter()
@@ -94,7 +94,7 @@ class LearnerLink:
                 if self._turned_away(peer):
                     continue
             try:
-                yield peer, decode_to_learner(frames[1:], self.room)
+                yield peer, decode_to_learner(frames[1:], self.packed_bytes_limit)
             except BadMessage as error:
                 yield peer, error
 

@@ -78,7 +78,7 @@ class SharedMemory:
         self.reward, self.terminated, self.truncated = arrays[-3:]
         self.lanes = []
         for lane, copies in enumerate(spec.lanes):
-            rows = slice(spec.first(lane), spec.first(lane) + copies)
+            rows = slice(spec.first_copy(lane), spec.first_copy(lane) + copies)
             actions, obs = (tuple(array[rows] for array in leaves) for leaves in (self.actions, self.obs))
             view = memoryview(memory)[infos : infos + self.info_bytes[lane]]
             reward, terminated, truncated = self.reward[rows], self.terminated[rows], self.truncated[rows]
@@ -112,7 +112,7 @@ class SharedMemory:
         self._words[2 * WORDS * lane + WORDS] = number
         return fits
 
-    def under_way(self) -> int:
+    def unanswered_orders(self) -> int:
         """How many lanes have an order that is not done, as whoever has just done one sees it.
 
         Of workers that end at the same moment at least one sees none: taking the lock is what makes one's own answer seen

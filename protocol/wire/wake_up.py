@@ -23,7 +23,7 @@ MOST_LEFT_OUT = 63  # waits without spinning between two tries to spin
 class WakeReason(IntEnum):
     """What a bell was rung for."""
 
-    NOT = 0
+    NONE = 0
     STEP = 1
     MESSAGE = 2
 
@@ -35,17 +35,19 @@ class WakePipe:
     other sleeps. Whom an eventfd or a semaphore wakes may be made to wait for a core where a third one spins.
     """
 
-    def __init__(self, *, hears: int = -1, rings: int = -1) -> None:
+    def __init__(self, *, read_fd: int = -1, write_fd: int = -1) -> None:
         """A new one; or one of the ends, which was handed over."""
-        self.hears, self.rings = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC) if hears == rings == -1 else (hears, rings)
+        self.read_fd, self.write_fd = (
+            os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC) if read_fd == write_fd == -1 else (read_fd, write_fd)
+        )
         self._poll = select.poll()
-        if self.hears != -1:
-            self._poll.register(self.hears, select.POLLIN)
+        if self.read_fd != -1:
+            self._poll.register(self.read_fd, select.POLLIN)
 
-    def ring(self, rung: WakeReason = WakeReason.STEP) -> None:
+    def wake(self, reason: WakeReason = WakeReason.STEP) -> None:
         """Wake whoever waits, or will."""
         with suppress(BlockingIOError, BrokenPipeError):  # full: it will wake; broken: nobody is left to
-            os.write(self.rings, _STROKES[rung])
+            os.write(self.write_fd, _BYTES[reason])
 
     def wait(self, timeout_s: float) -> WakeReason:
         """Sleep until it is rung, at most `timeout_s`; of all that it was rung for, a message counts most.
@@ -53,21 +55,21 @@ class WakePipe:
         Rung for a step that was seen without sleeping, it wakes the next sleeper for nothing.
         """
         if not self._poll.poll(timeout_s * 1000):
-            return WakeReason.NOT
+            return WakeReason.NONE
         try:
-            strokes = os.read(self.hears, 4096)
+            strokes = os.read(self.read_fd, 4096)
         except BlockingIOError:
-            return WakeReason.NOT
+            return WakeReason.NONE
         return WakeReason(max(strokes, default=0))
 
     def close(self) -> None:
         """Let go of it."""
-        for fd in {self.hears, self.rings} - {-1}:
+        for fd in {self.read_fd, self.write_fd} - {-1}:
             os.close(fd)
-        self.hears = self.rings = -1
+        self.read_fd = self.write_fd = -1
 
 
-_STROKES = {rung: bytes([rung]) for rung in WakeReason}
+_BYTES = {reason: bytes([reason]) for reason in WakeReason}
 
 
 class SpinWait:

@@ -47,7 +47,7 @@ class WorkerLink:
         if not 1 <= len(name.encode()) <= longest or "\0" in name:
             raise UsageError(f"worker name {name[:40]!r}: expected 1 to {longest} bytes, got {len(name.encode())}")
         self.address, self.token = address, token
-        self.trouble: ConnectionProblem | None = None
+        self.problem: ConnectionProblem | None = None
         """why there is no connection, as far as that is known"""
         self.packing = Packing(stack=token is not None or not is_local(address))
         """of the rollouts that go over it: what is encrypted, or leaves this machine, is worth looking at first"""
@@ -82,7 +82,7 @@ class WorkerLink:
             ready = dict(self._poller.poll(int(left_s * 1000)))
             if self._monitor in ready:
                 self._look()
-            if self._socket in ready or left_s == 0.0 or (self.trouble is not None and self.trouble.final):
+            if self._socket in ready or left_s == 0.0 or (self.problem is not None and self.problem.final):
                 return self._socket in ready
 
     def _watch(self) -> None:
@@ -101,18 +101,18 @@ class WorkerLink:
             while True:
                 event, value = struct.unpack("=HI", self._monitor.recv_multipart(zmq.NOBLOCK)[0])
                 if event == zmq.EVENT_DISCONNECTED:
-                    if not self._connected and self.trouble is None:
+                    if not self._connected and self.problem is None:
                         self._say(
                             ConnectionProblem(f"{self.address} closes the connection at once; is it a millrace learner?")
                         )
                     self._connected = False
                 elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
-                    self._connected, self.trouble = True, None
+                    self._connected, self.problem = True, None
                 else:
                     self._say(connection_problem(event, value, self.address, self.token))
 
     def _say(self, found: ConnectionProblem) -> None:
-        self.trouble = found
+        self.problem = found
         if not found.final and (kept_back := self._lid.due(found.line, time.monotonic())) is not None:
             log.warning("%s%s", found.line, suppressed_note(kept_back))
 

@@ -44,7 +44,7 @@ class SteppedLane:
         """Make the copies, and reset none. Raises `UsageError` when their spaces are not the vector environment's."""
         self.incarnation = incarnation
         self.rows = rows
-        first = spec.first(lane)
+        first = spec.first_copy(lane)
         makes = [partial(_make_copy, spec, first + copy, copy) for copy in range(spec.lanes[lane])]
         # Copies of a later incarnation replace lost ones, whose episodes have ended: a step resets them unless `reset` did.
         self._loop = EnvLoop(makes, pulse, spec.autoreset, ended=incarnation > 0)

@@ -46,8 +46,8 @@ class Stepper:
         self._lanes: dict[int, SteppedLane] = {}
         self._executed: dict[int, int] = {}  # lane -> number of the newest order through shared memory that was executed
         self._memory = None if shared_memory is None else SharedMemory(spec, shared_memory.memory)
-        self._bell_in = None if shared_memory is None else WakePipe(hears=shared_memory.to_worker)
-        self._bell_out = None if shared_memory is None else WakePipe(rings=shared_memory.to_learner)
+        self._bell_in = None if shared_memory is None else WakePipe(read_fd=shared_memory.to_worker)
+        self._bell_out = None if shared_memory is None else WakePipe(write_fd=shared_memory.to_learner)
         self._cores = usable_cores()
         self._awake = SpinWait()
         self._spin_s = 0.0  # how long to spin before the next wait for the bell
@@ -119,9 +119,9 @@ class Stepper:
         if not memory.answer(number, order, infos):
             step = Step(session, -order, number, lane.incarnation, ())
             send(_stepped(step, lane.rows, infos))
-        pending = memory.under_way()
+        pending = memory.unanswered_orders()
         if not pending or not CAN_SPIN:
-            self._bell_out.ring()
+            self._bell_out.wake()
         finished_before = len(memory.lanes) - len(self._lanes) - pending
         self._spin_s = SPIN_S if finished_before < self._cores - 1 else 0.0
         return True

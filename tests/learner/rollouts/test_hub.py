@@ -29,7 +29,7 @@ class FakeLink:
 
     def __init__(self) -> None:
         self.now = 100.0
-        self.room = 0
+        self.packed_bytes_limit = 0
         self.sent: list[Sequence[Buffer]] = []
         self.inbox: list[tuple[bytes, ToLearner]] = []
 
@@ -73,7 +73,7 @@ def listen(hub: Hub, link: FakeLink, seconds: float) -> None:
 
 def test_a_message_may_unpack_to_a_rollout_of_the_run_and_no_more() -> None:
     link, hub, _ = hub_with_a_worker()
-    assert link.room == rollout_bytes(hub.roster.run) > 0
+    assert link.packed_bytes_limit == rollout_bytes(hub.roster.run) > 0
 
 
 @pytest.mark.parametrize(("dtype", "sent"), [("float32", "<f4"), ("bfloat16", "<u2"), ("float16", "<f2")])

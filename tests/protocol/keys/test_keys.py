@@ -195,7 +195,7 @@ def test_every_file_is_made_private_and_not_made_so_later(folder: KeyFolder, mon
     monkeypatch.setattr(os, "open", watched)
     for name in ("chmod", "fchmod"):
         monkeypatch.delattr(os, name)
-    folder.first(NOW)
+    folder.ensure_first_client(NOW)
     folder.new("lab", NOW)
     assert stat.S_IMODE(folder.path.stat().st_mode) == 0o700
     assert modes(folder) == dict.fromkeys(("server.key", "allowed.toml", "default.token", "lab.token"), 0o600)
@@ -225,24 +225,24 @@ def test_two_commands_at_once_lose_nothing(folder: KeyFolder) -> None:
 
 
 def test_a_token_opens_the_learner_that_made_it(folder: KeyFolder) -> None:
-    allowed = folder.first(NOW)
+    allowed = folder.ensure_first_client(NOW)
     token = Token.from_text(folder.token_path("default").read_text(), "")
     assert token.server == folder.server().public
     assert not allowed.why_not(token.client.public)
     assert allowed.clients[0].made == NOW
-    assert folder.first(LATER) == allowed, "there was a first client already"
+    assert folder.ensure_first_client(LATER) == allowed, "there was a first client already"
 
 
 def test_revoking_deletes_the_token_and_makes_no_new_first_client(folder: KeyFolder) -> None:
-    folder.first(NOW)
+    folder.ensure_first_client(NOW)
     folder.revoke("default", LATER)
     assert not folder.token_path("default").exists()
-    assert folder.first(LATER).names() == []
+    assert folder.ensure_first_client(LATER).names() == []
 
 
 def test_a_client_may_keep_its_secret_to_itself(folder: KeyFolder, tmp_path: Path) -> None:
     elsewhere = KeyFolder(tmp_path / "elsewhere")
-    path, public = elsewhere.foreign("lab", folder.server().public)
+    path, public = elsewhere.new_for_other_learner("lab", folder.server().public)
     folder.allow("lab", public, NOW)
     token = Token.from_text(path.read_text(), "")
     assert not folder.allowed().why_not(token.client.public)
@@ -250,11 +250,11 @@ def test_a_client_may_keep_its_secret_to_itself(folder: KeyFolder, tmp_path: Pat
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     assert not folder.token_path("lab").exists()
     with pytest.raises(UsageError, match="is there already"):
-        elsewhere.foreign("lab", folder.server().public)
+        elsewhere.new_for_other_learner("lab", folder.server().public)
 
 
 def test_what_others_can_read_is_not_used(folder: KeyFolder) -> None:
-    folder.first(NOW)
+    folder.ensure_first_client(NOW)
     for name, what in (
         ("server.key", folder.server),
         ("default.token", lambda: read_token(str(folder.token_path("default")))),
@@ -290,7 +290,7 @@ def test_a_file_in_the_way_is_one_line(tmp_path: Path) -> None:
 
 
 def test_half_a_file_is_never_seen(folder: KeyFolder, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder.first(NOW)
+    folder.ensure_first_client(NOW)
     before = folder.list_path.read_text()
 
     def full(_: int) -> None:
@@ -307,7 +307,7 @@ def test_half_a_file_is_never_seen(folder: KeyFolder, monkeypatch: pytest.Monkey
 
 
 def test_a_list_that_changes_is_read_again(folder: KeyFolder) -> None:
-    ring = Keyring(folder.server(), folder.first(NOW), folder)
+    ring = Keyring(folder.server(), folder.ensure_first_client(NOW), folder)
     lab = Token.from_text(folder.new("lab", NOW).read_text(), "").client.public
     assert ring.why_not_enter(lab)
     ring.refresh()
@@ -320,7 +320,7 @@ def test_a_list_that_changes_is_read_again(folder: KeyFolder) -> None:
 
 @pytest.mark.parametrize("how", ["broken", "gone", "open to others", "a folder"])
 def test_a_list_that_cannot_be_read_lets_nobody_in_and_throws_nobody_out(folder: KeyFolder, how: str) -> None:
-    ring = Keyring(folder.server(), folder.first(NOW), folder)
+    ring = Keyring(folder.server(), folder.ensure_first_client(NOW), folder)
     lab = Token.from_text(folder.new("lab", NOW).read_text(), "").client.public
     ring.refresh()
     good = folder.list_path.read_text()

@@ -262,7 +262,7 @@ def test_who_has_a_token_is_heard_and_answered(net: Net) -> None:
     assert learner.send(peer, encode(Rejoin(3)))
     assert worker.poll(DEADLINE_S)
     assert list(worker.receive()) == [Rejoin(3)]
-    assert (worker.trouble, learner.refused) == (None, 0)
+    assert (worker.problem, learner.refused) == (None, 0)
 
 
 CASES: dict[str, tuple[bool, Token | None, str, str, bool]] = {
@@ -287,10 +287,10 @@ def test_both_sides_say_what_is_wrong(
     learner = net.keyed() if keys else net.learner(None)
     worker = net.worker(learner, mine)
     worker.send(encode(hello()))
-    until(lambda: learner.refused > 0 and worker.trouble is not None, worker)
-    assert worker.trouble is not None
-    assert worker_says in worker.trouble.line
-    assert worker.trouble.final is final
+    until(lambda: learner.refused > 0 and worker.problem is not None, worker)
+    assert worker.problem is not None
+    assert worker_says in worker.problem.line
+    assert worker.problem.final is final
     (line, *_) = lines(caplog, "millrace.authenticator")
     assert "was not let in" in line
     assert any(says in line for says in learner_says.split("|"))
@@ -332,15 +332,15 @@ def test_a_worker_at_another_kind_of_server_says_so(net: Net) -> None:
         connection, _ = server.accept()
         with connection:
             connection.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n")
-        until(lambda: worker.trouble is not None, worker)
-    assert worker.trouble is not None
-    assert not worker.trouble.final
-    assert worker.address in worker.trouble.line
+        until(lambda: worker.problem is not None, worker)
+    assert worker.problem is not None
+    assert not worker.problem.final
+    assert worker.address in worker.problem.line
 
 
 def test_a_worker_at_a_name_that_nobody_knows_says_so(net: Net) -> None:
     worker = net.worker("tcp://no.such.host.invalid:5555", token())
-    assert worker.trouble == ConnectionProblem(
+    assert worker.problem == ConnectionProblem(
         "the host of tcp://no.such.host.invalid:5555 is not known here; is it spelt right?"
     )
 
@@ -348,13 +348,13 @@ def test_a_worker_at_a_name_that_nobody_knows_says_so(net: Net) -> None:
 def test_trouble_that_is_over_is_forgotten(net: Net) -> None:
     first = net.learner(Keyring(STRANGER, ClientList()))
     worker = net.worker(first, token())
-    until(lambda: worker.trouble is not None, worker)
+    until(lambda: worker.problem is not None, worker)
     address = first.address
     first.close(0.0)
     first.context.term()  # then the port is free
     learner = net.learner(Keyring(SERVER, ClientList().adding("lab", LAB.public, NOW)), address)
     worker.send(encode(hello()))
-    until(lambda: worker.trouble is None, worker)
+    until(lambda: worker.problem is None, worker)
     assert [message for _, message in heard(learner)] == [hello()]
 
 
@@ -371,7 +371,7 @@ def test_nobody_gets_in_while_nobody_answers_zap(net: Net) -> None:
     end_the_door(learner)
     worker = net.worker(learner, token())
     worker.send(encode(hello()))
-    until(lambda: worker.trouble is not None, worker)
+    until(lambda: worker.problem is not None, worker)
     assert not learner._socket.poll(300)
 
 
@@ -386,7 +386,7 @@ def test_the_door_answers_while_the_learner_learns(net: Net) -> None:
     """Nobody polls the learner's link here."""
     learner = net.keyed()
     good, bad = net.worker(learner, token()), net.worker(learner, token(STRANGER), "w1")
-    until(lambda: good._connected and bad.trouble is not None, good, bad)
+    until(lambda: good._connected and bad.problem is not None, good, bad)
 
 
 def test_whatever_goes_wrong_with_one_visitor_the_next_is_answered(net: Net, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -609,9 +609,9 @@ def test_who_is_revoked_is_cut_off_at_once_and_told(net: Net, tmp_path: Path, ca
     assert all(isinstance(message, Refuse) for message in workers[0].receive())
 
     again = net.worker(learner, tokens[0], "w2")
-    serve(hub, lambda: again.trouble is not None, again)
-    assert again.trouble is not None
-    assert again.trouble.final
+    serve(hub, lambda: again.problem is not None, again)
+    assert again.problem is not None
+    assert again.problem.final
     assert any("was revoked" in line for line in lines(caplog, "millrace.authenticator"))
 
 

@@ -182,7 +182,7 @@ def test_a_packed_rollout_arrives_whole_where_there_is_room_for_it(ends: Ends) -
     worker.send(frames)
     ((_, error),) = heard(learner)
     assert isinstance(error, BadMessage)
-    learner.room = rollout.obs[0].nbytes
+    learner.packed_bytes_limit = rollout.obs[0].nbytes
     before = learner.received.bytes
     worker.send(frames)
     ((_, back),) = heard(learner)

@@ -23,23 +23,23 @@ def bell() -> Iterator[WakePipe]:
 
 
 def test_a_bell_tells_a_message_from_a_step_and_forgets_what_it_told(bell: WakePipe) -> None:
-    assert bell.wait(0) is WakeReason.NOT
-    bell.ring()
-    bell.ring(WakeReason.MESSAGE)
-    bell.ring()
+    assert bell.wait(0) is WakeReason.NONE
+    bell.wake()
+    bell.wake(WakeReason.MESSAGE)
+    bell.wake()
     assert bell.wait(0) is WakeReason.MESSAGE
-    assert bell.wait(0) is WakeReason.NOT
-    bell.ring()
+    assert bell.wait(0) is WakeReason.NONE
+    bell.wake()
     assert bell.wait(0) is WakeReason.STEP
 
 
 def test_ringing_never_waits_and_never_fails(bell: WakePipe) -> None:
     for _ in range(100_000):  # more than a pipe holds
-        bell.ring()
+        bell.wake()
     assert bell.wait(0) is WakeReason.STEP
-    ours = WakePipe(rings=os.dup(bell.rings))
+    ours = WakePipe(write_fd=os.dup(bell.write_fd))
     bell.close()
-    ours.ring()  # nobody is left to hear it
+    ours.wake()  # nobody is left to hear it
     ours.close()
 
 
@@ -52,7 +52,7 @@ def test_who_is_done_last_sees_that_nobody_is_under_way() -> None:
     left = []
     for lane in (2, 0, 1):
         assert there.answer(lane, there.ordered(lane), b"")
-        left.append(there.under_way())
+        left.append(there.unanswered_orders())
     assert left == [2, 1, 0]
     here.close()
     there.close()
