@@ -28,7 +28,7 @@ from protocol.policy.policy import Policy, make_policy
 from protocol.specs import ImagesDtype, PolicySpec, RunSpec
 from protocol.wire.learner_link import LearnerLink
 from workers.collect.collector import Collector
-from workers.collect.split_vector_env import SideBySide
+from workers.collect.split_vector_env import SplitVectorEnv
 from workers.env_loop import Pulse
 from workers.host import Host, WorkerThread
 
@@ -58,22 +58,20 @@ def train(
         env = listening.start(flags_of(config, setup.folder.path))
         stack.callback(env.close)
         workers = config.min_workers or (1 if elsewhere else min(config.workers, config.envs))
-        lanes = SideBySide(env, config.lanes, _before_waits(env, workers, config.no_workers_timeout_s))
+        lanes = SplitVectorEnv(env, config.lanes, _before_waits(env, workers, config.no_workers_timeout_s))
 
         def collector(spec: RunSpec) -> Collector:
             from learner.torch_setup import torch_device
 
             policy = acting_policy(spec.policy, torch_device(config), spec.images_dtype)
-            return Collector(spec, policy, lanes.open, lanes.begin)
+            return Collector(spec, policy, lanes.open_lane, lanes.step_all)
 
         host = Host(lambda name: WorkerThread(link.address, name, context, collector), 1, prefix="inference")
         stack.callback(host.stop)
         stack.callback(host.ask_to_leave)  # asked a second time, it leaves at once
 
         def ended() -> list[tuple[str, str]]:
-            if lanes.nobody is not None:
-                nobody, lanes.nobody = lanes.nobody, None
-                raise nobody
+            lanes.raise_if_no_workers()
             return host.poll()
 
         processes = WorkerProcesses(ended, lambda: env.workers, 0 if elsewhere else config.workers)

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from protocol.errors import UsageError
 from protocol.rollout import Rollout
 from protocol.specs import RunSpec
-from tests.support.collectors import TOY, a_collector, bits, collect, over_copies_of, over_sync, run_of
-from workers.collect.collector import OpenCopies
+from tests.support.collectors import TOY, bits, collect, loop_over, random_collector, run_of, sync_vector_env_over
+from workers.collect.collector import OpenEnvCopies
 from workers.collect.env_copies import VectorCopies
 from workers.envs.toy import Scripted
 
@@ -30,7 +30,7 @@ def scripted(T: int, N: int) -> RunSpec:
 def collect_script(script: str, T: int, rollouts: int = 1) -> list[Rollout]:
     """Rollouts of one copy that plays a script."""
     run = scripted(T, 1)
-    collector = a_collector(run, over_copies_of([partial(Scripted, script)]))
+    collector = random_collector(run, loop_over([partial(Scripted, script)]))
     return [collect(collector, run, k)[0] for k in range(rollouts)]
 
 
@@ -58,13 +58,13 @@ class Played:
             self.obs.append([episode, steps])
 
 
-@pytest.mark.parametrize("over", [over_copies_of, over_sync])
+@pytest.mark.parametrize("over", [loop_over, sync_vector_env_over])
 @settings(max_examples=60, deadline=None)
 @given(scripts=st.lists(st.text(".tub", min_size=1, max_size=6), min_size=1, max_size=4), T=st.integers(1, 7))
 def test_rows_and_episodes_are_those_of_the_script(over: Any, scripts: list[str], T: int) -> None:
     K, N = 3, len(scripts)
     run = scripted(T, N)
-    collector = a_collector(run, over([partial(Scripted, script) for script in scripts]))
+    collector = random_collector(run, over([partial(Scripted, script) for script in scripts]))
     rollouts = [collect(collector, run, k)[0] for k in range(K)]
     played = [Played(script, K * T) for script in scripts]
     for k, rollout in enumerate(rollouts):
@@ -82,7 +82,7 @@ def test_rows_and_episodes_are_those_of_the_script(over: Any, scripts: list[str]
 
 def test_the_reset_row_is_masked_and_not_an_env_step() -> None:
     run = run_of(f"{TOY}OneStep-v0", T=6, N=1)
-    collector = a_collector(run)
+    collector = random_collector(run)
     (rollout,) = collect(collector, run)
     assert rollout.valid[:, 0].tolist() == [True, False] * 3
     assert rollout.truncated[:, 0].tolist() == [True, False] * 3
@@ -93,7 +93,7 @@ def test_the_reset_row_is_masked_and_not_an_env_step() -> None:
 
 def test_both_flags_at_once_are_one_end() -> None:
     run = run_of(f"{TOY}Both-v0", T=4, N=1)
-    (rollout,) = collect(a_collector(run), run)
+    (rollout,) = collect(random_collector(run), run)
     assert rollout.terminated[:, 0].tolist() == rollout.truncated[:, 0].tolist() == [False, False, True, False]
     assert [(episode.reward, episode.length) for episode in rollout.episodes] == [(6.0, 3)]
 
@@ -119,7 +119,7 @@ def test_returns_run_on_across_rollouts() -> None:
 
 def test_returns_are_summed_before_rewards_are_rounded() -> None:
     run = run_of(f"{TOY}Countdown-v0", T=10, N=1, kwargs={"k": 10, "reward": 0.1})
-    (rollout,) = collect(a_collector(run), run)
+    (rollout,) = collect(random_collector(run), run)
     assert rollout.reward.dtype == np.float32
     assert rollout.episodes[0].reward == sum([0.1] * 10)
 
@@ -147,7 +147,7 @@ class EndsAgain(VectorEnv[Any, Any, Any]):
 
 def test_a_vector_environment_that_ends_on_the_reset_step() -> None:
     run = run_of(f"{TOY}Countdown-v0", T=5, N=2)  # it has the same spaces
-    collector = a_collector(run, lambda run, lane, pulse: VectorCopies(EndsAgain(2)))
+    collector = random_collector(run, lambda run, lane, pulse: VectorCopies(EndsAgain(2)))
     (rollout,) = collect(collector, run)
     assert rollout.terminated.T.tolist() == [[True] * 5, [False, True, False, True, False]]
     assert rollout.valid.T.tolist() == [[True, False, False, False, False], [True, True, False, True, False]]
@@ -158,7 +158,7 @@ def test_a_vector_environment_that_ends_on_the_reset_step() -> None:
 
 def test_a_loop_and_sync_vector_env_collect_the_same_bits() -> None:
     run = run_of("CartPole-v1", T=60, N=3)
-    loop, sync = a_collector(run), a_collector(run, over_sync([run.env.make] * 3))
+    loop, sync = random_collector(run), random_collector(run, sync_vector_env_over([run.env.make] * 3))
     for k in range(3):
         pairs = zip(collect(loop, run, k, lanes=(0, 1)), collect(sync, run, k, lanes=(0, 1)), strict=True)
         assert all(bits(one) == bits(other) for one, other in pairs)
@@ -166,7 +166,7 @@ def test_a_loop_and_sync_vector_env_collect_the_same_bits() -> None:
 
 def test_gymnasiums_vectorised_cartpole_collects_lawfully() -> None:
     run = run_of("CartPole-v1", T=100, N=4)
-    collector = a_collector(run, native_cartpole)
+    collector = random_collector(run, native_cartpole)
     lengths = 0
     for k in range(3):
         for rollout in collect(collector, run, k, lanes=(0, 1)):
@@ -189,6 +189,6 @@ def test_other_ways_to_reset_are_refused(mode: AutoresetMode) -> None:
 
 def test_a_vector_environment_of_another_size_is_refused() -> None:
     run = scripted(4, 3)
-    open_two: OpenCopies = over_sync([Scripted] * 2)
+    open_two: OpenEnvCopies = sync_vector_env_over([Scripted] * 2)
     with pytest.raises(UsageError, match="expected 3 copies, got 2"):
-        collect(a_collector(run, open_two), run)
+        collect(random_collector(run, open_two), run)

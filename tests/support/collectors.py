@@ -19,7 +19,7 @@ from protocol.policy.layout import acting_size, buffer_size
 from protocol.policy.policy import Policy, make_policy
 from protocol.rollout import Rollout, validate
 from protocol.specs import PolicySpec, RunSpec
-from workers.collect.collector import Collector, OpenCopies, copies_of
+from workers.collect.collector import Collector, OpenEnvCopies, open_env_copies
 from workers.collect.env_copies import LoopedCopies, VectorCopies
 from workers.collect.held_rollouts import Assignment
 
@@ -60,17 +60,17 @@ def random_policy(spec: PolicySpec) -> Policy:
     return policy
 
 
-def a_collector(run: RunSpec, open_copies: OpenCopies = copies_of) -> Collector:
+def random_collector(run: RunSpec, open_copies: OpenEnvCopies = open_env_copies) -> Collector:
     """A collector that acts with random weights."""
     return Collector(run, random_policy(run.policy), open_copies)
 
 
-def over_copies_of(makes: Sequence[Callable[[], gymnasium.Env[Any, Any]]]) -> OpenCopies:
+def loop_over(makes: Sequence[Callable[[], gymnasium.Env[Any, Any]]]) -> OpenEnvCopies:
     """A loop over these copies, one of each."""
     return lambda run, lane, pulse: LoopedCopies(makes, pulse)
 
 
-def over_sync(makes: Sequence[Callable[[], gymnasium.Env[Any, Any]]]) -> OpenCopies:
+def sync_vector_env_over(makes: Sequence[Callable[[], gymnasium.Env[Any, Any]]]) -> OpenEnvCopies:
     """A SyncVectorEnv over these copies, one of each."""
     return lambda run, lane, pulse: VectorCopies(SyncVectorEnv(makes))
 

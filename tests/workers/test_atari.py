@@ -17,7 +17,7 @@ from protocol.envs.envpool import envpool_spec
 from protocol.envs.vectorized import make_native
 from protocol.errors import UsageError
 from protocol.specs import RunSpec
-from tests.support.collectors import a_collector, bits, collect, no_pulse
+from tests.support.collectors import bits, collect, no_pulse, random_collector
 from workers.collect.env_copies import EnvCopies, LoopedCopies, VectorCopies, copy_seeds
 from workers.collect.envpool_copies import EnvpoolCopies
 from workers.envs import atari
@@ -69,8 +69,8 @@ def described(vector: Any) -> RunSpec:
 def test_lanes_are_the_same_again_and_others_than_their_neighbours(kind: str) -> None:
     run = described(kind)
     assert run.policy.observation[0].shape == (4, 84, 84)
-    once = collect(a_collector(run), run, lanes=(0, 1))
-    again = collect(a_collector(run), run, lanes=(0, 1))
+    once = collect(random_collector(run), run, lanes=(0, 1))
+    again = collect(random_collector(run), run, lanes=(0, 1))
     assert [bits(rollout) for rollout in once] == [bits(rollout) for rollout in again]
     assert once[0].obs[0].tobytes() != once[1].obs[0].tobytes()
 

@@ -11,7 +11,16 @@ import pytest
 
 from protocol.errors import UsageError
 from protocol.specs import RunSpec
-from tests.support.collectors import TOY, a_collector, collect, over_copies_of, over_sync, run_around, run_of, with_env
+from tests.support.collectors import (
+    TOY,
+    collect,
+    loop_over,
+    random_collector,
+    run_around,
+    run_of,
+    sync_vector_env_over,
+    with_env,
+)
 from workers.collect.env_copies import LoopedCopies
 from workers.env_errors import LaneFailed
 from workers.envs.toy import Countdown
@@ -20,7 +29,7 @@ from workers.envs.toy import Countdown
 def broken(run: RunSpec, lanes: tuple[int, ...] = (2, 5)) -> LaneFailed:
     """What a collector says of this run's environment."""
     with pytest.raises(LaneFailed) as caught:
-        collect(a_collector(run), run, lanes=lanes)
+        collect(random_collector(run), run, lanes=lanes)
     assert "\n" not in str(caught.value)
     return caught.value
 
@@ -42,12 +51,12 @@ def test_the_lane_and_copy_that_raise_are_named() -> None:
 
     run = run_of(f"{TOY}Countdown-v0", N=3)
     with pytest.raises(LaneFailed, match="lane 5, copy 2, first reset: its environment raised OSError: no display"):
-        collect(a_collector(run, over_copies_of([Countdown, Countdown, Third])), run, lanes=(5,))
+        collect(random_collector(run, loop_over([Countdown, Countdown, Third])), run, lanes=(5,))
 
 
 def test_an_environment_that_breaks_once_is_mended_by_a_new_life(tmp_path: Path) -> None:
     run = run_of(f"{TOY}Raises-v0", kwargs={"once": str(tmp_path / "broke")})
-    collector = a_collector(run)
+    collector = random_collector(run)
     with pytest.raises(LaneFailed):
         collect(collector, run)
     collect(collector, run, incarnation=1)
@@ -59,13 +68,13 @@ def test_an_environment_that_cannot_be_made_is_named() -> None:
 
     run = run_of(f"{TOY}Countdown-v0")
     with pytest.raises(LaneFailed, match=r"lane 0, copy 0, made: .* RuntimeError: no licence$"):
-        collect(a_collector(run, lambda r, lane, pulse: LoopedCopies([make] * 2, pulse)), run)
+        collect(random_collector(run, lambda r, lane, pulse: LoopedCopies([make] * 2, pulse)), run)
 
 
 def test_a_vector_environment_that_raises_is_named() -> None:
     run = run_of(f"{TOY}Raises-v0", N=2)
     with pytest.raises(LaneFailed, match="lane 0, step 3: its environment raised ValueError: the toy"):
-        collect(a_collector(run, over_sync([run.env.make] * 2)), run)
+        collect(random_collector(run, sync_vector_env_over([run.env.make] * 2)), run)
 
 
 def test_a_reward_that_is_not_finite_is_named() -> None:
@@ -103,7 +112,7 @@ def answer(good: int, observation: Any, reward: Any = 1.0, space: Any = None) ->
     env = Answers(good, observation, reward, space)
     run = run_around(env, T=6)
     with pytest.raises(LaneFailed) as caught:
-        collect(a_collector(run, over_copies_of([lambda: env])), run)
+        collect(random_collector(run, loop_over([lambda: env])), run)
     return str(caught.value)
 
 
@@ -124,7 +133,7 @@ def answer(good: int, observation: Any, reward: Any = 1.0, space: Any = None) ->
 def test_an_observation_that_does_not_fit_is_refused_before_it_is_kept(good: int, observation: Any, got: str) -> None:
     when = ["first reset", "step 0"][good]
     assert answer(good, observation).startswith(
-        f"lane 0, copy 0, {when}: observation expected float32[1] as its space says, got {got}; mend"
+        f"lane 0, copy 0, {when}: observation expected float32[1] as its space says, got {got}; fix"
     )
 
 
@@ -151,7 +160,7 @@ class Doubles(Countdown):
 
 def test_a_float_may_lose_precision() -> None:
     run = run_of(f"{TOY}Countdown-v0", N=1)
-    (rollout,) = collect(a_collector(run, over_copies_of([Doubles])), run)
+    (rollout,) = collect(random_collector(run, loop_over([Doubles])), run)
     assert (rollout.obs[0] == np.float32(0.1)).all()
 
 
@@ -164,8 +173,11 @@ def test_a_discrete_observation_outside_its_space_is_named(observation: int) -> 
 @pytest.mark.parametrize(
     ("reward", "said"),
     [
-        ("much", "step 2: its environment gave what cannot be kept: could not convert string to float: 'much'"),
-        ([1.0, 2.0], "step 2: its environment gave what cannot be kept: setting an array element"),
+        (
+            "much",
+            "step 2: its environment returned an unusable value: could not convert string to float: 'much'",
+        ),
+        ([1.0, 2.0], "step 2: its environment returned an unusable value: setting an array element"),
         (None, "reward: expected finite values, got nan at step 2, copy 0"),
     ],
 )
@@ -182,4 +194,4 @@ def test_a_nan_is_named_even_if_the_environment_then_chokes_on_it() -> None:
 def test_an_environment_of_another_version_is_refused() -> None:
     run = with_env(run_of("CartPole-v1"), "Acrobot-v1")
     with pytest.raises(UsageError, match=r"environment Acrobot-v1: its observations .* are not what the learner has"):
-        collect(a_collector(run), run)
+        collect(random_collector(run), run)

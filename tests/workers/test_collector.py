@@ -19,11 +19,11 @@ from protocol.policy.distributions import distribution
 from protocol.specs import Leaf, RunSpec
 from tests.support.collectors import (
     TOY,
-    a_collector,
     bits,
     collect,
+    loop_over,
     no_pulse,
-    over_copies_of,
+    random_collector,
     random_policy,
     run_around,
     run_of,
@@ -49,7 +49,7 @@ BITS = run_of(SPACES, kwargs={"observation": "bytes", "action": "multibinary"}, 
 )
 def test_a_lane_collects_the_same_bits_alone_and_beside_others(run: RunSpec, copies: int) -> None:
     run = msgspec.structs.replace(run, copies=copies, rollout_steps=5)
-    together, apart = a_collector(run), a_collector(run)
+    together, apart = random_collector(run), random_collector(run)
     for k, lanes in enumerate([range(7), (4, 1), range(6, -1, -1)]):
         for rollout in collect(together, run, k, lanes):
             if rollout.lane in (1, 4):
@@ -92,7 +92,7 @@ def test_a_policy_acts_alike_whatever_it_acted_on_before_and_keeps_what_it_gave(
 
 def test_a_lane_does_not_depend_on_how_many_the_run_has() -> None:
     few, many = (msgspec.structs.replace(DISCRETE, lanes=lanes) for lanes in (1, 100))
-    assert bits(collect(a_collector(few), few)[0]) == bits(collect(a_collector(many), many)[0])
+    assert bits(collect(random_collector(few), few)[0]) == bits(collect(random_collector(many), many)[0])
 
 
 # ------------------------------------------------------------------------------------------------ seeds
@@ -112,7 +112,7 @@ def test_every_copy_of_every_life_of_every_lane_has_a_seed_of_its_own() -> None:
 
 def test_copies_start_differently_and_a_new_life_starts_anew() -> None:
     run = run_of("CartPole-v1", T=2, N=4)
-    collector = a_collector(run)
+    collector = random_collector(run)
     firsts = [rollout.obs[0][0] for rollout in collect(collector, run, lanes=(0, 1))]
     firsts += [rollout.obs[0][0] for rollout in collect(collector, run, lanes=(0, 1), incarnation=1)]
     assert len(np.unique(np.concatenate(firsts), axis=0)) == 16
@@ -120,7 +120,7 @@ def test_copies_start_differently_and_a_new_life_starts_anew() -> None:
 
 def test_actions_of_lanes_and_lives_are_drawn_apart() -> None:
     run = run_of(f"{TOY}Countdown-v0", T=64, N=2)
-    collector = a_collector(run)
+    collector = random_collector(run)
     rollouts = collect(collector, run, lanes=(0, 1)) + collect(collector, run, lanes=(0, 1), incarnation=1)
     assert len({rollout.action.tobytes() for rollout in rollouts}) == 4
 
@@ -130,14 +130,14 @@ def test_actions_of_lanes_and_lives_are_drawn_apart() -> None:
 
 def test_a_gaussian_action_is_stored_as_drawn_and_clipped_only_at_the_environment() -> None:
     run = run_of(f"{TOY}Spaces-v0", T=4, N=3, kwargs={"action": "box"})  # raises if an action is outside ±0.1
-    (rollout,) = collect(a_collector(run), run)
+    (rollout,) = collect(random_collector(run), run)
     assert np.abs(rollout.action).max() > 0.2
     np.testing.assert_allclose(rollout.reward, np.clip(rollout.action, -0.1, 0.1).sum(-1), rtol=1e-6)
 
 
 def test_actions_count_from_zero_and_the_environment_counts_from_start() -> None:
     run = run_of(f"{TOY}Spaces-v0", T=4, N=30, kwargs={"action": "offset"})
-    (rollout,) = collect(a_collector(run), run)
+    (rollout,) = collect(random_collector(run), run)
     assert set(rollout.action.ravel().tolist()) == {0, 1, 2}
     assert (rollout.reward == rollout.action + 5).all()
 
@@ -161,13 +161,13 @@ class Greedy(Countdown):
 def test_an_environment_that_writes_into_its_action_does_not_change_the_rollout() -> None:
     env = Greedy()
     run = run_around(env, T=4)
-    (rollout,) = collect(a_collector(run, over_copies_of([lambda: env])), run)
+    (rollout,) = collect(random_collector(run, loop_over([lambda: env])), run)
     assert rollout.action[:, 0].tolist() == np.array(env.given).tolist()
 
 
 @pytest.mark.parametrize("run", [DISCRETE, GAUSSIAN, TABLE, BITS], ids=["discrete", "gaussian", "table", "bits"])
 def test_log_probabilities_are_those_of_the_policy_in_these_observations(run: RunSpec) -> None:
-    (rollout,) = collect(a_collector(run), run)
+    (rollout,) = collect(random_collector(run), run)
     params = random_policy(run.policy)([leaf[:-1] for leaf in rollout.obs])
     expected = distribution(run.policy).log_prob(params, rollout.action)
     np.testing.assert_allclose(rollout.log_prob, expected, rtol=1e-4, atol=1e-5)
@@ -175,7 +175,7 @@ def test_log_probabilities_are_those_of_the_policy_in_these_observations(run: Ru
 
 def test_arrays_are_contiguous_and_never_written_again() -> None:
     run = run_of(f"{TOY}Spaces-v0", T=3, N=2, kwargs={"observation": "dict"})
-    collector = a_collector(run)
+    collector = random_collector(run)
     rollouts = collect(collector, run, 0, lanes=(0, 1))
     before = [bits(rollout) for rollout in rollouts]
     collect(collector, run, 1, lanes=(0, 1))
@@ -210,7 +210,7 @@ def closable(T: int = 4) -> tuple[RunSpec, Collector, list[str]]:
     said: list[str] = []
     names = iter("abcdefgh")
     run = run_of(f"{TOY}Scripted-v0", T=T, N=1)
-    return run, a_collector(run, lambda r, n, p: over_copies_of([partial(Closable, said, next(names))])(r, n, p)), said
+    return run, random_collector(run, lambda r, n, p: loop_over([partial(Closable, said, next(names))])(r, n, p)), said
 
 
 class Doubled(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -231,7 +231,7 @@ def test_copies_are_stepped_past_the_guard_of_the_first_reset_and_past_no_other_
         lambda: OrderEnforcing(Doubled(Countdown())),
     ]
     run = run_of(f"{TOY}Countdown-v0", T=3, N=2)
-    (rollout,) = collect(a_collector(run, over_copies_of(made)), run)
+    (rollout,) = collect(random_collector(run, loop_over(made)), run)
     assert rollout.reward.tolist() == [[4, 2]] * 3
     assert rollout.truncated.tolist() == [[False, False]] * 2 + [[True, False]]
     assert not guard.called
@@ -282,19 +282,19 @@ def test_a_slow_copy_does_not_keep_the_pulse_waiting(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("workers.env_loop.PULSE_S", -1.0)  # any step is a slow one
     run = run_of(f"{TOY}Countdown-v0", T=3, N=5)
     pulses: list[int] = []
-    a_collector(run).collect([Assignment(0, 0, 0, 0)], 0, 0, lambda: pulses.append(1))
+    random_collector(run).collect([Assignment(0, 0, 0, 0)], 0, 0, lambda: pulses.append(1))
     assert len(pulses) >= 3 * 5
 
 
 def test_one_lane_cannot_be_asked_for_twice_at_once() -> None:
     run = run_of(f"{TOY}Countdown-v0")
     with pytest.raises(ValueError, match="one assignment for each lane"):
-        a_collector(run).collect([Assignment(0, 3, 0, 0), Assignment(1, 3, 0, 1)], 0, 0, no_pulse)
+        random_collector(run).collect([Assignment(0, 3, 0, 0), Assignment(1, 3, 0, 1)], 0, 0, no_pulse)
 
 
 def test_stages_and_steps_are_counted() -> None:
     run = run_of(f"{TOY}Countdown-v0", T=7, N=2, kwargs={"k": 100})
-    collector = a_collector(run)
+    collector = random_collector(run)
     collect(collector, run, lanes=(0, 1))
     assert collector.steps == 28
     assert collector.stages.keys() == {"open", "act", "step"}

@@ -16,10 +16,10 @@ from protocol.errors import NoWorkers
 from protocol.policy.layout import acting_size, buffer_size
 from protocol.policy.torch_policy import TorchPolicy
 from protocol.specs import RunSpec
-from tests.support.collectors import TOY, a_collector, bits, collect, no_pulse, random_policy, run_of
+from tests.support.collectors import TOY, bits, collect, no_pulse, random_collector, random_policy, run_of
 from workers.collect.collector import Collector
 from workers.collect.held_rollouts import Assignment
-from workers.collect.split_vector_env import SideBySide
+from workers.collect.split_vector_env import SplitVectorEnv
 
 LANES = 3
 RUNS = {
@@ -32,64 +32,66 @@ RUNS = {
 
 
 @contextmanager
-def side_by_side(run: RunSpec) -> Iterator[tuple[Collector, SideBySide]]:
+def split_collector(run: RunSpec) -> Iterator[Collector]:
     env = SyncVectorEnv([run.env.make] * (LANES * run.copies))
-    env.reset()  # unlike ours, it does not take a mask before
-    parts = SideBySide(env, LANES)
-    yield Collector(run, random_policy(run.policy), parts.open, parts.begin), parts
+    env.reset()  # SyncVectorEnv, unlike ZmqVectorEnv, takes a mask only after a first reset
+    split = SplitVectorEnv(env, LANES)
+    yield Collector(run, random_policy(run.policy), split.open_lane, split.step_all)
     env.close()
 
 
 @pytest.mark.parametrize("name", RUNS)
 def test_a_lane_gets_the_bits_of_a_loop_over_its_copies(name: str) -> None:
     run = RUNS[name]
-    loop = a_collector(run)
-    with side_by_side(run) as (parts, _):
+    loop = random_collector(run)
+    with split_collector(run) as split:
         for k in range(4):
-            mine, wanted = (collect(collector, run, k, lanes=range(LANES)) for collector in (parts, loop))
-            assert [bits(one) for one in mine] == [bits(other) for other in wanted]
-            assert k or len({one.obs[0].tobytes() for one in mine}) == LANES, "the lanes are the same"
+            actual, expected = (collect(collector, run, k, lanes=range(LANES)) for collector in (split, loop))
+            assert [bits(one) for one in actual] == [bits(other) for other in expected]
+            assert k or len({one.obs[0].tobytes() for one in actual}) == LANES, "the lanes are the same"
 
 
-def test_a_lane_that_lives_again_begins_anew_and_the_others_go_on() -> None:
+def test_a_lane_of_a_new_incarnation_starts_anew_and_the_others_go_on() -> None:
     run = RUNS["discrete"]
-    loop = a_collector(run)
+    loop = random_collector(run)
     assignments = [Assignment(n, n, 1 if n == 1 else 0, 0 if n == 1 else 1) for n in range(LANES)]
-    with side_by_side(run) as (parts, _):
+    with split_collector(run) as split:
         found = []
-        for collector in (parts, loop):
+        for collector in (split, loop):
             collect(collector, run, 0, lanes=range(LANES))
             found.append([bits(rollout) for rollout in collector.collect(assignments, 0, 0, no_pulse)])
     assert found[0] == found[1]
 
 
-def test_lanes_may_be_asked_for_in_any_order_but_only_all_at_once() -> None:
+def test_lanes_are_collected_in_any_order_but_only_all_together() -> None:
     run = RUNS["discrete"]
-    loop = a_collector(run)
-    with side_by_side(run) as (parts, _):
-        mine, wanted = (collect(collector, run, lanes=(2, 0, 1)) for collector in (parts, loop))
-        assert [bits(one) for one in mine] == [bits(other) for other in wanted]
+    loop = random_collector(run)
+    with split_collector(run) as split:
+        actual, expected = (collect(collector, run, lanes=(2, 0, 1)) for collector in (split, loop))
+        assert [bits(one) for one in actual] == [bits(other) for other in expected]
         with pytest.raises(ValueError, match=r"expected all 3 of the vector environment at once, got \[0, 2\]"):
-            collect(parts, run, 1, lanes=(0, 2))
+            collect(split, run, 1, lanes=(0, 2))
 
 
-class Deserted(SyncVectorEnv[Any, Any]):
+class WithoutWorkers(SyncVectorEnv[Any, Any]):
     def step(self, actions: Any) -> Any:
         raise NoWorkers("waited 1 s for 1 workers")
 
 
-def test_that_nobody_steps_is_remembered() -> None:
+def test_that_no_worker_is_left_is_raised_once_to_whoever_asks() -> None:
     run = RUNS["discrete"]
-    env = Deserted([run.env.make] * (LANES * run.copies))
+    env = WithoutWorkers([run.env.make] * (LANES * run.copies))
     env.reset()
-    parts = SideBySide(env, LANES)
+    split = SplitVectorEnv(env, LANES)
     with pytest.raises(NoWorkers):
-        collect(Collector(run, random_policy(run.policy), parts.open, parts.begin), run, lanes=range(LANES))
-    assert str(parts.nobody) == "waited 1 s for 1 workers"
+        collect(Collector(run, random_policy(run.policy), split.open_lane, split.step_all), run, lanes=range(LANES))
+    with pytest.raises(NoWorkers, match=r"^waited 1 s for 1 workers$"):
+        split.raise_if_no_workers()
+    split.raise_if_no_workers()
     env.close()
 
 
-class Loses(SyncVectorEnv[Any, Any]):
+class LosesTwoCopies(SyncVectorEnv[Any, Any]):
     """Loses the first two copies in its step number `at`, as a vector environment over worker processes would."""
 
     def __init__(self, makes: Any, at: int) -> None:
@@ -109,13 +111,13 @@ class Loses(SyncVectorEnv[Any, Any]):
 
 
 @pytest.mark.parametrize("at", range(9))
-def test_a_step_that_was_lost_is_in_no_valid_row(at: int) -> None:
-    """Wherever it falls: amid an episode, on its end (5 steps) or its reset, on the first or last row of a rollout (3)."""
+def test_a_lost_step_is_in_no_valid_row(at: int) -> None:
+    """Within an episode, at its end (5 steps) or its reset, in the first row or the last row of a rollout (3 rows)."""
     run = run_of(f"{TOY}Countdown-v0", T=3)
-    env = Loses([run.env.make] * (LANES * run.copies), at)
+    env = LosesTwoCopies([run.env.make] * (LANES * run.copies), at)
     env.reset()
-    parts = SideBySide(env, LANES)
-    collector = Collector(run, random_policy(run.policy), parts.open, parts.begin)
+    split = SplitVectorEnv(env, LANES)
+    collector = Collector(run, random_policy(run.policy), split.open_lane, split.step_all)
     by_lane = zip(*(collect(collector, run, k, lanes=range(LANES)) for k in range(4)), strict=True)
     assembler = EpisodeAssembler(lambda actions: actions)
     whole = []
@@ -145,7 +147,7 @@ def test_a_step_that_was_lost_is_in_no_valid_row(at: int) -> None:
         {"kwargs": {"observation": "dict", "action": "box"}, "normalize_observations": True},
     ],
 )
-def test_one_pass_for_all_lanes_says_what_a_pass_for_each_says(policy: dict[str, Any]) -> None:
+def test_one_forward_pass_for_all_lanes_equals_one_pass_for_each_lane(policy: dict[str, Any]) -> None:
     spec = run_of(f"{TOY}Spaces-v0", **policy).policy
     generator = np.random.default_rng(0)
     parameters = generator.normal(0, 0.3, acting_size(spec)).astype(np.float32)
@@ -153,24 +155,24 @@ def test_one_pass_for_all_lanes_says_what_a_pass_for_each_says(policy: dict[str,
     leaves = [generator.integers(0, 2, (LANES, 4, *leaf.shape)).astype(leaf.dtype) for leaf in spec.observation]
     for array, leaf in zip(leaves, spec.observation, strict=True):
         array += np.reshape(leaf.start, leaf.shape).astype(leaf.dtype) if leaf.start else 0
-    said = []
+    results = []
     for together in (True, False):
         acting = TorchPolicy(spec, together=together)
         acting.load(parameters, buffers)
         state = np.full((LANES, 4, spec.state_size), 0.25, np.float32)
-        said.append((acting(leaves, state), state))
-    (one, after_one), (each, after_each) = said
+        results.append((acting(leaves, state), state))
+    (one, after_one), (each, after_each) = results
     assert one.shape == each.shape
     np.testing.assert_allclose(one, each, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(after_one, after_each, rtol=1e-4, atol=1e-5)
     assert not spec.state_size or (after_one != 0.25).any()
 
 
-def test_a_collector_is_told_all_actions_before_the_first_lane_steps() -> None:
+def test_step_all_gets_the_actions_of_all_lanes_before_the_first_lane_steps() -> None:
     run = msgspec.structs.replace(RUNS["discrete"], rollout_steps=2)
-    told: list[tuple[list[int], tuple[int, ...]]] = []
+    calls: list[tuple[list[int], tuple[int, ...]]] = []
     collector = Collector(
-        run, random_policy(run.policy), begin=lambda lanes, actions, pulse: told.append((list(lanes), actions.shape))
+        run, random_policy(run.policy), step_all=lambda lanes, actions, pulse: calls.append((list(lanes), actions.shape))
     )
     collect(collector, run, lanes=(4, 1))
-    assert told == [([4, 1], (2, 2))] * 2
+    assert calls == [([4, 1], (2, 2))] * 2

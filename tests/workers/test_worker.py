@@ -31,7 +31,7 @@ from protocol.wire.codec import Buffer, decode_to_learner, decode_to_worker, enc
 from protocol.wire.compression import Packing
 from protocol.wire.weight_dtypes import WeightsDtype, to_float32, to_wire_dtype
 from protocol.wire.worker_link import WorkerLink
-from tests.support.collectors import a_collector, bits, collect, run_of
+from tests.support.collectors import bits, collect, random_collector, run_of
 from workers.session import Leave, Session
 from workers.worker import Worker, identity
 
@@ -107,7 +107,7 @@ def test_a_worker_acts_under_the_weights_that_travelled(dtype: WeightsDtype) -> 
     (rollout,) = (message for message in link.heard() if isinstance(message, Rollout))
     found = []
     for parameters in (to_float32(travelling), PARAMETERS):
-        collector = a_collector(RUN)
+        collector = random_collector(RUN)
         collector.load(parameters, BUFFERS)
         found.append(bits(collect(collector, RUN)[0])["log_prob"])
     assert rollout.log_prob.tobytes() == found[0]

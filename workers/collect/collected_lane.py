@@ -1,7 +1,7 @@
-"""One lane as it lives in a worker: its env copies, where each of them stands, and the generator of its actions.
+"""One lane that a worker collects on: its env copies, their running episodes, and the random generator of its actions.
 
-It keeps what must outlast a rollout (the last observations, who has ended, the running episodes) and refuses what no
-rollout can hold: an environment that raises, observations that do not fit their space, NaN.
+It keeps what one rollout passes on to the next: the last observations, which copies have ended, the running episodes. It
+raises `LaneFailed` for an environment that raises, for observations that do not fit their space, and for NaN.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ class CollectedLane:
         self.obs = tuple(
             np.empty((run.copies, *leaf.shape), leaf.dtype) for leaf in run.policy.observation
         )  # [N, *leaf] each
-        self.state = zero_state(run.policy, run.copies)  # [N, S] what the policy remembers
+        self.state = zero_state(run.policy, run.copies)  # [N, S] recurrent state of the policy
         self.ended = np.zeros(run.copies, bool)  # [N] the next step only resets this copy
         self._run = run
         self._seeds = copy_seeds(run.seed, number, incarnation, run.copies)
-        self._return = [0.0] * run.copies  # of the running episodes
+        self._return = [0.0] * run.copies  # of the running episodes, as are the next two
         self._length = [0] * run.copies
-        self._began = [0.0] * run.copies  # seconds, by perf_counter
-        self._proven = False
+        self._start_s = [0.0] * run.copies  # by perf_counter
+        self._fits = False
 
     def reset(self, pulse: Pulse) -> None:
-        """Begin. Raises `UsageError` when the copies' spaces are not the run's."""
+        """Start episodes in all copies. Raises `UsageError` when their spaces are not those of the run."""
         policy, observation, action = self._run.policy, self.copies.observation_space, self.copies.action_space
         if (observation_leaves(observation), action_spec(action)) != (policy.observation, policy.action):
             raise UsageError(
                 f"environment {self._run.env.id}: its observations {observation} and actions {action} are not what "
-                "the learner has; install the same version of it here and there"
+                "the learner has; install the same version of it on both machines"
             )
         try:
             leaves = self.copies.reset(self._seeds, pulse)
@@ -57,7 +57,7 @@ class CollectedLane:
         self._check_fit(leaves, "first reset")
         for array, leaf in zip(self.obs, leaves, strict=True):
             array[:] = leaf
-        self._began = [perf_counter()] * len(self._began)
+        self._start_s = [perf_counter()] * len(self._start_s)
 
     def step(self, actions: Array, t: int, pulse: Pulse) -> StepResult:
         """Step `t` of a rollout, with actions [N, *action]."""
@@ -65,15 +65,15 @@ class CollectedLane:
             row = self.copies.step(actions, pulse)
         except CopyRaised as error:
             raise lane_failed(self.number, f"step {t}", error) from error
-        if not self._proven:
+        if not self._fits:
             self._check_fit(row.leaves, f"step {t}")
-            self._proven = True
+            self._fits = True
         return row
 
     def _check_fit(self, leaves: Leaves, when: str) -> None:
-        """Raise if an observation is not of its space's shape, or would lose more than a float's precision in its dtype.
+        """Raise if an observation is not of its space's shape, or if a cast to its dtype changes its kind or an integer.
 
-        Asked at the first reset and the first step: an environment that fits then, fits later.
+        Checked at the first reset and the first step: an environment that fits then, fits later.
         """
         for leaf, values in zip(self._run.policy.observation, leaves, strict=True):
             wanted = np.dtype(leaf.dtype)
@@ -90,11 +90,11 @@ class CollectedLane:
                     raise LaneFailed(
                         self.number,
                         f"copy {n}, {when}: {_name(leaf)} expected {wanted}{list(leaf.shape)} as its space says, "
-                        f"got {array.dtype}{list(array.shape)}; mend the environment or its observation_space",
+                        f"got {array.dtype}{list(array.shape)}; fix the environment or its observation_space",
                     )
 
-    def check_sense(self, obs: Sequence[Array], reward: Array) -> None:
-        """Raise, naming step and copy, if observations [rows, N, *leaf] or rewards [rows, N] cannot be right."""
+    def check_values(self, obs: Sequence[Array], reward: Array) -> None:
+        """Raise, naming step and copy, if obs [rows, N, *leaf] or rewards [rows, N] are not finite or not in their space."""
         for leaf, array in zip(self._run.policy.observation, obs, strict=True):
             if array.dtype.kind == "f" and not np.isfinite(array).all():
                 raise LaneFailed(self.number, f"{_name(leaf)}: {describe_first_non_finite(array)}")
@@ -108,32 +108,34 @@ class CollectedLane:
         if not np.isfinite(reward).all():
             raise LaneFailed(self.number, f"reward: {describe_first_non_finite(reward)}")
 
-    def finish(self, reward: Array, done: Bools, clock: Sequence[float]) -> tuple[Bools, tuple[Episode, ...]]:
-        """Close the account of T rows: which are valid [T, N], and the episodes that ended, oldest first.
+    def finish(self, reward: Array, done: Bools, step_end_s: Sequence[float]) -> tuple[Bools, tuple[Episode, ...]]:
+        """After T steps: which rows are valid [T, N], and the episodes that ended, oldest first.
 
-        `reward` [T, N] float64 is raw and, in rows that are not valid, made 0; `done` [T, N] is terminated or truncated;
-        `clock` [T] tells when each step was over. An episode's seconds begin where the copy's last one ended.
+        `reward` [T, N] float64 is raw; it is set to 0 in rows that are not valid. `done` [T, N] is terminated or truncated.
+        `step_end_s` [T] is when each step ended. The seconds of an episode count from the end of the copy's last episode.
         """
         valid = ~np.concatenate([self.ended[None], done[:-1]])
         reward[~valid] = 0.0
         self.ended = done[-1].copy()
         rewards = reward.T.tolist()  # by copy
-        first, resets = [0] * len(rewards), (~valid[0]).tolist()  # where its next account begins, with a reset or not
+        # For each copy, the first row that is not yet added to its episode, and whether that row only resets the copy.
+        first, resets = [0] * len(rewards), (~valid[0]).tolist()
         episodes = []
 
         def add(n: int, end: int) -> None:
+            """Add the rows of copy n up to `end` to its episode."""
             self._return[n] += sum(rewards[n][first[n] : end])
-            self._length[n] += end - first[n] - resets[n]  # only the first row of an account can be one that resets
+            self._length[n] += end - first[n] - resets[n]  # only the first of these rows can be a reset
             first[n], resets[n] = end, True
 
         for t, n in np.argwhere(done).tolist():
             add(n, t + 1)
             if valid[t, n]:
-                episodes.append(Episode(self._return[n], self._length[n], clock[t] - self._began[n]))
-            self._return[n], self._length[n], self._began[n] = 0.0, 0, clock[t]
+                episodes.append(Episode(self._return[n], self._length[n], step_end_s[t] - self._start_s[n]))
+            self._return[n], self._length[n], self._start_s[n] = 0.0, 0, step_end_s[t]
         for n in range(len(rewards)):
-            if first[n] < len(clock):
-                add(n, len(clock))
+            if first[n] < len(step_end_s):
+                add(n, len(step_end_s))
         return valid, tuple(episodes)
 
 

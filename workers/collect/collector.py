@@ -1,8 +1,8 @@
-"""A policy and the env copies of some lanes -> rollouts that keep the law of a row (`protocol/rollout.py`).
+"""Collects rollouts that keep the law of a row (`protocol/rollout.py`), from a policy and the env copies of lanes.
 
-Lanes that are asked for together are stepped in lock-step, with one stacked forward pass [L, N, ·]. What a lane yields
-depends on the run's seed, the lane, its incarnation and the weights, and on nothing else: not on the lanes beside it.
-The arrays of a rollout are new each time and never written again, so they can be sent as they lie.
+Lanes that are collected together are stepped in lock-step, with one forward pass for all of them [L, N, ·]. The rollout of
+a lane depends on the run's seed, the lane, its incarnation and the weights, and on nothing else: not on the other lanes.
+The arrays of a rollout are new each time and are never written again, so they can be sent without a copy.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from workers.collect.held_rollouts import Assignment
 from workers.env_errors import CopyRaised, LaneFailed, lane_failed
 from workers.env_loop import Pulse
 
-OpenCopies = Callable[[RunSpec, int, Pulse], EnvCopies]
-"""The copies of the lane of this number."""
-Begin = Callable[[Sequence[int], Array, Pulse], None]
-"""Told the numbers of L lanes and their actions [L, N, *action], before the first of them is stepped."""
+OpenEnvCopies = Callable[[RunSpec, int, Pulse], EnvCopies]
+"""Makes the env copies of the lane of this number."""
+StepAll = Callable[[Sequence[int], Array, Pulse], None]
+"""Called with the numbers of L lanes and their actions [L, N, *action], before each of them is stepped."""
 
 
-def copies_of(run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
-    """The copies of one lane, as the run says: what a worker opens unless it is told otherwise."""
+def open_env_copies(run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
+    """The env copies of a lane in this process, of the kind that the run asks for."""
     match run.vector:
         case "native":
             return VectorCopies(make_native(run.env, run.copies))
@@ -47,70 +47,70 @@ def copies_of(run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
             return LoopedCopies([run.env.make] * run.copies, pulse)
 
 
-def each_by_itself(lanes: Sequence[int], actions: Array, pulse: Pulse) -> None:
-    """Nothing begins before a lane is stepped."""
+def no_step_for_all(lanes: Sequence[int], actions: Array, pulse: Pulse) -> None:
+    """Do nothing: each lane steps its own copies."""
 
 
 class _Rows(NamedTuple):
-    """The rows of L lanes while they are collected."""
+    """Arrays of the rollouts of L lanes while they are collected."""
 
     obs: tuple[Array, ...]  # [L, T+1, N, *leaf] each
-    state: Floats  # [L, N, S] what the policy remembers, moved on from step to step
+    state: Floats  # [L, N, S] recurrent state of the policy, updated at each step
     noise: Floats  # [L, T, N, noise]
     params: Floats  # [L, T, N, P]
     action: Array  # [L, T, N, *action]
-    reward: Array  # [L, T, N] float64, so that episodes are summed before they are rounded
+    reward: Array  # [L, T, N] float64, so that returns are summed before they are rounded
     terminated: Array  # [L, T, N] bool
     truncated: Array  # [L, T, N] bool
-    clock: list[float]  # [T] seconds, when each step was over
+    step_end_s: list[float]  # [T] by perf_counter
 
 
 class Collector:
-    """Collects rollouts on lanes that it opens as they are asked for."""
+    """Collects rollouts. It opens a lane when a rollout of it is first asked for."""
 
     def __init__(
         self,
         run: RunSpec,
         policy: Policy,
-        open_copies: OpenCopies = copies_of,
-        begin: Begin = each_by_itself,
+        open_copies: OpenEnvCopies = open_env_copies,
+        step_all: StepAll = no_step_for_all,
     ) -> None:
-        """`begin`: for copies that are stepped all at once, whichever lane they are of."""
+        """`step_all` is for env copies that one vector environment steps together, in whichever lane they are."""
         self.steps = 0
-        """env steps collected: valid rows"""
+        """env steps collected, which are the valid rows"""
         self.stages = {"open": 0.0, "act": 0.0, "step": 0.0}
-        """seconds spent making and first resetting copies, choosing actions, stepping copies"""
+        """seconds spent opening lanes (making and first resetting copies), choosing actions, stepping copies"""
         self._run = run
         self._policy = policy
-        self._open_copies, self._begin = open_copies, begin
+        self._open_copies, self._step_all = open_copies, step_all
         self._distribution = distribution(run.policy)
         self._write = make_action_converter(run.policy.action)
         self._lanes: dict[int, CollectedLane] = {}
-        self._leaving: list[CollectedLane] = []  # closed by a pulse, while their copies may be in mid-step
+        self._to_close: list[CollectedLane] = []  # released by a pulse, when their copies may be in the middle of a step
         self._collecting = False
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
-        """Act with these weights from now on."""
+        """Use these weights from now on."""
         self._policy.load(parameters, buffers)
 
     def collect(self, assignments: Sequence[Assignment], version: int, session: int, pulse: Pulse) -> list[Rollout]:
-        """One rollout for each assignment, in their order; each is of another lane.
+        """One rollout for each assignment, in their order. Each assignment must be of another lane.
 
-        `pulse` is called at every step and may raise. Whatever raises, it or an environment (`LaneFailed`), these
-        lanes are closed: half a rollout is nobody's.
+        `pulse` is called at every step and may raise. When it raises, or an environment does (`LaneFailed`), these lanes
+        are closed, and the unfinished rollouts are dropped.
         """
         if len({assignment.lane for assignment in assignments}) < len(assignments):
             raise ValueError(f"collect expected one assignment for each lane, got {assignments}")
         self._collecting = True
         try:
-            lanes = [self._living(assignment, pulse) for assignment in assignments]
+            lanes = [self._lane_for(assignment, pulse) for assignment in assignments]
             rows = self._new_rows(lanes)
             try:
                 self._fill(rows, lanes, pulse)
-            except (LaneFailed, EnvironmentFailed, IndexError):  # a nonsensical row explains what came of it
-                done = len(rows.clock)
+            except (LaneFailed, EnvironmentFailed, IndexError):  # an invalid row explains the error that followed
+                done = len(rows.step_end_s)
                 for i, lane in enumerate(lanes):
-                    lane.check_sense([array[i, : done + 1] for array in rows.obs], rows.reward[i, :done])
+                    lane.check_values([array[i, : done + 1] for array in rows.obs], rows.reward[i, :done])
                 raise
             return [
                 self._rollout(rows, i, lane, assignment, version, session)
@@ -124,17 +124,17 @@ class Collector:
             self.close(())
 
     def close(self, lanes: Iterable[int]) -> None:
-        """Let go of these lanes, those that are here; a pulse may ask for it, and then it is done after the collection."""
-        self._leaving += [self._lanes.pop(lane) for lane in lanes if lane in self._lanes]
-        while self._leaving and not self._collecting:
-            self._leaving.pop().copies.close()
+        """Close these lanes, if they are here. When a pulse calls this, they are closed after the collection."""
+        self._to_close += [self._lanes.pop(lane) for lane in lanes if lane in self._lanes]
+        while self._to_close and not self._collecting:
+            self._to_close.pop().copies.close()
 
     def close_all(self) -> None:
-        """Let go of every lane."""
+        """Close every lane."""
         self.close(list(self._lanes))
 
-    def _living(self, assignment: Assignment, pulse: Pulse) -> CollectedLane:
-        """The lane in this incarnation, opened if need be."""
+    def _lane_for(self, assignment: Assignment, pulse: Pulse) -> CollectedLane:
+        """The lane in this incarnation. It is opened if it does not exist."""
         lane = self._lanes.get(assignment.lane)
         if lane is not None and lane.incarnation == assignment.incarnation:
             return lane
@@ -165,64 +165,68 @@ class Collector:
             reward=np.empty((L, T, N)),
             terminated=np.empty((L, T, N), bool),
             truncated=np.empty((L, T, N), bool),
-            clock=[],
+            step_end_s=[],
         )
 
     def _fill(self, rows: _Rows, lanes: Sequence[CollectedLane], pulse: Pulse) -> None:
         """Step all lanes T times."""
-        remembers = rows.state.size > 0
+        is_recurrent = rows.state.size > 0
         resets = np.stack([lane.ended for lane in lanes])  # [L, N] row t is not valid
         numbers = [lane.number for lane in lanes]
         stages = self.stages
-        each = [  # the parts of every lane
+        views = [  # of every lane
             (i, lane, rows.reward[i], rows.terminated[i], rows.truncated[i], [array[i] for array in rows.obs])
             for i, lane in enumerate(lanes)
         ]
         for t in range(self._run.rollout_steps):
             pulse()
             began = perf_counter()
-            with np.errstate(all="ignore"):  # a NaN is named once the rows are full
+            with np.errstate(all="ignore"):  # a NaN is reported once the rollout is complete
                 params = self._policy([leaf[:, t] for leaf in rows.obs], rows.state)
                 action = self._distribution.sample(params, rows.noise[:, t])
                 taken = self._write(action)
             rows.params[:, t] = params
             rows.action[:, t] = action
             acted = perf_counter()
-            self._begin(numbers, taken, pulse)
-            for i, lane, reward, terminated, truncated, obs in each:
+            self._step_all(numbers, taken, pulse)
+            for i, lane, reward, terminated, truncated, obs in views:
                 row = lane.step(taken[i], t, pulse)
                 try:
                     leaves, reward[t], terminated[t], truncated[t], lost = row
                     for array, leaf in zip(obs, leaves, strict=True):
                         array[t + 1] = leaf
                 except (TypeError, ValueError) as error:
-                    raise LaneFailed(lane.number, f"step {t}: its environment gave what cannot be kept: {error}") from error
+                    raise LaneFailed(
+                        lane.number, f"step {t}: its environment returned an unusable value: {error}"
+                    ) from error
                 if lost is not None:
-                    _cut_short(rows, i, lane, t, lost)
-            if remembers:
+                    _truncate_lost(rows, i, lane, t, lost)
+            if is_recurrent:
                 rows.state[resets] = 0.0
                 resets = rows.terminated[:, t] | rows.truncated[:, t]
-            over = perf_counter()
-            rows.clock.append(over)
+            ended = perf_counter()
+            rows.step_end_s.append(ended)
             stages["act"] += acted - began
-            stages["step"] += over - acted
+            stages["step"] += ended - acted
 
-    def _rollout(self, rows: _Rows, i: int, lane: CollectedLane, about: Assignment, version: int, session: int) -> Rollout:
-        """Lane `i` of the rows, as views."""
-        valid, episodes = lane.finish(rows.reward[i], rows.terminated[i] | rows.truncated[i], rows.clock)
+    def _rollout(
+        self, rows: _Rows, i: int, lane: CollectedLane, assignment: Assignment, version: int, session: int
+    ) -> Rollout:
+        """The rollout of lane `i`, made of views of the rows."""
+        valid, episodes = lane.finish(rows.reward[i], rows.terminated[i] | rows.truncated[i], rows.step_end_s)
         obs = tuple(array[i] for array in rows.obs)
         with np.errstate(over="ignore"):
             reward = rows.reward[i].astype(np.float32)
-        lane.check_sense(obs, reward)
+        lane.check_values(obs, reward)
         lane.obs = tuple(array[-1].copy() for array in obs)
         before, lane.state = lane.state, rows.state[i].copy()
         self.steps += int(np.count_nonzero(valid))
         return Rollout(
             session=session,
             lane=lane.number,
-            ticket=about.ticket,
+            ticket=assignment.ticket,
             version=version,
-            sequence=about.sequence,
+            sequence=assignment.sequence,
             obs=obs,
             action=rows.action[i],
             log_prob=self._distribution.log_prob(rows.params[i], rows.action[i]),
@@ -235,13 +239,13 @@ class Collector:
         )
 
 
-def _cut_short(rows: _Rows, i: int, lane: CollectedLane, t: int, lost: npt.NDArray[np.bool_]) -> None:
-    """Lane `i` lost these copies [N] in step `t`: their episodes end, truncated, with the last step that was made.
+def _truncate_lost(rows: _Rows, i: int, lane: CollectedLane, t: int, lost: npt.NDArray[np.bool_]) -> None:
+    """Lane `i` lost these copies [N] in step `t`: their episodes are truncated at the last step that was made.
 
-    Rows `t` and `t + 1` are then not valid: nothing is made up for the step that was not.
+    Rows `t` and `t + 1` are then not valid, because step `t` was not made.
     """
     rows.truncated[i, t] |= lost
     if t:
         rows.truncated[i, t - 1] |= lost & ~rows.terminated[i, t - 1]
     else:
-        lane.ended |= lost  # the last rollout is delivered: the episode's end is in none
+        lane.ended |= lost  # the last rollout is already delivered, so no rollout has the end of the episode

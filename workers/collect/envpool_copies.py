@@ -1,8 +1,8 @@
-"""The env copies of one lane as envpool steps them, with a clock of our own.
+"""The env copies of one lane in envpool, with time limits that are applied here.
 
-The law is NEXT_STEP autoreset, which envpool keeps, and exact flags, which it does not: an episode that fails in the very
-step of its time limit comes as truncated alone. So envpool is given one step more than there is, and never reaches its
-limit: a copy that has had its steps is truncated here, and reset by hand in the step after.
+The law is NextStep autoreset, which envpool keeps, and exact flags, which it does not: it reports an episode that terminates
+in the last step of its time limit as truncated only. So envpool gets a limit of one step more, and never reaches it: a copy
+that has made all its steps is truncated here, and reset explicitly in the next step.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from workers.env_loop import Pulse
 
 
 class EnvpoolCopies:
-    """N copies in one pool, made at the first reset: envpool takes its seeds only then."""
+    """N copies in one pool. The pool is made at the first reset, because envpool takes its seeds when it is made."""
 
     def __init__(self, pool: EnvpoolSpec, copies: int) -> None:
         self.observation_space = pool.observation_space
@@ -31,10 +31,10 @@ class EnvpoolCopies:
         self._pool = pool
         self._env: VectorEnv[Any, Any, Any] | None = None
         self._read = make_flatten(self.observation_space)
-        self._cut = np.zeros(copies, bool)  # [N] truncated here: envpool does not know of it
+        self._truncated = np.zeros(copies, bool)  # [N] truncated here, which envpool does not know
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:
-        """Begin: one seed for each copy."""
+        """Start episodes in all copies, with a seed for each."""
         pulse()
         try:
             self._env = self._pool.make(seeds)
@@ -43,35 +43,37 @@ class EnvpoolCopies:
             raise CopyRaised(None, "reset") from error
 
     def step(self, actions: Array, pulse: Pulse) -> StepResult:
-        """Step all copies at once; those that were cut are reset."""
+        """Step all copies at once, and reset those that were truncated here."""
         try:
-            row, elapsed = self._step_beside_cut(actions) if self._cut.any() else self._step(actions)
+            result, elapsed = self._step_and_reset(actions) if self._truncated.any() else self._step(actions)
         except Exception as error:
             raise CopyRaised(None, "step") from error
-        over = elapsed >= self._pool.limit
-        self._cut = over & ~row.terminated & ~row.truncated
-        return row._replace(truncated=row.truncated | over)
+        at_limit = elapsed >= self._pool.limit
+        self._truncated = at_limit & ~result.terminated & ~result.truncated
+        return result._replace(truncated=result.truncated | at_limit)
 
     def _step(self, actions: Array, copies: Array | None = None) -> tuple[StepResult, Array]:
-        """Of these copies, or all: what they gave, and how many steps [n] their episodes have had."""
+        """Step these n copies, or all: the result, and the number of steps [n] of their episodes."""
         observation, reward, terminated, truncated, infos = self._env.step(actions, copies)  # type: ignore[union-attr,call-arg]
         return StepResult(self._read(observation), reward, terminated, truncated), infos["elapsed_step"]
 
-    def _step_beside_cut(self, actions: Array) -> tuple[StepResult, Array]:
-        cut, rest = np.flatnonzero(self._cut), np.flatnonzero(~self._cut)
-        first = self._read(self._env.reset(cut)[0])  # type: ignore[union-attr,arg-type,call-arg]
-        row, elapsed = self._step(actions[rest], rest)
+    def _step_and_reset(self, actions: Array) -> tuple[StepResult, Array]:
+        """Reset the copies that were truncated here and step the others: the result of all, as in `_step`."""
+        reset, rest = np.flatnonzero(self._truncated), np.flatnonzero(~self._truncated)
+        first = self._read(self._env.reset(reset)[0])  # type: ignore[union-attr,arg-type,call-arg]
+        result, elapsed = self._step(actions[rest], rest)
 
-        def whole(of_rest: Array, of_cut: Any = 0) -> Array:
+        def merged(of_rest: Array, of_reset: Any = 0) -> Array:
             array = np.empty((len(actions), *of_rest.shape[1:]), of_rest.dtype)
-            array[rest], array[cut] = of_rest, of_cut
+            array[rest], array[reset] = of_rest, of_reset
             return array
 
-        leaves = [whole(later, begun) for later, begun in zip(row.leaves, first, strict=True)]
-        return StepResult(leaves, whole(row.reward), whole(row.terminated), whole(row.truncated)), whole(elapsed)
+        leaves = [merged(stepped, started) for stepped, started in zip(result.leaves, first, strict=True)]
+        flags = merged(result.terminated), merged(result.truncated)
+        return StepResult(leaves, merged(result.reward), *flags), merged(elapsed)
 
     def close(self) -> None:
-        """Let go of it, whatever it says; its thread ends with it."""
+        """Close the pool and its threads. What it raises is ignored."""
         if self._env is not None:
             with suppress(Exception):
                 self._env.close()

@@ -1,13 +1,13 @@
-"""The env copies of all lanes, stepped at once: each lane is a part of one vector environment, whose copies live elsewhere.
+"""One vector environment split into lanes: the workers of the vector environment step its env copies, a collector acts.
 
-The law: a lane gets, bit for bit, what a loop over its copies would give. Its copies' seeds and actions are its own, and
-NEXT_STEP autoreset is the vector environment's as it is the loop's.
+The law: a lane returns, bit for bit, what a loop over its copies would return. The seeds and actions of its copies are its
+own, and autoreset is NextStep for the vector environment as for the loop.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from gymnasium.vector import VectorEnv
@@ -19,76 +19,83 @@ from protocol.specs import RunSpec
 from workers.collect.env_copies import EnvCopies, Leaves, StepResult
 from workers.env_loop import Pulse
 
+Result = TypeVar("Result")
 
-class SideBySide:
-    """The lanes of a run, of equally many copies each; lane 0 has the vector environment's first ones."""
+
+class SplitVectorEnv:
+    """Lanes of equally many copies each. Lane 0 has the first copies of the vector environment."""
 
     def __init__(
-        self, env: VectorEnv[Any, Any, Any], lanes: int, before: Callable[[Pulse], None] = lambda pulse: None
+        self, env: VectorEnv[Any, Any, Any], lanes: int, before_wait: Callable[[Pulse], None] = lambda pulse: None
     ) -> None:
-        """`before`: called before each wait for the vector environment, with what is to be called now and then meanwhile."""
+        """`before_wait` is called before each wait for the vector environment, with the `pulse` to call during the wait."""
         self.env = env
-        self.nobody: NoWorkers | None = None
-        """why nobody steps the copies any more"""
-        self._lanes, self._before = lanes, before
+        self._lanes, self._before_wait = lanes, before_wait
         self._read = make_flatten(env.single_observation_space)
-        self._row: StepResult | None = None
+        self._result: StepResult | None = None
+        self._no_workers: NoWorkers | None = None
 
-    def open(self, run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
-        """The copies of this lane: for `Collector`."""
-        return _Part(self, slice(lane * run.copies, (lane + 1) * run.copies))
+    def open_lane(self, run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
+        """The copies of this lane: `OpenEnvCopies` of a `Collector`."""
+        return _LaneOfVectorEnv(self, slice(lane * run.copies, (lane + 1) * run.copies))
 
-    def begin(self, lanes: Sequence[int], actions: Array, pulse: Pulse) -> None:
-        """Step the copies of all lanes, with actions [L, N, *action]: for `Collector`."""
+    def step_all(self, lanes: Sequence[int], actions: Array, pulse: Pulse) -> None:
+        """Step the copies of all lanes, with actions [L, N, *action]: `StepAll` of a `Collector`."""
         order = sorted(range(len(lanes)), key=lanes.__getitem__)
         if [lanes[i] for i in order] != list(range(self._lanes)):
             raise ValueError(f"lanes expected all {self._lanes} of the vector environment at once, got {sorted(lanes)}")
-        each = actions[order].reshape(-1, *actions.shape[2:])  # [L · N, *action]
-        observation, reward, terminated, truncated, infos = self.wait(lambda: self.env.step(each), pulse)
-        self._row = StepResult(self._read(observation), reward, terminated, truncated, infos.get("worker_lost"))
+        in_order = actions[order].reshape(-1, *actions.shape[2:])  # [L · N, *action]
+        observation, reward, terminated, truncated, infos = self._wait(lambda: self.env.step(in_order), pulse)
+        self._result = StepResult(self._read(observation), reward, terminated, truncated, infos.get("worker_lost"))
 
-    def row(self, copies: slice) -> StepResult:
-        """What these copies gave in the last step."""
-        assert self._row is not None
-        leaves, reward, terminated, truncated, lost = self._row
+    def result(self, copies: slice) -> StepResult:
+        """The part of the last step's result that belongs to these copies."""
+        assert self._result is not None
+        leaves, reward, terminated, truncated, lost = self._result
         lost = None if lost is None else lost[copies]
         return StepResult([leaf[copies] for leaf in leaves], reward[copies], terminated[copies], truncated[copies], lost)
 
     def reset(self, copies: slice, seeds: Sequence[int], pulse: Pulse) -> Leaves:
-        """Begin episodes in these copies."""
+        """Start episodes in these copies, with a seed for each."""
         mask = np.zeros(self.env.num_envs, bool)
         mask[copies] = True
-        each: list[Any] = [None] * self.env.num_envs
-        each[copies] = seeds
+        all_seeds: list[Any] = [None] * self.env.num_envs
+        all_seeds[copies] = seeds
         options = {"reset_mask": mask}
-        observation, _ = self.wait(lambda: self.env.reset(seed=each, options=options), pulse)  # type: ignore[arg-type]
+        observation, _ = self._wait(lambda: self.env.reset(seed=all_seeds, options=options), pulse)  # type: ignore[arg-type]
         return [leaf[copies] for leaf in self._read(observation)]
 
-    def wait(self, doing: Callable[[], Any], pulse: Pulse) -> Any:
-        """Do what may wait for workers."""
+    def raise_if_no_workers(self) -> None:
+        """Raise `NoWorkers` once, if a wait ended because no worker was left."""
+        if (error := self._no_workers) is not None:
+            self._no_workers = None
+            raise error
+
+    def _wait(self, call: Callable[[], Result], pulse: Pulse) -> Result:
+        """Make a call that may wait for workers."""
         try:
-            self._before(pulse)
-            return doing()
+            self._before_wait(pulse)
+            return call()
         except NoWorkers as error:
-            self.nobody = error
+            self._no_workers = error
             raise
 
 
-class _Part:
-    """One lane's copies."""
+class _LaneOfVectorEnv:
+    """The env copies of one lane."""
 
-    def __init__(self, whole: SideBySide, copies: slice) -> None:
-        self._whole, self._copies = whole, copies
-        self.observation_space = whole.env.single_observation_space
-        self.action_space = whole.env.single_action_space
+    def __init__(self, split: SplitVectorEnv, copies: slice) -> None:
+        self._split, self._copies = split, copies
+        self.observation_space = split.env.single_observation_space
+        self.action_space = split.env.single_action_space
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:
-        """Begin: one seed for each copy."""
-        return self._whole.reset(self._copies, seeds, pulse)
+        """Start episodes in all copies, with a seed for each."""
+        return self._split.reset(self._copies, seeds, pulse)
 
     def step(self, actions: Array, pulse: Pulse) -> StepResult:
-        """What `begin` stepped."""
-        return self._whole.row(self._copies)
+        """The result of the step that `SplitVectorEnv.step_all` made."""
+        return self._split.result(self._copies)
 
     def close(self) -> None:
-        """Nothing: they are the vector environment's, and begin anew when the lane does."""
+        """Do nothing: the copies belong to the vector environment, and are reset when the lane starts anew."""

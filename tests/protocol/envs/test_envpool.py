@@ -21,7 +21,7 @@ from protocol.env_spec import EnvSpec
 from protocol.envs.envpool import envpool_spec
 from protocol.errors import UsageError
 from protocol.specs import RunSpec
-from tests.support.collectors import TOY, a_collector, bits, collect, no_pulse, run_of, trained
+from tests.support.collectors import TOY, bits, collect, no_pulse, random_collector, run_of, trained
 from workers.collect.env_copies import LoopedCopies, StepResult, copy_seeds
 from workers.collect.envpool_copies import EnvpoolCopies
 from workers.envs.toy import Countdown
@@ -116,7 +116,7 @@ def test_every_row_keeps_the_law_whatever_is_done(N: int, limit: int, seed: int,
 @pytest.mark.parametrize(("env", "kwargs"), [("CartPole-v1", {"max_episode_steps": 7}), ("Pendulum-v1", {})])
 def test_time_limits_are_truncations_and_rows_are_those_of_the_loop(env: str, kwargs: dict[str, Any]) -> None:
     run = run_of(env, T=410 if env == "Pendulum-v1" else 20, N=3, kwargs=kwargs)
-    (loop,), (pool,) = (collect(a_collector(each), each) for each in (run, pooled(run)))
+    (loop,), (pool,) = (collect(random_collector(each), each) for each in (run, pooled(run)))
     for name in ("terminated", "truncated", "valid"):
         assert getattr(pool, name).tolist() == getattr(loop, name).tolist(), name
     assert [episode.length for episode in pool.episodes] == [episode.length for episode in loop.episodes]
@@ -129,12 +129,15 @@ def test_time_limits_are_truncations_and_rows_are_those_of_the_loop(env: str, kw
 @here
 def test_a_lane_gets_the_same_bits_alone_and_beside_others_and_others_by_its_seeds() -> None:
     run = pooled(run_of("CartPole-v1", T=30, N=5, kwargs={"max_episode_steps": 12}))
-    together, apart = a_collector(run), a_collector(run)
+    together, apart = random_collector(run), random_collector(run)
     for k in range(3):
         found = {rollout.lane: bits(rollout) for rollout in collect(together, run, k, (2, 0, 1))}
         assert found[1] == bits(collect(apart, run, k, (1,))[0])
         assert found[1]["obs"] != found[2]["obs"]
-    firsts = [*collect(a_collector(run), run, lanes=(0, 1)), *collect(a_collector(run), run, lanes=(1,), incarnation=1)]
+    firsts = [
+        *collect(random_collector(run), run, lanes=(0, 1)),
+        *collect(random_collector(run), run, lanes=(1,), incarnation=1),
+    ]
     assert len(np.unique(np.concatenate([rollout.obs[0][0] for rollout in firsts]), axis=0)) == 15
 
 

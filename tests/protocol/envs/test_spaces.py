@@ -13,7 +13,7 @@ from protocol.envs.spaces import action_spec, make_action_converter, make_flatte
 from protocol.errors import BadRollout, UsageError
 from protocol.rollout import Episode, Rollout, validate
 from protocol.specs import RunSpec
-from tests.support.collectors import TOY, a_collector, bits, collect, over_sync, run_of
+from tests.support.collectors import TOY, bits, collect, random_collector, run_of, sync_vector_env_over
 from workers.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_ACTIONS, UNSUPPORTED_OBSERVATIONS
 
 SEEN = sorted(OBSERVATIONS.keys() - UNSUPPORTED_OBSERVATIONS)
@@ -27,7 +27,7 @@ def spaces_run(observation: str = "box", action: str = "discrete") -> RunSpec:
 @pytest.mark.parametrize(("observation", "action"), [(seen, "discrete") for seen in SEEN] + [("box", done) for done in DONE])
 def test_every_space_collects_alike_in_a_loop_and_in_a_vector_environment(observation: str, action: str) -> None:
     run = spaces_run(observation, action)
-    loop, sync = a_collector(run), a_collector(run, over_sync([run.env.make] * 3))
+    loop, sync = random_collector(run), random_collector(run, sync_vector_env_over([run.env.make] * 3))
     for k in range(2):
         ours, theirs = (collect(collector, run, k, lanes=(0, 1)) for collector in (loop, sync))  # the toy checks its actions
         assert [bits(rollout) for rollout in ours] == [bits(rollout) for rollout in theirs]
@@ -39,7 +39,7 @@ def test_every_space_collects_alike_in_a_loop_and_in_a_vector_environment(observ
 @pytest.mark.parametrize("observation", SEEN)
 def test_the_leaves_of_an_observation_are_its_arrays_as_they_are(observation: str) -> None:
     run, space = spaces_run(observation), OBSERVATIONS[observation]
-    (rollout,) = collect(a_collector(run), run)
+    (rollout,) = collect(random_collector(run), run)
     env = run.env.make()
     for leaf, array in zip(observation_leaves(space), rollout.obs, strict=True):
         inner = space
@@ -142,7 +142,7 @@ def test_observations_without_a_fixed_array_are_refused(space: gymnasium.Space[o
 def altered(observation: str = "box", action_space: str = "discrete", **changes: object) -> str:
     """What `validate` says of a good rollout after these changes."""
     run = run_of(f"{TOY}Spaces-v0", T=6, N=3, kwargs={"observation": observation, "action": action_space})
-    (good,) = collect(a_collector(run), run)
+    (good,) = collect(random_collector(run), run)
     fields = {name: getattr(good, name) for name in good.__struct_fields__} | {
         name: change(getattr(good, name)) for name, change in changes.items() if callable(change)
     }

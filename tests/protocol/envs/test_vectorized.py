@@ -19,7 +19,7 @@ from protocol.env_spec import EnvSpec
 from protocol.envs.vectorized import make_native
 from protocol.errors import UsageError
 from protocol.specs import RunSpec
-from tests.support.collectors import TOY, a_collector, bits, collect, no_pulse, run_of, trained
+from tests.support.collectors import TOY, bits, collect, no_pulse, random_collector, run_of, trained
 from workers.collect.env_copies import LoopedCopies, VectorCopies, copy_seeds
 from workers.envs.toy import Countdown
 
@@ -80,13 +80,13 @@ def test_time_limits_are_truncations_and_rows_are_those_of_the_loop() -> None:
 
 
 def rollouts(run: RunSpec) -> list[Any]:
-    collector = a_collector(run)
+    collector = random_collector(run)
     return [collect(collector, run, k)[0] for k in range(3)]
 
 
 def test_a_lane_gets_the_same_bits_alone_and_beside_others_and_others_by_its_seeds() -> None:
     run = native(run_of("CartPole-v1", T=30, N=5))
-    together, apart = a_collector(run), a_collector(run)
+    together, apart = random_collector(run), random_collector(run)
     for k in range(3):
         found = {rollout.lane: bits(rollout) for rollout in collect(together, run, k, (2, 0, 1))}
         assert found[1] == bits(collect(apart, run, k, (1,))[0])

@@ -30,7 +30,7 @@ from protocol.policy.torch_policy import TorchPolicy
 from protocol.rollout import Rollout, stack_rollouts, validate
 from protocol.specs import PolicySpec, RunSpec
 from tests.support.batches import DISCRETE, GAUSSIAN, IMAGE, batch, no_pulse, normal, recurrent, shared
-from tests.support.collectors import TOY, a_collector, collect, random_policy, run_of
+from tests.support.collectors import TOY, collect, random_collector, random_policy, run_of
 from workers.collect.collector import Collector
 from workers.collect.held_rollouts import Assignment
 from workers.envs.toy import Scripted
@@ -150,7 +150,7 @@ def check_states(run: RunSpec, rollouts: list[Rollout]) -> None:
 @pytest.mark.parametrize("T", [1, 2, 5])
 def test_it_is_carried_from_rollout_to_rollout_and_begins_with_an_episode(core: Core, script: str, T: int) -> None:
     run = run_of(f"{TOY}Scripted-v0", T=T, N=2, kwargs={"script": script}, core=core, core_size=6)
-    collector = a_collector(run)
+    collector = random_collector(run)
     rollouts = [collect(collector, run, k)[0] for k in range(12 // T)]
     check_states(run, rollouts)
     assert (rollouts[0].state == 0).all()
@@ -161,7 +161,7 @@ def test_it_is_carried_from_rollout_to_rollout_and_begins_with_an_episode(core: 
 
 def test_a_state_that_does_not_fit_is_refused() -> None:
     run = run_of("CartPole-v1", T=2, N=3, core="gru", core_size=5)
-    (good,) = collect(a_collector(run), run)
+    (good,) = collect(random_collector(run), run)
     for state, says in [
         (np.zeros((3, 4), np.float32), r"state expected float32\[1, 3, 5\], got float32\[1, 3, 4\]"),
         (np.full((3, 5), np.nan, np.float32), "state expected finite values, got nan at step 0, copy 0"),
@@ -172,7 +172,7 @@ def test_a_state_that_does_not_fit_is_refused() -> None:
 
 def test_rollouts_are_stacked_with_their_states() -> None:
     run = run_of("CartPole-v1", T=4, N=2, core="gru", core_size=3)
-    collector = a_collector(run)
+    collector = random_collector(run)
     collect(collector, run, 0, (0, 1))
     later = collect(collector, run, 1, (0, 1))
     rows = stack_rollouts(later[::-1])

@@ -25,7 +25,7 @@ from protocol.rollout import Rollout, rollout_bytes
 from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
 from protocol.wire.codec import MAX_FRAME_BYTES, decode_to_learner, decode_to_worker, encode
 from protocol.wire.compression import Packing, pack_stack, unpack_array, unpack_stack, why_no_zstd
-from tests.support.collectors import a_collector, collect, over_copies_of, run_around, run_of
+from tests.support.collectors import collect, loop_over, random_collector, run_around, run_of
 
 U1 = np.dtype(np.uint8)
 
@@ -136,7 +136,7 @@ def test_what_a_worker_collects_of_gymnasiums_frame_stacks_is_packed(padding: st
         return FrameStackObservation(Dice(), 4, padding_type=padding)
 
     run = msgspec.structs.replace(run_around(make(), 40), copies=3)
-    (rollout,) = collect(a_collector(run, over_copies_of([make] * 3)), run)
+    (rollout,) = collect(random_collector(run, loop_over([make] * 3)), run)
     (obs,) = rollout.obs
     payload = pack_stack(obs)
     assert payload is not None
@@ -185,7 +185,7 @@ def sent(rollout: Rollout) -> list[bytes]:
 
 def test_the_room_of_a_run_is_what_its_rollouts_come_to() -> None:
     for run in (run_of("CartPole-v1", core="lstm", core_size=9), run_of("Pendulum-v1", T=3, N=5)):
-        (rollout,) = collect(a_collector(run), run)
+        (rollout,) = collect(random_collector(run), run)
         assert rollout_bytes(run) == sum(map(len, encode(rollout)[1:]))
     assert sum(map(len, encode(a_rollout())[1:])) == ROOM
 
