@@ -1,7 +1,7 @@
-"""Greedy episodes of a policy: how good is it? Deterministic for a seed.
+"""Evaluates a policy by greedy episodes. Deterministic for a seed.
 
-Copies are stepped side by side by hand, each for a number of episodes fixed beforehand: waiting for the first so many
-episodes to end would favour short ones. Every episode is counted, none is invented.
+Several env copies are stepped together. The number of episodes of each is fixed beforehand, because taking the first
+episodes that end would favor short ones.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from protocol.policy.recurrent import zero_state
 from protocol.specs import PolicySpec
 
 COPIES = 20
-LONGEST_EPISODE = 100_000  # env steps; an environment without a time limit must not stop a run from ending
+LONGEST_EPISODE = 100_000  # env steps; so that a run ends even if the environment has no time limit
 
 
 def evaluate(
@@ -36,44 +36,38 @@ def evaluate(
     seed: int,
     pulse: Callable[[], None] = lambda: None,
 ) -> Evaluation:
-    """Act greedily for so many episodes; `pulse` is called at every step. Raises `EnvironmentFailed` if it raises."""
+    """Play greedy episodes. `pulse` is called before every step. Raises `EnvironmentFailed` if the environment raises."""
     envs = [env_spec.make() for _ in range(min(episodes, COPIES))]
     try:
         returns, lengths, cut = _play(envs, policy, spec, episodes, seed, pulse)
     finally:
         for env in envs:
             env.close()
-    return Evaluation(
-        episodes=len(returns),
-        return_mean=float(np.mean(returns)),
-        return_std=float(np.std(returns)),
-        length_mean=float(np.mean(lengths)),
-        cut=cut,
-    )
+    return Evaluation.of(returns, lengths, cut)
 
 
-class _Copy:
-    """One env copy: the episode it is in, and how many more it plays."""
+class _EnvCopy:
+    """One env copy, its current episode, and the number of episodes that it still has to play."""
 
-    def __init__(self, env: gymnasium.Env[Any, Any], seed: int, quota: int) -> None:
+    def __init__(self, env: gymnasium.Env[Any, Any], seed: int, episodes: int) -> None:
         self._env = env
-        self.left = quota
+        self.episodes_left = episodes
         self._reset(seed)
 
     def step(self, action: Any) -> tuple[float, int, bool] | None:
-        """One step; return, length and whether it was cut, if that ended an episode."""
+        """Make one step. If the episode ends: its return, its length, and whether it was stopped because it was too long."""
         try:
             self.obs, reward, terminated, truncated, _ = self._env.step(action)
         except Exception as error:
-            raise _failed(self._env, error) from error
+            raise environment_failed(self._env, error, "the policy was evaluated") from error
         self._reward += float(reward)
         self._length += 1
         ended = terminated or truncated
         if not ended and self._length < LONGEST_EPISODE:
             return None
         done = self._reward, self._length, not ended
-        self.left -= 1
-        if self.left:
+        self.episodes_left -= 1
+        if self.episodes_left:
             self._reset(None)
         return done
 
@@ -82,7 +76,7 @@ class _Copy:
         try:
             self.obs, _ = self._env.reset(seed=seed)
         except Exception as error:
-            raise _failed(self._env, error) from error
+            raise environment_failed(self._env, error, "the policy was evaluated") from error
 
 
 def _play(
@@ -97,8 +91,8 @@ def _play(
     read, write, mode = make_flatten(space), make_action_converter(spec.action), distribution(spec).mode
     dtypes = [leaf.dtype for leaf in observation_leaves(space)]
     seeds = np.random.SeedSequence(seed).generate_state(len(envs))
-    quotas = [episodes // len(envs) + (i < episodes % len(envs)) for i in range(len(envs))]
-    playing = [_Copy(env, int(own), quota) for env, own, quota in zip(envs, seeds, quotas, strict=True)]
+    counts = [episodes // len(envs) + (i < episodes % len(envs)) for i in range(len(envs))]
+    playing = [_EnvCopy(env, int(own_seed), count) for env, own_seed, count in zip(envs, seeds, counts, strict=True)]
     done: list[tuple[float, int, bool]] = []
     state = zero_state(spec, 1, len(playing))
     while playing:
@@ -109,22 +103,25 @@ def _play(
         ends = [copy.step(action) for copy, action in zip(playing, actions, strict=True)]
         done += [end for end in ends if end is not None]
         state[0, [end is not None for end in ends]] = 0.0
-        state = state[:, [copy.left > 0 for copy in playing]]
-        playing = [copy for copy in playing if copy.left]
+        state = state[:, [copy.episodes_left > 0 for copy in playing]]
+        playing = [copy for copy in playing if copy.episodes_left]
     returns, lengths, cuts = zip(*done, strict=True)
     return list(returns), list(lengths), sum(cuts)
 
 
 def load_policy(run: Path, which: Which = "final") -> tuple[Policy, PolicySpec, EnvSpec]:
-    """The policy of a run folder, ready to act, and the environment it was made for. Raises `UsageError` in one line."""
+    """The policy of a run folder, its spec, and the environment for which it was trained.
+
+    Raises `UsageError` in one line.
+    """
     card, parameters, buffers = RunFolder.open(run).read_policy(which)
     policy = make_policy(card.policy)
     policy.load(parameters, buffers)
     return policy, card.policy, EnvSpec(card.env, card.env_kwargs)
 
 
-def _failed(env: gymnasium.Env[Any, Any], error: Exception) -> EnvironmentFailed:
-    """What the environment raised, as ours, with its traceback as text."""
+def environment_failed(env: gymnasium.Env[Any, Any], error: Exception, when: str) -> EnvironmentFailed:
+    """Our error for an exception of the environment, with the traceback as text. `when`: as "it was played"."""
     name = env.spec.id if env.spec else type(env.unwrapped).__name__
-    line = f"environment {name} raised while the policy was evaluated: {type(error).__name__}: {first_line(error, '')}"
+    line = f"environment {name} raised while {when}: {type(error).__name__}: {first_line(error, '')}"
     return EnvironmentFailed(line, traceback.format_exc())

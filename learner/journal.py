@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from learner.algorithms import Algorithm
 from learner.config.config import Config
 from learner.evaluations import Evaluations, warn_on_error
-from learner.recording.record import TrainingRecorder
+from learner.recording.training_recorder import TrainingRecorder
 from learner.rollouts.arrived_rollout import ArrivedRollout
 from learner.rollouts.hub import HubSnapshot
 from learner.run_folder import checkpoint

@@ -1,7 +1,7 @@
-"""A Minari dataset that is being written. Minari is an extra, imported when it is needed.
+"""Writes a Minari dataset. Minari is an optional dependency and is imported only when it is needed.
 
-The law: the dataset is there whole or not there; if it fails, what Minari has made for it is removed. No more than
-`CHUNK_BYTES` of episodes wait in memory, and images are kept as they are, not as JPEGs.
+The law: the dataset is there whole or not at all; if writing fails, everything that Minari made for it is removed. At most
+about `CHUNK_BYTES` of episodes are held in memory. Images are stored as they are, not as JPEG.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ CHUNK_BYTES = 64 * 2**20
 
 
 class MinariDataset:
-    """A Minari dataset that is being written, in the folder that Minari's own MINARI_DATASETS_PATH chooses.
+    """Writes a Minari dataset into the folder that MINARI_DATASETS_PATH names.
 
-    As a context: whole after it, and gone with all that Minari has made for it if the body raises.
+    As a context: afterwards the dataset is whole. If the body raises, it is removed.
     """
 
     def __init__(self, dataset_id: str, env: gymnasium.Env[Any, Any], about: str) -> None:
-        """Raises `UsageError` if there is no such dataset to be made, or no Minari."""
+        """Raises `UsageError` if such a dataset cannot be made or Minari is not installed."""
         try:
             import h5py  # noqa: F401
             from minari.dataset.minari_dataset import parse_dataset_id
@@ -56,7 +56,7 @@ class MinariDataset:
         self._chunk_bytes = 0
 
     def add(self, episode: RecordedEpisode) -> None:
-        """Keep an episode; it may be written later. Raises `RunError` if the dataset cannot be written."""
+        """Add an episode. It may be written later. Raises `RunError` if the dataset cannot be written."""
         from minari.data_collector import EpisodeBuffer
 
         buffer = EpisodeBuffer(
@@ -74,12 +74,12 @@ class MinariDataset:
             self._write()
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the episodes that are still in memory."""
         if self._chunk:
             self._write()
 
     def discard(self) -> None:
-        """Leave nothing: neither the dataset's folder nor those of its namespaces that were made for it."""
+        """Remove the dataset's folder, and the folders of its namespaces that were made for it."""
         shutil.rmtree(self._folder, ignore_errors=True)
         for folder in self._new_folders:
             with suppress(OSError):
@@ -110,7 +110,7 @@ class MinariDataset:
                     self._dataset = minari.create_dataset_from_buffers(
                         self._id,
                         buffer=self._chunk,
-                        env=self._env if _written_down(self._env) else None,
+                        env=self._env if _spec_can_be_stored(self._env) else None,
                         observation_space=self._env.observation_space,
                         action_space=self._env.action_space,
                         algorithm_name="millrace",
@@ -127,7 +127,7 @@ class MinariDataset:
 
 
 def nested(space: gymnasium.Space[Any], leaves: Iterator[Array]) -> Any:
-    """The arrays of an observation in the space's own order, put back into its Dicts and Tuples."""
+    """Put the arrays of an observation (in the space's own order) back into the Dicts and Tuples of the space."""
     match space:
         case spaces.Dict():
             return {key: nested(inner, leaves) for key, inner in space.spaces.items()}
@@ -137,8 +137,8 @@ def nested(space: gymnasium.Space[Any], leaves: Iterator[Array]) -> Any:
             return next(leaves)
 
 
-def _written_down(env: gymnasium.Env[Any, Any]) -> bool:
-    """Whether a dataset can say how to make its environment again: not if it was registered by a class or a function."""
+def _spec_can_be_stored(env: gymnasium.Env[Any, Any]) -> bool:
+    """Whether the dataset can store how to make its environment. It cannot if that was registered by a class or function."""
     try:
         return env.spec is not None and bool(env.spec.to_json())
     except (TypeError, ValueError):
@@ -146,7 +146,7 @@ def _written_down(env: gymnasium.Env[Any, Any]) -> bool:
 
 
 def _keys(space: gymnasium.Space[Any]) -> Iterator[str]:
-    """Of all Dicts in a space."""
+    """The keys of all Dicts in a space."""
     match space:
         case spaces.Dict():
             for key, inner in space.spaces.items():

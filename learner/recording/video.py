@@ -1,7 +1,7 @@
-"""Films of a run's policy: greedy episodes, one mp4 each, by gymnasium's RecordVideo. Its packages are an extra.
+"""`millrace evaluate --video`: greedy episodes as mp4 files, by gymnasium's RecordVideo, whose packages are optional.
 
-The law: a film stands in the folder whole or not at all. It is named for the seed and the episode: the same ones are filmed
-over.
+The law: a video is in the folder whole or not at all. Its name has the seed and the number of the episode, so the same
+episode overwrites its old video.
 """
 
 from __future__ import annotations
@@ -15,24 +15,26 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-import numpy as np
 
-from learner.recording.record import Player
+from learner.recording.player import Player
 from learner.run_folder.results import Evaluation
 from protocol.env_spec import EnvSpec
 from protocol.errors import EnvironmentFailed, RunError, UsageError
 from protocol.policy.policy import Policy
 from protocol.specs import PolicySpec
 
-LONGEST_FILM = 1_500  # frames; all of them are held in memory until the film is written
+LONGEST_VIDEO = 1_500  # frames; RecordVideo holds them in memory until it writes the file
 LONGEST_EPISODE = 20_000  # env steps
 FOLDER = "videos"
 
 
-def film(
+def record_videos(
     run: Path, env_spec: EnvSpec, policy: Policy, spec: PolicySpec, episodes: int, seed: int
 ) -> tuple[Evaluation, list[Path]]:
-    """Play so many greedy episodes and film them; what they gave, and the films. Raises `OurError` in one line."""
+    """Play greedy episodes and record a video of each.
+
+    Returns the evaluation and the videos. Raises `OurError` in one line.
+    """
     try:
         import moviepy  # noqa: F401
     except ImportError as error:
@@ -43,10 +45,10 @@ def film(
     try:
         folder.mkdir(exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".new-") as new, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of packages beneath gymnasium
-            found = _play(env_spec, policy, spec, episodes, seed, Path(new, "films"))
-            films = sorted(Path(new, "films").glob("*.mp4"), key=lambda path: int(path.stem.rpartition("-")[2]))
-            return found, [path.replace(folder / path.name) for path in films]
+            warnings.simplefilter("ignore")  # from packages that gymnasium uses
+            evaluation = _play(env_spec, policy, spec, episodes, seed, Path(new, "videos"))
+            videos = sorted(Path(new, "videos").glob("*.mp4"), key=lambda path: int(path.stem.rpartition("-")[2]))
+            return evaluation, [path.replace(folder / path.name) for path in videos]
     except OSError as error:
         raise RunError(f"videos of run {run} were not written: {error.strerror or error}") from error
 
@@ -58,7 +60,7 @@ def _play(env_spec: EnvSpec, policy: Policy, spec: PolicySpec, episodes: int, se
         if env.render_mode != "rgb_array" or "rgb_array" not in modes:
             raise UsageError(f"environment {env_spec.id} cannot be filmed: expected it to render rgb_array, got {modes}")
         env = gymnasium.wrappers.RecordVideo(
-            env, str(folder), episode_trigger=lambda _: True, video_length=LONGEST_FILM, name_prefix=f"seed-{seed}"
+            env, str(folder), episode_trigger=lambda _: True, video_length=LONGEST_VIDEO, name_prefix=f"seed-{seed}"
         )
         player = Player(env, policy, spec, seed)
         played, cut = [], 0
@@ -72,12 +74,5 @@ def _play(env_spec: EnvSpec, policy: Policy, spec: PolicySpec, episodes: int, se
         raise
     finally:
         close: Callable[[], None] = env.close
-        close()  # which writes the last film
-    returns = [episode.total for episode in played]
-    return Evaluation(
-        episodes=episodes,
-        return_mean=float(np.mean(returns)),
-        return_std=float(np.std(returns)),
-        length_mean=float(np.mean([episode.length for episode in played])),
-        cut=cut,
-    )
+        close()  # this writes the last video
+    return Evaluation.of([episode.episode_return for episode in played], [episode.length for episode in played], cut)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import msgspec
+import numpy as np
 
 from learner.run_folder.progress import EVALUATION_KEY
 
@@ -18,6 +21,17 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
     """mean length of an episode in env steps"""
     cut: int = 0
     """episodes that were stopped because they were too long; they count with the return they had by then"""
+
+    @staticmethod
+    def of(returns: Sequence[float], lengths: Sequence[int], cut: int) -> Evaluation:
+        """The evaluation of these episodes; `cut` of them were too long."""
+        return Evaluation(
+            episodes=len(returns),
+            return_mean=float(np.mean(returns)),
+            return_std=float(np.std(returns)),
+            length_mean=float(np.mean(lengths)),
+            cut=cut,
+        )
 
     def __str__(self) -> str:
         cut = f", {self.cut} of them cut short" if self.cut else ""

@@ -161,10 +161,10 @@ def _evaluate(argv: list[str]) -> int:
     if not flags.video:
         print(evaluate(env, policy, spec, episodes, flags.seed))
         return 0
-    from learner.recording.video import film
+    from learner.recording.video import record_videos
 
-    found, films = film(flags.run, env, policy, spec, episodes, flags.seed)
-    print("\n".join(map(str, [found, *films])))
+    evaluation, videos = record_videos(flags.run, env, policy, spec, episodes, flags.seed)
+    print("\n".join(map(str, [evaluation, *videos])))
     return 0
 
 

@@ -17,7 +17,8 @@ from learner.config.layers import resolve
 from learner.evaluate import load_policy
 from learner.recording import minari as dataset_module
 from learner.recording.episodes import EpisodeAssembler, RecordedEpisode
-from learner.recording.record import Player, record
+from learner.recording.player import Player
+from learner.recording.record import record
 from learner.run_folder.run_folder import RunFolder
 from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
@@ -273,7 +274,7 @@ def test_minari_reads_back_what_was_played(
         assert np.abs(got.actions).max() <= 0.25  # as the environment took them: clipped
     seeds = [metadata["seed"] for metadata in dataset.storage.get_episode_metadata(range(11))]
     assert seeds == [episode.seed for episode in expected]
-    returns = [episode.total for episode in expected]
+    returns = [episode.episode_return for episode in expected]
     assert [found.return_mean, found.return_std] == [float(np.mean(returns)), float(np.std(returns))]
 
 
@@ -407,7 +408,7 @@ def test_what_cannot_be_kept_is_said_before_a_step_is_made(
     slashed = a_run(tmp_path / "slashed", EnvSpec("millrace-tests/Box-v0", {"key": "a/b"}))
     fails(slashed, "ns/box-v0", UsageError, "Minari cannot keep an observation whose key has a slash, a/b")
     monkeypatch.setitem(sys.modules, "h5py", None)
-    fails(run, "ns/box-v0", UsageError, r"recording needs minari, which is an extra; pip install 'millrace\[record\]'")
+    fails(run, "ns/box-v0", UsageError, r"recording needs minari, which is an extra; pip install 'millrace-rl\[record\]'")
     assert everything(root) == set()
 
 

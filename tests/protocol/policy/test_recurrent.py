@@ -16,7 +16,7 @@ from learner.algorithms.minibatches import Minibatch
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
 from learner.evaluate import evaluate
-from learner.recording.record import Player
+from learner.recording.player import Player
 from protocol.arrays import Array
 from protocol.env_spec import EnvSpec
 from protocol.errors import BadRollout

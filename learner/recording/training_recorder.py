@@ -1,0 +1,50 @@
+"""`--record`: the whole episodes of training as a Minari dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from learner.recording.episodes import EpisodeAssembler
+from learner.recording.minari import MinariDataset
+from learner.rollouts.arrived_rollout import ArrivedRollout
+from protocol.env_spec import EnvSpec
+from protocol.envs.spaces import make_action_converter
+from protocol.specs import PolicySpec
+
+
+class TrainingRecorder:
+    """Writes every whole episode of training into a dataset, with the actions as they were taken.
+
+    Steps of episodes that cannot be whole are counted instead.
+    """
+
+    def __init__(self, dataset_id: str, env_spec: EnvSpec, spec: PolicySpec, about: str) -> None:
+        """`about`: the description of the dataset. Raises `UsageError` in one line if the dataset cannot be made."""
+        self._env = env_spec.make()
+        self._assembler = EpisodeAssembler(make_action_converter(spec.action))
+        self._id = dataset_id
+        self._episodes = 0
+        try:
+            self._dataset = MinariDataset(dataset_id, self._env, about)
+        except BaseException:
+            self._env.close()
+            raise
+
+    def add(self, rollouts: Sequence[ArrivedRollout]) -> None:
+        """Add the rollouts of an update."""
+        for arrived in rollouts:
+            for episode in self._assembler.add(arrived.rollout, arrived.incarnation):
+                self._dataset.add(episode)
+                self._episodes += 1
+
+    def close(self) -> str:
+        """Write the rest. Returns one line that describes the dataset. There is no dataset without a whole episode."""
+        try:
+            if self._episodes:
+                self._dataset.close()
+            else:
+                self._dataset.discard()
+        finally:
+            self._env.close()
+        parts = self._assembler.waiting + self._assembler.left_out
+        return f"dataset {self._id}: {self._episodes:,} training episodes; {parts:,} steps of others left out"
