@@ -1,23 +1,29 @@
-"""What happens among the workers, for the log and for whoever decides whether the run can go on. Plain data."""
+"""What happens among the workers, for the log and for the hub, which decides whether the run can go on. Plain data.
+
+`json_name` is the `event` field of a line of `--log-json`. Programs read these names: they must not change.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 
 @dataclass(frozen=True)
-class Joined:
+class WorkerJoined:
     """A worker joined."""
 
+    json_name: ClassVar[str] = "joined"
     worker: str
     host: str
     pid: int
 
 
 @dataclass(frozen=True)
-class Left:
-    """A worker is gone; `tickets` of its tickets are dealt again."""
+class WorkerLeft:
+    """A worker is no longer a member. `tickets` of its tickets are dealt again."""
 
+    json_name: ClassVar[str] = "left"
     worker: str
     why: str
     tickets: int
@@ -25,17 +31,19 @@ class Left:
 
 
 @dataclass(frozen=True)
-class Turned:
+class WorkerRefused:
     """A worker was refused."""
 
+    json_name: ClassVar[str] = "turned"
     worker: str
     why: str
 
 
 @dataclass(frozen=True)
-class Broke:
-    """A worker's environment raised."""
+class EnvironmentRaised:
+    """A worker's environment raised an exception."""
 
+    json_name: ClassVar[str] = "broke"
     worker: str
     host: str
     lane: int | None
@@ -44,39 +52,44 @@ class Broke:
 
 
 @dataclass(frozen=True)
-class Told:
-    """A worker was told to join again: its session had ended. `late` transitions that it sent are counted, not used."""
+class RejoinRequested:
+    """A worker was told to join again because its session had ended.
 
+    The `late` transitions that its message carried are counted and not used.
+    """
+
+    json_name: ClassVar[str] = "told"
     worker: str
     session: int
     late: int
 
 
 @dataclass(frozen=True)
-class Stale:
-    """A rollout was dropped because it was acted on under weights older than max_lag allows."""
+class RolloutDropped:
+    """A rollout was dropped because its weights were older than max_lag allows."""
 
+    json_name: ClassVar[str] = "stale"
     lane: int
     lag: int
     transitions: int
 
 
-Event = Joined | Left | Turned | Broke | Told | Stale
+Event = WorkerJoined | WorkerLeft | WorkerRefused | EnvironmentRaised | RejoinRequested | RolloutDropped
 
 
 def describe(event: Event) -> str:
     """One line for the log."""
     match event:
-        case Joined(worker, host, pid):
+        case WorkerJoined(worker, host, pid):
             return f"worker {worker} ({host}, pid {pid}) joined"
-        case Left(worker, why, tickets):
+        case WorkerLeft(worker, why, tickets):
             return f"worker {worker} {why}" + (f"; {tickets} of its tickets are dealt again" if tickets else "")
-        case Turned(worker, why):
+        case WorkerRefused(worker, why):
             return f"worker {worker} was refused: {why}"
-        case Broke(worker, host, lane, error, traceback):
+        case EnvironmentRaised(worker, host, lane, error, traceback):
             return f"worker {worker} ({host}): lane {lane}: {error}\n{traceback}"
-        case Told(worker, _, late):
+        case RejoinRequested(worker, _, late):
             counted = f"; {late} transitions that it sent are counted, not used" if late else ""
             return f"worker {worker} was told to join again: its session had ended{counted}"
-        case Stale(lane, lag, transitions):
+        case RolloutDropped(lane, lag, transitions):
             return f"a rollout of lane {lane} was dropped: {lag} versions old, {transitions} transitions"

@@ -1,8 +1,8 @@
 """Who is a member: joining, sessions, names, refusals, leaving. Pure: messages and `now` in, messages out.
 
-The law: one process has one session at a time. A repeated Hello is answered by the same Welcome; a new beginning, or another
-process under the same name, ends the session before it. Whoever was refused stays refused. Whoever is silent for too long
-is gone.
+The law: one process has one session at a time. A repeated Hello is answered by the same Welcome. A Hello of a new attempt,
+or of another process under the same name, ends the session before it. A process that was refused stays refused. A worker
+that is silent for too long is removed.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
-from learner.members.events import Event, Joined, Left, Told, Turned
-from learner.members.states import TABLE, Revoked, Silence, Standing
+from learner.members.events import Event, RejoinRequested, WorkerJoined, WorkerLeft, WorkerRefused
+from learner.members.states import TABLE, KeyRevoked, MemberState, TimedOut
 from protocol.address import worker_name
 from protocol.messages import (
     PROTOCOL_VERSION,
@@ -28,13 +28,15 @@ from protocol.messages import (
     ToLearner,
     ToWorker,
     Welcome,
+    WorkerStatus,
 )
 from protocol.specs import RunSpec, StepSpec
 
-MEASURE_S = 0.5  # at least, between two accounts that a worker's speed is measured by
-REMEMBERED_REFUSALS = 1000  # processes; who has many names must not fill the memory
+MEASURE_S = 0.5  # at least, between the two heartbeats that a worker's speed is measured by
+REMEMBERED_REFUSALS = 1000  # processes; a peer with many names must not fill the memory
 
-Out = tuple[bytes, ToWorker]
+Outgoing = tuple[bytes, ToWorker]
+"""A message and the routing id of the worker that it is sent to."""
 
 
 @dataclass
@@ -42,29 +44,55 @@ class Member:
     """A worker as the learner sees it."""
 
     peer: bytes
+    """routing id"""
     hello: Hello
     session: int
-    order: int
+    join_number: int
+    """rises with each worker that joins"""
     heard_s: float
-    standing: Standing = Standing.ACTIVE
+    """when its last message came"""
+    state: MemberState = MemberState.ACTIVE
     lanes: set[int] = field(default_factory=set)
-    tickets: dict[int, int] = field(default_factory=dict)  # ticket -> replies said when it was last said
+    tickets: dict[int, int] = field(default_factory=dict)
+    """each ticket that it holds, with `replies` at the time when the ticket was last sent"""
     replies: int = 0
+    """heartbeat replies that were sent"""
     heartbeat: Heartbeat | None = None
+    """the newest"""
     steps_per_s: float = 0.0
-    counted: tuple[int, float] = (0, 0.0)  # env steps that its last measured account told of, and when
+    measured: tuple[int, float] = (0, 0.0)
+    """env steps in the heartbeat that its speed was last measured by, and when that came"""
 
-    def account(self, heartbeat: Heartbeat) -> list[int]:
-        """Take note of its account of itself; the tickets that it shows to be lost: said before a reply that the worker
-        has seen, yet not held.
+    def record_heartbeat(self, heartbeat: Heartbeat) -> list[int]:
+        """Keep the heartbeat. Returns the tickets that were lost on the way.
+
+        A ticket is lost if it was sent before a reply that the worker has seen, and the worker does not hold it.
         """
         self.heartbeat = heartbeat
-        steps, since_s = self.counted
-        if self.heard_s - since_s >= MEASURE_S:  # new weights make an account come early: too short a time to measure
+        steps, since_s = self.measured
+        if self.heard_s - since_s >= MEASURE_S:  # a heartbeat that new weights cause comes too early to measure by
             self.steps_per_s = (heartbeat.steps - steps) / (self.heard_s - since_s) if since_s else 0.0
-            self.counted = heartbeat.steps, self.heard_s
+            self.measured = heartbeat.steps, self.heard_s
         held, seen = set(heartbeat.tickets), min(heartbeat.replies, self.replies)
-        return [ticket for ticket, said_at in self.tickets.items() if ticket not in held and seen > said_at]
+        return [ticket for ticket, sent_at in self.tickets.items() if ticket not in held and seen > sent_at]
+
+    def status(self, now: float) -> WorkerStatus:
+        """What `millrace status` shows of it."""
+        heartbeat = self.heartbeat
+        return WorkerStatus(
+            worker=self.hello.worker,
+            host=self.hello.host,
+            pid=self.hello.pid,
+            standing=self.state.value,
+            lanes=tuple(sorted(self.lanes)),
+            tickets=len(self.tickets),
+            steps=heartbeat.steps if heartbeat else 0,
+            steps_per_s=self.steps_per_s,
+            version=-1,
+            silent_s=max(0.0, now - self.heard_s),
+            resident_bytes=heartbeat.resident_bytes if heartbeat else 0,
+            strikes=0,
+        )
 
 
 M = TypeVar("M", bound=Member)
@@ -73,52 +101,59 @@ M = TypeVar("M", bound=Member)
 class Membership(Generic[M]):
     """The members, by their routing ids."""
 
-    def __init__(self, run: RunSpec | StepSpec, kind: type[M], lost: Callable[[M, str], None], first_session: int) -> None:
-        """`kind` is what is kept of each; `lost` is called when one is forgotten: it takes back what that one held."""
+    def __init__(
+        self, run: RunSpec | StepSpec, member_class: type[M], on_removed: Callable[[M, str], None], first_session: int
+    ) -> None:
+        """`on_removed` is called with each member that was removed, and why: it takes back what that member held."""
         self.members: dict[bytes, M] = {}
         self.events: list[Event] = []
         self.draining: str | None = None
-        self._run, self._kind, self._lost = run, kind, lost
+        """why the workers were asked to leave; None while they were not"""
+        self._run, self._member_class, self._on_removed = run, member_class, on_removed
         self._next_session = first_session
         self._joins = 0
-        self._silent_from_s = -math.inf  # before then nobody can have been silent for too long
-        self._silent: set[str] = set()  # names of those given up for their silence, until they join again
-        self._refused: dict[bytes, tuple[int, str]] = {}  # the life that was refused, and why
+        self._none_silent_before_s = -math.inf  # until then no member can have been silent for too long
+        self._removed_for_silence: set[str] = set()  # names, until they join again
+        self._refused: dict[bytes, tuple[int, str]] = {}  # the life (process) that was refused, and why
 
     def active(self) -> list[M]:
-        """Those that are given work, in the order in which they joined."""
-        return [member for member in self.members.values() if member.standing is Standing.ACTIVE]
+        """The members that are given work, in the order in which they joined."""
+        return [member for member in self.members.values() if member.state is MemberState.ACTIVE]
 
-    def happened(self) -> list[Event]:
-        """What has happened since this was last asked."""
+    def status(self, now: float) -> tuple[WorkerStatus, ...]:
+        """What `millrace status` shows of the members, in the order in which they joined."""
+        return tuple(member.status(now) for member in sorted(self.members.values(), key=lambda member: member.join_number))
+
+    def take_events(self) -> list[Event]:
+        """What has happened since the last call."""
         events, self.events = self.events, []
         return events
 
-    def speaker(self, peer: bytes, message: ToLearner, now: float) -> M | None:
-        """Who says this, if it is of a session that lasts; it is heard."""
+    def sender(self, peer: bytes, message: ToLearner, now: float) -> M | None:
+        """The member that sent this message in its current session; None if there is none."""
         member = self.members.get(peer)
         if member is None or isinstance(message, Hello) or member.session != message.session:
             return None
         member.heard_s = now
         return member
 
-    def stranger(self, peer: bytes, message: ToLearner) -> list[Out]:
-        """What is answered to whoever speaks of a session that has ended: to join again, unless it leaves anyway."""
+    def answer_ended_session(self, peer: bytes, message: ToLearner) -> list[Outgoing]:
+        """The answer to a message of a session that has ended: join again, unless the worker leaves anyway."""
         if isinstance(message, Hello | Goodbye | Failure):
             return []
         late = message.env_steps if isinstance(message, Rollout) else 0
-        self.events.append(Told(worker_name(peer).decode(errors="replace")[:40], message.session, late))
+        self.events.append(RejoinRequested(worker_name(peer).decode(errors="replace")[:40], message.session, late))
         return [(peer, Rejoin(message.session))]
 
-    def hello(self, peer: bytes, hello: Hello, now: float) -> tuple[list[Out], M | None]:
-        """What is answered, and the member that has joined by it, if one has."""
+    def join(self, peer: bytes, hello: Hello, now: float) -> tuple[list[Outgoing], M | None]:
+        """Answer a Hello. Returns the answer, and the member if one has joined by it."""
         why = ""
         if hello.protocol != PROTOCOL_VERSION:
             why = f"protocol expected {PROTOCOL_VERSION}, got {hello.protocol}; install the learner's version of millrace"
         elif hello.worker.encode() != worker_name(peer):
             why = f"name expected {worker_name(peer)[:40]!r}, as in its routing id, got {hello.worker[:40]!r}"
         if why:
-            self.events.append(Turned(hello.worker, why))
+            self.events.append(WorkerRefused(hello.worker, why))
             return [(peer, Refuse(why))], None
         life, why = self._refused.get(peer, (-1, ""))
         if life == hello.life:
@@ -127,79 +162,76 @@ class Membership(Generic[M]):
             return [(peer, Drain(self.draining))], None
         member = self.members.get(peer)
         if member is not None:
-            same = member.hello.life == hello.life
-            if same and hello.attempt == member.hello.attempt:
+            same_process = member.hello.life == hello.life
+            if same_process and hello.attempt == member.hello.attempt:
                 member.heard_s = now
                 return [(peer, Welcome(member.session, hello.attempt, self._run))], None
-            if same and hello.attempt < member.hello.attempt:
+            if same_process and hello.attempt < member.hello.attempt:
                 return [], None
-            if not same:
+            if not same_process:
                 why = f"another process, on {hello.host}, joined as {hello.worker}; give each worker a name of its own"
-                self._remember(member, why)
-            self.forget(member, Silence, "began again" if same else f"replaced by process {hello.pid}")
-        member = self._kind(peer, hello, self._next_session, self._joins, now)
+                self._remember_refusal(member, why)
+            self.remove(member, TimedOut, "began again" if same_process else f"replaced by process {hello.pid}")
+        member = self._member_class(peer, hello, self._next_session, self._joins, now)
         self._next_session += 1
         self._joins += 1
         self.members[peer] = member
-        self._silent.discard(hello.worker)
-        self.events.append(Joined(hello.worker, hello.host, hello.pid))
+        self._removed_for_silence.discard(hello.worker)
+        self.events.append(WorkerJoined(hello.worker, hello.host, hello.pid))
         return [(peer, Welcome(member.session, hello.attempt, self._run))], member
 
-    def refuse(self, member: M, event: type, why: str) -> list[Out]:
-        """Turn a member out for good."""
-        self._remember(member, why)
-        return self._turn_out(member, event, f"refused: {why}", why)
+    def refuse(self, member: M, event: type, why: str) -> list[Outgoing]:
+        """Remove a member; its process must not come back."""
+        self._remember_refusal(member, why)
+        return self._refuse_and_remove(member, event, f"refused: {why}", why)
 
-    def revoke(self, peer: bytes, why: str) -> list[Out]:
-        """A member may speak no more: it is told so and forgotten at once, whatever it holds."""
-        return self._turn_out(self.members[peer], Revoked, f"was shut out: {why}", why)
+    def revoke(self, peer: bytes, why: str) -> list[Outgoing]:
+        """Remove a member whose key was revoked, at once, whatever it holds."""
+        return self._refuse_and_remove(self.members[peer], KeyRevoked, f"was shut out: {why}", why)
 
-    def gone(self, worker: str, why: str) -> bool:
-        """A worker's process is known to be dead: do not wait for its silence. False if it was no member any more."""
+    def remove_worker(self, worker: str, why: str) -> bool:
+        """Remove a worker by name, as when its process is known to be dead. False if it was no longer a member."""
         member = next((member for member in self.members.values() if member.hello.worker == worker), None)
         if member is not None:
-            self.forget(member, Silence, why)
-        elif worker in self._silent:  # given up already, and now it is known why
-            self._silent.discard(worker)
-            self.events.append(Left(worker, why, 0, False))
+            self.remove(member, TimedOut, why)
+        elif worker in self._removed_for_silence:  # now it is known why it was silent
+            self._removed_for_silence.discard(worker)
+            self.events.append(WorkerLeft(worker, why, 0, False))
         return member is not None
 
-    def silence(self, now: float, timeout_s: float, listening_since_s: float = -math.inf) -> list[M]:
-        """Forget who has been silent for too long, and too long in the hearing of the learner; those that were."""
-        if now < self._silent_from_s:
+    def remove_silent(self, now: float, timeout_s: float) -> list[M]:
+        """Remove the members that have been silent for too long. Returns them."""
+        if now < self._none_silent_before_s:
             return []
-        members = self.members.values()
-        silent = [member for member in members if now - max(member.heard_s, listening_since_s) > timeout_s]
+        silent = [member for member in self.members.values() if now - member.heard_s > timeout_s]
         for member in silent:
-            self._silent.add(member.hello.worker)
-            self.forget(member, Silence, f"silent for {timeout_s:.0f} s")
-        heard_s = min((member.heard_s for member in self.members.values()), default=now)
-        self._silent_from_s = max(heard_s, listening_since_s) + timeout_s
+            self._removed_for_silence.add(member.hello.worker)
+            self.remove(member, TimedOut, f"silent for {timeout_s:.0f} s")
+        self._none_silent_before_s = min((member.heard_s for member in self.members.values()), default=now) + timeout_s
         return silent
 
-    def forget(self, member: M, event: type, why: str) -> None:
-        """It is gone."""
-        member.standing = TABLE[member.standing][event]
+    def remove(self, member: M, event: type, why: str) -> None:
+        """Remove a member."""
+        member.state = TABLE[member.state][event]
         del self.members[member.peer]
-        self.events.append(Left(member.hello.worker, why, len(member.tickets), event is Goodbye))
-        self._lost(member, why)
+        self.events.append(WorkerLeft(member.hello.worker, why, len(member.tickets), event is Goodbye))
+        self._on_removed(member, why)
 
-    def drain(self, reason: str) -> list[Out]:
-        """Ask everybody to leave; nobody joins any more."""
+    def drain(self, reason: str) -> list[Outgoing]:
+        """Ask every member to leave; nobody can join any more."""
         self.draining = reason
-        out: list[Out] = []
+        out: list[Outgoing] = []
         for member in self.active():
-            member.standing = TABLE[member.standing][Drain]
+            member.state = TABLE[member.state][Drain]
             out.append((member.peer, Drain(reason)))
         return out
 
-    def _turn_out(self, member: M, event: type, why: str, told: str) -> list[Out]:
-        self.events.append(Turned(member.hello.worker, told))
-        self.forget(member, event, why)
+    def _refuse_and_remove(self, member: M, event: type, why: str, told: str) -> list[Outgoing]:
+        self.events.append(WorkerRefused(member.hello.worker, told))
+        self.remove(member, event, why)
         return [(member.peer, Refuse(told))]
 
-    def _remember(self, member: M, why: str) -> None:
-        """Remember that its process was refused: it must not come back."""
+    def _remember_refusal(self, member: M, why: str) -> None:
         self._refused.pop(member.peer, None)
         self._refused[member.peer] = (member.hello.life, why)
         if len(self._refused) > REMEMBERED_REFUSALS:

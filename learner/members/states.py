@@ -1,4 +1,4 @@
-"""Where the learner sees a worker stand, as a table: what each message, or event, makes of each standing. Plain data."""
+"""The states of a worker as the learner sees them, and the table of what each message or event makes of them. Plain data."""
 
 from __future__ import annotations
 
@@ -7,51 +7,51 @@ from enum import Enum
 from protocol.messages import Drain, Failure, Goodbye, Heartbeat, Hello, Returned, Rollout, Stepped
 
 
-class Standing(Enum):
-    """Where the learner sees a worker."""
+class MemberState(Enum):
+    """The state of a worker, as the learner sees it."""
 
     UNKNOWN = "unknown"
     ACTIVE = "active"
     DRAINING = "draining"
 
 
-class Silence:
-    """Event: nothing was heard of the worker for `worker_timeout_s`, or its process is known to be dead."""
+class TimedOut:
+    """Event: the worker was silent for `worker_timeout_s`, or its process is known to be dead."""
 
 
-class Rubbish:
-    """Event: it sent too much that could not be used."""
+class SentUnusable:
+    """Event: the worker sent too much that could not be used."""
 
 
-class Revoked:
-    """Event: the key under which it speaks may connect no more."""
+class KeyRevoked:
+    """Event: the worker's key may no longer connect."""
 
 
-# What each standing becomes; Drain is what the learner says. What an unknown worker says otherwise is answered by Rejoin.
-TABLE: dict[Standing, dict[type, Standing]] = {
-    Standing.UNKNOWN: {Hello: Standing.ACTIVE},
-    Standing.ACTIVE: {
-        Hello: Standing.ACTIVE,
-        Rollout: Standing.ACTIVE,
-        Heartbeat: Standing.ACTIVE,
-        Stepped: Standing.ACTIVE,
-        Returned: Standing.ACTIVE,
-        Goodbye: Standing.UNKNOWN,
-        Failure: Standing.UNKNOWN,
-        Silence: Standing.UNKNOWN,
-        Rubbish: Standing.UNKNOWN,
-        Revoked: Standing.UNKNOWN,
-        Drain: Standing.DRAINING,
+# The next state for each event. The learner itself sends Drain. Other messages of an unknown worker are answered by Rejoin.
+TABLE: dict[MemberState, dict[type, MemberState]] = {
+    MemberState.UNKNOWN: {Hello: MemberState.ACTIVE},
+    MemberState.ACTIVE: {
+        Hello: MemberState.ACTIVE,
+        Rollout: MemberState.ACTIVE,
+        Heartbeat: MemberState.ACTIVE,
+        Stepped: MemberState.ACTIVE,
+        Returned: MemberState.ACTIVE,
+        Goodbye: MemberState.UNKNOWN,
+        Failure: MemberState.UNKNOWN,
+        TimedOut: MemberState.UNKNOWN,
+        SentUnusable: MemberState.UNKNOWN,
+        KeyRevoked: MemberState.UNKNOWN,
+        Drain: MemberState.DRAINING,
     },
-    Standing.DRAINING: {
-        Rollout: Standing.DRAINING,
-        Heartbeat: Standing.DRAINING,
-        Stepped: Standing.DRAINING,
-        Returned: Standing.DRAINING,
-        Goodbye: Standing.UNKNOWN,
-        Failure: Standing.UNKNOWN,
-        Silence: Standing.UNKNOWN,
-        Rubbish: Standing.UNKNOWN,
-        Revoked: Standing.UNKNOWN,
+    MemberState.DRAINING: {
+        Rollout: MemberState.DRAINING,
+        Heartbeat: MemberState.DRAINING,
+        Stepped: MemberState.DRAINING,
+        Returned: MemberState.DRAINING,
+        Goodbye: MemberState.UNKNOWN,
+        Failure: MemberState.UNKNOWN,
+        TimedOut: MemberState.UNKNOWN,
+        SentUnusable: MemberState.UNKNOWN,
+        KeyRevoked: MemberState.UNKNOWN,
     },
 }

@@ -1,6 +1,6 @@
-"""A lane, and a ticket, as the learner sees them, and whose turn it is. No clock, no messages.
+"""A lane and a ticket as the roster of a run keeps them, and the order in which lanes get tickets. No clock, no messages.
 
-The law: a lane has one owner at a time; whoever gets it starts it afresh: its incarnation rises, its rollouts are counted
+The law: a lane has one owner at a time. A new owner starts it afresh: its incarnation rises, and its rollouts are counted
 from 0 again.
 """
 
@@ -10,34 +10,42 @@ import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from learner.members.lane_placement import PlacedLane
+
 
 @dataclass
-class Lane:
-    """A lane as the learner sees it."""
+class TicketedLane(PlacedLane):
+    """A lane on which workers collect rollouts."""
 
-    number: int
-    incarnation: int = 0
-    owner: bytes | None = None
-    progress: int = 0  # tickets used or outstanding
-    started: bool = False  # a ticket of this incarnation was dealt
-    moving: bool = False  # it waits for its last tickets to end before it moves to another worker
+    progress: int = 0
+    """tickets used or outstanding"""
+    started: bool = False
+    """a ticket of this incarnation was dealt"""
     outstanding: set[int] = field(default_factory=set)
-    below: int = 0  # every rollout of this incarnation below this sequence has arrived
-    ahead: set[int] = field(default_factory=set)  # sequences that have arrived out of order
+    """tickets that are with its worker"""
+    below: int = 0
+    """every rollout of this incarnation with a smaller sequence number has arrived"""
+    ahead: set[int] = field(default_factory=set)
+    """sequence numbers that have arrived out of order"""
+
+    @property
+    def busy(self) -> int:
+        """How many of its tickets are with its worker."""
+        return len(self.outstanding)
 
     def restart(self) -> None:
-        """A new life: on new env copies."""
-        self.owner, self.moving = None, False
+        """The lane left its worker. Its incarnation rises only if a ticket of this one was dealt."""
+        super().restart()
         if self.started:
             self.incarnation += 1
             self.started, self.below, self.ahead = False, 0, set()
 
-    def awaits(self, sequence: int) -> bool:
-        """Whether an outstanding rollout can have this sequence."""
+    def expects(self, sequence: int) -> bool:
+        """Whether an outstanding rollout can have this sequence number."""
         return self.below <= sequence < self.below + len(self.ahead) + len(self.outstanding) and sequence not in self.ahead
 
     def arrived(self, sequence: int) -> None:
-        """Take note of a rollout."""
+        """The rollout with this sequence number has arrived."""
         self.ahead.add(sequence)
         while self.below in self.ahead:
             self.ahead.remove(self.below)
@@ -52,21 +60,22 @@ class Ticket:
     lane: int
     incarnation: int
     version: int
+    """of the newest weights when it was dealt"""
     peer: bytes
 
 
-class Turns:
-    """Whose turn it is: the least advanced lane's; of equals, that of the lowest number.
+class LaneQueue:
+    """Which lane gets the next ticket: the least advanced; of equals, the one with the lowest number.
 
-    What an entry of the heap says of its lane may be out of date; then there is another one that is not.
+    An entry of the heap may be out of date; then the heap also holds a newer one of the same lane.
     """
 
-    def __init__(self, lanes: Sequence[Lane]) -> None:
+    def __init__(self, lanes: Sequence[TicketedLane]) -> None:
         self._lanes = lanes
         self._heap = [(lane.progress, lane.number) for lane in lanes]
         heapq.heapify(self._heap)
 
-    def first(self) -> Lane:
+    def first(self) -> TicketedLane:
         """The least advanced lane."""
         while True:
             progress, number = self._heap[0]
@@ -74,14 +83,14 @@ class Turns:
                 return self._lanes[number]
             heapq.heappop(self._heap)
 
-    def forward(self, lane: Lane) -> None:
-        """It was dealt a ticket."""
-        self._moved(lane, 1)
+    def advance(self, lane: TicketedLane) -> None:
+        """The lane was dealt a ticket."""
+        self._move(lane, 1)
 
-    def back(self, lane: Lane) -> None:
-        """One of its tickets came to nothing."""
-        self._moved(lane, -1)
+    def set_back(self, lane: TicketedLane) -> None:
+        """One of the lane's tickets was lost, or its rollout dropped."""
+        self._move(lane, -1)
 
-    def _moved(self, lane: Lane, by: int) -> None:
+    def _move(self, lane: TicketedLane, by: int) -> None:
         lane.progress += by
         heapq.heappush(self._heap, (lane.progress, lane.number))

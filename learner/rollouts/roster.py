@@ -14,12 +14,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from learner.members.events import Broke, Event, Stale
-from learner.members.membership import Member, Membership, Out
-from learner.members.states import Rubbish, Standing
+import msgspec
+
+from learner.members.events import EnvironmentRaised, Event, RolloutDropped
+from learner.members.lane_placement import LanePlacement
+from learner.members.membership import Member, Membership, Outgoing
+from learner.members.states import MemberState, SentUnusable
 from learner.rollouts.arrived_rollout import ArrivedRollout
-from learner.rollouts.lane_placement import Placing
-from learner.rollouts.lanes import Lane, Ticket, Turns
+from learner.rollouts.lanes import LaneQueue, Ticket, TicketedLane
 from learner.rollouts.ledger import Ledger
 from protocol.messages import (
     Array,
@@ -39,10 +41,9 @@ from protocol.messages import (
     Stepped,
     ToLearner,
     Weights,
+    WorkerStatus,
 )
 from protocol.specs import RunSpec
-
-__all__ = ["STRIKES", "CollectingMember", "Out", "Roster"]
 
 STRIKES = 3  # rollouts or messages that could not be used, after which a worker is refused
 
@@ -52,9 +53,17 @@ class CollectingMember(Member):
     """A worker as the learner of a run sees it."""
 
     acknowledged: int = -1
-    under_way: int | None = None  # version of the Weights sent and not acknowledged
-    said_at: int = 0  # replies said when it was sent
+    """newest version that it is known to have"""
+    sending: int | None = None
+    """version of the Weights that were sent and are not acknowledged"""
+    sending_since: int = 0
+    """`replies` when they were sent"""
     strikes: int = 0
+    """rollouts and messages of it that could not be used"""
+
+    def status(self, now: float) -> WorkerStatus:
+        """What `millrace status` shows of it."""
+        return msgspec.structs.replace(super().status(now), version=self.acknowledged, strikes=self.strikes)
 
 
 class Roster:
@@ -79,12 +88,12 @@ class Roster:
         self.ledger = ledger or Ledger()
         self.version = version
         self.worker_timeout_s = worker_timeout_s
-        self.membership = Membership(run, CollectingMember, self._lost, first_session)
-        self.lanes = [Lane(n, incarnations[n] if incarnations else 0) for n in range(run.lanes)]
+        self.membership: Membership[CollectingMember] = Membership(run, CollectingMember, self._removed, first_session)
+        self.lanes = [TicketedLane(n, incarnations[n] if incarnations else 0) for n in range(run.lanes)]
         self.tickets: dict[int, Ticket] = {}
         self.ready: list[ArrivedRollout] = []
-        self._placing, self._turns = Placing(self.lanes), Turns(self.lanes)
-        self._oldest = version  # no rollout that is ready is older
+        self._placement, self._queue = LanePlacement(self.lanes, _by_joining), LaneQueue(self.lanes)
+        self._oldest_ready = version  # no rollout that is ready is older
         self._weights: Weights | None = None
 
     @property
@@ -94,77 +103,77 @@ class Roster:
 
     @property
     def events(self) -> list[Event]:
-        """What has happened, and nobody has taken note of."""
+        """What has happened and was not logged yet."""
         return self.membership.events
 
     # ---------------------------------------------------------------- in
 
-    def receive(self, peer: bytes, message: ToLearner, now: float) -> list[Out]:
-        """What a worker said. A rollout must have passed `protocol.rollout.validate`; else call `reject`."""
+    def receive(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
+        """Answer a message. A rollout must have passed `protocol.rollout.validate`; else call `reject_rollout`."""
         if isinstance(message, Hello):
-            return self._hello(peer, message, now)
+            return self._join(peer, message, now)
         if isinstance(message, Rollout):
             self.ledger.transitions_received += message.env_steps
-        member = self.membership.speaker(peer, message, now)
+        member = self.membership.sender(peer, message, now)
         if member is None:
             if isinstance(message, Rollout):
                 self.ledger.transitions_late += message.env_steps
-            return self.membership.stranger(peer, message)
+            return self.membership.answer_ended_session(peer, message)
         match message:
             case Rollout():
                 return self._rollout(member, message)
             case Heartbeat():
                 return self._heartbeat(member, message)
             case Stepped() | Returned():
-                return []  # nobody asked: a run collects rollouts
+                return []  # answers to orders, which a run does not give
             case Goodbye(_, reason):
-                self.membership.forget(member, Goodbye, f"left: {reason}")
+                self.membership.remove(member, Goodbye, f"left: {reason}")
                 return self._deal()
             case Failure(_, error, traceback, lane):
                 hello = member.hello
-                self.events.append(Broke(hello.worker, hello.host, lane, error, traceback))
-                self.membership.forget(member, Failure, f"broke: {error}")
+                self.events.append(EnvironmentRaised(hello.worker, hello.host, lane, error, traceback))
+                self.membership.remove(member, Failure, f"broke: {error}")
                 return self._deal()
 
-    def reject(self, peer: bytes, rollout: Rollout | None, why: str, now: float) -> list[Out]:
-        """A message that could not be read (`rollout` is None), or a rollout that cannot be used."""
+    def reject_message(self, peer: bytes, why: str, now: float) -> list[Outgoing]:
+        """A message that could not be read."""
+        self.ledger.messages_bad += 1
         member = self.members.get(peer)
-        if rollout is None:
-            self.ledger.messages_bad += 1
-        else:
-            steps = int(rollout.valid.sum()) if rollout.valid.dtype == bool else 0
-            self.ledger.transitions_received += steps
-            self.ledger.transitions_invalid += steps
-        if rollout is not None and (member is None or member.session != rollout.session):
-            return [(peer, Rejoin(rollout.session))]
         if member is None:
             return [(peer, Refuse(f"not understood: {why}"))]
-        member.heard_s = now
-        member.strikes += 1
-        if member.strikes >= STRIKES:
-            return self.membership.refuse(member, Rubbish, why) + self._deal()
-        if rollout is not None and rollout.ticket in member.tickets:
+        return self._strike(member, why, now) + self._deal()
+
+    def reject_rollout(self, peer: bytes, rollout: Rollout, why: str, now: float) -> list[Outgoing]:
+        """A rollout that cannot be used: its ticket is lost."""
+        member = self.members.get(peer)
+        steps = int(rollout.valid.sum()) if rollout.valid.dtype == bool else 0
+        self.ledger.transitions_received += steps
+        self.ledger.transitions_invalid += steps
+        if member is None or member.session != rollout.session:
+            return [(peer, Rejoin(rollout.session))]
+        out = self._strike(member, why, now)
+        if rollout.ticket in member.tickets:
             lane = self.lanes[self.tickets[rollout.ticket].lane]
-            if lane.awaits(rollout.sequence):
+            if lane.expects(rollout.sequence):
                 lane.arrived(rollout.sequence)
             self._lose(member, rollout.ticket)
-        return self._deal()
+        return out + self._deal()
 
-    def gone(self, worker: str, why: str) -> list[Out]:
+    def remove_worker(self, worker: str, why: str) -> list[Outgoing]:
         """A worker's process is known to be dead: do not wait for its silence."""
-        return self._deal() if self.membership.gone(worker, why) else []
+        return self._deal() if self.membership.remove_worker(worker, why) else []
 
-    def revoke(self, peer: bytes, why: str) -> list[Out]:
-        """A member may speak no more: it is told so and forgotten at once, whatever it holds."""
+    def revoke(self, peer: bytes, why: str) -> list[Outgoing]:
+        """A member's key was revoked: it is told so and removed at once, whatever it holds."""
         return self.membership.revoke(peer, why) + self._deal()
 
-    def tick(self, now: float) -> list[Out]:
+    def remove_silent(self, now: float) -> list[Outgoing]:
         """Judge silence. Call it only when every message that has arrived was given to `receive`."""
-        return self._deal() if self.membership.silence(now, self.worker_timeout_s) else []
+        return self._deal() if self.membership.remove_silent(now, self.worker_timeout_s) else []
 
     # ---------------------------------------------------------------- the learner's side
 
-    def publish(self, version: int, parameters: Array, buffers: Array) -> list[Out]:
+    def publish(self, version: int, parameters: Array, buffers: Array) -> list[Outgoing]:
         """New weights: offer them to every worker, and deal the tickets that they allow."""
         self.version = version
         self._weights = Weights(version, parameters, buffers)
@@ -173,7 +182,7 @@ class Roster:
 
     def take(self) -> list[ArrivedRollout] | None:
         """The rollouts of the next update, or None while there are too few. What is too stale is dropped and counted."""
-        if self.version - self._oldest > self.max_lag:
+        if self.version - self._oldest_ready > self.max_lag:
             self._drop_stale()
         if len(self.ready) < self.rollouts_per_update:
             return None
@@ -182,11 +191,11 @@ class Roster:
         self.ledger.transitions_used += sum(arrived.rollout.env_steps for arrived in taken)
         return taken
 
-    def deal(self) -> list[Out]:
+    def deal(self) -> list[Outgoing]:
         """Deal what may be dealt, as after a stale drop."""
         return self._deal()
 
-    def drain(self, reason: str) -> list[Out]:
+    def drain(self, reason: str) -> list[Outgoing]:
         """Ask everybody to leave; no more tickets."""
         return self.membership.drain(reason)
 
@@ -196,24 +205,30 @@ class Roster:
 
     # ---------------------------------------------------------------- inside
 
-    def _hello(self, peer: bytes, hello: Hello, now: float) -> list[Out]:
-        welcome, member = self.membership.hello(peer, hello, now)
+    def _join(self, peer: bytes, hello: Hello, now: float) -> list[Outgoing]:
+        welcome, member = self.membership.join(peer, hello, now)
         if member is None:
             return welcome
-        self._placing.joined()
+        self._placement.joined()
         return welcome + self._offer(member) + self._deal()
+
+    def _strike(self, member: CollectingMember, why: str, now: float) -> list[Outgoing]:
+        """Count something that could not be used; after too many the worker is refused."""
+        member.heard_s = now
+        member.strikes += 1
+        return self.membership.refuse(member, SentUnusable, why) if member.strikes >= STRIKES else []
 
     def _drop_stale(self) -> None:
         stale = [arrived.rollout for arrived in self.ready if self.version - arrived.rollout.version > self.max_lag]
         self.ready = [arrived for arrived in self.ready if self.version - arrived.rollout.version <= self.max_lag]
-        self._oldest = min((arrived.rollout.version for arrived in self.ready), default=self.version)
+        self._oldest_ready = min((arrived.rollout.version for arrived in self.ready), default=self.version)
         for rollout in stale:
             self.ledger.stale += 1
             self.ledger.transitions_stale += rollout.env_steps
-            self._turns.back(self.lanes[rollout.lane])
-            self.events.append(Stale(rollout.lane, self.version - rollout.version, rollout.env_steps))
+            self._queue.set_back(self.lanes[rollout.lane])
+            self.events.append(RolloutDropped(rollout.lane, self.version - rollout.version, rollout.env_steps))
 
-    def _rollout(self, member: CollectingMember, rollout: Rollout) -> list[Out]:
+    def _rollout(self, member: CollectingMember, rollout: Rollout) -> list[Outgoing]:
         self._acknowledge(member, min(rollout.version, self.version))
         ticket = self.tickets.get(rollout.ticket)
         if ticket is None:
@@ -223,59 +238,59 @@ class Roster:
             ticket.peer != member.peer
             or ticket.lane != rollout.lane
             or not ticket.version <= rollout.version <= self.version
-            or not self.lanes[ticket.lane].awaits(rollout.sequence)
+            or not self.lanes[ticket.lane].expects(rollout.sequence)
         ):
-            self.ledger.transitions_received -= rollout.env_steps  # `reject` counts it
+            self.ledger.transitions_received -= rollout.env_steps  # `reject_rollout` counts it
             why = f"ticket {ticket.number} expected lane {ticket.lane} under version {ticket.version} or newer, "
             why += f"got lane {rollout.lane}, version {rollout.version}, sequence {rollout.sequence}"
-            return self.reject(member.peer, rollout, why, member.heard_s)
+            return self.reject_rollout(member.peer, rollout, why, member.heard_s)
         del self.tickets[ticket.number], member.tickets[ticket.number]
         lane = self.lanes[ticket.lane]
         lane.outstanding.remove(ticket.number)
         lane.arrived(rollout.sequence)
-        self._placing.ended(member)
+        self._placement.ticket_ended(member)
         self.ready.append(ArrivedRollout(rollout, ticket.incarnation))
-        self._oldest = min(self._oldest, rollout.version)
+        self._oldest_ready = min(self._oldest_ready, rollout.version)
         return self._offer(member) + self._deal()
 
-    def _heartbeat(self, member: CollectingMember, heartbeat: Heartbeat) -> list[Out]:
+    def _heartbeat(self, member: CollectingMember, heartbeat: Heartbeat) -> list[Outgoing]:
         """Say again what this account shows to be lost: said before a reply that the worker has seen, yet not held."""
-        missing = member.account(heartbeat)
+        lost = member.record_heartbeat(heartbeat)
         peer = member.peer
-        if member.standing is Standing.DRAINING:
+        if member.state is MemberState.DRAINING:
             return [(peer, Drain(self.membership.draining or ""))]
         self._acknowledge(member, min(heartbeat.version, self.version))
         seen = min(heartbeat.replies, member.replies)
-        if member.under_way is not None and seen > member.said_at:
-            member.under_way = None
+        if member.sending is not None and seen > member.sending_since:
+            member.sending = None
         out = self._offer(member)
-        out += self._collect(member, missing)
+        out += self._collect(member, lost)
         member.replies += 1
         out.append((peer, HeartbeatReply(member.session, member.replies, self._received(member.lanes))))
         return out + self._deal()
 
     def _acknowledge(self, member: CollectingMember, version: int) -> None:
         member.acknowledged = max(member.acknowledged, version)
-        if member.under_way is not None and version >= member.under_way:
-            member.under_way = None
+        if member.sending is not None and version >= member.sending:
+            member.sending = None
 
-    def _offer(self, member: CollectingMember) -> list[Out]:
+    def _offer(self, member: CollectingMember) -> list[Outgoing]:
         """The newest weights, unless the worker has them or older ones are still on their way."""
         newest = self._weights
-        if newest is None or member.under_way is not None or member.acknowledged >= newest.version:
+        if newest is None or member.sending is not None or member.acknowledged >= newest.version:
             return []
-        if member.standing is not Standing.ACTIVE:
+        if member.state is not MemberState.ACTIVE:
             return []
-        member.under_way, member.said_at = newest.version, member.replies
+        member.sending, member.sending_since = newest.version, member.replies
         return [(member.peer, newest)]
 
     def _received(self, lanes: set[int]) -> tuple[Received, ...]:
         mine = [self.lanes[number] for number in lanes]
         return tuple(Received(lane.number, lane.incarnation, lane.below, tuple(lane.ahead)) for lane in mine)
 
-    def _collect(self, member: CollectingMember, tickets: Sequence[int]) -> list[Out]:
+    def _collect(self, member: CollectingMember, tickets: Sequence[int]) -> list[Outgoing]:
         """Collect messages for these outstanding tickets: one for each version that they were dealt under."""
-        out: list[Out] = []
+        out: list[Outgoing] = []
         for version in sorted({self.tickets[number].version for number in tickets}):
             chosen = [self.tickets[number] for number in tickets if self.tickets[number].version == version]
             permits = tuple(Permit(ticket.number, ticket.lane, ticket.incarnation) for ticket in chosen)
@@ -283,36 +298,36 @@ class Roster:
             out.append((member.peer, Collect(member.session, version, permits, self._received(member.lanes))))
         return out
 
-    def _lost(self, member: CollectingMember, why: str) -> None:
+    def _removed(self, member: CollectingMember, why: str) -> None:
         """The worker is gone: its tickets are lost, its lanes have no owner. `_deal` gives both to the living."""
         for number in list(member.tickets):
             self._lose(member, number)
-        self._placing.lost(member)
+        self._placement.removed(member)
 
     def _lose(self, member: CollectingMember, number: int) -> None:
         ticket = self.tickets.pop(number)
         del member.tickets[number]
         lane = self.lanes[ticket.lane]
         lane.outstanding.remove(number)
-        self._turns.back(lane)
-        self._placing.ended(member)
+        self._queue.set_back(lane)
+        self._placement.ticket_ended(member)
         self.ledger.lost += 1
 
-    def _deal(self) -> list[Out]:
+    def _deal(self) -> list[Outgoing]:
         """Place lanes that have no owner, even out, and deal tickets to the least advanced lanes."""
         if self._weights is None or self.membership.draining is not None or not self.members:
             return []
-        out = self._placing.place(self.members.values())
+        out = self._placement.place(self.members.values())
         room = self.rollouts_per_update * (self.version + 1 + self.max_lag) - self.ledger.used - self.ledger.outstanding
         dealt: dict[bytes, list[int]] = {}
         while room > 0:
-            lane = self._turns.first()
+            lane = self._queue.first()
             if lane.owner is None or lane.moving:
                 break  # the least advanced lane comes first: in a synchronous run no other may take its place
             number = self.ledger.issued
             self.tickets[number] = Ticket(number, lane.number, lane.incarnation, self.version, lane.owner)
             lane.outstanding.add(number)
-            self._turns.forward(lane)
+            self._queue.advance(lane)
             lane.started = True
             dealt.setdefault(lane.owner, []).append(number)
             self.ledger.issued += 1
@@ -320,3 +335,8 @@ class Roster:
         for peer, numbers in dealt.items():
             out += self._collect(self.members[peer], numbers)
         return out
+
+
+def _by_joining(member: Member) -> int:
+    """Among workers with equally few lanes, the one that joined first gets the next."""
+    return member.join_number

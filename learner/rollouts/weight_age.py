@@ -1,7 +1,7 @@
-"""How old the weights are that rollouts were acted on under, and how long new ones take to be used. Pure.
+"""How old the weights were that rollouts were acted under, and how long new weights take to be used. Pure.
 
-The lag of a rollout is the learner's version minus the rollout's, when it is used. From publishing weights to the arrival
-of a worker's first rollout under them passes what the network, the worker and one rollout take together.
+The lag of a rollout is the learner's version minus the rollout's version, when the rollout is used. The time from publishing
+weights to the arrival of a worker's first rollout under them is what the network, the worker and one rollout take together.
 """
 
 from __future__ import annotations
@@ -10,17 +10,17 @@ from collections import Counter, defaultdict, deque
 from collections.abc import Iterable
 from statistics import median
 
-REMEMBERED = 1_000  # versions, and measurements of each worker: the newest
+REMEMBERED = 1_000  # the newest versions, and the newest measurements of each worker
 
 
-class Freshness:
-    """Since this learner started."""
+class WeightAge:
+    """Lags and first-use times since this learner started."""
 
     def __init__(self) -> None:
         self.lags: Counter[int] = Counter()
         """rollouts that were used, by their lag"""
         self._published_s: dict[int, float] = {}
-        self._seen: dict[str, int] = {}  # newest version that a rollout of this worker was acted on under
+        self._newest_used: dict[str, int] = {}  # by worker: the newest version that a rollout of it was acted under
         self._first_use_s: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=REMEMBERED))
 
     def published(self, version: int, now: float) -> None:
@@ -29,19 +29,19 @@ class Freshness:
         self._published_s.pop(version - REMEMBERED, None)
 
     def arrived(self, worker: str, version: int, now: float) -> None:
-        """A rollout of this worker came, acted on under this version."""
-        if version > self._seen.get(worker, -1) and version in self._published_s:
+        """A rollout of this worker arrived. It was acted under this version."""
+        if version > self._newest_used.get(worker, -1) and version in self._published_s:
             self._first_use_s[worker].append(now - self._published_s[version])
-        self._seen[worker] = max(version, self._seen.get(worker, -1))
+        self._newest_used[worker] = max(version, self._newest_used.get(worker, -1))
 
     def used(self, lags: Iterable[int]) -> None:
         """Rollouts with these lags went into an update."""
         self.lags.update(lags)
 
     def histogram(self) -> dict[str, int]:
-        """Rollouts by lag, from the smallest; a JSON object has strings for keys."""
+        """How many rollouts were used, by lag, from the smallest; a JSON object has strings for keys."""
         return {str(lag): self.lags[lag] for lag in sorted(self.lags)}
 
     def first_use_s(self) -> dict[str, float]:
-        """Of each worker, the median of the seconds from publishing to the arrival of its first rollout under it."""
+        """Of each worker, the median of the seconds from publishing weights to its first rollout under them."""
         return {worker: median(seconds) for worker, seconds in sorted(self._first_use_s.items())}

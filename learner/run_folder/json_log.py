@@ -24,7 +24,7 @@ class JsonLines(logging.Formatter):
         """The line, without its end."""
         event = getattr(record, "event", None)
         fields: dict[str, Any] = {} if event is None else dataclasses.asdict(event)
-        kind = "said" if event is None else type(event).__name__.lower()
+        kind = "said" if event is None else event.json_name
         return _line(record.created, record.levelname.lower(), kind, record.getMessage(), fields)
 
 

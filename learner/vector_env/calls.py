@@ -7,7 +7,7 @@ from typing import Any
 
 from learner.vector_env.batch_layout import BatchLayout
 from learner.vector_env.lane_orders import call_order
-from learner.vector_env.step_roster import Make
+from learner.vector_env.step_roster import MakeOrder
 from protocol.errors import EnvironmentFailed
 from protocol.messages import Answer, Returned
 from protocol.wire.plain_values import unpack
@@ -18,7 +18,7 @@ USE_INSTEAD = ("reset", "step", "close")
 
 def call_orders(
     layout: BatchLayout, copies: Sequence[int], name: str, args: tuple[Any, ...], kwargs: dict[str, Any]
-) -> dict[int, Make]:
+) -> dict[int, MakeOrder]:
     """Orders by lane that call, or get, the attribute of these copies. Raises `ValueError` for `reset`, `step`, `close`."""
     if name in USE_INSTEAD:
         raise ValueError(f"call of {name!r}: use {name}() of the vector environment")
@@ -28,7 +28,7 @@ def call_orders(
     }
 
 
-def assign_orders(layout: BatchLayout, copies: Sequence[int], name: str, values: Sequence[Any]) -> dict[int, Make]:
+def assign_orders(layout: BatchLayout, copies: Sequence[int], name: str, values: Sequence[Any]) -> dict[int, MakeOrder]:
     """Orders by lane that assign one value to each of these copies, which are in ascending order."""
     by_copy = dict(zip(copies, values, strict=True))
     return {

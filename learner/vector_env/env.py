@@ -25,8 +25,8 @@ from learner.vector_env.infos import Infos, unpack_infos
 from learner.vector_env.lane_orders import packed, reset_order, step_order
 from learner.vector_env.lost_lanes import RESET_ATTEMPTS, UNKNOWN_REASON, LostLanes, replacement_seeds, worker_lost
 from learner.vector_env.spec import VectorEnvDescription
-from learner.vector_env.step_hub import LockstepHub
-from learner.vector_env.step_roster import Make
+from learner.vector_env.step_hub import StepHub
+from learner.vector_env.step_roster import MakeOrder
 from protocol.arrays import Array
 from protocol.envs.spaces import make_flatten
 from protocol.errors import BadMessage, UsageError, WorkerLost
@@ -45,7 +45,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
     def __init__(
         self,
         description: VectorEnvDescription,
-        hub: LockstepHub,
+        hub: StepHub,
         *,
         memory: SharedMemory | None = None,
         timeout_s: float = 60.0,
@@ -96,9 +96,9 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         mask, options = take_reset_mask(options, self.num_envs)
         self._seeds = [new if new is not None else old for new, old in zip(seeds, self._seeds, strict=True)]
         if mask.all():
-            self._hub.renew()
+            self._hub.rebalance()
             self._lost_lanes.forget_unreported()
-            self._hub.lost()
+            self._hub.take_lost()
         infos = self._reset_copies(self._layout.by_lane(np.flatnonzero(mask).tolist()), seeds, options)
         self._ever_reset |= mask
         self._all_were_reset = bool(self._ever_reset.all())
@@ -116,13 +116,13 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
             for lane, chosen in waiting.items():
                 lane_seeds = seeds[self._layout.rows[lane]]
                 orders[lane] = reset_order(chosen, [lane_seeds[n] for n in chosen], packed_options)
-            self._hub.say(orders)
-            answers = self._hub.hear(self.timeout_s)
+            self._hub.send_orders(orders)
+            answers = self._hub.wait_for_answers(self.timeout_s)
             infos |= self._store(answers)
             waiting = {lane: chosen for lane, chosen in waiting.items() if lane not in answers}
-            lost = self._hub.lost()
+            lost = self._hub.take_lost()
             self._lost_lanes.add(
-                {lane: why for lane, why in lost.items() if lane not in waiting and not self._hub.lives(lane)}
+                {lane: why for lane, why in lost.items() if lane not in waiting and not self._hub.is_started(lane)}
             )
             if not waiting:
                 return infos
@@ -149,7 +149,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
                 f"copies {np.flatnonzero(ended).tolist()} have ended: autoreset_mode is Disabled, expected "
                 "reset(options={'reset_mask': ended}) before the next step"
             )
-        self._lost_lanes.add(self._hub.lost())
+        self._lost_lanes.add(self._hub.take_lost())
         awaiting_reset, lost = self._lost_lanes.awaiting_reset, self._lost_lanes.unreported
         if awaiting_reset and self.on_worker_loss == "raise":
             raise WorkerLost(f"lanes {sorted(awaiting_reset)} were lost with their worker; call reset() first")
@@ -160,7 +160,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
                 array[:] = leaf
             self._hub.step_shared(self._stepping)
         else:
-            self._hub.say({lane: self._step_order(lane, arrays) for lane in self._stepping})
+            self._hub.send_orders({lane: self._step_order(lane, arrays) for lane in self._stepping})
 
     def step_wait(self, timeout: float | None = None) -> StepResult:
         """Wait for the pending step. A worker that does not answer within `timeout` seconds is given up.
@@ -173,10 +173,10 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
             raise NoAsyncCallError("step_wait without step_async before it", "step")
         hub, timeout_s = self._hub, self.timeout_s if timeout is None else timeout
         try:
-            answers = hub.hear(timeout_s)
+            answers = hub.wait_for_answers(timeout_s)
         except Exception:
             self._pending = ""
-            self._lost_lanes.expect_reset(hub.lost())
+            self._lost_lanes.expect_reset(hub.take_lost())
             raise
         self._pending = ""
         infos = self._store(answers)
@@ -193,7 +193,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
             self._merge_infos(infos),
         )
 
-    def _step_order(self, lane: int, actions: Sequence[Array]) -> Make:
+    def _step_order(self, lane: int, actions: Sequence[Array]) -> MakeOrder:
         rows = self._layout.rows[lane]
         if lane in self._lost_lanes.awaiting_reset:  # as NEXT_STEP: the step after a truncation resets
             seeds = replacement_seeds(self._seeds[rows], self._hub.incarnation(lane))
@@ -203,7 +203,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
     def _step_result_with_losses(self, infos: dict[int, bytes], answered: set[int]) -> StepResult:
         """The result of a step that some lanes did not answer: their copies are truncated at their newest observation."""
         batch, layout = self._batch, self._layout
-        self._lost_lanes.add(self._hub.lost())
+        self._lost_lanes.add(self._hub.take_lost())
         lost = self._lost_lanes.report([lane for lane in layout.lanes if lane not in answered])
         if self.on_worker_loss == "raise":
             raise worker_lost(lost, layout)
@@ -266,11 +266,11 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         """The seed of each copy's random generator, as `SyncVectorEnv` shows it."""
         return self.get_attr("np_random_seed")
 
-    def _results_of_call(self, name: str, orders: Mapping[int, Make]) -> tuple[Any, ...]:
-        self._hub.say(orders)
-        answers = self._hub.hear(self.timeout_s)
+    def _results_of_call(self, name: str, orders: Mapping[int, MakeOrder]) -> tuple[Any, ...]:
+        self._hub.send_orders(orders)
+        answers = self._hub.wait_for_answers(self.timeout_s)
         if unanswered := [lane for lane in orders if lane not in answers]:
-            lost = self._hub.lost()
+            lost = self._hub.take_lost()
             self._lost_lanes.add(lost)
             raise worker_lost({lane: lost.get(lane, UNKNOWN_REASON) for lane in unanswered}, self._layout)
         return call_results(name, answers)
@@ -293,7 +293,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
 
     def watch(self, callback: Callable[[], None]) -> None:
         """Set what is called regularly during each wait. An exception that it raises ends the wait."""
-        self._hub.watch = callback
+        self._hub.call_while_waiting(callback)
 
     # ---------------------------------------------------------------- close
 
@@ -335,7 +335,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
                 for n, info in unpack_infos(data, self._layout.copies(lane)).items():
                     by_copy[n] = by_copy.get(n, {}) | info
             except BadMessage as error:
-                self._hub.distrust(lane, f"lane {lane}: infos cannot be read: {error}")
+                self._hub.refuse_owner(lane, f"lane {lane}: infos cannot be read: {error}")
         infos: Infos = {}
         for n in sorted(by_copy):
             infos = self._add_info(infos, by_copy[n], n)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from learner.vector_env.step_roster import Make
+from learner.vector_env.step_roster import MakeOrder
 from protocol.arrays import Array, Bytes
 from protocol.messages import Call, LaneLife, Reset, Step
 from protocol.wire.plain_values import pack
@@ -20,7 +20,7 @@ def packed(value: object) -> Bytes:
     return np.frombuffer(pack(value), np.uint8)
 
 
-def reset_order(copies: Sequence[int], seeds: Sequence[int | None], options: Bytes) -> Make:
+def reset_order(copies: Sequence[int], seeds: Sequence[int | None], options: Bytes) -> MakeOrder:
     """Begin episodes in these copies of the lane, with one seed each. `options` are packed."""
 
     def make(session: int, ticket: int, life: LaneLife) -> Reset:
@@ -29,7 +29,7 @@ def reset_order(copies: Sequence[int], seeds: Sequence[int | None], options: Byt
     return make
 
 
-def step_order(actions: Sequence[Array]) -> Make:
+def step_order(actions: Sequence[Array]) -> MakeOrder:
     """Step all copies of the lane with these actions: [N, *leaf] each."""
     leaves = tuple(array.copy() for array in actions)
 
@@ -39,7 +39,7 @@ def step_order(actions: Sequence[Array]) -> Make:
     return make
 
 
-def call_order(copies: Sequence[int], name: str, arguments: object, *, assign: bool) -> Make:
+def call_order(copies: Sequence[int], name: str, arguments: object, *, assign: bool) -> MakeOrder:
     """Get or call the attribute of this name in these copies of the lane, or assign to it."""
     packed_arguments = packed(arguments)
 

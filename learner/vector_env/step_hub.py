@@ -1,8 +1,8 @@
-"""The shell round the lock-step: link + lock-step + shared memory + clock. `hear` is the only place that waits.
+"""The hub of a vector environment: a shell round its roster and shared memory. Only `wait_for_answers` waits.
 
-The law: every wait has a deadline; when it passes, whoever has not answered is given up (and killed, if it is a child of
-ours), so that a wait ends with every lane answered or lost, and nobody under way. Nobody is silent whom nobody listens to:
-the caller may think as long as it likes between two waits.
+The law: every wait has a deadline. When it passes, the workers that have not answered are given up, and killed if they are
+child processes of ours. So a wait ends with every lane answered or lost. Silence is judged only while the hub listens: the
+caller may take as long as it likes between two waits.
 """
 
 from __future__ import annotations
@@ -14,32 +14,29 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from learner.members.events import Broke, Left, Turned, describe
-from learner.members.membership import Out
-from learner.members.peer_log import Doorkeeper, Lid
-from learner.rollouts.status import stepping_status
-from learner.vector_env.step_roster import Lockstep, Make
+from learner.members.events import Event, WorkerLeft
+from learner.members.member_server import MemberServer, ServerCallbacks, ServerSettings
+from learner.vector_env.status import status
+from learner.vector_env.step_roster import MakeOrder, StepRoster
 from protocol.address import worker_name
-from protocol.errors import BadMessage, EnvironmentFailed, NoWorkers
-from protocol.messages import Answer, Inquire
+from protocol.errors import EnvironmentFailed
+from protocol.messages import Answer
 from protocol.specs import StepSpec
-from protocol.wire.codec import encode
 from protocol.wire.learner_link import LearnerLink
 from protocol.wire.shared_memory import SharedMemory
 from protocol.wire.wake_up import SpinWait, WakePipe, WakeReason
 
 log = logging.getLogger("millrace.learner")
 
-POLL_S = 0.05  # between two looks at whether a child has ended
+POLL_S = 0.05  # between two checks whether a child process has ended
 LISTEN_EVERY_S = 0.5  # heartbeats are answered so often while steps go through shared memory
-AWAY_S = 1.0  # a caller that has not listened for longer was busy: what was said meanwhile may still be on its way
-PATIENCE_S = 10.0  # a lost lane waits so long for its worker's successor, and no longer than half its time: then it moves in
-# with another lane
-BUSY_S = 1.0  # of closing, for a step under way: it may hang, and nobody waits for what it gives
-LAST_WORDS_S = 0.1  # what a process said before it ended may still be on its way
+PATIENCE_S = 10.0  # a lost lane waits so long for its worker's successor, and no longer than half the timeout: then it moves
+# to a worker that has lanes already
+BUSY_S = 1.0  # how long closing waits for a step under way: the step may hang, and its result is not used
+LAST_WORDS_S = 0.1  # what a process sent before it ended may still be on its way
 
 
-class Staff(Protocol):
+class LocalWorkers(Protocol):
     """Worker processes of our own."""
 
     def poll(self) -> Iterable[tuple[str, str]]:
@@ -60,11 +57,11 @@ class Staff(Protocol):
         ...
 
 
-class Nobody:
-    """Staff of a learner whose workers are all started elsewhere."""
+class NoLocalWorkers:
+    """For a vector environment whose workers are all started elsewhere."""
 
     def poll(self) -> Iterable[tuple[str, str]]:
-        """None ended."""
+        """None has ended."""
         return ()
 
     def kill(self, name: str) -> bool:
@@ -73,7 +70,7 @@ class Nobody:
 
     @property
     def count(self) -> int:
-        """Nobody is."""
+        """None."""
         return 0
 
     def stop(self, timeout_s: float) -> None:
@@ -81,21 +78,21 @@ class Nobody:
 
 
 @dataclass(frozen=True)
-class Shared:
-    """Shared memory and the bells of each worker that was handed it."""
+class SharedSteps:
+    """What steps through shared memory need: the memory, and the bells of each worker that was handed it."""
 
     memory: SharedMemory
     bells: Mapping[str, tuple[WakePipe, WakePipe]]
-    """by name: rung for the worker, and by it"""
+    """by worker name: the bell that wakes the worker, and the bell that it rings"""
 
     def close(self) -> None:
-        """Let go of all descriptors."""
+        """Close all file descriptors."""
         self.memory.close()
         for bell in (bell for pair in self.bells.values() for bell in pair):
             bell.close()
 
 
-class LockstepHub:
+class StepHub:
     """Everything the vector environment knows of workers."""
 
     def __init__(
@@ -104,104 +101,105 @@ class LockstepHub:
         spec: StepSpec,
         *,
         first_session: int,
-        staff: Staff | None = None,
-        shared: Shared | None = None,
+        local_workers: LocalWorkers | None = None,
+        shared: SharedSteps | None = None,
         spin_s: float = 0.0,
         worker_timeout_s: float = math.inf,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`spin_s`: how long to wait awake for a step through shared memory before sleeping. `worker_timeout_s`: whoever is
-        silent for so long while it is listened to is given up; never, where the end of a process is known otherwise.
+        """`spin_s`: how long to wait awake for a step through shared memory before sleeping. `worker_timeout_s`: a worker
+        that is silent for so long while the hub listens is given up; infinite where the end of a process is known otherwise.
         """
-        self.link, self.spec = link, spec
-        self.lockstep = Lockstep(spec, first_session, worker_timeout_s)
-        self.staff: Staff = staff or Nobody()
+        self._link = link
+        self._roster = StepRoster(spec, first_session, worker_timeout_s)
+        self._local_workers: LocalWorkers = local_workers or NoLocalWorkers()
         self._shared, self._spin_s, self._clock = shared, spin_s, clock
         self._awake = SpinWait()
-        self._wanted: dict[int, Make] = {}  # lane -> an order that is said as soon as the lane is placed
-        self._wanted_since_s = 0.0
+        self._waiting_orders: dict[int, MakeOrder] = {}  # lane -> an order that is sent as soon as the lane is placed
+        self._waiting_since_s = 0.0
         self._patience_s = PATIENCE_S
-        self.watch: Callable[[], None] = lambda: None
-        """called while waiting; what it raises ends the wait"""
+        self._while_waiting: Callable[[], None] = lambda: None
         self.stepped: set[int] = set()
         """lanes whose last step, through shared memory, is done"""
         self._under_way: dict[int, int] = {}  # lane -> number of its order through shared memory
-        self._waits: dict[int, tuple[WakePipe, WakePipe] | None] = {}  # lane -> its worker's bells, if it may use them
+        self._bells: dict[int, tuple[WakePipe, WakePipe] | None] = {}  # lane -> its worker's bells, if it may use them
         self._listen_due_s = 0.0
-        self._closing = False
-        self._turned_away = ""  # what became of the last one that did not stay
-        self._lid = Lid(link, clock)
-        self._doorkeeper = Doorkeeper(link)
-        self._listened_s = self._listening_since_s = clock()
+        # To lose a worker costs the user's episodes. So a worker has its whole timeout to be heard again, not only the
+        # server's short grace: after a long suspension even its connection must be made anew.
+        settings = ServerSettings(grace_s=worker_timeout_s, last_words_s=LAST_WORDS_S, log_tracebacks=False)
+        callbacks = ServerCallbacks(
+            self._roster.receive, lambda now: status(self._roster, now), self._on_event, self._wake_sleeping
+        )
+        self._server = MemberServer(link, self._roster, callbacks, self._local_workers.poll, settings, clock)
 
     @property
     def address(self) -> str:
         """The address that workers connect to."""
-        return self.link.address
+        return self._link.address
 
     @property
     def worker_count(self) -> int:
         """Number of workers that have joined."""
-        return len(self.lockstep.members)
+        return len(self._roster.members)
 
-    def incarnation(self, lane: int) -> int:
-        """How many times the lane has been given new env copies."""
-        return self.lockstep.seats[lane].incarnation
+    def call_while_waiting(self, callback: Callable[[], None]) -> None:
+        """Call this now and then while waiting; what it raises ends the wait."""
+        self._while_waiting = callback
 
-    # ---------------------------------------------------------------- saying
+    # ---------------------------------------------------------------- orders
 
-    def say(self, makes: Mapping[int, Make]) -> None:
-        """Orders, one for each of these lanes; what has not been placed is placed while `hear` waits."""
-        self.lockstep.begin()
+    def send_orders(self, makes: Mapping[int, MakeOrder]) -> None:
+        """Send an order to each of these lanes. Lanes that have no worker are placed while `wait_for_answers` waits."""
+        self._roster.begin()
         self.stepped.clear()
-        self._wanted = dict(makes)
-        self._wanted_since_s = self._clock()
-        self._say_wanted()
+        self._waiting_orders = dict(makes)
+        self._waiting_since_s = self._clock()
+        self._send_waiting_orders()
 
     def shares(self, lane: int) -> bool:
         """Whether a step of this lane may go through shared memory: its copies live with a child that was handed it."""
-        if lane not in self._waits:
-            member = self.lockstep.owner(lane)
-            if member is None or not self.lockstep.seats[lane].living or self._shared is None:
+        if lane not in self._bells:
+            member = self._roster.owner(lane)
+            if member is None or not self._roster.lanes[lane].started or self._shared is None:
                 return False
-            self._waits[lane] = self._shared.bells.get(member.hello.worker)
-        return self._waits[lane] is not None
+            self._bells[lane] = self._shared.bells.get(member.hello.worker)
+        return self._bells[lane] is not None
 
     def step_shared(self, lanes: Sequence[int]) -> None:
         """The actions are laid in shared memory: step these lanes."""
-        self.lockstep.begin()
+        self._roster.begin()
         self.stepped.clear()
         assert self._shared is not None
         memory = self._shared.memory
         for lane in lanes:
-            self._under_way[lane] = self.lockstep.in_memory[lane] = number = memory.ordered(lane) + 1
+            self._under_way[lane] = self._roster.shared_orders[lane] = number = memory.ordered(lane) + 1
             memory.order(lane, number)
         for lane in lanes:
-            bells = self._waits[lane]
+            bells = self._bells[lane]
             assert bells is not None
             bells[0].wake()
 
     # ---------------------------------------------------------------- waiting
 
-    def hear(self, timeout_s: float) -> dict[int, Answer]:
-        """Wait until every order is answered or its lane is lost; the answers that came as messages, by lane.
+    def wait_for_answers(self, timeout_s: float) -> dict[int, Answer]:
+        """Wait until every order is answered or its lane is lost. Returns the answers that came as messages, by lane.
 
-        Raises `EnvironmentFailed` if an environment raised, `NoWorkers` if there was nobody to take a lane in time.
+        Raises `EnvironmentFailed` if an environment raised, `NoWorkers` if there was no worker to take a lane in time.
         """
         deadline_s = self._clock() + timeout_s
         self._patience_s = min(PATIENCE_S, timeout_s / 2)
         for lane in list(self._under_way):
             if lane in self._under_way:  # not lost while another was waited for
-                self._hear_shared(lane, deadline_s)
-        while self._wanted or self.lockstep.orders:
+                self._wait_for_shared_step(lane, deadline_s)
+        while self._waiting_orders or self._roster.orders:
             self._turn(POLL_S)
             if self._clock() > deadline_s:
                 self._give_up(timeout_s)
         if self._clock() > self._listen_due_s:
             self._turn(0.0)
-        if self.lockstep.broke:
-            self._raise_broken()
-        return dict(self.lockstep.answers)
+        if self._roster.failures:
+            self._raise_failure()
+        return dict(self._roster.answers)
 
     def infos(self, lane: int, timeout_s: float) -> bytes:
         """The packed infos of a lane that was stepped through shared memory."""
@@ -211,65 +209,60 @@ class LockstepHub:
             return packed
         deadline_s = self._clock() + timeout_s
         while True:
-            if (said := self.lockstep.infos.get(lane)) is not None:
+            if (said := self._roster.infos.get(lane)) is not None:
                 return said
-            if lane not in self.lockstep.in_memory:
+            if lane not in self._roster.shared_orders:
                 return b""  # its worker is gone, and that is told
             if self._clock() > deadline_s:
                 self._give_up_lane(lane, "did not send its infos in time")
             else:
                 self._turn(POLL_S)
 
-    def distrust(self, lane: int, why: str) -> None:
-        """What this lane's worker sent cannot be used: it is refused."""
-        if (member := self.lockstep.owner(lane)) is not None:
+    def refuse_owner(self, lane: int, why: str) -> None:
+        """What this lane's worker sent cannot be used: refuse the worker."""
+        if (member := self._roster.owner(lane)) is not None:
             log.warning("worker %s: %s", member.hello.worker, why)
-            self._send(self.lockstep.reject(member.peer, why))
-            self._after()
+            self._server.send(self._roster.reject_message(member.peer, why, self._clock()))
 
-    def lost(self) -> dict[int, str]:
-        """Lanes whose copies are gone since this was last asked, and why."""
-        lost, self.lockstep.lost = self.lockstep.lost, {}
+    def take_lost(self) -> dict[int, str]:
+        """Lanes whose env copies were lost since the last call, and why."""
+        lost, self._roster.lost = self._roster.lost, {}
         return lost
 
-    def lives(self, lane: int) -> bool:
-        """Whether its copies are with a worker."""
-        return self.lockstep.seats[lane].living
+    def is_started(self, lane: int) -> bool:
+        """Whether the lane's env copies are with a worker."""
+        return self._roster.lanes[lane].started
 
-    def renew(self) -> None:
-        """Every lane is about to begin anew: even out."""
+    def incarnation(self, lane: int) -> int:
+        """How often the lane was started again on new env copies."""
+        return self._roster.lanes[lane].incarnation
+
+    def rebalance(self) -> None:
+        """Every lane is about to begin anew: even out the lanes of the workers."""
         self._turn(0.0)
-        self._waits.clear()
-        self._send(self.lockstep.rebalance())
+        self._bells.clear()
+        self._server.send(self._roster.rebalance())
 
     def wait_for(self, workers: int, timeout_s: float) -> None:
-        """Wait until so many workers have joined."""
-        deadline_s = self._clock() + timeout_s
-        while len(self.lockstep.members) < workers:
-            if self._clock() > deadline_s:
-                raise self._nobody(timeout_s, workers)
-            self._turn(POLL_S)
+        """Wait until so many workers have joined. Raises `NoWorkers`."""
+        self._server.wait_for(workers, timeout_s, lambda: self._turn(POLL_S))
 
     def close(self, timeout_s: float) -> None:
-        """Ask everybody to leave, wait a moment for their Goodbye, and end those that are ours."""
-        self._closing = True
-        busy = bool(self._under_way or self.lockstep.orders)
+        """Ask every worker to leave, wait a moment for their Goodbye, and end those that are ours."""
+        busy = bool(self._under_way or self._roster.orders)
         deadline_s = self._clock() + (min(BUSY_S, timeout_s) if busy else timeout_s)
-        self._send(self.lockstep.membership.drain("the vector environment was closed"))
+        self._server.send(self._roster.drain("the vector environment was closed"))
         for bell, _ in self._shared.bells.values() if self._shared is not None else ():
             bell.wake(WakeReason.MESSAGE)
-        while self.lockstep.members and self._clock() < deadline_s:
-            self._receive(POLL_S)
-            for name, why in self.staff.poll():
-                self.lockstep.gone(name, why)
-        self.staff.stop(max(0.0, deadline_s - self._clock()))
+        self._server.wait_until_all_left(deadline_s, POLL_S)
+        self._local_workers.stop(max(0.0, deadline_s - self._clock()))
 
     # ---------------------------------------------------------------- inside
 
-    def _hear_shared(self, lane: int, deadline_s: float) -> None:
-        """Wait for one lane's step: awake for a moment, then asleep; it is done when the number is."""
+    def _wait_for_shared_step(self, lane: int, deadline_s: float) -> None:
+        """Wait for one lane's step, awake for a moment, then asleep. It is done when its number is that of the order."""
         assert self._shared is not None
-        memory, number, bells = self._shared.memory, self._under_way[lane], self._waits[lane]
+        memory, number, bells = self._shared.memory, self._under_way[lane], self._bells[lane]
         assert bells is not None
         self._awake.wait(lambda: memory.answered(lane) == number, self._spin_s)
         while memory.answered(lane) != number and lane in self._under_way:
@@ -279,112 +272,57 @@ class LockstepHub:
                     self._give_up_lane(lane, "did not answer in time")
             elif self._clock() > self._listen_due_s:
                 self._turn(0.0)
-        self._take(lane)
+        self._step_ended(lane)
 
-    def _take(self, lane: int) -> None:
-        """Its step is done, or it is lost."""
+    def _step_ended(self, lane: int) -> None:
+        """The lane's step is done, or the lane is lost."""
         number = self._under_way.pop(lane, None)
         if number is not None and self._shared is not None and self._shared.memory.answered(lane) == number:
             self.stepped.add(lane)
 
     def _turn(self, timeout_s: float) -> None:
-        """Listen; see who has ended; say what can be said."""
+        """Listen, remove the workers that are gone, and send the orders that can be sent."""
         self._listen_due_s = self._clock() + LISTEN_EVERY_S
-        self.watch()
-        now = self._clock()
-        if now - self._listened_s > AWAY_S:
-            self._listening_since_s = now
-        self._receive(timeout_s)
-        self._shut_out()
-        self._listened_s = self._clock()
-        self.lockstep.tick(self._listened_s, self._listening_since_s)
-        self._after()
-        for name, why in self.staff.poll():
-            self._receive(LAST_WORDS_S)
-            self.lockstep.gone(name, why)
-            self._after()
-        self._say_wanted()
+        self._while_waiting()
+        self._server.listen(timeout_s)
+        self._send_waiting_orders()
 
-    def _receive(self, timeout_s: float) -> None:
-        if self.link.poll(timeout_s):
-            for peer, message in self.link.receive():
-                match message:
-                    case BadMessage():
-                        self._lid.complain(peer, f"message from {worker_name(peer)[:40]!r}: {message}")
-                        self._send(self.lockstep.reject(peer, str(message)))
-                    case Inquire():
-                        self.link.send(peer, encode(stepping_status(self.lockstep, self._clock())))
-                    case _:
-                        self._send(self.lockstep.receive(peer, message, self._clock()))
-        self._after()
+    def _on_event(self, event: Event) -> None:
+        """Let go of the lanes of a worker that has left."""
+        if isinstance(event, WorkerLeft):
+            for lane in [lane for lane in self._bells if self._roster.owner(lane) is None]:
+                del self._bells[lane]
+                self._step_ended(lane)
 
-    def _shut_out(self) -> None:
-        for peer, why in self._doorkeeper.shut_out(self.lockstep.members):
-            self._send(self.lockstep.revoke(peer, why))
-            self._after()
+    def _send_waiting_orders(self) -> None:
+        awaited = len(self._roster.membership.active()) < self._local_workers.count  # one of ours has yet to join
+        patient = awaited and self._clock() - self._waiting_since_s < self._patience_s
+        for lane, make in list(self._waiting_orders.items()):
+            if self._roster.place(lane, patient):
+                del self._waiting_orders[lane]
+                self._server.send(self._roster.order(lane, make))
 
-    def _after(self) -> None:
-        """Tell what has happened, and let go of what is lost."""
-        for event in self.lockstep.events():
-            match event:
-                case Turned(_, why):
-                    self._turned_away = f"was refused: {why}"
-                    self._lid.tell(logging.WARNING, event, describe(event))
-                case Left(_, why, _, on_purpose):
-                    if on_purpose and not self._closing:
-                        self._turned_away = why
-                    expected = on_purpose and self._closing
-                    self._lid.tell(logging.INFO if expected else logging.WARNING, event, describe(event))
-                case Broke(worker, host, _, error, _):  # it is raised, with its traceback
-                    self._lid.tell(logging.INFO, event, f"worker {worker} ({host}): {error}")
-                case _:
-                    self._lid.tell(logging.INFO, event, describe(event))
-        for lane in [lane for lane in self._waits if self.lockstep.owner(lane) is None]:
-            del self._waits[lane]
-            self._take(lane)
-
-    def _say_wanted(self) -> None:
-        awaited = len(self.lockstep.membership.active()) < self.staff.count  # somebody of ours has yet to join
-        patient = awaited and self._clock() - self._wanted_since_s < self._patience_s
-        for lane, make in list(self._wanted.items()):
-            if self.lockstep.place(lane, patient):
-                del self._wanted[lane]
-                self._send(self.lockstep.order(lane, make))
-
-    def _send(self, outs: Sequence[Out]) -> None:
-        for peer, message in outs:
-            if not self.link.send(peer, encode(message)):
-                continue  # it is gone, or does not read: its silence will tell
-            if self._shared is not None and (bells := self._shared.bells.get(worker_name(peer).decode(errors="replace"))):
-                bells[0].wake(WakeReason.MESSAGE)  # it may be asleep beside its shared memory
+    def _wake_sleeping(self, peer: bytes) -> None:
+        """Ring the bell of a worker that was sent a message: it may sleep beside its shared memory."""
+        if self._shared is not None and (bells := self._shared.bells.get(worker_name(peer).decode(errors="replace"))):
+            bells[0].wake(WakeReason.MESSAGE)
 
     def _give_up(self, timeout_s: float) -> None:
-        """The deadline has passed: whoever holds an order has had it."""
-        if self._wanted and not self.lockstep.orders:
-            self._wanted.clear()
-            raise self._nobody(timeout_s, 1)
-        for order in list(self.lockstep.orders.values()):
+        """The deadline has passed: give up every worker that has not answered."""
+        if self._waiting_orders and not self._roster.orders:
+            self._waiting_orders.clear()
+            raise self._server.no_workers(1, timeout_s)
+        for order in list(self._roster.orders.values()):
             self._give_up_lane(order.lane, f"did not answer within {timeout_s:g} s")
 
     def _give_up_lane(self, lane: int, why: str) -> None:
-        member = self.lockstep.owner(lane)
+        member = self._roster.owner(lane)
         if member is not None:
-            killed = self.staff.kill(member.hello.worker)
-            self.lockstep.gone(member.hello.worker, f"{why}, and was killed" if killed else why)
-        self._after()
+            killed = self._local_workers.kill(member.hello.worker)
+            self._server.send(self._roster.remove_worker(member.hello.worker, f"{why}, and was killed" if killed else why))
 
-    def _raise_broken(self) -> None:
-        broke, self.lockstep.broke = self.lockstep.broke[0], []
-        error = EnvironmentFailed(f"worker {broke.worker} ({broke.host}): {broke.error}", broke.traceback)
-        error.add_note(broke.traceback)
+    def _raise_failure(self) -> None:
+        failure, self._roster.failures = self._roster.failures[0], []
+        error = EnvironmentFailed(f"worker {failure.worker} ({failure.host}): {failure.error}", failure.traceback)
+        error.add_note(failure.traceback)
         raise error
-
-    def _nobody(self, timeout_s: float, workers: int) -> NoWorkers:
-        because = f" ({self.link.refused} were not let in; the log says why)" if self.link.refused else ""
-        if self._turned_away:
-            because = f" (the last one {self._turned_away})"
-        token = "" if self.link.keyring is None else " --token FILE"
-        return NoWorkers(
-            f"waited {timeout_s:g} s for {workers} workers at {self.link.address}, {len(self.lockstep.members)} are there"
-            f"{because}; start one: python -m workers {self.link.address}{token}"
-        )

@@ -1,8 +1,9 @@
-"""The learner's half of a vector environment. Pure: messages and `now` in, messages out; no socket, clock or environment.
+"""The learner's half of the conversation of a vector environment. Pure: messages and `now` in, messages out.
 
-The law: an order goes to one lane, which has one at a time; it is answered, or its lane is lost with its worker. A lost lane
-lives again, on new env copies, in its next life. What a Heartbeat shows to be lost on the way is said again. Steps through
-shared memory are counted elsewhere; of these only infos that are too long to be laid there come as messages.
+The law: an order goes to one lane, and a lane has one order at a time. The order is answered, or its lane is lost with its
+worker. A lost lane starts again on new env copies, in its next incarnation. An order that a Heartbeat shows to be lost on
+the way is sent again. Steps through shared memory are no orders here; only their infos come as messages, where they are
+too long for the shared memory.
 """
 
 from __future__ import annotations
@@ -13,9 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from learner.members.events import Broke, Event
-from learner.members.membership import Member, Membership, Out
-from learner.members.states import Rubbish, Standing
+from learner.members.events import EnvironmentRaised
+from learner.members.lane_placement import LanePlacement, PlacedLane
+from learner.members.membership import Member, Membership, Outgoing
+from learner.members.states import MemberState, SentUnusable
 from protocol.errors import BadMessage
 from protocol.messages import (
     Answer,
@@ -29,7 +31,6 @@ from protocol.messages import (
     Order,
     Received,
     Refuse,
-    Release,
     Returned,
     Rollout,
     Stepped,
@@ -37,40 +38,45 @@ from protocol.messages import (
 )
 from protocol.specs import StepSpec
 
-Make = Callable[[int, int, LaneLife], Order]
-"""An order for a lane, from the session, the ticket and the life of the lane."""
+MakeOrder = Callable[[int, int, LaneLife], Order]
+"""Makes an order for a lane from the session, the ticket, and the lane's number and incarnation."""
 
 
 @dataclass
-class Seat:
-    """A lane as the learner sees it."""
+class SteppedLane(PlacedLane):
+    """A lane whose env copies are stepped by orders."""
 
-    number: int
-    incarnation: int = 0
-    owner: bytes | None = None
-    living: bool = False  # an order of this life was said: its copies exist, and can be lost
+    started: bool = False
+    """an order of this incarnation was sent: its env copies exist, and can be lost"""
+
+    def restart(self) -> None:
+        """The lane left its worker."""
+        super().restart()
+        self.started = False
+        self.incarnation += 1
 
 
-class Lockstep:
+class StepRoster:
     """Members, lanes, orders and their answers."""
 
     def __init__(self, spec: StepSpec, first_session: int, worker_timeout_s: float = math.inf) -> None:
         self.spec = spec
         self.worker_timeout_s = worker_timeout_s
-        self.membership = Membership(spec, Member, self._lost, first_session)
-        self.seats = [Seat(lane) for lane in range(len(spec.lanes))]
+        self.membership: Membership[Member] = Membership(spec, Member, self._removed, first_session)
+        self.lanes = [SteppedLane(lane) for lane in range(len(spec.lanes))]
         self.orders: dict[int, Order] = {}
-        """said and not answered, by ticket"""
+        """orders that were sent and not answered, by ticket"""
         self.answers: dict[int, Answer] = {}
-        """by lane; whoever gave the order takes it"""
-        self.in_memory: dict[int, int] = {}
-        """lane -> number of its newest order, of those that went through shared memory"""
+        """answers by lane, until the next orders"""
+        self.shared_orders: dict[int, int] = {}
+        """by lane: the number of its newest order through shared memory"""
         self.infos: dict[int, bytes] = {}
         """by lane: the packed infos of such an order, where they came as a message"""
         self.lost: dict[int, str] = {}
-        """lanes whose copies are gone, and why; whoever steps them takes note of it"""
-        self.broke: list[Broke] = []
+        """lanes whose env copies are gone, and why, until the vector environment takes note of them"""
+        self.failures: list[EnvironmentRaised] = []
         """environments that raised"""
+        self._placement = LanePlacement(self.lanes, _by_name)
         self._tickets = 0
 
     @property
@@ -78,156 +84,147 @@ class Lockstep:
         """By routing id."""
         return self.membership.members
 
-    def events(self) -> list[Event]:
-        """What has happened since it was last asked."""
-        return self.membership.happened()
-
     # ---------------------------------------------------------------- in
 
-    def receive(self, peer: bytes, message: ToLearner, now: float) -> list[Out]:
-        """What a worker said."""
+    def receive(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
+        """Answer a message."""
         if isinstance(message, Hello):
-            return self.membership.hello(peer, message, now)[0]
-        member = self.membership.speaker(peer, message, now)
+            return self.membership.join(peer, message, now)[0]
+        member = self.membership.sender(peer, message, now)
         if member is None:
-            return self.membership.stranger(peer, message)
+            return self.membership.answer_ended_session(peer, message)
         match message:
             case Stepped() | Returned():
                 return self._answer(member, message)
             case Heartbeat():
                 return self._heartbeat(member, message)
             case Goodbye(_, reason):
-                self.membership.forget(member, Goodbye, f"left: {reason}")
+                self.membership.remove(member, Goodbye, f"left: {reason}")
             case Failure(_, error, traceback, lane):
-                broke = Broke(member.hello.worker, member.hello.host, lane, error, traceback)
-                self.broke.append(broke)
-                self.membership.events.append(broke)
-                self.membership.forget(member, Failure, f"broke: {error}")
+                failure = EnvironmentRaised(member.hello.worker, member.hello.host, lane, error, traceback)
+                self.failures.append(failure)
+                self.membership.events.append(failure)
+                self.membership.remove(member, Failure, f"broke: {error}")
             case Rollout():
-                return self.membership.refuse(member, Rubbish, "it sent a rollout, and nobody collects rollouts here")
+                why = "it sent a rollout, and a vector environment collects none"
+                return self.membership.refuse(member, SentUnusable, why)
         return []
 
-    def reject(self, peer: bytes, why: str) -> list[Out]:
+    def reject_message(self, peer: bytes, why: str, now: float) -> list[Outgoing]:
         """A message that could not be read, or an answer that does not fit: its sender is refused."""
         member = self.members.get(peer)
-        return [(peer, Refuse(f"not understood: {why}"))] if member is None else self.membership.refuse(member, Rubbish, why)
+        if member is None:
+            return [(peer, Refuse(f"not understood: {why}"))]
+        return self.membership.refuse(member, SentUnusable, why)
 
-    def revoke(self, peer: bytes, why: str) -> list[Out]:
-        """A member may speak no more: it is told so and forgotten at once, whatever it holds."""
+    def revoke(self, peer: bytes, why: str) -> list[Outgoing]:
+        """A member's key was revoked: it is told so and removed at once, whatever it holds."""
         return self.membership.revoke(peer, why)
 
-    def gone(self, worker: str, why: str) -> None:
+    def remove_worker(self, worker: str, why: str) -> list[Outgoing]:
         """A worker's process has ended, or it is given up."""
-        self.membership.gone(worker, why)
+        self.membership.remove_worker(worker, why)
+        return []
 
-    def tick(self, now: float, listening_since_s: float) -> None:
+    def remove_silent(self, now: float) -> list[Outgoing]:
         """Judge silence. Call it only when every message that has arrived was given to `receive`."""
-        self.membership.silence(now, self.worker_timeout_s, listening_since_s)
+        self.membership.remove_silent(now, self.worker_timeout_s)
+        return []
+
+    def drain(self, reason: str) -> list[Outgoing]:
+        """Ask every worker to leave."""
+        return self.membership.drain(reason)
 
     # ---------------------------------------------------------------- the vector environment's side
 
     def begin(self) -> None:
-        """What the last orders gave has been taken."""
+        """The answers to the last orders were taken: forget them."""
         self.answers.clear()
-        self.in_memory.clear()
+        self.shared_orders.clear()
         self.infos.clear()
 
     def place(self, lane: int, patient: bool) -> bool:
-        """See that the lane lives with a worker; False if there is none, or (`patient`) only such as have lanes already."""
-        seat = self.seats[lane]
-        if seat.owner is None:
-            emptiest = min(self.membership.active(), key=_by_lanes, default=None)
-            if emptiest is None or (emptiest.lanes and patient):
-                return False
-            seat.owner = emptiest.peer
-            emptiest.lanes.add(lane)
-        return True
+        """See that the lane lives with a worker. False if there is none, or (`patient`) only such as have lanes already."""
+        if self.lanes[lane].owner is not None:
+            return True
+        candidates = [member for member in self.membership.active() if not (patient and member.lanes)]
+        if candidates:
+            self._placement.assign([self.lanes[lane]], candidates)
+        return bool(candidates)
 
-    def rebalance(self) -> list[Out]:
-        """All lanes are about to begin anew: move some from the fullest workers to the emptiest."""
-        out: list[Out] = []
-        active = self.membership.active()
-        while active:
-            fullest = max(active, key=lambda member: len(member.lanes))
-            emptiest = min(active, key=_by_lanes)
-            if len(fullest.lanes) - len(emptiest.lanes) < 2:
-                break
-            seat = self.seats[max(fullest.lanes)]
-            fullest.lanes.remove(seat.number)
-            out.append((fullest.peer, Release(fullest.session, (LaneLife(seat.number, seat.incarnation),))))
-            seat.owner, seat.living, seat.incarnation = emptiest.peer, False, seat.incarnation + 1
-            emptiest.lanes.add(seat.number)
-        return out
+    def rebalance(self) -> list[Outgoing]:
+        """All lanes are about to begin anew: move some from the workers with the most to those with the fewest."""
+        return self._placement.even_out(self.membership.active())
 
     def owner(self, lane: int) -> Member | None:
-        """Whoever the lane lives with."""
-        peer = self.seats[lane].owner
+        """The worker that the lane lives with."""
+        peer = self.lanes[lane].owner
         return None if peer is None else self.members[peer]
 
-    def order(self, lane: int, make: Make) -> list[Out]:
-        """Say an order to a lane that has been placed."""
-        member, seat = self.owner(lane), self.seats[lane]
+    def order(self, lane: int, make: MakeOrder) -> list[Outgoing]:
+        """Send an order to a lane that was placed."""
+        member, record = self.owner(lane), self.lanes[lane]
         if member is None:
             raise ValueError(f"lane {lane} expected a worker, has none")
         self._tickets += 1
-        order = make(member.session, self._tickets, LaneLife(lane, seat.incarnation))
-        seat.living = True
+        order = make(member.session, self._tickets, LaneLife(lane, record.incarnation))
+        record.started = True
         self.orders[order.ticket] = order
         member.tickets[order.ticket] = member.replies
         return [(member.peer, order)]
 
     # ---------------------------------------------------------------- inside
 
-    def _answer(self, member: Member, answer: Answer) -> list[Out]:
+    def _answer(self, member: Member, answer: Answer) -> list[Outgoing]:
         if answer.ticket < 0:
             return self._long_infos(member, answer)
         order = self.orders.get(answer.ticket)
         if order is None or answer.ticket not in member.tickets:
-            return []  # a repeat
+            return []  # this answer has come before
         try:
             check(answer, order, self.spec)
         except BadMessage as error:
-            return self.reject(member.peer, str(error))
+            return self.reject_message(member.peer, str(error), member.heard_s)
         del self.orders[answer.ticket], member.tickets[answer.ticket]
         self.answers[answer.lane] = answer
         return []
 
-    def _long_infos(self, member: Member, answer: Answer) -> list[Out]:
-        """To an order through shared memory; it counts only while that lane's newest order is this one."""
+    def _long_infos(self, member: Member, answer: Answer) -> list[Outgoing]:
+        """Infos of a step through shared memory. They count only if they belong to the lane's newest order."""
         if not isinstance(answer, Stepped):
-            return self.reject(member.peer, "an answer to an order through shared memory expected Stepped, got Returned")
-        mine = answer.lane in member.lanes and self.seats[answer.lane].incarnation == answer.incarnation
-        if mine and self.in_memory.get(answer.lane) == -answer.ticket:
+            why = "an answer to an order through shared memory expected Stepped, got Returned"
+            return self.reject_message(member.peer, why, member.heard_s)
+        mine = answer.lane in member.lanes and self.lanes[answer.lane].incarnation == answer.incarnation
+        if mine and self.shared_orders.get(answer.lane) == -answer.ticket:
             self.infos[answer.lane] = bytes(answer.infos.data)
         return []
 
-    def _heartbeat(self, member: Member, heartbeat: Heartbeat) -> list[Out]:
-        """Say again what this account shows to be lost."""
-        missing = member.account(heartbeat)
-        if member.standing is Standing.DRAINING:
+    def _heartbeat(self, member: Member, heartbeat: Heartbeat) -> list[Outgoing]:
+        """Answer a heartbeat. Send again the orders that it shows to be lost on the way."""
+        lost = member.record_heartbeat(heartbeat)
+        if member.state is MemberState.DRAINING:
             return [(member.peer, Drain(self.membership.draining or ""))]
-        out: list[Out] = []
-        for ticket in missing:
+        out: list[Outgoing] = []
+        for ticket in lost:
             member.tickets[ticket] = member.replies
             out.append((member.peer, self.orders[ticket]))
         member.replies += 1
-        lanes = tuple(Received(lane, self.seats[lane].incarnation, 0) for lane in sorted(member.lanes))
+        lanes = tuple(Received(lane, self.lanes[lane].incarnation, 0) for lane in sorted(member.lanes))
         return [*out, (member.peer, HeartbeatReply(member.session, member.replies, lanes))]
 
-    def _lost(self, member: Member, why: str) -> None:
+    def _removed(self, member: Member, why: str) -> None:
         for ticket in member.tickets:
             del self.orders[ticket]
         for lane in member.lanes:
-            self.in_memory.pop(lane, None)
-            seat = self.seats[lane]
-            if seat.living:
+            self.shared_orders.pop(lane, None)
+            if self.lanes[lane].started:
                 self.lost[lane] = f"worker {member.hello.worker} ({member.hello.host}) {why}"
-            seat.owner, seat.living, seat.incarnation = None, False, seat.incarnation + 1
+        self._placement.removed(member)
 
 
-def _by_lanes(member: Member) -> tuple[int, int, str]:
-    """Who has fewest comes first; among equals by name, not by who was faster to join."""
-    return len(member.lanes), len(member.hello.worker), member.hello.worker
+def _by_name(member: Member) -> tuple[int, str]:
+    """Among workers with equally few lanes, the next lane goes by name, not by who was faster to join."""
+    return len(member.hello.worker), member.hello.worker
 
 
 def check(answer: Answer, order: Order, spec: StepSpec) -> None:

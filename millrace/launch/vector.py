@@ -19,7 +19,7 @@ from learner.members.endpoint import Bind, join_lines, keyring_for
 from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.settings import VectorEnvSettings
 from learner.vector_env.spec import VectorEnvDescription, describe
-from learner.vector_env.step_hub import LockstepHub, Shared
+from learner.vector_env.step_hub import SharedSteps, StepHub
 from millrace.launch.local_workers import StartFlags, own_address, own_keys
 from protocol.address import advertised_address, check_address
 from protocol.cpu_cores import usable_cores
@@ -65,7 +65,7 @@ class ListeningVectorEnv:
     keyring: Keyring | None
     token: Token | None
     """of local workers"""
-    shared: Shared | None
+    shared: SharedSteps | None
     """with local workers"""
     resources: ExitStack
 
@@ -73,11 +73,11 @@ class ListeningVectorEnv:
         """Start the local workers with these flags. Call it once; it does not wait until workers have joined."""
         settings, count = self.settings, self.settings.local_workers
         host = Host(self._starter(flags), count) if count else None
-        hub = LockstepHub(
+        hub = StepHub(
             self.link,
             self.description.step,
             first_session=int.from_bytes(os.urandom(6), "little"),
-            staff=host,
+            local_workers=host,
             shared=self.shared,
             worker_timeout_s=WORKER_TIMEOUT_S if settings.listen.bind else math.inf,
             spin_s=SPIN_S if count < usable_cores() else 0.0,  # only if a core is left for the learner
@@ -130,7 +130,7 @@ def listen(settings: VectorEnvSettings, resources: ExitStack) -> ListeningVector
     shared = None
     if settings.shared_memory and SUPPORTED and count and transport != "inproc":
         to_learner = WakePipe()  # one for all: the worker that finishes a step last rings it
-        shared = Shared(SharedMemory(description.step), {f"w{n}": (WakePipe(), to_learner) for n in range(count)})
+        shared = SharedSteps(SharedMemory(description.step), {f"w{n}": (WakePipe(), to_learner) for n in range(count)})
         resources.callback(shared.close)
     return ListeningVectorEnv(settings, description, link, context, keyring, token, shared, resources)
 

@@ -106,10 +106,10 @@ def test_the_numbers_are_those_of_the_roster_and_the_ledger(scraped: Scraped) ->
     learning.publish(0)
     learning.deliver_all()
     assert learning.roster.take()
-    hub._freshness.used([0, 0, 3])
+    hub._weight_age.used([0, 0, 3])
     learning.publish(1)
-    learning.roster.gone("a", "was killed")
-    learning.roster.reject(B, None, "rubbish", 0.0)
+    learning.roster.remove_worker("a", "was killed")
+    learning.roster.reject_message(B, "rubbish", 0.0)
     found = scraped.metrics()
     ledger = learning.roster.ledger.counts()
     assert ledger["lost"] > 0

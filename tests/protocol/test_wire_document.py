@@ -289,7 +289,7 @@ def test_every_limit_is_in_the_document() -> None:
 
 def test_every_state_has_a_row_in_its_table() -> None:
     assert set(states.TABLE) == set(states.State)
-    assert set(standing.TABLE) == set(standing.Standing)
+    assert set(standing.TABLE) == set(standing.MemberState)
 
 
 def test_a_worker_is_told_by_its_table_what_to_do_with_every_message() -> None:

@@ -15,8 +15,9 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 
+from learner.members.membership import Outgoing
 from learner.rollouts.ledger import Ledger
-from learner.rollouts.roster import Out, Roster
+from learner.rollouts.roster import Roster
 from protocol.env_spec import EnvSpec
 from protocol.messages import Rollout, ToLearner, ToWorker
 from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
@@ -143,7 +144,7 @@ class World:
             self.arrival[key] = arrival
             self.at(arrival - self.now, lambda: deliver() if epoch == self.epoch else None)
 
-    def to_workers(self, outs: list[Out]) -> None:
+    def to_workers(self, outs: list[Outgoing]) -> None:
         for peer, message in outs:
             self.carry((peer, "down"), lambda peer=peer, message=message: self._arrives(peer, message))  # type: ignore[misc]
 
@@ -165,7 +166,7 @@ class World:
     def _hears(self, peer: bytes, message: ToLearner) -> None:
         faulty = self.now < self.faults.until_s and self.random.random() < self.faults.spoiled
         if faulty and isinstance(message, Rollout):
-            self.to_workers(self.roster.reject(peer, message, "spoiled", self.now))
+            self.to_workers(self.roster.reject_rollout(peer, message, "spoiled", self.now))
         else:
             self.to_workers(self.roster.receive(peer, message, self.now))
         self.check()
@@ -238,7 +239,7 @@ class World:
         self._learner()
 
     def _tick(self) -> None:
-        self.to_workers(self.roster.tick(self.now))
+        self.to_workers(self.roster.remove_silent(self.now))
         self._learn()
 
     def _learn(self) -> None:
@@ -302,7 +303,7 @@ class World:
             name = self.random.choice(sorted(self.workers))
             del self.workers[name]
             if self.random.random() < 0.5:  # the host sees it at once; else only silence tells
-                self.to_workers(self.roster.gone(name.decode(), "killed"))
+                self.to_workers(self.roster.remove_worker(name.decode(), "killed"))
             self.at(self.random.uniform(0.1, 8.0), lambda: self.spawn(name) if name not in self.workers else None)
 
     def _freeze_one(self) -> None:

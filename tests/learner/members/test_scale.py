@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from learner.members.peer_log import Doorkeeper
+from learner.members.key_revocation import KeyRevocation
 from protocol.messages import Heartbeat
 from tests.learner.rollouts.test_roster import Learner
 
@@ -47,7 +47,7 @@ def crowd(workers: int, max_lag: int = 0) -> Learner:
 
 def of_rollout(learner: Learner, number: int | None = None) -> int:
     """Lines for the arrival of one rollout, and for a look whether an update can be made of all."""
-    learner.roster.tick(learner.now)
+    learner.roster.remove_silent(learner.now)
     while learner.roster.take() is not None:  # what is there already
         pass
     number = learner.tickets()[0] if number is None else number
@@ -57,7 +57,7 @@ def of_rollout(learner: Learner, number: int | None = None) -> int:
         learner.roster.receive(peer, rollout, learner.now)
         learner.roster.take()
         learner.roster.deal()
-        learner.roster.tick(learner.now)
+        learner.roster.remove_silent(learner.now)
 
     return lines(arrives)
 
@@ -80,7 +80,7 @@ def test_while_a_lane_waits_to_move_the_rollouts_of_others_cost_no_more() -> Non
     def waiting(workers: int) -> Learner:
         learner = crowd(2 * workers)
         for number in range(workers):  # half of them leave; the others have two lanes each, until somebody comes
-            learner.roster.gone(f"w{number}", "gone")
+            learner.roster.remove_worker(f"w{number}", "gone")
         learner.joins(b"newcomer", pid=9998)  # is given the lane whose rollout has come
         learner.joins(b"another", pid=9999)
         assert sum(lane.moving for lane in learner.roster.lanes) == 1
@@ -96,16 +96,16 @@ def test_while_a_lane_waits_to_move_the_rollouts_of_others_cost_no_more() -> Non
 
 def test_silence_is_judged_when_it_can_have_come_about_and_not_before() -> None:
     learner = crowd(MANY)
-    learner.roster.tick(0.0)
+    learner.roster.remove_silent(0.0)
     learner.now = 4.0
     for number in range(1, MANY):
         learner.beats(b"w%d" % number)
-    assert lines(lambda: learner.roster.tick(4.9)) < 20
-    learner.roster.tick(5.1)
+    assert lines(lambda: learner.roster.remove_silent(4.9)) < 20
+    learner.roster.remove_silent(5.1)
     assert b"w0" not in learner.roster.members
     assert len(learner.roster.members) == MANY - 1
-    assert lines(lambda: learner.roster.tick(8.9)) < 20
-    learner.roster.tick(9.1)
+    assert lines(lambda: learner.roster.remove_silent(8.9)) < 20
+    learner.roster.remove_silent(9.1)
     assert not learner.roster.members
 
 
@@ -122,10 +122,10 @@ def test_keys_are_looked_at_once_for_each_state_of_their_list() -> None:
             return "revoked" if peer == b"b" and self.keyring.allowed == "newer" else ""
 
     link: Any = Link()
-    keeper = Doorkeeper(link)
-    assert keeper.shut_out([b"a", b"b"]) == []
-    assert keeper.shut_out([b"a", b"b"]) == []
+    keys = KeyRevocation(link)
+    assert keys.revoked([b"a", b"b"]) == []
+    assert keys.revoked([b"a", b"b"]) == []
     assert link.asked == 2
     link.keyring.allowed = "newer"
-    assert keeper.shut_out([b"a", b"b"]) == [(b"b", "revoked")]
+    assert keys.revoked([b"a", b"b"]) == [(b"b", "revoked")]
     assert link.asked == 4

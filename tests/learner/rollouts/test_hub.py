@@ -3,51 +3,24 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
 from typing import cast
 
 import numpy as np
 import pytest
 
-from learner.rollouts.hub import AWAY_S, POLL_S, PULSE_S, Hub, HubSettings
+from learner.members.member_server import AWAY_S
+from learner.rollouts.hub import POLL_S, PULSE_S, Hub, HubSettings
 from learner.rollouts.roster import Roster
 from protocol.errors import RunError
-from protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello, ToLearner, Weights
+from protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello, Weights
 from protocol.rollout import rollout_bytes
-from protocol.wire.codec import Buffer, decode_to_worker
+from protocol.wire.codec import decode_to_worker
 from protocol.wire.learner_link import LearnerLink
 from protocol.wire.weight_dtypes import WeightsDtype, to_float32
 from tests.support.fake_ends import run_spec
+from tests.support.fake_link import FakeLink
 
 WORKER_TIMEOUT_S = 3.0
-
-
-class FakeLink:
-    """Holds what workers have said until it is asked for; waiting takes time."""
-
-    address, keyring = "fake", None
-
-    def __init__(self) -> None:
-        self.now = 100.0
-        self.packed_bytes_limit = 0
-        self.sent: list[Sequence[Buffer]] = []
-        self.inbox: list[tuple[bytes, ToLearner]] = []
-
-    def poll(self, timeout_s: float) -> bool:
-        if not self.inbox:
-            self.now += timeout_s
-        return bool(self.inbox)
-
-    def receive(self) -> Iterator[tuple[bytes, ToLearner]]:
-        while self.inbox:
-            yield self.inbox.pop(0)
-
-    def send(self, peer: bytes, frames: Sequence[Buffer]) -> bool:
-        self.sent.append(frames)
-        return True
-
-    def why_not(self, peer: bytes) -> str:
-        return ""
 
 
 def hub_with_a_worker(weights_dtype: WeightsDtype = "float32") -> tuple[FakeLink, Hub, Heartbeat]:

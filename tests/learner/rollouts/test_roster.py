@@ -9,10 +9,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from learner.members.events import Broke, Joined, Left, Turned
-from learner.members.states import TABLE, Rubbish, Silence, Standing
+from learner.members.events import EnvironmentRaised, WorkerJoined, WorkerLeft, WorkerRefused
+from learner.members.membership import Outgoing
+from learner.members.states import TABLE, MemberState, SentUnusable, TimedOut
 from learner.rollouts.ledger import Ledger
-from learner.rollouts.roster import STRIKES, Out, Roster
+from learner.rollouts.roster import STRIKES, Roster
 from protocol.messages import (
     PROTOCOL_VERSION,
     Collect,
@@ -67,13 +68,13 @@ class Learner:
         if publish:
             self.publish(0)
 
-    def publish(self, version: int) -> list[Out]:
+    def publish(self, version: int) -> list[Outgoing]:
         return self.balanced(self.roster.publish(version, PARAMETERS, BUFFERS))
 
-    def says(self, peer: bytes, message: ToLearner) -> list[Out]:
+    def says(self, peer: bytes, message: ToLearner) -> list[Outgoing]:
         return self.balanced(self.roster.receive(peer, message, self.now))
 
-    def joins(self, peer: bytes, *, pid: int = 1, attempt: int = 1, host: str = "host") -> list[Out]:
+    def joins(self, peer: bytes, *, pid: int = 1, attempt: int = 1, host: str = "host") -> list[Outgoing]:
         return self.says(peer, Hello(PROTOCOL_VERSION, peer.decode(), host, pid, 1000 * len(host) + pid, "fake", attempt))
 
     def session(self, peer: bytes) -> int:
@@ -96,7 +97,7 @@ class Learner:
             expected if sequence is None else sequence,
         )
 
-    def delivers(self, number: int) -> list[Out]:
+    def delivers(self, number: int) -> list[Outgoing]:
         return self.says(self.roster.tickets[number].peer, self.rollout_of(number))
 
     def deliver_all(self) -> None:
@@ -105,7 +106,7 @@ class Learner:
 
     def beats(
         self, peer: bytes, *, version: int = 0, tickets: Sequence[int] | None = None, replies: int | None = None
-    ) -> list[Out]:
+    ) -> list[Outgoing]:
         """A Heartbeat: by default of a worker that lost nothing."""
         held = self.tickets(peer) if tickets is None else tickets
         seen = self.roster.members[peer].replies if replies is None else replies
@@ -124,7 +125,7 @@ class Learner:
         self.publish(self.roster.version + 1)
         return taken
 
-    def balanced(self, outs: list[Out]) -> list[Out]:
+    def balanced(self, outs: list[Outgoing]) -> list[Outgoing]:
         roster, ledger = self.roster, self.roster.ledger
         in_flight = len(roster.tickets) + len(roster.ready)
         assert ledger.issued == ledger.used + ledger.stale + ledger.lost + in_flight
@@ -132,16 +133,16 @@ class Learner:
         return outs
 
 
-def of(outs: Sequence[Out], kind: type[M], peer: bytes | None = None) -> list[M]:
+def of(outs: Sequence[Outgoing], kind: type[M], peer: bytes | None = None) -> list[M]:
     """The messages of this kind, to this worker or to any."""
     return [message for to, message in outs if isinstance(message, kind) and peer in (None, to)]
 
 
-def permits(outs: Sequence[Out], peer: bytes | None = None) -> list[Permit]:
+def permits(outs: Sequence[Outgoing], peer: bytes | None = None) -> list[Permit]:
     return [permit for collect in of(outs, Collect, peer) for permit in collect.permits]
 
 
-def kinds(outs: Sequence[Out], peer: bytes) -> list[type]:
+def kinds(outs: Sequence[Outgoing], peer: bytes) -> list[type]:
     return [type(message) for to, message in outs if to == peer]
 
 
@@ -157,7 +158,7 @@ def test_hello_is_answered_by_welcome_weights_and_collect_in_this_order() -> Non
     outs = learner.joins(A)
     assert kinds(outs, A) == [Welcome, Weights, Collect]
     assert of(outs, Welcome) == [Welcome(100, 1, learner.roster.run)]
-    assert learner.roster.events == [Joined("a", "host", 1)]
+    assert learner.roster.events == [WorkerJoined("a", "host", 1)]
 
 
 def test_before_the_first_weights_a_worker_is_welcomed_and_given_nothing() -> None:
@@ -180,7 +181,7 @@ def test_a_repeated_hello_is_a_sign_of_life() -> None:
     learner.joins(A)
     learner.now = TIMEOUT_S
     learner.joins(A)
-    learner.roster.tick(TIMEOUT_S + 1)
+    learner.roster.remove_silent(TIMEOUT_S + 1)
     assert A in learner.roster.members
 
 
@@ -208,7 +209,7 @@ def test_the_same_name_from_another_process_replaces_the_old_one(pid: int, host:
     assert kinds(outs, A) == [Welcome, Weights, Collect]
     assert learner.session(A) == 101
     assert learner.roster.ledger.lost == 2
-    assert Left("a", f"replaced by process {pid}", 2, False) in learner.roster.events
+    assert WorkerLeft("a", f"replaced by process {pid}", 2, False) in learner.roster.events
 
 
 def test_the_one_that_was_replaced_is_told_why_when_it_comes_back() -> None:
@@ -234,7 +235,7 @@ def test_another_protocol_is_refused_and_says_what_to_do() -> None:
     (refuse,) = of(outs, Refuse)
     assert f"expected {PROTOCOL_VERSION}, got {PROTOCOL_VERSION + 1}" in refuse.reason
     assert learner.roster.members == {}
-    assert isinstance(learner.roster.events[0], Turned)
+    assert isinstance(learner.roster.events[0], WorkerRefused)
 
 
 @pytest.mark.parametrize("known", [False, True], ids=["unknown worker", "earlier session"])
@@ -314,7 +315,7 @@ def test_a_lane_that_fell_behind_catches_up() -> None:
     learner.joins(A)
     learner.delivers(1)
     member = learner.roster.members[A]
-    outs = learner.balanced(learner.roster.reject(A, learner.rollout_of(0), "broken", 0.0))
+    outs = learner.balanced(learner.roster.reject_rollout(A, learner.rollout_of(0), "broken", 0.0))
     assert [permit.lane for permit in permits(outs)] == [0]
     assert member.strikes == 1
 
@@ -362,7 +363,7 @@ def test_while_the_least_advanced_lane_is_moving_no_other_takes_its_place() -> N
 def test_when_every_worker_is_lost_no_ticket_is_dealt_until_one_joins() -> None:
     learner = Learner(lanes=2)
     learner.joins(A)
-    assert learner.balanced(learner.roster.gone("a", "killed")) == []
+    assert learner.balanced(learner.roster.remove_worker("a", "killed")) == []
     assert learner.roster.deal() == []
     outs = learner.joins(B)
     assert {(permit.lane, permit.incarnation) for permit in permits(outs)} == {(0, 1), (1, 1)}
@@ -390,7 +391,7 @@ def test_a_late_rollout_of_an_ended_session_is_counted_and_answered_by_rejoin() 
     learner = Learner(lanes=1)
     learner.joins(A)
     rollout = learner.rollout_of(0)
-    learner.roster.gone("a", "killed")
+    learner.roster.remove_worker("a", "killed")
     assert learner.says(A, rollout) == [(A, Rejoin(100))]
     assert (learner.roster.ledger.transitions_late, learner.roster.ready) == (1, [])
 
@@ -438,7 +439,7 @@ def test_a_lost_workers_tickets_and_lanes_are_dealt_to_the_living_with_a_higher_
     (lost,) = learner.tickets(A)
     lane = learner.roster.tickets[lost].lane
     before = learner.roster.lanes[lane].incarnation
-    outs = learner.balanced(learner.roster.gone("a", "killed"))
+    outs = learner.balanced(learner.roster.remove_worker("a", "killed"))
     assert [(p.lane, p.incarnation) for p in permits(outs, B)] == [(lane, before + 1)]
     assert lost not in learner.roster.tickets
     assert lanes_of(learner, B) == {0, 1}
@@ -449,7 +450,7 @@ def test_a_new_life_of_a_lane_has_received_nothing() -> None:
     learner.joins(A)
     learner.update()
     learner.joins(B)
-    outs = learner.roster.gone("a", "killed")
+    outs = learner.roster.remove_worker("a", "killed")
     (collect,) = of(outs, Collect, B)
     assert collect.received == (Received(0, 1, 0, ()),)
 
@@ -512,7 +513,7 @@ def test_a_lane_has_one_owner_whoever_comes_and_goes() -> None:
     learner = Learner(lanes=5)
     for step, peer in enumerate([A, B, C, A, B, A, C, B] * 4):
         if peer in learner.roster.members and step % 3:
-            learner.balanced(learner.roster.gone(peer.decode(), "killed"))
+            learner.balanced(learner.roster.remove_worker(peer.decode(), "killed"))
         else:
             learner.joins(peer, pid=step)
         if learner.roster.members:
@@ -675,7 +676,7 @@ def test_a_reply_leaves_out_lanes_that_live_elsewhere() -> None:
 def test_a_bad_rollout_is_counted_and_its_ticket_dealt_again() -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
-    outs = learner.balanced(learner.roster.reject(A, learner.rollout_of(0), "obs are NaN", 0.0))
+    outs = learner.balanced(learner.roster.reject_rollout(A, learner.rollout_of(0), "obs are NaN", 0.0))
     assert permits(outs) == [Permit(1, 0, 0)]
     ledger = learner.roster.ledger
     assert (ledger.lost, ledger.transitions_invalid, ledger.outstanding) == (1, 1, 1)
@@ -684,7 +685,7 @@ def test_a_bad_rollout_is_counted_and_its_ticket_dealt_again() -> None:
 def test_a_bad_rollout_is_let_go_by_its_worker() -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
-    (collect,) = of(learner.roster.reject(A, learner.rollout_of(0), "obs are NaN", 0.0), Collect)
+    (collect,) = of(learner.roster.reject_rollout(A, learner.rollout_of(0), "obs are NaN", 0.0), Collect)
     assert collect.received == (Received(0, 0, 1, ()),)
 
 
@@ -692,30 +693,33 @@ def test_a_bad_rollout_is_let_go_by_its_worker() -> None:
 def test_a_worker_that_keeps_sending_rubbish_is_refused_and_what_it_held_is_dealt_again(kind: str) -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
-    outs: list[Out] = []
+    outs: list[Outgoing] = []
     for strike in range(STRIKES):
         assert A in learner.roster.members, strike
-        rollout = learner.rollout_of(learner.tickets()[0]) if kind == "rollout" else None
-        outs = learner.balanced(learner.roster.reject(A, rollout, "not understood", 0.0))
+        if kind == "rollout":
+            rollout = learner.rollout_of(learner.tickets()[0])
+            outs = learner.balanced(learner.roster.reject_rollout(A, rollout, "not understood", 0.0))
+        else:
+            outs = learner.balanced(learner.roster.reject_message(A, "not understood", 0.0))
     assert outs == [(A, Refuse("not understood"))]
     assert A not in learner.roster.members
     assert learner.roster.ledger.outstanding == 0
     assert learner.roster.ledger.messages_bad == (STRIKES if kind == "message" else 0)
-    assert Turned("a", "not understood") in learner.roster.events
+    assert WorkerRefused("a", "not understood") in learner.roster.events
 
 
 def test_one_that_was_refused_stays_refused_and_another_process_of_its_name_may_join() -> None:
     learner = Learner(lanes=1)
     learner.joins(A, pid=1)
     for _ in range(STRIKES):
-        learner.roster.reject(A, None, "rubbish", 0.0)
+        learner.roster.reject_message(A, "rubbish", 0.0)
     assert learner.joins(A, pid=1, attempt=2) == [(A, Refuse("rubbish"))]
     assert kinds(learner.joins(A, pid=2), A) == [Welcome, Weights, Collect]
 
 
 def test_rubbish_of_a_stranger_is_counted_and_refused() -> None:
     learner = Learner()
-    ((peer, refuse),) = learner.roster.reject(b"stranger", None, "no head", 0.0)
+    ((peer, refuse),) = learner.roster.reject_message(b"stranger", "no head", 0.0)
     assert isinstance(refuse, Refuse)
     assert (peer, learner.roster.ledger.messages_bad, learner.roster.members) == (b"stranger", 1, {})
 
@@ -724,7 +728,7 @@ def test_whatever_dtype_a_bad_rollouts_flags_have_they_are_counted_without_raisi
     learner = Learner(lanes=1)
     learner.joins(A)
     bad = msgspec.structs.replace(learner.rollout_of(0), valid=np.full((1, 1), 9.0, np.float32))
-    learner.balanced(learner.roster.reject(A, bad, "valid expected bool", 0.0))
+    learner.balanced(learner.roster.reject_rollout(A, bad, "valid expected bool", 0.0))
     assert learner.roster.ledger.transitions_invalid == 0
 
 
@@ -733,7 +737,7 @@ def test_a_late_bad_rollout_of_an_ended_session_does_not_touch_the_ticket_of_the
     learner = Learner(lanes=1)
     learner.joins(A)
     late = fake_rollout(session=5, lane=0, ticket=0, version=0, sequence=3)
-    learner.balanced(learner.roster.reject(A, late, "obs are NaN", 0.0))
+    learner.balanced(learner.roster.reject_rollout(A, late, "obs are NaN", 0.0))
     assert learner.tickets(A) == [0]
     assert learner.roster.lanes[0].ahead == set()
 
@@ -758,7 +762,7 @@ def test_goodbye_forgets_the_worker_and_deals_what_it_held() -> None:
     outs = learner.says(A, Goodbye(learner.session(A), "told to stop", (0, 1)))
     assert A not in learner.roster.members
     assert {permit.lane for permit in permits(outs, B)} == {0, 1}
-    assert learner.roster.events[-1] == Left("a", "left: told to stop", 2, True)
+    assert learner.roster.events[-1] == WorkerLeft("a", "left: told to stop", 2, True)
 
 
 def test_failure_forgets_the_worker_and_its_traceback_is_kept_for_the_log() -> None:
@@ -768,8 +772,8 @@ def test_failure_forgets_the_worker_and_its_traceback_is_kept_for_the_log() -> N
     outs = learner.says(A, Failure(learner.session(A), "ValueError: x", "Traceback: …", 0))
     assert A not in learner.roster.members
     assert [permit.incarnation for permit in permits(outs, B)] == [1]
-    assert Broke("a", "host", 0, "ValueError: x", "Traceback: …") in learner.roster.events
-    assert learner.roster.events[-1] == Left("a", "broke: ValueError: x", 1, False)
+    assert EnvironmentRaised("a", "host", 0, "ValueError: x", "Traceback: …") in learner.roster.events
+    assert learner.roster.events[-1] == WorkerLeft("a", "broke: ValueError: x", 1, False)
 
 
 def test_silence_is_judged_in_tick_only() -> None:
@@ -779,18 +783,18 @@ def test_silence_is_judged_in_tick_only() -> None:
     assert of(learner.publish(1), Rejoin) == []
     learner.joins(B)
     learner.beats(A)  # it was only slow to be heard
-    learner.roster.tick(1000.0)
+    learner.roster.remove_silent(1000.0)
     assert A in learner.roster.members
 
 
 def test_a_silent_worker_is_forgotten_by_tick() -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
-    assert learner.roster.tick(TIMEOUT_S) == []
+    assert learner.roster.remove_silent(TIMEOUT_S) == []
     assert A in learner.roster.members
-    learner.balanced(learner.roster.tick(TIMEOUT_S + 0.1))
+    learner.balanced(learner.roster.remove_silent(TIMEOUT_S + 0.1))
     assert learner.roster.members == {}
-    assert learner.roster.events[-1] == Left("a", "silent for 5 s", 1, False)
+    assert learner.roster.events[-1] == WorkerLeft("a", "silent for 5 s", 1, False)
 
 
 @pytest.mark.parametrize("kind", ["heartbeat", "rollout", "rubbish"])
@@ -804,8 +808,8 @@ def test_any_message_of_the_session_is_a_sign_of_life(kind: str) -> None:
         case "rollout":
             learner.delivers(0)
         case _:
-            learner.roster.reject(A, None, "rubbish", learner.now)
-    learner.roster.tick(4.0 + TIMEOUT_S)
+            learner.roster.reject_message(A, "rubbish", learner.now)
+    learner.roster.remove_silent(4.0 + TIMEOUT_S)
     assert A in learner.roster.members
 
 
@@ -850,7 +854,7 @@ def test_a_draining_worker_that_falls_silent_is_forgotten() -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
     learner.roster.drain("finished")
-    assert learner.balanced(learner.roster.tick(TIMEOUT_S + 0.1)) == []
+    assert learner.balanced(learner.roster.remove_silent(TIMEOUT_S + 0.1)) == []
     assert learner.roster.members == {}
 
 
@@ -858,9 +862,9 @@ def test_gone_does_not_wait_for_silence() -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
     learner.joins(B)
-    outs = learner.balanced(learner.roster.gone("a", "killed by signal 9"))
+    outs = learner.balanced(learner.roster.remove_worker("a", "killed by signal 9"))
     assert [permit.lane for permit in permits(outs, B)] == [0]
-    assert learner.roster.gone("a", "again") == []
+    assert learner.roster.remove_worker("a", "again") == []
 
 
 # -------------------------------------------------------------------- the ledger and the checkpoint
@@ -875,7 +879,7 @@ def test_every_ticket_ends_as_used_stale_or_lost() -> None:
     learner.publish(2)
     learner.roster.take()  # 0 was stale
     learner.roster.deal()
-    learner.roster.gone("a", "killed")
+    learner.roster.remove_worker("a", "killed")
     learner.joins(B)
     learner.deliver_all()
     learner.take()
@@ -894,7 +898,7 @@ def test_every_transition_that_arrived_is_used_or_counted_under_a_reason() -> No
     learner.says(A, rollout)  # duplicate
     learner.take()
     learner.publish(1)
-    learner.roster.reject(A, learner.rollout_of(1), "NaN", 0.0)  # invalid
+    learner.roster.reject_rollout(A, learner.rollout_of(1), "NaN", 0.0)  # invalid
     learner.says(A, msgspec.structs.replace(rollout, session=5))  # late
     counts = learner.roster.ledger.counts()
     named = ("used", "duplicate", "invalid", "late")
@@ -910,7 +914,7 @@ def test_incarnations_for_a_checkpoint_name_no_life_that_was_dealt_a_ticket() ->
     assert learner.roster.incarnations() == [1, 0, 0]
     learner.update()
     assert learner.roster.incarnations() == [1, 1, 0]
-    learner.roster.gone("a", "killed")
+    learner.roster.remove_worker("a", "killed")
     assert learner.roster.incarnations() == [1, 1, 0]
 
 
@@ -927,7 +931,7 @@ def test_no_life_is_lived_twice_across_resumes() -> None:
             assert not fresh & lives
             lives |= fresh
             learner.update()
-            learner.roster.gone(peer.decode(), "killed")
+            learner.roster.remove_worker(peer.decode(), "killed")
         version, ledger = learner.roster.version, msgspec.structs.replace(learner.roster.ledger)
         incarnations = learner.roster.incarnations()
         ledger.lost += ledger.outstanding
@@ -944,16 +948,16 @@ def test_a_resumed_learner_counts_tickets_on() -> None:
 # -------------------------------------------------------------------- the table
 
 
-def standing_of(learner: Learner, peer: bytes) -> Standing:
+def standing_of(learner: Learner, peer: bytes) -> MemberState:
     member = learner.roster.members.get(peer)
-    return Standing.UNKNOWN if member is None else member.standing
+    return MemberState.UNKNOWN if member is None else member.state
 
 
-def in_standing(standing: Standing) -> Learner:
+def in_standing(standing: MemberState) -> Learner:
     learner = Learner(lanes=1)
-    if standing is not Standing.UNKNOWN:
+    if standing is not MemberState.UNKNOWN:
         learner.joins(A)
-    if standing is Standing.DRAINING:
+    if standing is MemberState.DRAINING:
         learner.roster.drain("finished")
     assert standing_of(learner, A) is standing
     return learner
@@ -974,24 +978,24 @@ def test_every_message_to_a_learner_is_tried() -> None:
     assert {type(message) for message in EVERY_MESSAGE} == set(ToLearner.__args__)
 
 
-@pytest.mark.parametrize("standing", Standing)
+@pytest.mark.parametrize("standing", MemberState)
 @pytest.mark.parametrize("message", EVERY_MESSAGE, ids=lambda message: type(message).__name__)
-def test_the_table_names_the_standing_that_follows(standing: Standing, message: ToLearner) -> None:
+def test_the_table_names_the_standing_that_follows(standing: MemberState, message: ToLearner) -> None:
     learner = in_standing(standing)
     learner.says(A, message)
     assert standing_of(learner, A) is TABLE[standing].get(type(message), standing)
 
 
-@pytest.mark.parametrize("standing", [Standing.ACTIVE, Standing.DRAINING])
-@pytest.mark.parametrize("event", [Silence, Rubbish])
-def test_the_table_names_the_standing_that_follows_an_event(standing: Standing, event: type) -> None:
+@pytest.mark.parametrize("standing", [MemberState.ACTIVE, MemberState.DRAINING])
+@pytest.mark.parametrize("event", [TimedOut, SentUnusable])
+def test_the_table_names_the_standing_that_follows_an_event(standing: MemberState, event: type) -> None:
     learner = in_standing(standing)
-    if event is Silence:
-        learner.roster.tick(1e6)
+    if event is TimedOut:
+        learner.roster.remove_silent(1e6)
     else:
         for _ in range(STRIKES):
-            learner.roster.reject(A, None, "rubbish", 0.0)
-    assert standing_of(learner, A) is TABLE[standing][event] is Standing.UNKNOWN
+            learner.roster.reject_message(A, "rubbish", 0.0)
+    assert standing_of(learner, A) is TABLE[standing][event] is MemberState.UNKNOWN
 
 
 def test_why_one_was_silent_is_told_once_it_is_known() -> None:
@@ -999,13 +1003,13 @@ def test_why_one_was_silent_is_told_once_it_is_known() -> None:
     learner.joins(b"a")
     learner.joins(b"b")
     learner.now += TIMEOUT_S + 1
-    learner.balanced(learner.roster.tick(learner.now))
+    learner.balanced(learner.roster.remove_silent(learner.now))
     learner.roster.events.clear()
     for _ in range(2):
-        learner.balanced(learner.roster.gone("a", "was ended: too slow"))
-    assert learner.roster.events == [Left("a", "was ended: too slow", 0, False)]
+        learner.balanced(learner.roster.remove_worker("a", "was ended: too slow"))
+    assert learner.roster.events == [WorkerLeft("a", "was ended: too slow", 0, False)]
     learner.joins(b"b", attempt=2)
     learner.says(b"b", Goodbye(learner.session(b"b"), "told to stop", ()))
     learner.roster.events.clear()
-    learner.balanced(learner.roster.gone("b", "ended with exit code 0"))
+    learner.balanced(learner.roster.remove_worker("b", "ended with exit code 0"))
     assert learner.roster.events == []

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import zmq
 
-from learner.members.events import Event, Left, Stale, Told, describe
+from learner.members.events import Event, RejoinRequested, RolloutDropped, WorkerLeft, describe
 from learner.rollouts.hub import Hub, HubSettings
 from learner.rollouts.status import status
 from learner.run_folder.json_log import JsonLines, progress_line
@@ -175,10 +175,10 @@ def test_one_whose_session_has_ended_is_told_to_join_again_and_that_is_an_event(
     learner = Learner()
     learner.joins(b"a")
     late = learner.rollout_of(learner.tickets()[0])
-    learner.roster.gone("a", "was killed")
+    learner.roster.remove_worker("a", "was killed")
     learner.roster.events.clear()
     learner.says(b"a", late)
-    assert learner.roster.events == [Told("a", late.session, 1)]
+    assert learner.roster.events == [RejoinRequested("a", late.session, 1)]
     assert "1 transitions that it sent are counted, not used" in describe(learner.roster.events[0])
 
 
@@ -190,15 +190,15 @@ def test_a_rollout_that_is_too_old_is_an_event() -> None:
     learner.publish(2)
     learner.roster.events.clear()
     assert learner.roster.take() is None
-    stale = [event for event in learner.roster.events if isinstance(event, Stale)]
+    stale = [event for event in learner.roster.events if isinstance(event, RolloutDropped)]
     assert stale
     assert stale[0].lag == 2
     assert "2 versions old" in describe(stale[0])
 
 
 EVENTS: list[tuple[Event, dict[str, Any]]] = [
-    (Left("w0", "was killed", 2, False), {"event": "left", "worker": "w0", "why": "was killed", "tickets": 2}),
-    (Stale(3, 2, 640), {"event": "stale", "lane": 3, "lag": 2, "transitions": 640}),
+    (WorkerLeft("w0", "was killed", 2, False), {"event": "left", "worker": "w0", "why": "was killed", "tickets": 2}),
+    (RolloutDropped(3, 2, 640), {"event": "stale", "lane": 3, "lag": 2, "transitions": 640}),
 ]
 
 
@@ -242,7 +242,7 @@ def test_what_is_unusual_about_a_worker_is_shown() -> None:
     learner = Learner(lanes=1)
     for name in (b"w0", b"w1"):
         learner.joins(name)
-    learner.roster.reject(b"w1", None, "rubbish", learner.now)
+    learner.roster.reject_message(b"w1", "rubbish", learner.now)
     text = as_table(told(learner))
     assert "spare" in text
     assert "w1 (1 strikes)" in text

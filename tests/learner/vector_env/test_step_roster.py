@@ -6,9 +6,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from learner.members.events import Left, Turned
-from learner.rollouts.status import stepping_status
-from learner.vector_env.step_roster import Lockstep
+from learner.members.events import WorkerLeft, WorkerRefused
+from learner.vector_env.status import status
+from learner.vector_env.step_roster import StepRoster
 from protocol.env_spec import EnvSpec
 from protocol.messages import (
     PROTOCOL_VERSION,
@@ -40,16 +40,16 @@ SPEC = StepSpec(
 )
 
 
-def lockstep(*peers: bytes) -> Lockstep:
+def step_roster(*peers: bytes) -> StepRoster:
     """With these workers, one lane each, all of them stepped once."""
-    made = Lockstep(SPEC, 100, TIMEOUT_S)
+    made = StepRoster(SPEC, 100, TIMEOUT_S)
     for peer in peers:
         made.receive(peer, Hello(PROTOCOL_VERSION, peer.decode(), "host", 1, 1, "fake", 1), 0.0)
     for lane in range(len(peers)):
         assert made.place(lane, patient=False)
         ((peer, order),) = made.order(lane, step)
         assert made.receive(peer, stepped(order), 0.0) == []
-    made.events()
+    made.membership.take_events()
     made.begin()
     return made
 
@@ -66,15 +66,15 @@ def stepped(order: object, **changes: object) -> Stepped:
     return msgspec.structs.replace(answer, **changes)
 
 
-def in_memory(made: Lockstep, lane: int, number: int) -> Stepped:
+def in_memory(made: StepRoster, lane: int, number: int) -> Stepped:
     """What its worker says when the infos of that order do not fit into shared memory."""
     member = made.owner(lane)
     assert member is not None
-    return stepped(Step(member.session, -number, lane, made.seats[lane].incarnation, ()), infos=WORDS)
+    return stepped(Step(member.session, -number, lane, made.lanes[lane].incarnation, ()), infos=WORDS)
 
 
 def test_an_order_is_answered_once() -> None:
-    made = lockstep(A)
+    made = step_roster(A)
     ((_, order),) = made.order(0, step)
     made.receive(A, stepped(order), 0.0)
     assert list(made.answers) == [0]
@@ -98,7 +98,7 @@ def test_an_order_is_answered_once() -> None:
     ids=str,
 )
 def test_an_answer_that_does_not_fit_is_refused_and_its_lane_is_lost(changes: dict[str, object]) -> None:
-    made = lockstep(A, B)
+    made = step_roster(A, B)
     ((_, order),) = made.order(0, step)
     ((_, said),) = made.receive(A, stepped(order, **changes), 0.0)
     assert isinstance(said, Refuse)
@@ -111,8 +111,8 @@ def test_an_answer_that_does_not_fit_is_refused_and_its_lane_is_lost(changes: di
 
 
 def test_infos_too_long_for_shared_memory_are_those_of_the_step_under_way() -> None:
-    made = lockstep(A)
-    made.in_memory[0] = 7
+    made = step_roster(A)
+    made.shared_orders[0] = 7
     assert made.receive(A, in_memory(made, 0, 7), 0.0) == []
     assert made.infos == {0: b"words"}
     assert made.answers == {}, "counted as an answer it would stand for that of a lane which has none"
@@ -120,36 +120,36 @@ def test_infos_too_long_for_shared_memory_are_those_of_the_step_under_way() -> N
 
 @pytest.mark.parametrize("number", [6, 8])
 def test_infos_of_another_step_are_not_used(number: int) -> None:
-    made = lockstep(A)
-    made.in_memory[0] = 7
+    made = step_roster(A)
+    made.shared_orders[0] = 7
     assert made.receive(A, in_memory(made, 0, number), 0.0) == []
     assert (made.infos, made.answers) == ({}, {})
 
 
 def test_infos_that_nobody_waits_for_are_not_used() -> None:
-    made = lockstep(A)
+    made = step_roster(A)
     made.receive(A, in_memory(made, 0, 1), 0.0)
     assert (made.infos, made.answers) == ({}, {})
-    made.in_memory[0] = 1
+    made.shared_orders[0] = 1
     made.begin()
     made.receive(A, in_memory(made, 0, 1), 0.0)
     assert (made.infos, made.answers) == ({}, {})
 
 
 def test_infos_of_anothers_lane_or_an_earlier_life_are_not_used() -> None:
-    made = lockstep(A, B)
-    made.in_memory[0] = made.in_memory[1] = 7
+    made = step_roster(A, B)
+    made.shared_orders[0] = made.shared_orders[1] = 7
     theirs = in_memory(made, 1, 7)
     made.receive(A, msgspec.structs.replace(theirs, session=in_memory(made, 0, 7).session), 0.0)
     made.receive(B, msgspec.structs.replace(theirs, incarnation=9), 0.0)
     assert (made.infos, made.answers) == ({}, {})
-    made.gone("b", "was killed")
-    assert made.in_memory == {0: 7}, "whoever is gone will not say its infos"
+    made.remove_worker("b", "was killed")
+    assert made.shared_orders == {0: 7}, "whoever is gone will not say its infos"
 
 
 def test_nothing_but_a_step_is_answered_beside_shared_memory() -> None:
-    made = lockstep(A)
-    made.in_memory[0] = 7
+    made = step_roster(A)
+    made.shared_orders[0] = 7
     session = in_memory(made, 0, 7).session
     ((_, said),) = made.receive(A, Returned(session, -7, 0, 0, NOTHING, "", ""), 0.0)
     assert isinstance(said, Refuse)
@@ -159,52 +159,44 @@ def test_nothing_but_a_step_is_answered_beside_shared_memory() -> None:
 # ---------------------------------------------------------------- silence
 
 
-def beat(made: Lockstep, peer: bytes, now: float, steps: int = 0) -> None:
+def beat(made: StepRoster, peer: bytes, now: float, steps: int = 0) -> None:
     made.receive(peer, Heartbeat(made.members[peer].session, 0, -1, (), steps, {}, 0), now)
 
 
 def test_whoever_is_silent_while_it_is_listened_to_is_given_up() -> None:
-    made = lockstep(A, B)
+    made = step_roster(A, B)
     beat(made, A, 3.0)
-    made.tick(TIMEOUT_S + 1, listening_since_s=0.0)
+    made.remove_silent(TIMEOUT_S + 1)
     assert list(made.members) == [A]
     assert made.lost == {1: "worker b (host) silent for 5 s"}
-    made.gone("b", "was killed by SIGKILL")
-    assert made.events()[-1] == Left("b", "was killed by SIGKILL", 0, False)
-
-
-def test_whoever_nobody_listened_to_was_not_silent() -> None:
-    made = lockstep(A)
-    made.tick(1000.0, listening_since_s=1000.0 - TIMEOUT_S)
-    assert made.lost == {}
-    made.tick(1000.1, listening_since_s=1000.0 - TIMEOUT_S)
-    assert list(made.lost) == [0]
+    made.remove_worker("b", "was killed by SIGKILL")
+    assert made.membership.take_events()[-1] == WorkerLeft("b", "was killed by SIGKILL", 0, False)
 
 
 def test_where_an_end_is_known_otherwise_nobody_is_silent() -> None:
-    made = lockstep(A)
+    made = step_roster(A)
     made.worker_timeout_s = float("inf")
-    made.tick(1e9, listening_since_s=0.0)
+    made.remove_silent(1e9)
     assert made.lost == {}
 
 
 def test_a_worker_that_was_given_up_is_told_to_join_again() -> None:
-    made = lockstep(A)
+    made = step_roster(A)
     session = made.members[A].session
-    made.tick(TIMEOUT_S + 1, listening_since_s=0.0)
+    made.remove_silent(TIMEOUT_S + 1)
     assert made.receive(A, Heartbeat(session, 0, -1, (), 0, {}, 0), 9.0) == [(A, Rejoin(session))]
     assert made.receive(A, Goodbye(session, "told to stop", ()), 9.0) == []
 
 
 def test_one_whose_key_was_revoked_is_told_so_and_forgotten() -> None:
-    made = lockstep(A)
+    made = step_roster(A)
     assert made.revoke(A, "its key was revoked") == [(A, Refuse("its key was revoked"))]
     assert made.lost == {0: "worker a (host) was shut out: its key was revoked"}
-    assert isinstance(made.events()[0], Turned)
+    assert isinstance(made.membership.take_events()[0], WorkerRefused)
 
 
 def test_what_was_lost_on_the_way_is_said_again() -> None:
-    made = lockstep(A)
+    made = step_roster(A)
     ((_, order),) = made.order(0, step)
     session = made.members[A].session
     said: list[list[object]] = []
@@ -223,10 +215,10 @@ def order_ticket(order: object) -> int:
 
 
 def test_it_says_how_it_is() -> None:
-    made = lockstep(B, A)
+    made = step_roster(B, A)
     beat(made, B, 10.0, steps=100)
     beat(made, B, 12.0, steps=300)
     beat(made, A, 12.0, steps=50)
-    found = stepping_status(made, 13.0)
+    found = status(made, 13.0)
     assert (found.env, found.env_steps, found.steps_per_s, found.total_steps) == ("Fake-v0", 350, 100.0, 0)
     assert [(one.worker, one.lanes, one.silent_s) for one in found.workers] == [("b", (1,), 1.0), ("a", (0,), 1.0)]

@@ -657,7 +657,7 @@ def test_who_comes_under_ever_new_names_does_not_fill_the_memory() -> None:
         peer = b"w%d" % number
         learner.receive(peer, hello(f"w{number}", number), 0.0)
         for _ in range(3):
-            learner.reject(peer, None, "rubbish", 0.0)
+            learner.reject_message(peer, "rubbish", 0.0)
     logging.disable(logging.NOTSET)
     assert not learner.members
     assert len(learner.membership._refused) == REMEMBERED_REFUSALS

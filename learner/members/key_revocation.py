@@ -1,0 +1,24 @@
+"""Finds the members whose key was revoked. ZeroMQ checks a key only at the handshake, so the learner must check again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from protocol.keys.keys import ClientList
+from protocol.wire.learner_link import LearnerLink
+
+
+class KeyRevocation:
+    """Checks the members' keys each time that the list of allowed keys has changed."""
+
+    def __init__(self, link: LearnerLink) -> None:
+        self._link = link
+        self._checked_against: ClientList | None = None
+
+    def revoked(self, members: Iterable[bytes]) -> list[tuple[bytes, str]]:
+        """The peers whose key was revoked, and why. Each list of allowed keys is checked once."""
+        keyring = self._link.keyring
+        if keyring is None or keyring.allowed is self._checked_against:
+            return []
+        self._checked_against = keyring.allowed  # before the check: the list may be replaced meanwhile
+        return [(peer, why) for peer in members if (why := self._link.why_not(peer))]

@@ -1,0 +1,112 @@
+"""Which worker each lane lives with. Pure: no clock, no socket.
+
+The law: every lane has an owner as long as there are workers, and no worker has two lanes more than another. A lane moves
+only between its rollouts. Placement is computed again only after an event that can change it: with a thousand workers, to
+look at all of them at each rollout would cost more than the rollout.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+from learner.members.membership import Member, Outgoing
+from protocol.messages import LaneLife, Release
+
+
+@dataclass
+class PlacedLane:
+    """A lane as the learner sees it: with which worker it lives, and how often it was started."""
+
+    number: int
+    incarnation: int = 0
+    """rises when the lane starts again on new env copies"""
+    owner: bytes | None = None
+    """routing id of the worker"""
+    moving: bool = False
+    """the lane waits for its last tickets to end before it moves to another worker"""
+
+    @property
+    def busy(self) -> int:
+        """How many of its tickets are with its worker: a busy lane cannot move."""
+        return 0
+
+    def restart(self) -> None:
+        """The lane left its worker: its next owner starts it on new env copies."""
+        self.owner, self.moving = None, False
+
+
+L = TypeVar("L", bound=PlacedLane)
+
+
+class LanePlacement(Generic[L]):
+    """Places lanes with workers."""
+
+    def __init__(self, lanes: Sequence[L], tie_break: Callable[[Member], Any]) -> None:
+        """`tie_break`: among workers with equally few lanes, the one with the smallest value gets the next lane."""
+        self._lanes, self._tie_break = lanes, tie_break
+        self._unplaced = {lane.number for lane in lanes}
+        self._settled = False
+        self._waiting_for: Member | None = None  # a lane of this worker is to move, once its tickets have ended
+
+    def joined(self) -> None:
+        """A worker joined."""
+        self._settled = False
+
+    def removed(self, member: Member) -> None:
+        """A worker was removed: its lanes need another owner."""
+        self._settled = False
+        for number in member.lanes:
+            self._lanes[number].restart()
+        self._unplaced |= member.lanes
+
+    def ticket_ended(self, member: Member) -> None:
+        """A ticket of this worker has ended."""
+        if member is self._waiting_for:
+            self._settled = False
+
+    def place(self, active: Iterable[Member]) -> list[Outgoing]:
+        """Place all lanes that have no owner, then even out. Does nothing if nothing has changed."""
+        if self._settled:
+            return []
+        self._settled = True
+        members = sorted(active, key=lambda member: member.join_number)
+        self.assign([self._lanes[number] for number in sorted(self._unplaced)], members)
+        return self.even_out(members)
+
+    def assign(self, lanes: Iterable[L], members: Iterable[Member]) -> None:
+        """Give each of these lanes to the worker that has the fewest."""
+        fewest_first = [(len(member.lanes), self._tie_break(member), n, member) for n, member in enumerate(members)]
+        heapq.heapify(fewest_first)
+        for lane in lanes:
+            count, tie_break, n, member = fewest_first[0]
+            self._give(lane, member)
+            heapq.heapreplace(fewest_first, (count + 1, tie_break, n, member))
+
+    def even_out(self, members: Sequence[Member]) -> list[Outgoing]:
+        """Move lanes from the workers with the most to those with the fewest. Stops at a lane that must wait to move."""
+        for number in self._waiting_for.lanes if self._waiting_for is not None else ():
+            self._lanes[number].moving = False
+        self._waiting_for = None
+        out: list[Outgoing] = []
+        while members:
+            fullest = max(members, key=lambda member: len(member.lanes))
+            emptiest = min(members, key=lambda member: (len(member.lanes), self._tie_break(member)))
+            if len(fullest.lanes) - len(emptiest.lanes) < 2:
+                break
+            lane = min((self._lanes[n] for n in fullest.lanes), key=lambda lane: (lane.busy, -lane.number))
+            if lane.busy:
+                lane.moving, self._waiting_for = True, fullest
+                break
+            fullest.lanes.remove(lane.number)
+            out.append((fullest.peer, Release(fullest.session, (LaneLife(lane.number, lane.incarnation),))))
+            lane.restart()
+            self._give(lane, emptiest)
+        return out
+
+    def _give(self, lane: L, member: Member) -> None:
+        self._unplaced.discard(lane.number)
+        lane.owner = member.peer
+        member.lanes.add(lane.number)

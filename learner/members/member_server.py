@@ -1,0 +1,210 @@
+"""The server of members: what every learner does for the workers that are connected to it. A shell: link, clock and log.
+
+The law: the inbox is emptied before silence is judged, and a learner that was away listens for a while first. So a long
+update, or a stopped process, never costs a healthy worker its membership.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from learner.members.events import (
+    EnvironmentRaised,
+    Event,
+    RejoinRequested,
+    RolloutDropped,
+    WorkerJoined,
+    WorkerLeft,
+    WorkerRefused,
+    describe,
+)
+from learner.members.key_revocation import KeyRevocation
+from learner.members.member_log import MemberLog
+from learner.members.membership import Membership, Outgoing
+from protocol.address import worker_name
+from protocol.errors import BadMessage, NoWorkers
+from protocol.messages import Inquire, Status, ToLearner, ToWorker, Weights
+from protocol.wire.codec import Buffer, encode
+from protocol.wire.learner_link import LearnerLink
+
+AWAY_S = 0.5  # a learner that has not listened for longer was busy, or its process was stopped
+
+
+class MemberRoster(Protocol):
+    """The pure half of a learner, which decides what is answered."""
+
+    membership: Membership[Any]
+
+    def reject_message(self, peer: bytes, why: str, now: float) -> list[Outgoing]:
+        """A message that could not be read."""
+        ...
+
+    def revoke(self, peer: bytes, why: str) -> list[Outgoing]:
+        """A member's key was revoked."""
+        ...
+
+    def remove_worker(self, worker: str, why: str) -> list[Outgoing]:
+        """A worker's process is known to be dead."""
+        ...
+
+    def remove_silent(self, now: float) -> list[Outgoing]:
+        """Judge silence."""
+        ...
+
+
+@dataclass(frozen=True)
+class ServerCallbacks:
+    """What a hub does itself."""
+
+    message: Callable[[bytes, ToLearner, float], Sequence[Outgoing]]
+    """answers a message (sender, message, now)"""
+    status: Callable[[float], Status]
+    """answers `millrace status`"""
+    event: Callable[[Event], None]
+    """called with each event, after it was logged"""
+    sent: Callable[[bytes], None] = lambda peer: None
+    """called with the receiver of each message that was sent"""
+
+
+@dataclass(frozen=True)
+class ServerSettings:
+    """How the server of one hub differs from that of another."""
+
+    grace_s: float = AWAY_S
+    """after the learner was away, silence is not judged for so long"""
+    last_words_s: float = 0.0
+    """how long to wait for the last messages of a process that has ended"""
+    log_tracebacks: bool = True
+    """whether the traceback of an environment is logged; if not, the hub raises it"""
+
+
+class MemberServer:
+    """Receives from the members and sends to them; removes those whose key was revoked, that ended or are silent."""
+
+    def __init__(
+        self,
+        link: LearnerLink,
+        roster: MemberRoster,
+        callbacks: ServerCallbacks,
+        ended: Callable[[], Iterable[tuple[str, str]]],
+        settings: ServerSettings | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """`ended` names the workers whose processes have ended since the last call, each with the reason."""
+        self.listened_s = clock()
+        """when this last listened"""
+        self._link, self._roster, self._callbacks, self._ended = link, roster, callbacks, ended
+        self._membership = roster.membership
+        self._settings, self._clock = settings or ServerSettings(), clock
+        self._log, self._keys = MemberLog(link, clock), KeyRevocation(link)
+        self._judge_silence_from_s = self.listened_s
+        self._last_turned_away = ""  # what became of the last worker that did not stay
+        self._encoded: tuple[ToWorker, Sequence[Buffer]] | None = None
+
+    def listen(self, timeout_s: float) -> None:
+        """Wait at most `timeout_s` for messages, answer all that have come, and remove the members that are gone."""
+        self.receive(timeout_s)
+        self._revoke_keys()
+        self._reap(self._settings.last_words_s)
+        now = self._clock()
+        if now - self.listened_s > timeout_s + AWAY_S:
+            # Messages of the meantime may still lie in the kernel: if we were stopped, so was ZeroMQ's thread.
+            self._judge_silence_from_s = now + self._settings.grace_s
+        self.listened_s = now
+        if now >= self._judge_silence_from_s:
+            self.send(self._roster.remove_silent(now))
+
+    def receive(self, timeout_s: float) -> None:
+        """Wait at most `timeout_s` for messages and answer all that have come."""
+        if not self._link.poll(timeout_s):
+            return
+        for peer, message in self._link.receive():
+            now = self._clock()
+            if isinstance(message, BadMessage):
+                self.complain(peer, f"message from {worker_name(peer)[:40]!r}: {message}")
+                self.send(self._roster.reject_message(peer, str(message), now))
+            elif isinstance(message, Inquire):
+                self._link.send(peer, encode(self._callbacks.status(now)))
+            else:
+                self.send(self._callbacks.message(peer, message, now))
+
+    def send(self, messages: Sequence[Outgoing]) -> None:
+        """Send these messages, then log what has happened."""
+        for peer, message in messages:
+            if self._link.send(peer, self._frames(message)):  # if not, it is gone or does not read: it will be silent
+                self._callbacks.sent(peer)
+        if self._membership.events:
+            self._log_events()
+
+    def complain(self, peer: bytes, line: str) -> None:
+        """Warn about what a peer sent; few lines for each peer."""
+        self._log.complain(peer, line)
+
+    def wait_for(self, workers: int, timeout_s: float, turn: Callable[[], None]) -> None:
+        """Call `turn`, which listens, until so many workers have joined. Raises `NoWorkers` after `timeout_s`."""
+        deadline_s = self._clock() + timeout_s
+        while len(self._membership.members) < workers:
+            if self._clock() > deadline_s:
+                raise self.no_workers(workers, timeout_s)
+            turn()
+
+    def wait_until_all_left(self, deadline_s: float, poll_s: float) -> None:
+        """Listen until no member is left, at most until the deadline. Silence is not judged."""
+        while self._membership.members and self._clock() < deadline_s:
+            self.receive(poll_s)
+            self._revoke_keys()
+            self._reap(0.0)
+
+    def no_workers(self, workers: int, timeout_s: float) -> NoWorkers:
+        """The error of a wait for so many workers that came to nothing: it says how to start one."""
+        address = self._link.address
+        start = f"python -m workers {address}{'' if self._link.keyring is None else ' --token FILE'}"
+        joined = f"{len(self._membership.members)} joined{self.why_missing()}"
+        return NoWorkers(f"waited {timeout_s:g} s for {workers} workers at {address}, {joined}; start one: {start}")
+
+    def why_missing(self) -> str:
+        """Why workers may be missing, in parentheses; empty if nothing is known."""
+        if self._last_turned_away:
+            return f" (the last one {self._last_turned_away})"
+        return f" ({self._link.refused} were not let in; the log says why)" if self._link.refused else ""
+
+    # ---------------------------------------------------------------- inside
+
+    def _revoke_keys(self) -> None:
+        for peer, why in self._keys.revoked(self._membership.members):
+            self.send(self._roster.revoke(peer, why))
+
+    def _reap(self, last_words_s: float) -> None:
+        """Remove the workers whose processes have ended."""
+        for worker, why in self._ended():
+            if last_words_s:
+                self.receive(last_words_s)
+            self.send(self._roster.remove_worker(worker, why))
+
+    def _frames(self, message: ToWorker) -> Sequence[Buffer]:
+        """Frames of a message. Weights are encoded once, however many workers there are."""
+        if not isinstance(message, Weights):
+            return encode(message)
+        if self._encoded is None or self._encoded[0] is not message:
+            self._encoded = (message, encode(message))
+        return self._encoded[1]
+
+    def _log_events(self) -> None:
+        for event in self._membership.take_events():
+            line, expected = describe(event), isinstance(event, WorkerJoined | RejoinRequested | RolloutDropped)
+            match event:
+                case WorkerRefused(_, why):
+                    self._last_turned_away = f"was refused: {why}"
+                case WorkerLeft(_, why, _, on_purpose) if on_purpose:
+                    expected = self._membership.draining is not None
+                    self._last_turned_away = self._last_turned_away if expected else why
+                case EnvironmentRaised(worker, host, _, error, _) if not self._settings.log_tracebacks:
+                    line, expected = f"worker {worker} ({host}): {error}", True
+                case _:
+                    pass
+            self._log.tell(logging.INFO if expected else logging.WARNING, event, line)
+            self._callbacks.event(event)

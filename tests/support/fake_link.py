@@ -1,0 +1,36 @@
+"""A learner's link and its clock, neither of them real: waiting moves the clock."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from protocol.messages import ToLearner
+from protocol.wire.codec import Buffer
+
+
+class FakeLink:
+    """Holds what workers have said until it is asked for; waiting takes time."""
+
+    address, keyring, refused = "fake", None, 0
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        self.packed_bytes_limit = 0
+        self.sent: list[Sequence[Buffer]] = []
+        self.inbox: list[tuple[bytes, ToLearner]] = []
+
+    def poll(self, timeout_s: float) -> bool:
+        if not self.inbox:
+            self.now += timeout_s
+        return bool(self.inbox)
+
+    def receive(self) -> Iterator[tuple[bytes, ToLearner]]:
+        while self.inbox:
+            yield self.inbox.pop(0)
+
+    def send(self, peer: bytes, frames: Sequence[Buffer]) -> bool:
+        self.sent.append(frames)
+        return True
+
+    def why_not(self, peer: bytes) -> str:
+        return ""
