@@ -1,7 +1,7 @@
-"""Files that are there whole or not at all.
+"""Writes files that are there whole or not at all.
 
-The law: written beside the target under a name that ends in `.tmp`, flushed to the disk, and only then put in its place; the
-folder is flushed too. Whatever fails, the target stays as it was and nothing is left beside it.
+The law: a file is written beside the target under a name that ends with `.tmp`, flushed to the disk, and then renamed to the
+target; the folder is flushed too. If anything fails, the target stays as it was and the temporary file is removed.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ TEMPORARY = ".tmp"
 
 
 def write_atomically(target: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Let `write` fill the file, then put it in place of the target. Raises what `write` or the file system raises."""
+    """Let `write` fill the file and replace the target by it. Raises what `write` or the file system raises."""
     temporary = target.with_name(target.name + TEMPORARY)
     try:
         with temporary.open("wb") as file:
@@ -30,7 +30,7 @@ def write_atomically(target: Path, write: Callable[[BinaryIO], object]) -> None:
 
 
 def _flush_folder(folder: Path) -> None:
-    """Make the new name itself survive a power cut."""
+    """Make sure that the new name survives a power failure."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -1,8 +1,9 @@
-"""Checkpoints of a run: `checkpoints/<env steps>.pt`. No clock and no thread; the loop decides when.
+"""Checkpoints of a run: `checkpoints/<env steps>.pt`. The training loop decides when to write one.
 
-The law: a checkpoint is there whole or not at all, the newest whole one wins, and reading one runs no code
-(`weights_only`). So a state is tensors and plain data; a numpy generator goes in as its `bit_generator.state`. torch's
-loader does not notice a flipped bit, so the checksums of the file (a zip archive) are compared first.
+The law: a checkpoint is there whole or not at all; the newest whole one is used; and reading one executes no code
+(`weights_only`). A state therefore consists of tensors and plain data; a numpy generator is stored as its
+`bit_generator.state`. torch's loader does not detect damaged data, so the checksums of the file (a zip archive) are verified
+first.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ SUFFIX = ".pt"
 
 
 class Checkpoint(NamedTuple):
-    """A checkpoint that was read."""
+    """The content of a checkpoint file."""
 
     path: Path
     env_steps: int
@@ -28,14 +29,14 @@ class Checkpoint(NamedTuple):
 
 
 class _Unreadable(Exception):
-    """The file is broken; an older one may do."""
+    """The file is damaged; an older one may be whole."""
 
 
 def save(folder: Path, state: dict[str, Any], env_steps: int, keep: int) -> Path:
     """Write a checkpoint into the run folder and remove all but the newest `keep`.
 
-    Raises `CheckpointError`, with the older checkpoints untouched, when the disk does not take it; TypeError when the state
-    holds something that could not be read back.
+    Raises `CheckpointError` if it cannot be written; older checkpoints then stay untouched. Raises TypeError if the state
+    contains something that could not be read back.
     """
     import torch
 
@@ -44,20 +45,20 @@ def save(folder: Path, state: dict[str, Any], env_steps: int, keep: int) -> Path
     record = {"format": FORMAT, "env_steps": env_steps, "state": state}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        for left in path.parent.glob(f"*{TEMPORARY}"):  # by a process that was killed
+        for left in path.parent.glob(f"*{TEMPORARY}"):  # from a process that was killed
             left.unlink()
         write_atomically(path, lambda file: torch.save(record, file))
         for old in sorted(path.parent.glob(f"*{SUFFIX}"))[:-keep]:
             old.unlink()
-    except (OSError, RuntimeError) as error:  # torch says RuntimeError when its writer cannot go on
+    except (OSError, RuntimeError) as error:  # torch raises RuntimeError when it cannot write
         raise CheckpointError(f"checkpoint {path} not written: {_why(error)}; older checkpoints are untouched") from error
     return path
 
 
 def newest(folder: Path) -> tuple[Checkpoint, list[str]]:
-    """The newest whole checkpoint of a run folder, and a line for each newer one that could not be read.
+    """Read the newest whole checkpoint of a run folder. Also returns a warning for each newer one that is damaged.
 
-    Raises `CheckpointError` when there is none, or when the newest is whole but of another format.
+    Raises `CheckpointError` if there is none, or if the newest whole one is of another format.
     """
     paths = sorted((folder / FOLDER).glob(f"*{SUFFIX}"), reverse=True)
     if not paths:
@@ -74,7 +75,7 @@ def newest(folder: Path) -> tuple[Checkpoint, list[str]]:
 
 
 def load(path: Path) -> Checkpoint:
-    """One checkpoint file. Raises `CheckpointError` in one line."""
+    """Read one checkpoint file. Raises `CheckpointError` in one line."""
     try:
         return _read(path)
     except _Unreadable as error:
@@ -92,7 +93,7 @@ def _read(path: Path) -> Checkpoint:
         record = torch.load(path, map_location="cpu", weights_only=True)
     except _Unreadable:
         raise
-    except Exception as error:  # zipfile and torch raise a dozen types on damaged bytes; to us they are one
+    except Exception as error:  # zipfile and torch raise a dozen types for damaged files
         raise _Unreadable(_why(error)) from error
     if not isinstance(record, dict) or "format" not in record:
         raise CheckpointError(f"checkpoint {path}: expected one of millrace, got another program's file")

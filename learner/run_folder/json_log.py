@@ -1,6 +1,6 @@
-"""The log as JSON, one event a line, for machines: what happened, to whom, when (`--log-json`).
+"""The log as JSON, one event per line (`--log-json`).
 
-Every line has `time` (UTC, ISO 8601), `level`, `event` and `message`, the line that people read. `event` is "joined",
+Every line has `time` (UTC, ISO 8601), `level`, `event` and `message`, the text for people. `event` is "joined",
 "left", "turned", "broke", "told", "stale" (`learner.members.events`, whose fields stand beside it), "progress", or "said"
 for any other line of the log.
 """
@@ -18,10 +18,10 @@ from learner.run_folder.progress import Progress
 
 
 class JsonLines(logging.Formatter):
-    """A log record as one line of JSON."""
+    """Formats a log record as one line of JSON."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The line, without its end."""
+        """The line, without a line break."""
         event = getattr(record, "event", None)
         fields: dict[str, Any] = {} if event is None else dataclasses.asdict(event)
         kind = "said" if event is None else event.json_name
@@ -29,7 +29,7 @@ class JsonLines(logging.Formatter):
 
 
 def progress_line(progress: Progress, now: float) -> str:
-    """How far the run is. `now` is wall-clock time."""
+    """The progress of the run as one line of JSON. `now` is wall-clock time."""
     message = f"{progress.env_steps} of {progress.total_steps} env steps"
     return _line(now, "info", "progress", message, msgspec.to_builtins(progress))
 

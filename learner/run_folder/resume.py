@@ -1,4 +1,4 @@
-"""Which run `--resume auto` goes on with: so that the same command starts a run, and goes on with it however it ended."""
+"""`--resume auto`: the run to continue. The same command thus starts a run and continues it, however it ended."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ import tomllib
 from pathlib import Path
 
 from learner.run_folder.checkpoint import FOLDER, SUFFIX
-from learner.run_folder.run_folder import RunSettings, sanitised
+from learner.run_folder.run_folder import RunSettings, as_folder_name
 
 AUTO = Path("auto")
 
 
 def newest_run(config: RunSettings) -> Path | None:
-    """The newest run folder in `run_dir` of this environment, algorithm and seed that holds a checkpoint, if there is one.
+    """The newest run folder with a checkpoint in `run_dir`, for this environment, algorithm and seed; or None.
 
-    A folder's name ends in the time when its run began, so the newest is the last by name.
+    The name of a run folder ends with the start time, so the newest is the last by name.
     """
-    kin = re.compile(re.escape(f"{sanitised(config.env)}-{config.algo}-s{config.seed}-") + r"\d{8}-\d{6}")
+    pattern = re.compile(re.escape(f"{as_folder_name(config.env)}-{config.algo}-s{config.seed}-") + r"\d{8}-\d{6}")
     root = Path(config.run_dir)
-    found = [path for path in root.iterdir() if kin.fullmatch(path.name)] if root.is_dir() else []
-    return max((path for path in found if _is_of(path, config)), key=lambda path: path.name, default=None)
+    matching = [path for path in root.iterdir() if pattern.fullmatch(path.name)] if root.is_dir() else []
+    return max((path for path in matching if _can_be_resumed(path, config)), key=lambda path: path.name, default=None)
 
 
-def _is_of(path: Path, config: RunSettings) -> bool:
-    """A learner that was killed before its first checkpoint left nothing to go on with; nor does half a folder."""
+def _can_be_resumed(path: Path, config: RunSettings) -> bool:
+    """Whether this is a folder of the same environment that can be resumed: it has a config.toml and a checkpoint."""
     try:
         table = tomllib.loads((path / "config.toml").read_text())
     except (OSError, ValueError):

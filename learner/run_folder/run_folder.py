@@ -1,17 +1,18 @@
-"""A run is a folder, and the folder is everything: what stands in it, and where.
+"""The folder of a run: which files it has, and how they are written and read.
 
     runs/<env>-<algo>-s<seed>-<time>/
-      config.toml           the resolved configuration
+      config.toml           all settings of the run
       run.json              the format of the folder (run_format.py)
-      metrics.jsonl         a row per update                       } metrics_log.py
-      tensorboard/                                                 }
-      checkpoints/          checkpoint.py
-      policy.safetensors    the arrays that act, by name           } all that another program needs to act,
-      best.safetensors      those of the best evaluation           }
-      policy.json           what they mean                         } the same bytes for the same policy
-      summary.json          how the run went
+      metrics.jsonl         a row per update (metrics_log.py)
+      tensorboard/          the same for TensorBoard
+      checkpoints/          to resume from (checkpoint.py)
+      policy.safetensors    the arrays of the acting policy, by name
+      best.safetensors      the same of the best policy in the run's own evaluations
+      policy.json           the meaning of these arrays: with it, another program can act
+      summary.json          the results of the run (results.py)
+      workers/              the logs of local worker processes
 
-The law: a file here is whole or not there. Nothing is pickled.
+The law: a file is there whole or not at all. The same policy gives the same bytes. Nothing is pickled.
 """
 
 from __future__ import annotations
@@ -37,39 +38,39 @@ from protocol.specs import PolicySpec
 POLICY_FORMAT = 1
 Which = Literal["final", "best"]
 POLICY_ARRAYS = {"final": "policy.safetensors", "best": "best.safetensors"}
-POLICY_CARD = "policy.json"
+POLICY_JSON = "policy.json"
 
 
 class Interrupted(KeyboardInterrupt):
-    """The user stopped the run; it was drained and checkpointed, and can be resumed from its folder."""
+    """The user stopped the run. Its checkpoint is written, and it can be resumed from its folder."""
 
     def __init__(self, run: Path) -> None:
         super().__init__(str(run))
         self.run = run
 
 
-class ArrayCard(msgspec.Struct, frozen=True):
-    """Where one array of the policy stands in the flat buffer of parameters, counted in float32s."""
+class ArrayPosition(msgspec.Struct, frozen=True):
+    """The position of one array in the flat parameters of the policy. `offset` counts float32 numbers."""
 
     name: str
     shape: tuple[int, ...]
     offset: int
 
 
-class PolicyCard(msgspec.Struct, frozen=True, kw_only=True):
-    """policy.json: what the arrays of policy.safetensors mean."""
+class PolicyDescription(msgspec.Struct, frozen=True, kw_only=True):
+    """policy.json: the meaning of the arrays in policy.safetensors."""
 
     format: int
     env: str
     env_kwargs: dict[str, Scalar]
     policy: PolicySpec
-    arrays: tuple[ArrayCard, ...]
+    arrays: tuple[ArrayPosition, ...]
     buffers: tuple[str, ...]
-    """arrays that are not parameters: the mean and standard deviation that observations are normalised with"""
+    """names of arrays that are not parameters: mean and standard deviation for observation normalization"""
 
 
 class RunSettings(Protocol):
-    """What a run folder needs of the settings of its run: `Config` has it."""
+    """The settings that a run folder needs. `Config` has them."""
 
     @property
     def env(self) -> str:
@@ -100,14 +101,17 @@ class RunFolder:
     """The folder of one run."""
 
     def __init__(self, path: Path, made: Path | None = None) -> None:
-        """`made`: the topmost folder that was made for it, if it is new."""
+        """`made`: if the folder is new, the topmost folder that was made for it."""
         self.path, self._made = path, made
 
     @staticmethod
     def create(config: RunSettings, started_s: float | None = None) -> RunFolder:
-        """A new folder with its config.toml. Raises `UsageError` if it exists. `started_s` is wall-clock time."""
+        """Make a new folder with its config.toml.
+
+        `started_s` is wall-clock time. Raises `UsageError` if the folder exists.
+        """
         stamp = time.strftime("%Y%m%d-%H%M%S", time.localtime(started_s))
-        path = Path(config.run_dir) / f"{sanitised(config.env)}-{config.algo}-s{config.seed}-{stamp}"
+        path = Path(config.run_dir) / f"{as_folder_name(config.env)}-{config.algo}-s{config.seed}-{stamp}"
         made = [folder for folder in (path, *path.parents) if not folder.exists()]
         try:
             path.mkdir(parents=True)
@@ -121,7 +125,10 @@ class RunFolder:
 
     @staticmethod
     def open(path: Path) -> RunFolder:
-        """A folder that is there. Raises `UsageError` if it is not one of ours."""
+        """Open an existing folder.
+
+        Raises `UsageError` if it is not a run folder, or of a newer format than this code knows.
+        """
         if not path.is_dir():
             raise UsageError(f"run {path}: no such folder")
         check_format(path)
@@ -149,53 +156,56 @@ class RunFolder:
     def write_policy(
         self, spec: PolicySpec, env: EnvSpec, parameters: Floats, buffers: Floats, which: Which = "final"
     ) -> None:
-        """The arrays and policy.json. `parameters` starts with the acting part; the critic's is left out."""
+        """Write the arrays and policy.json.
+
+        `parameters` [P] begins with the acting part; the rest (the critic) is not written.
+        """
         from safetensors.numpy import save
 
         acting, _ = parameter_layout(spec)
         arrays = named_views(parameters[: total_size(acting)], acting) | named_views(buffers, buffer_layout(spec))
-        card = PolicyCard(
+        description = PolicyDescription(
             format=POLICY_FORMAT,
             env=env.id,
             env_kwargs=env.kwargs,
             policy=spec,
-            arrays=_array_cards(acting),
+            arrays=_array_positions(acting),
             buffers=tuple(named_views(buffers, buffer_layout(spec))),
         )
         self._write(POLICY_ARRAYS[which], save({name: np.ascontiguousarray(array) for name, array in arrays.items()}))
-        self._write(POLICY_CARD, msgspec.json.format(msgspec.json.encode(card), indent=2) + b"\n")
+        self._write(POLICY_JSON, msgspec.json.format(msgspec.json.encode(description), indent=2) + b"\n")
 
-    def read_policy(self, which: Which = "final") -> tuple[PolicyCard, Floats, Floats]:
-        """The card, and the parameters and buffers as `Policy.load` takes them. Raises `UsageError` in one line."""
+    def read_policy(self, which: Which = "final") -> tuple[PolicyDescription, Floats, Floats]:
+        """Read policy.json, and the parameters and buffers for `Policy.load`. Raises `UsageError` in one line."""
         from safetensors import SafetensorError
         from safetensors.numpy import load
 
-        if not (self.path / POLICY_CARD).is_file():
-            raise UsageError(f"run {self.path}: expected a {POLICY_CARD}, got none; has the run saved its policy yet?")
+        if not (self.path / POLICY_JSON).is_file():
+            raise UsageError(f"run {self.path}: expected a {POLICY_JSON}, got none; has the run saved its policy yet?")
         try:
-            card = _read_card((self.path / POLICY_CARD).read_bytes())
+            description = _decode_description((self.path / POLICY_JSON).read_bytes())
             arrays = load((self.path / POLICY_ARRAYS[which]).read_bytes())
         except (OSError, msgspec.MsgspecError, SafetensorError) as error:
             raise UsageError(f"policy of run {self.path} cannot be read: {error}") from error
-        if card.format != POLICY_FORMAT:
-            raise UsageError(f"policy of run {self.path}: expected format {POLICY_FORMAT}, got {card.format}")
-        acting, _ = parameter_layout(card.policy)
-        wanted = {field.name: field.shape for field in acting}
-        wanted |= {field.name: field.shape for field in buffer_layout(card.policy)}
-        for name in sorted(arrays.keys() | wanted.keys()):
+        if description.format != POLICY_FORMAT:
+            raise UsageError(f"policy of run {self.path}: expected format {POLICY_FORMAT}, got {description.format}")
+        acting, _ = parameter_layout(description.policy)
+        expected_shapes = {field.name: field.shape for field in acting}
+        expected_shapes |= {field.name: field.shape for field in buffer_layout(description.policy)}
+        for name in sorted(arrays.keys() | expected_shapes.keys()):
             shape = arrays[name].shape if name in arrays else "nothing"
-            if name not in wanted or shape != wanted[name] or arrays[name].dtype != np.float32:
-                expected = f"float32 {wanted[name]}" if name in wanted else "no such array"
+            if name not in expected_shapes or shape != expected_shapes[name] or arrays[name].dtype != np.float32:
+                expected = f"float32 {expected_shapes[name]}" if name in expected_shapes else "no such array"
                 raise UsageError(f"policy of run {self.path}: {name} expected {expected}, got {shape}")
         parameters = _flat([arrays[field.name] for field in acting])
-        return card, parameters, _flat([arrays[name] for name in card.buffers])
+        return description, parameters, _flat([arrays[name] for name in description.buffers])
 
     def write_summary(self, summary: Summary) -> None:
-        """summary.json."""
+        """Write summary.json."""
         self._write("summary.json", msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n")
 
     def summary(self) -> Summary | None:
-        """What `write_summary` wrote, or None if there is nothing whole."""
+        """Read summary.json. None if it is missing or damaged."""
         try:
             return msgspec.json.decode((self.path / "summary.json").read_bytes(), type=Summary)
         except (OSError, msgspec.MsgspecError):
@@ -208,24 +218,24 @@ class RunFolder:
             raise RunError(f"{self.path / name} not written: {error.strerror}") from error
 
 
-def _read_card(text: bytes) -> PolicyCard:
-    """JSON has no infinities: a bound that is not there is null."""
-    plain = msgspec.json.decode(text, type=dict[str, Any])
-    match plain:
+def _decode_description(text: bytes) -> PolicyDescription:
+    """Decode policy.json. JSON has no infinity, so a missing bound is null there."""
+    fields = msgspec.json.decode(text, type=dict[str, Any])
+    match fields:
         case {"policy": {"action": {"low": list(low), "high": list(high)} as action}}:
             action["low"] = [-np.inf if bound is None else bound for bound in low]
             action["high"] = [np.inf if bound is None else bound for bound in high]
-    return msgspec.convert(plain, PolicyCard)
+    return msgspec.convert(fields, PolicyDescription)
 
 
-def sanitised(env: str) -> str:
-    """An environment's name as part of a folder's name."""
+def as_folder_name(env: str) -> str:
+    """The name of an environment as part of a folder's name."""
     return re.sub(r"[^A-Za-z0-9._]+", "-", env).strip("-.") or "env"
 
 
-def _array_cards(fields: tuple[Field, ...]) -> tuple[ArrayCard, ...]:
+def _array_positions(fields: tuple[Field, ...]) -> tuple[ArrayPosition, ...]:
     starts = [total_size(fields[:i]) for i in range(len(fields))]
-    return tuple(ArrayCard(field.name, field.shape, start) for field, start in zip(fields, starts, strict=True))
+    return tuple(ArrayPosition(field.name, field.shape, start) for field, start in zip(fields, starts, strict=True))
 
 
 def _flat(arrays: list[Floats]) -> Floats:

@@ -16,7 +16,7 @@ from learner.run_folder.episode_window import EpisodeWindow
 from learner.run_folder.metrics_log import EVENTS_EVERY_S, MetricsLog, read_rows
 from learner.run_folder.progress import Progress
 from learner.run_folder.results import Evaluation, Summary
-from learner.run_folder.run_folder import RunFolder, sanitised
+from learner.run_folder.run_folder import RunFolder, as_folder_name
 from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import RunError, UsageError
@@ -65,7 +65,7 @@ def test_a_run_has_a_folder_of_its_own(tmp_path: Path) -> None:
     [("ALE/Pong-v5", "ALE-Pong-v5"), ("my.envs:My Env-v0", "my.envs-My-Env-v0"), ("../../etc", "etc"), ("/", "env")],
 )
 def test_no_environment_leads_out_of_the_folder(env: str, name: str) -> None:
-    assert sanitised(env) == name
+    assert as_folder_name(env) == name
 
 
 def test_what_is_no_run_folder_is_said(tmp_path: Path) -> None:
