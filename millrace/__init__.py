@@ -1,4 +1,6 @@
-"""millrace: worker processes step a gymnasium environment, one PyTorch learner learns. User code imports this alone.
+"""millrace: worker processes step copies of a gymnasium environment; one learner trains a policy in PyTorch.
+
+User code imports this package only.
 
 import millrace
 run = millrace.train("CartPole-v1", seed=1)
@@ -33,16 +35,23 @@ def train(
     watch: Callable[[Progress], None] | None = None,
     **keywords: Any,
 ) -> Path:
-    """Train on this machine; the run folder.
+    """Train a policy on this machine: the learner runs in this process, the workers in processes that it starts.
 
-    `env` is anything `gymnasium.make` takes, or a callable that returns an environment. `config` is a TOML file, `resume` a
-    run folder to go on with, or "auto": the newest of this environment, algorithm and seed, or a new one. Every flag of
-    `millrace train` is a keyword argument of the same name: `learning_rate=1e-3`.
-    `watch` is called after each update. Guard the call with `if __name__ == "__main__":` in a script. Raises `OurError`.
+    Arguments:
+        env: An id that `gymnasium.make` takes, or a callable that returns an environment.
+        config: A TOML file of settings.
+        resume: A run folder to continue from its newest checkpoint, or "auto": the newest run of this environment, algorithm
+            and seed if there is one, else a new run.
+        preset: The name of a preset (`millrace presets` lists them); "auto" takes that of `env`; "none" takes none.
+        watch: Called with a `Progress` after each update.
+        **keywords: The flags of `millrace train`, by the same names: `learning_rate=1e-3`.
+
+    Returns the run folder. Raises `UserFacingError` with a message of one line. In a script, guard the call with
+    `if __name__ == "__main__":`.
     """
     from learner.config.layers import resolve
     from learner.run_folder.resume import AUTO, newest_run
-    from millrace.launch import local
+    from millrace.launch import local_run
 
     name = env if isinstance(env, str) else getattr(env, "__name__", type(env).__name__)
     file, run = (None if path is None else Path(path) for path in (config, resume))
@@ -50,7 +59,7 @@ def train(
         run = newest_run(resolve(name, file=file, preset=preset, **keywords))
         file = None if run else file
     settings = resolve(name, file=file, resume=run, preset=preset, **keywords)
-    return local.train(settings, run, watch or (lambda progress: None), factory=None if isinstance(env, str) else env)
+    return local_run.train(settings, run, watch or (lambda progress: None), factory=None if isinstance(env, str) else env)
 
 
 def make_vec(
@@ -131,7 +140,7 @@ def make_vec(
 
 
 def __getattr__(name: str) -> str:
-    """`__version__`, looked up when it is asked for: that costs more than the rest of this file."""
+    """Look up `__version__` when it is first used: that takes longer than the rest of this file."""
     if name != "__version__":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import metadata

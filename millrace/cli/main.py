@@ -105,11 +105,11 @@ def _train(argv: list[str]) -> int:
     from learner.config.command_line import read_config
 
     config, resume = read_config("train", argv)
-    from millrace.launch import local
+    from millrace.launch import local_run
     from millrace.terminal import progress_view
 
     with progress_view("--log-json" in argv) as watch:
-        run = local.train(config, resume, watch)
+        run = local_run.train(config, resume, watch)
     return _print_result(run)
 
 

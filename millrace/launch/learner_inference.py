@@ -21,7 +21,7 @@ from learner.members.worker_processes import WorkerProcesses
 from learner.run import Run, Watch, prometheus_observer, set_up
 from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.settings import VectorEnvSettings
-from millrace.launch.local_workers import flags_of, own_address
+from millrace.launch.local_workers import private_address, worker_flags
 from millrace.launch.vector import listen
 from protocol.env_spec import EnvSpec
 from protocol.policy.policy import Policy, make_policy
@@ -49,13 +49,13 @@ def train(
     with ExitStack() as stack:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         stack.callback(context.term)
-        link = LearnerLink(own_address("inproc", stack), context)
+        link = LearnerLink(private_address("inproc", stack), context)
         stack.callback(link.close, 0.5)
         listening = listen(_settings(config, factory, elsewhere=elsewhere), stack.enter_context(ExitStack()))
         observer = stack.enter_context(prometheus_observer(config))
         env_spec = EnvSpec.of(config.env if factory is None else factory, config.env_kwargs)
         setup = stack.enter_context(set_up(config, env_spec, resume))
-        env = listening.start(flags_of(config, setup.folder.path))
+        env = listening.start(worker_flags(config, setup.folder.path))
         stack.callback(env.close)
         workers = config.min_workers or (1 if elsewhere else min(config.workers, config.envs))
         lanes = SplitVectorEnv(env, config.lanes, _before_waits(env, workers, config.no_workers_timeout_s))

@@ -1,6 +1,6 @@
-"""Where a learner meets workers that it starts on this machine, and whether they need keys for it. Shared by the launchers.
+"""What a learner needs to start workers on this machine: an address, keys, their flags, their cores.
 
-The law: a socket file lies in a folder of its own that only this user can enter (0700), and goes with it.
+The law: a socket file lies in a folder of its own that only this user can enter (0700), and is removed with it.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from protocol.keys.key_folder import Keyring, chosen_key_folder
 from protocol.keys.keys import Token
 from workers.host import core_flags
 
-StartFlags = Callable[[str], tuple[list[str], Path | None]]
-"""By a worker's name: the flags that its process is started with, and the file that its stderr goes to."""
+WorkerFlags = Callable[[str], tuple[list[str], Path | None]]
+"""From a worker's name to the flags of its process, and the file for its stderr (None: ours)."""
 
 
-def own_address(transport: str, stack: ExitStack) -> str:
-    """An address that nobody else has; `stack` tidies up after it."""
+def private_address(transport: str, stack: ExitStack) -> str:
+    """An address that no other process uses; `stack` removes its files. Raises `UsageError`."""
     match transport:
         case "inproc":
             return f"inproc://millrace-{os.getpid()}-{time.monotonic_ns()}"
@@ -40,17 +40,17 @@ def own_address(transport: str, stack: ExitStack) -> str:
             raise UsageError(f"transport expected ipc, tcp or inproc, got {transport!r}")
 
 
-def own_keys(transport: str, keys: str, *, insecure: bool) -> tuple[Keyring | None, Token | None]:
-    """Keys for this run alone, where loopback TCP is to have some: a key folder was named."""
-    sealed = transport == "tcp" and chosen_key_folder(keys) is not None and not insecure
-    return throwaway("local", datetime.now(UTC)) if sealed else (None, None)
+def temporary_keys(transport: str, keys: str, *, insecure: bool) -> tuple[Keyring | None, Token | None]:
+    """Keys for this run alone if it uses TCP and a key folder was named; else None."""
+    encrypted = transport == "tcp" and chosen_key_folder(keys) is not None and not insecure
+    return throwaway("local", datetime.now(UTC)) if encrypted else (None, None)
 
 
-def flags_of(config: Config, run: Path) -> StartFlags:
-    """Those of a run's workers; their logs lie in the run folder."""
+def worker_flags(config: Config, run: Path) -> WorkerFlags:
+    """The flags of a run's workers. Their logs are in the run folder."""
     logs = run / "workers"
     logs.mkdir(exist_ok=True)
-    cores = cores_for(config)
+    cores = worker_cores(config)
 
     def flags(name: str) -> tuple[list[str], Path]:
         return ["--step-timeout-s", str(config.step_timeout_s), *core_flags(cores, name)], logs / f"{name}.log"
@@ -58,12 +58,12 @@ def flags_of(config: Config, run: Path) -> StartFlags:
     return flags
 
 
-def cores_for(config: Config) -> list[int]:
-    """The cores that local workers keep to, in turn; none if they go where they are put. Raises `UsageError`.
+def worker_cores(config: Config) -> list[int]:
+    """The cores that local workers are pinned to, in turn; empty if they are not pinned. Raises `UsageError`.
 
-    New weights wake all workers at once, while the learner still runs: left to itself, Linux then often puts two on one core
-    and lets another one idle, for so short a time that it never moves them. Fewer workers than cores find a free one by
-    themselves, and would meet those of another run on theirs.
+    New weights wake all workers at once, while the learner still runs. Linux then often puts two workers on one core and
+    leaves another core idle, for too short a time to move them. If there are fewer workers than cores, they find a free core
+    themselves; pinned, they could share a core with the workers of another run.
     """
     if not hasattr(os, "sched_setaffinity"):
         if config.pin_workers:

@@ -25,7 +25,7 @@ from protocol.keys.key_folder import Keyring, read_token
 
 
 def launch(flags: RayFlags, rest: Sequence[str], watch: Watch) -> Path:
-    """Train; the run folder. `rest` are the user's flags for the learner. Raises `OurError`."""
+    """Train; the run folder. `rest` are the user's flags for the learner. Raises `UserFacingError`."""
     for name in ("processes", "port"):
         if getattr(flags, name) < 1:
             raise UsageError(f"{name} expected int >= 1, got {getattr(flags, name)}")

@@ -20,7 +20,7 @@ from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.settings import VectorEnvSettings
 from learner.vector_env.spec import VectorEnvDescription, describe
 from learner.vector_env.step_hub import SharedSteps, StepHub
-from millrace.launch.local_workers import StartFlags, own_address, own_keys
+from millrace.launch.local_workers import WorkerFlags, private_address, temporary_keys
 from protocol.address import advertised_address, check_address
 from protocol.cpu_cores import usable_cores
 from protocol.errors import UsageError
@@ -69,7 +69,7 @@ class ListeningVectorEnv:
     """with local workers"""
     resources: ExitStack
 
-    def start(self, flags: StartFlags) -> ZmqVectorEnv:
+    def start(self, flags: WorkerFlags) -> ZmqVectorEnv:
         """Start the local workers with these flags. Call it once; it does not wait until workers have joined."""
         settings, count = self.settings, self.settings.local_workers
         host = Host(self._starter(flags), count) if count else None
@@ -96,7 +96,7 @@ class ListeningVectorEnv:
             on_close=self.resources.close,
         )
 
-    def _starter(self, flags: StartFlags) -> Callable[[str], Running]:
+    def _starter(self, flags: WorkerFlags) -> Callable[[str], Running]:
         """A function that starts the local worker of a name."""
         if self.settings.transport == "inproc":
             return lambda name: WorkerThread(self.link.address, name, self.context)
@@ -119,7 +119,7 @@ def listen(settings: VectorEnvSettings, resources: ExitStack) -> ListeningVector
         raise UsageError(f"workers expected 0 with a bind address, for they are started elsewhere, got {settings.workers}")
     # Local workers end with this process, which sees at once when one of them ends: neither side needs a timeout.
     description = describe(settings, LEARNER_TIMEOUT_S if where.bind else math.inf)
-    address = where.bind or own_address(transport, resources)
+    address = where.bind or private_address(transport, resources)
     keyring, token = _keys(where, transport)
     if address.startswith("tcp://") and keyring is None and any(env.factory is not None for env in description.step.envs):
         raise UsageError("an environment factory is code: it travels over ipc or inproc only, or over tcp with keys")
@@ -138,7 +138,7 @@ def listen(settings: VectorEnvSettings, resources: ExitStack) -> ListeningVector
 def _keys(where: Bind, transport: str) -> tuple[Keyring | None, Token | None]:
     """Who may connect, and the token of local workers."""
     if not where.bind:
-        return own_keys(transport, where.keys, insecure=where.insecure)
+        return temporary_keys(transport, where.keys, insecure=where.insecure)
     check_address(advertised_address("tcp://*:1", where.advertise, "machine"))
     return keyring_for(where, datetime.now(UTC).replace(microsecond=0)), None
 

@@ -10,7 +10,7 @@ import pytest
 
 from learner.config.layers import resolve
 from learner.torch_setup import threads
-from millrace.launch.local_workers import cores_for
+from millrace.launch.local_workers import worker_cores
 from protocol import cpu_cores as counting
 from protocol.cpu_cores import usable_cores
 from protocol.errors import UsageError
@@ -42,14 +42,14 @@ def test_workers_keep_to_the_cores_that_this_process_may_use(
     workers: int, max_lag: int, pin: bool | None, kept: bool
 ) -> None:
     config = resolve("CartPole-v1", workers=workers, max_lag=max_lag, pin_workers=pin)
-    assert cores_for(config) == (sorted(CORES) if kept else [])
+    assert worker_cores(config) == (sorted(CORES) if kept else [])
 
 
 def test_where_the_system_cannot_only_who_asked_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(os, "sched_setaffinity")
-    assert cores_for(resolve("CartPole-v1", workers=2)) == []
+    assert worker_cores(resolve("CartPole-v1", workers=2)) == []
     with pytest.raises(UsageError, match="pin_workers"):
-        cores_for(resolve("CartPole-v1", workers=2, pin_workers=True))
+        worker_cores(resolve("CartPole-v1", workers=2, pin_workers=True))
 
 
 @pytest.mark.parametrize(

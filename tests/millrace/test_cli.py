@@ -54,7 +54,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
         watch(Progress(env_steps=5, total_steps=10))
         return Path("runs/a-run")
 
-    monkeypatch.setattr("millrace.launch.local.train", train)
+    monkeypatch.setattr("millrace.launch.local_run.train", train)
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     return calls
@@ -266,7 +266,7 @@ def failing(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
     def train(*_: Any) -> Path:
         raise error
 
-    monkeypatch.setattr("millrace.launch.local.train", train)
+    monkeypatch.setattr("millrace.launch.local_run.train", train)
 
 
 def test_errors_of_ours_are_one_line_with_their_exit_code(capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:

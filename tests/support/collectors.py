@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium.vector import SyncVectorEnv
 
 from learner.config.layers import resolve
-from millrace.launch.local import train
+from millrace.launch.local_run import train
 from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.policy.layout import acting_size, buffer_size

@@ -20,7 +20,7 @@ import millrace
 from learner.config.layers import resolve
 from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.progress import Progress
-from millrace.launch.local import train
+from millrace.launch.local_run import train
 from protocol.errors import EnvironmentFailed, NoWorkers, UsageError
 from tests.system.processes import Stage, free_port, wait_for
 from tests.system.test_local_run import assert_balanced, run, start, summary, worker_processes

@@ -16,7 +16,7 @@ from gymnasium.wrappers import FrameStackObservation, TransformObservation
 
 import millrace
 from learner.config.layers import resolve
-from millrace.launch.local import train
+from millrace.launch.local_run import train
 from protocol.wire import compression as packing
 from tests.system.processes import START_S, Learner, Stage, crowding
 from tests.system.runs import accounted

@@ -22,7 +22,7 @@ from learner.config.layers import config_from_toml, resolve
 from learner.evaluate import load_policy
 from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.progress import Progress
-from millrace.launch.local import train
+from millrace.launch.local_run import train
 from protocol.errors import EnvironmentFailed, NoWorkers, RunError, Stalled, UsageError
 
 SMALL: dict[str, Any] = {"n_epochs": 2, "eval_episodes": 2}  # what is shown here does not hang on learning much

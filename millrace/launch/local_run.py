@@ -1,6 +1,6 @@
-"""A run on this machine: the learner in this process, and worker processes (threads, over inproc) of its own.
+"""A run on this machine: the learner in this process, and worker processes (over inproc: threads) that it starts.
 
-The law: whatever happens, no worker, socket file or folder of ours is left behind.
+The law: whatever happens, no worker, socket file or temporary folder is left behind.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import zmq
 from learner.config.config import Config
 from learner.members.worker_processes import WorkerProcesses
 from learner.run import Run, Watch, prometheus_observer, set_up
-from millrace.launch.local_workers import flags_of, own_address, own_keys
+from millrace.launch.local_workers import private_address, temporary_keys, worker_flags
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
 from protocol.keys.keys import Token
@@ -23,19 +23,19 @@ from workers.host import Host, Running, WorkerCommand, WorkerProcess, WorkerThre
 
 
 def train(config: Config, resume: Path | None, watch: Watch, factory: Callable[..., object] | None = None) -> Path:
-    """A whole run on this machine; its folder. `factory` makes the environment, if its id does not.
+    """Train; the run folder. `factory` returns the environment, if the id does not name one.
 
-    Raises `OurError`, or `Interrupted` when the user stopped it.
+    Raises `UserFacingError`, or `Interrupted` when the user stopped the run.
     """
     if config.inference == "learner":
         from millrace.launch import learner_inference as inference
 
         return inference.train(config, resume, watch, factory)
-    keyring, token = own_keys(config.transport, config.keys, insecure=config.insecure)
+    keyring, token = temporary_keys(config.transport, config.keys, insecure=config.insecure)
     if factory is not None and config.transport == "tcp" and keyring is None:
         raise UsageError("an environment factory is code: it travels over ipc or inproc only, or over tcp with --keys")
     with ExitStack() as stack:
-        address = own_address(config.transport, stack)
+        address = private_address(config.transport, stack)
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         stack.callback(context.term)
         link = LearnerLink(address, context, keyring)
@@ -55,7 +55,7 @@ def _starter(
 ) -> Callable[[str], Running]:
     if config.transport == "inproc":
         return lambda name: WorkerThread(address, name, context)
-    flags = flags_of(config, run)
+    flags = worker_flags(config, run)
 
     def start(name: str) -> WorkerProcess:
         own, log = flags(name)
