@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from benchmarks.contest import Contest, repeated
-from learner.algorithms.kernels.fused import MOST_ROWS
+from learner.algorithms.kernels.fused import MAX_ROWS
 from learner.algorithms.minibatches import Minibatch
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import PPOConfig
@@ -83,7 +83,7 @@ def ours(rows: Minibatch, policy: PolicySpec, graph: bool) -> Callable[[Tensor],
     in_numpy = rows.in_numpy()
 
     def update(index: Tensor) -> object:
-        numpy = not graph and len(index) <= MOST_ROWS  # as `ActorCritic.minibatches` chooses
+        numpy = not graph and len(index) <= MAX_ROWS  # as `ActorCritic.minibatches` chooses
         return algorithm.step(in_numpy.select(index.numpy()) if numpy else rows.select(index))
 
     return update

@@ -20,7 +20,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from benchmarks.contest import Contest, repeated
 from learner.algorithms.a2c import A2C
 from learner.algorithms.dqn import DQN
-from learner.algorithms.kernels.action_values import WithGraph
+from learner.algorithms.kernels.action_values import AutogradActionValues
 from learner.config.hyperparameters import A2CConfig, DQNConfig
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf
@@ -63,7 +63,7 @@ def dqn(width: int, target: float) -> Contest:
     def ours(graph: bool) -> Callable[[], float]:
         made = DQN(config, DQN.policy_spec(config, OBSERVATION, ACTION), total_steps=NEVER, seed=0)
         if graph:
-            made._values, made._target_values = WithGraph(made.net), WithGraph(made.target)
+            made._values, made._target_values = AutogradActionValues(made.net), AutogradActionValues(made.target)
         for seed in range(20):
             made.replay.add(some_batch(32, seed))
         return lambda: repeated(lambda: made.step(made.replay.sample(rows)), STEPS)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from learner.algorithms.kernels.fused import applies
+from learner.algorithms.kernels.fused import can_fuse
 from learner.config.config import Config
 from protocol.cpu_cores import usable_cores
 from protocol.errors import UsageError
@@ -26,6 +26,6 @@ def threads(config: Config, policy: PolicySpec, workers: int) -> int:
     """
     if config.torch_threads is not None:
         return config.torch_threads
-    if applies(policy):
+    if can_fuse(policy):
         return 1
     return max(1, usable_cores() - (workers if config.max_lag else 0))

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from learner.algorithms import losses
 from learner.algorithms.kernels import loss_gradients
-from learner.algorithms.kernels.fused import MOST_ROWS, FusedActorCritic, applies
+from learner.algorithms.kernels.fused import MAX_ROWS, FusedActorCritic, can_fuse
 from learner.algorithms.kernels.loss_gradients import Numbers, OutputGradients
 from learner.algorithms.kernels.optimizer_step import avoid_compiler_import, take_step
 from learner.algorithms.minibatches import Index, LossInput, Minibatch, NetworkInput, Observations, rows_of_columns
@@ -58,7 +58,7 @@ class ActorCritic:
     algorithm also defines `loss_gradients`: the same loss with its derivatives by the network's outputs, derived by hand. If
     there is one, it is always used instead of `loss`, and the derivatives go backward through the network
 
-    - in numpy (`kernels.fused`) where the network is a small MLP on the CPU and the minibatch has at most `MOST_ROWS` rows,
+    - in numpy (`kernels.fused`) where the network is a small MLP on the CPU and the minibatch has at most `MAX_ROWS` rows,
     - by autograd everywhere else (images, recurrent cores, custom encoders, large layers or minibatches, GPUs).
 
     A subclass that overrides `loss` and not `loss_gradients` gets autograd for its loss. Both ways give the same numbers
@@ -106,7 +106,7 @@ class ActorCritic:
         self._total_steps = total_steps
         self._hand_derived = _loss_gradients_are_of_this_loss(type(self))
         self._fused: FusedActorCritic | None = None
-        if self._hand_derived and device == "cpu" and applies(policy):
+        if self._hand_derived and device == "cpu" and can_fuse(policy):
             self._fused = FusedActorCritic(policy, self.net.flat.numpy(), self.net.flat_grad.numpy())
         self._normalizer = ObservationNormalizer(policy)
         self._reward_scaler = RewardScaler(config.gamma)
@@ -382,7 +382,7 @@ class ActorCritic:
 
     def _in_numpy(self, rows: int) -> bool:
         """Whether the network is evaluated in numpy for a minibatch of so many rows."""
-        return self._fused is not None and rows <= MOST_ROWS
+        return self._fused is not None and rows <= MAX_ROWS
 
     def _shuffled(self, index: Array) -> Array:
         shuffled: Array = index[torch.randperm(len(index), generator=self.generator).numpy()]

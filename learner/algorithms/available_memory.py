@@ -1,4 +1,4 @@
-"""How much memory is left: of this machine, or of the container that bounds it. Reads the system's own files, no more."""
+"""Available memory of this machine or of its container, read from the files of the Linux kernel."""
 
 from __future__ import annotations
 
@@ -15,34 +15,34 @@ CGROUPS = (
         "total_inactive_file",
     ),
 )
-"""version 2, version 1: the bound, what is used, and of that the cached files that would be given back"""
+"""cgroup version 2, then 1: the limit, the usage, and the file and field with the reclaimable file cache in it"""
 GIB = 2**30
 
 
 def available_bytes() -> int | None:
-    """What can still be taken without swapping, or None where the system does not say."""
-    found = [_of_machine(), *(_of_container(*paths) for paths in CGROUPS)]
+    """Bytes that can be allocated without swapping, or None where the system does not say."""
+    found = [_machine_bytes(), *(_container_bytes(*paths) for paths in CGROUPS)]
     return min((free for free in found if free is not None), default=None)
 
 
-def _of_machine() -> int | None:
+def _machine_bytes() -> int | None:
     kilobytes = _table(MEMINFO).get("MemAvailable:")
     return None if kilobytes is None else kilobytes * 1024
 
 
-def _of_container(bound: Path, used: Path, stat: Path, cached: str) -> int | None:
+def _container_bytes(limit_file: Path, usage_file: Path, stat_file: Path, cache_field: str) -> int | None:
     try:
-        limit = bound.read_text().strip()
-        taken = int(used.read_text())
+        limit = limit_file.read_text().strip()
+        taken = int(usage_file.read_text())
     except (OSError, ValueError):
         return None
-    if not limit.isdigit():  # "max": no bound
+    if not limit.isdigit():  # "max": no limit
         return None
-    return max(0, int(limit) - taken + _table(stat).get(cached, 0))
+    return max(0, int(limit) - taken + _table(stat_file).get(cache_field, 0))
 
 
 def _table(path: Path) -> dict[str, int]:
-    """Lines of a name and a number."""
+    """A file whose lines are a name and a number."""
     try:
         lines = [line.split() for line in path.read_text().splitlines()]
     except (OSError, ValueError):

@@ -1,8 +1,8 @@
-"""DQN (Mnih et al. 2015), double, dueling, n-step and prioritised if asked. Its settings: `learner.config.hyperparameters`.
+"""DQN (Mnih et al. 2015), with double, dueling, n-step and prioritized variants. Settings: `learner.config.hyperparameters`.
 
-No sockets, no files, no clock; seeded. One update keeps a batch in the replay and then makes a fixed number of gradient
-steps, so how often a transition is learned from is a setting, not a matter of speed. Observations are kept raw and
-normalised when they are drawn, by the statistics of that moment. ε falls with the env steps used and is published with
+No sockets, no files, no clock; seeded. An update adds a batch to the replay buffer and makes a fixed number of gradient
+steps, so how often a transition is used is a setting and does not depend on speed. The buffer holds raw observations. They
+are normalized when they are drawn, by the statistics of that moment. ε falls with the env steps used and is published with
 the weights. With one torch thread on a CPU the same batches give the same bits, also after `load_state_dict`.
 """
 
@@ -21,7 +21,7 @@ from learner.algorithms.kernels import loss_gradients
 from learner.algorithms.kernels.action_values import action_values
 from learner.algorithms.kernels.optimizer_step import avoid_compiler_import, take_step
 from learner.algorithms.normalization import ObservationNormalizer
-from learner.algorithms.replay import Replay, Sample
+from learner.algorithms.replay import ReplayBuffer, Sample
 from learner.algorithms.updates import check_finite, scheduled
 from learner.config.hyperparameters import DQNConfig
 from protocol.arrays import Array, Floats
@@ -32,31 +32,31 @@ from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
-class Measured(NamedTuple):
-    """What one gradient step measured, before it moved the weights."""
+class StepMetrics(NamedTuple):
+    """The metrics of one gradient step, measured before it changed the weights."""
 
     loss: float
-    q_mean: float  # of the actions that were taken
-    grad_norm: float  # before it was cut or shortened
+    q_mean: float  # mean over the actions that were taken
+    grad_norm: float  # before clipping
 
 
 LOSSES = {"huber": loss_gradients.huber_loss, "squared": loss_gradients.squared_loss}
 
 
 def exploration_rate(config: DQNConfig, env_steps: int) -> float:
-    """ε after so many env steps of all copies together."""
+    """ε after so many env steps of all env copies together."""
     start, end, done = config.epsilon_start, config.epsilon_end, env_steps / config.epsilon_steps
     return end + (start - end) * (max(0.0, 1 - done) if config.epsilon_schedule == "linear" else math.exp(-done))
 
 
 class DQN:
-    """Action values, those of the target, their optimiser, and the replay."""
+    """The Q-network, the target network, their optimizer and the replay buffer."""
 
     whole_episodes: ClassVar[bool] = False
 
     @staticmethod
     def policy_spec(config: DQNConfig, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
-        """Action values, on any of the supported observations; one choice among a few is the only action it can learn."""
+        """Action values for any supported observation. Raises `UsageError` unless the action space is Discrete."""
         if action.kind != "discrete":
             shape = list(action.shape)
             raise UsageError(f"dqn: expected an action space Discrete(n), got {action.kind}{shape}; take --algo ppo for it")
@@ -73,7 +73,7 @@ class DQN:
     def __init__(self, config: DQNConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
         self.config = config
         self.policy = policy
-        self.replay = Replay(
+        self.replay = ReplayBuffer(
             policy.observation,
             size=config.replay_size,
             n_step=config.n_step,
@@ -84,19 +84,19 @@ class DQN:
         self.net = QNetwork(policy, device, seed=seed)
         self.target = QNetwork(policy, device, seed=seed)
         self._values, self._target_values = (action_values(net, config.batch_size) for net in (self.net, self.target))
-        self.env_steps = 0  # transitions used so far: where the schedules are
+        self.env_steps = 0  # valid rows used so far; schedules depend on it
         self.version = 0  # updates made
         self.gradient_steps = 0  # what Stable-Baselines3 calls n_updates
         self._total_steps = total_steps
         avoid_compiler_import()
         optimizer = torch.optim.Adam if config.optimizer == "adam" else torch.optim.AdamW
         self._optimizer = optimizer([self.net.flat], lr=config.learning_rate, amsgrad=config.amsgrad, fused=True)
-        # The normaliser asks for the measured features alone, whichever head acts on them.
+        # The buffers of a Q policy also hold ε, which is not the normalizer's: so it gets the policy with the other head.
         self._normalizer = ObservationNormalizer(msgspec.structs.replace(policy, head="actor_critic"))
         self._statistics = self._normalizer.buffers()
 
     def update(self, batch: Batch, pulse: Callable[[], None]) -> dict[str, float]:
-        """Keep a batch and learn from the replay, calling `pulse` between gradient steps; gives the metrics.
+        """Add a batch to the replay buffer and learn from it, calling `pulse` between gradient steps. Returns metrics.
 
         Raises `RunError` when a loss or a gradient is not finite, before it reaches the weights.
         """
@@ -112,7 +112,7 @@ class DQN:
         self._statistics = self._normalizer.buffers()
         self.env_steps += batch.env_steps
         self.version += 1
-        measured: list[Measured] = []
+        measured: list[StepMetrics] = []
         if self.env_steps >= config.learning_starts and len(self.replay):
             for _ in range(config.gradient_steps):
                 measured.append(self.step(self.replay.sample(config.batch_size, beta)))
@@ -125,49 +125,49 @@ class DQN:
             "replay/bytes": float(self.replay.bytes),
         }
         if measured:
-            mean = Measured(*np.mean(measured, 0).tolist())
+            mean = StepMetrics(*np.mean(measured, 0).tolist())
             metrics |= {f"train/{name}": number for name, number in mean._asdict().items()}
             metrics["replay/env_steps_per_gradient_step"] = batch.env_steps / len(measured)
         return metrics
 
-    @np.errstate(all="ignore")  # what is not finite is found and named
-    def step(self, sample: Sample) -> Measured:
-        """One gradient step on a minibatch, and what follows it: the target, the priorities."""
+    @np.errstate(all="ignore")  # `check_finite` finds and names what is not finite
+    def step(self, sample: Sample) -> StepMetrics:
+        """One gradient step on a minibatch; then the target network and the priorities are updated."""
         values, target = self._values, self.targets(sample)
-        chosen = values.of(*self._inputs(sample.leaves), values.array(sample.action))
+        chosen = values.chosen(*self._inputs(sample.leaves), values.to_array(sample.action))
         error = chosen - target
-        loss, by_chosen = LOSSES[self.config.loss](error, values.array(sample.weight))
+        loss, by_chosen = LOSSES[self.config.loss](error, values.to_array(sample.weight))
         values.backward(by_chosen)
-        measured = Measured(*values.read(loss, chosen.sum() / len(chosen)))
+        measured = StepMetrics(*values.numbers_and_norm(loss, chosen.sum() / len(chosen)))
         check_finite(measured._asdict(), self.version, "a lower learning_rate, or normalize_observations")
-        self._bound_gradient(measured.grad_norm)
+        self._clip_gradient(measured.grad_norm)
         take_step(self._optimizer)
         self.gradient_steps += 1
-        self._follow()
-        self.replay.reprioritise(sample.slots, error if isinstance(error, np.ndarray) else error.cpu().numpy())
+        self._update_target()
+        self.replay.update_priorities(sample.slots, error if isinstance(error, np.ndarray) else error.cpu().numpy())
         return measured
 
     def targets(self, sample: Sample) -> Any:
-        """What action values should be [B]:  Σ γⁱ r + γᵏ Q′(s′, a′), where the task has not terminated (there γᵏ is 0).
+        """The targets [B] of the action values:  Σ γⁱ r + γᵏ Q′(s′, a′), where the task has not terminated (there γᵏ is 0).
 
         a′ = argmax Q′(s′, ·), or argmax Q(s′, ·) if double (van Hasselt et al. 2016), with Q′ the target network.
         """
         inputs, values = self._inputs(sample.next_leaves), self._target_values
         if self.config.double:
             with torch.no_grad():
-                value = values.of(*inputs, self._values.best(*inputs))
+                value = values.chosen(*inputs, self._values.best_actions(*inputs))
         else:
-            value = values.highest(*inputs)
-        return values.array(sample.reward) + values.array(sample.discount) * value
+            value = values.best_values(*inputs)
+        return values.to_array(sample.reward) + values.to_array(sample.discount) * value
 
     def _inputs(self, leaves: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Features [B, D], normalised by the present statistics, and images [B, *leaf] uint8."""
+        """Features [B, D], normalized by the present statistics, and images [B, *leaf] uint8."""
         x = features(self.policy, leaves)
         if self.policy.normalize_observations:
             x = normalize(x, *np.split(self._statistics, 2))
         return x, [array for leaf, array in zip(self.policy.observation, leaves, strict=True) if leaf.is_image]
 
-    def _bound_gradient(self, norm: float) -> None:
+    def _clip_gradient(self, norm: float) -> None:
         config, gradient = self.config, self.net.flat_grad
         if config.max_grad_value is not None:
             gradient.clamp_(-config.max_grad_value, config.max_grad_value)
@@ -175,20 +175,20 @@ class DQN:
         if config.max_grad_norm is not None and norm > config.max_grad_norm:
             gradient.mul_(config.max_grad_norm / norm)
 
-    def _follow(self) -> None:
-        """The target network, one gradient step on."""
+    def _update_target(self) -> None:
+        """Update the target network after a gradient step."""
         if self.config.target == "polyak":
             self.target.flat.lerp_(self.net.flat, self.config.tau)
         elif self.gradient_steps % self.config.target_every == 0:
             self.target.flat.copy_(self.net.flat)
 
     def weights(self) -> tuple[Floats, Floats]:
-        """Copies of the action values' parameters [P] and of the buffers: the observations' statistics, then ε."""
+        """Copies of the Q-network's parameters [P] and of the buffers: the observation statistics, then ε."""
         epsilon = np.float32(exploration_rate(self.config, self.env_steps))
         return self.net.flat.cpu().numpy().copy(), np.append(self._statistics, epsilon)
 
     def state_dict(self) -> dict[str, Any]:
-        """A copy of all that the next update depends on: tensors and plain data (`torch.load(weights_only=True)`)."""
+        """A copy of everything that the next update depends on: tensors and plain data (`torch.load(weights_only=True)`)."""
         return {
             "parameters": self.net.flat.clone(),
             "target": self.target.flat.clone(),
@@ -201,7 +201,7 @@ class DQN:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from there: the next update is the one that would have followed, bit for bit."""
+        """Continue from a `state_dict`: the next update is the one that would have followed it, bit for bit."""
         self.net.flat.copy_(state["parameters"])
         self.target.flat.copy_(state["target"])
         self._optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))

@@ -1,6 +1,6 @@
-"""Running statistics: of the observations' features, and of the discounted return. float64; numpy only, but for the state.
+"""Running mean and variance of observation features and of the discounted return: float64, numpy; tensors only in the state.
 
-Only valid rows are counted. The learner alone updates; workers act with the float32 buffers that it publishes.
+Only valid rows count. The learner alone updates these; workers act with the float32 buffers that it publishes.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from protocol.policy.layout import buffer_size
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
 
-TINY = 1e-12  # a variance below this share of the squared mean is rounding: it did not vary
+TINY = 1e-12  # a variance below this fraction of the squared mean is rounding: the value did not vary
 
 
 class RunningMoments:
-    """Mean and variance [*shape] of all rows ever given, batch by batch (Chan, Golub and LeVeque 1979)."""
+    """Mean and variance [*shape] of all rows so far, updated batch by batch (Chan, Golub and LeVeque 1979)."""
 
     def __init__(self, shape: tuple[int, ...] = ()) -> None:
         self.count = 0
@@ -41,7 +41,7 @@ class RunningMoments:
 
     @property
     def std(self) -> Doubles:
-        """Standard deviation [*shape] of the population; 1 for what never varied."""
+        """Standard deviation [*shape] of the population; 1 where the value never varied."""
         variance = self._squares / max(self.count, 1)
         varied = variance > TINY * self.mean**2 + TINY**2
         return np.sqrt(np.where(varied, variance, 1.0))
@@ -51,31 +51,31 @@ class RunningMoments:
         return {"count": self.count, "mean": torch.tensor(self.mean), "squares": torch.tensor(self._squares)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from there."""
+        """Continue from a `state_dict`."""
         self.count = int(state["count"])
         self.mean, self._squares = state["mean"].numpy().copy(), state["squares"].numpy().copy()
 
 
 class ObservationNormalizer:
-    """Means and standard deviations of the measured features; one-hot and binary ones are left as they are."""
+    """Means and standard deviations of the features of Box observations. One-hot and binary features are not normalized."""
 
     def __init__(self, spec: PolicySpec) -> None:
-        self._on = spec.normalize_observations
-        self._measured = box_feature_mask(spec)
-        self._moments = RunningMoments(self._measured.shape)
-        assert not self._on or buffer_size(spec) == 2 * len(self._measured)
+        self._enabled = spec.normalize_observations
+        self._box_features = box_feature_mask(spec)
+        self._moments = RunningMoments(self._box_features.shape)
+        assert not self._enabled or buffer_size(spec) == 2 * len(self._box_features)
 
     def update(self, features: Floats, valid: npt.NDArray[np.bool_]) -> None:
         """Count features [T, N, D], not yet normalised, of the rows [T, N] that are valid."""
-        if self._on:
+        if self._enabled:
             self._moments.update(features[valid])
 
     def buffers(self) -> Floats:
-        """What workers normalise with: D means, then D standard deviations, float32; empty if the policy does not."""
-        if not self._on:
+        """D means, then D standard deviations, float32, as published; empty if the policy does not normalize."""
+        if not self._enabled:
             return np.empty(0, np.float32)
-        mean = np.where(self._measured, self._moments.mean, 0)
-        std = np.where(self._measured, self._moments.std, 1)
+        mean = np.where(self._box_features, self._moments.mean, 0)
+        std = np.where(self._box_features, self._moments.std, 1)
         return np.concatenate([mean, std]).astype(np.float32)
 
     def state_dict(self) -> dict[str, Any]:
@@ -83,14 +83,15 @@ class ObservationNormalizer:
         return self._moments.state_dict()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from there."""
+        """Continue from a `state_dict`."""
         self._moments.load_state_dict(state)
 
 
 class RewardScaler:
-    """Rewards over the running standard deviation of the discounted return (Engstrom et al. 2020), never shifted.
+    """Divides rewards by the running standard deviation of the discounted return (Engstrom et al. 2020); no shift.
 
-    Each env copy's return goes on from rollout to rollout of its lane; it starts at zero with an episode or a fresh lane.
+    The return of each env copy continues from rollout to rollout of its lane. It starts at 0
+    with each episode and in a fresh lane.
     """
 
     def __init__(self, gamma: float) -> None:
@@ -99,9 +100,9 @@ class RewardScaler:
         self._returns: dict[int, Doubles] = {}  # lane -> [copies]
 
     def scale(self, batch: Batch) -> Floats:
-        """Count the batch, then give its rewards [T, ΣN], scaled."""
+        """Count the batch, then return its scaled rewards [T, ΣN]."""
         ended = batch.terminated | batch.truncated
-        for at in range(0, len(batch.lane), batch.copies):  # a lane's rollouts stand in the order they were collected
+        for at in range(0, len(batch.lane), batch.copies):  # rollouts of a lane are in the order of collection
             columns = slice(at, at + batch.copies)
             lane = int(batch.lane[at])
             start = self._returns.get(lane)
@@ -122,6 +123,6 @@ class RewardScaler:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from there."""
+        """Continue from a `state_dict`."""
         self._moments.load_state_dict(state["moments"])
         self._returns = {int(lane): found.numpy().copy() for lane, found in state["returns"].items()}

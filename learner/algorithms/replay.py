@@ -1,12 +1,12 @@
-"""What was seen, kept to be learned from again: a ring of preallocated numpy arrays. No sockets, no files; seeded.
+"""The replay buffer: a ring of preallocated numpy arrays. No sockets, no files; seeded.
 
-A slot holds an observation as it came and, where a valid row began there, that row: action, reward, whether it
-terminated, and the slot of the observation that it led to. So each observation stands once, and the steps of n-step
-returns are followed from slot to slot when they are drawn. A slot without a row is the final observation of a truncated
-episode, or the newest of a copy, which its next rollout fills in.
+A slot holds a raw observation. If a valid row began with it, the slot also holds that row: action, reward, whether it
+terminated, and the slot of the next observation. So each observation is stored once, and n-step returns follow the rows
+from slot to slot when they are drawn. A slot without a row holds the final observation of a truncated episode, or the
+newest observation of an env copy, whose row comes with its next rollout.
 
-The law: rows that are not valid are never kept. What a row leads to is younger than it, so the ring, which overwrites
-the oldest first, never breaks a chain that has a living beginning.
+The law: rows that are not valid are never stored. A row's next observation is newer than the row, and the ring overwrites
+the oldest slot first. So a row that is still stored always finds the rows that follow it.
 """
 
 from __future__ import annotations
@@ -24,33 +24,33 @@ from protocol.errors import UsageError
 from protocol.rollout import Batch
 from protocol.specs import Leaf
 
-TINY = 1e-6  # added to errors, so that no transition is never drawn again
-NOWHERE = -1
-ROW = np.dtype(  # one record, so that drawing is one copy
+PRIORITY_OFFSET = 1e-6  # added to errors, so that every transition can be drawn again
+NO_SLOT = -1
+ROW = np.dtype(  # one record, so that drawing a row is one copy
     [("action", "i8"), ("follows", "i8"), ("reward", "f4"), ("terminated", "?"), ("is_row", "?")], align=True
 )
 
 
 class Sample(NamedTuple):
-    """B transitions of n steps, or fewer where the episode, or what is known of it, ends before."""
+    """B transitions of n steps, or of fewer where the episode ends or the stored rows end."""
 
-    slots: Ints  # [B] where they stand
+    slots: Ints  # [B] of their first rows
     leaves: tuple[Array, ...]  # [B, *leaf] each
     action: Ints  # [B]
     reward: Floats  # [B] Σ γⁱ r over its k steps
     discount: Floats  # [B] γᵏ; 0 where the task ended
     next_leaves: tuple[Array, ...]  # [B, *leaf] each, k steps later
-    weight: Floats  # [B] by which to multiply its loss: importance sampling, at most 1
+    weight: Floats  # [B] importance-sampling weight of the loss, at most 1
 
 
 def memory_bytes(observation: Sequence[Leaf], size: int, prioritized: bool) -> int:
-    """What a replay of so many slots takes, when it is full."""
+    """The memory of a replay buffer with so many slots."""
     row = sum(int(np.prod(leaf.shape)) * np.dtype(leaf.dtype).itemsize for leaf in observation)
     return size * (row + ROW.itemsize) + (SumTree.memory_bytes(size) if prioritized else 0)
 
 
-def refuse_what_does_not_fit(observation: Sequence[Leaf], size: int, prioritized: bool) -> None:
-    """Raise `UsageError`, with the size that fits. Twice the memory is asked for: a checkpoint is a copy."""
+def check_fits_memory(observation: Sequence[Leaf], size: int, prioritized: bool) -> None:
+    """Raise `UsageError` that names a size that fits. Twice the memory is needed, because a checkpoint is a copy."""
     needed, free = 2 * memory_bytes(observation, size, prioritized), available_bytes()
     if free is None or needed <= free:
         return
@@ -62,8 +62,8 @@ def refuse_what_does_not_fit(observation: Sequence[Leaf], size: int, prioritized
     )
 
 
-class Replay:
-    """The newest transitions of all lanes."""
+class ReplayBuffer:
+    """The newest transitions of all lanes, drawn uniformly or by priority."""
 
     def __init__(
         self,
@@ -75,34 +75,34 @@ class Replay:
         seed: int,
         alpha: float | None = None,
     ) -> None:
-        """`alpha`: draw in proportion to (error)^alpha, or uniformly if None. Raises `UsageError` if it cannot fit."""
-        refuse_what_does_not_fit(observation, size, alpha is not None)
+        """`alpha`: draw in proportion to |error|^alpha, or uniformly if None. Raises `UsageError` if memory is too small."""
+        check_fits_memory(observation, size, alpha is not None)
         self.size = size  # slots
         self.bytes = memory_bytes(observation, size, alpha is not None)
         self._n_step, self._gamma, self._alpha = n_step, gamma, alpha
         self._generator = np.random.default_rng(seed)
         self._obs = tuple(np.zeros((size, *leaf.shape), leaf.dtype) for leaf in observation)
         self._row = np.zeros(size, ROW)
-        self._action: Ints = self._row["action"]  # and so on: views
+        self._action: Ints = self._row["action"]  # this and the next four: views of `_row`
         self._reward: Floats = self._row["reward"]
         self._terminated: Bools = self._row["terminated"]
         self._follows: Ints = self._row["follows"]  # slot of the next observation; itself if terminated
         self._is_row: Bools = self._row["is_row"]
         self._tree = None if alpha is None else SumTree(size)
-        self._highest = 1.0  # error ever seen: what is new gets it
+        self._highest = 1.0  # greatest priority so far: new transitions get it
         self._written = 0  # slots ever written; the next one is this, modulo the size
         self._rows = 0
-        self._newest: dict[int, Ints] = {}  # lane -> [copies] the count at which its last observation was written
+        self._newest: dict[int, Ints] = {}  # lane -> [copies] value of `_written` when the last observation was written
 
     def __len__(self) -> int:
-        """Transitions that can be drawn."""
+        """The number of transitions that can be drawn."""
         return self._rows
 
     # ---------------------------------------------------------------- writing
 
     def add(self, batch: Batch) -> None:
-        """Keep the valid rows. Raises `UsageError` when a single rollout is more than fits."""
-        for at in range(0, len(batch.lane), batch.copies):  # a lane's rollouts stand in the order they were collected
+        """Store the valid rows. Raises `UsageError` when a single rollout does not fit."""
+        for at in range(0, len(batch.lane), batch.copies):  # rollouts of a lane are in the order of collection
             self._add(batch, slice(at, at + batch.copies), int(batch.lane[at]))
 
     def _add(self, batch: Batch, columns: slice, lane: int) -> None:
@@ -112,14 +112,14 @@ class Replay:
         if most > self.size:
             raise UsageError(f"replay_size {self.size}: a rollout takes up to {most}; take --replay-size {most} or more")
         newest = self._newest.get(lane) if not batch.fresh[columns.start] else None
-        goes_on, newest = self._going_on([leaf[0] for leaf in obs], newest, most)
-        needed = np.zeros((len(valid) + 1, valid.shape[1]), bool)  # [T+1, N] which observations are kept
+        continues, newest = self._continues([leaf[0] for leaf in obs], newest, most)
+        needed = np.zeros((len(valid) + 1, valid.shape[1]), bool)  # [T+1, N] observations to store
         needed[:-1] = valid
         needed[1:] |= valid & ~terminated
-        needed[0] &= ~goes_on
-        written = np.full(needed.shape, NOWHERE)  # [T+1, N] the count at which each was written
+        needed[0] &= ~continues
+        written = np.full(needed.shape, NO_SLOT)  # [T+1, N] value of `_written` for each
         written[needed] = self._written + np.arange(np.count_nonzero(needed))
-        written[0][goes_on] = newest[goes_on]
+        written[0][continues] = newest[continues]
         self._written += int(np.count_nonzero(needed))
         slot = written % self.size
         self._clear(slot[needed])
@@ -135,20 +135,21 @@ class Replay:
         if self._tree is not None and self._alpha is not None:
             self._tree.set(rows, self._highest**self._alpha)
         ended = terminated[-1] | batch.truncated[-1, columns] | ~valid[-1]
-        self._newest[lane] = np.where(ended, NOWHERE, written[-1])
+        self._newest[lane] = np.where(ended, NO_SLOT, written[-1])
 
-    def _going_on(self, first: Sequence[Array], newest: Ints | None, room: int) -> tuple[Bools, Ints]:
-        """[N] whether a copy's rollout begins with the newest observation kept of it, and where that was written.
+    def _continues(self, first: Sequence[Array], newest: Ints | None, room: int) -> tuple[Bools, Ints]:
+        """[N] whether a copy's rollout begins with the newest observation stored for it, and where that was written.
 
-        A rollout between may have been dropped (stale, lost), hence the comparison; and the ring may reach it.
+        The observations are compared, because a rollout between the two may have been dropped. The stored observation must
+        also be new enough that the ring does not overwrite it now.
         """
         if newest is None:
-            newest = np.full(len(first[0]), NOWHERE)
-        goes_on = (newest != NOWHERE) & (newest + self.size >= self._written + room)
+            newest = np.full(len(first[0]), NO_SLOT)
+        continues = (newest != NO_SLOT) & (newest + self.size >= self._written + room)
         for kept, leaf in zip(self._obs, first, strict=True):
             same = kept[newest % self.size] == leaf
-            goes_on &= same.reshape(len(leaf), -1).all(1)
-        return goes_on, newest
+            continues &= same.reshape(len(leaf), -1).all(1)
+        return continues, newest
 
     def _clear(self, slots: Ints) -> None:
         self._rows -= int(np.count_nonzero(self._is_row[slots]))
@@ -159,7 +160,7 @@ class Replay:
     # ---------------------------------------------------------------- reading
 
     def sample(self, count: int, beta: float = 1.0) -> Sample:
-        """Draw transitions, with replacement; `beta` is how far the weights undo the drawing by priority."""
+        """Draw transitions with replacement. `beta`: how much the weights correct for drawing by priority; 1 is fully."""
         slots, weight = self._uniform(count) if self._tree is None else self._by_priority(self._tree, count, beta)
         row = self._row[slots]
         reward, discount, last = self._follow(row)
@@ -176,46 +177,46 @@ class Replay:
     def _uniform(self, count: int) -> tuple[Ints, Floats]:
         used = min(self._written, self.size)
         slots = self._generator.integers(0, used, count)
-        while not (found := self._is_row[slots]).all():  # at least half of the slots, nearly always nearly all
+        while not (found := self._is_row[slots]).all():  # at least half of the slots have a row; usually nearly all
             slots[~found] = self._generator.integers(0, used, np.count_nonzero(~found))
         return slots, np.ones(count, np.float32)
 
     def _by_priority(self, tree: SumTree, count: int, beta: float) -> tuple[Ints, Floats]:
-        """P(i) = pᵢ^α / Σ p^α;  wᵢ = (rows · P(i))^−β, over the greatest of them (Schaul et al. 2016, section 3.4)."""
+        """P(i) = pᵢ^α / Σ p^α;  wᵢ = (rows · P(i))^−β, divided by the greatest of them (Schaul et al. 2016, section 3.4)."""
         slots = tree.draw(self._generator, count)
         chance = tree.weights[slots] / tree.total
         weight = (self._rows * chance) ** -beta
         return slots, (weight / weight.max()).astype(np.float32)
 
     def _follow(self, row: Array) -> tuple[Doubles, Doubles, Ints]:
-        """From each row, up to n steps on: the discounted rewards, γᵏ (0 if the task ended), and where that leads."""
+        """Follow each row for up to n steps: the discounted rewards, γᵏ (0 if the task ended), and the slot reached."""
         reward, discount, at = row["reward"].astype(np.float64), self._gamma * ~row["terminated"], row["follows"]
         for _ in range(self._n_step - 1):
             row = self._row[at]
-            going = row["is_row"]  # else it stays there; a row that terminated leads to itself, worth nothing more
+            going = row["is_row"]  # else stay there; a terminated row follows itself with discount 0
             reward += np.where(going, discount * row["reward"], 0)
             discount = np.where(going, discount * self._gamma * ~row["terminated"], discount)
             at = np.where(going, row["follows"], at)
         return reward, discount, at
 
-    def reprioritise(self, slots: Ints, error: Floats) -> None:
-        """Draw these transitions [B], none added since they were drawn, from now on by the size of their errors [B]."""
+    def update_priorities(self, slots: Ints, error: Floats) -> None:
+        """Set the priorities of these slots [B] from their errors [B]. Call it before the next `add`."""
         if self._tree is None or self._alpha is None:
             return
-        priority = np.abs(error).astype(np.float64) + TINY
+        priority = np.abs(error).astype(np.float64) + PRIORITY_OFFSET
         self._highest = max(self._highest, float(priority.max()))
         self._tree.set(slots, priority**self._alpha)
 
     # ---------------------------------------------------------------- saving
 
     def _arrays(self) -> dict[str, Array]:
-        """All that is kept for each slot."""
+        """All arrays with one entry for each slot, by name."""
         own = {name: getattr(self, f"_{name}") for name in ("action", "reward", "terminated", "follows", "is_row")}
         tree = {} if self._tree is None else {"weight": self._tree.weights}
         return {f"obs{i}": leaf for i, leaf in enumerate(self._obs)} | own | tree
 
     def state_dict(self) -> dict[str, Any]:
-        """A copy, in tensors and plain data: only of the slots that are used."""
+        """A copy of the slots in use, as tensors and plain data."""
         used = min(self._written, self.size)
         return {
             "size": self.size,
@@ -227,7 +228,7 @@ class Replay:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from there, bit for bit. Raises ValueError when it is of another size."""
+        """Continue from a `state_dict`, bit for bit. Raises ValueError if its size is another."""
         if state["size"] != self.size:
             raise ValueError(f"replay_size expected {state['size']}, got {self.size}")
         self._written, self._highest = state["written"], state["highest"]

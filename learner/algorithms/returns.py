@@ -1,8 +1,8 @@
 """Returns and advantages. Pure: arrays [T, N] in, arrays [T, N] out; T steps of N env copies.
 
-Every function keeps the law of a row (`protocol.rollout`): row t bootstraps from `values[t+1]`, the value of `obs[t+1]`,
-which is the true final observation of an episode that the clock ended. Nothing flows across an end, and a row that is
-not valid is zero and touches no other, whatever stands in it.
+Every function follows the law of a row (`protocol.rollout`): row t bootstraps from `values[t+1]`, the value of `obs[t+1]`,
+which is the true final observation of a truncated episode. Nothing flows across the end of an episode. A row that is not
+valid gives zero and affects no other row, whatever its contents.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def gae(
     gamma: float,
     gae_lambda: float,
 ) -> Floats:
-    """Generalised advantage estimates [T, N] float32 (Schulman et al. 2016); reward [T, N], values [T+1, N].
+    """Generalized advantage estimates [T, N] float32 (Schulman et al. 2016); reward [T, N], values [T+1, N].
 
         δₜ = rₜ + γ V(sₜ₊₁) [not terminated] − V(sₜ)
         Aₜ = δₜ + γλ Aₜ₊₁ [neither terminated nor truncated]
@@ -82,7 +82,7 @@ def vtrace(
 
 
 def complete(ended: Bools, valid: Bools) -> Bools:
-    """[T, N] True for valid rows whose episode ends within the rollout: all the reward that follows them is known."""
+    """[T, N] True for valid rows whose episode ends within the rollout, so that all the reward that follows is known."""
     return np.asarray(np.logical_or.accumulate((ended & valid)[::-1])[::-1] & valid)
 
 
@@ -93,12 +93,12 @@ def discounted_return(
     gamma: float,
     start: npt.NDArray[np.float64],
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """What reward normalisation measures: the discounted sum of the *past* rewards of this episode.
+    """The discounted sum of the *past* rewards of this episode, which reward scaling measures.
 
         Gₜ = rₜ + γ Gₜ₋₁ [the same episode]
 
     `start` [N] is G of the row before the first, 0 where an episode begins. Returns G [T, N] float64 (0 where the row is
-    not valid) and what to start the next rollout of these copies with [N].
+    not valid) and the `start` [N] of the next rollout of these copies.
     """
     found = np.zeros(reward.shape)
     last = start

@@ -1,7 +1,7 @@
-"""Drawing numbers in proportion to their weights, and changing weights, in a logarithm of their number. numpy, vectorised.
+"""A sum tree: draws indices in proportion to their weights and changes weights, in logarithmic time. numpy, vectorized.
 
-The law: every inner node is the sum of its two children, computed anew from them whenever one changes; so the tree is a
-function of its leaves to the bit, and no rounding builds up.
+The law: every inner node is the sum of its two children and is computed again when one of them changes. So the tree is a
+function of its leaves, bit for bit, and rounding errors do not accumulate.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from protocol.arrays import Doubles, Ints
 class SumTree:
     """`size` weights, 0 at first. Node i has the children 2i and 2i + 1; the leaves are the nodes from `size` on.
 
-    `size` need not be a power of two: then leaves stand at two depths, and every node but the root still has one parent.
+    `size` need not be a power of two: then leaves are at two depths, and every node but the root still has one parent.
     """
 
     def __init__(self, size: int) -> None:
         self._size = max(size, 2)
         self._nodes: Doubles = np.zeros(2 * self._size)
-        self._depth = (2 * self._size - 1).bit_length() - 1  # of the deepest leaf; the root's is 0
+        self._depth = (2 * self._size - 1).bit_length() - 1  # of the deepest leaf; the root has depth 0
 
     @staticmethod
     def memory_bytes(size: int) -> int:
-        """What a tree of so many weights takes."""
+        """The memory of a tree of so many weights."""
         return 2 * max(size, 2) * np.dtype(np.float64).itemsize
 
     @property
@@ -37,11 +37,11 @@ class SumTree:
 
     @property
     def weights(self) -> Doubles:
-        """The weights [size], to read."""
+        """The weights [size], a view: do not write to it."""
         return self._nodes[self._size :]
 
     def set(self, index: Ints, weight: npt.NDArray[Any] | float) -> None:
-        """Give these weights, none negative; of an index that stands twice, the last one counts."""
+        """Set these weights, which must not be negative. If an index occurs twice, its last weight counts."""
         nodes, i = self._nodes, index + self._size
         nodes[i] = weight
         for _ in range(self._depth):
@@ -49,7 +49,7 @@ class SumTree:
             nodes[i] = nodes[2 * i] + nodes[2 * i + 1]
 
     def find(self, mass: Doubles) -> Ints:
-        """Where the running sum of weights passes `mass` [B], each in [0, total): never at a weight of 0, if one is not."""
+        """The indices where the cumulative sum of weights exceeds `mass` [B], each in [0, total); never one of weight 0."""
         nodes, i, mass = self._nodes, np.ones(len(mass), np.int64), mass.copy()
         for _ in range(self._depth):
             inner = i < self._size
@@ -61,5 +61,5 @@ class SumTree:
         return i - self._size
 
     def draw(self, generator: np.random.Generator, count: int) -> Ints:
-        """`count` indices in proportion to their weights, one from each of as many equal shares of the sum."""
+        """`count` indices in proportion to their weights, one from each of `count` equal segments of the sum."""
         return self.find((np.arange(count) + generator.random(count)) * (self.total / count))

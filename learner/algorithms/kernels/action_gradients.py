@@ -1,7 +1,7 @@
-"""Log-probabilities and entropies of actions, and their gradients by hand, for the update without a graph.
+"""Log-probabilities and entropies of actions with their gradients derived by hand, in numpy.
 
-The law: they are those of `log_prob_and_entropy` (`protocol.policy.torch_distributions`) and autograd, to
-rounding. Parameters are [P, B], a column for each of B rows; actions are [B, k]. Forward keeps what backward needs.
+The law: they are those of `log_prob_and_entropy` (`protocol.policy.torch_distributions`) and autograd, except for rounding.
+Parameters are [P, B], a column for each of B rows; actions are [B, k]. `forward` keeps what `backward` needs.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from protocol.policy.distributions import LOG_SQRT_2PI
 from protocol.specs import ActionSpec
 
 
-class Actions(Protocol):
-    """A distribution over actions."""
+class ActionGradients(Protocol):
+    """A distribution over actions with the gradients of its log-probability and entropy."""
 
     def forward(self, params: Array, action: Array) -> tuple[Array, Array]:
         """Parameters [P, B] and actions [B, k] -> log π(action) [B], entropy [B]."""
@@ -40,7 +40,7 @@ class _Categorical:
         self._log_p, self._p = log_p, p
         self._entropy = -np.add.reduce(p * log_p, 0)
         rows = params.shape[1]
-        self._chosen = action[:, 0] * rows + np.arange(rows)  # where log π(a) stands in [P · B]
+        self._chosen = action[:, 0] * rows + np.arange(rows)  # index of log π(a) in [P · B]
         return log_p.take(self._chosen), self._entropy
 
     def backward(self, by_log_prob: Array, by_entropy: Array) -> Array:
@@ -53,8 +53,8 @@ class _Categorical:
         return g
 
 
-class _Several:
-    """A product of categoricals."""
+class _MultiCategorical:
+    """A product of independent categorical distributions: ∂ of a sum, part by part."""
 
     def __init__(self, sizes: Sequence[int]) -> None:
         self._ends = np.cumsum(sizes)[:-1]
@@ -71,7 +71,7 @@ class _Several:
         return np.concatenate([part.backward(by_log_prob, by_entropy) for part in self._parts])
 
 
-class _Bits:
+class _Bernoulli:
     """Independent bits with logits l: ∂log π/∂l = bit − σ(l);  ∂H/∂l = −l σ(l) (1 − σ(l))."""
 
     def forward(self, params: Array, action: Array) -> tuple[Array, Array]:
@@ -110,15 +110,15 @@ class _Gaussian:
         return found
 
 
-def actions(spec: ActionSpec, log_std: Array | None, log_std_grad: Array | None) -> Actions:
-    """The distribution of this space; `log_std` and its gradient [k] where it has one."""
+def action_gradients(spec: ActionSpec, log_std: Array | None, log_std_grad: Array | None) -> ActionGradients:
+    """The distribution of this action space. `log_std`, `log_std_grad`: [k], for Box actions only."""
     match spec.kind:
         case "discrete":
             return _Categorical()
         case "multidiscrete":
-            return _Several(spec.sizes)
+            return _MultiCategorical(spec.sizes)
         case "multibinary":
-            return _Bits()
+            return _Bernoulli()
         case "box":
             assert log_std is not None
             assert log_std_grad is not None

@@ -1,7 +1,7 @@
-"""Action values of a minibatch and their gradient: with a graph, or without one where layers are all there is and small.
+"""Action values of a minibatch and their gradient: by autograd, or in numpy where the network is a small MLP on the CPU.
 
-The law: both give the same numbers, to rounding. Which one is used depends on the policy, the device and the size of the
-minibatch, never on time. Each has its own kind of array (tensors, or numpy's), which it makes and reads.
+The law: both give the same numbers, except for rounding. Which one is used depends on the policy, the device and the size of
+the minibatch, never on time. Each has its own kind of array: torch tensors, or numpy arrays.
 """
 
 from __future__ import annotations
@@ -20,57 +20,57 @@ from protocol.policy.networks import QNetwork
 
 
 class ActionValues(Protocol):
-    """Of one network, for B rows: features [B, D] and images [B, *leaf] uint8 each."""
+    """The action values of one network, for B rows: features [B, D] and images [B, *leaf] uint8 each."""
 
-    def array(self, array: Array) -> Any:
-        """An array [B] of the kind that is used here."""
+    def to_array(self, array: Array) -> Any:
+        """A numpy array [B] as the kind of array that is used here."""
         ...
 
-    def best(self, x: Array, images: Sequence[Array]) -> Any:
+    def best_actions(self, x: Array, images: Sequence[Array]) -> Any:
         """The best actions [B]."""
         ...
 
-    def of(self, x: Array, images: Sequence[Array], action: Any) -> Any:
-        """The values [B] of these actions [B]; `backward` goes back from the last ones."""
+    def chosen(self, x: Array, images: Sequence[Array], action: Any) -> Any:
+        """The values [B] of these actions [B]. `backward` starts from those of the last call."""
         ...
 
-    def highest(self, x: Array, images: Sequence[Array]) -> Any:
-        """The value [B] of the best actions."""
+    def best_values(self, x: Array, images: Sequence[Array]) -> Any:
+        """The values [B] of the best actions."""
         ...
 
     def backward(self, gradient: Any) -> None:
-        """From the gradient [B] by the last values to that of every parameter, in place."""
+        """Write the gradient of every parameter, from the gradient [B] by the last values of `chosen`."""
         ...
 
-    def read(self, *numbers: Any) -> list[float]:
-        """These numbers, and the length of the gradient."""
+    def numbers_and_norm(self, *numbers: Any) -> list[float]:
+        """These numbers as floats, and the norm of the gradient."""
         ...
 
 
-class WithGraph:
-    """By autograd, on any device."""
+class AutogradActionValues:
+    """With autograd, on any device."""
 
     def __init__(self, net: QNetwork) -> None:
         self._net = net
 
-    def array(self, array: Array) -> Tensor:
-        """On the device of the weights."""
+    def to_array(self, array: Array) -> Tensor:
+        """See `ActionValues`; on the device of the weights."""
         return torch.from_numpy(array).to(self._net.flat.device)
 
     def _values(self, x: Array, images: Sequence[Array]) -> Tensor:
-        return self._net.params(self.array(x), [self.array(image) for image in images])
+        return self._net.params(self.to_array(x), [self.to_array(image) for image in images])
 
-    def best(self, x: Array, images: Sequence[Array]) -> Tensor:
+    def best_actions(self, x: Array, images: Sequence[Array]) -> Tensor:
         """See `ActionValues`."""
         with torch.no_grad():
             return self._values(x, images).argmax(1)
 
-    def of(self, x: Array, images: Sequence[Array], action: Tensor) -> Tensor:
+    def chosen(self, x: Array, images: Sequence[Array], action: Tensor) -> Tensor:
         """See `ActionValues`."""
         self._chosen = self._values(x, images).gather(1, action[:, None])[:, 0]
         return self._chosen.detach()
 
-    def highest(self, x: Array, images: Sequence[Array]) -> Tensor:
+    def best_values(self, x: Array, images: Sequence[Array]) -> Tensor:
         """See `ActionValues`."""
         with torch.no_grad():
             return self._values(x, images).amax(1)
@@ -80,34 +80,34 @@ class WithGraph:
         self._net.flat_grad.zero_()
         torch.autograd.backward(self._chosen, gradient)
 
-    def read(self, *numbers: Tensor) -> list[float]:
+    def numbers_and_norm(self, *numbers: Tensor) -> list[float]:
         """See `ActionValues`."""
         found: list[float] = torch.stack((*numbers, self._net.flat_grad.norm())).tolist()
         return found
 
 
-class WithoutGraph:
-    """By `fused.py`, in numpy."""
+class FusedActionValues:
+    """In numpy, by `FusedQNetwork`."""
 
     def __init__(self, net: QNetwork) -> None:
         self._gradient = net.flat_grad.numpy()
-        self._net = fused.FusedQ(net.spec, net.flat.numpy(), self._gradient)
+        self._net = fused.FusedQNetwork(net.spec, net.flat.numpy(), self._gradient)
 
-    def array(self, array: Array) -> Array:
-        """As it is."""
+    def to_array(self, array: Array) -> Array:
+        """See `ActionValues`."""
         return array
 
-    def best(self, x: Array, images: Sequence[Array]) -> Array:
+    def best_actions(self, x: Array, images: Sequence[Array]) -> Array:
         """See `ActionValues`."""
         return np.asarray(self._net.forward(x).argmax(0))
 
-    def of(self, x: Array, images: Sequence[Array], action: Array) -> Array:
+    def chosen(self, x: Array, images: Sequence[Array], action: Array) -> Array:
         """See `ActionValues`."""
         values = self._net.forward(x)
         self._shape, self._where = values.shape, action * len(x) + np.arange(len(x))
         return values.take(self._where)
 
-    def highest(self, x: Array, images: Sequence[Array]) -> Array:
+    def best_values(self, x: Array, images: Sequence[Array]) -> Array:
         """See `ActionValues`."""
         return np.asarray(np.maximum.reduce(self._net.forward(x), 0))
 
@@ -117,12 +117,12 @@ class WithoutGraph:
         by_value.reshape(-1)[self._where] = gradient
         self._net.backward(by_value)
 
-    def read(self, *numbers: Any) -> list[float]:
+    def numbers_and_norm(self, *numbers: Any) -> list[float]:
         """See `ActionValues`."""
         return [*map(float, numbers), math.sqrt(float(np.dot(self._gradient, self._gradient)))]
 
 
 def action_values(net: QNetwork, rows: int) -> ActionValues:
-    """What is faster for minibatches of so many rows."""
-    small = net.flat.is_cpu and rows <= fused.MOST_ROWS and fused.applies(net.spec)
-    return WithoutGraph(net) if small else WithGraph(net)
+    """The faster of the two for minibatches of so many rows."""
+    small = net.flat.is_cpu and rows <= fused.MAX_ROWS and fused.can_fuse(net.spec)
+    return FusedActionValues(net) if small else AutogradActionValues(net)

@@ -1,10 +1,10 @@
-"""Layers without a graph: some MLPs side by side, forward and back, on arrays that are kept from one minibatch to the next.
+"""MLPs without a graph: several side by side, forward and backward, in arrays that are reused from minibatch to minibatch.
 
-The law: outputs and gradients are those of the formulas below, to rounding; how rows are cut into pieces depends on their
-number alone, so the same minibatch gives the same bits.
+The law: outputs and gradients are those of the formulas below, except for rounding. How rows are divided into chunks depends
+only on their number, so the same minibatch gives the same bits.
 
-Arrays are [S, n, B]: S networks side by side, a column for each row of the minibatch, so that inner loops are long. A piece
-of the rows goes all the way forward, or back, while it is in the cache. With g = ∂L/∂(pre-activation): ∂L/∂W = g hᵀ,
+Arrays are [S, n, B]: S networks side by side, and one column for each of B rows, so that inner loops are long. Each chunk of
+the rows goes all the way forward, or backward, while it is in the cache. With g = ∂L/∂(pre-activation): ∂L/∂W = g hᵀ,
 ∂L/∂b = Σ g, ∂L/∂h = Wᵀ g; φ' is 1 − h² (tanh) or h > 0 (ReLU).
 """
 
@@ -23,13 +23,13 @@ from protocol.arrays import Array
 
 Call = Callable[[], object]
 
-PIECE = 512  # rows, at most
-LARGE = 64 * 64 * 128  # multiplications of one product: from here torch's are faster than numpy's
-KEPT = 256  # sizes of minibatch: rows that are not valid make them change
+CHUNK_ROWS = 512  # rows of a chunk, at most
+TORCH_PRODUCT_SIZE = 64 * 64 * 128  # multiplications: matrix products at least this large are faster in torch than in numpy
+MAX_PLANS = 256  # sizes of minibatches to remember; they vary with the number of valid rows
 
 
 class Linear(NamedTuple):
-    """Layers of the same shape in S networks, and where their gradients go: views into flat arrays."""
+    """A layer of the same shape in S networks, and its gradients: views of flat arrays."""
 
     weight: Array  # [S, out, in]
     bias: Array  # [S, out, 1]
@@ -37,153 +37,158 @@ class Linear(NamedTuple):
     bias_grad: Array  # [S, out]
 
     @staticmethod
-    def of(names: Sequence[str], values: Mapping[str, Array], grads: Mapping[str, Array]) -> Linear:
-        """One layer of each of one or two networks, by name."""
+    def stacked(names: Sequence[str], values: Mapping[str, Array], grads: Mapping[str, Array]) -> Linear:
+        """One layer of each of one or two networks, by the names of the layers."""
         weight, bias, weight_grad, bias_grad = (
-            _side_by_side([of[f"{name}.{kind}"] for name in names]) for of in (values, grads) for kind in ("weight", "bias")
+            _stacked_view([of[f"{name}.{kind}"] for name in names]) for of in (values, grads) for kind in ("weight", "bias")
         )
         return Linear(weight, bias[..., None], weight_grad, bias_grad)
 
 
 class Head(NamedTuple):
-    """A linear layer on one of the networks."""
+    """A linear output layer on one of the networks."""
 
     layer: Linear
     network: int
 
 
-class Layers:
-    """MLPs of the same shape that see the same features, and linear heads on them."""
+class FusedMLP:
+    """MLPs of the same shape that take the same features, with linear heads."""
 
     def __init__(self, hidden: Sequence[Linear], heads: Sequence[Head], relu: bool) -> None:
         self._hidden, self._heads, self._relu = hidden, heads, relu
-        self._memory = _Memory(heads[0].layer.weight)
-        self._passes: dict[int, _Pass] = {}
+        self._workspace = _Workspace(heads[0].layer.weight)
+        self._plans: dict[int, _MinibatchPlan] = {}
 
     def forward(self, x: Array) -> list[Array]:
-        """Features [B, D] -> what each head says, [out, B]; good until the next forward pass."""
-        made = self._passes.get(len(x))
-        if made is None:
-            if len(self._passes) == KEPT:
-                self._passes.clear()
-            self._memory.begin_again()
-            made = self._passes[len(x)] = _Pass(len(x), self._hidden, self._heads, self._relu, self._memory)
-        self._last = made
-        for piece in made.pieces:
-            piece.x[0] = x[piece.rows].T
-            for call in piece.forward:
+        """Features [B, D] -> the output [out, B] of each head. The next forward pass overwrites them."""
+        plan = self._plans.get(len(x))
+        if plan is None:
+            if len(self._plans) == MAX_PLANS:
+                self._plans.clear()
+            self._workspace.restart()
+            plan = self._plans[len(x)] = _MinibatchPlan(len(x), self._hidden, self._heads, self._relu, self._workspace)
+        self._plan = plan
+        for chunk in plan.chunks:
+            chunk.x[0] = x[chunk.rows].T
+            for call in chunk.forward:
                 call()
-        return [said[0] for said in made.said]
+        return [output[0] for output in plan.head_outputs]
 
     def backward(self, gradients: Sequence[Array]) -> None:
-        """From the gradients of the last forward pass's outputs [out, B] to those of all layers, in place."""
-        for given, by_said in zip(gradients, self._last.by_said, strict=True):
-            by_said[0] = given
-        for piece in self._last.pieces:
-            for call in piece.back_from_heads + piece.back_through_hidden:
+        """Write the gradients of all layers, from the gradients [out, B] by the outputs of the last forward pass."""
+        for gradient, place in zip(gradients, self._plan.head_gradients, strict=True):
+            place[0] = gradient
+        for chunk in self._plan.chunks:
+            for call in chunk.back_from_heads + chunk.back_through_hidden:
                 call()
-        for call in self._last.gather:
+        for call in self._plan.gather:
             call()
 
 
-class _Memory:
-    """Arrays that passes of all sizes share, for there is one pass at a time: each takes the same ones in the same order."""
+class _Workspace:
+    """Arrays that the plans of all sizes share, because one pass runs at a time.
+
+    Each plan takes the same arrays in the same order.
+    """
 
     def __init__(self, like: Array) -> None:
         self._like = like
         self._arrays: list[Array] = []
         self._taken = 0
 
-    def begin_again(self) -> None:
-        """The next array is the first."""
+    def restart(self) -> None:
+        """Take from the first array again."""
         self._taken = 0
 
     def take(self, *shape: int) -> Array:
-        """The next array, C-ordered, whatever is in it."""
+        """The next array, C-ordered, not initialized."""
         size, number = math.prod(shape), self._taken
         self._taken += 1
         if number == len(self._arrays):
             self._arrays.append(np.empty(0, self._like.dtype))
         if self._arrays[number].size < size:
-            # By torch, which aligns arrays always alike: its products could give other bits where they are not. To a power
-            # of two, lest every size that is a little larger takes memory of its own.
+            # torch allocates it, because torch aligns all arrays in the same way: with another alignment its products could
+            # give other bits. The size is a power of two, so that a slightly larger minibatch does not need a new array.
             room = 1 << (size - 1).bit_length()
             self._arrays[number] = torch.zeros(room, dtype=torch.from_numpy(self._like).dtype).numpy()
         return self._arrays[number][:size].reshape(shape)
 
     def outputs(self, layer: Linear, rows: int) -> Array:
-        """For what a layer says, [S, out, B]."""
+        """An array for the output of a layer, [S, out, B]."""
         return self.take(*layer.bias_grad.shape, rows)
 
 
-class _Pass:
-    """What is done with so many rows: pieces of them, one after another, then one gradient of those of the pieces."""
+class _MinibatchPlan:
+    """The calls for a minibatch of so many rows: each chunk in turn, then the sums of the chunks' gradients."""
 
-    def __init__(self, rows: int, hidden: Sequence[Linear], heads: Sequence[Head], relu: bool, memory: _Memory) -> None:
-        count = -(-rows // PIECE)
-        self._memory = memory
-        self.said = [memory.outputs(head.layer, rows) for head in heads]
-        self.by_said = [memory.outputs(head.layer, rows) for head in heads]
+    def __init__(
+        self, rows: int, hidden: Sequence[Linear], heads: Sequence[Head], relu: bool, workspace: _Workspace
+    ) -> None:
+        count = -(-rows // CHUNK_ROWS)
+        self._workspace = workspace
+        self.head_outputs = [workspace.outputs(head.layer, rows) for head in heads]
+        self.head_gradients = [workspace.outputs(head.layer, rows) for head in heads]
         self.gather: list[Call] = []
         trunk = [self._for_each(layer, count) for layer in hidden]
-        tops = [self._for_each(head.layer, count) for head in heads]
-        # One for all pieces, to stay in the cache.
-        gradients = [memory.outputs(layer, -(-rows // count)) for layer in hidden]
-        self.pieces: list[_Piece] = []
+        head_layers = [self._for_each(head.layer, count) for head in heads]
+        # All chunks share these arrays, so that they stay in the cache.
+        gradients = [workspace.outputs(layer, -(-rows // count)) for layer in hidden]
+        self.chunks: list[_Chunk] = []
         for i in range(count):
-            its = slice(rows * i // count, rows * (i + 1) // count)
-            piece = _Piece(its, (trunk or tops)[0][i], memory)
+            its_rows = slice(rows * i // count, rows * (i + 1) // count)
+            chunk = _Chunk(its_rows, (trunk or head_layers)[0][i], workspace)
             for layer, dy in zip(trunk, gradients, strict=True):
-                piece.hide(layer[i], dy[..., : its.stop - its.start], relu)
-            for layer, head, said, by_said in zip(tops, heads, self.said, self.by_said, strict=True):
-                piece.say(layer[i], head.network, said[..., its], by_said[..., its])
-            self.pieces.append(piece)
+                chunk.add_hidden(layer[i], dy[..., : its_rows.stop - its_rows.start], relu)
+            for layer, head, y, dy in zip(head_layers, heads, self.head_outputs, self.head_gradients, strict=True):
+                chunk.add_head(layer[i], head.network, y[..., its_rows], dy[..., its_rows])
+            self.chunks.append(chunk)
 
     def _for_each(self, layer: Linear, count: int) -> list[Linear]:
-        """The same layer for each piece, each with a gradient of its own."""
+        """The same layer once for each chunk, each with its own gradient arrays."""
         if count == 1:
             return [layer]
-        weight, bias = (self._memory.take(count, *grad.shape) for grad in (layer.weight_grad, layer.bias_grad))
+        weight, bias = (self._workspace.take(count, *grad.shape) for grad in (layer.weight_grad, layer.bias_grad))
         self.gather += [partial(np.add.reduce, weight, 0, out=layer.weight_grad)]
         self.gather += [partial(np.add.reduce, bias, 0, out=layer.bias_grad)]
         return [layer._replace(weight_grad=weight[i], bias_grad=bias[i]) for i in range(count)]
 
 
-class _Piece:
-    """Some of the rows: what they are, and the calls, made ready in their order."""
+class _Chunk:
+    """Some rows of a minibatch, and the calls of their forward and backward pass, in order."""
 
-    def __init__(self, rows: slice, first: Linear, memory: _Memory) -> None:
+    def __init__(self, rows: slice, first: Linear, workspace: _Workspace) -> None:
         self.rows = rows
-        self._memory = memory
-        self.x = self._h = memory.take(1, first.weight.shape[2], rows.stop - rows.start)
-        self._dh: Array | None = None  # the gradient by the last hidden layers
-        self._given: set[int] = set()  # networks that have one from a head
+        self._workspace = workspace
+        self.x = self._h = workspace.take(1, first.weight.shape[2], rows.stop - rows.start)
+        self._dh: Array | None = None  # the gradient by the outputs of the last hidden layers
+        self._networks_with_gradient: set[int] = set()  # those whose part of `_dh` a head has written
         self._ones = np.ones(rows.stop - rows.start, first.weight.dtype)
         self.forward: list[Call] = []
         self.back_from_heads: list[Call] = []
         self.back_through_hidden: list[Call] = []
 
-    def hide(self, layer: Linear, dy: Array, relu: bool) -> None:
-        """One more hidden layer; `dy`: where the gradient by what it says will be."""
-        y = self._memory.outputs(layer, len(self._ones))
+    def add_hidden(self, layer: Linear, dy: Array, relu: bool) -> None:
+        """Add a hidden layer. `dy`: the array for the gradient by its output."""
+        y = self._workspace.outputs(layer, len(self._ones))
         self.forward += [*_linear(layer, self._h, y), _activation(y, relu)]
-        self.back_through_hidden[:0] = [_slope(dy, y, relu), *self._back(layer, self._h, dy, self._dh)]
+        self.back_through_hidden[:0] = [_activation_gradient(dy, y, relu), *self._back(layer, self._h, dy, self._dh)]
         self._h, self._dh = y, dy
 
-    def say(self, layer: Linear, network: int, y: Array, dy: Array) -> None:
-        """One more head, after all hidden layers."""
-        its = slice(None) if self._dh is None else slice(network, network + 1)
-        dh = None if self._dh is None else self._dh[its]
-        self.forward += _linear(layer, self._h[its], y)
-        if dh is None or network not in self._given:
-            self.back_from_heads += self._back(layer, self._h[its], dy, dh)
+    def add_head(self, layer: Linear, network: int, y: Array, dy: Array) -> None:
+        """Add a head, after all hidden layers."""
+        networks = slice(None) if self._dh is None else slice(network, network + 1)
+        dh = None if self._dh is None else self._dh[networks]
+        self.forward += _linear(layer, self._h[networks], y)
+        if dh is None or network not in self._networks_with_gradient:
+            self.back_from_heads += self._back(layer, self._h[networks], dy, dh)
         else:
-            more = self._memory.take(*dh.shape)
-            self.back_from_heads += [*self._back(layer, self._h[its], dy, more), partial(np.add, dh, more, out=dh)]
-        self._given.add(network)
+            more = self._workspace.take(*dh.shape)
+            self.back_from_heads += [*self._back(layer, self._h[networks], dy, more), partial(np.add, dh, more, out=dh)]
+        self._networks_with_gradient.add(network)
 
     def _back(self, layer: Linear, x: Array, dy: Array, dx: Array | None) -> list[Call]:
-        """From `dy` to the gradients of a layer, and to `dx` if it is wanted."""
+        """The calls that compute the gradients of a layer from `dy`, and `dx` if it is needed."""
         calls: list[Call] = [
             _product(dy, x.swapaxes(1, 2), layer.weight_grad),
             partial(np.matmul, dy, self._ones, out=layer.bias_grad),
@@ -197,22 +202,22 @@ def _linear(layer: Linear, x: Array, y: Array) -> list[Call]:
 
 
 def _activation(y: Array, relu: bool) -> Call:
-    """In place."""
+    """The call that applies the activation in place."""
     return partial(np.maximum, y, 0, out=y) if relu else partial(np.tanh, y, out=y)
 
 
-def _slope(dy: Array, y: Array, relu: bool) -> Call:
-    """The gradient before the activation, in place."""
-    to, of = torch.from_numpy(dy), torch.from_numpy(y)
+def _activation_gradient(dy: Array, y: Array, relu: bool) -> Call:
+    """The call that turns the gradient by the activation's output into that by its input, in place."""
+    gradient, output = torch.from_numpy(dy), torch.from_numpy(y)
     if relu:
-        return partial(torch.ops.aten.threshold_backward.grad_input, to, of, 0, grad_input=to)
-    return partial(torch.ops.aten.tanh_backward.grad_input, to, of, grad_input=to)
+        return partial(torch.ops.aten.threshold_backward.grad_input, gradient, output, 0, grad_input=gradient)
+    return partial(torch.ops.aten.tanh_backward.grad_input, gradient, output, grad_input=gradient)
 
 
 def _product(a: Array, b: Array, out: Array) -> Call:
-    """What computes `out` = a b, [S, n, k] by [S, k, m], whenever it is called."""
+    """The call that computes `out` = a b, [S, n, k] by [S, k, m]."""
     networks, n, k = out.shape[0], *a.shape[1:]
-    if k > 1 and n * k * b.shape[2] < LARGE:
+    if k > 1 and n * k * b.shape[2] < TORCH_PRODUCT_SIZE:
         return partial(np.matmul, a, b, out=out)
     one, other, result = map(torch.from_numpy, (a, b, out))
     if k == 1:
@@ -220,8 +225,8 @@ def _product(a: Array, b: Array, out: Array) -> Call:
     return partial(torch.bmm, one, other.expand(networks, -1, -1), out=result)
 
 
-def _side_by_side(arrays: Sequence[Array]) -> Array:
-    """One or two views of the same shape into the same array, as one view [S, *shape]."""
+def _stacked_view(arrays: Sequence[Array]) -> Array:
+    """One or two views of the same shape and the same array, as one view [S, *shape]."""
     first, last = arrays[0], arrays[-1]
-    apart = last.__array_interface__["data"][0] - first.__array_interface__["data"][0]
-    return as_strided(first, (len(arrays), *first.shape), (apart, *first.strides))
+    distance = last.__array_interface__["data"][0] - first.__array_interface__["data"][0]
+    return as_strided(first, (len(arrays), *first.shape), (distance, *first.strides))

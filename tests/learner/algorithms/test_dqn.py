@@ -199,7 +199,7 @@ def test_a_step_follows_the_gradient_of_the_usual_loss(dueling: bool) -> None:
     made.replay.add(batch(0))
     made.target.flat.mul_(1.5)
     first = made.replay.sample(30)
-    made.replay.reprioritise(first.slots, np.linspace(0, 5, 30, dtype=np.float32))
+    made.replay.update_priorities(first.slots, np.linspace(0, 5, 30, dtype=np.float32))
     drawn = made.replay.sample(64, beta=0.5)
     x, following = torch.from_numpy(drawn.leaves[0]), torch.from_numpy(drawn.next_leaves[0])
     with torch.no_grad():
@@ -299,7 +299,7 @@ def test_priorities_are_the_errors_and_beta_grows_to_one(monkeypatch: pytest.Mon
     made = dqn(changed(PLAIN, replay="prioritized", gradient_steps=1, priority_beta=0.4))
     betas: list[float] = []
     seen: list[tuple[Ints, Floats]] = []
-    sample, told = made.replay.sample, made.replay.reprioritise
+    sample, told = made.replay.sample, made.replay.update_priorities
 
     def watched_sample(count: int, beta: float) -> Sample:
         betas.append(beta)
@@ -310,7 +310,7 @@ def test_priorities_are_the_errors_and_beta_grows_to_one(monkeypatch: pytest.Mon
         told(slots, error)
 
     monkeypatch.setattr(made.replay, "sample", watched_sample)
-    monkeypatch.setattr(made.replay, "reprioritise", watched_telling)
+    monkeypatch.setattr(made.replay, "update_priorities", watched_telling)
     made.update(batch(0), no_pulse)
     assert betas == [pytest.approx(0.4)]
     made.env_steps = 5_000

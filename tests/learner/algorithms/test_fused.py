@@ -18,7 +18,7 @@ from learner.algorithms import algorithm_class, losses
 from learner.algorithms.actor_critic import Estimates
 from learner.algorithms.kernels import loss_gradients
 from learner.algorithms.kernels import mlp as layers
-from learner.algorithms.kernels.fused import FusedActorCritic, applies
+from learner.algorithms.kernels.fused import FusedActorCritic, can_fuse
 from learner.algorithms.minibatches import Minibatch
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
@@ -70,7 +70,7 @@ def make(spec: PolicySpec, seed: int, scale: float = 0.4) -> tuple[ActorCriticNe
 def test_outputs_and_gradients_are_autograds(
     action: str, activation: Any, net: list[int], shared_net: bool, rows: int, piece: int, by_torch: bool, seed: int
 ) -> None:
-    with patch.multiple(layers, PIECE=piece, LARGE=0 if by_torch else layers.LARGE):
+    with patch.multiple(layers, CHUNK_ROWS=piece, TORCH_PRODUCT_SIZE=0 if by_torch else layers.TORCH_PRODUCT_SIZE):
         outputs_and_gradients(PolicySpec(BOX, ACTIONS[action], tuple(net), activation, shared_net=shared_net), rows, seed)
 
 
@@ -104,13 +104,13 @@ def outputs_and_gradients(spec: PolicySpec, rows: int, seed: int) -> None:
 @pytest.mark.parametrize("action", sorted(ACTIONS))
 @pytest.mark.parametrize("activation", ["tanh", "relu"])
 @pytest.mark.parametrize("shared_net", [False, True])
-@pytest.mark.parametrize(("piece", "large"), [(512, layers.LARGE), (4, 0)])
+@pytest.mark.parametrize(("piece", "large"), [(512, layers.TORCH_PRODUCT_SIZE), (4, 0)])
 def test_the_gradient_is_the_slope_in_float64(
     action: str, activation: Any, shared_net: bool, piece: int, large: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Central differences of a weighted sum of all outputs, by every parameter."""
-    monkeypatch.setattr(layers, "PIECE", piece)
-    monkeypatch.setattr(layers, "LARGE", large)
+    monkeypatch.setattr(layers, "CHUNK_ROWS", piece)
+    monkeypatch.setattr(layers, "TORCH_PRODUCT_SIZE", large)
     generator = np.random.default_rng(3)
     spec = PolicySpec(BOX, ACTIONS[action], (5, 3), activation, shared_net=shared_net)
     flat = generator.normal(0, 0.5, sum(map(total_size, parameter_layout(spec))))
@@ -212,7 +212,7 @@ def test_an_update_is_the_same_by_kernels_by_hand_derived_gradients_and_by_autog
     built_in: Any = algorithm_class(name)
     of_its_own_loss: Any = type("OfItsOwnLoss", (built_in,), {"loss": built_in.loss})
     for algorithm_type, most in ((built_in, 512), (built_in, 0), (of_its_own_loss, 512)):
-        monkeypatch.setattr("learner.algorithms.actor_critic.MOST_ROWS", most)
+        monkeypatch.setattr("learner.algorithms.actor_critic.MAX_ROWS", most)
         algorithm = algorithm_type(config, spec, total_steps=1_000, seed=0)
         assert algorithm._hand_derived == (algorithm_type is built_in)
         for seed in range(3):
@@ -254,27 +254,27 @@ def test_a_thousand_steps_stay_together() -> None:
     ],
 )
 def test_it_is_for_small_layers_and_nothing_else(spec: PolicySpec, expected: bool) -> None:
-    assert applies(spec) == expected
+    assert can_fuse(spec) == expected
 
 
 def test_sizes_of_minibatches_come_and_go(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(layers, "KEPT", 30)
+    monkeypatch.setattr(layers, "MAX_PLANS", 30)
     _, fused = make(PolicySpec(BOX, ACTIONS["discrete"], (5,)), 0)
     x = np.random.default_rng(0).normal(size=(99, 4)).astype(np.float32)
     whole = fused.value(x).copy()
     for rows in (*range(1, 99), 40, 2):
         np.testing.assert_allclose(fused.value(x[:rows]), whole[:rows], atol=1e-6)
-        assert len(fused._critic._passes) <= 30
-    assert {40, 2} <= set(fused._critic._passes)
+        assert len(fused._critic_mlp._plans) <= 30
+    assert {40, 2} <= set(fused._critic_mlp._plans)
 
 
 def test_sizes_of_minibatches_share_their_memory() -> None:
     """And give the bits that they would give alone, whichever came before."""
     spec = PolicySpec(BOX, ACTIONS["discrete"], (32,))
     _, fused = make(spec, 0)
-    x = np.random.default_rng(0).normal(size=(2 * layers.PIECE, 4)).astype(np.float32)
+    x = np.random.default_rng(0).normal(size=(2 * layers.CHUNK_ROWS, 4)).astype(np.float32)
     action = np.zeros((len(x), 1), np.int64)
-    for rows in (200, 256, 255, 2 * layers.PIECE, 256, 1, 255):
+    for rows in (200, 256, 255, 2 * layers.CHUNK_ROWS, 256, 1, 255):
         _, alone = make(spec, 0)
         for found in (alone, fused):
             found.forward(x[:rows], action[:rows])
@@ -283,18 +283,18 @@ def test_sizes_of_minibatches_share_their_memory() -> None:
         for found in (alone, fused):
             said = [each.copy() for each in found.forward(x[:rows], action[:rows])]
             found.backward(ones, ones, ones)
-            gradients.append([*said, *(layer.weight_grad.copy() for layer in found._layers._hidden)])
+            gradients.append([*said, *(layer.weight_grad.copy() for layer in found._mlp._hidden)])
         for one, other in zip(*gradients, strict=True):
             np.testing.assert_array_equal(one, other)
-    passes = fused._layers._passes
-    assert np.shares_memory(passes[256].said[0], passes[255].said[0])
-    assert sum(array.nbytes for array in fused._layers._memory._arrays) < 3 * 4 * 2 * layers.PIECE * (4 + 4 * 32 * 2)
+    passes = fused._mlp._plans
+    assert np.shares_memory(passes[256].head_outputs[0], passes[255].head_outputs[0])
+    assert sum(array.nbytes for array in fused._mlp._workspace._arrays) < 3 * 4 * 2 * layers.CHUNK_ROWS * (4 + 4 * 32 * 2)
 
 
 def test_large_minibatches_keep_the_graph(monkeypatch: pytest.MonkeyPatch) -> None:
     kinds: list[type] = []
     for most in (30, 29):
-        monkeypatch.setattr("learner.algorithms.actor_critic.MOST_ROWS", most)
+        monkeypatch.setattr("learner.algorithms.actor_critic.MAX_ROWS", most)
         algorithm = PPO(PPOConfig(batch_size=30, n_epochs=1), DISCRETE, total_steps=1, seed=0)
         rows = batch(algorithm, 0)
         estimates = Estimates(rows.reward, rows.reward, rows.reward, rows.valid, {})

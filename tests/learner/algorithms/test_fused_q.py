@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from learner.algorithms.dqn import DQN, LOSSES
 from learner.algorithms.kernels import fused
 from learner.algorithms.kernels import mlp as layers
-from learner.algorithms.kernels.action_values import WithGraph, WithoutGraph, action_values
-from learner.algorithms.kernels.fused import FusedQ
+from learner.algorithms.kernels.action_values import AutogradActionValues, FusedActionValues, action_values
+from learner.algorithms.kernels.fused import FusedQNetwork
 from learner.algorithms.replay import Sample
 from learner.config.hyperparameters import DQNConfig
 from protocol.arrays import Array
@@ -51,7 +51,7 @@ def outputs_and_gradients(spec: PolicySpec, rows: int, seed: int) -> None:
     torch.autograd.backward(values, torch.tensor(by_value.T, dtype=torch.float32))
     expected = net.flat_grad.numpy().copy()
     net.flat_grad.fill_(7.0)  # every gradient is written, none added to
-    without = FusedQ(spec, net.flat.numpy(), net.flat_grad.numpy())
+    without = FusedQNetwork(spec, net.flat.numpy(), net.flat_grad.numpy())
     found = without.forward(x.astype(np.float32))
     np.testing.assert_allclose(found, values.detach().numpy().T, rtol=1e-5, atol=1e-5)
     without.backward(by_value.astype(np.float32))
@@ -71,7 +71,7 @@ def outputs_and_gradients(spec: PolicySpec, rows: int, seed: int) -> None:
 def test_outputs_and_gradients_are_autograds(
     activation: Any, net: list[int], dueling: bool, rows: int, piece: int, by_torch: bool, seed: int
 ) -> None:
-    with patch.multiple(layers, PIECE=piece, LARGE=0 if by_torch else layers.LARGE):
+    with patch.multiple(layers, CHUNK_ROWS=piece, TORCH_PRODUCT_SIZE=0 if by_torch else layers.TORCH_PRODUCT_SIZE):
         outputs_and_gradients(policy(tuple(net), activation, dueling), rows, seed)
 
 
@@ -85,18 +85,18 @@ def test_so_they_are_at_the_sizes_that_are_used(dueling: bool, rows: int) -> Non
 @pytest.mark.parametrize("dueling", [False, True])
 @pytest.mark.parametrize("activation", ["tanh", "relu"])
 @pytest.mark.parametrize("loss", sorted(LOSSES))
-@pytest.mark.parametrize(("piece", "large"), [(512, layers.LARGE), (4, 0)])
+@pytest.mark.parametrize(("piece", "large"), [(512, layers.TORCH_PRODUCT_SIZE), (4, 0)])
 def test_the_gradient_is_the_slope_of_the_loss_in_float64(
     dueling: bool, activation: Any, loss: str, piece: int, large: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Central differences of the loss of the values of some actions, by every parameter."""
-    monkeypatch.setattr(layers, "PIECE", piece)
-    monkeypatch.setattr(layers, "LARGE", large)
+    monkeypatch.setattr(layers, "CHUNK_ROWS", piece)
+    monkeypatch.setattr(layers, "TORCH_PRODUCT_SIZE", large)
     generator, rows = np.random.default_rng(5), 9
     spec = policy((5, 3), activation, dueling)
     flat = generator.normal(0, 0.5, sum(map(total_size, parameter_layout(spec))))
     grad = np.full_like(flat, np.nan)
-    without = FusedQ(spec, flat, grad)
+    without = FusedQNetwork(spec, flat, grad)
     x, action = generator.normal(size=(rows, 4)), generator.integers(0, 4, rows)
     target, weight = 2 * generator.normal(size=rows), generator.random(rows)
 
@@ -127,15 +127,15 @@ def test_updates_are_the_same_either_way(options: dict[str, Any], monkeypatch: p
     settings = {"net": (16,), "replay_size": 1000, "learning_starts": 0, "gradient_steps": 8, "target_every": 5}
     config = msgspec.convert(settings | options, DQNConfig)
     found: list[tuple[DQN, dict[str, float]]] = []
-    for most in (fused.MOST_ROWS, 0):
-        monkeypatch.setattr(fused, "MOST_ROWS", most)
+    for most in (fused.MAX_ROWS, 0):
+        monkeypatch.setattr(fused, "MAX_ROWS", most)
         made = DQN(config, DQN.policy_spec(config, (BOX,), DISCRETE.action), total_steps=1000, seed=0)
         for seed in range(3):
             metrics = made.update(batch(seed, fresh=seed == 0), no_pulse)
         found.append((made, metrics))
     (one, metrics), (other, expected) = found
-    assert isinstance(one._values, WithoutGraph)
-    assert isinstance(other._values, WithGraph)
+    assert isinstance(one._values, FusedActionValues)
+    assert isinstance(other._values, AutogradActionValues)
     assert not torch.equal(one.net.flat, QNetwork(one.policy, seed=0).flat)
     torch.testing.assert_close(one.net.flat, other.net.flat, atol=2e-5, rtol=0)
     torch.testing.assert_close(one.target.flat, other.target.flat, atol=2e-5, rtol=0)
@@ -147,7 +147,7 @@ def test_a_thousand_steps_stay_together(monkeypatch: pytest.MonkeyPatch) -> None
     config = DQNConfig(target_every=50, replay_size=100)
     spec = DQN.policy_spec(config, (BOX,), DISCRETE.action)
     one = DQN(config, spec, total_steps=1, seed=0)
-    monkeypatch.setattr(fused, "MOST_ROWS", 0)
+    monkeypatch.setattr(fused, "MAX_ROWS", 0)
     other = DQN(config, spec, total_steps=1, seed=0)
     generator = np.random.default_rng(0)
     for _ in range(1_000):
@@ -169,11 +169,11 @@ def test_a_thousand_steps_stay_together(monkeypatch: pytest.MonkeyPatch) -> None
 @pytest.mark.parametrize(
     ("spec", "rows", "expected"),
     [
-        (policy((16,)), 64, WithoutGraph),
-        (policy((16,), dueling=True), fused.MOST_ROWS, WithoutGraph),
-        (policy((16,)), fused.MOST_ROWS + 1, WithGraph),
-        (policy((fused.MOST_UNITS + 1,)), 64, WithGraph),
-        (msgspec.structs.replace(IMAGE, head="q"), 64, WithGraph),
+        (policy((16,)), 64, FusedActionValues),
+        (policy((16,), dueling=True), fused.MAX_ROWS, FusedActionValues),
+        (policy((16,)), fused.MAX_ROWS + 1, AutogradActionValues),
+        (policy((fused.MAX_UNITS + 1,)), 64, AutogradActionValues),
+        (msgspec.structs.replace(IMAGE, head="q"), 64, AutogradActionValues),
     ],
 )
 def test_it_is_chosen_by_the_policy_and_the_minibatch(spec: PolicySpec, rows: int, expected: type) -> None:

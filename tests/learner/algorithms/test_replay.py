@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from learner.algorithms import available_memory as memory
 from learner.algorithms import replay as module
 from learner.algorithms.available_memory import GIB, available_bytes
-from learner.algorithms.replay import Replay, Sample, memory_bytes
+from learner.algorithms.replay import ReplayBuffer, Sample, memory_bytes
 from learner.algorithms.sum_tree import SumTree
 from protocol.errors import UsageError
 from protocol.rollout import Batch
@@ -139,11 +139,11 @@ def side_by_side(*batches: Batch) -> Batch:
     return msgspec.structs.replace(batches[0], **joined)
 
 
-def replay(size: int = 1000, n_step: int = 1, alpha: float | None = None, seed: int = 0) -> Replay:
-    return Replay(OBS, size=size, n_step=n_step, gamma=GAMMA, seed=seed, alpha=alpha)
+def replay(size: int = 1000, n_step: int = 1, alpha: float | None = None, seed: int = 0) -> ReplayBuffer:
+    return ReplayBuffer(OBS, size=size, n_step=n_step, gamma=GAMMA, seed=seed, alpha=alpha)
 
 
-def filled(lanes: Lanes, into: Replay, rollouts: int = 4) -> Replay:
+def filled(lanes: Lanes, into: ReplayBuffer, rollouts: int = 4) -> ReplayBuffer:
     for _ in range(rollouts):
         into.add(side_by_side(*(lanes.used(lanes.rollout(lane)) for lane in (0, 1))))
     return into
@@ -284,14 +284,14 @@ def test_a_batch_without_a_valid_row_adds_nothing() -> None:
 # -------------------------------------------------------------------- drawing
 
 
-def priorities(errors: dict[float, float], alpha: float) -> tuple[Replay, npt.NDArray[np.int64]]:
+def priorities(errors: dict[float, float], alpha: float) -> tuple[ReplayBuffer, npt.NDArray[np.int64]]:
     """A replay of transitions with these errors, by the observations they begin with; and the slots."""
     lanes, kept = Lanes(0, lanes=1, copies=1, T=len(errors), ends=0.0), replay(alpha=alpha)
     rollout = lanes.rollout(0)
     rollout.obs[0][:-1, 0, 0] = list(errors)
     kept.add(rollout)
     drawn = kept.sample(100)
-    kept.reprioritise(drawn.slots, np.array([errors[key] for key in drawn.leaves[0][:, 0]], np.float32))
+    kept.update_priorities(drawn.slots, np.array([errors[key] for key in drawn.leaves[0][:, 0]], np.float32))
     return kept, drawn.slots
 
 
@@ -313,7 +313,7 @@ def test_transitions_are_drawn_in_proportion_to_their_priorities_and_weighted_ag
 def test_what_is_new_gets_the_highest_priority_ever_seen() -> None:
     kept, _ = priorities({1.0: 0.1, 2.0: 3.0}, alpha=1.0)
     kept.add(Lanes(5, lanes=1, copies=1, T=1, ends=0.0).rollout(0))
-    kept.reprioritise(kept.sample(50).slots, np.full(50, 1e-3, np.float32))
+    kept.update_priorities(kept.sample(50).slots, np.full(50, 1e-3, np.float32))
     kept.add(Lanes(6, lanes=1, copies=1, T=1, ends=0.0).rollout(0))
     drawn = kept.sample(1000)
     newest = drawn.slots == drawn.slots.max()
@@ -359,7 +359,7 @@ def test_a_sum_tree_is_the_sum_of_its_leaves_and_finds_each_by_its_weight(data: 
 def test_a_restored_replay_goes_on_to_the_bit(size: int, alpha: float | None) -> None:
     lanes = Lanes(2)
     first = filled(lanes, replay(size, 3, alpha))
-    first.reprioritise(first.sample(9).slots, np.arange(9, dtype=np.float32))
+    first.update_priorities(first.sample(9).slots, np.arange(9, dtype=np.float32))
     file = io.BytesIO()
     torch.save(first.state_dict(), file)
     file.seek(0)
@@ -371,7 +371,7 @@ def test_a_restored_replay_goes_on_to_the_bit(size: int, alpha: float | None) ->
         for a, b in zip(*drawn, strict=True):
             np.testing.assert_array_equal(a, b)
         for each in (first, second):
-            each.reprioritise(drawn[0].slots, np.linspace(0, 3, 50, dtype=np.float32))
+            each.update_priorities(drawn[0].slots, np.linspace(0, 3, 50, dtype=np.float32))
             each.add(batch)
         assert len(first) == len(second)
     check(second.sample(500), lanes, 3)
@@ -394,7 +394,7 @@ def test_a_state_of_another_size_is_refused() -> None:
 @pytest.mark.parametrize("dtype", ["bool", "int8", "uint8", "uint16", "uint32", "uint64", "float16", "float64", "int64"])
 def test_observations_stay_as_they_are(dtype: str) -> None:
     leaf = Leaf("", "box", (2, 1), dtype)
-    kept = Replay((leaf, OBS[0]), size=50, n_step=1, gamma=GAMMA, seed=0)
+    kept = ReplayBuffer((leaf, OBS[0]), size=50, n_step=1, gamma=GAMMA, seed=0)
     rollout = Lanes(0, ends=0.0).rollout(0)
     ones = np.ones((5, 2, 2, 1), dtype)
     kept.add(msgspec.structs.replace(rollout, obs=(ones, *rollout.obs)))
@@ -414,7 +414,7 @@ def test_observations_stay_as_they_are(dtype: str) -> None:
 @pytest.mark.parametrize("alpha", [None, 0.5])
 def test_the_memory_that_is_foretold_is_what_it_takes(alpha: float | None) -> None:
     observation = (Leaf("", "box", (84, 84, 4), "uint8"), Leaf("n", "discrete", (), "int64", (3,), (0,)))
-    kept = Replay(observation, size=50, n_step=1, gamma=GAMMA, seed=0, alpha=alpha)
+    kept = ReplayBuffer(observation, size=50, n_step=1, gamma=GAMMA, seed=0, alpha=alpha)
     arrays = kept._row.nbytes + sum(leaf.nbytes for leaf in kept._obs)
     tree = 0 if kept._tree is None else kept._tree._nodes.nbytes
     assert kept.bytes == memory_bytes(observation, 50, alpha is not None) == arrays + tree
@@ -426,17 +426,17 @@ def test_a_replay_that_does_not_fit_is_refused_before_it_is_made(monkeypatch: py
     monkeypatch.setattr(np, "zeros", lambda *args: made.append(args))
     image = (Leaf("", "box", (84, 84, 4), "uint8"),)
     with pytest.raises(UsageError) as refused:
-        Replay(image, size=1_000_000, n_step=1, gamma=GAMMA, seed=0)
+        ReplayBuffer(image, size=1_000_000, n_step=1, gamma=GAMMA, seed=0)
     assert not made
     line = str(refused.value)
     assert "\n" not in line
     assert "replay_size 1000000: 1000000 transitions take 26.3 GiB" in line
     assert "2.0 GiB of memory are free; take --replay-size 38000 or less" in line
-    module.refuse_what_does_not_fit(image, 38_000, False)
+    module.check_fits_memory(image, 38_000, False)
     with pytest.raises(UsageError):
-        module.refuse_what_does_not_fit(image, 39_000, False)
+        module.check_fits_memory(image, 39_000, False)
     monkeypatch.setattr(module, "available_bytes", lambda: None)
-    module.refuse_what_does_not_fit(image, 1_000_000, False)
+    module.check_fits_memory(image, 1_000_000, False)
 
 
 def test_a_rollout_that_does_not_fit_is_refused() -> None:
