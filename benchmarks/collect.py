@@ -1,15 +1,16 @@
-"""Collecting in two processes, ours against the bare loop over the same copies: `python -m benchmarks.collect`.
+"""Speed of collecting in two processes, compared with a bare loop over the same copies: `python -m benchmarks.collect`.
 
-Ours is `Collector` of `workers/collect`, as a worker runs it: a policy acts (64-64 in numpy, or convolutions in torch), rows
-of T = 128 steps are stored with their log-probabilities, episodes are counted. The bare loop takes random actions, keeps
-nothing and resets at an episode's end. It comes in two kinds. `sampled`, the one that counts, is `gymnasium.make` as it
-comes and `action_space.sample()`, as the field measures it. `drawn` is the fastest that a loop over these copies can be:
-gymnasium's checker left out, as we leave it out, and all actions drawn beforehand. `native` is an environment's own
-vectorised form, `envpool` envpool's, bare and as a lane; `bfloat16` is ours that looks at images in it; `no network` is ours
-with a policy that does not look: storing and stepping alone. What is not installed is left out.
+`ours` is the `Collector` of `workers/collect`, as a worker runs it: a policy acts (64-64 in numpy, or convolutions in
+torch), rollouts of T = 128 steps are stored with their log-probabilities, and episodes are counted. `bare` is a loop that
+takes random actions, stores nothing and resets at an episode's end. There are two kinds of it. `sampled`, to which the
+targets refer, uses plain `gymnasium.make` and `action_space.sample()`, as the field measures it. `drawn` is the fastest loop
+over these copies: without gymnasium's checker, which the collector leaves out, too, and with actions drawn beforehand.
+`native` is the vectorized form of the environment and `envpool` that of envpool, both bare and as a lane. `bfloat16`
+processes images in bfloat16. `no network` has a policy without a network, so it measures storing and stepping. What is not
+installed is left out.
 
-All contenders of a case take turns, one pair of processes at a time, one thread each; medians of rounds. On a machine that
-does other work too, `--cpu` counts seconds of CPU, which that work does not take away.
+All contenders of a case take turns, one pair of processes at a time, with one thread each. The figures are medians of the
+rounds. On a machine that does other work, too, `--cpu` counts seconds of CPU time, which other work does not change.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ from workers.collect.held_rollouts import Assignment
 PROCESSES = 2
 STEPS = 128  # T
 CARTPOLE, FRAMES = EnvSpec("CartPole-v1"), EnvSpec("benchmarks.frames:Frames-v0")
-PONG = EnvSpec("workers.envs:millrace/Atari-v0")  # the module, because the bare loop asks gymnasium alone
+PONG = EnvSpec("workers.envs:millrace/Atari-v0")  # with its module, because the bare loop uses plain gymnasium.make
 BARE = ("bare, sampled", "bare, drawn")
 OURS = ("ours, 2 lanes", "ours, 1 lane")
 NARROW = ("ours, 1 lane, bfloat16", "native, 1 lane, bfloat16")
@@ -58,16 +59,16 @@ NATIVE, POOL = ("bare, native", "native, 1 lane"), ("bare, envpool", "envpool, 1
 
 
 class Case(NamedTuple):
-    """What is collected, and what must come of it."""
+    """What is collected, and the targets."""
 
     env: EnvSpec
     copies: int
     """in each process"""
     contenders: tuple[str, ...]
     share: float | None = None
-    """what ours must be of `bare, sampled`"""
+    """target of ours, as a share of `bare, sampled`"""
     rate: int | None = None
-    """env steps/s that ours must reach"""
+    """target of ours, in env steps/s"""
 
 
 CASES = (
@@ -84,7 +85,7 @@ Turn = Callable[[], int]  # steps copies once or a few times -> env steps
 
 
 def bare_sampled(spec: EnvSpec, copies: int, number: int) -> Turn:
-    """Random actions as the field takes them."""
+    """A bare loop with `action_space.sample()`, as the field measures it."""
     envs = [gymnasium.make(spec.id) for _ in range(copies)]
     for seed, env in enumerate(envs, start=number * copies):
         env.reset(seed=seed)
@@ -101,7 +102,7 @@ def bare_sampled(spec: EnvSpec, copies: int, number: int) -> Turn:
 
 
 def bare_drawn(spec: EnvSpec, copies: int, number: int) -> Turn:
-    """The fastest bare loop: no checker, actions drawn beforehand."""
+    """The fastest bare loop: without the checker, and with actions drawn beforehand."""
     envs = [spec.make() for _ in range(copies)]
     for seed, env in enumerate(envs, start=number * copies):
         env.reset(seed=seed)
@@ -118,7 +119,7 @@ def bare_drawn(spec: EnvSpec, copies: int, number: int) -> Turn:
 
 
 def bare_vector(kind: str, spec: EnvSpec, copies: int, number: int) -> Turn:
-    """A vectorised form, with actions drawn beforehand; a step in which a copy only resets is none."""
+    """A vectorized form, with actions drawn beforehand. Steps that only reset a copy are not counted."""
     if kind == "native":
         env = make_native(spec, copies)
         env.reset(seed=number)
@@ -135,19 +136,19 @@ def bare_vector(kind: str, spec: EnvSpec, copies: int, number: int) -> Turn:
 
 
 def _drawn(space: gymnasium.Space[Any], copies: int, number: int) -> Iterator[npt.NDArray[Any]]:
-    """Rows of actions [copies, *action], drawn beforehand, again and again."""
+    """An endless cycle of actions [copies, *action], drawn beforehand."""
     space.seed(number)
     return itertools.cycle([np.array([space.sample() for _ in range(copies)]) for _ in range(500)])
 
 
-class Blind:
-    """A policy that does not look: its params are zeros."""
+class ZeroPolicy:
+    """A policy without a network: its distribution parameters are zeros."""
 
     def __init__(self, spec: PolicySpec) -> None:
         self._params = distribution(spec).params_size
 
     def load(self, parameters: object, buffers: object) -> None:
-        """It has no weights."""
+        """Do nothing: it has no weights."""
 
     def __call__(self, leaves: Sequence[npt.NDArray[Any]], state: object = None) -> npt.NDArray[np.float32]:
         """Zeros [L, N, P]."""
@@ -155,22 +156,24 @@ class Blind:
 
 
 def ours(kind: str, lanes: int, images: ImagesDtype, spec: EnvSpec, copies: int, number: int) -> Turn:
-    """The collector over `lanes` lanes that share the copies; `images`: as what it looks at them."""
+    """The collector on `lanes` lanes that share the copies. `images`: precision in which the policy processes images."""
     made = spec.make()
-    about = PolicySpec(observation_leaves(made.observation_space), action_spec(made.action_space))
+    policy_spec = PolicySpec(observation_leaves(made.observation_space), action_spec(made.action_space))
     vector: Literal["loop", "native", "envpool"] = "loop"
     match kind:
         case "native" | "envpool":
             vector = kind
-    run = RunSpec(spec, about, rollout_steps=STEPS, copies=copies // lanes, lanes=PROCESSES * lanes, seed=1, vector=vector)
-    policy: Policy = Blind(about) if kind == "no network" else make_policy(about, images)
-    if about.needs_torch:
+    run = RunSpec(
+        spec, policy_spec, rollout_steps=STEPS, copies=copies // lanes, lanes=PROCESSES * lanes, seed=1, vector=vector
+    )
+    policy: Policy = ZeroPolicy(policy_spec) if kind == "no network" else make_policy(policy_spec, images)
+    if policy_spec.needs_torch:
         import torch
 
         torch.set_num_threads(1)
     collector = Collector(run, policy)
-    parameters = 0.01 * np.random.default_rng(0).standard_normal(acting_size(about), np.float32)
-    collector.load(parameters, np.zeros(buffer_size(about), np.float32))
+    parameters = 0.01 * np.random.default_rng(0).standard_normal(acting_size(policy_spec), np.float32)
+    collector.load(parameters, np.zeros(buffer_size(policy_spec), np.float32))
     mine = range(number * lanes, (number + 1) * lanes)
     sequence = 0
 
@@ -201,7 +204,7 @@ def _make(name: str, env: EnvSpec, copies: int, number: int) -> Turn:
 
 
 def _process(name: str, env: EnvSpec, copies: int, number: int, cpu: bool, pipe: Connection) -> None:
-    """Step for as long as is asked, each time it is asked."""
+    """Step for as many seconds as each request of the pipe says, and answer with the rate."""
     turn = _make(name, env, copies, number)
     clock = time.process_time if cpu else time.perf_counter
     while (seconds := pipe.recv()) is not None:
@@ -212,7 +215,7 @@ def _process(name: str, env: EnvSpec, copies: int, number: int, cpu: bool, pipe:
 
 
 class Pair:
-    """Two processes that do the same at the same time."""
+    """Two processes that run the same contender at the same time."""
 
     def __init__(self, name: str, copies: int, env: EnvSpec = CARTPOLE, *, cpu: bool = False) -> None:
         context = multiprocessing.get_context("spawn")
@@ -226,7 +229,7 @@ class Pair:
             self._processes.append(process)
 
     def rate(self, seconds: float) -> float:
-        """Env steps/s of both together."""
+        """Env steps/s of both processes together."""
         for pipe in self._pipes:
             pipe.send(seconds)
         return float(sum(pipe.recv() for pipe in self._pipes))
@@ -239,9 +242,9 @@ class Pair:
 
 
 def collecting(case: Case, rounds: int, seconds: float, *, cpu: bool) -> list[dict[str, object]]:
-    """A row for each contender: its rate and its share of the bare loops that take part."""
-    here = [name for name in case.contenders if "envpool" not in name or find_spec("envpool")]
-    pairs = {name: Pair(name, case.copies, case.env, cpu=cpu) for name in here}
+    """A row for each contender: its rate, and its share of the rates of the bare loops in this case."""
+    available = [name for name in case.contenders if "envpool" not in name or find_spec("envpool")]
+    pairs = {name: Pair(name, case.copies, case.env, cpu=cpu) for name in available}
     for pair in pairs.values():
         pair.rate(0.2)  # warm up
     turns = [{name: pair.rate(seconds) for name, pair in pairs.items()} for _ in range(rounds)]
@@ -264,7 +267,7 @@ def collecting(case: Case, rounds: int, seconds: float, *, cpu: bool) -> list[di
             "target_share": case.share if name.startswith("ours") else None,
             "target_rate": case.rate if name.startswith("native") else None,
         }
-        for name in here
+        for name in available
     ]
 
 
@@ -293,11 +296,11 @@ def show(rows: list[dict[str, object]], second: str) -> Table:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="collecting in two processes against the bare loop")
+    parser = argparse.ArgumentParser(description="speed of collecting in two processes, compared with a bare loop")
     parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--seconds", type=float, default=1.0, help="of each turn")
-    parser.add_argument("--cpu", action="store_true", help="count seconds of CPU")
-    parser.add_argument("--env", default="", help="only the cases whose environment has this in its id")
+    parser.add_argument("--seconds", type=float, default=1.0, help="seconds of each turn")
+    parser.add_argument("--cpu", action="store_true", help="count seconds of CPU time")
+    parser.add_argument("--env", default="", help="run only cases whose environment id contains this")
     arguments = parser.parse_args()
     rows: list[dict[str, object]] = []
     charts = []

@@ -1,8 +1,8 @@
-"""Memory of all processes of a CartPole-v1 run, beside Stable-Baselines3's: `python -m benchmarks.memory`.
+"""Memory of all processes of a CartPole-v1 run, compared with Stable-Baselines3: `python -m benchmarks.memory`.
 
-The most that was seen at one time over the run, of the whole process tree. What files back (libraries) is counted once for
-all its processes, what each has for itself is added up. Not PSS: that shares a library's pages with strangers, too, and
-another program with torch would halve it.
+Reports the highest memory of the whole process tree at one time. Pages of files (libraries) are counted once for all
+processes, private pages are added up. PSS is not used, because it divides the pages of a library among all programs of the
+machine: another program with torch would halve it.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from benchmarks.writing import bars, write
 
 STEPS = 20_000
 TARGET_WORKER_MB = 70
-EVERY_S = 0.3  # between two looks
+INTERVAL_S = 0.3  # between two measurements
 
 
 class Tree:
-    """The most memory that a process and its descendants took at one time, MB."""
+    """Highest memory of a process and its descendants at one time, in MB."""
 
     def __init__(self) -> None:
         self.own = self.rss = self.child_rss = 0.0
         self.processes = 0
         self._due_s = 0.0
 
-    def look(self, pid: int) -> None:
-        """Look once, unless it is too soon: to look costs time."""
+    def measure(self, pid: int) -> None:
+        """Measure once, unless it is too soon: a measurement takes time."""
         if time.monotonic() < self._due_s:
             return
         try:
@@ -58,13 +58,13 @@ class Tree:
                 self.child_rss = max(self.child_rss, resident / 1e6)
         self.own, self.rss = max(self.own, (own + sum(files.values())) / 1e6), max(self.rss, rss / 1e6)
         self.processes = max(self.processes, len(tree))
-        self._due_s = time.monotonic() + EVERY_S
+        self._due_s = time.monotonic() + INTERVAL_S
 
 
-def measure(contender: str) -> Tree:
-    """Of one run."""
+def measure_run(contender: str) -> Tree:
+    """Memory of one run."""
     tree = Tree()
-    run(contender, ZOO | {"steps": STEPS, "seed": 1}, look=tree.look)
+    run(contender, ZOO | {"steps": STEPS, "seed": 1}, look=tree.measure)
     return tree
 
 
@@ -73,7 +73,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=2)
     rounds = parser.parse_args().rounds
     names = [name for name in contenders() if not CONTENDERS[name].own]
-    turns = [{name: measure(name) for name in names} for _ in range(rounds)]
+    turns = [{name: measure_run(name) for name in names} for _ in range(rounds)]
     rows = [
         {
             "contender": name,

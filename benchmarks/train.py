@@ -56,7 +56,7 @@ class Measure(NamedTuple):
                 return {self.column: _rate(run(contender, settings).updates)}
             case "memory":
                 tree = Tree()
-                run(contender, settings, look=tree.look)
+                run(contender, settings, look=tree.measure)
                 return {self.column: tree.own}
             case _:
                 ran = run(contender, settings, SOLVED)

@@ -1,7 +1,7 @@
-"""What a worker process costs: seconds from exec to first rollout, and resident memory: `python -m benchmarks.worker`.
+"""Start-up time and memory of a worker process: `python -m benchmarks.worker`.
 
-A real `python -m workers` over ipc and a bare hub. Two policies: an MLP, which acts in numpy and imports no torch, and an
-image policy, which needs it.
+Measures the seconds from exec to the first rollout, and resident memory, of a real `python -m workers` over ipc with a hub
+alone. There are two policies: an MLP, which acts in numpy without torch, and an image policy, which needs torch.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def start_one(env: EnvSpec) -> tuple[float, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="what a worker process costs")
+    parser = argparse.ArgumentParser(description="start-up time and memory of a worker process")
     parser.add_argument("--rounds", type=int, default=7)
     rounds = parser.parse_args().rounds
     turns = [{name: start_one(env) for name, env in CASES.items()} for _ in range(rounds)]

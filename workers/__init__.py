@@ -1,1 +1,1 @@
-"""Steps environments and streams rollouts. Never imports learner; for an MLP policy, never imports torch."""
+"""Workers step environments and stream rollouts. Never imports learner. Imports torch only for an image policy."""

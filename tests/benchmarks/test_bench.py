@@ -64,5 +64,5 @@ def test_bars() -> None:
 
 def test_memory_of_a_process_that_has_ended_is_nothing() -> None:
     tree = Tree()
-    tree.look(2**22 + 1)  # no such process
+    tree.measure(2**22 + 1)  # no such process
     assert (tree.own, tree.processes) == (0.0, 0)

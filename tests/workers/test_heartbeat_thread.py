@@ -1,4 +1,4 @@
-"""One thread at a time has the conversation: the second only while the first is away, in the environment's code."""
+"""Only one thread at a time has the lock: the second sends heartbeats only while the first runs the environment's code."""
 
 from __future__ import annotations
 
@@ -13,57 +13,57 @@ SOON_S = 10.0
 
 
 @pytest.fixture(autouse=True)
-def often(monkeypatch: pytest.MonkeyPatch) -> None:
+def short_interval(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(heartbeat_thread, "INTERVAL_S", 0.001)
 
 
-def test_it_breathes_while_the_first_thread_is_away() -> None:
-    breathed = threading.Event()
-    made = HeartbeatThread(breathed.set)
-    made.start()
-    made.start()
-    with made.lock_released():
-        assert breathed.wait(SOON_S)
-    made.stop()
+def test_it_sends_heartbeats_while_the_first_thread_has_released_the_lock() -> None:
+    sent = threading.Event()
+    heartbeats = HeartbeatThread(sent.set)
+    heartbeats.start()
+    heartbeats.start()
+    with heartbeats.lock_released():
+        assert sent.wait(SOON_S)
+    heartbeats.stop()
     assert not any(thread.name == "heartbeat" for thread in threading.enumerate())
 
 
-def test_it_holds_its_breath_while_the_first_thread_is_here_or_back() -> None:
-    inside, breathed = threading.Event(), threading.Event()
-    meetings: list[str] = []
+def test_it_sends_none_while_the_first_thread_has_the_lock() -> None:
+    first_thread_has_lock, sent = threading.Event(), threading.Event()
+    overlaps: list[str] = []
 
-    def breathe() -> None:
-        if inside.is_set():
-            meetings.append("both")
-        breathed.set()
+    def heartbeat() -> None:
+        if first_thread_has_lock.is_set():
+            overlaps.append("both")
+        sent.set()
 
-    made = HeartbeatThread(breathe)
-    inside.set()
-    made.start()
+    heartbeats = HeartbeatThread(heartbeat)
+    first_thread_has_lock.set()
+    heartbeats.start()
     for _ in range(100):
-        inside.clear()
-        with made.lock_released():
-            breathed.clear()
-            assert breathed.wait(SOON_S)
-            with made.lock_reacquired():
-                inside.set()
-                breathed.clear()
-                assert not breathed.wait(0.002)
-                inside.clear()
-        inside.set()
-    made.stop()
-    assert meetings == []
+        first_thread_has_lock.clear()
+        with heartbeats.lock_released():
+            sent.clear()
+            assert sent.wait(SOON_S)
+            with heartbeats.lock_reacquired():
+                first_thread_has_lock.set()
+                sent.clear()
+                assert not sent.wait(0.002)
+                first_thread_has_lock.clear()
+        first_thread_has_lock.set()
+    heartbeats.stop()
+    assert overlaps == []
 
 
-def test_what_the_environment_raises_brings_the_first_thread_back() -> None:
-    breathed = threading.Event()
-    made = HeartbeatThread(breathed.set)
-    with pytest.raises(KeyError), made.lock_released():
+def test_the_first_thread_has_the_lock_again_when_the_environment_raises() -> None:
+    sent = threading.Event()
+    heartbeats = HeartbeatThread(sent.set)
+    with pytest.raises(KeyError), heartbeats.lock_released():
         raise KeyError
-    made.start()
-    assert not breathed.wait(0.01)
-    made.stop()
+    heartbeats.start()
+    assert not sent.wait(0.01)
+    heartbeats.stop()
 
 
-def test_one_that_never_started_can_be_stopped() -> None:
+def test_a_thread_that_never_started_can_be_stopped() -> None:
     HeartbeatThread(lambda: None).stop()

@@ -1,4 +1,4 @@
-"""The host's law: who is started again, and when. Time and processes are faked."""
+"""Which workers the host starts again, and when. Time and processes are faked."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from workers.host import BACKOFF_FIRST_S, BACKOFF_MOST_S, EXIT_NO_LEARNER, HEALT
 @dataclass
 class FakeRunning:
     end: tuple[int, str] | None = None
-    asked: list[str] = field(default_factory=list)
+    requests: list[str] = field(default_factory=list)
 
     def ended(self) -> tuple[int, str] | None:
         return self.end
 
     def stop(self) -> None:
-        self.asked.append("stop")
+        self.requests.append("stop")
 
     def wait(self, timeout_s: float) -> None:
-        self.asked.append("wait")
+        self.requests.append("wait")
 
     def kill(self) -> None:
-        self.asked.append("kill")
+        self.requests.append("kill")
 
 
 class Machine:
-    """Starts fakes and tells the time."""
+    """Starts fake workers and has a clock."""
 
     def __init__(self, workers: int = 1) -> None:
         self.now = 0.0
@@ -45,7 +45,7 @@ class Machine:
         return self.host.poll()
 
     def pause_s(self) -> float:
-        """How long until it is started again, to a tenth of a second."""
+        """Seconds until the worker is started again, to a tenth of a second."""
         before, died_s = len(self.started), self.now
         while len(self.started) == before:
             self.now += 0.1
@@ -54,7 +54,7 @@ class Machine:
         return self.now - died_s
 
 
-def test_a_worker_that_died_comes_back_under_its_name_after_a_pause_that_doubles() -> None:
+def test_a_worker_that_died_is_restarted_under_its_name_with_backoff() -> None:
     machine = Machine()
     pauses = []
     for _ in range(9):
@@ -65,7 +65,7 @@ def test_a_worker_that_died_comes_back_under_its_name_after_a_pause_that_doubles
     assert pauses == pytest.approx(expected, abs=0.11)
 
 
-def test_a_worker_that_was_healthy_starts_anew() -> None:
+def test_the_backoff_of_a_worker_that_was_healthy_is_reset() -> None:
     machine = Machine()
     for _ in range(4):
         machine.die(-9)
@@ -75,7 +75,7 @@ def test_a_worker_that_was_healthy_starts_anew() -> None:
 
 
 @pytest.mark.parametrize("code", [0, 2, EXIT_NO_LEARNER])
-def test_one_that_left_on_purpose_or_was_refused_stays_away(code: int) -> None:
+def test_a_worker_that_left_on_purpose_or_was_refused_is_not_restarted(code: int) -> None:
     machine = Machine()
     assert machine.die(code) == [("w0", "why")]
     machine.now += 10 * BACKOFF_MOST_S
@@ -83,19 +83,19 @@ def test_one_that_left_on_purpose_or_was_refused_stays_away(code: int) -> None:
     assert len(machine.started) == 1
 
 
-def test_each_end_is_told_once() -> None:
+def test_each_end_is_reported_once() -> None:
     machine = Machine(workers=2)
     assert machine.die(1) == [("w1", "why")]
     assert machine.host.poll() == []
 
 
-def test_stopping_asks_all_waits_for_all_and_starts_nobody() -> None:
+def test_stop_asks_all_waits_for_all_and_restarts_none() -> None:
     machine = Machine(workers=2)
     machine.die(1)
     machine.host.stop()
     machine.now += 10
     assert machine.host.poll() == []
-    assert [running.asked for _, running in machine.started] == [["stop", "wait"], []]
+    assert [running.requests for _, running in machine.started] == [["stop", "wait"], []]
 
 
 @pytest.mark.parametrize(
@@ -108,30 +108,32 @@ def test_stopping_asks_all_waits_for_all_and_starts_nobody() -> None:
         ([EXIT_NO_LEARNER, EXIT_NO_LEARNER], 1),
     ],
 )
-def test_a_host_that_nobody_is_left_on_says_what_became_of_them(codes: list[int], expected: int) -> None:
+def test_a_host_without_workers_returns_the_exit_code_and_reports_each_end(codes: list[int], expected: int) -> None:
     machine = Machine(workers=2)
     for (_, running), code in zip(machine.started, codes, strict=True):
         running.end = (code, f"ended with {code}")
-    said: list[str] = []
-    assert machine.host.run(lambda: 0, said.append) == expected
-    assert said == [f"w0 ended with {codes[0]}", f"w1 ended with {codes[1]}"]
+    reports: list[str] = []
+    assert machine.host.run(lambda: 0, reports.append) == expected
+    assert reports == [f"w0 ended with {codes[0]}", f"w1 ended with {codes[1]}"]
 
 
-def test_every_request_to_stop_is_passed_on_and_patience_has_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_request_to_stop_is_passed_on_and_a_worker_that_does_not_leave_is_killed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     machine = Machine(workers=1)
     worker = machine.started[0][1]
     requests = 0
 
     def sleeps(seconds: float) -> None:
-        """Time goes on; the worker is asked twice, and does not listen before it is killed."""
+        """Time passes; the worker is asked twice, and ends only when it is killed."""
         nonlocal requests
         machine.now += seconds
         requests = 2 if machine.now > 5 else 1 if machine.now > 1 else 0
-        if "wait" in worker.asked:
+        if "wait" in worker.requests:
             worker.end = (-9, "was killed")
 
     monkeypatch.setattr("workers.host.time.sleep", sleeps)
     assert machine.host.run(lambda: requests, lambda line: None) == 1
-    assert worker.asked == ["stop", "stop", "stop", "wait"]
+    assert worker.requests == ["stop", "stop", "stop", "wait"]
     assert machine.now == pytest.approx(1 + LEAVE_WITHIN_S, abs=5 * POLL_S)
     assert len(machine.started) == 1

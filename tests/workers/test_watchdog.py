@@ -1,4 +1,4 @@
-"""The watchdog, in processes of its own: who is fed lives, who hangs is ended, and it is said where."""
+"""The watchdog, in processes of its own: it ends a process that hangs, and reports where it hung."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ watchdog.stop()
 time.sleep({after_s})
 print("alive")
 """
-FEEDS = "for _ in range(12): watchdog.feed(time.monotonic()); time.sleep(0.1)"
+FEED_OFTEN = "for _ in range(12): watchdog.feed(time.monotonic()); time.sleep(0.1)"
 
 
-def played(tmp_path: Path, hang: str, timeout_s: float, after_s: float = 0) -> subprocess.CompletedProcess[str]:
+def run_program(tmp_path: Path, hang: str, timeout_s: float, after_s: float = 0) -> subprocess.CompletedProcess[str]:
     script = tmp_path / "script.py"
     script.write_text(PROGRAM.format(hang=hang, timeout_s=timeout_s, after_s=after_s))
     root = str(Path(__file__).parents[2])
@@ -38,8 +38,8 @@ def played(tmp_path: Path, hang: str, timeout_s: float, after_s: float = 0) -> s
 
 
 @pytest.mark.parametrize("hang", ["time.sleep(60)", "re.match('(a+)+$', 'a' * 60 + 'b')"], ids=["sleeps", "in C, lock held"])
-def test_one_that_hangs_is_ended_and_it_is_said_where(tmp_path: Path, hang: str) -> None:
-    found = played(tmp_path, hang, 0.3)
+def test_a_process_that_hangs_is_ended_and_the_line_is_reported(tmp_path: Path, hang: str) -> None:
+    found = run_program(tmp_path, hang, 0.3)
     assert (found.returncode, found.stdout) == (1, "")
     assert "script.py" in found.stderr
     where = where_it_hung(found.stderr)
@@ -47,10 +47,10 @@ def test_one_that_hangs_is_ended_and_it_is_said_where(tmp_path: Path, hang: str)
     assert where.endswith("in step") or "in match" in where
 
 
-def test_one_that_is_fed_lives_and_so_does_one_that_is_watched_no_more(tmp_path: Path) -> None:
-    assert played(tmp_path, FEEDS, 0.5, after_s=1.0).stdout == "alive\n"
+def test_a_process_that_feeds_or_stops_the_watchdog_is_not_ended(tmp_path: Path) -> None:
+    assert run_program(tmp_path, FEED_OFTEN, 0.5, after_s=1.0).stdout == "alive\n"
 
 
-def test_a_log_without_a_hang_tells_of_none() -> None:
+def test_output_without_a_hang_has_no_line() -> None:
     assert where_it_hung("Traceback …\nValueError: no") is None
     assert where_it_hung("said before\nTimeout (0:02:00)!\n") == "an unknown place"

@@ -1,1 +1,1 @@
-"""Rollouts: env copies of a lane, stepped with the policy's actions."""
+"""Collecting rollouts: the env copies of a lane are stepped with the actions of the policy."""

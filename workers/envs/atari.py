@@ -1,8 +1,8 @@
-"""Atari games as Mnih et al. (2015) show them to a network: each fourth screen, grey, 84 × 84, the last four of them.
+"""Atari games with the preprocessing of Mnih et al. (2015): every fourth screen, grayscale, 84 × 84, the last four.
 
-The law: one stack of screens [4, 84, 84], whoever steps the game. A game alone, the emulator's vectorised form and envpool
-differ in nothing but their random numbers, and in what stands before an episode's first screen (nothing; envpool repeats
-it). Up to 30 screens without an action begin an episode; rewards are the game's own.
+The law: an observation is a stack of screens [4, 84, 84], whichever program steps the game. A single game, the vectorized
+form of the emulator and envpool differ only in their random numbers, and in the frames before an episode's first screen:
+zeros, except that envpool repeats the first screen. An episode starts with up to 30 no-op actions. Rewards are not clipped.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import gymnasium
 from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation
 
 FRAMES, SKIP, SIDE, NOOPS = 4, 4, 84, 30
-MAX_FRAMES = 108_000  # of an episode: half an hour of play
+MAX_FRAMES = 108_000  # in an episode: half an hour of play
 
 
 def make_game(game: str = "Pong", repeat_action_probability: float = 0.0, **options: Any) -> gymnasium.Env[Any, Any]:
-    """One copy; `options` are those of `gymnasium.make`. Needs ale-py and OpenCV."""
-    _quiet()
+    """One env copy. `options` are further arguments of `gymnasium.make`. Needs ale-py and OpenCV."""
+    _silence_emulator()
     sticky: dict[str, Any] = {
         "repeat_action_probability": repeat_action_probability,
         "max_num_frames_per_episode": MAX_FRAMES,
@@ -28,8 +28,8 @@ def make_game(game: str = "Pong", repeat_action_probability: float = 0.0, **opti
 
 
 def make_games(num_envs: int, game: str = "Pong", repeat_action_probability: float = 0.0) -> Any:
-    """So many copies, stepped at once by the emulator's own code; in one thread, for there is a worker for each core."""
-    _quiet()
+    """`num_envs` copies that the emulator steps together; in one thread, because there is a worker for each core."""
+    _silence_emulator()
     return gymnasium.make_vec(
         f"ale_py:ALE/{game}-v5",
         num_envs,
@@ -44,15 +44,15 @@ def make_games(num_envs: int, game: str = "Pong", repeat_action_probability: flo
     )
 
 
-def _quiet() -> None:
-    """The emulator says who it is in every process, unless it is told not to."""
+def _silence_emulator() -> None:
+    """Otherwise the emulator prints its name and version in every process."""
     import ale_py
 
     ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)
 
 
 def _envpool(game: str = "Pong", repeat_action_probability: float = 0.0) -> tuple[str, dict[str, Any]]:
-    """What envpool calls it, and its options there."""
+    """Name and options of the game in envpool."""
     options = {"noop_max": NOOPS, "use_fire_reset": False, "repeat_action_probability": repeat_action_probability}
     return f"{game}-v5", {**options, "frame_skip": SKIP, "stack_num": FRAMES, "max_episode_steps": MAX_FRAMES // SKIP}
 

@@ -1,12 +1,12 @@
-"""A cart that balances two links, one on top of the other: the equations of motion, the environment.
+"""A cart that balances two links, one on top of the other: the equations of motion and the environment.
 
-The law: with q = (x, θ, φ), both angles absolute, 0 upright, positive towards +x, and a mass M of inertia I at the end of
-each massless link, the Lagrangian
+The law: q = (x, θ, φ). Both angles are absolute, 0 is upright and positive is towards +x. At the end of each massless link
+is a mass M with inertia I. The Lagrangian
 
     L = ½ m ẋ² + ½ M (v₁² + v₂²) + ½ I (θ̇² + φ̇²) − M g l (2 cos θ + cos φ),   v₁, v₂ the speeds of the two masses,
 
 gives M(q) q̈ + c(q, q̇) = (F − friction · ẋ, 0, 0). A step applies one force for `dt_s` seconds, in `substeps` equal steps of
-the classical Runge–Kutta method of fourth order. Plain floats, because for three unknowns they are faster than arrays.
+the classical Runge–Kutta method of fourth order. Uses Python floats: for three unknowns they are faster than arrays.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SPEED_LIMIT = 50.0  # m/s and rad/s: far beyond what the force can do on the tra
 
 @dataclass(frozen=True)
 class Physics:
-    """The constants of the Lagrangian. `friction_Ns_m` is what the cart's speed is multiplied with."""
+    """The constants of the Lagrangian. `friction_Ns_m` times the cart's speed is the friction force."""
 
     cart_kg: float = 1.0
     link_kg: float = 0.1
@@ -91,7 +91,7 @@ def mass_matrix(physics: Physics, theta_rad: float = 0.0, phi_rad: float = 0.0) 
 
 
 def energy(physics: Physics, state: Sequence[float]) -> float:
-    """In joules: ½ q̇ᵀ M(q) q̇ + M g l (2 cos θ + cos φ). Constant where there is neither force nor friction."""
+    """Energy in joules: ½ q̇ᵀ M(q) q̇ + M g l (2 cos θ + cos φ). Constant without force and friction."""
     _, theta_rad, phi_rad, *speeds = state
     speed = np.array(speeds)
     mgl = physics.link_kg * physics.gravity_m_s2 * physics.link_m
@@ -100,7 +100,7 @@ def energy(physics: Physics, state: Sequence[float]) -> float:
 
 
 def linear_model(physics: Physics) -> tuple[Doubles, Doubles]:
-    """A [6, 6] and B [6] at the top, d state/dt = A state + B F: sin α becomes α, cos α 1, and squares of speeds 0."""
+    """A [6, 6] and B [6] of d state/dt = A state + B F, linear at the top: sin α = α, cos α = 1, squared speeds = 0."""
     mgl = physics.link_kg * physics.gravity_m_s2 * physics.link_m
     forces = [[0, 0, 0, -physics.friction_Ns_m, 0, 0, 1], [0, 2 * mgl, 0, 0, 0, 0, 0], [0, 0, mgl, 0, 0, 0, 0]]
     solved = np.linalg.solve(mass_matrix(physics), np.array(forces))  # [3, 7]: by state, then by F
@@ -108,7 +108,7 @@ def linear_model(physics: Physics) -> tuple[Doubles, Doubles]:
 
 
 def linear_accelerations(physics: Physics) -> Accelerations:
-    """The same function as `accelerations`, of the linear model."""
+    """The same function as `accelerations`, for the linear model."""
     a, b = linear_model(physics)
     (x1, x2, x3, x4), (t1, t2, t3, t4), (p1, p2, p3, p4) = np.column_stack([a[3:, 1:4], b[3:]]).tolist()
 
@@ -125,7 +125,7 @@ def linear_accelerations(physics: Physics) -> Accelerations:
 
 
 def advance(solve: Accelerations, state: State, force: float, h: float) -> State:
-    """One Runge–Kutta step of fourth order, `h` seconds long: k₁ to k₄ are (speeds, accelerations) of its four points."""
+    """One Runge–Kutta step of fourth order, `h` seconds long: k₁ to k₄ are (speeds, accelerations) at its four points."""
     x, t, p, u1, v1, w1 = state
     half = h / 2
     a1, b1, c1 = solve(t, p, u1, v1, w1, force)
@@ -149,13 +149,13 @@ def advance(solve: Accelerations, state: State, force: float, h: float) -> State
 class CartDoublePendulum(gymnasium.Env[Floats, Floats]):
     """Keep both links up by pushing the cart.
 
-    Action, Box [1] float32: the force, as a part of `force_limit_N`, from -1 to 1; beyond it is clipped.
+    Action, Box [1] float32: the force divided by `force_limit_N`; clipped to -1 to 1.
     Observation, Box [6] float32: x_m, theta_rad, phi_rad, x_dot_m_s, theta_dot_rad_s, phi_dot_rad_s; θ is the lower link.
-    Start: each of these six uniform in ±`start_spread`.
-    Reward of a step that ends up: 1 − 0.3 (x / track)² − 0.3 (θ² + φ²) / 2 angle_limit² − 0.05 action², so from 0.35 to 1;
-    of a step that ends down: 0.
+    Start: each of these six is drawn uniformly from ±`start_spread`.
+    Reward: 1 − 0.3 (x / track)² − 0.3 (θ² + φ²) / 2 angle_limit² − 0.05 action² of a step after which both links are up,
+    so from 0.35 to 1; otherwise 0.
     Terminated: |x| above `track_m`, or |θ| or |φ| above `angle_limit_rad`, or a speed above `SPEED_LIMIT`. Truncated: never,
-    but `gymnasium.make` adds a time limit of 500 steps, 10 s. With `linearised`, the linear model at the top moves it.
+    but `gymnasium.make` adds a time limit of 500 steps (10 s). With `linearised`, it moves as the linear model does.
     Other keyword arguments are those of `Physics`.
     """
 
@@ -187,18 +187,18 @@ class CartDoublePendulum(gymnasium.Env[Floats, Floats]):
         self.metadata = self.metadata | {"render_fps": round(1 / dt_s)}
         self.force_limit_N, self.dt_s, self.substeps = force_limit_N, dt_s, substeps
         self.track_m, self.angle_limit_rad, self.start_spread = track_m, angle_limit_rad, start_spread
-        # Twice the limits of x and the angles: the last observation of an episode lies inside, too.
+        # Twice the limits of x and the angles, so that the last observation of an episode is inside, too.
         self._high = np.array([2 * track_m, *[2 * angle_limit_rad] * 2, *[SPEED_LIMIT] * 3], np.float32)
         self.observation_space = spaces.Box(-self._high, self._high, dtype=np.float32)
         self.action_space = spaces.Box(-1, 1, (1,), np.float32)
         self.state: State | None = None
-        self.push = 0.0  # the last action, clipped
+        self.push = 0.0  # last action, clipped
         self._solve = (linear_accelerations if linearised else accelerations)(self.physics)
         self._x_cost, self._angle_cost = 0.3 / track_m**2, 0.15 / angle_limit_rad**2
         self._screen: Screen | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
-        """Stand nearly upright."""
+        """Start nearly upright."""
         super().reset(seed=seed)
         x, theta, phi, *speeds = self.np_random.uniform(-self.start_spread, self.start_spread, 6).tolist()
         self.state = (x, theta, phi, *speeds)
@@ -241,7 +241,7 @@ class CartDoublePendulum(gymnasium.Env[Floats, Floats]):
         return observation, reward, not up, False, {}
 
     def render(self) -> Any:
-        """The picture [400, 600, 3] uint8 with "rgb_array"; None otherwise, and a window with "human"."""
+        """A picture [400, 600, 3] uint8 with "rgb_array"; with "human", show it in a window and return None."""
         if self.render_mode is None:
             gymnasium.logger.warn(
                 'CartDoublePendulum: render() needs a render_mode, "rgb_array" or "human", given to make()'

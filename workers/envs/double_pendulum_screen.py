@@ -1,4 +1,4 @@
-"""Pictures of the cart with two links, by pygame, which is imported when the first is drawn and not before."""
+"""Renders the cart with two links with pygame, which is imported when the first picture is drawn."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SCREEN = (600, 400)  # pixels: width, height
 
 
 class Screen:
-    """Draws a state with pygame: at twice the size, then made smaller, so that edges are smooth."""
+    """Draws a state with pygame, at twice the size and then scaled down, so that edges are smooth."""
 
     def __init__(self, window: bool, track_m: float, link_m: float) -> None:
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
@@ -30,7 +30,7 @@ class Screen:
         width, height = SCREEN
         self._scale = 2 * min(
             width / (2 * track_m + 0.8), 0.6 * height / (2 * link_m)
-        )  # pixels of the large picture a metre
+        )  # pixels of the large picture for each meter
         self._canvas = self._pygame.Surface((2 * width, 2 * height))
         self._window = self._clock = None
         if window:
@@ -40,7 +40,7 @@ class Screen:
             self._clock = self._pygame.time.Clock()
 
     def show(self, state: Sequence[float], push: float, fps: int) -> npt.NDArray[np.uint8] | None:
-        """Draw it; give the pixels if there is no window."""
+        """Draw the state. Without a window, returns the pixels [400, 600, 3] uint8."""
         self._draw(state[0], state[1], state[2], push)
         picture = self._pygame.transform.smoothscale(self._canvas, SCREEN)
         if self._window is None or self._clock is None:
@@ -57,7 +57,7 @@ class Screen:
         ground, cart_x, top = 0.72 * height, width / 2 + scale * x_m, 0.72 * height - 66
         left, right = (width / 2 + scale * side for side in (-self._track_m, self._track_m))
         canvas.fill("#f6f4ef")
-        draw.line(canvas, "#d9d4c7", (width / 2, ground + 8), (width / 2, ground + 34), 3)  # the middle
+        draw.line(canvas, "#d9d4c7", (width / 2, ground + 8), (width / 2, ground + 34), 3)  # mark of the middle
         draw.rect(canvas, "#8a8577", (left, ground, right - left, 8))
         for end in (left, right):
             draw.rect(canvas, "#8a8577", (end - 6, ground - 44, 12, 52), border_radius=6)
@@ -70,22 +70,22 @@ class Screen:
             draw.line(canvas, "#c8553d", (cart_x + 84 * side, top + 24), (tip, top + 24), 8)
             draw.polygon(canvas, "#c8553d", [(tip, top + 10), (tip + 22 * side, top + 24), (tip, top + 38)])
         joint = (cart_x, top)
-        for angle_rad, colour in ((theta_rad, "#2a9d8f"), (phi_rad, "#e9a23b")):
+        for angle_rad, color in ((theta_rad, "#2a9d8f"), (phi_rad, "#e9a23b")):
             reach = scale * self._link_m
             end_point = (joint[0] + reach * math.sin(angle_rad), joint[1] - reach * math.cos(angle_rad))
-            self._rod(joint, end_point, colour)
+            self._rod(joint, end_point, color)
             draw.circle(canvas, "#33415c", joint, 9)
             joint = end_point
-            draw.circle(canvas, colour, joint, 20)
+            draw.circle(canvas, color, joint, 20)
         draw.circle(canvas, "#f6f4ef", joint, 7)
 
-    def _rod(self, start: tuple[float, float], end: tuple[float, float], colour: str) -> None:
-        """A thick line with square ends across its direction, which pygame's own has not."""
+    def _rod(self, start: tuple[float, float], end: tuple[float, float], color: str) -> None:
+        """A thick line whose ends are at right angles to it, which those of pygame's line are not."""
         (x1, y1), (x2, y2) = start, end
         across = 8 / (math.hypot(x2 - x1, y2 - y1) or 1)
         dx, dy = (y2 - y1) * across, (x1 - x2) * across
         points = [(x1 + dx, y1 + dy), (x1 - dx, y1 - dy), (x2 - dx, y2 - dy), (x2 + dx, y2 + dy)]
-        self._pygame.draw.polygon(self._canvas, colour, points)
+        self._pygame.draw.polygon(self._canvas, color, points)
 
     def close(self) -> None:
         """Close the window."""

@@ -1,4 +1,4 @@
-"""Toy environments: with known answers, with every space, slow and broken ones; for tests and benchmarks.
+"""Toy environments for tests and benchmarks: with known returns, with every supported space, slow ones and faulty ones.
 
 Importing this file registers each class under its name: `gymnasium.make("workers.envs.toy:Countdown-v0", k=3)`.
 """
@@ -22,9 +22,9 @@ Info = dict[str, Any]
 
 
 class Scripted(gymnasium.Env[Floats, Any]):
-    """Plays a script, one letter a step, again and again: `.` goes on, `t` terminated, `u` truncated, `b` both.
+    """Plays a script again and again, one letter for each step: `.` goes on, `t` terminates, `u` truncates, `b` does both.
 
-    Observations are [episode, steps in it], both from 0; the reward of a step is the number of steps so far, from 1.
+    Observations are [episode, steps in it], both from 0. The reward of a step is the number of steps in the episode, from 1.
     """
 
     def __init__(self, script: str = "...t") -> None:
@@ -35,7 +35,7 @@ class Scripted(gymnasium.Env[Floats, Any]):
         self._episode = -1
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Floats, Info]:
-        """Begin the next episode, where the script stands."""
+        """Start the next episode. The script goes on where it was."""
         super().reset(seed=seed)
         self._episode += 1
         self._steps = 0
@@ -75,7 +75,7 @@ class Countdown(gymnasium.Env[Floats, Any]):
         self._k, self._reward, self._left = k, reward, k
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Floats, Info]:
-        """Begin at `k`."""
+        """Start at `k`."""
         super().reset(seed=seed)
         self._left = self._k
         return self._observation(), {}
@@ -90,7 +90,7 @@ class Countdown(gymnasium.Env[Floats, Any]):
 
 
 class Identity(gymnasium.Env[Floats, Any]):
-    """Shows one of `n` signs, one-hot; the reward is 1 for the action of that number. Truncates after 10 steps."""
+    """Shows one of `n` signs, one-hot. The reward is 1 if the action is the number of the sign. Truncates after 10 steps."""
 
     def __init__(self, n: int = 4) -> None:
         self.observation_space = spaces.Box(0, 1, (n,), np.float32)
@@ -105,7 +105,7 @@ class Identity(gymnasium.Env[Floats, Any]):
         return self._show(), {}
 
     def step(self, action: Any) -> tuple[Floats, float, bool, bool, Info]:
-        """Judge the action, show the next sign."""
+        """Reward the action, and show the next sign."""
         reward = float(int(action) == self._sign)
         self._steps += 1
         return self._show(), reward, False, self._steps == 10, {}
@@ -116,9 +116,9 @@ class Identity(gymnasium.Env[Floats, Any]):
 
 
 class Recall(gymnasium.Env[Floats, Any]):
-    """Shows one of `n` signs, one-hot, for one step; the reward of the step `delay` steps later is 1 for its number.
+    """Shows one of `n` signs, one-hot, for one step. The action `delay` steps later gets 1 if it is the number of the sign.
 
-    In between, and when it asks, the observation is zeros: without memory the mean return is 1 / n.
+    All other observations are zeros, so the mean return of a policy without memory is 1 / n.
     """
 
     def __init__(self, n: int = 3, delay: int = 3) -> None:
@@ -134,27 +134,27 @@ class Recall(gymnasium.Env[Floats, Any]):
         return np.eye(self._n, dtype=np.float32)[self._sign], {}
 
     def step(self, action: Any) -> tuple[Floats, float, bool, bool, Info]:
-        """Show nothing; judge the last action."""
+        """Show zeros; reward the last action of the episode."""
         self._steps += 1
         last = self._steps > self._delay
         return np.zeros(self._n, np.float32), float(last and int(action) == self._sign), last, False, {}
 
 
 class Slow(Countdown):
-    """A countdown that takes `seconds` a step, and MILLRACE_TOY_SLEEPS_S more: one worker may be slower than others."""
+    """A countdown whose step takes `seconds`, and MILLRACE_TOY_SLEEPS_S more, so that one worker may be slower."""
 
     def __init__(self, seconds: float = 0.01, k: int = 5) -> None:
         super().__init__(k)
         self._seconds = seconds + float(os.environ.get("MILLRACE_TOY_SLEEPS_S", "0"))
 
     def step(self, action: Any) -> tuple[Floats, float, bool, bool, Info]:
-        """Sleep, then count."""
+        """Sleep, then count down."""
         time.sleep(self._seconds)
         return super().step(action)
 
 
 class Frames(gymnasium.Env[npt.NDArray[np.uint8], Any]):
-    """Frames 84 x 84 x 4 such as Atari games give, drawn at the start; an episode has 100 steps."""
+    """Random frames 84 x 84 x 4, of the size of Atari observations, drawn at the start. An episode has 100 steps."""
 
     def __init__(self) -> None:
         self.observation_space = spaces.Box(0, 255, (84, 84, 4), np.uint8)
@@ -163,7 +163,7 @@ class Frames(gymnasium.Env[npt.NDArray[np.uint8], Any]):
         self._steps = 0
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[npt.NDArray[np.uint8], Info]:
-        """Begin at the first frame."""
+        """Start at the first frame."""
         super().reset(seed=seed)
         self._steps = 0
         return self._frames[0], {}
@@ -175,10 +175,10 @@ class Frames(gymnasium.Env[npt.NDArray[np.uint8], Any]):
 
 
 class Faulty(Countdown):
-    """A countdown that goes wrong at its step number `after` (from 0) and at all later ones; says how in `fault`.
+    """A countdown that fails at its step number `after` (from 0) and at all later ones. `fault` says how.
 
-    With `once`, a path, it goes wrong only if it can create that file: one time, whoever makes the environment again.
-    With `only_seed` it goes wrong only where that was the seed of its first reset: in one copy of one life of one lane.
+    With `once`, a path, it fails only if it can create that file: one time, even if the environment is made again.
+    With `only_seed` it fails only if that was the seed of its first reset: in one copy of one incarnation of one lane.
     """
 
     def __init__(self, after: int = 3, once: str = "", k: int = 5, only_seed: int | None = None) -> None:
@@ -188,12 +188,12 @@ class Faulty(Countdown):
         self._seed: int | None = None
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Floats, Info]:
-        """Begin at `k`."""
+        """Start at `k`."""
         self._seed = seed if self._seed is None else self._seed
         return super().reset(seed=seed)
 
     def step(self, action: Any) -> tuple[Floats, float, bool, bool, Info]:
-        """Count down, or go wrong."""
+        """Count down, or fail."""
         row = super().step(action)
         self._total += 1
         return self.fault(*row) if self._total > self._after and self._due() else row
@@ -211,7 +211,7 @@ class Faulty(Countdown):
     def fault(
         self, observation: Floats, reward: float, terminated: bool, truncated: bool, info: Info
     ) -> tuple[Floats, float, bool, bool, Info]:
-        """What is wrong with this row."""
+        """Fail, or return a wrong row instead of this one."""
         raise NotImplementedError
 
 
@@ -224,23 +224,23 @@ class Raises(Faulty):
 
 
 class NaNReward(Faulty):
-    """Gives a reward that is not a number."""
+    """Returns a reward of NaN."""
 
     def fault(self, observation: Floats, reward: float, *rest: Any) -> tuple[Floats, float, bool, bool, Info]:
-        """Spoil the reward."""
+        """Replace the reward."""
         return (observation, np.nan, *rest)
 
 
 class NaNObservation(Faulty):
-    """Gives an observation that is not a number."""
+    """Returns an observation of NaN."""
 
     def fault(self, observation: Floats, *rest: Any) -> tuple[Floats, float, bool, bool, Info]:
-        """Spoil the observation."""
+        """Replace the observation."""
         return (observation * np.float32(np.nan), *rest)
 
 
 class Hangs(Faulty):
-    """Does not come back from `step`, for an hour."""
+    """Does not return from `step` for an hour."""
 
     def fault(self, *row: Any) -> tuple[Floats, float, bool, bool, Info]:
         """Hang."""
@@ -249,10 +249,10 @@ class Hangs(Faulty):
 
 
 class Dies(Faulty):
-    """Takes its process with it, as a crash in C would."""
+    """Kills its process, as a crash in C code would."""
 
     def fault(self, *row: Any) -> tuple[Floats, float, bool, bool, Info]:
-        """Die at once."""
+        """Kill the process."""
         os.kill(os.getpid(), signal.SIGKILL)
         return row
 
@@ -297,7 +297,7 @@ UNSUPPORTED_ACTIONS = ("integers", "text")
 
 
 class Spaces(gymnasium.Env[Any, Any]):
-    """Observations and actions of a named space; refuses an action outside it. Truncates after 4 steps."""
+    """Observations and actions of named spaces. Raises for an action outside its space. Truncates after 4 steps."""
 
     def __init__(self, observation: str = "box", action: str = "discrete") -> None:
         self.observation_space = deepcopy(OBSERVATIONS[observation])
@@ -312,7 +312,7 @@ class Spaces(gymnasium.Env[Any, Any]):
         return self.observation_space.sample(), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
-        """Show another. The reward is the sum of the action."""
+        """Show another random observation. The reward is the sum of the action."""
         box = isinstance(self.action_space, spaces.Box)
         if not self.action_space.contains(np.asarray(action) if box else action):  # a scalar Box iterates as scalars
             raise ValueError(f"action expected in {self.action_space}, got {action!r} of type {type(action).__name__}")
@@ -321,17 +321,17 @@ class Spaces(gymnasium.Env[Any, Any]):
 
 
 class Odd:
-    """No plain data; of a class that only this module knows."""
+    """A value that is not plain data, because only this module has its class."""
 
     def __repr__(self) -> str:
         return "<odd>"
 
 
 class Informs(gymnasium.Env[Any, Any]):
-    """Episodes of random length; a Dict observation, and infos of every kind: numbers, words, arrays, nested, rare ones.
+    """Episodes of random length, a Dict observation, and infos of every kind: numbers, words, arrays, nested and rare ones.
 
-    With `odd`, one that is no plain data, too; words end in `wordy` letters more.
-    `level` is an attribute to get and set, `shout` a method to call; it renders whether it was told to or not.
+    With `odd`, one info is not plain data. Words get `wordy` more letters.
+    `level` is an attribute to get and set, `shout` a method to call. It renders whatever its render_mode is.
     """
 
     def __init__(self, odd: bool = False, length: float = 6.0, wordy: int = 0) -> None:
@@ -341,7 +341,7 @@ class Informs(gymnasium.Env[Any, Any]):
         self.level = 1
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
-        """Begin; the info says how."""
+        """Start an episode. The info holds the options."""
         super().reset(seed=seed)
         self._steps = 0
         return self._show(), {"began": True, **(options or {})}
@@ -364,11 +364,11 @@ class Informs(gymnasium.Env[Any, Any]):
         return self._show(), reward, draw < 1 / self._length, draw > 1 - 1 / self._length, info
 
     def shout(self, word: str, times: int = 1) -> str:
-        """To be called."""
+        """A method to call."""
         return word.upper() * times
 
     def render(self) -> Any:
-        """A picture of how far it is."""
+        """A picture of the number of steps."""
         return np.full((2, 2, 3), self._steps, np.uint8)
 
     def _show(self) -> Any:

@@ -1,1 +1,1 @@
-"""The vector environment's lanes: env copies stepped with the learner's actions."""
+"""Stepping for a vector environment: env copies are stepped with the actions that the learner sends."""
