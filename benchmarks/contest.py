@@ -1,6 +1,6 @@
-"""The same work in several ways, timed in turns: medians of many short turns, and of the ratios within each.
+"""Times several implementations of the same work in turns. Reports medians, also of the ratios within each turn.
 
-CPU seconds of this process, one thread: what else the machine does moves them less than the clock on the wall.
+It measures CPU seconds of this process with one thread, which depend less on other load than wall-clock time.
 """
 
 from __future__ import annotations
@@ -12,19 +12,19 @@ from typing import NamedTuple
 
 
 class Contest(NamedTuple):
-    """A piece of work; each run does some of it and gives its CPU seconds."""
+    """A piece of work. Each implementation in `runs` does some of it and returns its CPU seconds."""
 
     title: str
     rows: int
     peer: str
-    """who the run `peer` is; the others are `graph` (ours by autograd) and `ours` (as it is chosen)"""
+    """the system behind the run `peer`; the other runs are `graph` (ours by autograd) and `ours` (what millrace chooses)"""
     target: float | None
-    """what our time may be, as a share of the peer's"""
+    """our time should be at most this fraction of the peer's"""
     runs: Mapping[str, Callable[[], float]]
 
 
 def repeated(work: Callable[[], object], times: int) -> float:
-    """CPU seconds of one, over so many."""
+    """Mean CPU seconds of one call, over `times` calls."""
     start = time.process_time()
     for _ in range(times):
         work()
@@ -32,13 +32,13 @@ def repeated(work: Callable[[], object], times: int) -> float:
 
 
 def measure(contest: Contest, rounds: int) -> dict[str, object]:
-    """Medians in milliseconds, and of the ratios; every other round goes backwards."""
+    """Medians of the times in milliseconds and of the ratios. Every other round runs in reverse order."""
     names = list(contest.runs)
     times: dict[str, list[float]] = {name: [] for name in names}
     for turn in range(-3, rounds):
         for name in names[:: 1 if turn % 2 else -1]:
             taken = contest.runs[name]()
-            if turn >= 0:  # those before warm up
+            if turn >= 0:  # the earlier ones are warm-up
                 times[name].append(taken * 1e3)
 
     def ratio(other: str) -> float:

@@ -1,8 +1,8 @@
-"""Does V-trace earn its keep? A2C and IMPALA on CartPole-v1, on new weights and on old: `python -m benchmarks.off_policy`.
+"""The effect of V-trace: A2C and IMPALA on CartPole-v1, with new and old weights (`python -m benchmarks.off_policy`).
 
-The law: nothing differs between two runs but the algorithm, `max_lag` and the seed. At `max_lag` 0 both compute the same
-update; at 8 rollouts may be eight versions old when they are used, which A2C does not know and V-trace corrects. The lag
-that a run had is measured, not assumed. Whole runs, as the command line makes them; draws docs/off_policy.png.
+The law: two runs differ only in the algorithm, `max_lag` and the seed. With `max_lag` 0 both algorithms compute the same
+update. With 8, rollouts may be eight versions old when they are used; A2C ignores this, and V-trace corrects for it. The
+actual lag of a run is measured. These are whole runs of `millrace.train`. The figure is docs/off_policy.png.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ LAGS = (0, 8)
 SEEDS = 5
 SETTINGS: dict[str, Any] = {
     "steps": 200_000,
-    "workers": 4,  # many, and small batches: the learner must be the slower side, else nothing is old
+    "workers": 4,  # many, and small batches, so that the learner is the slower side; otherwise no rollout is old
     "envs": 8,
     "lanes": 4,
     "rollout_steps": 16,
@@ -53,21 +53,21 @@ SETTINGS: dict[str, Any] = {
 
 
 class Trained(NamedTuple):
-    """What one run came to."""
+    """The result of one run."""
 
     algo: str
     max_lag: int
     seed: int
     lag_mean: float
-    """versions, over all rollouts that were used"""
+    """mean lag of the rollouts that were used, in versions"""
     return_final: float
-    """mean over the greedy episodes of the last policy"""
+    """mean return of greedy episodes of the final policy"""
     wall_s: float
     curve: Curve
 
 
 def train(algo: str, max_lag: int, seed: int) -> Trained:
-    """One whole run."""
+    """Run the training and read its results."""
     where = RESULTS / "off_policy" / f"{algo}-lag{max_lag}"
     run = millrace.train("CartPole-v1", preset="none", algo=algo, max_lag=max_lag, seed=seed, run_dir=str(where), **SETTINGS)
     summary = RunFolder.open(run).summary()
@@ -78,7 +78,7 @@ def train(algo: str, max_lag: int, seed: int) -> Trained:
 
 
 def show(runs: Sequence[Trained]) -> Table:
-    """A line for each algorithm and lag."""
+    """A table with a row for each algorithm and `max_lag`."""
     table = Table(title=f"CartPole-v1 after {SETTINGS['steps']:,} env steps, the same settings everywhere")
     for column in ("", "max lag", "lag measured", "greedy return of each seed", "median", "seconds"):
         table.add_column(column, justify="right" if column in ("max lag", "lag measured", "median", "seconds") else "left")
@@ -94,7 +94,7 @@ def show(runs: Sequence[Trained]) -> Table:
 
 
 def draw(runs: Sequence[Trained], out: Path) -> None:
-    """A panel for each lag: the median of the seeds, and a band from the worst to the best."""
+    """Draw a panel for each `max_lag`: the median over seeds, and a band from the worst to the best."""
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
     from matplotlib.ticker import EngFormatter, MaxNLocator
@@ -105,8 +105,8 @@ def draw(runs: Sequence[Trained], out: Path) -> None:
         group = [run for run in runs if run.max_lag == max_lag]
         _curves(panel, group)
         lag = statistics.fmean(run.lag_mean for run in group)
-        says = "always the newest weights" if max_lag == 0 else f"weights {lag:.1f} versions old on average"
-        panel.set_title(f"max_lag {max_lag}: {says}", fontsize=11, fontweight="bold", loc="left")
+        subtitle = "always the newest weights" if max_lag == 0 else f"weights {lag:.1f} versions old on average"
+        panel.set_title(f"max_lag {max_lag}: {subtitle}", fontsize=11, fontweight="bold", loc="left")
         panel.set_xlabel("env steps", color=GREY)
         panel.xaxis.set_major_formatter(EngFormatter(sep=""))
         panel.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
@@ -123,17 +123,17 @@ def draw(runs: Sequence[Trained], out: Path) -> None:
 
 
 def _curves(panel: Axes, runs: Sequence[Trained]) -> None:
-    for algo, colour in ALGORITHMS.items():
+    for algo, color in ALGORITHMS.items():
         curves = [run.curve for run in runs if run.algo == algo]
         grid, returns = common_grid(curves)
-        panel.fill_between(grid, returns.min(0), returns.max(0), color=colour, alpha=0.15, linewidth=0)
+        panel.fill_between(grid, returns.min(0), returns.max(0), color=color, alpha=0.15, linewidth=0)
         label = f"{algo.upper()}: median of {len(curves)} seeds, worst to best"
-        panel.plot(grid, np.median(returns, 0), color=colour, linewidth=2.0, label=label)
+        panel.plot(grid, np.median(returns, 0), color=color, linewidth=2.0, label=label)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="A2C and IMPALA, on new weights and on old")
-    parser.add_argument("--seeds", type=int, default=SEEDS, help="how many, from 1")
+    parser = argparse.ArgumentParser(description="A2C and IMPALA with new and old weights")
+    parser.add_argument("--seeds", type=int, default=SEEDS, help="number of seeds, counted from 1")
     seeds = range(1, parser.parse_args().seeds + 1)
     plan = [(algo, max_lag, seed) for max_lag in LAGS for algo in ALGORITHMS for seed in seeds]
     runs = [train(*each) for each in track(plan, "training")]

@@ -1,7 +1,7 @@
-"""`millrace bench [NAME [flags]]`, or `python -m benchmarks.program`: one benchmark, or all of them in turn.
+"""`millrace bench [NAME [flags]]`, or `python -m benchmarks.program`: runs one benchmark, or all of them in turn.
 
-The law: each is a module with a main of its own and runs in a process of its own, so that none inherits another's threads,
-imports or memory. What it finds it prints, and leaves in `benchmarks/results`.
+The law: each benchmark is a module with a `main` and runs in its own process, so it does not inherit threads, imports or
+memory of another. It prints its results and writes them to `benchmarks/results`.
 """
 
 from __future__ import annotations
@@ -20,48 +20,52 @@ ROOT = Path(__file__).parents[1]
 
 
 class Benchmark(NamedTuple):
-    """One of them."""
+    """One benchmark."""
 
     module: str
     about: str
     peers: bool = False
-    """worth nothing without Stable-Baselines3"""
+    """needs Stable-Baselines3"""
     brief: tuple[str, ...] = ()
-    """its flags when all are run"""
+    """its flags when all benchmarks are run"""
 
 
 BENCHMARKS = {
     "collect": Benchmark(
-        "collect", "collecting in two processes against the bare loop", brief=("--rounds", "3", "--seconds", "0.5")
+        "collect",
+        "collecting with two worker processes, compared with a plain loop",
+        brief=("--rounds", "3", "--seconds", "0.5"),
     ),
     "vector": Benchmark(
         "vector_env",
-        "vector environments beside gymnasium's and Stable-Baselines3's",
+        "vector environments, compared with gymnasium's and Stable-Baselines3's",
         True,
         ("--rounds", "3", "--seconds", "0.5"),
     ),
-    "update": Benchmark("update", "updates against the usual style and Stable-Baselines3's", brief=("--rounds", "40")),
+    "update": Benchmark("update", "updates, compared with autograd and Stable-Baselines3", brief=("--rounds", "40")),
     "train": Benchmark(
         "train",
-        "PPO on CartPole-v1 beside Stable-Baselines3, from the command to solved; --peers: beside six systems more",
+        "PPO on CartPole-v1, compared with Stable-Baselines3; --peers: with six more systems",
         brief=("--rounds", "2"),
     ),
-    "wire": Benchmark("wire", "the way of a rollout beside raw ZeroMQ"),
-    "scale": Benchmark("scale", "one learner before 10, 100 and 1,000 simulated workers"),
-    "memory": Benchmark("memory", "memory of all processes of a run, beside Stable-Baselines3", brief=("--rounds", "1")),
-    "worker": Benchmark("worker", "what a worker process costs: seconds to its first rollout, memory"),
+    "wire": Benchmark("wire", "sending rollouts, compared with raw ZeroMQ"),
+    "scale": Benchmark("scale", "one learner with 10, 100 and 1,000 simulated workers"),
+    "memory": Benchmark(
+        "memory", "memory of all processes of a run, compared with Stable-Baselines3", brief=("--rounds", "1")
+    ),
+    "worker": Benchmark("worker", "cost of a worker process: seconds to its first rollout, memory"),
 }
 
 
 def overview() -> str:
-    """What there is."""
+    """The text that lists all benchmarks."""
     lines = [f"  millrace bench {name:8}  {each.about}" for name, each in BENCHMARKS.items()]
     usage = ["usage: millrace bench [NAME [flags]]", "", "Run one benchmark, or all of them (ten minutes).", ""]
     return "\n".join([*usage, *lines, "", "millrace bench NAME --help lists the flags of each."])
 
 
 def main(argv: list[str]) -> int:
-    """Run what is asked for; the exit code. Raises `UsageError`."""
+    """Run the benchmark that `argv` names, or all. Returns the exit code. Raises `UsageError`."""
     if argv and argv[0] in ("-h", "--help"):
         print(overview())
         return 0
@@ -100,5 +104,5 @@ if __name__ == "__main__":
     except UsageError as error:
         print(f"millrace: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
-    except KeyboardInterrupt:  # `millrace bench` says so
+    except KeyboardInterrupt:  # `millrace bench` prints the message
         sys.exit(130)

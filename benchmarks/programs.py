@@ -1,7 +1,7 @@
-"""Training CartPole-v1 as programs of their own, alike in settings: ours, as the command line makes it, and its peers'.
+"""Programs that train CartPole-v1 with the same settings: millrace, as its command line runs it, and other systems.
 
-The law: whoever is compared gets the same hyperparameters, one torch thread, and its own process tree from a cold start.
-What a peer cannot be told stands in the first lines of its program, in `benchmarks/peers`.
+The law: all get the same hyperparameters, one torch thread, and a process tree of their own with a cold start. The first
+lines of each program in `benchmarks/peers` say which settings that system does not have.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ LARGE = ACTOR_CRITIC | {
     "ent_coef": 0.0, "learning_rate": 3e-4, "learning_rate_schedule": "constant", "clip_range": 0.2,
     "clip_range_schedule": "constant",
 }  # fmt: skip
-# RL Zoo's, too. Its DQN has one copy, trains after 256 steps, and makes a target anew every 10 steps: before each update, in
-# effect, that is, after 128 gradient steps.
+# These are RL Zoo's settings, too. Its DQN has one env copy, trains after 256 env steps, and copies the target network every
+# 10 steps: in effect before each update, which is after 128 gradient steps.
 A2C = ACTOR_CRITIC | {
     "algo": "a2c", "envs": 8, "rollout_steps": 5, "gamma": 0.99, "gae_lambda": 1.0, "ent_coef": 0.0, "learning_rate": 7e-4,
 }  # fmt: skip
@@ -48,28 +48,28 @@ DQN = COMMON | {
     "gradient_steps": 128, "learning_starts": 1000, "replay_size": 100_000, "net": [256, 256], "target": "hard",
     "target_every": 128, "double": False, "epsilon_steps": 8000, "epsilon_end": 0.04, "max_grad_norm": 10.0,
 }  # fmt: skip
-LEAST_S = 0.05  # between two looks at a program that runs
+LEAST_S = 0.05  # between two calls of `look`
 LONGEST_S = 300.0
 
 
 class Contender(NamedTuple):
-    """A program that is compared."""
+    """A program that takes part in the comparison."""
 
     module: str
     how: str = ""
-    """which of its ways"""
+    """mode of the program: its flag --how"""
     peer: str = ""
-    """whose environment it needs; none: this Python's"""
+    """the system whose virtual environment it needs; empty: this Python"""
     most_envs: int = 64
-    """copies that this machine has room for"""
+    """largest number of env copies that fit on this machine"""
     own: bool = False
-    """settings of its own instead of those that all have"""
+    """whether it has its own settings instead of the common ones"""
     flags: tuple[str, ...] = ()
-    """of ours, besides the settings"""
+    """additional flags of millrace"""
 
     @property
     def ours(self) -> bool:
-        """Not a peer."""
+        """Whether it is millrace."""
         return self.module == "millrace"
 
 
@@ -81,7 +81,7 @@ AS_PUFFERLIB, AS_SAMPLE_FACTORY = "millrace, as PufferLib's own", "millrace, as 
 
 
 def _flags(sizes: str, more: str) -> tuple[str, ...]:
-    """Copies, steps and minibatch of a peer's own settings, one epoch; and its network."""
+    """Flags for a peer's own settings: env copies, steps, minibatch, one epoch, and its network."""
     copies, steps, minibatch = sizes.split()
     given = f"--preset none --envs {copies} --lanes 2 --rollout-steps {steps} --batch-size {minibatch} --n-epochs 1 {more}"
     return tuple(given.split())
@@ -96,7 +96,7 @@ CONTENDERS = {
     AS_SAMPLE_FACTORY: Contender("millrace", own=True, flags=_flags("40 32 512", "--net 512 512 --shared-net --max-lag 1")),
     OURS_OWN: Contender("millrace", own=True),
     DUMMY: Contender(_SB3, "one"),
-    SUBPROC: Contender(_SB3, "subproc", most_envs=8),  # a process for each copy
+    SUBPROC: Contender(_SB3, "subproc", most_envs=8),  # it has a process for each env copy
     "CleanRL": Contender(f"{_PEERS}.cleanrl_ppo", "", "cleanrl"),
     "Sample Factory, one process": Contender(f"{_PEERS}.sample_factory_ppo", "serial", "sample_factory"),
     "Sample Factory, 2 workers": Contender(f"{_PEERS}.sample_factory_ppo", "async", "sample_factory"),
@@ -109,24 +109,24 @@ CONTENDERS = {
 }
 
 
-class Ran(NamedTuple):
-    """What a program did."""
+class ProgramResult(NamedTuple):
+    """The result of running a program."""
 
     solved_s: float
-    """from the command until it was known to be solved (ours: until the program's end); NaN if it was not"""
+    """seconds from the command until the task was solved (millrace: until the program ended); NaN if it was not"""
     updates: list[tuple[int, float]]
-    """env steps, and seconds by some clock, at the end of each update"""
+    """env steps and time in seconds at the end of each update"""
 
 
 def contenders(peers: bool = False) -> list[str]:
-    """Those that can be run here; of other systems only Stable-Baselines3, unless all `peers` are asked for."""
+    """The contenders that can run here. Other systems than Stable-Baselines3 are included only with `peers`."""
     here = ["", *install.installed()] if peers else [""]
     sb3 = importlib.util.find_spec("stable_baselines3") is not None
     return [name for name, each in CONTENDERS.items() if each.peer in here and (each.module != _SB3 or sb3)]
 
 
 def missing() -> list[str]:
-    """The peers whose environments are not there."""
+    """The peers that are not installed."""
     return [name for name in install.PEERS if name not in install.installed()]
 
 
@@ -135,8 +135,11 @@ def run(
     settings: dict[str, Any],
     target: float | None = None,
     look: Callable[[int], None] = lambda pid: None,
-) -> Ran:
-    """Run it to its end; `look` is called now and then with its pid. With a target it ends as soon as that is reached."""
+) -> ProgramResult:
+    """Run a program to its end.
+
+    `look` is called with its pid from time to time. With a target it ends once that is reached.
+    """
     each = CONTENDERS[contender]
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         command = _ours(each, settings, target, folder) if each.ours else _theirs(each, settings, target)
@@ -151,7 +154,7 @@ def run(
                 stderr=subprocess.STDOUT,
                 env=os.environ | threads | {"PYTHONPATH": path},
                 cwd=folder,
-                start_new_session=True,  # so that whatever it leaves can be ended with it
+                start_new_session=True,  # so that its child processes can be ended with it
             )
             try:
                 while process.poll() is None and time.monotonic() - began_s < LONGEST_S:
@@ -172,11 +175,13 @@ def run(
             config = config_of_run(table.parent)
             updates = [(int(row["time/total_timesteps"]), row["time/time_elapsed"]) for row in read_rows(table)]
             early = config.steps - updates[-1][0] > 2 * config.envs * config.algorithm.rollout_steps
-            return Ran(wall_s if early else math.nan, updates)
-        told = [line for line in out.read_text().splitlines() if line.startswith(('{"env_steps"', '{"solved"'))]
-        lines = [json.JSONDecoder().raw_decode(line)[0] for line in told]  # a peer's own words may follow on the same line
+            return ProgramResult(wall_s if early else math.nan, updates)
+        json_lines = [line for line in out.read_text().splitlines() if line.startswith(('{"env_steps"', '{"solved"'))]
+        lines = [
+            json.JSONDecoder().raw_decode(line)[0] for line in json_lines
+        ]  # output of the peer may follow on the same line
         solved = [line["at_s"] - began_s for line in lines if "solved" in line]  # one clock for all processes
-        return Ran(
+        return ProgramResult(
             solved[0] if solved else math.nan, [(line["env_steps"], line["at_s"]) for line in lines if "env_steps" in line]
         )
 

@@ -1,8 +1,8 @@
-"""docs/results.md from run folders, what was learned by which command: `python -m benchmarks.results RUN …`.
+"""Writes docs/results.md, the returns and commands of runs, from run folders: `python -m benchmarks.results RUN ...`.
 
-A run counts by the policy that did best in its own evaluations, tried again on 100 other episodes; the final policy stands
-beside it. Where a run was told to play fewer episodes, its policies are played here. Runs that differ in nothing but their
-seed make one row.
+For each run the table has the best policy of the run's own evaluations, evaluated again on 100 other episodes, and the
+final policy. If a run's own evaluations had fewer episodes, the policies are evaluated here. Runs that differ only in their
+seed form one row.
 """
 
 from __future__ import annotations
@@ -23,30 +23,32 @@ from learner.run_folder.run_folder import RunFolder, Which
 
 OUT = Path(__file__).parents[1] / "docs" / "results.md"
 EPISODES = 100
-OTHER_EPISODES = 1_000_000  # the seed of `millrace evaluate`: episodes that no choice was made by
+OTHER_EPISODES = 1_000_000  # the seed of `millrace evaluate`; no run chooses its best policy by these episodes
 HEAD = """# Results
 
-Greedy episodes: the mean return over 100 of them, for seeds 1, 2 and 3. *Best* is the policy that did best in the run's own
-evaluations, tried again on other episodes than those it was chosen by; *final* is the last one. Made by
-`python -m benchmarks.results RUN …` from run folders.
+Mean return of 100 greedy episodes, for seeds 1, 2 and 3. *Best* is the best policy of the run's own evaluations, evaluated
+again on other episodes than those by which it was chosen. *Final* is the last policy. `python -m benchmarks.results RUN
+...` made this table from run folders.
 
 | environment | algorithm | env steps | best | final | seconds | command (for each seed) |
 |---|---|---|---|---|---|---|
 """
 TAIL = """
 
-On HalfCheetah-v5 CleanRL's settings (in this learner) ended at 1,818. What makes the difference is a first log standard
-deviation of -2, so that the first actions are small, together with a shorter horizon (gamma 0.98, lambda 0.92), a
-narrow clip (0.1) and 20 epochs; observations and rewards are normalised in both. Settings and sources stand in
-[`learner/config/presets.toml`](../learner/presets.toml). [off_policy.md](off_policy.md) shows what V-trace is good for,
-[notebooks.md](notebooks.md) the runs of five teaching notebooks.
+On HalfCheetah-v5 CleanRL's settings (in this learner) reached 1,818. The difference comes from an initial log standard
+deviation of -2, which makes the first actions small, a shorter horizon (gamma 0.98, lambda 0.92), a narrow clip range (0.1)
+and 20 epochs. Observations and rewards are normalized in both cases.
+[`learner/config/presets.toml`](../learner/config/presets.toml) has the settings and their sources.
+[off_policy.md](off_policy.md) shows the effect of V-trace, and [notebooks.md](notebooks.md) the runs of five teaching
+notebooks.
 
-Two cores, no GPU, shared with other work while these ran: read the seconds as upper bounds. Versions: {versions}.
+The machine had two cores and no GPU, and did other work while these ran, so the seconds are upper bounds. Versions:
+{versions}.
 """
 
 
 class Run(NamedTuple):
-    """One run folder, as the table needs it."""
+    """What the table needs of one run folder."""
 
     config: Config
     summary: Summary
@@ -55,7 +57,7 @@ class Run(NamedTuple):
 
 
 def read(path: Path) -> Run | None:
-    """A run that ended, or None."""
+    """The run, or None if it has not finished."""
     folder = RunFolder.open(path)
     config, summary = config_of_run(path), folder.summary()
     if summary is None:
@@ -65,7 +67,7 @@ def read(path: Path) -> Run | None:
 
 
 def _played(path: Path, found: Evaluation | None, which: Which) -> float | None:
-    """The mean return, over as many episodes as the table says."""
+    """The mean return over `EPISODES` episodes. They are played here if the run's own evaluation had another number."""
     if found is not None and found.episodes != EPISODES:
         policy, spec, env = load_policy(path, which)
         found = evaluate(env, policy, spec, EPISODES, OTHER_EPISODES)
@@ -73,16 +75,16 @@ def _played(path: Path, found: Evaluation | None, which: Which) -> float | None:
 
 
 def command(config: Config) -> str:
-    """The shortest command line that makes this run, without its seed and run folder."""
+    """The shortest command line that repeats this run, with S as the seed and without the run folder."""
     words = ["millrace", "train", config.env, "--seed", "S"]
     if config.algo != "ppo":
         words += ["--algo", config.algo]
-    usual = msgspec.to_builtins(resolve(config.env, algo=config.algo))
-    own = msgspec.to_builtins(config)
-    usual |= usual.pop("algorithm")
-    own |= own.pop("algorithm")
-    for name, value in own.items():
-        if name in ("env", "algo", "seed", "run_dir") or value == usual[name]:
+    defaults = msgspec.to_builtins(resolve(config.env, algo=config.algo))
+    settings = msgspec.to_builtins(config)
+    defaults |= defaults.pop("algorithm")
+    settings |= settings.pop("algorithm")
+    for name, value in settings.items():
+        if name in ("env", "algo", "seed", "run_dir") or value == defaults[name]:
             continue
         words.append(f"--{name.replace('_', '-')}")
         words += [str(item) for item in value] if isinstance(value, list | tuple) else [str(value)]

@@ -1,9 +1,10 @@
-"""CartPole-v1 beside Stable-Baselines3, with the same hyperparameters: `python -m benchmarks.train`.
+"""Compares training on CartPole-v1 with Stable-Baselines3, with the same hyperparameters: `python -m benchmarks.train`.
 
-With `--peers` beside all other systems that `python -m benchmarks.peers.install` has installed, with memory, and A2C and DQN
-beside Stable-Baselines3's. Env steps/s are from the third update on. Solved: from the command (imports, start, evaluations)
-until a greedy evaluation of 20 episodes, one every 5,000 env steps, averages 475; for ours until the program has ended,
-too. Each is a process tree of its own, started cold; all take turns. What fails is said and left out.
+`--peers` adds all other systems that `python -m benchmarks.peers.install` has installed, the memory, and A2C and DQN of
+Stable-Baselines3. Env steps/s are measured from the third update on. The time to solve is from the command (with imports,
+start and evaluations) until the mean return of a greedy evaluation is 475; there is an evaluation of 20 episodes every
+5,000 env steps. For millrace it lasts until the program has ended. Each run is a process tree of its own with a cold start;
+all take turns. A run that fails is reported and left out.
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ from benchmarks.programs import A2C, CONTENDERS, DQN, DUMMY, LARGE, OURS, OURS_O
 from benchmarks.writing import bars, write
 
 WARM_UP = 2  # updates
-TARGET = 5.0  # times the env steps/s of Stable-Baselines3's best
+TARGET = 5.0  # times the env steps/s of Stable-Baselines3 at its best
 SOLVED = 475.0
 NAN = math.nan
 
 
 class Measure(NamedTuple):
-    """What is asked of a contender in one turn."""
+    """A measurement that is made of each contender in every turn."""
 
     column: str
     settings: dict[str, Any]
@@ -37,7 +38,7 @@ class Measure(NamedTuple):
     """rate, solved or memory"""
 
     def fits(self, contender: str) -> bool:
-        """Whether it is asked of this one."""
+        """Whether it is made of this contender."""
         each = CONTENDERS[contender]
         if self.settings["algo"] != "ppo":
             among = (OURS, DUMMY, SUBPROC) if self.settings["algo"] == "a2c" else (OURS, DUMMY)
@@ -45,11 +46,11 @@ class Measure(NamedTuple):
         if contender == OURS_OWN:
             return False  # the preset of PPO has the same settings
         if each.ours and each.own and self.kind != "rate":
-            return False  # what they learn with is not alike: their env steps/s are asked for
+            return False  # their settings differ, so only their env steps/s are measured
         return self.settings["envs"] <= each.most_envs and not (each.own and self.settings is LARGE)
 
     def of(self, contender: str, seed: int) -> dict[str, float]:
-        """One figure or two. Raises `RuntimeError`."""
+        """Run the contender; one or two numbers by column. Raises `RuntimeError`."""
         settings = self.settings | {"steps": self.steps, "seed": seed}
         match self.kind:
             case "rate":
@@ -65,7 +66,7 @@ class Measure(NamedTuple):
 
 
 def _rate(updates: list[tuple[int, float]]) -> float:
-    """Env steps/s."""
+    """Env steps/s after the warm-up."""
     (first, began_s), (last, ended_s) = updates[WARM_UP], updates[-1]
     return (last - first) / (ended_s - began_s)
 
@@ -85,11 +86,11 @@ PEERS_MEASURES = [
     Measure("DQN solved, s", DQN, 50_000, "solved"),
 ]
 Turn = dict[str, dict[str, float]]
-"""of each contender, a figure for each column"""
+"""by contender and column, the number that was measured"""
 
 
 def take_turns(names: list[str], measures: list[Measure], seed: int) -> Turn:
-    """Each measure of each contender, once."""
+    """Make each measurement of each contender once."""
     turn: Turn = {name: {} for name in names}
     for measure in measures:
         for name in filter(measure.fits, names):
@@ -101,7 +102,7 @@ def take_turns(names: list[str], measures: list[Measure], seed: int) -> Turn:
 
 
 def summary(names: list[str], turns: list[Turn]) -> list[dict[str, object]]:
-    """A row for each contender: medians, and what they are of."""
+    """A row for each contender: the medians and the numbers behind them."""
     rows: list[dict[str, object]] = []
     for name in names:
         asked = dict.fromkeys(column for turn in turns for column in turn[name])
@@ -113,7 +114,7 @@ def summary(names: list[str], turns: list[Turn]) -> list[dict[str, object]]:
 
 
 def _median(found: list[float]) -> float:
-    """NaN, a task that was not solved, is longer than all."""
+    """The median. NaN (not solved) counts as longer than everything."""
     return statistics.median_low(sorted(found, key=lambda x: (math.isnan(x), x))) if len(found) % 2 else _middle(found)
 
 
@@ -123,7 +124,7 @@ def _middle(found: list[float]) -> float:
 
 
 def table(rows: list[dict[str, Any]], title: str, algo: str = "") -> Table:
-    """Medians, from least to most; of PPO, or of another algorithm."""
+    """A table of medians with minimum and maximum; of PPO, or of the algorithm that is named."""
     columns = [
         c for c in dict.fromkeys(c for row in rows for c in row["of"]) if c.startswith(algo or ("env", "solved", "mem"))
     ]
@@ -150,25 +151,25 @@ def _cell(median: float | None, found: list[float]) -> str:
 
 
 def against(rows: list[dict[str, Any]]) -> list[str]:
-    """Ours against the best peer, in words. Settings of their own count for the seconds, which is what those are for."""
-    said = []
+    """Lines that compare millrace with the best peer. Contenders with their own settings are only compared by seconds."""
+    lines = []
     for column in (SMALL_RATE, LARGE_RATE, SECONDS):
         fast = max if column != SECONDS else min
         found = [(row["median"].get(column, NAN), row["contender"]) for row in rows]
         known = [(figure, who) for figure, who in found if math.isfinite(figure)]
-        alike = [(figure, who) for figure, who in known if column == SECONDS or not CONTENDERS[who].own]
-        peers = [(figure, who) for figure, who in alike if not CONTENDERS[who].ours]
+        comparable = [(figure, who) for figure, who in known if column == SECONDS or not CONTENDERS[who].own]
+        peers = [(figure, who) for figure, who in comparable if not CONTENDERS[who].ours]
         if peers:
             best, peer = fast(peers)
-            each = [f"{who} {figure / best:.2f} ×" for figure, who in alike if CONTENDERS[who].ours]
-            said.append(f"{column}, against the best peer, {peer}: {', '.join(each)}")
-    return said
+            each = [f"{who} {figure / best:.2f} ×" for figure, who in comparable if CONTENDERS[who].ours]
+            lines.append(f"{column}, against the best peer, {peer}: {', '.join(each)}")
+    return lines
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="CartPole-v1 beside other systems, with the same hyperparameters")
-    parser.add_argument("--rounds", type=int, default=3, help="turns, each of another seed")
-    parser.add_argument("--peers", action="store_true", help="beside all that are installed; memory; A2C and DQN")
+    parser = argparse.ArgumentParser(description="compare CartPole-v1 with other systems, with the same hyperparameters")
+    parser.add_argument("--rounds", type=int, default=3, help="number of turns, each with another seed")
+    parser.add_argument("--peers", action="store_true", help="compare with all installed systems; also memory, A2C and DQN")
     arguments = parser.parse_args()
     names = [name for name in contenders(arguments.peers) if arguments.peers or not CONTENDERS[name].own]
     for name in missing() if arguments.peers else []:
@@ -176,28 +177,28 @@ def main() -> None:
     measures = PPO_MEASURES + (PEERS_MEASURES if arguments.peers else [])
     turns: list[Turn] = []
     for turn in range(arguments.rounds):
-        again = [measure for measure in measures if measure.kind != "memory" or not turns]  # which hardly differs
+        again = [measure for measure in measures if measure.kind != "memory" or not turns]  # memory hardly varies
         turns.append(take_turns(names, again, turn + 1))
         rows = summary(names, turns)
         charts = [(column, _bars(rows, column)) for column in (SMALL_RATE, LARGE_RATE, SECONDS)]
-        write("train", {"rows": _plain(rows)}, charts)  # after each, should a later one not come to its end
+        write("train", {"rows": _without_nan(rows)}, charts)  # after each turn, in case a later one fails
     console = Console(width=140)
     console.print(table(rows, f"PPO, CartPole-v1, medians of {arguments.rounds} (least to most)"))
     if arguments.peers:
         for algo in ("A2C", "DQN"):
             console.print(table(rows, f"{algo}, CartPole-v1, RL Zoo's settings", algo))
-    for said in against(rows):
-        console.print(said)
+    for line in against(rows):
+        console.print(line)
     console.print(f"aim: {TARGET:g} × the env steps/s of Stable-Baselines3, half of its seconds")
 
 
-def _plain(data: Any) -> Any:
-    """JSON has no NaN."""
+def _without_nan(data: Any) -> Any:
+    """Replace NaN by None, because JSON has no NaN."""
     match data:
         case dict():
-            return {key: _plain(value) for key, value in data.items()}
+            return {key: _without_nan(value) for key, value in data.items()}
         case list():
-            return [_plain(value) for value in data]
+            return [_without_nan(value) for value in data]
         case float() if math.isnan(data):
             return None
         case _:

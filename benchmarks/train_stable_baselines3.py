@@ -1,7 +1,8 @@
-"""PPO, A2C and DQN of Stable-Baselines3 as a program of its own, with our names for their settings: a peer of `train.py`.
+"""PPO, A2C and DQN of Stable-Baselines3 as a program, with our names for their settings. `benchmarks/train.py` runs it.
 
-One torch thread, which is its fastest here. Each update is a line of JSON: env steps, and when by the monotonic clock. Two
-things are worded otherwise: a DQN of ours counts a hard target's age in gradient steps, and has as many copies as it likes.
+It uses one torch thread, which is fastest here. For each update it prints a line of JSON: env steps, and the time by the
+monotonic clock. Two settings differ: our DQN counts the age of a hard target in gradient steps, and may have several env
+copies.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 
-class Told(BaseCallback):
-    """A line for each update."""
+class PrintUpdates(BaseCallback):
+    """Prints a line for each update."""
 
     def _on_step(self) -> bool:
         return True
@@ -30,7 +31,7 @@ class Told(BaseCallback):
 
 
 def make(s: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
-    """The algorithm that the settings ask for."""
+    """Make the algorithm that the settings describe."""
     linear = s.get("learning_rate_schedule") == "linear"
     rate, seed = s["learning_rate"], {"seed": s["seed"], "device": "cpu", "gamma": s["gamma"]}
     match s["algo"]:
@@ -42,9 +43,9 @@ def make(s: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
                 batch_size=s["batch_size"],
                 buffer_size=s["replay_size"],
                 learning_starts=s["learning_starts"],
-                train_freq=s["envs"] * s["rollout_steps"],  # its one copy's
+                train_freq=s["envs"] * s["rollout_steps"],  # for its single env copy
                 gradient_steps=s["gradient_steps"],
-                target_update_interval=10,  # env steps: before each update, in effect
+                target_update_interval=10,  # in env steps; in effect before each update
                 exploration_fraction=s["epsilon_steps"] / s["steps"],
                 exploration_final_eps=s["epsilon_end"],
                 max_grad_norm=s["max_grad_norm"],
@@ -98,7 +99,7 @@ def main() -> None:
             eval_freq=max(1, s["eval_every"] // copies),
             verbose=0,
         )
-    make(s, env).learn(s["steps"], CallbackList([Told(), *([evaluate] if evaluate else [])]))
+    make(s, env).learn(s["steps"], CallbackList([PrintUpdates(), *([evaluate] if evaluate else [])]))
     if evaluate and evaluate.best_mean_reward >= arguments.target:
         print(json.dumps({"solved": float(evaluate.best_mean_reward), "at_s": time.monotonic()}), flush=True)
     env.close()

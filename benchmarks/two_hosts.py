@@ -1,9 +1,10 @@
-"""Workers on another host behind a 5 ms link, beside the same ones on loopback: `python -m benchmarks.two_hosts`.
+"""Compares workers on another host, with a link of 5 ms, with workers on loopback: `python -m benchmarks.two_hosts`.
 
-The learner is on one host, `millrace worker --processes 4` on the other. The hosts are network namespaces of this machine
-(root, iproute2, nftables); the link's delay is a TCP proxy's, 5 ms in either direction. All share this machine's cores: the
-figures tell what the way costs, and nothing else. Each run is one of PPO, with keys and the same settings; env steps/s from
-its fifth update on. Two environments: CartPole-v1, where the way is much, and one whose step sleeps for a millisecond.
+The learner runs on one host and `millrace worker --processes 4` on the other. The hosts are network namespaces of this
+machine (this needs root, iproute2 and nftables). A TCP proxy delays the link by 5 ms in each direction. All processes share
+the cores of this machine, so the numbers show only the cost of the link. Each run trains PPO with keys and the same
+settings; env steps/s are measured from the fifth update on. There are two environments: CartPole-v1, where the link costs
+most, and one whose step sleeps for a millisecond.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ WAYS = ("loopback", "two hosts", "two hosts, 5 ms")
 
 
 def rate(env: str, way: str, max_lag: int, seconds: float) -> float:
-    """Env steps/s of one run."""
+    """Measure the env steps/s of one run."""
     with tempfile.TemporaryDirectory() as folder, Network() as network:
         stage = Stage(Path(folder))
         try:
@@ -55,7 +56,7 @@ def _rate(stage: Stage, network: Network, env: str, way: str, max_lag: int, seco
         stage.start([*before, *proxy], "proxy", told=True).tell(f"delay {DELAY_S}")
     command = [sys.executable, "-m", "millrace", "worker", f"tcp://{host}:{to}", "--token", str(token)]
     stage.start([*(here.before if before else ()), *command, "--processes", str(PROCESSES)], "workers")
-    learner.trains(5)  # warm
+    learner.trains(5)  # warm-up
     first = learner.rows()[-1]
     learner.until(lambda row: row["time/time_elapsed"] >= first["time/time_elapsed"] + seconds, START_S + seconds)
     last = learner.rows()[-1]
@@ -64,9 +65,9 @@ def _rate(stage: Stage, network: Network, env: str, way: str, max_lag: int, seco
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="two hosts with a 5 ms link beside loopback")
+    parser = argparse.ArgumentParser(description="compare two hosts with a 5 ms link with loopback")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--seconds", type=float, default=8.0, help="of each run")
+    parser.add_argument("--seconds", type=float, default=8.0, help="seconds to measure in each run")
     parser.add_argument("--max-lag", type=int, nargs="+", default=[0, 1])
     arguments = parser.parse_args()
     if why := why_not():

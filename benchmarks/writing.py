@@ -1,4 +1,4 @@
-"""What a benchmark leaves behind: JSON, with the machine, the versions, the commit and the load; and a picture of bars."""
+"""Writes the results of a benchmark: JSON with machine, versions, commit and load, and a bar chart."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from learner.run_folder.versions import versions
 
 RESULTS = Path(__file__).parent / "results"
 Bars = tuple[str, Mapping[str, float]]
-"""a title, and the length of each bar by its name"""
+"""a title, and the length of each bar by its label"""
 
 
 def circumstances() -> dict[str, object]:
-    """Where and under what these figures came about."""
+    """Date, commit, machine, load and versions."""
     return {
         "at": datetime.now(UTC).isoformat(timespec="seconds"),
         "commit": _commit(),
@@ -40,7 +40,7 @@ def _commit() -> str:
 
 
 def write(name: str, record: Mapping[str, Any], charts: Sequence[Bars] = ()) -> None:
-    """The record as results/NAME.json; the charts, if there are any, as results/NAME.png."""
+    """Write the record to results/NAME.json, and the charts, if there are any, to results/NAME.png."""
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / f"{name}.json").write_text(json.dumps({"circumstances": circumstances(), **record}, indent=2) + "\n")
     if charts:
@@ -48,12 +48,12 @@ def write(name: str, record: Mapping[str, Any], charts: Sequence[Bars] = ()) -> 
 
 
 def bars(rows: Sequence[Mapping[str, object]], label: str, length: str, first: object = None) -> dict[str, float]:
-    """A bar for each row, or for each whose first field is `first`: `label` and `length` are names of fields."""
+    """A bar for each row, or for each row whose first field is `first`. `label` and `length` are names of fields."""
     chosen = [row for row in rows if first is None or next(iter(row.values())) == first]
     return {str(row[label]): float(str(row[length])) for row in chosen}
 
 
-def _figure(number: float) -> str:
+def _number_text(number: float) -> str:
     return f"{number:,.0f}" if number >= 100 else f"{number:.3g}"
 
 
@@ -66,9 +66,9 @@ def _draw(charts: Sequence[Bars], out: Path) -> None:
     panels = figure.subplots(len(charts), 1, squeeze=False, height_ratios=heights)[:, 0]
     for panel, (title, bars) in zip(panels, charts, strict=True):
         ours = [label for label in bars if label.startswith(("millrace", "ours"))] or list(bars)
-        colours = [COLORS[0] if label in ours else "#bbbbbb" for label in bars]
-        drawn = panel.barh(list(bars), list(bars.values()), color=colours)
-        panel.bar_label(drawn, [_figure(length) for length in bars.values()], padding=3, fontsize=8, color=GREY)
+        colors = [COLORS[0] if label in ours else "#bbbbbb" for label in bars]
+        drawn = panel.barh(list(bars), list(bars.values()), color=colors)
+        panel.bar_label(drawn, [_number_text(length) for length in bars.values()], padding=3, fontsize=8, color=GREY)
         panel.set_title(title, fontsize=10, fontweight="bold", loc="left")
         panel.invert_yaxis()
         panel.margins(x=0.12)

@@ -100,10 +100,10 @@ def test_own_settings_are_not_asked_for_the_large_batch() -> None:
 
 
 def test_what_fails_is_said_and_left_out(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def run(contender: str, *_: object) -> programs.Ran:
+    def run(contender: str, *_: object) -> programs.ProgramResult:
         if contender == "Tianshou":
             raise RuntimeError("Tianshou ended with 1: no")
-        return programs.Ran(math.nan, [(256 * update, float(update)) for update in range(5)])
+        return programs.ProgramResult(math.nan, [(256 * update, float(update)) for update in range(5)])
 
     monkeypatch.setattr(train, "run", run)
     turn = train.take_turns([OURS, "Tianshou"], [Measure(SMALL_RATE, ZOO, 1000, "rate")], 1)
