@@ -89,7 +89,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
     ) -> tuple[Any, Infos]:
         """Begin episodes in all copies, or in those that `options["reset_mask"]` selects. Returns observations and infos.
 
-        A single seed s gives the copies s, s + 1, …. Raises `OurError` if a worker is lost again and again.
+        A single seed s gives the copies s, s + 1, …. Raises `WorkerLost` if each attempt loses a worker.
         """
         self._check_idle("reset")
         seeds = seed_list(seed, self.num_envs)

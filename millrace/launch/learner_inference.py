@@ -44,7 +44,7 @@ def train(
     """Train until the run is done. Returns the run folder.
 
     `factory` makes the environment if it has no id. `elsewhere`: the workers are started elsewhere and join at
-    `config.bind`. Raises `OurError`, or `Interrupted` if the user stopped the run.
+    `config.bind`. Raises `UserFacingError`, or `Interrupted` if the user stopped the run.
     """
     with ExitStack() as stack:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
