@@ -27,23 +27,23 @@ _Made = TypeVar("_Made")
 
 
 class AllowedCode(Enum):
-    """How much code a learner may have a worker run, by how sure the worker is of who the learner is."""
+    """Which code a worker runs for its learner. It depends on how surely the worker knows the learner."""
 
     REGISTERED = 0
-    """environments that are registered where the worker runs, by their ids alone, and of their attributes those whose names
-    do not begin with an underscore: anybody may have answered
+    """only environments that are registered on the worker's machine, by id, and their attributes without a leading
+    underscore: the learner may be anybody
     """
     MODULES = 1
-    """also `module:EnvId`, which imports the module: somebody on this machine has answered"""
+    """also `module:EnvId`, which imports the module: the learner runs on this machine"""
     CALLABLES = 2
-    """also pickled callables: the learner whose key is pinned, or one that only this user can be"""
+    """also pickled callables: the learner's key is known, or only this user can have started it"""
 
 
 class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The environment: a gymnasium id, or a factory that was pickled by the learner."""
+    """The environment: a gymnasium id, or a factory that the learner pickled."""
 
     id: str
-    """anything `gymnasium.make` takes: `CartPole-v1`, `ALE/Pong-v5`, `my_package.envs:MyEnv-v0`"""
+    """any id that `gymnasium.make` takes: `CartPole-v1`, `ALE/Pong-v5`, `my_package.envs:MyEnv-v0`"""
     kwargs: dict[str, Scalar] = {}
     """keyword arguments of `gymnasium.make`"""
     factory: bytes | None = None
@@ -59,7 +59,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return EnvSpec(getattr(env, "__name__", type(env).__name__), kwargs or {}, cloudpickle.dumps(env))
 
     def why_not(self, code: AllowedCode) -> str:
-        """Why a worker that runs so much code cannot make it; empty if it can."""
+        """Why a worker that allows only this code cannot make it; empty if it can."""
         if self.factory is not None and code is not AllowedCode.CALLABLES:
             return (
                 f"environment {self.id} is a callable, which this worker does not unpickle; it may come over ipc, inproc or "
@@ -73,7 +73,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return ""
 
     def make(self, render_mode: str | None = None) -> gymnasium.Env[object, object]:
-        """One env copy. Raises `UsageError` with what to do when the id is unknown or a package is missing."""
+        """Make one env copy. Raises `UsageError`, with advice, if the id is unknown or a package is missing."""
         extra: dict[str, object] = {} if render_mode is None else {"render_mode": render_mode}
         if self.factory is not None:
             import cloudpickle
@@ -82,16 +82,16 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             if not isinstance(env, gymnasium.Env):
                 raise UsageError(f"env factory {self.id}: expected it to return a gymnasium.Env, got {type(env).__name__}")
             return env
-        # The checker is left out: it costs a tenth of a CartPole step, and `Rollout.validate` checks every row.
+        # Without gymnasium's checker: it costs a tenth of a CartPole step, and `protocol.rollout.validate` checks every row.
         return self._made(lambda env_id: gymnasium.make(env_id, disable_env_checker=True, **self.kwargs, **extra))  # type: ignore[arg-type]
 
     def make_vectorized(self, copies: int) -> VectorEnv[Any, Any, Any]:
-        """So many copies as the environment's own vectorised form; `protocol.envs.vectorized` says which can serve."""
+        """Make `copies` copies in the environment's own vectorized form; `protocol.envs.vectorized` checks it."""
         own, kwargs = VectorizeMode.VECTOR_ENTRY_POINT, dict[str, Any](self.kwargs)
         return self._made(lambda env_id: gymnasium.make_vec(env_id, copies, own, **kwargs))
 
     def registered(self) -> gymnasium.envs.registration.EnvSpec:
-        """What gymnasium knows of the id. Raises `UsageError`."""
+        """Gymnasium's registry entry of the id. Raises `UsageError`."""
 
         def look_up(env_id: str) -> gymnasium.envs.registration.EnvSpec:
             module, colon, name = env_id.partition(":")
@@ -102,13 +102,13 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self._made(look_up)
 
     def _made(self, make: Callable[[str], _Made]) -> _Made:
-        """What `make` makes of the id. Raises `UsageError`."""
+        """Call `make` with the id. Raises `UsageError`."""
         registrar = REGISTERING_MODULES.get(self.id.partition("/")[0])
         try:
             return make(f"{registrar}:{self.id}" if registrar and find_spec(registrar) else self.id)
         except (gymnasium.error.Error, ImportError, TypeError) as error:  # TypeError: keyword arguments it does not take
             raise UsageError(_why_not_made(self.id, error)) from error
-        except Exception as error:  # its own constructor raised, whatever that may be
+        except Exception as error:  # its constructor raised any exception
             line = f"environment {self.id} cannot be made: {type(error).__name__}: {first_line(error)}"
             raise UsageError(line, traceback.format_exc()) from error
 
@@ -128,7 +128,7 @@ def _why_not_made(env_id: str, error: Exception) -> str:
             return f"environment {env_id}: a package it needs is missing ({says}); pip install it, then try again"
         case gymnasium.error.Error() if "vector entry point" in says:
             return (
-                f"environment {env_id} has no vectorised form of its own (gymnasium's vector_entry_point); use --vector loop"
+                f"environment {env_id} has no vectorized form of its own (gymnasium's vector_entry_point); use --vector loop"
             )
         case gymnasium.error.UnregisteredEnv() if not colon:
             return f"environment {env_id} is not registered: {says} One of your own is given as my_module:MyEnv-v0"

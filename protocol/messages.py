@@ -1,6 +1,7 @@
-"""The messages: small frozen records, nothing more. Who may say which, and when, stands in `README.md`.
+"""The messages, as small frozen records. `README.md` says who may send which message, and when.
 
-A session is one stay of one worker with one learner; a message of another session is counted and not used.
+A session lasts from the `Welcome` of a worker until it leaves or is given up. A message of another session is counted and
+not used.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ PROTOCOL_VERSION = 3
 
 
 class Message(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unknown_fields=True):
-    """Base of all messages but `Rollout`, which has a file of its own. They travel by position, without names of fields."""
+    """Base of all messages except `Rollout`, which has its own file. Fields travel by position, without their names."""
 
 
 class Hello(Message, frozen=True, array_like=False):  # a map, as in every version, so that any two can part politely
-    """I exist; may I join? Said again, with backoff, until answered."""
+    """May I join? Repeated with backoff until it is answered."""
 
     protocol: int
     worker: str
@@ -30,15 +31,15 @@ class Hello(Message, frozen=True, array_like=False):  # a map, as in every versi
     """drawn at random by each process (pids repeat in containers)"""
     software: str
     attempt: int
-    """how often this process has begun to join: a repeated Hello keeps it, a new beginning raises it"""
+    """counts how often this process has started to join: a repeated Hello keeps the number, a new start raises it"""
 
 
 class Welcome(Message, frozen=True):
-    """Join: what to do, collect rollouts or step copies; the environment, the policy, T, N, the seed."""
+    """You may join. It says what to do: collect rollouts (`RunSpec`) or step env copies (`StepSpec`)."""
 
     session: int
     attempt: int
-    """of the Hello that is answered"""
+    """`attempt` of the Hello that this answers"""
     run: RunSpec | StepSpec
 
 
@@ -49,23 +50,23 @@ class Refuse(Message, frozen=True, array_like=False):  # a map, as Hello is
 
 
 class Rejoin(Message, frozen=True):
-    """I do not know this session (I restarted, or gave you up): say Hello again."""
+    """I do not know this session, because I restarted or gave you up: say Hello again."""
 
     session: int
 
 
 class Weights(Message, frozen=True):
-    """The newest weights. They name no session, so that they are encoded once however many workers there are."""
+    """The newest weights. They carry no session, so that one encoding serves all workers."""
 
     version: int
     parameters: Array
-    """[P] float32, the acting part of the flat parameter buffer; or rounded, float16 or bfloat16, the latter as uint16"""
+    """[P] the parameters needed to act: float32, or rounded to float16 or bfloat16 (which is sent as uint16)"""
     buffers: Array
-    """[B] float32, what the learner keeps for the policy: observation mean and standard deviation"""
+    """[B] float32, observation mean and standard deviation if observations are normalized, and ε for action values"""
 
 
 class Permit(msgspec.Struct, frozen=True, array_like=True):
-    """A ticket as it travels: one rollout, on this lane, in this life of the lane."""
+    """A ticket as it travels: permission for one rollout, on this lane and incarnation."""
 
     ticket: int
     lane: int
@@ -73,13 +74,13 @@ class Permit(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Received(msgspec.Struct, frozen=True, array_like=True):
-    """The learner has the rollouts of this life of the lane whose sequence is below `below`, and those in `ahead`."""
+    """The learner has all rollouts of this lane and incarnation whose sequence is below `below`, and those in `ahead`."""
 
     lane: int
     incarnation: int
     below: int
     ahead: tuple[int, ...] = ()
-    """arrived although an earlier one was lost on the way"""
+    """sequences that have arrived although an earlier one is missing"""
 
 
 class Collect(Message, frozen=True):
@@ -89,43 +90,43 @@ class Collect(Message, frozen=True):
     version: int
     permits: tuple[Permit, ...]
     received: tuple[Received, ...]
-    """one for each lane that is the worker's: a lane that is missing lives elsewhere"""
+    """one entry for each lane of this worker; a lane that is not listed belongs to another worker"""
 
 
 class LaneLife(msgspec.Struct, frozen=True, array_like=True):
-    """A lane, and how often it has been started afresh."""
+    """A lane, and how often it has been started on new env copies."""
 
     lane: int
     incarnation: int
 
 
 class Release(Message, frozen=True):
-    """These lanes live elsewhere now: close them."""
+    """These lanes belong to other workers now: close them."""
 
     session: int
     lanes: tuple[LaneLife, ...]
 
 
 class Heartbeat(Message, frozen=True):
-    """The worker's account of itself. The learner compares it with its own, and says again what was lost."""
+    """What the worker holds. The learner compares it with its own records and sends again what was lost."""
 
     session: int
     replies: int
-    """number of the last HeartbeatReply seen: what the learner said before it has arrived, or is lost"""
+    """number of the last HeartbeatReply received; what the learner sent before that has arrived or is lost"""
     version: int
-    """newest weights held; -1 before the first"""
+    """version of the newest weights held; -1 before the first"""
     tickets: tuple[int, ...]
-    """held and not finished"""
+    """tickets that are held and not finished"""
     steps: int
     """env steps since the worker started"""
     stages: dict[str, float]
     """seconds spent in each stage since the worker started"""
     resident_bytes: int
-    """memory of the worker's process; 0 where that is not known"""
+    """resident memory of the worker's process; 0 if it is not known"""
 
 
 class HeartbeatReply(Message, frozen=True):
-    """I am here too, and this is what I have of each of your lanes; a lane that is missing lives elsewhere."""
+    """The learner is alive, and this is what it has received of each of your lanes."""
 
     session: int
     number: int
@@ -133,13 +134,13 @@ class HeartbeatReply(Message, frozen=True):
 
 
 class Drain(Message, frozen=True):
-    """Finish the rollout in hand, send it, leave."""
+    """Finish the current rollout, send it, and leave."""
 
     reason: str
 
 
 class Goodbye(Message, frozen=True):
-    """I leave on purpose; these tickets I held and did not finish."""
+    """I leave on purpose, and did not finish these tickets."""
 
     session: int
     reason: str
@@ -147,7 +148,7 @@ class Goodbye(Message, frozen=True):
 
 
 class Failure(Message, frozen=True):
-    """My environment (or I) broke; I leave."""
+    """My environment, or my own code, raised an exception; I leave."""
 
     session: int
     error: str
@@ -156,23 +157,23 @@ class Failure(Message, frozen=True):
 
 
 class Reset(Message, frozen=True):
-    """Begin episodes in these copies of the lane; answered by `Stepped`. A new life of the lane begins on new copies."""
+    """Start episodes in these copies of the lane. Answered by `Stepped`. A new incarnation starts on new copies."""
 
     session: int
     ticket: int
-    """rises with every order; each is obeyed once, and answered again if it is said again"""
+    """rises with every order; an order is executed once, and answered again if it is repeated"""
     lane: int
     incarnation: int
     copies: tuple[int, ...]
     """which of the lane's copies, from 0"""
     seeds: tuple[int | None, ...]
-    """one for each of them"""
+    """one seed for each of `copies`"""
     options: Array
     """[bytes] uint8, `protocol.wire.plain_values`: the options of `Env.reset`, or None"""
 
 
 class Step(Message, frozen=True):
-    """Step every copy of the lane; answered by `Stepped`."""
+    """Step every copy of the lane. Answered by `Stepped`."""
 
     session: int
     ticket: int
@@ -183,7 +184,7 @@ class Step(Message, frozen=True):
 
 
 class Call(Message, frozen=True):
-    """Call, read or set an attribute of these copies of the lane; answered by `Returned`."""
+    """Call, read or set an attribute of these copies of the lane. Answered by `Returned`."""
 
     session: int
     ticket: int
@@ -192,19 +193,19 @@ class Call(Message, frozen=True):
     copies: tuple[int, ...]
     """which of the lane's copies, from 0"""
     name: str
-    """of the attribute, wherever among the wrappers it is; what is not callable is read"""
+    """name of the attribute, which any of the wrappers may have; an attribute that is not callable is read"""
     assign: bool
-    """set it, instead"""
+    """true: set the attribute"""
     given: Array
-    """[bytes] uint8, `protocol.wire.plain_values`: (arguments, keyword arguments), or one value for each of the copies"""
+    """[bytes] uint8, `protocol.wire.plain_values`: (arguments, keyword arguments); with `assign`, a value for each copy"""
 
 
 class Stepped(Message, frozen=True):
-    """What a Reset or a Step gave, of every copy of the lane."""
+    """The result of a Reset or a Step, for every copy of the lane."""
 
     session: int
     ticket: int
-    """of the order; below 0: a step through shared memory, whose infos were too long to be laid there"""
+    """ticket of the order; below 0: a step through shared memory whose infos did not fit there"""
     lane: int
     incarnation: int
     obs: tuple[Array, ...]
@@ -220,22 +221,22 @@ class Stepped(Message, frozen=True):
 
 
 class Returned(Message, frozen=True):
-    """What a Call gave."""
+    """The result of a Call."""
 
     session: int
     ticket: int
     lane: int
     incarnation: int
     results: Array
-    """[bytes] uint8, `protocol.wire.plain_values`: a list of what each copy gave"""
+    """[bytes] uint8, `protocol.wire.plain_values`: a list with one result for each copy"""
     error: str
-    """the exception's type and text, in one line, if the call raised; else empty"""
+    """type and message of the exception, in one line, if the call raised; else empty"""
     traceback: str
     """where it was raised, as text"""
 
 
 class Inquire(Message, frozen=True):
-    """How is the run, or the vector environment? From anybody who may connect; one who asks need not be a worker."""
+    """How is the run, or the vector environment? Anybody who may connect may ask, without being a worker."""
 
 
 class WorkerStatus(msgspec.Struct, frozen=True):
@@ -248,21 +249,21 @@ class WorkerStatus(msgspec.Struct, frozen=True):
     standing: str
     """active, or draining"""
     lanes: tuple[int, ...]
-    """those that live there: none, if it is a spare"""
+    """its lanes; none if it is a spare worker"""
     tickets: int
-    """dealt to it, and not back"""
+    """tickets that were dealt to it and have not come back"""
     steps: int
-    """env steps since it started"""
+    """env steps since the worker started"""
     steps_per_s: float
-    """between its last two accounts of itself"""
+    """env steps per second between its last two heartbeats"""
     version: int
-    """newest weights that it is known to hold; -1 before the first"""
+    """version of the newest weights that it is known to hold; -1 before the first"""
     silent_s: float
     """seconds since its last message"""
     resident_bytes: int
-    """memory of its process; 0 where that is not known"""
+    """resident memory of its process; 0 if it is not known"""
     strikes: int
-    """messages and rollouts of it that could not be used"""
+    """how many of its messages and rollouts could not be used"""
 
 
 class Status(Message, frozen=True):
@@ -272,21 +273,21 @@ class Status(Message, frozen=True):
     version: int
     """how many updates the learner has made; -1 before the first weights"""
     env_steps: int
-    """used by updates, since the run began"""
+    """env steps used by updates since the run began"""
     total_steps: int
-    """when it ends; 0: it is no run but a vector environment, and has neither updates nor an end"""
+    """env steps at which the run ends; 0 for a vector environment, which has no updates and no end"""
     steps_per_s: float
     """env steps used per second, since this learner started"""
     return_mean: float | None
-    """of the last 100 episodes, raw rewards"""
+    """mean return of the last 100 episodes, in raw rewards"""
     lag_mean: float
-    """of the rollouts of the last update, in versions"""
+    """mean lag of the rollouts of the last update, in versions"""
     lag_max: int
-    """of the rollouts of the last update, in versions"""
+    """largest lag of the rollouts of the last update, in versions"""
     workers: tuple[WorkerStatus, ...]
     """in the order in which they joined"""
     ledger: dict[str, int]
-    """what became of every ticket, transition and message"""
+    """counts of what happened to every ticket, transition and message"""
 
 
 ToLearner = Hello | Rollout | Heartbeat | Goodbye | Failure | Stepped | Returned

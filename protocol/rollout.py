@@ -1,12 +1,12 @@
 """The law of a row. Pure: arrays in, arrays out.
 
-Row t says: in `obs[t]` we did `action[t]`, got `reward[t]` and saw `obs[t+1]`, wherever `valid[t]`. That is gymnasium's
-NEXT_STEP autoreset taken at its word: the step after an episode's end only resets that copy, so its row says nothing and
-is not valid. Hence, for every copy:
+Row t says: in `obs[t]` we did `action[t]`, got `reward[t]` and saw `obs[t+1]`, wherever `valid[t]`. This is gymnasium's
+NEXT_STEP autoreset: the step after an episode's end only resets that copy, so its row holds no transition and is not valid.
+Hence, for every copy:
 
     valid[t+1]  ==  not (terminated[t] or truncated[t])
 
-If both flags are set, terminated wins. Every consumer (returns, losses, counts, replay) masks with `valid`.
+If both flags are set, terminated wins. Every consumer (returns, losses, counts, replay buffer) masks with `valid`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Episode(msgspec.Struct, frozen=True, array_like=True):
     """An episode that ended in this rollout, in raw rewards."""
 
     reward: float
-    """undiscounted sum of raw rewards: the return"""
+    """the return: undiscounted sum of raw rewards"""
     length: int
     seconds: float
 
@@ -40,33 +40,33 @@ class Rollout(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unk
     ticket: int
     version: int
     sequence: int
-    """counts the rollouts of this life of the lane, from 0"""
+    """counts the rollouts of this lane and incarnation, from 0"""
     obs: tuple[Array, ...]
     """one array [T+1, N, *leaf] for each leaf of the observation"""
     action: Array
-    """[T, N, *action] as sampled: int64 from 0, or float32 before it is clipped"""
+    """[T, N, *action] as sampled: int64 counted from 0, or float32 before clipping"""
     log_prob: Array
     """[T, N] float32, under the policy that acted"""
     reward: Array
     """[T, N] float32, raw"""
     terminated: Array
-    """[T, N] bool: the task ended, do not bootstrap"""
+    """[T, N] bool: the task ended; do not bootstrap"""
     truncated: Array
-    """[T, N] bool: the clock ended, bootstrap from obs[t+1]"""
+    """[T, N] bool: a time limit ended the episode; bootstrap from obs[t+1]"""
     valid: Array
-    """[T, N] bool: False on the one row in which a finished copy resets"""
+    """[T, N] bool: False on the row in which a finished copy is reset"""
     state: Array
-    """[N, S] float32: what the policy's core remembered before obs[0]; S is 0 without one"""
+    """[N, S] float32: state of the recurrent core before obs[0]; S is 0 without a core"""
     episodes: tuple[Episode, ...] = ()
 
     @property
     def env_steps(self) -> int:
-        """Transitions that count."""
+        """Number of valid transitions."""
         return int(np.count_nonzero(self.valid))
 
 
 def rollout_bytes(run: RunSpec) -> int:
-    """Bytes of all arrays of a rollout of this run."""
+    """Number of bytes of all arrays of a rollout of this run."""
     T, N = run.rollout_steps, run.copies
     leaves = [(T + 1, leaf.shape, leaf.dtype) for leaf in run.policy.observation]
     steps = [*leaves, (T, run.policy.action.shape, run.policy.action.stored_dtype), (1, (run.policy.state_size,), "float32")]
@@ -129,7 +129,7 @@ def _named(leaf: Leaf) -> str:
 
 
 def describe_first_non_finite(array: Array) -> str:
-    """Where the first NaN or infinity of a [T, N, …] array stands, in words."""
+    """Where the first NaN or infinity of a [T, N, …] array is, as text for an error message."""
     t, n = np.argwhere(~np.isfinite(array))[0][:2]
     value = array[t, n][~np.isfinite(array[t, n])] if array.ndim > 2 else array[t, n : n + 1]
     return f"expected finite values, got {value.flat[0]} at step {t}, copy {n}"
@@ -149,18 +149,18 @@ class Batch(msgspec.Struct, frozen=True):
     valid: Bools
     """[T, ΣN] each"""
     state: Floats
-    """[ΣN, S] what the policy's core remembered before obs[0]"""
+    """[ΣN, S] state of the recurrent core before obs[0]"""
     lane: npt.NDArray[np.int64]
     """[ΣN] the lane of each column"""
     fresh: Bools
-    """[ΣN] True where the column's lane has just been started: nothing carries over from its last rollout"""
+    """[ΣN] True where the column's lane has just been started, so that no state carries over from an earlier rollout"""
     copies: int
-    """N: each lane has this many neighbouring columns, or a multiple when it has several rollouts here"""
+    """N: each lane has this many adjacent columns, or a multiple if the batch has several of its rollouts"""
     episodes: tuple[Episode, ...]
 
     @property
     def env_steps(self) -> int:
-        """Transitions that count."""
+        """Number of valid transitions."""
         return int(np.count_nonzero(self.valid))
 
 

@@ -11,7 +11,7 @@ from protocol.wire.compression import why_no_zstd
 
 
 class Leaf(msgspec.Struct, frozen=True):
-    """One array of an observation; a Dict or Tuple observation has several."""
+    """One array of an observation. A Dict or Tuple observation has several."""
 
     path: str
     """where it stands in the observation, `camera/left`; empty when the observation is one array"""
@@ -53,23 +53,23 @@ class ActionSpec(msgspec.Struct, frozen=True):
 
 
 class NamedShape(msgspec.Struct, frozen=True, array_like=True):
-    """An array by its name, and how large it is."""
+    """Name and shape of an array."""
 
     name: str
-    """as torch's `named_parameters` has it"""
+    """its name in torch's `named_parameters`"""
     shape: tuple[int, ...]
-    """its sides"""
+    """its shape"""
 
 
 class EncoderSpec(msgspec.Struct, frozen=True):
-    """A torch module of the user's own, which stands before all other layers; see `protocol/policy/encoder.py`."""
+    """A torch module written by the user, which comes before all other layers; see `protocol/policy/encoder.py`."""
 
     factory: str
-    """`my_package.networks:encoder`, a callable that makes it"""
+    """the callable that makes it, as `my_package.networks:encoder`"""
     arrays: tuple[NamedShape, ...]
-    """its parameters, in its order"""
+    """its parameters, in the module's order"""
     size: int
-    """how many features it gives"""
+    """how many features it returns"""
 
 
 ImagesDtype = Literal["float32", "bfloat16"]
@@ -81,41 +81,41 @@ class PolicySpec(msgspec.Struct, frozen=True):
     observation: tuple[Leaf, ...]
     action: ActionSpec
     net: tuple[int, ...] = (64, 64)
-    """hidden layers of the actor, and of the critic; or of the action values"""
+    """widths of the hidden layers of the actor, and of the critic; or of the Q-network"""
     activation: Literal["tanh", "relu"] = "tanh"
     normalize_observations: bool = False
     """subtract the running mean, divide by the running standard deviation, clip to ±10 (not images)"""
     head: Literal["actor_critic", "q"] = "actor_critic"
-    """a distribution over actions and a value, or the value of every (discrete) action, acted on epsilon-greedily"""
+    """a distribution over actions and a state value, or the value of every discrete action, for epsilon-greedy acting"""
     shared_net: bool = False
     """actor and critic share their hidden layers"""
     dueling: bool = False
-    """action values are a state's value and each action's advantage over the mean (Wang et al. 2016)"""
+    """dueling architecture: action values from a state value and advantages (Wang et al. 2016)"""
     encoder: EncoderSpec | None = None
-    """a module of the user's own before all other layers; none: the arrays as they are, and convolutions of images"""
+    """a module written by the user; none: images go through convolutions, other arrays are used directly"""
     core: Literal["lstm", "gru"] | None = None
-    """what remembers, between an observation's features and the hidden layers; none: nothing is remembered"""
+    """recurrent core between the features and the hidden layers; none: a policy without memory"""
     core_size: int = 64
-    """units of the core"""
+    """number of units of the core"""
 
     @property
     def state_size(self) -> int:
-        """S, how many numbers an env copy carries from one observation to the next: the core's memory."""
+        """S, the size of the recurrent state of one env copy; 0 without a core."""
         return 0 if self.core is None else self.core_size * (2 if self.core == "lstm" else 1)
 
     @property
     def needs_torch(self) -> bool:
-        """Images need convolutions, which numpy has not, and modules are torch's; every other policy acts without it."""
+        """True for policies with images (convolutions) or an encoder. Every other policy acts in numpy."""
         return self.encoder is not None or self.convolves
 
     @property
     def convolves(self) -> bool:
-        """Images go through convolutions of ours."""
+        """True if images go through the built-in convolutions."""
         return self.encoder is None and any(leaf.is_image for leaf in self.observation)
 
 
 class RunSpec(msgspec.Struct, frozen=True, tag=True):
-    """Everything a worker needs to know of the run it joins: it collects rollouts."""
+    """Everything that a worker needs to know about a run for which it collects rollouts."""
 
     env: EnvSpec
     policy: PolicySpec
@@ -126,19 +126,19 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
     lanes: int
     seed: int
     vector: Literal["loop", "native", "envpool"] = "loop"
-    """how the copies of a lane are stepped: one after another, or at once, by the environment's own vectorised form or by
-    envpool's
+    """how the copies of a lane are stepped: one after another (`loop`), or together, by the environment's own vectorized
+    form (`native`) or by envpool's
     """
     compress: Literal["none", "zstd"] = "none"
-    """what workers do with the larger arrays of their rollouts, besides what they do anyway"""
+    """whether workers also compress the larger arrays of their rollouts"""
     images_dtype: ImagesDtype = "float32"
-    """as what workers look at images, with convolutions of ours"""
+    """precision in which workers process images with the built-in convolutions"""
     heartbeat_s: float = 1.0
     learner_timeout_s: float = 30.0
-    """a worker that heard nothing of the learner for so long starts again with Hello"""
+    """a worker that received nothing from the learner for so long says Hello again"""
 
     def why_not(self, code: AllowedCode) -> str:
-        """Why a worker that runs so much code cannot take part; empty if it can."""
+        """Why a worker that allows only this code cannot take part; empty if it can."""
         if self.compress == "zstd" and (why := why_no_zstd()):
             return why
         if self.policy.encoder is not None and code is AllowedCode.REGISTERED:
@@ -150,25 +150,25 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
 
 
 class StepSpec(msgspec.Struct, frozen=True, tag=True):
-    """Everything a worker needs to know of the vector environment it joins: it steps copies when it is told to."""
+    """Everything that a worker needs to know about a vector environment whose copies it steps on order."""
 
     envs: tuple[EnvSpec, ...]
-    """each of the different environments, once"""
+    """the different environments, each listed once"""
     copies: tuple[int, ...]
-    """which of `envs` each copy is, in the order of the whole vector environment"""
+    """index in `envs` for each copy, in the order of the whole vector environment"""
     lanes: tuple[int, ...]
-    """how many copies each lane has; lane 0 has the first ones"""
+    """how many copies each lane has; lane 0 has the first copies"""
     observation: tuple[Leaf, ...]
     action: tuple[Leaf, ...]
     """the arrays of an action, described as those of an observation are"""
     autoreset: Literal["NextStep", "SameStep", "Disabled"] = "NextStep"
-    """what follows an episode's end, as gymnasium's `AutoresetMode` names it"""
+    """what happens when an episode ends, by the names of gymnasium's `AutoresetMode`"""
     render_mode: str | None = None
-    """passed on to each copy"""
+    """passed to each copy"""
     heartbeat_s: float = 1.0
     learner_timeout_s: float = 600.0
-    """a worker that heard nothing of the learner for so long starts again with Hello. The caller may do much between two
-    steps, and nobody listens then; workers that end with the learner's process wait for ever (infinity)
+    """a worker that received nothing from the learner for so long says Hello again. The caller may compute for long between
+    two steps, without reading messages; workers that end with the learner's process wait for ever (infinity)
     """
 
     def first_copy(self, lane: int) -> int:
@@ -176,5 +176,5 @@ class StepSpec(msgspec.Struct, frozen=True, tag=True):
         return sum(self.lanes[:lane])
 
     def why_not(self, code: AllowedCode) -> str:
-        """Why a worker that runs so much code cannot take part; empty if it can."""
+        """Why a worker that allows only this code cannot take part; empty if it can."""
         return next((why for env in self.envs if (why := env.why_not(code))), "")

@@ -1,8 +1,8 @@
-"""What libzmq's monitor says of a handshake, in words for the people on both sides. Pure, but for one look at a connection.
+"""Explains failed handshakes, from the events of libzmq's monitor. Pure, except for `peer_host`.
 
-The law: the learner can tell what a visitor lacked; a worker is told by libzmq only whether its key was refused, and that is
-the one thing that no retry can heal. All else it sees as a connection that is broken off, so it is told what may be meant,
-and goes on trying.
+The law: the learner knows what was wrong with a client. A worker learns from libzmq only whether its key was refused, the
+one problem that a retry cannot solve. It sees every other problem as a connection that was closed, so its log names the
+likely causes, and it tries again.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import zmq
 from protocol.keys.keys import Token, fingerprint
 
 FAILED = zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_AUTH
-WATCHED = FAILED | zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED
-WATCHED_BY_WORKER = FAILED | zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED
+LEARNER_EVENTS = FAILED | zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED
+WORKER_EVENTS = FAILED | zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED
 HANDSHAKE_MS = 2000
-NOT_ALLOWED = 400  # ZAP's word for: this key, no
+NOT_ALLOWED = 400  # ZAP's status code for a key that is not allowed
 
 
 # ---------------------------------------------------------------- the worker's side
@@ -33,11 +33,11 @@ class ConnectionProblem:
 
     line: str
     final: bool = False
-    """no retry can heal it: the learner has refused this key"""
+    """a retry cannot solve it: the learner has refused this key"""
 
 
 def connection_problem(event: int, value: int, address: str, token: Token | None) -> ConnectionProblem:
-    """What a failed handshake means to a worker."""
+    """The likely cause of a failed handshake, for a worker."""
     if event == zmq.EVENT_HANDSHAKE_FAILED_AUTH and value == NOT_ALLOWED:
         key = fingerprint(token.client.public) if token else "none"
         advice = (
@@ -61,16 +61,16 @@ def connection_problem(event: int, value: int, address: str, token: Token | None
 
 
 def handshake_failure(event: int, value: int, keys: bool) -> str:
-    """What was wrong with a visitor's handshake, to a learner with or without keys."""
+    """Why a client's handshake failed, for a learner with or without keys."""
     match event, value:
         case zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, zmq.PROTOCOL_ERROR_ZMTP_CRYPTOGRAPHIC:
-            return "it believes in the key of another learner: its token is not of this one"
+            return "its token is for another learner: it expects another server key"
         case zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, zmq.PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH if keys:
             return "it shows no key; a worker needs --token"
         case zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, zmq.PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH:
             return "it shows a key, and this learner has none: leave its token out, or start the learner with --keys"
         case zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, _:
-            return f"it breaks the protocol of the handshake ({value:#x})"
+            return f"it violates the protocol of the handshake ({value:#x})"
         case _, errno.EAGAIN | errno.ETIMEDOUT:
             return f"it did not finish the handshake within {HANDSHAKE_MS // 1000} s"
         case _, errno.EPIPE | errno.ECONNRESET:
@@ -84,34 +84,38 @@ NO_ZEROMQ = "it does not speak ZeroMQ, or left before it had said who it is"
 
 
 class PendingHandshakes:
-    """Connections whose handshake is not over. Finds out whose handshake it was that failed.
+    """Connections whose handshake is not finished. Finds out which client's handshake failed, for the log only.
 
-    libzmq names a connection by its descriptor when it is accepted and when it ends, and not in between. A failure is
-    followed by the end of the same connection; which one succeeded is guessed from the addresses that ZAP let in. It serves
-    the log alone.
+    libzmq gives a connection's descriptor when it is accepted and when it ends, but not in between. A failure is followed by
+    the end of the same connection. Which handshake succeeded is guessed from the addresses that ZAP approved.
     """
 
     def __init__(self, keys: bool, host_of: Callable[[int], str] | None = None) -> None:
         self._keys, self._host_of = keys, host_of or peer_host
-        self._fresh: dict[int, str] = {}
+        self._pending: dict[int, str] = {}
         self._failed: tuple[int, int] | None = None
         self._approved: deque[str] = deque(maxlen=100)
 
-    def approved(self, host: str) -> None:
-        """ZAP let somebody in from there: its handshake will succeed."""
+    def add_approved(self, host: str) -> None:
+        """ZAP approved a client at this address: its handshake will succeed."""
         self._approved.append(host)
 
-    def saw(self, event: int, value: int) -> tuple[str, str] | None:
-        """An event of the monitor. Whose handshake failed, and why, once that is known; a refused key is ZAP's to tell."""
+    def handle_event(self, event: int, value: int) -> tuple[str, str] | None:
+        """Handle an event of the monitor. Returns the host and the reason of a failed handshake, once they are known.
+
+        For a refused key it returns None: the ZAP handler reports that.
+        """
         match event:
             case zmq.EVENT_ACCEPTED:
-                self._fresh[value] = self._host_of(value)
+                self._pending[value] = self._host_of(value)
             case zmq.EVENT_HANDSHAKE_SUCCEEDED:
                 host = self._approved.popleft() if self._approved else None
-                if self._fresh:
-                    del self._fresh[next((one for one, at in self._fresh.items() if at == host), next(iter(self._fresh)))]
+                if self._pending:
+                    del self._pending[
+                        next((one for one, at in self._pending.items() if at == host), next(iter(self._pending)))
+                    ]
             case zmq.EVENT_DISCONNECTED:
-                host, failed = self._fresh.pop(value, None), self._failed
+                host, failed = self._pending.pop(value, None), self._failed
                 self._failed = None
                 if failed is not None and failed[0] != zmq.EVENT_HANDSHAKE_FAILED_AUTH:
                     return host or "", handshake_failure(*failed, self._keys)
@@ -123,7 +127,7 @@ class PendingHandshakes:
 
 
 def peer_host(descriptor: int) -> str:
-    """The address at the other end; empty if the connection has ended already. The descriptor is libzmq's, and stays so."""
+    """The address of the peer; empty if the connection has ended. The descriptor still belongs to libzmq afterwards."""
     try:
         borrowed = socket.socket(fileno=descriptor)
     except OSError:

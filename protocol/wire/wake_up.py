@@ -13,15 +13,15 @@ from contextlib import suppress
 from enum import IntEnum
 from time import perf_counter
 
-# x86 makes an earlier store visible before a later one. Other processors need a system call for that: there is no spinning.
+# On x86 no core sees a later store before an earlier one. Elsewhere only a system call orders them, so there is no spinning.
 CAN_SPIN = platform.machine() in {"x86_64", "AMD64", "i686"}
 SPIN_S = 0.0002  # a learner that only computes its next action is back by then; sleeping and waking costs 50 µs
-WANTED_S = 0.00005  # a spin turn that takes longer means that another process ran meanwhile and needs this core
-MOST_LEFT_OUT = 63  # waits without spinning between two tries to spin
+BUSY_CORE_S = 0.00005  # a spin turn that takes longer means that another process ran meanwhile and needs this core
+MAX_SKIPPED_SPINS = 63  # waits without spinning between two tries to spin
 
 
 class WakeReason(IntEnum):
-    """What a bell was rung for."""
+    """Why a sleeper was woken."""
 
     NONE = 0
     STEP = 1
@@ -29,14 +29,15 @@ class WakeReason(IntEnum):
 
 
 class WakePipe:
-    """A pipe: rung by one side, which writes, and heard by the other, which reads.
+    """A pipe by which one side wakes the other: one writes a byte, the other waits until it can read.
 
-    A pipe, for Linux takes it that who writes to one is about to wait: whom it wakes begins on the same core as soon as the
-    other sleeps. Whom an eventfd or a semaphore wakes may be made to wait for a core where a third one spins.
+    It is a pipe because Linux assumes that a process that writes to a pipe is about to wait: the woken process starts on the
+    same core as soon as the writer sleeps. A process woken by an eventfd or a semaphore may have to wait for a core on which
+    a third process spins.
     """
 
     def __init__(self, *, read_fd: int = -1, write_fd: int = -1) -> None:
-        """A new one; or one of the ends, which was handed over."""
+        """A new pipe, or one end of a pipe that this process inherited."""
         self.read_fd, self.write_fd = (
             os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC) if read_fd == write_fd == -1 else (read_fd, write_fd)
         )
@@ -45,25 +46,25 @@ class WakePipe:
             self._poll.register(self.read_fd, select.POLLIN)
 
     def wake(self, reason: WakeReason = WakeReason.STEP) -> None:
-        """Wake whoever waits, or will."""
-        with suppress(BlockingIOError, BrokenPipeError):  # full: it will wake; broken: nobody is left to
+        """Wake the other side, now or when it next waits."""
+        with suppress(BlockingIOError, BrokenPipeError):  # full: the reader will wake anyway; broken: the reader is gone
             os.write(self.write_fd, _BYTES[reason])
 
     def wait(self, timeout_s: float) -> WakeReason:
-        """Sleep until it is rung, at most `timeout_s`; of all that it was rung for, a message counts most.
+        """Sleep until woken, at most `timeout_s`. Of several reasons, `MESSAGE` is returned before `STEP`.
 
-        Rung for a step that was seen without sleeping, it wakes the next sleeper for nothing.
+        After a step that was noticed without sleeping, the pipe still wakes the next sleeper, once and without need.
         """
         if not self._poll.poll(timeout_s * 1000):
             return WakeReason.NONE
         try:
-            strokes = os.read(self.read_fd, 4096)
+            received = os.read(self.read_fd, 4096)
         except BlockingIOError:
             return WakeReason.NONE
-        return WakeReason(max(strokes, default=0))
+        return WakeReason(max(received, default=0))
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the descriptors."""
         for fd in {self.read_fd, self.write_fd} - {-1}:
             os.close(fd)
         self.read_fd = self.write_fd = -1
@@ -73,23 +74,23 @@ _BYTES = {reason: bytes([reason]) for reason in WakeReason}
 
 
 class SpinWait:
-    """Waiting awake for what is expected at once. While it does not come at once, this is tried less and less often.
+    """Spins for a short time before a sleep. Each time that spinning was in vain, more of the next waits skip it.
 
-    Yielding is a request that Linux may decline for a while: only who sleeps surely makes room. So the first turn that takes
-    long, because somebody else wanted this core, ends it.
+    Linux may ignore `sched_yield` for a while; only a sleeping process surely frees its core. So spinning ends at the first
+    turn that takes long because another process wanted this core.
     """
 
     def __init__(self) -> None:
-        self._left_out = self._to_leave_out = 0
+        self._skipped = self._to_skip = 0
 
     def wait(self, seen: Callable[[], bool], seconds: float) -> bool:
-        """Whether it was seen within `seconds`."""
+        """Spin until `seen` returns true, at most `seconds`; whether it did."""
         if seen():
             return True
         if not CAN_SPIN or seconds <= 0:
             return False
-        if self._to_leave_out:
-            self._to_leave_out -= 1
+        if self._to_skip:
+            self._to_skip -= 1
             return False
         now = perf_counter()
         until = now + seconds
@@ -97,9 +98,9 @@ class SpinWait:
             os.sched_yield()
             before, now = now, perf_counter()
             if seen():
-                self._left_out = 0
+                self._skipped = 0
                 return True
-            if now - before > WANTED_S:
+            if now - before > BUSY_CORE_S:
                 break
-        self._left_out = self._to_leave_out = min(2 * self._left_out + 1, MOST_LEFT_OUT)
+        self._skipped = self._to_skip = min(2 * self._skipped + 1, MAX_SKIPPED_SPINS)
         return False

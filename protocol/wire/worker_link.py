@@ -15,7 +15,7 @@ import zmq
 
 from protocol.address import check_address, is_local, resolves
 from protocol.errors import BadMessage, UsageError
-from protocol.keys.handshake import WATCHED_BY_WORKER, ConnectionProblem, connection_problem
+from protocol.keys.handshake import WORKER_EVENTS, ConnectionProblem, connection_problem
 from protocol.keys.keys import Token
 from protocol.keys.zap import connect_with
 from protocol.log_rate_limiter import LogRateLimiter, suppressed_note
@@ -87,7 +87,7 @@ class WorkerLink:
 
     def _watch(self) -> None:
         name = f"inproc://millrace-worker-{os.urandom(6).hex()}"
-        self._socket.monitor(name, WATCHED_BY_WORKER)
+        self._socket.monitor(name, WORKER_EVENTS)
         self._monitor = self.context.socket(zmq.PAIR)
         self._monitor.linger = 0
         self._monitor.rcvhwm = 0  # libzmq waits where nobody reads, and an environment's step may take minutes

@@ -215,30 +215,30 @@ def test_every_complaint_is_a_line_of_its_own() -> None:
 
 
 def test_a_failed_handshake_is_told_with_its_address_once_its_connection_ends() -> None:
-    visitors = PendingHandshakes(True, lambda fd: f"10.0.0.{fd}")
+    pending = PendingHandshakes(True, lambda fd: f"10.0.0.{fd}")
     failed = (zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, zmq.PROTOCOL_ERROR_ZMTP_CRYPTOGRAPHIC)
-    assert visitors.saw(zmq.EVENT_ACCEPTED, 5) is None
-    assert visitors.saw(zmq.EVENT_ACCEPTED, 6) is None
-    assert visitors.saw(*failed) is None
-    assert visitors.saw(zmq.EVENT_DISCONNECTED, 6) == ("10.0.0.6", handshake_failure(*failed, True))
-    assert visitors.saw(zmq.EVENT_DISCONNECTED, 5) == ("10.0.0.5", NO_ZEROMQ)
+    assert pending.handle_event(zmq.EVENT_ACCEPTED, 5) is None
+    assert pending.handle_event(zmq.EVENT_ACCEPTED, 6) is None
+    assert pending.handle_event(*failed) is None
+    assert pending.handle_event(zmq.EVENT_DISCONNECTED, 6) == ("10.0.0.6", handshake_failure(*failed, True))
+    assert pending.handle_event(zmq.EVENT_DISCONNECTED, 5) == ("10.0.0.5", NO_ZEROMQ)
 
 
 def test_a_worker_that_leaves_is_no_failed_handshake() -> None:
-    visitors = PendingHandshakes(True, lambda fd: f"10.0.0.{fd}")
+    pending = PendingHandshakes(True, lambda fd: f"10.0.0.{fd}")
     for fd in (5, 6):
-        visitors.saw(zmq.EVENT_ACCEPTED, fd)
-    visitors.approved("10.0.0.6")
-    visitors.saw(zmq.EVENT_HANDSHAKE_SUCCEEDED, 0)
-    assert visitors.saw(zmq.EVENT_DISCONNECTED, 6) is None
-    assert visitors.saw(zmq.EVENT_DISCONNECTED, 5) == ("10.0.0.5", NO_ZEROMQ)
+        pending.handle_event(zmq.EVENT_ACCEPTED, fd)
+    pending.add_approved("10.0.0.6")
+    pending.handle_event(zmq.EVENT_HANDSHAKE_SUCCEEDED, 0)
+    assert pending.handle_event(zmq.EVENT_DISCONNECTED, 6) is None
+    assert pending.handle_event(zmq.EVENT_DISCONNECTED, 5) == ("10.0.0.5", NO_ZEROMQ)
 
 
 def test_a_refused_key_is_counted_once_by_zap_alone() -> None:
-    visitors = PendingHandshakes(True, lambda fd: "10.0.0.7")
-    visitors.saw(zmq.EVENT_ACCEPTED, 5)
-    visitors.saw(zmq.EVENT_HANDSHAKE_FAILED_AUTH, 400)
-    assert visitors.saw(zmq.EVENT_DISCONNECTED, 5) is None
+    pending = PendingHandshakes(True, lambda fd: "10.0.0.7")
+    pending.handle_event(zmq.EVENT_ACCEPTED, 5)
+    pending.handle_event(zmq.EVENT_HANDSHAKE_FAILED_AUTH, 400)
+    assert pending.handle_event(zmq.EVENT_DISCONNECTED, 5) is None
 
 
 # ---------------------------------------------------------------- the handshake
@@ -268,7 +268,7 @@ def test_who_has_a_token_is_heard_and_answered(net: Net) -> None:
 CASES: dict[str, tuple[bool, Token | None, str, str, bool]] = {
     # what: has the learner keys?, the worker's token, the learner says, the worker says, is that final?
     "a key that is not allowed": (True, token(STRANGER), "is not allowed here", "refused this worker's key", True),
-    "another learner's token": (True, token(server=STRANGER), "the key of another learner", "token is of another", False),
+    "another learner's token": (True, token(server=STRANGER), "its token is for another learner", "token is of another", False),
     "no token": (True, None, "no key|no token", "perhaps it asks for a key: give this worker --token", False),
     "a token too many": (False, token(), "shows a key|has a token", "started without keys; then leave the token", False),
 }
