@@ -1,4 +1,4 @@
-"""How many cores this process may use: those it may run on, or its container's share of them, if that is less."""
+"""How many cores this process may use: the cores it may run on, or the CPU quota of its container if that is less."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ CPU_MAX = Path("/sys/fs/cgroup/cpu.max")  # control groups, version 2: microseco
 
 
 def usable_cores() -> int:
-    """At least 1."""
+    """Number of cores, at least 1."""
     allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, min(allowed, int(_share(CPU_MAX, allowed))))
+    return max(1, min(allowed, int(_cpu_quota(CPU_MAX, allowed))))
 
 
-def _share(cpu_max: Path, otherwise: float) -> float:
-    """Of CPU time, in cores."""
+def _cpu_quota(cpu_max: Path, otherwise: float) -> float:
+    """The container's CPU quota, in cores; `otherwise` if there is none."""
     try:
         quota, period = cpu_max.read_text().split()
         return float(quota) / float(period)

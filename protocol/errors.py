@@ -6,12 +6,12 @@
     │   ├── Refused               2   the learner told this worker to leave
     │   └── RunError              1   the run cannot go on
     │       ├── CheckpointError   1   a checkpoint is missing, broken or of another format
-    │       ├── NoWorkers         1   nobody is left (or came) to step the environment
+    │       ├── NoWorkers         1   no worker is left, or none ever joined
     │       ├── WorkerLost        1   a worker is gone, and env copies with it, where none may be lost
     │       ├── Stalled           1   a deadline passed; the text says what was waited for
     │       └── EnvironmentFailed 1   the environment raised too often; the text carries the worker's own traceback
     └── TheirError            counted and answered, never raised into the loop: a peer sent something wrong
-        ├── BadMessage            not a message of ours: shape, size, type or version
+        ├── BadMessage            not a valid message: shape, size, type or version
         └── BadRollout            a rollout that breaks the law of a row
 
 A message is one line: who, what, expected, got, what to do next.
@@ -28,12 +28,12 @@ class MillraceError(Exception):
 
 
 class UserFacingError(MillraceError):
-    """We cannot go on."""
+    """One side cannot go on. The command line prints the one line and exits with `exit_code`."""
 
     exit_code = 1
 
     def __init__(self, line: str, detail: str = "") -> None:
-        """`line` says all in one line; `detail` (a traceback, as text) is shown beneath it."""
+        """`line` is the whole message, in one line; `detail` (a traceback, as text) is shown below it."""
         super().__init__(line)
         self.detail = detail
 
@@ -59,11 +59,11 @@ class CheckpointError(RunError):
 
 
 class NoWorkers(RunError):
-    """Nobody is left, or came, to step the environment."""
+    """No worker is left, or none ever joined."""
 
 
 class WorkerLost(RunError):
-    """A worker is gone, and env copies with it."""
+    """A worker was lost, and its env copies with it."""
 
 
 class Stalled(RunError):
@@ -79,7 +79,7 @@ class PeerError(MillraceError):
 
 
 class BadMessage(PeerError):
-    """Bytes that are not a message of ours."""
+    """Bytes that are not a valid message."""
 
 
 class BadRollout(PeerError):

@@ -1,7 +1,7 @@
-"""Memory that is freed stays with the process, for networks that need the same megabytes again and again.
+"""Keeps freed memory in the process, for networks that need the same megabytes in every pass.
 
-Without it the C library gives what lies at its heap's end back to the system after each pass, and the system hands it out
-again page by page, each one zeroed: a third of the time in which a network acts on batches of 64 images.
+Without it, glibc returns the end of its heap to the system after each pass, and the system hands it out again page by page,
+each page zeroed. That costs a third of the time in which a network acts on batches of 64 images.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 
 
 def keep_freed_memory() -> bool:
-    """Of the whole process, from now on; whether the C library is one that can (glibc)."""
+    """Set this for the whole process, from now on. False if the C library cannot (only glibc can)."""
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError, TypeError):  # another library, another system

@@ -28,35 +28,35 @@ from protocol.wire.sockets import LINGER_MS, Traffic, receive_frames, send_frame
 
 log = logging.getLogger("millrace.link")
 
-MESSAGES_AT_ONCE = 10_000
-HOLDERS = 10_000
+MAX_MESSAGES = 10_000
+MAX_REMEMBERED_KEYS = 10_000
 
 
 class LearnerLink:
-    """The learner's end: many workers, one port."""
+    """The learner's end: one port, many workers."""
 
     def __init__(
         self, address: str, context: zmq.Context[zmq.Socket[bytes]] | None = None, keyring: Keyring | None = None
     ) -> None:
-        """With a keyring (tcp alone) only those on it get in. There can be one such link in a context."""
+        """With a keyring (only over tcp), only its clients may connect. A context can hold one such link."""
         check_address(address)
         self.context = context or zmq.Context.instance()
         self.keyring = keyring
         self.received, self.sent = Traffic(), Traffic()
         self.refused_messages = 0
-        """messages under keys that may speak no more"""
+        """messages under keys that are not allowed any more"""
         self.packed_bytes_limit = 0
-        """bytes to which the packed arrays of one message may come; 0: none may come packed"""
-        self._holders: dict[bytes, str] = {}  # routing id -> key under which it spoke last
-        self._lid = LogRateLimiter()
+        """most bytes that the packed arrays of one message may unpack to; 0: no array may be packed"""
+        self._last_keys: dict[bytes, str] = {}  # routing id -> key of its last message
+        self._log_limiter = LogRateLimiter()
         self._socket = self.context.socket(zmq.ROUTER)
         set_options(self._socket, address, keyring is not None)
         self._socket.router_mandatory = True
         self._socket.router_handover = True
-        self._door: AuthenticatorThread | None = None
+        self._authenticator: AuthenticatorThread | None = None
         try:
             if address.startswith("tcp://"):
-                self._door = AuthenticatorThread(self._socket, keyring)  # before the port is bound
+                self._authenticator = AuthenticatorThread(self._socket, keyring)  # before the port is bound
             self._socket.bind(address)
         except UsageError:
             self.close(linger_s=0.0)
@@ -65,33 +65,31 @@ class LearnerLink:
             self.close(linger_s=0.0)
             raise UsageError(_why_not_bound(address, error)) from error
         self.address = bytes(self._socket.get(zmq.LAST_ENDPOINT)).decode().rstrip("\0")
-        """where workers connect: the port that was chosen, if it was `*`"""
+        """where workers connect, with the port that was chosen for `*`"""
 
     @property
     def refused(self) -> int:
-        """Handshakes that failed, of those who were not let in."""
-        return self._door.refused if self._door is not None else 0
+        """Number of failed handshakes."""
+        return self._authenticator.refused if self._authenticator is not None else 0
 
     def poll(self, timeout_s: float) -> bool:
-        """Wait until something arrives, at most `timeout_s`. Raises `RunError` if nobody stands at the door."""
-        if self._door is not None and not self._door.is_alive():
-            raise RunError(
-                f"the door of {self.address} is shut: its thread has ended, see the log; start again with --resume"
-            )
+        """Wait until something arrives, at most `timeout_s`. Raises `RunError` if the authenticator ended."""
+        if self._authenticator is not None and not self._authenticator.is_alive():
+            raise RunError(f"authenticator of {self.address}: its thread has ended, see the log; start again with --resume")
         return bool(self._socket.poll(max(0, int(timeout_s * 1000))))
 
     def receive(self) -> Iterator[tuple[bytes, ToLearner | Inquire | BadMessage]]:
-        """What has arrived, with its sender; what cannot be read comes as its error. At most MESSAGES_AT_ONCE."""
+        """Messages that have arrived, each with its sender; at most MAX_MESSAGES. An unreadable one comes as its error."""
         said_by: list[str] | None = None if self.keyring is None else []
-        for _ in range(MESSAGES_AT_ONCE):  # a flood must not keep the learner here
+        for _ in range(MAX_MESSAGES):  # a flood must not block the learner
             frames = receive_frames(self._socket, said_by)
             if frames is None:
                 return
             self.received.add(frames)
             peer = bytes(frames[0])
             if said_by is not None:
-                peer = self._held(peer, said_by[0])
-                if self._turned_away(peer):
+                peer = self._peer(peer, said_by[0])
+                if self._refuse_key(peer):
                     continue
             try:
                 yield peer, decode_to_learner(frames[1:], self.packed_bytes_limit)
@@ -99,32 +97,32 @@ class LearnerLink:
                 yield peer, error
 
     def why_not(self, peer: bytes) -> str:
-        """Why this peer may speak no more; empty if it may."""
+        """Why this peer is not allowed any more; empty if it is."""
         return "" if self.keyring is None else self.keyring.allowed.why_not(_key_of(peer))
 
     def speaker(self, peer: bytes) -> str:
-        """Who answers for what this peer sends: the name of its key, or else its own."""
+        """The name to blame for what this peer sends: that of its key, or without keys its own."""
         return (
             worker_name(peer).decode(errors="replace")
             if self.keyring is None
             else self.keyring.allowed.name_of(_key_of(peer))
         )
 
-    def _held(self, routing_id: bytes, key: str) -> bytes:
-        """The peer that speaks from this routing id now."""
-        self._holders.pop(routing_id, None)  # the one that spoke longest ago stands first
-        self._holders[routing_id] = key
-        if len(self._holders) > HOLDERS:
-            del self._holders[next(iter(self._holders))]
+    def _peer(self, routing_id: bytes, key: str) -> bytes:
+        """The peer that uses this routing id now."""
+        self._last_keys.pop(routing_id, None)  # so that the routing id of the oldest message stands first
+        self._last_keys[routing_id] = key
+        if len(self._last_keys) > MAX_REMEMBERED_KEYS:
+            del self._last_keys[next(iter(self._last_keys))]
         return b"%s\0%s" % (routing_id, key.encode())
 
-    def _turned_away(self, peer: bytes) -> bool:
-        """A message under a key that may speak no more is counted, answered and not read."""
+    def _refuse_key(self, peer: bytes) -> bool:
+        """Count and answer a message if its key is not allowed any more; whether it was not."""
         why = self.why_not(peer)
         if why:
             self.refused_messages += 1
             self.send(peer, encode(Refuse(why)))
-            if (kept_back := self._lid.due(why, time.monotonic())) is not None:
+            if (kept_back := self._log_limiter.due(why, time.monotonic())) is not None:
                 log.warning(
                     "worker %s is not heard: %s%s",
                     worker_name(peer).decode(errors="replace"),
@@ -137,8 +135,8 @@ class LearnerLink:
         """Send; False if the peer is gone."""
         if self.keyring is not None:
             routing_id, _, key = peer.rpartition(b"\0")
-            if self._holders.get(routing_id) != key.decode():
-                return False  # another one speaks from there now
+            if self._last_keys.get(routing_id) != key.decode():
+                return False  # another peer uses the routing id now
             peer = routing_id
         whole = [peer, *frames]
         try:
@@ -152,15 +150,15 @@ class LearnerLink:
 
     def close(self, linger_s: float = LINGER_MS / 1000) -> None:
         """Send what is queued, at most `linger_s`, and close."""
-        if self._door is not None and not self._socket.closed:
-            self._socket.disable_monitor()  # before its reader goes: libzmq would wait for one
+        if self._authenticator is not None and not self._socket.closed:
+            self._socket.disable_monitor()  # before its reader is closed: libzmq blocks without one
         self._socket.close(linger=int(linger_s * 1000))
-        if self._door is not None:
-            self._door.close()
+        if self._authenticator is not None:
+            self._authenticator.close()
 
 
 def _key_of(peer: bytes) -> bytes:
-    """The public key under which a peer speaks; empty, which nobody has, if there is none."""
+    """The public key of a peer; empty if there is none."""
     try:
         return bytes.fromhex(peer.rpartition(b"\0")[2].decode())
     except ValueError:

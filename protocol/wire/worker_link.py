@@ -24,7 +24,7 @@ from protocol.wire.codec import Buffer, decode_to_observer, decode_to_worker
 from protocol.wire.compression import Packing
 from protocol.wire.sockets import LINGER_MS, receive_frames, send_frames, set_options
 
-Said = TypeVar("Said")
+Decoded = TypeVar("Decoded")
 
 log = logging.getLogger("millrace.link")
 
@@ -32,7 +32,7 @@ TAG_CHARACTERS = 32
 
 
 class WorkerLink:
-    """A worker's end."""
+    """A worker's end: one connection to the learner."""
 
     def __init__(
         self,
@@ -41,18 +41,18 @@ class WorkerLink:
         context: zmq.Context[zmq.Socket[bytes]] | None = None,
         token: Token | None = None,
     ) -> None:
-        """With a token (tcp alone) it speaks with that token's learner and nobody else."""
+        """With a token (only over tcp) it connects only to the learner of that token."""
         check_address(address)
         longest = 255 - (TAG_CHARACTERS + 1)
         if not 1 <= len(name.encode()) <= longest or "\0" in name:
             raise UsageError(f"worker name {name[:40]!r}: expected 1 to {longest} bytes, got {len(name.encode())}")
         self.address, self.token = address, token
         self.problem: ConnectionProblem | None = None
-        """why there is no connection, as far as that is known"""
+        """why there is no connection, if known"""
         self.packing = Packing(stack=token is not None or not is_local(address))
-        """of the rollouts that go over it: what is encrypted, or leaves this machine, is worth looking at first"""
+        """how rollouts are packed: frame stacks only if the connection is encrypted or leaves this machine"""
         self._connected = False
-        self._lid = LogRateLimiter()
+        self._log_limiter = LogRateLimiter()
         self.context = context or zmq.Context.instance()
         self._socket = self.context.socket(zmq.DEALER)
         set_options(self._socket, address, token is not None)
@@ -63,7 +63,7 @@ class WorkerLink:
         self._poller = zmq.Poller()
         self._poller.register(self._socket, zmq.POLLIN)
         if address.startswith("tcp://"):
-            self._watch()
+            self._open_monitor()
         if token is not None:
             connect_with(self._socket, token)
         try:
@@ -72,59 +72,59 @@ class WorkerLink:
             self.close(linger_s=0.0)
             raise UsageError(f"address {address}: cannot connect ({error.strerror})") from error
         if not resolves(address):
-            self._say(ConnectionProblem(f"the host of {address} is not known here; is it spelt right?"))
+            self._report(ConnectionProblem(f"the host of {address} is not known here; is it spelt right?"))
 
     def poll(self, timeout_s: float) -> bool:
-        """Wait until something arrives, at most `timeout_s`; also no longer than until the learner has refused our key."""
+        """Wait until something arrives, at most `timeout_s`. Returns early if the learner refuses our key."""
         deadline_s = time.monotonic() + timeout_s
         while True:
             left_s = max(0.0, deadline_s - time.monotonic())
             ready = dict(self._poller.poll(int(left_s * 1000)))
             if self._monitor in ready:
-                self._look()
+                self._read_events()
             if self._socket in ready or left_s == 0.0 or (self.problem is not None and self.problem.final):
                 return self._socket in ready
 
-    def _watch(self) -> None:
+    def _open_monitor(self) -> None:
         name = f"inproc://millrace-worker-{os.urandom(6).hex()}"
         self._socket.monitor(name, WORKER_EVENTS)
         self._monitor = self.context.socket(zmq.PAIR)
         self._monitor.linger = 0
-        self._monitor.rcvhwm = 0  # libzmq waits where nobody reads, and an environment's step may take minutes
+        self._monitor.rcvhwm = 0  # no limit: libzmq blocks while nobody reads, and an environment's step may take minutes
         self._monitor.connect(name)
         self._poller.register(self._monitor, zmq.POLLIN)
 
-    def _look(self) -> None:
-        """What became of the connection."""
+    def _read_events(self) -> None:
+        """Handle events of the connection."""
         assert self._monitor is not None
         with suppress(zmq.Again):
             while True:
                 event, value = struct.unpack("=HI", self._monitor.recv_multipart(zmq.NOBLOCK)[0])
                 if event == zmq.EVENT_DISCONNECTED:
                     if not self._connected and self.problem is None:
-                        self._say(
+                        self._report(
                             ConnectionProblem(f"{self.address} closes the connection at once; is it a millrace learner?")
                         )
                     self._connected = False
                 elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
                     self._connected, self.problem = True, None
                 else:
-                    self._say(connection_problem(event, value, self.address, self.token))
+                    self._report(connection_problem(event, value, self.address, self.token))
 
-    def _say(self, found: ConnectionProblem) -> None:
+    def _report(self, found: ConnectionProblem) -> None:
         self.problem = found
-        if not found.final and (kept_back := self._lid.due(found.line, time.monotonic())) is not None:
+        if not found.final and (kept_back := self._log_limiter.due(found.line, time.monotonic())) is not None:
             log.warning("%s%s", found.line, suppressed_note(kept_back))
 
     def receive(self) -> Iterator[ToWorker | BadMessage]:
-        """All that has arrived; what cannot be read comes as its error."""
+        """All messages that have arrived. An unreadable message comes as its error."""
         return self._received(decode_to_worker)
 
     def answers(self) -> Iterator[ToObserver | BadMessage]:
-        """All that has arrived for an observer, who is no worker: answers to Inquire."""
+        """All answers to `Inquire` that have arrived, for an observer that is not a worker."""
         return self._received(decode_to_observer)
 
-    def _received(self, decode: Callable[[Sequence[Buffer]], Said]) -> Iterator[Said | BadMessage]:
+    def _received(self, decode: Callable[[Sequence[Buffer]], Decoded]) -> Iterator[Decoded | BadMessage]:
         while (frames := receive_frames(self._socket)) is not None:
             try:
                 yield decode(frames)
@@ -139,13 +139,13 @@ class WorkerLink:
     def close(self, linger_s: float = LINGER_MS / 1000) -> None:
         """Send what is queued, at most `linger_s`, and close."""
         if self._monitor is not None and not self._socket.closed:
-            self._socket.disable_monitor()  # before its reader goes: libzmq would wait for one
+            self._socket.disable_monitor()  # before its reader is closed: libzmq blocks without one
             self._monitor.close(linger=0)
         self._socket.close(linger=int(linger_s * 1000))
 
 
 def _routing_id(name: str, token: Token | None) -> bytes:
-    """The name; under a key with a tag behind it that nobody can make who has another key."""
+    """The name. With a key, a tag follows that nobody else can compute."""
     if token is None:
         return name.encode()
     tag = hashlib.blake2b(name.encode(), key=token.client.secret, digest_size=TAG_CHARACTERS // 2)

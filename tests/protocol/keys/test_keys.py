@@ -405,5 +405,5 @@ def test_many_things_make_few_lines_and_little_memory() -> None:
     said = [lid.due(str(number), number * 0.001) for number in range(10_000)]
     assert said[:3] == [0, 0, 0]
     assert set(said[3:]) == {None}
-    assert len(lid._said) == 3
+    assert len(lid._last_lines) == 3
     assert lid.due("later", 100.0) == 0

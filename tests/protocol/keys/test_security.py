@@ -268,7 +268,13 @@ def test_who_has_a_token_is_heard_and_answered(net: Net) -> None:
 CASES: dict[str, tuple[bool, Token | None, str, str, bool]] = {
     # what: has the learner keys?, the worker's token, the learner says, the worker says, is that final?
     "a key that is not allowed": (True, token(STRANGER), "is not allowed here", "refused this worker's key", True),
-    "another learner's token": (True, token(server=STRANGER), "its token is for another learner", "token is of another", False),
+    "another learner's token": (
+        True,
+        token(server=STRANGER),
+        "its token is for another learner",
+        "token is of another",
+        False,
+    ),
     "no token": (True, None, "no key|no token", "perhaps it asks for a key: give this worker --token", False),
     "a token too many": (False, token(), "shows a key|has a token", "started without keys; then leave the token", False),
 }
@@ -358,31 +364,31 @@ def test_trouble_that_is_over_is_forgotten(net: Net) -> None:
     assert [message for _, message in heard(learner)] == [hello()]
 
 
-def end_the_door(learner: LearnerLink) -> None:
+def end_the_authenticator(learner: LearnerLink) -> None:
     """As if its thread had died."""
-    assert learner._door is not None
-    learner._door._ender.send(b"")
-    learner._door.join(DEADLINE_S)
+    assert learner._authenticator is not None
+    learner._authenticator._end_sender.send(b"")
+    learner._authenticator.join(DEADLINE_S)
 
 
-def test_nobody_gets_in_while_nobody_answers_zap(net: Net) -> None:
+def test_no_client_connects_while_zap_is_not_answered(net: Net) -> None:
     """The server's two options are what shuts the port then: it fails without either."""
     learner = net.keyed()
-    end_the_door(learner)
+    end_the_authenticator(learner)
     worker = net.worker(learner, token())
     worker.send(encode(hello()))
     until(lambda: worker.problem is not None, worker)
     assert not learner._socket.poll(300)
 
 
-def test_a_dead_door_ends_the_run(net: Net) -> None:
+def test_a_dead_authenticator_ends_the_run(net: Net) -> None:
     learner = net.keyed()
-    end_the_door(learner)
+    end_the_authenticator(learner)
     with pytest.raises(RunError, match="its thread has ended"):
         learner.poll(0.0)
 
 
-def test_the_door_answers_while_the_learner_learns(net: Net) -> None:
+def test_the_authenticator_answers_while_the_learner_learns(net: Net) -> None:
     """Nobody polls the learner's link here."""
     learner = net.keyed()
     good, bad = net.worker(learner, token()), net.worker(learner, token(STRANGER), "w1")
@@ -407,7 +413,7 @@ def test_whatever_goes_wrong_with_one_visitor_the_next_is_answered(net: Net, mon
     assert (worker_name(heard(learner)[0][0]), learner.poll(0.0)) == (b"w0", False)
 
 
-def test_a_question_that_is_no_question_does_not_stop_the_door(net: Net) -> None:
+def test_a_malformed_zap_request_does_not_stop_the_authenticator(net: Net) -> None:
     learner = net.keyed()
     odd = learner.context.socket(zmq.DEALER)
     net.sockets.append(odd)
@@ -569,11 +575,11 @@ def test_two_workers_of_one_name_and_two_keys_do_not_disturb_each_other(net: Net
 
 
 def test_the_table_of_who_spoke_last_stays_small(net: Net, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("protocol.wire.learner_link.HOLDERS", 10)
+    monkeypatch.setattr("protocol.wire.learner_link.MAX_REMEMBERED_KEYS", 10)
     learner = net.keyed()
     for number in range(100):
-        learner._held(b"%d" % number, LAB.public.hex())
-    assert list(learner._holders) == [b"%d" % number for number in range(90, 100)]
+        learner._peer(b"%d" % number, LAB.public.hex())
+    assert list(learner._last_keys) == [b"%d" % number for number in range(90, 100)]
 
 
 # ---------------------------------------------------------------- revoking
