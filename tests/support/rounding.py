@@ -1,7 +1,7 @@
-"""How far two float32 computations of the same gradient may differ, on any processor.
+"""How far two float32 computations of the same outputs or the same gradient may differ, on any processor.
 
-The tolerance is derived, not tuned. A sum of products whose terms pass through n roundings differs from the exact sum by at
-most g(n) times the sum of the absolute values of its terms, with
+The tolerances are derived, not tuned. A sum of products whose terms pass through n roundings differs from the exact sum by
+at most g(n) times the sum of the absolute values of its terms, with
 
     g(n) = exp(4 √n u + n u² / (1 - u)) - 1,    u = 2^-24 in float32
 
@@ -12,6 +12,7 @@ analysis", theorem 2.4 with λ = 4). The order of the sum, and so the processor 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -28,6 +29,44 @@ ELEMENTWISE = 16  # roundings that an activation, a softmax or a log-probability
 def growth(roundings: int) -> float:
     """g(n) for float32."""
     return math.expm1(4 * math.sqrt(roundings) * UNIT + roundings * UNIT**2 / (1 - UNIT))
+
+
+def forward_tolerance(layers: Sequence[tuple[Array, Array]], x: Array, relu: bool = False) -> Array:
+    """How far two float32 forward passes of the same MLP may differ, [B, outputs].
+
+    `layers`: weight [out, in] and bias [out] of each layer, the last one linear; `x` [B, in]. A unit is a sum of n = in + 1
+    terms. Each of its n roundings is at most u s with s = |h| |W|ᵀ + |b|, and roundings are independent (as in `growth`). So
+    a layer adds a variance of at most n (u s)², and its weights carry over the variance v of its input: v W²ᵀ. tanh and ReLU
+    do not enlarge an error, and add ELEMENTWISE roundings. The difference of two passes has twice the variance. The result
+    is 4 standard deviations (λ in `growth`) of this bound, which is itself several times the true deviation.
+
+    A test in `test_fused` shows that the loss of a single term exceeds it.
+    """
+    h, variance = x.astype(np.float64), np.zeros(x.shape)
+    for i, (weight, bias) in enumerate(layers):
+        w, b = weight.astype(np.float64), bias.astype(np.float64)
+        size = np.abs(h) @ np.abs(w).T + np.abs(b)
+        variance = variance @ (w**2).T + (w.shape[1] + 1) * (UNIT * size) ** 2
+        h = h @ w.T + b
+        if i < len(layers) - 1:
+            h = np.maximum(h, 0) if relu else np.tanh(h)
+            variance = variance + (ELEMENTWISE * UNIT * h) ** 2
+    return np.asarray(4 * np.sqrt(2 * variance))
+
+
+def network_layers(parameters: Mapping[str, torch.Tensor], names: Sequence[str]) -> list[tuple[Array, Array]]:
+    """Weight and bias of each of these layers, as `forward_tolerance` takes them."""
+    return [
+        (parameters[f"{name}.weight"].detach().numpy().copy(), parameters[f"{name}.bias"].detach().numpy().copy())
+        for name in names
+    ]
+
+
+def assert_within(found: Array, expected: Array, tolerance: Array) -> None:
+    """Assert that |found − expected| is at most `tolerance`, element by element."""
+    off = np.abs(np.asarray(found, np.float64) - np.asarray(expected, np.float64))
+    assert off.shape == tolerance.shape
+    assert (off <= tolerance).all(), f"{off.max():.3g} off, {tolerance.flat[int(np.argmax(off - tolerance))]:.3g} allowed"
 
 
 def sums_of_absolute_values(

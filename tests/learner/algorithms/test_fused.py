@@ -23,14 +23,14 @@ from learner.algorithms.minibatches import Minibatch
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
 from protocol.arrays import Array
-from protocol.policy.layout import parameter_layout, total_size
+from protocol.policy.layout import hidden_names, parameter_layout, total_size
 from protocol.policy.networks import ActorCriticNetwork
 from protocol.policy.torch_distributions import log_prob_and_entropy
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 from tests.protocol.policy.test_networks import ACTIONS
 from tests.support.batches import DISCRETE, GAUSSIAN, IMAGE, batch, no_pulse, normal, recurrent, shared
 from tests.support.finite_differences import is_the_slope
-from tests.support.rounding import growth, sums_of_absolute_values
+from tests.support.rounding import assert_within, forward_tolerance, growth, network_layers, sums_of_absolute_values
 
 BOX = (Leaf("", "box", (4,), "float32"),)
 
@@ -80,6 +80,26 @@ def test_so_they_are_at_the_sizes_that_are_used(rows: int, shared_net: bool) -> 
     outputs_and_gradients(PolicySpec(BOX, ACTIONS["discrete"], (64, 64), shared_net=shared_net), rows, 0)
 
 
+def value_tolerance(spec: PolicySpec, net: ActorCriticNetwork, x: Array) -> Array:
+    """How far two ways to compute the values [B] of these features may differ."""
+    names = [*hidden_names(spec, "" if spec.shared_net else "critic"), "critic.out"]
+    return forward_tolerance(network_layers(net.parameters, names), x, spec.activation == "relu")[:, 0]
+
+
+def test_the_tolerance_of_values_is_exceeded_if_a_single_term_is_lost() -> None:
+    for net_size in ((), (5,), (64, 64)):
+        spec = PolicySpec(BOX, ACTIONS["discrete"], net_size)
+        net, fused = make(spec, 0)
+        x = np.random.default_rng(0).normal(size=(64, 4)).astype(np.float32)
+        before, tolerance = fused.value(x).copy(), value_tolerance(spec, net, x)
+        for name in [name for name in net.parameters if name.startswith("critic") and name.endswith("weight")]:
+            with torch.no_grad():
+                lost = net.parameters[name][0, -1].clone()
+                net.parameters[name][0, -1] = 0
+                assert (np.abs(fused.value(x) - before) > 10 * tolerance).mean() > 0.8, name
+                net.parameters[name][0, -1] = lost
+
+
 def outputs_and_gradients(spec: PolicySpec, rows: int, seed: int) -> None:
     generator = np.random.default_rng(seed)
     with_graph, fused = make(spec, seed)
@@ -87,7 +107,9 @@ def outputs_and_gradients(spec: PolicySpec, rows: int, seed: int) -> None:
     params, value = with_graph.forward(torch.tensor(x))
     expected = (*log_prob_and_entropy(spec.action, params, torch.tensor(taken)), value)
     found = fused.forward(x, taken)
-    np.testing.assert_allclose(fused.value(x), found[2], rtol=1e-4, atol=1e-4)
+    tolerance = value_tolerance(spec, with_graph, x)
+    assert_within(fused.value(x), found[2], tolerance)
+    assert_within(found[2], value.detach().numpy(), tolerance)
     for ours, theirs in zip(found, expected, strict=True):
         np.testing.assert_allclose(ours, theirs.detach().numpy(), rtol=1e-4, atol=1e-4)
     given_back = [generator.normal(size=rows).astype(np.float32) for _ in range(3)]
@@ -259,11 +281,12 @@ def test_it_is_for_small_layers_and_nothing_else(spec: PolicySpec, expected: boo
 
 def test_sizes_of_minibatches_come_and_go(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(layers, "MAX_PLANS", 30)
-    _, fused = make(PolicySpec(BOX, ACTIONS["discrete"], (5,)), 0)
+    spec = PolicySpec(BOX, ACTIONS["discrete"], (5,))
+    net, fused = make(spec, 0)
     x = np.random.default_rng(0).normal(size=(99, 4)).astype(np.float32)
-    whole = fused.value(x).copy()
+    whole, tolerance = fused.value(x).copy(), value_tolerance(spec, net, x)
     for rows in (*range(1, 99), 40, 2):
-        np.testing.assert_allclose(fused.value(x[:rows]), whole[:rows], atol=1e-6)
+        assert_within(fused.value(x[:rows]), whole[:rows], tolerance[:rows])
         assert len(fused._critic_mlp._plans) <= 30
     assert {40, 2} <= set(fused._critic_mlp._plans)
 
