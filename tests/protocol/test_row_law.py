@@ -1,4 +1,4 @@
-"""The law of a row, kept by every kind of lane: a loop over copies, SyncVectorEnv, gymnasium's own vectorised CartPole."""
+"""The law of a row holds for every kind of env copies: a loop, SyncVectorEnv, gymnasium's vectorized CartPole."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def collect_script(script: str, T: int, rollouts: int = 1) -> list[Rollout]:
     return [collect(collector, run, k)[0] for k in range(rollouts)]
 
 
-class Played:
-    """What a script must look like in rows, step by step: the slow way."""
+class ExpectedRows:
+    """The rows that a script must give, computed step by step."""
 
     def __init__(self, script: str, rows: int) -> None:
         self.obs: list[list[int]] = [[0, 0]]
@@ -66,7 +66,7 @@ def test_rows_and_episodes_are_those_of_the_script(over: Any, scripts: list[str]
     run = scripted(T, N)
     collector = random_collector(run, over([partial(Scripted, script) for script in scripts]))
     rollouts = [collect(collector, run, k)[0] for k in range(K)]
-    played = [Played(script, K * T) for script in scripts]
+    played = [ExpectedRows(script, K * T) for script in scripts]
     for k, rollout in enumerate(rollouts):
         rows = slice(k * T, (k + 1) * T)
         for n, expected in enumerate(played):
@@ -91,14 +91,14 @@ def test_the_reset_row_is_masked_and_not_an_env_step() -> None:
     assert rollout.env_steps == collector.steps == 3
 
 
-def test_both_flags_at_once_are_one_end() -> None:
+def test_terminated_and_truncated_at_once_end_one_episode() -> None:
     run = run_of(f"{TOY}Both-v0", T=4, N=1)
     (rollout,) = collect(random_collector(run), run)
     assert rollout.terminated[:, 0].tolist() == rollout.truncated[:, 0].tolist() == [False, False, True, False]
     assert [(episode.reward, episode.length) for episode in rollout.episodes] == [(6.0, 3)]
 
 
-def test_obs_after_a_truncation_is_the_true_last_one() -> None:
+def test_obs_after_a_truncation_is_the_last_of_the_episode() -> None:
     (rollout,) = collect_script("..u", T=4)
     assert rollout.obs[0][3, 0].tolist() == [0, 3]  # bootstrap from this,
     assert rollout.obs[0][4, 0].tolist() == [1, 0]  # not from the next episode's first
@@ -111,7 +111,7 @@ def test_a_rollout_starts_where_the_last_one_ended() -> None:
     assert first.obs[0][-1].tobytes() == second.obs[0][0].tobytes()
 
 
-def test_returns_run_on_across_rollouts() -> None:
+def test_returns_continue_across_rollouts() -> None:
     rollouts = collect_script("......t", T=3, rollouts=3)
     assert [[(episode.reward, episode.length) for episode in r.episodes] for r in rollouts] == [[], [], [(28.0, 7)]]
     assert all(episode.seconds > 0 for episode in rollouts[2].episodes)
@@ -124,8 +124,8 @@ def test_returns_are_summed_before_rewards_are_rounded() -> None:
     assert rollout.episodes[0].reward == sum([0.1] * 10)
 
 
-class EndsAgain(VectorEnv[Any, Any, Any]):
-    """Copy n ends at every step n, 2n, …, even where it was only reset; its reward is 5 whatever happened."""
+class EndsInResetSteps(VectorEnv[Any, Any, Any]):
+    """Copy n ends at every step n, 2n, …, even at a step that only resets it. Every reward is 5."""
 
     metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}
 
@@ -147,7 +147,7 @@ class EndsAgain(VectorEnv[Any, Any, Any]):
 
 def test_a_vector_environment_that_ends_on_the_reset_step() -> None:
     run = run_of(f"{TOY}Countdown-v0", T=5, N=2)  # it has the same spaces
-    collector = random_collector(run, lambda run, lane, pulse: VectorCopies(EndsAgain(2)))
+    collector = random_collector(run, lambda run, lane, pulse: VectorCopies(EndsInResetSteps(2)))
     (rollout,) = collect(collector, run)
     assert rollout.terminated.T.tolist() == [[True] * 5, [False, True, False, True, False]]
     assert rollout.valid.T.tolist() == [[True, False, False, False, False], [True, True, False, True, False]]
@@ -164,7 +164,7 @@ def test_a_loop_and_sync_vector_env_collect_the_same_bits() -> None:
         assert all(bits(one) == bits(other) for one, other in pairs)
 
 
-def test_gymnasiums_vectorised_cartpole_collects_lawfully() -> None:
+def test_gymnasiums_vectorized_cartpole_keeps_the_law() -> None:
     run = run_of("CartPole-v1", T=100, N=4)
     collector = random_collector(run, native_cartpole)
     lengths = 0
@@ -181,7 +181,7 @@ def native_cartpole(run: RunSpec, lane: int, pulse: object) -> VectorCopies:
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.DISABLED])
-def test_other_ways_to_reset_are_refused(mode: AutoresetMode) -> None:
+def test_other_autoreset_modes_are_refused(mode: AutoresetMode) -> None:
     env = SyncVectorEnv([Scripted] * 2, autoreset_mode=mode)
     with pytest.raises(UsageError, match=r"autoreset_mode.* expected .*NEXT_STEP, got .*; make it with"):
         VectorCopies(env)

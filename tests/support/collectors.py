@@ -1,4 +1,4 @@
-"""What the tests of collecting share: runs of one environment, collectors with random weights, equality to the bit."""
+"""Support for tests of collecting: runs of one environment, collectors with random weights, comparison bit by bit."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ VERSION, SESSION = 7, 3
 
 
 def no_pulse() -> None:
-    """Nobody listens."""
+    """A pulse that does nothing."""
 
 
 def run_of(env: str, T: int = 8, N: int = 2, kwargs: dict[str, Any] | None = None, **policy: Any) -> RunSpec:
-    """A run of this environment, on as many lanes as you like."""
+    """A run of this environment, on up to 8 lanes."""
     spec = EnvSpec.of(env, kwargs)
     made = spec.make()
     described = PolicySpec(observation_leaves(made.observation_space), action_spec(made.action_space), **policy)
@@ -41,18 +41,18 @@ def run_of(env: str, T: int = 8, N: int = 2, kwargs: dict[str, Any] | None = Non
 
 
 def run_around(env: gymnasium.Env[Any, Any], T: int) -> RunSpec:
-    """A run with the spaces of this environment, of one copy."""
+    """A run with the spaces of this environment, with one copy."""
     policy = PolicySpec(observation_leaves(env.observation_space), action_spec(env.action_space))
     return RunSpec(EnvSpec(type(env).__name__), policy, rollout_steps=T, copies=1, lanes=8, seed=1)
 
 
 def with_env(run: RunSpec, env: str, **kwargs: Any) -> RunSpec:
-    """The same run, on an environment that only seems to be the same."""
+    """The same run, on another environment."""
     return msgspec.structs.replace(run, env=EnvSpec.of(env, kwargs))
 
 
 def random_policy(spec: PolicySpec) -> Policy:
-    """A policy with random weights, the same ones each time."""
+    """A policy with random weights, which are the same each time."""
     generator = np.random.default_rng(5)
     policy = make_policy(spec)
     parameters = generator.normal(0, 0.3, acting_size(spec)).astype(np.float32)
@@ -78,7 +78,7 @@ def sync_vector_env_over(makes: Sequence[Callable[[], gymnasium.Env[Any, Any]]])
 def collect(
     collector: Collector, run: RunSpec, sequence: int = 0, lanes: Iterable[int] = (0,), incarnation: int = 0
 ) -> list[Rollout]:
-    """Rollout number `sequence` of each lane; each keeps the law."""
+    """Rollout number `sequence` of each lane, after a check that it keeps the law of a row."""
     assignments = [Assignment(100 + lane, lane, incarnation, sequence) for lane in lanes]
     rollouts = collector.collect(assignments, VERSION, SESSION, no_pulse)
     for assignment, rollout in zip(assignments, rollouts, strict=True):
@@ -89,7 +89,7 @@ def collect(
 
 
 def bits(rollout: Rollout) -> dict[str, object]:
-    """All of a rollout that must not depend on who collects it, as bytes."""
+    """As bytes, everything in a rollout that must not depend on which worker collects it."""
     fields = ("action", "log_prob", "reward", "terminated", "truncated", "valid", "state")
     found: dict[str, object] = {name: getattr(rollout, name).tobytes() for name in fields}
     found["obs"] = [leaf.tobytes() for leaf in rollout.obs]
@@ -98,7 +98,7 @@ def bits(rollout: Rollout) -> dict[str, object]:
 
 
 def trained(folder: Path, vector: Literal["native", "envpool"], workers: int) -> bytes:
-    """The policy of a short run on CartPole-v1, whose lanes are stepped like that."""
+    """The policy file of a short run on CartPole-v1 with this kind of env copies."""
     config = resolve(
         "CartPole-v1", vector=vector, steps=1_500, workers=workers, transport="inproc", eval_episodes=1,
         run_dir=str(folder / str(workers)),

@@ -1,4 +1,4 @@
-"""Environments that raise, or give what no rollout can hold: one line that names lane, copy and step, and the traceback."""
+"""Environments that raise or return invalid data: one line names lane, copy and step, and the detail has the traceback."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from workers.env_errors import LaneFailed
 from workers.envs.toy import Countdown
 
 
-def broken(run: RunSpec, lanes: tuple[int, ...] = (2, 5)) -> LaneFailed:
-    """What a collector says of this run's environment."""
+def failure_of(run: RunSpec, lanes: tuple[int, ...] = (2, 5)) -> LaneFailed:
+    """The error of a collector on this run's environment."""
     with pytest.raises(LaneFailed) as caught:
         collect(random_collector(run), run, lanes=lanes)
     assert "\n" not in str(caught.value)
@@ -35,7 +35,7 @@ def broken(run: RunSpec, lanes: tuple[int, ...] = (2, 5)) -> LaneFailed:
 
 
 def test_an_environment_that_raises_is_named_with_its_own_traceback() -> None:
-    error = broken(run_of(f"{TOY}Raises-v0", N=3, kwargs={"after": 3}))
+    error = failure_of(run_of(f"{TOY}Raises-v0", N=3, kwargs={"after": 3}))
     assert (
         str(error) == "lane 2, copy 0, step 3: its environment raised ValueError: the toy is broken, as it was asked to be"
     )
@@ -54,7 +54,7 @@ def test_the_lane_and_copy_that_raise_are_named() -> None:
         collect(random_collector(run, loop_over([Countdown, Countdown, Third])), run, lanes=(5,))
 
 
-def test_an_environment_that_breaks_once_is_mended_by_a_new_life(tmp_path: Path) -> None:
+def test_an_environment_that_fails_once_works_again_in_a_new_incarnation(tmp_path: Path) -> None:
     run = run_of(f"{TOY}Raises-v0", kwargs={"once": str(tmp_path / "broke")})
     collector = random_collector(run)
     with pytest.raises(LaneFailed):
@@ -78,14 +78,14 @@ def test_a_vector_environment_that_raises_is_named() -> None:
 
 
 def test_a_reward_that_is_not_finite_is_named() -> None:
-    error = broken(run_of(f"{TOY}NaNReward-v0", N=1, kwargs={"after": 3}))
+    error = failure_of(run_of(f"{TOY}NaNReward-v0", N=1, kwargs={"after": 3}))
     assert str(error) == "lane 2, reward: expected finite values, got nan at step 3, copy 0"
-    huge = broken(run_of(f"{TOY}Countdown-v0", N=1, kwargs={"reward": 1e300}))
+    huge = failure_of(run_of(f"{TOY}Countdown-v0", N=1, kwargs={"reward": 1e300}))
     assert str(huge) == "lane 2, reward: expected finite values, got inf at step 0, copy 0"
 
 
 def test_an_observation_that_is_not_finite_is_named() -> None:
-    error = broken(run_of(f"{TOY}NaNObservation-v0", N=1, kwargs={"after": 3}))
+    error = failure_of(run_of(f"{TOY}NaNObservation-v0", N=1, kwargs={"after": 3}))
     assert str(error) == "lane 2, observation: expected finite values, got nan at step 4, copy 0"
 
 

@@ -1,4 +1,4 @@
-"""The collector: lanes side by side get the bits they would get alone; seeds, actions, the lives of lanes."""
+"""The collector: a lane gets the same bits alone and beside others; seeds, actions, opening and closing of lanes."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_any_lanes_of_any_size_act_the_same_alone_and_beside_others(run: RunSpec
             assert chosen.sample(alone, noise[lane : lane + 1]).tobytes() == action[lane].tobytes()
 
 
-def test_a_policy_acts_alike_whatever_it_acted_on_before_and_keeps_what_it_gave() -> None:
+def test_a_policy_acts_the_same_whatever_it_acted_on_before_and_does_not_change_its_results() -> None:
     generator = np.random.default_rng(0)
     given = [generator.normal(size=(L, N, 4)).astype(np.float32) for L, N in ((1, 3), (2, 3), (2, 8), (1, 3))]
     policy = random_policy(DISCRETE.policy)
@@ -98,7 +98,7 @@ def test_a_lane_does_not_depend_on_how_many_the_run_has() -> None:
 # ------------------------------------------------------------------------------------------------ seeds
 
 
-def test_every_copy_of_every_life_of_every_lane_has_a_seed_of_its_own() -> None:
+def test_every_copy_of_every_incarnation_of_every_lane_has_its_own_seed() -> None:
     seeds = [
         seed
         for run_seed in (0, 1)
@@ -110,7 +110,7 @@ def test_every_copy_of_every_life_of_every_lane_has_a_seed_of_its_own() -> None:
     assert all(0 <= seed < 2**31 for seed in seeds)
 
 
-def test_copies_start_differently_and_a_new_life_starts_anew() -> None:
+def test_copies_and_incarnations_start_differently() -> None:
     run = run_of("CartPole-v1", T=2, N=4)
     collector = random_collector(run)
     firsts = [rollout.obs[0][0] for rollout in collect(collector, run, lanes=(0, 1))]
@@ -118,7 +118,7 @@ def test_copies_start_differently_and_a_new_life_starts_anew() -> None:
     assert len(np.unique(np.concatenate(firsts), axis=0)) == 16
 
 
-def test_actions_of_lanes_and_lives_are_drawn_apart() -> None:
+def test_actions_of_lanes_and_incarnations_are_drawn_independently() -> None:
     run = run_of(f"{TOY}Countdown-v0", T=64, N=2)
     collector = random_collector(run)
     rollouts = collect(collector, run, lanes=(0, 1)) + collect(collector, run, lanes=(0, 1), incarnation=1)
@@ -142,8 +142,8 @@ def test_actions_count_from_zero_and_the_environment_counts_from_start() -> None
     assert (rollout.reward == rollout.action + 5).all()
 
 
-class Greedy(Countdown):
-    """Keeps the actions it was given, and spoils them afterwards."""
+class OverwritesActions(Countdown):
+    """Records its actions, and overwrites them afterwards."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -159,7 +159,7 @@ class Greedy(Countdown):
 
 
 def test_an_environment_that_writes_into_its_action_does_not_change_the_rollout() -> None:
-    env = Greedy()
+    env = OverwritesActions()
     run = run_around(env, T=4)
     (rollout,) = collect(random_collector(run, loop_over([lambda: env])), run)
     assert rollout.action[:, 0].tolist() == np.array(env.given).tolist()
@@ -189,7 +189,7 @@ def test_arrays_are_contiguous_and_never_written_again() -> None:
 
 
 class Closable(Scripted):
-    """Says when it is closed, and cannot be used afterwards."""
+    """Reports when it is closed, and cannot be used afterwards."""
 
     def __init__(self, said: list[str], name: str) -> None:
         super().__init__()
@@ -206,7 +206,7 @@ class Closable(Scripted):
 
 
 def closable(T: int = 4) -> tuple[RunSpec, Collector, list[str]]:
-    """A collector over one copy a lane, and what its copies said; they are named by the order of their making."""
+    """A collector with one copy for each lane, and the names of the copies closed so far, in order of making."""
     said: list[str] = []
     names = iter("abcdefgh")
     run = run_of(f"{TOY}Scripted-v0", T=T, N=1)
@@ -221,7 +221,7 @@ class Doubled(gymnasium.Wrapper[Any, Any, Any, Any]):
         return obs, 2 * float(reward), terminated, truncated, info
 
 
-def test_copies_are_stepped_past_the_guard_of_the_first_reset_and_past_no_other_wrapper(
+def test_copies_are_stepped_without_the_order_check_and_with_every_other_wrapper(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     guard = Mock()
@@ -237,7 +237,7 @@ def test_copies_are_stepped_past_the_guard_of_the_first_reset_and_past_no_other_
     assert not guard.called
 
 
-def test_lanes_are_closed_when_released_or_begun_afresh() -> None:
+def test_lanes_are_closed_when_released_or_started_anew() -> None:
     run, collector, said = closable()
     collect(collector, run, lanes=(0, 1, 2))
     collect(collector, run, 1, lanes=(0, 1, 2))
@@ -278,7 +278,7 @@ def test_a_lane_released_by_a_pulse_is_closed_after_the_collection() -> None:
     assert said == ["b"]
 
 
-def test_a_slow_copy_does_not_keep_the_pulse_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_pulse_is_called_between_slow_copies(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("workers.env_loop.PULSE_S", -1.0)  # any step is a slow one
     run = run_of(f"{TOY}Countdown-v0", T=3, N=5)
     pulses: list[int] = []
@@ -286,7 +286,7 @@ def test_a_slow_copy_does_not_keep_the_pulse_waiting(monkeypatch: pytest.MonkeyP
     assert len(pulses) >= 3 * 5
 
 
-def test_one_lane_cannot_be_asked_for_twice_at_once() -> None:
+def test_one_lane_cannot_be_collected_twice_at_once() -> None:
     run = run_of(f"{TOY}Countdown-v0")
     with pytest.raises(ValueError, match="one assignment for each lane"):
         random_collector(run).collect([Assignment(0, 3, 0, 0), Assignment(1, 3, 0, 1)], 0, 0, no_pulse)

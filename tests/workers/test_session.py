@@ -1,4 +1,4 @@
-"""Each rule of the worker's half of the conversation, by name. Pure: the test is the learner, time is a number."""
+"""The session of a worker, one rule in each test. Pure: the test plays the learner, and time is a number."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ SESSION = 11
 JOIN_S, REJOIN_S = 60.0, 600.0
 
 
-def said(effects: Sequence[Effect], kind: type[M]) -> list[M]:
+def sent(effects: Sequence[Effect], kind: type[M]) -> list[M]:
     """The messages of this kind among the effects."""
     return [effect.message for effect in effects if isinstance(effect, Send) and isinstance(effect.message, kind)]
 
@@ -107,19 +107,19 @@ def task_of(session: Session) -> Task:
 
 def collected(session: Session) -> list[Rollout]:
     """Collect the next task; the rollouts that were said."""
-    return said(session.finished(fake_rollouts(task_of(session))), Rollout)
+    return sent(session.finished(fake_rollouts(task_of(session))), Rollout)
 
 
 def hello_attempt(effects: Sequence[Effect]) -> int:
-    (hello,) = said(effects, Hello)
+    (hello,) = sent(effects, Hello)
     return hello.attempt
 
 
 # -------------------------------------------------------------------- joining
 
 
-def test_hello_says_who_this_is_and_which_protocol_it_speaks() -> None:
-    (hello,) = said(joining().tick(0.0), Hello)
+def test_hello_has_the_identity_and_the_protocol_version() -> None:
+    (hello,) = sent(joining().tick(0.0), Hello)
     assert hello == Hello(PROTOCOL_VERSION, "w0", "host", 7, 77, "fake 1", 1)
 
 
@@ -128,7 +128,7 @@ def test_hello_repeats_with_backoff_and_keeps_its_attempt() -> None:
     times, attempts = [], set()
     for step in range(120):
         now = step * HELLO_FIRST_S
-        for hello in said(session.tick(now), Hello):
+        for hello in sent(session.tick(now), Hello):
             times.append(now)
             attempts.add(hello.attempt)
     gaps = [after - before for before, after in itertools.pairwise(times)]
@@ -137,20 +137,20 @@ def test_hello_repeats_with_backoff_and_keeps_its_attempt() -> None:
     assert attempts == {1}
 
 
-def test_next_due_names_the_time_of_the_next_hello() -> None:
+def test_next_due_s_is_the_time_of_the_next_hello() -> None:
     session = joining()
     assert session.next_due_s() == 0.0
     session.tick(0.0)
     assert session.next_due_s() == HELLO_FIRST_S
 
 
-def test_a_new_joining_raises_the_attempt_and_begins_the_backoff_again() -> None:
+def test_joining_again_raises_the_attempt_and_resets_the_backoff() -> None:
     session = ready()
     assert hello_attempt(session.handle(Rejoin(SESSION), 5.0)) == 2
     assert session.next_due_s() == 5.0 + HELLO_FIRST_S
 
 
-def test_welcome_begins_a_session() -> None:
+def test_welcome_starts_a_session() -> None:
     session = joining()
     session.tick(0.0)
     assert session.handle(Welcome(SESSION, 1, RUN), 0.1) == [StartSession(RUN)]
@@ -171,14 +171,14 @@ def test_a_repeated_welcome_is_ignored() -> None:
     assert session.held_count() == 1
 
 
-def test_welcome_to_another_session_of_the_same_attempt_begins_afresh() -> None:
+def test_welcome_to_another_session_of_the_same_attempt_starts_anew() -> None:
     """The learner gave this worker up, then heard a late Hello of it."""
     session = ready(collect((0, 0)))
     assert session.handle(Welcome(12, 1, RUN), 0.1) == [StartSession(RUN)]
     assert (session.session, session.held_count()) == (12, 0)
 
 
-def test_whatever_else_is_said_while_joining_is_ignored() -> None:
+def test_every_other_message_while_joining_is_ignored() -> None:
     session = joining()
     session.tick(0.0)
     for message in (weights(0), collect((0, 0)), HeartbeatReply(0, 1, ()), Release(0, (LaneLife(0, 0),)), Rejoin(0)):
@@ -186,19 +186,19 @@ def test_whatever_else_is_said_while_joining_is_ignored() -> None:
     assert (session.state, session.held_count()) == (State.JOINING, 0)
 
 
-def test_joining_for_too_long_is_given_up_with_exit_code_1() -> None:
+def test_a_worker_gives_up_joining_with_exit_code_1() -> None:
     session = joining()
-    assert said(session.tick(JOIN_S), Hello)
+    assert sent(session.tick(JOIN_S), Hello)
     (leave,) = session.tick(JOIN_S + 0.1)
     assert isinstance(leave, Leave)
     assert leave.exit_code == 1
     assert "no learner answered for 60 s" in leave.reason
 
 
-def test_one_that_had_joined_waits_longer_for_a_learner_to_come_back() -> None:
+def test_a_worker_that_had_joined_waits_longer_for_the_learner() -> None:
     session = ready()
     session.handle(Rejoin(SESSION), 1.0)
-    assert said(session.tick(1.0 + REJOIN_S), Hello)
+    assert sent(session.tick(1.0 + REJOIN_S), Hello)
     (leave,) = session.tick(1.0 + REJOIN_S + 0.1)
     assert isinstance(leave, Leave)
 
@@ -213,23 +213,23 @@ def test_a_repeated_collect_is_collected_once() -> None:
     assert session.next_task() is None
 
 
-def test_a_repeat_of_the_ticket_in_hand_is_collected_once() -> None:
+def test_a_repeat_of_the_ticket_in_progress_is_collected_once() -> None:
     session = ready(collect((0, 0)))
     task = task_of(session)
     session.handle(collect((0, 0)), 0.1)
-    assert len(said(session.finished(fake_rollouts(task)), Rollout)) == 1
+    assert len(sent(session.finished(fake_rollouts(task)), Rollout)) == 1
     assert session.next_task() is None
 
 
-def test_asked_again_for_a_finished_ticket_the_same_rollout_object_is_said_again() -> None:
+def test_a_repeat_of_a_finished_ticket_sends_the_same_rollout_object_again() -> None:
     session = ready(collect((0, 0)))
     (rollout,) = collected(session)
-    (again,) = said(session.handle(collect((0, 0)), 1.0), Rollout)
+    (again,) = sent(session.handle(collect((0, 0)), 1.0), Rollout)
     assert again is rollout
     assert session.next_task() is None
 
 
-def test_a_rollout_is_kept_until_received_says_that_it_has_arrived_and_then_forgotten() -> None:
+def test_a_rollout_is_kept_until_the_learner_has_received_it() -> None:
     session = ready(collect((0, 0)))
     collected(session)
     session.handle(HeartbeatReply(SESSION, 1, lanes(0, below=0)), 1.0)
@@ -244,24 +244,24 @@ def test_a_rollout_that_arrived_ahead_of_a_lost_one_is_forgotten_and_the_lost_on
     assert (first.sequence, second.sequence) == (0, 1)
     session.handle(HeartbeatReply(SESSION, 1, lanes(0, below=0, ahead=(1,))), 1.0)
     assert session.held_count() == 1
-    assert said(session.handle(collect((0, 0)), 1.0), Rollout) == [first]
+    assert sent(session.handle(collect((0, 0)), 1.0), Rollout) == [first]
 
 
-def test_collect_too_says_what_has_arrived() -> None:
+def test_collect_also_lists_what_was_received() -> None:
     session = ready(collect((0, 0)))
     collected(session)
     session.handle(collect((1, 0), received=lanes(0, below=1)), 0.1)
     assert session.held_count() == 1  # the new ticket
 
 
-def test_received_of_another_life_of_the_lane_forgets_nothing() -> None:
+def test_received_of_another_incarnation_of_the_lane_drops_nothing() -> None:
     session = ready(collect((0, 0), incarnation=1))
     collected(session)
     session.handle(HeartbeatReply(SESSION, 1, lanes(0, below=9, incarnation=0)), 1.0)
     assert session.held_count() == 1
 
 
-def test_a_late_repeat_of_a_ticket_whose_rollout_has_arrived_is_known_for_what_it_is() -> None:
+def test_a_late_repeat_of_a_ticket_whose_rollout_was_received_is_ignored() -> None:
     session = ready(collect((0, 0)))
     collected(session)
     session.handle(HeartbeatReply(SESSION, 1, lanes(0, below=1)), 1.0)
@@ -269,7 +269,7 @@ def test_a_late_repeat_of_a_ticket_whose_rollout_has_arrived_is_known_for_what_i
     assert session.next_task() is None
 
 
-def test_the_sequence_counts_the_rollouts_of_a_life_of_the_lane() -> None:
+def test_the_sequence_counts_the_rollouts_of_an_incarnation_of_the_lane() -> None:
     session = ready(collect((0, 0), (1, 0), (2, 0)))
     assert [rollout.sequence for _ in range(3) for rollout in collected(session)] == [0, 1, 2]
 
@@ -286,12 +286,12 @@ def test_without_weights_nothing_starts() -> None:
     assert session.next_task() is None
 
 
-def test_acts_under_the_newest_weights_held() -> None:
+def test_a_task_has_the_newest_weights() -> None:
     session = ready(weights(3), weights(2), collect((0, 0), version=1))
     assert task_of(session).weights.version == 3
 
 
-def test_a_ticket_that_asks_for_newer_weights_does_not_hold_up_an_older_one_of_its_lane() -> None:
+def test_a_ticket_that_waits_for_newer_weights_does_not_delay_an_older_one_of_its_lane() -> None:
     session = ready(collect((0, 0), version=5), collect((1, 0), version=0))
     assert [assignment.ticket for assignment in task_of(session).assignments] == [1]
 
@@ -316,8 +316,8 @@ def test_finished_with_nothing_puts_the_tickets_back() -> None:
     assert task_of(session).assignments[0].ticket == 0
 
 
-def test_what_is_in_memory_is_bounded_by_what_the_learner_has_outstanding() -> None:
-    """Five tickets outstanding at any time, a hundred rounds: what has arrived goes as the next are dealt."""
+def test_the_worker_holds_at_most_what_the_learner_has_outstanding() -> None:
+    """Five tickets outstanding at any time, in a hundred rounds: received rollouts are dropped when new tickets come."""
     session = ready()
     issued = arrived = 0
     for _ in range(100):
@@ -332,7 +332,7 @@ def test_what_is_in_memory_is_bounded_by_what_the_learner_has_outstanding() -> N
     assert arrived == issued == 500
 
 
-def test_what_is_remembered_of_old_tickets_is_bounded() -> None:
+def test_the_number_of_remembered_tickets_is_bounded() -> None:
     session = ready()
     for ticket in range(200):
         session.handle(collect((ticket, 0), received=lanes(0, below=ticket)), 0.1)
@@ -347,7 +347,7 @@ def test_weights_are_acknowledged_at_once_when_nothing_else_does() -> None:
     session = ready()
     assert session.tick(0.1) == []
     session.handle(weights(1), 0.2)
-    (heartbeat,) = said(session.tick(0.2), Heartbeat)
+    (heartbeat,) = sent(session.tick(0.2), Heartbeat)
     assert heartbeat.version == 1
     assert session.tick(0.3) == []  # once
 
@@ -359,50 +359,50 @@ def test_a_rollout_acknowledges_the_weights_it_was_acted_under() -> None:
     assert session.tick(0.1) == []
 
 
-def test_a_heartbeat_every_heartbeat_s_says_all_that_is_held() -> None:
+def test_a_heartbeat_every_heartbeat_s_lists_all_tickets() -> None:
     session = ready(collect((7, 0), (8, 1), version=9))
     session.handle(HeartbeatReply(SESSION, 4, lanes(0, 1)), 0.5)
     session.update_statistics(Statistics(120, {"env": 0.5}, 0))
     assert session.tick(0.9) == []
-    (heartbeat,) = said(session.tick(1.0), Heartbeat)
+    (heartbeat,) = sent(session.tick(1.0), Heartbeat)
     assert heartbeat == Heartbeat(SESSION, 4, 0, (7, 8), 120, {"env": 0.5}, 0)
     assert session.next_due_s() == 2.0
 
 
-def test_a_heartbeat_lists_the_ticket_in_hand_and_not_a_finished_one() -> None:
+def test_a_heartbeat_lists_the_ticket_in_progress_and_no_finished_one() -> None:
     session = ready(collect((7, 0), (8, 0)))
     task = task_of(session)
-    assert said(session.tick(1.0), Heartbeat)[0].tickets == (7, 8)
+    assert sent(session.tick(1.0), Heartbeat)[0].tickets == (7, 8)
     session.finished(fake_rollouts(task))
-    assert said(session.tick(2.0), Heartbeat)[0].tickets == (8,)
+    assert sent(session.tick(2.0), Heartbeat)[0].tickets == (8,)
 
 
-def test_before_the_first_weights_a_heartbeat_says_minus_one() -> None:
+def test_before_the_first_weights_a_heartbeat_has_version_minus_one() -> None:
     session = ready(version=None)
-    (heartbeat,) = said(session.tick(1.0), Heartbeat)
+    (heartbeat,) = sent(session.tick(1.0), Heartbeat)
     assert heartbeat.version == -1
 
 
 # -------------------------------------------------------------------- lanes
 
 
-def test_a_higher_incarnation_starts_the_lane_afresh_with_sequence_0() -> None:
+def test_a_higher_incarnation_starts_the_lane_anew_with_sequence_0() -> None:
     session = ready(collect((0, 0), (1, 0)))
     collected(session)
     session.handle(collect((2, 0), incarnation=1), 0.1)
-    assert session.held_count() == 1  # the old life's ticket and rollout are gone
+    assert session.held_count() == 1  # the ticket and the rollout of the old incarnation are dropped
     (assignment,) = task_of(session).assignments
     assert (assignment.ticket, assignment.incarnation, assignment.sequence) == (2, 1, 0)
 
 
-def test_a_ticket_of_an_older_life_is_ignored() -> None:
+def test_a_ticket_of_an_older_incarnation_is_ignored() -> None:
     session = ready(collect((2, 0), incarnation=1))
     session.handle(collect((1, 0), received=lanes(0, incarnation=1)), 0.1)
     assert session.held_count() == 1
     assert task_of(session).assignments[0].ticket == 2
 
 
-def test_release_closes_the_lane_and_forgets_what_was_held_for_it() -> None:
+def test_release_closes_the_lane_and_drops_its_tickets_and_rollouts() -> None:
     session = ready(collect((0, 0), (1, 1)))
     collected(session)
     assert session.handle(Release(SESSION, (LaneLife(0, 0),)), 0.1) == [CloseLanes((LaneLife(0, 0),))]
@@ -410,7 +410,7 @@ def test_release_closes_the_lane_and_forgets_what_was_held_for_it() -> None:
     assert session.handle(Release(SESSION, (LaneLife(0, 0),)), 0.2) == []  # a repeat
 
 
-def test_a_late_release_does_not_close_a_later_life() -> None:
+def test_a_late_release_does_not_close_a_later_incarnation() -> None:
     session = ready(collect((0, 0), incarnation=2))
     assert session.handle(Release(SESSION, (LaneLife(0, 1),)), 0.1) == []
     assert session.held_count() == 1
@@ -426,11 +426,11 @@ def test_a_lane_missing_from_received_is_closed(message: ToWorker) -> None:
     assert session.handle(message, 1.0) == [CloseLanes((LaneLife(0, 0),))]
 
 
-def test_a_rollout_of_a_lane_that_was_released_while_it_was_collected_is_not_said() -> None:
+def test_a_rollout_of_a_lane_that_was_released_while_it_was_collected_is_not_sent() -> None:
     session = ready(collect((0, 0), (1, 1)))
     task = task_of(session)
     session.handle(Release(SESSION, (LaneLife(0, 0),)), 0.1)
-    assert [rollout.lane for rollout in said(session.finished(fake_rollouts(task)), Rollout)] == [1]
+    assert [rollout.lane for rollout in sent(session.finished(fake_rollouts(task)), Rollout)] == [1]
 
 
 # -------------------------------------------------------------------- sessions
@@ -447,11 +447,11 @@ def test_nothing_of_a_session_outlives_it() -> None:
     session.handle(Welcome(12, 2, RUN), 1.1)
     assert session.held_count() == 0
     assert session.next_task() is None
-    (heartbeat,) = said(session.tick(2.2), Heartbeat)
+    (heartbeat,) = sent(session.tick(2.2), Heartbeat)
     assert (heartbeat.session, heartbeat.replies, heartbeat.version, heartbeat.tickets) == (12, 0, -1, ())
 
 
-def test_a_task_of_an_ended_session_is_abandoned_and_its_rollouts_are_not_said() -> None:
+def test_a_task_of_an_ended_session_is_abandoned_and_its_rollouts_are_not_sent() -> None:
     session = ready(collect((0, 0)))
     task = task_of(session)
     assert not session.abandoned(task.session)
@@ -475,7 +475,7 @@ def test_a_message_of_another_session_is_ignored() -> None:
     ):
         assert session.handle(message, 1.0) == []
     assert (session.state, session.held_count()) == (State.READY, 1)
-    assert said(session.tick(1.0), Heartbeat)[0].replies == 0
+    assert sent(session.tick(1.0), Heartbeat)[0].replies == 0
 
 
 def test_rejoin_is_answered_by_hello_at_once() -> None:
@@ -486,9 +486,9 @@ def test_rejoin_is_answered_by_hello_at_once() -> None:
     assert hello_attempt(effects) == 2
 
 
-def test_a_silent_learner_is_joined_anew() -> None:
+def test_a_worker_joins_a_silent_learner_again() -> None:
     session = ready(collect((0, 0)))
-    assert said(session.tick(6.0), Heartbeat)
+    assert sent(session.tick(6.0), Heartbeat)
     assert hello_attempt(session.tick(6.1)) == 2
     assert (session.state, session.held_count()) == (State.JOINING, 0)
 
@@ -501,37 +501,37 @@ def test_a_silent_learner_is_joined_anew() -> None:
 def test_any_message_of_the_session_is_a_sign_of_life(message: ToWorker) -> None:
     session = ready()
     session.handle(message, 5.0)
-    assert said(session.tick(10.9), Heartbeat)
-    assert said(session.tick(11.1), Hello)
+    assert sent(session.tick(10.9), Heartbeat)
+    assert sent(session.tick(11.1), Hello)
 
 
 # -------------------------------------------------------------------- leaving
 
 
-def test_sigterm_finishes_the_rollout_in_hand_and_hands_back_the_rest_in_goodbye() -> None:
+def test_stop_finishes_the_rollout_in_progress_and_returns_the_other_tickets_in_goodbye() -> None:
     session = ready(collect((0, 0), (1, 0), (2, 1)))
     task = task_of(session)  # tickets 0 and 2
     assert session.stop() == []
     assert session.state is State.DRAINING
     assert not session.abandoned(task.session)
     *rollouts, goodbye, leave = session.finished(fake_rollouts(task))
-    assert [rollout.ticket for rollout in said(rollouts, Rollout)] == [0, 2]
+    assert [rollout.ticket for rollout in sent(rollouts, Rollout)] == [0, 2]
     assert goodbye == Send(Goodbye(SESSION, "told to stop", (1,)))
     assert leave == Leave(0, "told to stop")
 
 
-def test_sigterm_with_nothing_in_hand_leaves_at_once() -> None:
+def test_stop_without_work_in_progress_leaves_at_once() -> None:
     session = ready(collect((0, 0)))
     assert session.stop() == [Send(Goodbye(SESSION, "told to stop", (0,))), Leave(0, "told to stop")]
     assert session.state is State.LEFT
 
 
-def test_sigterm_while_joining_leaves_at_once() -> None:
+def test_stop_while_joining_leaves_at_once() -> None:
     session = joining()
     assert session.stop() == [Leave(0, "told to stop")]
 
 
-def test_sigterm_twice_leaves_at_once() -> None:
+def test_two_stops_leave_at_once() -> None:
     session = ready(collect((0, 0)))
     task = task_of(session)
     session.stop()
@@ -540,17 +540,17 @@ def test_sigterm_twice_leaves_at_once() -> None:
     assert session.stop() == []
 
 
-def test_drain_finishes_the_rollout_in_hand_and_then_leaves() -> None:
+def test_drain_finishes_the_rollout_in_progress_and_then_leaves() -> None:
     session = ready(collect((0, 0), (1, 0)))
     task = task_of(session)
     assert session.handle(Drain("finished"), 0.1) == []
     assert session.next_task() is None
     effects = session.finished(fake_rollouts(task))
-    assert len(said(effects, Rollout)) == 1
+    assert len(sent(effects, Rollout)) == 1
     assert effects[-2:] == [Send(Goodbye(SESSION, "finished", (1,))), Leave(0, "finished")]
 
 
-def test_drain_with_nothing_in_hand_leaves_at_once() -> None:
+def test_drain_without_work_in_progress_leaves_at_once() -> None:
     session = ready()
     assert session.handle(Drain("finished"), 0.1) == [Send(Goodbye(SESSION, "finished", ())), Leave(0, "finished")]
 
@@ -560,22 +560,22 @@ def test_drain_while_joining_leaves_with_exit_code_0() -> None:
     assert session.handle(Drain("finished"), 0.1) == [Leave(0, "finished")]
 
 
-def test_no_ticket_is_taken_while_draining() -> None:
+def test_no_ticket_is_accepted_while_draining() -> None:
     session = ready(collect((0, 0)))
     task = task_of(session)
     session.stop()
     assert session.handle(collect((1, 0)), 0.1) == []
     effects = session.finished(fake_rollouts(task))
-    assert said(effects, Goodbye)[0].tickets == ()
+    assert sent(effects, Goodbye)[0].tickets == ()
 
 
 def test_heartbeats_go_on_while_draining() -> None:
     session = ready(collect((0, 0)))
     task_of(session)
     session.stop()
-    assert said(session.tick(1.0), Heartbeat)
+    assert sent(session.tick(1.0), Heartbeat)
     session.handle(HeartbeatReply(SESSION, 1, lanes(0)), 5.0)
-    assert said(session.tick(10.0), Heartbeat)
+    assert sent(session.tick(10.0), Heartbeat)
 
 
 def test_the_drain_that_answers_its_heartbeats_is_a_sign_of_life_to_a_draining_worker() -> None:
@@ -587,7 +587,7 @@ def test_the_drain_that_answers_its_heartbeats_is_a_sign_of_life_to_a_draining_w
         assert all(not isinstance(effect, Leave) for effect in session.tick(second + 0.5))
 
 
-def test_a_silent_learner_is_not_waited_for_while_draining() -> None:
+def test_a_draining_worker_does_not_wait_for_a_silent_learner() -> None:
     session = ready(collect((0, 0)))
     task_of(session)
     session.stop()
@@ -611,7 +611,7 @@ def test_refuse_leaves_with_exit_code_2_in_every_state(state: State) -> None:
     assert session.state is State.LEFT
 
 
-def test_a_failure_is_told_with_its_traceback_and_leaves_with_exit_code_1() -> None:
+def test_a_failure_is_reported_with_its_traceback_and_leaves_with_exit_code_1() -> None:
     session = ready(collect((0, 3)))
     task_of(session)
     effects = session.fail("ValueError: bad action", "Traceback: …", 3)
@@ -621,15 +621,15 @@ def test_a_failure_is_told_with_its_traceback_and_leaves_with_exit_code_1() -> N
     ]
 
 
-def test_a_failure_before_any_session_has_nobody_to_be_told_to() -> None:
+def test_a_failure_before_any_session_is_not_reported() -> None:
     assert joining().fail("no such environment", "", None) == [Leave(1, "no such environment")]
 
 
-def test_a_run_that_it_will_not_take_part_in_is_left_with_exit_code_2_and_a_word() -> None:
+def test_a_declined_run_is_left_with_exit_code_2_and_a_goodbye() -> None:
     assert ready().decline("no code") == [Send(Goodbye(SESSION, "no code", ())), Leave(2, "no code")]
 
 
-def test_one_whose_key_is_refused_leaves_with_exit_code_2_whatever_it_was_doing() -> None:
+def test_a_worker_whose_key_is_refused_leaves_with_exit_code_2_in_every_state() -> None:
     for state in (State.JOINING, State.READY, State.DRAINING):
         session = in_state(state)
         assert session.refused("refused") == [Leave(2, "refused")]
@@ -637,7 +637,7 @@ def test_one_whose_key_is_refused_leaves_with_exit_code_2_whatever_it_was_doing(
         assert session.refused("refused") == []
 
 
-def test_one_that_has_left_says_nothing_more() -> None:
+def test_a_worker_that_has_left_sends_nothing() -> None:
     session = in_state(State.LEFT)
     for message in EVERY_MESSAGE:
         assert session.handle(message, 1.0) == []
@@ -698,7 +698,7 @@ def test_the_table_names_the_state_that_follows(state: State, message: ToWorker)
     assert session.state is TABLE[state].get(type(message), state)
 
 
-def test_all_that_a_worker_says_can_be_said_to_a_learner() -> None:
+def test_a_worker_sends_only_messages_for_a_learner() -> None:
     kinds = set(ToLearner.__args__)
     session = ready(collect((0, 0)))
     effects = session.finished(fake_rollouts(task_of(session))) + session.tick(1.0) + session.stop()
