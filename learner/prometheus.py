@@ -1,7 +1,7 @@
-"""The learner's `/metrics` for Prometheus: what the run's roster, ledger and freshness count, by Prometheus's conventions.
+"""The learner's `/metrics` for Prometheus, by Prometheus's naming conventions.
 
-The law: the loop publishes a snapshot now and then, a whole record in one assignment, and waits for nobody; the server's
-threads read the newest one and nothing else. Labels have few values, all ours: no names of workers, paths or keys.
+The law: the training loop publishes a whole snapshot in one assignment now and then, and never waits. The server's threads
+read the newest snapshot and nothing else. Labels have few values, all of them ours: no names of workers, paths or keys.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from protocol.errors import UsageError
 log = logging.getLogger("millrace.learner")
 
 EVERY_S = 0.5  # between snapshots
-SILENT_SCRAPER_S = 5.0  # then its connection is closed, and its thread ends
+SCRAPE_TIMEOUT_S = 5.0  # a scraper that is silent for longer loses its connection, and its thread ends
 LAGS = (0, 1, 2, 4, 8, 16, 32)
 """upper bounds of the histogram's buckets, in versions"""
 STAGES = {"learner": ("wait", "update", "other"), "worker": ("wait", "open", "act", "step")}
@@ -46,7 +46,7 @@ TRANSITION_ENDS = ("used", "stale", "duplicate", "late", "invalid")
 STATES = ("active", "spare", "draining")
 
 
-class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
+class MetricsSnapshot(msgspec.Struct, frozen=True, kw_only=True):
     """What the learner knew at one moment."""
 
     at_s: float = 0.0
@@ -62,24 +62,24 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     received: tuple[int, int] = (0, 0)
     """messages, bytes"""
     sent: tuple[int, int] = (0, 0)
-    unheard: int = 0
-    """messages under keys that may speak no more"""
-    turned_away: int = 0
+    refused_messages: int = 0
+    """messages under revoked keys"""
+    refused_handshakes: int = 0
     """handshakes that failed"""
 
 
-class Exposition(Collector):
-    """The newest snapshot, and the metrics that it makes."""
+class MetricsCollector(Collector):
+    """Keeps the newest snapshot and turns it into metrics."""
 
     def __init__(self, config: Config, clock: Callable[[], float] = time.time) -> None:
         """`clock` tells seconds since 1970."""
         self._clock = clock
-        self._snapshot = Snapshot()
-        self._updates_before: int | None = None  # of a run that is resumed: those of earlier learners
+        self._snapshot = MetricsSnapshot()
+        self._updates_before: int | None = None  # updates of earlier learners, if the run was resumed
         self._about = {"env": config.env, "algo": config.algo, "seed": str(config.seed)}
 
-    def look(self, hub: Hub) -> None:
-        """Called by the loop whenever it has listened: a new snapshot, if the last one is old enough."""
+    def observe(self, hub: Hub) -> None:
+        """Take a new snapshot if the last one is old enough. Called whenever the hub has listened."""
         now = self._clock()
         if 0.0 <= now - self._snapshot.at_s < EVERY_S:
             return
@@ -87,7 +87,7 @@ class Exposition(Collector):
         if self._updates_before is None:
             self._updates_before = known.progress.updates
         states = known.worker_states()
-        self._snapshot = Snapshot(
+        self._snapshot = MetricsSnapshot(
             at_s=now,
             progress=known.progress,
             version=known.version,
@@ -96,16 +96,16 @@ class Exposition(Collector):
             lags=known.lag_counts,
             received=known.received,
             sent=known.sent,
-            unheard=known.refused_messages,
-            turned_away=known.refused_handshakes,
+            refused_messages=known.refused_messages,
+            refused_handshakes=known.refused_handshakes,
         )
 
     def describe(self) -> Iterator[Metric]:
-        """Nothing in advance: the registry then does not collect to learn the names."""
+        """Describe nothing in advance, so that the registry does not collect at registration."""
         return iter(())
 
     def collect(self) -> Iterator[Metric]:
-        """In a thread of the server, once a scrape."""
+        """All metrics. Called in a thread of the server, once for each scrape."""
         yield InfoMetricFamily("millrace_build", "Versions of millrace and of what decides its results.", versions())
         yield InfoMetricFamily("millrace_run", "What is trained.", self._about)
         now = self._snapshot
@@ -114,7 +114,7 @@ class Exposition(Collector):
             yield from (*_of_progress(now, updates), *_of_ledger(now.ledger), *_of_workers(now), *_of_link(now))
 
 
-def _of_progress(now: Snapshot, updates: int) -> Iterator[Metric]:
+def _of_progress(now: MetricsSnapshot, updates: int) -> Iterator[Metric]:
     done = now.progress
     yield GaugeMetricFamily("millrace_loop_timestamp_seconds", "When the learner's loop last listened.", now.at_s)
     yield CounterMetricFamily("millrace_env_steps", "Env steps that updates have used, since the run began.", done.env_steps)
@@ -155,7 +155,7 @@ def _of_ledger(ledger: Mapping[str, int]) -> Iterator[Metric]:
     yield GaugeMetricFamily("millrace_transitions_waiting", "Transitions not yet used.", ledger["transitions_waiting"])
 
 
-def _of_workers(now: Snapshot) -> Iterator[Metric]:
+def _of_workers(now: MetricsSnapshot) -> Iterator[Metric]:
     workers = GaugeMetricFamily("millrace_workers", "Workers by state; a spare one has no lane.", labels=("state",))
     for state in STATES:
         workers.add_metric((state,), now.workers.get(state, 0))
@@ -170,13 +170,13 @@ def _of_workers(now: Snapshot) -> Iterator[Metric]:
     )
 
 
-def _of_link(now: Snapshot) -> Iterator[Metric]:
+def _of_link(now: MetricsSnapshot) -> Iterator[Metric]:
     for name, (messages, size) in (("received", now.received), ("sent", now.sent)):
         yield CounterMetricFamily(f"millrace_{name}_messages", f"Messages {name} by this learner.", messages)
         yield CounterMetricFamily(f"millrace_{name}_bytes", f"Bytes of the messages {name}.", size)
-    refused = {"unreadable": now.ledger["messages_bad"], "key": now.unheard}
+    refused = {"unreadable": now.ledger["messages_bad"], "key": now.refused_messages}
     yield _by_reason("millrace_refused_messages", "Messages that were not used, by reason.", refused)
-    yield CounterMetricFamily("millrace_refused_handshakes", "Connections that were not let in.", now.turned_away)
+    yield CounterMetricFamily("millrace_refused_handshakes", "Connections that were not let in.", now.refused_handshakes)
 
 
 def _by_reason(name: str, text: str, counts: Mapping[str, int]) -> CounterMetricFamily:
@@ -190,17 +190,17 @@ def _by_reason(name: str, text: str, counts: Mapping[str, int]) -> CounterMetric
 
 
 @contextmanager
-def exposed(config: Config) -> Iterator[HubObserver]:
-    """Serve at `metrics_bind` while it is entered; what it gives is to be called by the loop.
+def metrics_server(config: Config) -> Iterator[HubObserver]:
+    """Serve `/metrics` at `metrics_bind` until the context ends. Yields the observer that the hub must call.
 
     Raises `UsageError` in one line if the port is in use.
     """
-    exposition = Exposition(config)
+    collector = MetricsCollector(config)
     registry = CollectorRegistry()
-    registry.register(exposition)
+    registry.register(collector)
     ProcessCollector(registry=registry)
     with _served(config.metrics_bind, registry):
-        yield exposition.look
+        yield collector.observe
 
 
 @contextmanager
@@ -220,7 +220,9 @@ def _served(bind: str, registry: CollectorRegistry) -> Iterator[None]:
         if is_local(f"tcp://{bind}"):
             log.info("%s", where)
         else:
-            log.warning("%s are open to whoever can reach that port: what is trained, and how far it is", where)
+            log.warning(
+                "%s can be read by anyone who can reach that port: they show what is trained and how far it is", where
+            )
         yield
     finally:
         server.shutdown()
@@ -230,7 +232,7 @@ def _served(bind: str, registry: CollectorRegistry) -> Iterator[None]:
 
 class _Server(ThreadingWSGIServer):
     def handle_error(self, request: object, client_address: object) -> None:
-        """A scraper that hangs up or says nothing is none of the run's business."""
+        """Ignore scrapers that hang up or send nothing."""
 
 
 class _IPv6(_Server):
@@ -238,9 +240,9 @@ class _IPv6(_Server):
 
 
 class _Quiet(WSGIRequestHandler):
-    """Says nothing about each scrape."""
+    """Logs no line for each scrape."""
 
-    timeout = SILENT_SCRAPER_S
+    timeout = SCRAPE_TIMEOUT_S
 
     def log_message(self, format: str, *args: object) -> None:
-        """Nothing."""
+        """Log nothing."""

@@ -157,6 +157,6 @@ def prometheus_observer(config: Config) -> AbstractContextManager[HubObserver]:
     """Serves metrics at `config.metrics_bind` while it is entered; without an address it imports no HTTP server."""
     if not config.metrics_bind:
         return nullcontext(lambda hub: None)
-    from learner.prometheus import exposed
+    from learner.prometheus import metrics_server
 
-    return exposed(config)
+    return metrics_server(config)

@@ -116,7 +116,7 @@ def make_vec(
         EnvironmentFailed: an environment raised; the error has the worker's traceback.
         WorkerLost: see `on_worker_loss`.
     """
-    from learner.members.endpoint import Bind
+    from learner.members.endpoint import BindSettings
     from learner.vector_env.settings import VectorEnvSettings
     from millrace.launch import vector
 
@@ -126,7 +126,7 @@ def make_vec(
             num_envs,
             workers=workers,
             lanes=lanes,
-            listen=Bind(bind, keys, insecure, advertise),
+            listen=BindSettings(bind, keys, insecure, advertise),
             transport=transport,
             shared_memory=shared_memory,
             autoreset_mode=autoreset_mode,

@@ -1,8 +1,8 @@
-"""Where a learner listens, who may come in, and what to type on another machine.
+"""Where a learner listens, who may connect, and what to type on another machine.
 
-The law: an address that other machines can reach has keys, or somebody has spelt out that it has none. Keys are made by
-themselves at first use. On loopback they are asked for where a key folder was named; between processes that share a file or
-memory the operating system decides.
+The law: an address that other machines can reach needs keys, unless the user says `insecure`. Keys are made automatically at
+first use. On loopback they are needed only if a key folder was named. Between processes that share a file or memory, the
+operating system decides who may connect.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from protocol.keys.keys import ClientList, Key, Token
 log = logging.getLogger("millrace.learner")
 
 
-class Listens(Protocol):
-    """Whatever says where a learner listens: a run's `Config`, or a vector environment's `Bind`."""
+class Listening(Protocol):
+    """What says where a learner listens: a run's `Config`, or a vector environment's `BindSettings`."""
 
     @property
     def bind(self) -> str:
@@ -41,8 +41,8 @@ class Listens(Protocol):
 
 
 @dataclass(frozen=True)
-class Bind:
-    """Where a vector environment listens, named as in `Config`; without an address it meets workers of its own."""
+class BindSettings:
+    """Where a vector environment listens, named as in `Config`. Without an address it starts its own workers."""
 
     bind: str = ""
     keys: str = ""
@@ -50,8 +50,8 @@ class Bind:
     advertise: str = ""
 
 
-def keyring_for(config: Listens, now: datetime) -> Keyring | None:
-    """Who may connect to `config.bind`; None where everybody may. Raises `UsageError`."""
+def keyring_for(config: Listening, now: datetime) -> Keyring | None:
+    """The keys that may connect to `config.bind`; None if no key is needed. Raises `UsageError`."""
     if config.insecure and config.keys:
         raise UsageError(f"keys {config.keys} or insecure: expected one, got both")
     if not config.bind.startswith("tcp://"):
@@ -71,14 +71,14 @@ def keyring_for(config: Listens, now: datetime) -> Keyring | None:
     return Keyring(folder.server(), folder.ensure_first_client(now), folder)
 
 
-def throwaway(worker: str, now: datetime) -> tuple[Keyring, Token]:
-    """Keys for one run on this machine, which no file holds."""
+def generate_run_keys(worker: str, now: datetime) -> tuple[Keyring, Token]:
+    """Keys for one run on this machine. They are in no file."""
     server, client = Key.new(), Key.new()
     return Keyring(server, ClientList().adding(worker, client.public, now)), Token(server.public, client)
 
 
 def join_lines(address: str, advertise: str, keyring: Keyring | None) -> list[str]:
-    """How a worker joins the learner that listens at `address`, as lines for people."""
+    """Lines that tell a person how to start a worker for the learner that listens at `address`."""
     reach = advertised_address(address, advertise, socket.gethostname())
     if keyring is None:
         insecure = "" if is_local(reach) else " --insecure"

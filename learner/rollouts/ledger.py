@@ -3,7 +3,7 @@
     tickets       issued   = used + outstanding + stale + lost
     transitions   received = used + waiting + stale + duplicate + late + invalid
 
-hold at every moment. `outstanding` tickets are with a worker, or their rollouts wait to be used (`waiting`).
+Both equations hold at every moment. `outstanding` tickets are with a worker, or their rollouts wait to be used (`waiting`).
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ class Ledger(msgspec.Struct, kw_only=True):
     used: int = 0
     """tickets whose rollout an update used"""
     stale: int = 0
-    """tickets whose rollout came under weights older than max_lag allows: dropped, dealt again"""
+    """tickets whose rollout was acted under weights older than max_lag allows: it was dropped, and a new ticket dealt"""
     lost: int = 0
-    """tickets whose worker was lost, left or sent what could not be used: dealt again"""
+    """tickets whose worker was lost, left or sent an unusable rollout: a new ticket was dealt"""
 
     transitions_received: int = 0
     transitions_used: int = 0
     transitions_stale: int = 0
     transitions_duplicate: int = 0
-    """of rollouts that came twice: one is used"""
+    """of the second copy of rollouts that came twice"""
     transitions_late: int = 0
     """of rollouts of a session that had ended"""
     transitions_invalid: int = 0

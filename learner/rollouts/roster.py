@@ -4,9 +4,9 @@ The law: a ticket is the permission for one rollout on one lane, and is dealt to
 
     used + outstanding < rollouts_per_update * (version + 1 + max_lag)
 
-A lane has one owner at a time and moves only between rollouts; whoever gets it starts it afresh (its incarnation rises). A
-worker that is lost gives back its lanes and tickets, which are dealt again: that is the whole of failure handling. What a
-Heartbeat shows to be lost on the way is said again. Every ticket and every transition is counted in the ledger.
+A lane has one owner at a time and moves only between rollouts. Its new owner starts it afresh: its incarnation rises. When a
+worker is lost, its lanes and tickets are dealt again: that is the whole of failure handling. What a Heartbeat shows to be
+lost on the way is sent again. Every ticket and every transition is counted in the ledger.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Roster:
         version: int = -1,
         incarnations: Sequence[int] = (),
     ) -> None:
-        """`version` is -1 until `publish`; `ledger`, and each lane's first incarnation, go on from a checkpoint."""
+        """`version` is -1 until `publish`. `ledger` and `incarnations` (of each lane, the first) come from a checkpoint."""
         self.run = run
         self.rollouts_per_update = rollouts_per_update
         self.max_lag = max_lag
@@ -181,7 +181,7 @@ class Roster:
         return out + self._deal()
 
     def take(self) -> list[ArrivedRollout] | None:
-        """The rollouts of the next update, or None while there are too few. What is too stale is dropped and counted."""
+        """The rollouts of the next update, or None while there are too few. Stale ones are dropped and counted."""
         if self.version - self._oldest_ready > self.max_lag:
             self._drop_stale()
         if len(self.ready) < self.rollouts_per_update:
@@ -192,15 +192,15 @@ class Roster:
         return taken
 
     def deal(self) -> list[Outgoing]:
-        """Deal what may be dealt, as after a stale drop."""
+        """Deal the tickets that may be dealt, as after stale rollouts were dropped."""
         return self._deal()
 
     def drain(self, reason: str) -> list[Outgoing]:
-        """Ask everybody to leave; no more tickets."""
+        """Ask every worker to leave; deal no more tickets."""
         return self.membership.drain(reason)
 
     def incarnations(self) -> list[int]:
-        """The next life of each lane, for a checkpoint: one that was dealt a ticket is not lived again."""
+        """The next incarnation of each lane, for a checkpoint. One that was dealt a ticket is not used again."""
         return [lane.incarnation + lane.started for lane in self.lanes]
 
     # ---------------------------------------------------------------- inside
@@ -254,7 +254,7 @@ class Roster:
         return self._offer(member) + self._deal()
 
     def _heartbeat(self, member: CollectingMember, heartbeat: Heartbeat) -> list[Outgoing]:
-        """Say again what this account shows to be lost: said before a reply that the worker has seen, yet not held."""
+        """Answer a heartbeat. Send again what it shows to be lost on the way."""
         lost = member.record_heartbeat(heartbeat)
         peer = member.peer
         if member.state is MemberState.DRAINING:
@@ -299,7 +299,7 @@ class Roster:
         return out
 
     def _removed(self, member: CollectingMember, why: str) -> None:
-        """The worker is gone: its tickets are lost, its lanes have no owner. `_deal` gives both to the living."""
+        """The worker is gone: its tickets are lost, its lanes have no owner. `_deal` gives both to other workers."""
         for number in list(member.tickets):
             self._lose(member, number)
         self._placement.removed(member)

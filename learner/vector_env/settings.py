@@ -10,7 +10,7 @@ from typing import Any, Literal
 import gymnasium
 from gymnasium.vector import AutoresetMode
 
-from learner.members.endpoint import Bind
+from learner.members.endpoint import BindSettings
 from protocol.env_spec import Scalar
 
 EnvLike = str | Callable[..., gymnasium.Env[Any, Any]]
@@ -25,7 +25,7 @@ class VectorEnvSettings:
     num_envs: int | None = None
     workers: int | None = None
     lanes: int | None = None
-    listen: Bind = field(default_factory=Bind)
+    listen: BindSettings = field(default_factory=BindSettings)
     """The address for workers that are started elsewhere, and its keys. An empty address means local workers."""
     transport: Literal["ipc", "tcp", "inproc"] = "ipc"
     shared_memory: bool = True

@@ -79,17 +79,17 @@ class NoLocalWorkers:
 
 @dataclass(frozen=True)
 class SharedSteps:
-    """What steps through shared memory need: the memory, and the bells of each worker that was handed it."""
+    """What steps through shared memory need: the memory, and the wake pipes of each worker that was handed it."""
 
     memory: SharedMemory
-    bells: Mapping[str, tuple[WakePipe, WakePipe]]
-    """by worker name: the bell that wakes the worker, and the bell that it rings"""
+    wake_pipes: Mapping[str, tuple[WakePipe, WakePipe]]
+    """by worker name: the pipe that wakes the worker, and the pipe by which it wakes us"""
 
     def close(self) -> None:
         """Close all file descriptors."""
         self.memory.close()
-        for bell in (bell for pair in self.bells.values() for bell in pair):
-            bell.close()
+        for pipe in (pipe for pair in self.wake_pipes.values() for pipe in pair):
+            pipe.close()
 
 
 class StepHub:
@@ -114,7 +114,7 @@ class StepHub:
         self._roster = StepRoster(spec, first_session, worker_timeout_s)
         self._local_workers: LocalWorkers = local_workers or NoLocalWorkers()
         self._shared, self._spin_s, self._clock = shared, spin_s, clock
-        self._awake = SpinWait()
+        self._spin_wait = SpinWait()
         self._waiting_orders: dict[int, MakeOrder] = {}  # lane -> an order that is sent as soon as the lane is placed
         self._waiting_since_s = 0.0
         self._patience_s = PATIENCE_S
@@ -122,7 +122,7 @@ class StepHub:
         self.stepped: set[int] = set()
         """lanes whose last step, through shared memory, is done"""
         self._under_way: dict[int, int] = {}  # lane -> number of its order through shared memory
-        self._bells: dict[int, tuple[WakePipe, WakePipe] | None] = {}  # lane -> its worker's bells, if it may use them
+        self._wake_pipes: dict[int, tuple[WakePipe, WakePipe] | None] = {}  # lane -> its worker's pipes, if it has any
         self._listen_due_s = 0.0
         # To lose a worker costs the user's episodes. So a worker has its whole timeout to be heard again, not only the
         # server's short grace: after a long suspension even its connection must be made anew.
@@ -157,16 +157,16 @@ class StepHub:
         self._send_waiting_orders()
 
     def shares(self, lane: int) -> bool:
-        """Whether a step of this lane may go through shared memory: its copies live with a child that was handed it."""
-        if lane not in self._bells:
+        """Whether a step of this lane may go through shared memory: its worker was handed the memory."""
+        if lane not in self._wake_pipes:
             member = self._roster.owner(lane)
             if member is None or not self._roster.lanes[lane].started or self._shared is None:
                 return False
-            self._bells[lane] = self._shared.bells.get(member.hello.worker)
-        return self._bells[lane] is not None
+            self._wake_pipes[lane] = self._shared.wake_pipes.get(member.hello.worker)
+        return self._wake_pipes[lane] is not None
 
     def step_shared(self, lanes: Sequence[int]) -> None:
-        """The actions are laid in shared memory: step these lanes."""
+        """Step these lanes with the actions that are in shared memory."""
         self._roster.begin()
         self.stepped.clear()
         assert self._shared is not None
@@ -175,9 +175,9 @@ class StepHub:
             self._under_way[lane] = self._roster.shared_orders[lane] = number = memory.ordered(lane) + 1
             memory.order(lane, number)
         for lane in lanes:
-            bells = self._bells[lane]
-            assert bells is not None
-            bells[0].wake()
+            pipes = self._wake_pipes[lane]
+            assert pipes is not None
+            pipes[0].wake()
 
     # ---------------------------------------------------------------- waiting
 
@@ -209,10 +209,10 @@ class StepHub:
             return packed
         deadline_s = self._clock() + timeout_s
         while True:
-            if (said := self._roster.infos.get(lane)) is not None:
-                return said
+            if (packed := self._roster.infos.get(lane)) is not None:
+                return packed
             if lane not in self._roster.shared_orders:
-                return b""  # its worker is gone, and that is told
+                return b""  # its worker is gone, and the lane is in `take_lost`
             if self._clock() > deadline_s:
                 self._give_up_lane(lane, "did not send its infos in time")
             else:
@@ -240,7 +240,7 @@ class StepHub:
     def rebalance(self) -> None:
         """Every lane is about to begin anew: even out the lanes of the workers."""
         self._turn(0.0)
-        self._bells.clear()
+        self._wake_pipes.clear()
         self._server.send(self._roster.rebalance())
 
     def wait_for(self, workers: int, timeout_s: float) -> None:
@@ -252,8 +252,8 @@ class StepHub:
         busy = bool(self._under_way or self._roster.orders)
         deadline_s = self._clock() + (min(BUSY_S, timeout_s) if busy else timeout_s)
         self._server.send(self._roster.drain("the vector environment was closed"))
-        for bell, _ in self._shared.bells.values() if self._shared is not None else ():
-            bell.wake(WakeReason.MESSAGE)
+        for pipe, _ in self._shared.wake_pipes.values() if self._shared is not None else ():
+            pipe.wake(WakeReason.MESSAGE)
         self._server.wait_until_all_left(deadline_s, POLL_S)
         self._local_workers.stop(max(0.0, deadline_s - self._clock()))
 
@@ -262,11 +262,11 @@ class StepHub:
     def _wait_for_shared_step(self, lane: int, deadline_s: float) -> None:
         """Wait for one lane's step, awake for a moment, then asleep. It is done when its number is that of the order."""
         assert self._shared is not None
-        memory, number, bells = self._shared.memory, self._under_way[lane], self._bells[lane]
-        assert bells is not None
-        self._awake.wait(lambda: memory.answered(lane) == number, self._spin_s)
+        memory, number, pipes = self._shared.memory, self._under_way[lane], self._wake_pipes[lane]
+        assert pipes is not None
+        self._spin_wait.wait(lambda: memory.answered(lane) == number, self._spin_s)
         while memory.answered(lane) != number and lane in self._under_way:
-            if not bells[1].wait(POLL_S):
+            if not pipes[1].wait(POLL_S):
                 self._turn(0.0)
                 if self._clock() > deadline_s:
                     self._give_up_lane(lane, "did not answer in time")
@@ -290,8 +290,8 @@ class StepHub:
     def _on_event(self, event: Event) -> None:
         """Let go of the lanes of a worker that has left."""
         if isinstance(event, WorkerLeft):
-            for lane in [lane for lane in self._bells if self._roster.owner(lane) is None]:
-                del self._bells[lane]
+            for lane in [lane for lane in self._wake_pipes if self._roster.owner(lane) is None]:
+                del self._wake_pipes[lane]
                 self._step_ended(lane)
 
     def _send_waiting_orders(self) -> None:
@@ -303,9 +303,9 @@ class StepHub:
                 self._server.send(self._roster.order(lane, make))
 
     def _wake_sleeping(self, peer: bytes) -> None:
-        """Ring the bell of a worker that was sent a message: it may sleep beside its shared memory."""
-        if self._shared is not None and (bells := self._shared.bells.get(worker_name(peer).decode(errors="replace"))):
-            bells[0].wake(WakeReason.MESSAGE)
+        """Wake a worker that was sent a message: it may sleep until its next step through shared memory."""
+        if self._shared is not None and (pipes := self._shared.wake_pipes.get(worker_name(peer).decode(errors="replace"))):
+            pipes[0].wake(WakeReason.MESSAGE)
 
     def _give_up(self, timeout_s: float) -> None:
         """The deadline has passed: give up every worker that has not answered."""

@@ -16,7 +16,7 @@ from pathlib import Path
 import zmq
 
 from learner.config.config import Config
-from learner.members.endpoint import Bind
+from learner.members.endpoint import BindSettings
 from learner.members.worker_processes import WorkerProcesses
 from learner.run import Run, Watch, prometheus_observer, set_up
 from learner.vector_env.env import ZmqVectorEnv
@@ -99,7 +99,7 @@ def _settings(config: Config, factory: Callable[..., object] | None, *, elsewher
         config.envs,
         workers=None if elsewhere else config.workers,
         lanes=config.lanes,
-        listen=Bind(config.bind if elsewhere else "", config.keys, config.insecure, config.advertise),
+        listen=BindSettings(config.bind if elsewhere else "", config.keys, config.insecure, config.advertise),
         transport=config.transport,
         # A local worker ends itself when the step of one copy hangs. One elsewhere may vanish without a message.
         timeout_s=config.step_timeout_s * (1 if elsewhere else config.envs),

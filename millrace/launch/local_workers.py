@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from learner.config.config import Config
-from learner.members.endpoint import throwaway
+from learner.members.endpoint import generate_run_keys
 from protocol.errors import UsageError
 from protocol.keys.key_folder import Keyring, chosen_key_folder
 from protocol.keys.keys import Token
@@ -43,7 +43,7 @@ def private_address(transport: str, stack: ExitStack) -> str:
 def temporary_keys(transport: str, keys: str, *, insecure: bool) -> tuple[Keyring | None, Token | None]:
     """Keys for this run alone if it uses TCP and a key folder was named; else None."""
     encrypted = transport == "tcp" and chosen_key_folder(keys) is not None and not insecure
-    return throwaway("local", datetime.now(UTC)) if encrypted else (None, None)
+    return generate_run_keys("local", datetime.now(UTC)) if encrypted else (None, None)
 
 
 def worker_flags(config: Config, run: Path) -> WorkerFlags:

@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 
 import zmq
 
-from learner.members.endpoint import Bind, join_lines, keyring_for
+from learner.members.endpoint import BindSettings, join_lines, keyring_for
 from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.settings import VectorEnvSettings
 from learner.vector_env.spec import VectorEnvDescription, describe
@@ -104,7 +104,7 @@ class ListeningVectorEnv:
         def start(name: str) -> WorkerProcess:
             handed = None
             if self.shared is not None:
-                to_worker, to_learner = self.shared.bells[name]
+                to_worker, to_learner = self.shared.wake_pipes[name]
                 handed = InheritedDescriptors(self.shared.memory.fd, to_worker.read_fd, to_learner.write_fd)
             worker_flags, log_file = flags(name)
             return WorkerProcess(WorkerCommand(self.link.address, name, log_file, self.token, worker_flags, handed))
@@ -113,7 +113,7 @@ class ListeningVectorEnv:
 
 
 def listen(settings: VectorEnvSettings, resources: ExitStack) -> ListeningVectorEnv:
-    """Bind the address. Closing `resources`, or the environment that is started, releases all that was acquired."""
+    """BindSettings the address. Closing `resources`, or the environment that is started, releases all that was acquired."""
     where, transport, count = settings.listen, settings.transport, settings.local_workers
     if where.bind and settings.workers:
         raise UsageError(f"workers expected 0 with a bind address, for they are started elsewhere, got {settings.workers}")
@@ -135,7 +135,7 @@ def listen(settings: VectorEnvSettings, resources: ExitStack) -> ListeningVector
     return ListeningVectorEnv(settings, description, link, context, keyring, token, shared, resources)
 
 
-def _keys(where: Bind, transport: str) -> tuple[Keyring | None, Token | None]:
+def _keys(where: BindSettings, transport: str) -> tuple[Keyring | None, Token | None]:
     """Who may connect, and the token of local workers."""
     if not where.bind:
         return temporary_keys(transport, where.keys, insecure=where.insecure)

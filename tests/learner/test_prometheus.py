@@ -22,7 +22,7 @@ from prometheus_client.parser import text_string_to_metric_families
 import learner.prometheus
 from learner.config.config import Config
 from learner.config.layers import resolve
-from learner.prometheus import EVERY_S, STAGES, Exposition, exposed
+from learner.prometheus import EVERY_S, STAGES, MetricsCollector, metrics_server
 from learner.rollouts.hub import PULSE_S, Hub, HubSettings
 from learner.run import prometheus_observer
 from learner.run_folder.progress import Progress
@@ -61,11 +61,11 @@ class Scraped:
         self.learner = Learner(lanes, publish=False)
         self.link = LearnerLink("inproc://exposition", context)
         self.now = 1_000.0
-        self.exposition = Exposition(Config(env="CartPole-v1"), lambda: self.now)
+        self.exposition = MetricsCollector(Config(env="CartPole-v1"), lambda: self.now)
         asked = itertools.count()
         self.hub = Hub(
             self.link, self.learner.roster, HubSettings(no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=0),
-            observer=self.exposition.look, clock=lambda: 2 * PULSE_S * next(asked),
+            observer=self.exposition.observe, clock=lambda: 2 * PULSE_S * next(asked),
         )  # fmt: skip
 
     def text(self) -> str:
@@ -249,16 +249,16 @@ def test_it_is_off_unless_asked_for(caplog: pytest.LogCaptureFixture) -> None:
 
 
 def test_a_run_that_breaks_leaves_no_server_behind() -> None:
-    with pytest.raises(RuntimeError, match="broke"), exposed(Config(env="CartPole-v1", metrics_bind="127.0.0.1:*")):
+    with pytest.raises(RuntimeError, match="broke"), metrics_server(Config(env="CartPole-v1", metrics_bind="127.0.0.1:*")):
         raise RuntimeError("it broke")
     assert not [thread for thread in threading.enumerate() if thread.name == "metrics"]
 
 
 def test_what_others_can_reach_is_said_to_be_open(caplog: pytest.LogCaptureFixture) -> None:
-    with exposed(Config(env="CartPole-v1", metrics_bind="0.0.0.0:*")):
+    with metrics_server(Config(env="CartPole-v1", metrics_bind="0.0.0.0:*")):
         pass
     (line,) = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
-    assert "are open to whoever can reach that port" in line
+    assert "can be read by anyone who can reach that port" in line
 
 
 def test_a_port_in_use_is_one_line_and_no_run_folder_is_made(tmp_path: Path) -> None:

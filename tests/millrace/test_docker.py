@@ -21,7 +21,7 @@ from prometheus_client.samples import Sample
 
 from learner.config.command_line import read_config
 from learner.config.config import Config
-from learner.prometheus import Exposition, Snapshot
+from learner.prometheus import MetricsCollector, MetricsSnapshot
 from learner.rollouts.ledger import Ledger
 from learner.run_folder.progress import Progress
 from protocol.keys.key_folder import KeyFolder
@@ -187,8 +187,8 @@ def test_every_service_comes_back_and_those_of_ours_are_confined(compose: dict[s
 
 
 def exposed_names() -> set[str]:
-    exposition = Exposition(Config(env="CartPole-v1"))
-    exposition._snapshot = Snapshot(
+    exposition = MetricsCollector(Config(env="CartPole-v1"))
+    exposition._snapshot = MetricsSnapshot(
         at_s=1.0, progress=Progress(return_mean=1.0, length_mean=1.0), ledger=Ledger().counts(), workers={}
     )
     samples: list[Sample] = [sample for metric in exposition.collect() for sample in metric.samples]

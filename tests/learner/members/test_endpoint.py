@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from learner.config.config import Config
-from learner.members.endpoint import join_lines, keyring_for, throwaway
+from learner.members.endpoint import join_lines, keyring_for, generate_run_keys
 from protocol.address import advertised_address, check_address, is_local, needs_ipv6, resolves
 from protocol.env_spec import AllowedCode, EnvSpec
 from protocol.errors import UsageError
@@ -103,7 +103,7 @@ def test_the_line_to_paste_is_the_whole_command(home: Path, monkeypatch: pytest.
 
 
 def test_throwaway_keys_fit_each_other_and_no_others() -> None:
-    keyring, token = throwaway("local", NOW)
+    keyring, token = generate_run_keys("local", NOW)
     assert token.server == keyring.key.public
     assert not keyring.why_not_enter(token.client.public)
     assert keyring.why_not_enter(TOKEN.client.public)
