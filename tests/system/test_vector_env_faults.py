@@ -244,7 +244,7 @@ def test_nothing_stays_open_after_many_environments() -> None:
 
 def test_no_worker_joins() -> None:
     env: ZmqVectorEnv | None = None
-    with pytest.raises(NoWorkers, match=r"waited 0.5 s for 2 workers at tcp://127.0.0.1:\d+, 0 are there; start one"):
+    with pytest.raises(NoWorkers, match=r"waited 0.5 s for 2 workers at tcp://127.0.0.1:\d+, 0 joined; start one"):
         env = make(workers=0, lanes=2, bind="tcp://127.0.0.1:*", timeout=0.5)
     assert env is None
 
@@ -401,7 +401,7 @@ def test_a_slow_step_or_a_slow_caller_is_no_silence(elsewhere: Elsewhere, monkey
 
 def test_a_worker_without_a_token_is_refused(elsewhere: Elsewhere, tmp_path: Path) -> None:
     elsewhere.start("a")
-    with pytest.raises(NoWorkers, match=r"0 are there \(\d+ were not let in.*start one: .* --token FILE"):
+    with pytest.raises(NoWorkers, match=r"0 joined \(\d+ were not let in.*start one: .* --token FILE"):
         make(workers=None, bind=elsewhere.address, keys=str(tmp_path / "keys"), timeout=5.0)
 
 
