@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from learner.config.config import Config
-from learner.members.endpoint import join_lines, keyring_for, generate_run_keys
+from learner.members.endpoint import generate_run_keys, join_lines, keyring_for
 from protocol.address import advertised_address, check_address, is_local, needs_ipv6, resolves
 from protocol.env_spec import AllowedCode, EnvSpec
 from protocol.errors import UsageError
