@@ -1,4 +1,4 @@
-"""`millrace bench`: what it knows exists, and what it cannot do it says in one line."""
+"""`millrace bench`: every benchmark that it lists exists, and errors are one line."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize("name", sorted(BENCHMARKS))
-def test_each_is_a_module_with_a_main(name: str) -> None:
+def test_each_benchmark_is_a_module_with_a_main(name: str) -> None:
     tree = ast.parse((ROOT / "benchmarks" / f"{BENCHMARKS[name].module}.py").read_text())
     assert any(isinstance(node, ast.FunctionDef) and node.name == "main" for node in tree.body)
     assert isinstance(tree.body[-1], ast.If)  # __name__ == "__main__"
     assert f"bench {name} " in overview()
 
 
-def test_an_unknown_one_is_refused(capfd: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_benchmark_is_refused(capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "speed"]) == 2
     assert "bench speed: expected one of collect, vector" in capfd.readouterr().err
 

@@ -1,4 +1,4 @@
-"""docker/compose.yaml brought up by a real `docker compose`: by the plugin, or by the older program of its own."""
+"""Runs docker/compose.yaml with a real `docker compose` (the plugin), or with the older program `docker-compose`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ BUILD_S = 900.0
 LOOK_EVERY_S = 1.0  # Prometheus asks the learner every 5 s
 
 IMAGES = {
-    # Debian's, run as the image that compose.yaml names by default, whose wget is busybox's.
+    # Prometheus from Debian, with the user, paths and wget of the image that compose.yaml names by default.
     PROMETHEUS: f"""
 FROM {BASE}
 COPY prometheus wget /bin/
@@ -35,7 +35,7 @@ USER nobody
 ENTRYPOINT ["/bin/prometheus"]
 CMD ["--config.file=/etc/prometheus/prometheus.yml", "--storage.tsdb.path=/prometheus"]
 """,
-    # No Debian package has Grafana. A stand-in that shows, as the same user at the same port, what it would be given.
+    # No Debian package has Grafana. A file server replaces it, with the same user and port, serves the files that it reads.
     GRAFANA: f"""
 FROM {BASE}
 USER 472
@@ -46,13 +46,13 @@ WGET = "#!/usr/bin/python3\nimport sys, urllib.request\nurllib.request.urlopen(s
 
 
 class Program(Enum):
-    """What reads compose.yaml."""
+    """A program that reads compose.yaml."""
 
     V1 = ("docker-compose",)
     V2 = ("docker", "compose")
 
     def why_not(self) -> str:
-        """Why it cannot be run here; empty if it can."""
+        """The reason why it cannot run here; empty if it can."""
         if shutil.which(self.value[0]) is None:
             return f"{' '.join(self.value)} is not installed"
         done = subprocess.run([*self.value, "version"], capture_output=True, text=True, timeout=60, check=False)
@@ -63,7 +63,7 @@ class Program(Enum):
 
 
 def prepare(engine: Engine, folder: Path) -> None:
-    """Give the engine what a registry has elsewhere: an image to build on, and those of others."""
+    """Give the engine the images that it cannot get from a registry: the base image, Prometheus and Grafana."""
     engine.docker("import", stock.base(), BASE)
     folder.mkdir()
     prometheus = shutil.which("prometheus")
@@ -90,7 +90,7 @@ class Cluster:
             shutil.copy(wheel, self.folder / "docker" / "wheels")
         self.docker_folder = self.folder / "docker"
         self.typed: set[str] = set()
-        """all commands so far, in the plugin's spelling"""
+        """all commands so far, as one would type them for the plugin"""
         self.project = f"millrace-{program.name.lower()}"
         self._environment = engine.environment | {
             "MILLRACE_BASE": BASE,
@@ -111,32 +111,32 @@ class Cluster:
         return run(command, within_s=within_s, env=self._environment, where=self.docker_folder)
 
     def set_flags(self, flags: str) -> None:
-        """The learner's, from the next `up` on."""
+        """Set the learner's flags, from the next `up` on."""
         self._environment["MILLRACE_FLAGS"] = flags
 
     def up(self, workers: int, *arguments: str) -> None:
-        """As many workers as said."""
+        """`docker compose up` with so many workers."""
         self.compose("up", "-d", *arguments, "--scale", f"worker={workers}")
         log.info("up: %d workers", workers)
 
     def containers(self, service: str, *, running: bool = True) -> list[str]:
-        """Their ids."""
+        """The ids of a service's containers."""
         labels = {"project": self.project, "service": service}
         filters = [f"--filter=label=com.docker.compose.{name}={value}" for name, value in labels.items()]
         return self.engine.docker("ps", "-q", *([] if running else ["-a"]), *filters).split()
 
     def state(self, service: str) -> list[dict[str, Any]]:
-        """`State` of each of its containers, as `docker inspect` tells it."""
+        """`State` of each container of a service, from `docker inspect`."""
         return [self.engine.look(container)["State"] for container in self.containers(service, running=False)]
 
     def ask(self, query: str) -> list[float]:
-        """What Prometheus answers, one number a series."""
+        """The answer of Prometheus: one number for each series."""
         quoted = "".join(character if character.isalnum() else f"%{ord(character):02X}" for character in query)
         answer = json.loads(self.engine.fetch(f"http://127.0.0.1:9090/api/v1/query?query={quoted}"))
         return [float(series["value"][1]) for series in answer["data"]["result"]]
 
     def sees(self, query: str, wanted: Callable[[float], bool], within_s: float = 90.0) -> float:
-        """Wait until Prometheus answers with one number that is wanted."""
+        """Wait until Prometheus answers with one number that `wanted` accepts; the number."""
         newest: list[float] = []
 
         def found() -> bool:
@@ -147,10 +147,10 @@ class Cluster:
         return newest[0]
 
     def trains(self) -> None:
-        """Wait for a thousand env steps more than there are now."""
+        """Wait until the learner has used a thousand more env steps."""
         before = self.sees("millrace_env_steps_total", math.isfinite)
         self.sees("millrace_env_steps_total", lambda steps: steps > before + 1_000)
 
     def said(self) -> str:
-        """The learner's last words."""
+        """The last lines of the learner's log."""
         return self.compose("logs", "--tail=20", "learner")

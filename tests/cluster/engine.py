@@ -1,7 +1,7 @@
-"""A real Docker Engine of a test's own: it runs in namespaces that nobody else sees, and is gone with them.
+"""A real Docker Engine for one test: it runs in namespaces of its own and ends with them.
 
-The law: its network, mounts and processes are its own, so that nothing of this machine changes (no bridge, no firewall rule)
-and nothing can outlive it. Therefore it reaches no registry. Needs root; `why_not` says what is missing.
+The law: its network, mounts and processes are separate, so that nothing of this machine changes (no bridge, no
+firewall rule) and nothing outlives it. It cannot reach a registry. It needs root; `why_not` says what is missing.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ TOOLS = {
     "iptables": "iptables", "ip": "iproute2",
     "unshare": "util-linux", "nsenter": "util-linux", "setpriv": "util-linux",
 }  # fmt: skip
-"""what it takes, and the Debian package that has it"""
+"""the programs that it needs, and the Debian package of each"""
 
-# /run is its own, so that its sockets and process ids meet nobody's; the first process reaps what containers leave.
+# A separate /run keeps its sockets and pid files apart; the first process reaps orphans of containers.
 START = """
 umount -l -R /run/netns 2>/dev/null || true
 mount -t tmpfs engine /run
@@ -45,7 +45,7 @@ exec docker-init -s -- dockerd --data-root "$1/data" --exec-root /run/docker --p
 
 
 def why_not(tools: Mapping[str, str] = TOOLS) -> str:
-    """Why there can be no engine here; empty if there can."""
+    """The reason why no engine can run here; empty if one can."""
     if os.geteuid() != 0:
         return "a Docker Engine takes root"
     missing = sorted({package for tool, package in tools.items() if shutil.which(tool) is None})
@@ -60,7 +60,7 @@ def run(
     env: Mapping[str, str] | None = None,
     where: Path | None = None,
 ) -> str:
-    """What the command says on stdout; fails with all that it said if it fails."""
+    """The stdout of a command. If the command fails, the assertion shows its output."""
     done = subprocess.run(
         command, input=stdin, capture_output=True, text=True, timeout=within_s, check=False, cwd=where, env=env
     )
@@ -70,10 +70,10 @@ def run(
 
 
 class Engine:
-    """A context. `environment` is that of a Docker client that shall speak with it."""
+    """A context manager. `environment` holds the environment variables for its Docker clients."""
 
     def __init__(self, folder: Path) -> None:
-        """`folder` holds its images and volumes, which are deleted when it ends, and its log."""
+        """`folder` holds its log, and its images and volumes, which are deleted when it ends."""
         self.folder = folder
         self.log = folder / "dockerd.log"
         self.environment = {**os.environ, "DOCKER_HOST": f"unix://{folder / 'docker.sock'}"}
@@ -114,7 +114,7 @@ class Engine:
                     inner.rmdir()
 
     def docker(self, *arguments: str | Path, within_s: float = 120.0) -> str:
-        """`docker …`; what it says on stdout."""
+        """`docker …`; its stdout."""
         return run(["docker", *arguments], within_s=within_s, env=self.environment).strip()
 
     def look(self, container: str) -> dict[str, Any]:
@@ -124,17 +124,17 @@ class Engine:
         return found
 
     def fetch(self, url: str) -> str:
-        """What is at a port that the engine publishes: on its own 127.0.0.1, not on this machine's."""
+        """Get a URL on the engine's own 127.0.0.1, where it publishes ports, not on this machine's."""
         reads = "import sys, urllib.request; print(urllib.request.urlopen(sys.argv[1], timeout=10).read().decode())"
         return run(["nsenter", f"--target={self._first}", "--net", sys.executable, "-c", reads, url])
 
     def kill(self, container: str) -> None:
-        """SIGKILL as the kernel sends it when memory runs out: after `docker kill` Docker would not start it again."""
+        """Send SIGKILL as the kernel does when memory runs out. `docker kill` would keep Docker from restarting it."""
         process = self.look(container)["State"]["Pid"]
         run(["nsenter", f"--target={self._first}", "--pid", "kill", "-KILL", str(process)])
 
     def is_empty(self) -> bool:
-        """No container, volume, or network but the three that it always has."""
+        """Whether it has no container, no volume, and only the three networks that every engine has."""
         left = [self.docker(*command.split()).split() for command in ("ps -aq", "volume ls -q", "network ls -q")]
         return [len(found) for found in left] == [0, 0, 3]
 

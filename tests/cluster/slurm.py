@@ -1,7 +1,6 @@
 """A Slurm cluster on this one machine: munged, slurmctld and two nodes with two cores each, all on loopback, in one folder.
 
-The law: nothing of a Slurm that may be installed here is read or touched; no daemon and no job is there any more when the
-cluster is closed.
+The law: an installed Slurm's files are neither read nor changed; no daemon and no job remains when the cluster is closed.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ PartitionName=all Nodes=ALL Default=YES MaxTime=INFINITE State=UP
 
 
 def why_not() -> str:
-    """Why this machine cannot have such a cluster; empty if it can."""
+    """The reason why no such cluster can run here; empty if one can."""
     if os.geteuid() != 0:
         return "slurmd takes root"
     missing = [name for name in DAEMONS if shutil.which(name) is None]
@@ -55,7 +54,7 @@ def why_not() -> str:
 
 
 class Slurm:
-    """A cluster. A context."""
+    """A cluster, as a context manager."""
 
     def __init__(self, stage: Stage) -> None:
         self._stage = stage
@@ -95,19 +94,19 @@ class Slurm:
             shutil.rmtree(self._folder)
 
     def submit(self, script: Path) -> str:
-        """As sbatch does; the job's number."""
+        """Submit a script with sbatch; the job id."""
         return self._ask("sbatch", "--parsable", str(script)).strip()
 
     def cancel(self, job: str, *flags: str) -> None:
-        """As scancel does."""
+        """Cancel a job with scancel."""
         self._ask("scancel", *flags, job)
 
     def requeue(self, job: str) -> None:
-        """As an administrator would: end it, and queue it again."""
+        """End a job and queue it again, as an administrator would."""
         self._ask("scontrol", "requeue", job)
 
     def seen(self, job: str) -> dict[str, str]:
-        """What scontrol shows of a job: JobState, Restarts, ExitCode and more."""
+        """The fields that scontrol shows of a job: JobState, Restarts, ExitCode and more."""
         words = self._ask("scontrol", "show", "job", "-o", job).split()
         return dict(word.partition("=")[::2] for word in words)
 

@@ -1,7 +1,7 @@
-"""What images are built from where no registry is reached: a small Debian with Python as their base, and a folder of wheels.
+"""What the images are built from without a registry: a small Debian with Python as the base image, and a folder of wheels.
 
-The law: both are made once, by debootstrap and by pip as it is configured, and kept in `.cluster` beside the sources, or
-where MILLRACE_CLUSTER says.
+The law: both are made once, by debootstrap and by pip with its configuration, and kept in `.cluster` beside the sources, or
+in the folder that MILLRACE_CLUSTER names.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from tests.system.processes import ROOT
 STOCK = Path(os.environ.get("MILLRACE_CLUSTER", ROOT / ".cluster"))
 SUITE, PYTHON = "bookworm", "3.11"
 NOT_NEEDED = ("var/cache/apt", "var/lib/apt/lists", "usr/share/doc", "usr/share/man", "usr/share/locale", "dev")
-"""neither has an image that is slim"""
+"""folders that a slim image does not have either"""
 MAKE_WITHIN_S = 900.0
 
 
 def base() -> Path:
-    """A tar for `docker import`."""
+    """The base image, as a tar file for `docker import`."""
     made = STOCK / f"{SUITE}.tar"
     if not made.exists():
         STOCK.mkdir(parents=True, exist_ok=True)
@@ -37,7 +37,7 @@ def base() -> Path:
 
 
 def wheels() -> list[Path]:
-    """All that both images install. With PyTorch's CPU build within pip's reach that is 0.3 GB, else several."""
+    """The wheels that both images install: 0.3 GB if pip finds PyTorch's CPU build, else several GB."""
     folder = STOCK / "wheels"
     if not folder.exists():
         STOCK.mkdir(parents=True, exist_ok=True)

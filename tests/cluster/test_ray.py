@@ -32,7 +32,7 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
 
 
 class Ray:
-    """A head and a second node, both on loopback; everything in a folder of its own."""
+    """A Ray cluster of a head and a second node, both on loopback, with all files in one folder."""
 
     def __init__(self, stage: Stage, folder: Path) -> None:
         self.address = f"127.0.0.1:{free_port()}"
@@ -50,14 +50,14 @@ class Ray:
         self._start("second", "--address", self.address)
 
     def _start(self, name: str, *flags: str) -> None:
-        """`ray start` stays, and ends its node when it is asked to."""
+        """Run `ray start`, which stays in the foreground until SIGTERM ends the node."""
         command = [str(Path(sys.executable).with_name("ray")), "start", "--block", "--disable-usage-stats", *flags]
         command += ["--node-ip-address", "127.0.0.1", "--num-cpus", str(CORES[name])]
         self._nodes.append(self._stage.start(command, f"ray-{name}"))
         self._nodes[-1].hears("block forever", START_S)
 
     def actors(self) -> set[int]:
-        """Their processes' numbers, while they run the worker program."""
+        """Process ids of the actors that run the worker program."""
         found = set()
         for process in self._processes():
             with suppress(psutil.NoSuchProcess):
@@ -66,7 +66,7 @@ class Ray:
         return found
 
     def close(self) -> None:
-        """End both nodes; fail if a process of theirs stays."""
+        """End both nodes; fail if one of their processes remains."""
         theirs = self._processes()
         for node in reversed(self._nodes):
             node.signal(signal.SIGTERM)

@@ -39,7 +39,7 @@ def slurm(stage: Stage) -> Iterator[Slurm]:
 
 
 class Script:
-    """The folder that all nodes share, and the script in it."""
+    """The job script, in the folder that all nodes share."""
 
     def __init__(self, capsys: pytest.CaptureFixture[str], folder: Path, minutes: int, save_s: int) -> None:
         self.folder, self.path = folder, folder / "run.sbatch"
@@ -47,7 +47,7 @@ class Script:
         flags = ["--workers", str(WORKERS), "--time", str(minutes), "--save-s", str(save_s), "--folder", str(folder)]
         settings = SMALL | {"min-workers": WORKERS}
         given = [word for name, value in settings.items() for word in (f"--{name}", *str(value).split())]
-        # The launcher's own patience, as it is written.
+        # Keep the launcher's own --no-workers-timeout-s.
         del given[(at := given.index("--no-workers-timeout-s")) : at + 2]
         assert main(["launch", "slurm", TOY, *flags, "--", *given]) == 0
         self.path.write_text(capsys.readouterr().out)
@@ -156,7 +156,7 @@ def test_the_job_ends_as_the_learner_does(
 
 
 def worker_processes(folder: Path) -> list[psutil.Process]:
-    """Those of this job, wherever they run."""
+    """The worker processes of this job, on any node."""
     found = []
     for process in psutil.process_iter():
         try:

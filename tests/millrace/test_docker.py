@@ -65,7 +65,7 @@ sys.exit(main(["worker", "tcp://127.0.0.1:1", "--join-timeout-s", "0.01"]))
 """
 
 
-def test_a_worker_starts_where_nothing_else_is_installed() -> None:
+def test_a_worker_starts_with_the_packages_of_its_image_alone() -> None:
     missing = {
         "matplotlib",
         "prometheus_client",
@@ -85,11 +85,11 @@ def test_a_worker_starts_where_nothing_else_is_installed() -> None:
     assert "is the learner running, and is this its address?" in done.stderr
 
 
-def test_what_builds_the_images_is_pinned_too() -> None:
+def test_the_build_backend_is_pinned_too() -> None:
     assert "hatchling" in names(ROOT / "constraints.txt")
 
 
-def test_no_registry_is_named_and_nobody_is_root() -> None:
+def test_the_dockerfile_names_no_registry_and_no_stage_runs_as_root() -> None:
     text = (DOCKER / "Dockerfile").read_text()
     assert not re.search(r"https?://|\.(org|io|com)\b", text)
     stages = re.split(r"^FROM ", text, flags=re.MULTILINE)
@@ -105,7 +105,7 @@ def test_no_registry_is_named_and_nobody_is_root() -> None:
 
 @pytest.fixture
 def compose() -> dict[str, Any]:
-    """compose.yaml as it is where no variable is set."""
+    """compose.yaml with the default of every variable."""
     text = re.sub(r"\$\{\w+:-([^}]*)\}", r"\1", (DOCKER / "compose.yaml").read_text())
     assert "$" not in re.sub(r"^#.*", "", text, flags=re.MULTILINE)
     found: dict[str, Any] = yaml.safe_load(text)
@@ -197,8 +197,8 @@ def exposed_names() -> set[str]:
 
 def test_the_dashboard_asks_for_metrics_that_exist() -> None:
     dashboard = json.loads((DOCKER / "grafana/dashboards/millrace.json").read_text())
-    asked = [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
-    used = {name for expr in asked for name in re.findall(r"millrace_\w+", expr)}
+    queries = [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
+    used = {name for expr in queries for name in re.findall(r"millrace_\w+", expr)}
     assert used <= exposed_names()
     assert len(used) > 15
     assert {panel["datasource"]["uid"] for panel in dashboard["panels"]} == {"prometheus"}
@@ -207,7 +207,7 @@ def test_the_dashboard_asks_for_metrics_that_exist() -> None:
     assert (source["uid"], source["url"]) == ("prometheus", "http://prometheus:9090")
 
 
-def test_panels_do_not_lie_on_each_other() -> None:
+def test_panels_do_not_overlap() -> None:
     taken: set[tuple[int, int]] = set()
     for panel in json.loads((DOCKER / "grafana/dashboards/millrace.json").read_text())["panels"]:
         at = panel["gridPos"]

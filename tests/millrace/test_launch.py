@@ -1,4 +1,4 @@
-"""What the launchers write: the engines' own checkers take it, and our own command lines take the commands in it."""
+"""What the launchers write: the checkers of the engines accept it, and our command line accepts the commands in it."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def test_a_workers_pod_has_the_token_and_not_the_learners_key(cluster: dict[str,
     assert (variable["name"], variable["valueFrom"]["secretKeyRef"]["key"]) == ("MILLRACE_TOKEN", "default.token")
 
 
-def test_kubernetes_puts_nothing_into_our_arguments(capsys: pytest.CaptureFixture[str]) -> None:
+def test_kubernetes_expands_no_variable_in_our_arguments(capsys: pytest.CaptureFixture[str]) -> None:
     text = launched(capsys, *DEFAULTS, "--env-kwargs", "render_mode", '$(HOME)\u2028é: {"x"}')
     assert container(documents(text)["Job"])["args"][-5] == '$$(HOME)\u2028é: {"x"}'
 
@@ -174,13 +174,15 @@ def test_the_script_is_one_that_a_shell_and_sbatch_know(capsys: pytest.CaptureFi
         [checker, "--severity=warning", "-"], input=text, capture_output=True, text=True, timeout=60, check=False
     )
     assert done.returncode == 0, done.stdout
-    asked = dict(re.findall(r"^#SBATCH --([-a-z]+)=(.*)$", text, re.MULTILINE))
-    assert (asked["ntasks"], asked["signal"], asked["partition"]) == ("4", "B:USR1@120", "short")
-    assert asked["output"].startswith(str(tmp_path))
+    options = dict(re.findall(r"^#SBATCH --([-a-z]+)=(.*)$", text, re.MULTILINE))
+    assert (options["ntasks"], options["signal"], options["partition"]) == ("4", "B:USR1@120", "short")
+    assert options["output"].startswith(str(tmp_path))
     assert "#SBATCH --requeue\n" in text
 
 
-def test_what_is_odd_in_a_flag_reaches_the_learner_as_it_is(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_special_characters_in_a_flag_reach_the_learner_unchanged(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     odd = "a 'b' $HOME `id` \\"
     flags = ("--env-kwargs", "render_mode", odd)
     text = launched(capsys, "slurm", "CartPole-v1", "--folder", str(tmp_path), "--", *flags, "--seed", "7")

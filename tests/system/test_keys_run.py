@@ -1,4 +1,4 @@
-"""Learner and workers as processes that know each other by keys: joining by token, revoking in mid-run, refusals."""
+"""Learner and workers as processes with keys: joining by token, revoking during a run, refusals."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def no_keys_of_the_users_own(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def join_address(learner: Learner) -> str:
-    """Of the line that it says for workers."""
+    """The address in the line that the learner prints for workers."""
     return learner.hears(JOIN_LINE, START_S).partition(JOIN_LINE)[2].split()[0]
 
 
@@ -107,8 +107,8 @@ def test_an_insecure_learner_warns_and_a_worker_of_it_runs_no_code(stage: Stage)
     learner.hears("worker w left: environment workers.envs.toy:Spaces-v0 imports a module")
 
 
-def test_a_run_on_this_machine_over_sealed_tcp_learns_the_same(tmp_path: Path) -> None:
-    """Keys that no file holds, made for this run; the weights are those of a run without, bit for bit."""
+def test_a_run_on_this_machine_over_encrypted_tcp_learns_the_same(tmp_path: Path) -> None:
+    """With keys made for this run alone, in no file, the weights are the same bits as without keys."""
     policies = []
     runs: dict[str, dict[str, Any]] = {"ipc": {}, "sealed": {"transport": "tcp", "keys": str(tmp_path / "keys")}}
     for name, settings in runs.items():
@@ -118,10 +118,8 @@ def test_a_run_on_this_machine_over_sealed_tcp_learns_the_same(tmp_path: Path) -
     assert not (tmp_path / "keys").exists()
 
 
-def test_frame_stacks_that_travel_packed_teach_what_those_do_that_lie_as_they_are(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Over an encrypted connection they are packed, between processes of this machine not; the weights are the same bits."""
+def test_packed_frame_stacks_train_the_same_policy_as_unpacked_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames are packed over an encrypted connection, not between local processes. The weights are the same bits."""
 
     def stacks() -> gymnasium.Env[Any, Any]:
         frames = gymnasium.make("workers.envs.toy:Frames-v0")

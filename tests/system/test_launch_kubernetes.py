@@ -1,4 +1,4 @@
-"""The commands of the Kubernetes manifest as they stand there, run as plain processes: keys, learner, probes, workers."""
+"""The commands of the Kubernetes manifest, run unchanged as plain processes: keys, learner, probes, workers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.system.processes import START_S, Learner, Stage, free_port
 
 
 def manifest(capsys: pytest.CaptureFixture[str], tmp_path: Path, *argv: str) -> dict[str, Any]:
-    """By kind. What a pod mounts lies in the folder of the test, and the Service is on loopback."""
+    """The documents, by kind. Mounted paths are changed to the folder of the test, and the Service to loopback."""
     assert main(["launch", "kubernetes", "CartPole-v1", "--keys", str(tmp_path / "made"), *argv]) == 0
     text = capsys.readouterr().out
     for mounted in ("/secret", "/keys", "/runs"):
@@ -35,7 +35,7 @@ def manifest(capsys: pytest.CaptureFixture[str], tmp_path: Path, *argv: str) -> 
 
 
 def with_variables(container: dict[str, Any], secret: dict[str, bytes]) -> list[str]:
-    """What goes before a command, so that it has the container's variables and no others of ours."""
+    """The `env` command that gives a process the environment variables of the container."""
     found = {}
     for variable in container["env"]:
         key = variable.get("valueFrom", {}).get("secretKeyRef", {}).get("key")
