@@ -79,7 +79,7 @@ def test_compressed_rollouts_change_nothing_but_their_bytes(tmp_path: Path) -> N
 
 def test_a_learner_that_cannot_decompress_does_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "zstandard", None)
-    with pytest.raises(UsageError, match=r"needs the package zstandard, .* pip install 'millrace\[compress\]'"):
+    with pytest.raises(UsageError, match=r"needs the package zstandard, .* pip install 'millrace-rl\[compress\]'"):
         run(tmp_path, "CartPole-v1", compress="zstd", steps=1_000)
     assert not list(tmp_path.glob("runs*"))
 
