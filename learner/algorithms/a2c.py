@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from learner.algorithms.actor_critic import ActorCritic, Estimates, Pulse
 from learner.algorithms.minibatches import Observations
-from learner.algorithms.returns import gae
+from learner.algorithms.returns import EpisodeEnds, gae
 from learner.config.hyperparameters import A2CConfig
 from protocol.arrays import Floats
 from protocol.rollout import Batch
@@ -25,5 +25,5 @@ class A2C(ActorCritic):
     def estimate(self, batch: Batch, observations: Observations, reward: Floats, pulse: Pulse) -> Estimates:
         """Generalized advantage estimates, and their sums with the values as targets."""
         config, values = self.config, self.values(observations, pulse)
-        advantage = gae(reward, values, batch.terminated, batch.truncated, batch.valid, config.gamma, config.gae_lambda)
+        advantage = gae(reward, values, EpisodeEnds.of(batch), config.gamma, config.gae_lambda)
         return Estimates(advantage, advantage + values[:-1], values, batch.valid, {})

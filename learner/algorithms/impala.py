@@ -10,7 +10,7 @@ import numpy as np
 
 from learner.algorithms.actor_critic import ActorCritic, Estimates, Pulse
 from learner.algorithms.minibatches import Observations
-from learner.algorithms.returns import vtrace
+from learner.algorithms.returns import EpisodeEnds, vtrace
 from learner.config.hyperparameters import ImpalaConfig
 from protocol.arrays import Floats
 from protocol.rollout import Batch
@@ -42,9 +42,7 @@ class Impala(ActorCritic):
             reward,
             values,
             log_ratio,
-            batch.terminated,
-            batch.truncated,
-            batch.valid,
+            EpisodeEnds.of(batch),
             config.gamma,
             config.vtrace_lambda,
             config.rho_bar,

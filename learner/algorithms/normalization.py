@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from learner.algorithms.returns import discounted_return
+from learner.algorithms.returns import EpisodeEnds, discounted_return
 from protocol.arrays import Doubles, Floats
 from protocol.policy.features import box_feature_mask
 from protocol.policy.layout import buffer_size
@@ -101,18 +101,17 @@ class RewardScaler:
 
     def scale(self, batch: Batch) -> Floats:
         """Count the batch, then return its scaled rewards [T, ΣN]."""
-        ended = batch.terminated | batch.truncated
+        ends = EpisodeEnds.of(batch)
         for at in range(0, len(batch.lane), batch.copies):  # rollouts of a lane are in the order of collection
             columns = slice(at, at + batch.copies)
             lane = int(batch.lane[at])
             start = self._returns.get(lane)
             if start is None or batch.fresh[at]:
                 start = np.zeros(batch.copies)
-            valid = batch.valid[:, columns]
             found, self._returns[lane] = discounted_return(
-                batch.reward[:, columns], ended[:, columns], valid, self._gamma, start
+                batch.reward[:, columns], ends.columns(columns), self._gamma, start
             )
-            self._moments.update(found[valid])
+            self._moments.update(found[ends.valid[:, columns]])
         return (batch.reward / self._moments.std).astype(np.float32)
 
     def state_dict(self) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from learner.algorithms.actor_critic import ActorCritic, Estimates, Metrics, Pul
 from learner.algorithms.kernels import loss_gradients
 from learner.algorithms.kernels.loss_gradients import Numbers, OutputGradients
 from learner.algorithms.minibatches import LossInput, Observations
-from learner.algorithms.returns import gae
+from learner.algorithms.returns import EpisodeEnds, gae
 from learner.algorithms.updates import scheduled
 from learner.config.hyperparameters import PPOConfig
 from protocol.arrays import Floats
@@ -57,7 +57,7 @@ class PPO(ActorCritic):
     def estimate(self, batch: Batch, observations: Observations, reward: Floats, pulse: Pulse) -> Estimates:
         """Generalized advantage estimates, and their sums with the values as targets."""
         config, values = self.config, self.values(observations, pulse)
-        advantage = gae(reward, values, batch.terminated, batch.truncated, batch.valid, config.gamma, config.gae_lambda)
+        advantage = gae(reward, values, EpisodeEnds.of(batch), config.gamma, config.gae_lambda)
         return Estimates(advantage, advantage + values[:-1], values, batch.valid, {})
 
     def loss(self, rows: LossInput) -> tuple[Tensor, Mapping[str, Tensor | float]]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from learner.algorithms.actor_critic import ActorCritic, Estimates, Pulse
 from learner.algorithms.minibatches import Observations
-from learner.algorithms.returns import complete, gae
+from learner.algorithms.returns import EpisodeEnds, complete, gae
 from learner.config.hyperparameters import REINFORCEConfig
 from protocol.arrays import Floats
 from protocol.rollout import Batch
@@ -36,9 +36,10 @@ class REINFORCE(ActorCritic):
         """Monte-Carlo returns as targets; less the baseline's values they are the advantages."""
         T, N = reward.shape
         values = self.values(observations, pulse) if self.config.baseline else np.zeros((T + 1, N), np.float32)
+        ends = EpisodeEnds.of(batch)
         # With λ = 1 an advantage is the return minus the baseline (Sutton and Barto 2018, section 13.4).
-        advantage = gae(reward, values, batch.terminated, batch.truncated, batch.valid, self.config.gamma, 1.0)
-        known = complete(batch.terminated | batch.truncated, batch.valid)
+        advantage = gae(reward, values, ends, self.config.gamma, 1.0)
+        known = complete(ends)
         counts = {
             "rows_used": float(np.count_nonzero(known)),
             "rows_dropped": float(np.count_nonzero(batch.valid & ~known)),

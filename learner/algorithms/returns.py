@@ -8,22 +8,37 @@ valid gives zero and affects no other row, whatever its contents.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from protocol.arrays import Bools, Floats
+from protocol.arrays import Bools, Doubles, Floats
+from protocol.rollout import Batch
 
 
-def gae(
-    reward: Floats,
-    values: Floats,
-    terminated: Bools,
-    truncated: Bools,
-    valid: Bools,
-    gamma: float,
-    gae_lambda: float,
-) -> Floats:
+class EpisodeEnds(NamedTuple):
+    """Where episodes end in a batch, and which of its rows are steps of an episode. [T, N] each."""
+
+    terminated: Bools
+    truncated: Bools
+    valid: Bools
+
+    @classmethod
+    def of(cls, batch: Batch) -> EpisodeEnds:
+        """Those of a batch, not copied."""
+        return cls(batch.terminated, batch.truncated, batch.valid)
+
+    @property
+    def ended(self) -> Bools:
+        """[T, N] True where the episode was terminated or truncated."""
+        return self.terminated | self.truncated
+
+    def columns(self, at: slice) -> EpisodeEnds:
+        """Those of some env copies."""
+        return EpisodeEnds(self.terminated[:, at], self.truncated[:, at], self.valid[:, at])
+
+
+def gae(reward: Floats, values: Floats, ends: EpisodeEnds, gamma: float, gae_lambda: float) -> Floats:
     """Generalized advantage estimates [T, N] float32 (Schulman et al. 2016); reward [T, N], values [T+1, N].
 
         δₜ = rₜ + γ V(sₜ₊₁) [not terminated] − V(sₜ)
@@ -33,9 +48,9 @@ def gae(
     """
     T, N = reward.shape
     assert values.shape == (T + 1, N), f"values expected {(T + 1, N)}, got {values.shape}"
-    bootstrap = np.where(terminated, np.float32(0), values[1:])
-    advantage = np.where(valid, reward + np.float32(gamma) * bootstrap - values[:-1], np.float32(0))
-    carried = (valid & ~(terminated | truncated)) * np.float32(gamma * gae_lambda)
+    bootstrap = np.where(ends.terminated, np.float32(0), values[1:])
+    advantage = np.where(ends.valid, reward + np.float32(gamma) * bootstrap - values[:-1], np.float32(0))
+    carried = (ends.valid & ~ends.ended) * np.float32(gamma * gae_lambda)
     for t in range(T - 2, -1, -1):
         advantage[t] += carried[t] * advantage[t + 1]
     return advantage
@@ -45,9 +60,7 @@ def vtrace(
     reward: Floats,
     values: Floats,
     log_ratio: Floats,
-    terminated: Bools,
-    truncated: Bools,
-    valid: Bools,
+    ends: EpisodeEnds,
     gamma: float,
     vtrace_lambda: float = 1.0,
     rho_bar: float = 1.0,
@@ -65,34 +78,28 @@ def vtrace(
     T, N = reward.shape
     assert values.shape == (T + 1, N), f"values expected {(T + 1, N)}, got {values.shape}"
     zero, discount, mix = np.float32(0), np.float32(gamma), np.float32(vtrace_lambda)
-    log_ratio = np.where(valid, log_ratio, zero)
+    log_ratio = np.where(ends.valid, log_ratio, zero)
     rho = np.exp(np.minimum(log_ratio, np.float32(math.log(rho_bar))))  # clipped first: exp cannot overflow
     c = np.exp(np.minimum(log_ratio, np.float32(math.log(c_bar))))
-    bootstrap = np.where(terminated, zero, values[1:])
-    delta = np.where(valid, rho * (reward + discount * bootstrap - values[:-1]), zero)
-    goes_on = valid & ~(terminated | truncated)
+    bootstrap = np.where(ends.terminated, zero, values[1:])
+    delta = np.where(ends.valid, rho * (reward + discount * bootstrap - values[:-1]), zero)
+    goes_on = ends.valid & ~ends.ended
     goes_on[-1] = False
     ahead = np.zeros_like(delta)  # vs − V of the next row, where the episode goes on in this rollout
     found = delta.copy()  # vs − V
     for t in range(T - 2, -1, -1):
         ahead[t] = np.where(goes_on[t], found[t + 1], zero)
         found[t] += discount * mix * c[t] * ahead[t]
-    target = np.where(valid, found + values[:-1], zero)
+    target = np.where(ends.valid, found + values[:-1], zero)
     return target, delta + rho * discount * mix * ahead
 
 
-def complete(ended: Bools, valid: Bools) -> Bools:
+def complete(ends: EpisodeEnds) -> Bools:
     """[T, N] True for valid rows whose episode ends within the rollout, so that all the reward that follows is known."""
-    return np.asarray(np.logical_or.accumulate((ended & valid)[::-1])[::-1] & valid)
+    return np.asarray(np.logical_or.accumulate((ends.ended & ends.valid)[::-1])[::-1] & ends.valid)
 
 
-def discounted_return(
-    reward: Floats,
-    ended: Bools,
-    valid: Bools,
-    gamma: float,
-    start: npt.NDArray[np.float64],
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def discounted_return(reward: Floats, ends: EpisodeEnds, gamma: float, start: Doubles) -> tuple[Doubles, Doubles]:
     """The discounted sum of the *past* rewards of this episode, which reward scaling measures.
 
         Gₜ = rₜ + γ Gₜ₋₁ [the same episode]
@@ -101,8 +108,8 @@ def discounted_return(
     not valid) and the `start` [N] of the next rollout of these copies.
     """
     found = np.zeros(reward.shape)
-    last = start
+    last, ended = start, ends.ended
     for t in range(len(reward)):
-        found[t] = np.where(valid[t], reward[t] + gamma * last, 0)
+        found[t] = np.where(ends.valid[t], reward[t] + gamma * last, 0)
         last = np.where(ended[t], 0, found[t])
     return found, last

@@ -13,7 +13,7 @@ from learner.algorithms.a2c import A2C
 from learner.algorithms.minibatches import Minibatch
 from learner.algorithms.ppo import PPO
 from learner.algorithms.reinforce import REINFORCE
-from learner.algorithms.returns import gae
+from learner.algorithms.returns import EpisodeEnds, gae
 from learner.config.hyperparameters import A2CConfig, PPOConfig, REINFORCEConfig
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
@@ -45,7 +45,7 @@ def test_an_update_is_one_step_on_all_valid_rows(monkeypatch: pytest.MonkeyPatch
     algorithm = a2c(gamma=0.9, gae_lambda=0.7)
     rows = batch(algorithm, 0)
     values = algorithm.values(algorithm.observations(rows), no_pulse)
-    expected = gae(rows.reward, values, rows.terminated, rows.truncated, rows.valid, 0.9, 0.7)
+    expected = gae(rows.reward, values, EpisodeEnds.of(rows), 0.9, 0.7)
     assert algorithm.vf_coef > 0
     minibatches: list[Minibatch] = []
     step = algorithm.step

@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from learner.algorithms.returns import discounted_return, gae
+from learner.algorithms.returns import EpisodeEnds, discounted_return, gae
 from protocol.arrays import Array
 
 GAMMA, LAMBDA = 0.9, 0.8
 
 
 class Rows(NamedTuple):
-    """Columns of a batch, in the order `gae` takes them."""
+    """Columns of a batch that returns and advantages are computed from."""
 
     reward: Array  # [T, N]
     values: Array  # [T+1, N]
@@ -25,8 +25,12 @@ class Rows(NamedTuple):
     truncated: Array
     valid: Array
 
+    @property
+    def ends(self) -> EpisodeEnds:
+        return EpisodeEnds(self.terminated, self.truncated, self.valid)
+
     def gae(self, gamma: float = GAMMA, gae_lambda: float = LAMBDA) -> Array:
-        return gae(*self, gamma, gae_lambda)
+        return gae(self.reward, self.values, self.ends, gamma, gae_lambda)
 
 
 def lawful(terminated: Array, truncated: Array, first: Array) -> tuple[Array, Array, Array]:
@@ -164,7 +168,7 @@ def test_a_row_that_is_not_valid_changes_nothing(r: Rows, rubbish: float) -> Non
 def test_discounted_return_is_the_sum_of_past_rewards(r: Rows, gamma: float) -> None:
     T, N = r.reward.shape
     start = np.arange(1.0, N + 1)
-    found, last = discounted_return(r.reward, r.terminated | r.truncated, r.valid, gamma, start)
+    found, last = discounted_return(r.reward, r.ends, gamma, start)
     for n in range(N):
         past: list[float] = [start[n]]
         for t in range(T):
@@ -182,10 +186,10 @@ def test_discounted_return_is_the_sum_of_past_rewards(r: Rows, gamma: float) -> 
 def test_discounted_return_goes_on_where_the_last_rollout_stopped() -> None:
     generator = np.random.default_rng(0)
     reward = generator.normal(size=(10, 3)).astype(np.float32)
-    terminated, truncated, valid = lawful(generator.random((10, 3)) < 0.2, np.zeros((10, 3), bool), np.ones(3, bool))
-    ended = terminated | truncated
-    whole, end = discounted_return(reward, ended, valid, GAMMA, np.zeros(3))
-    first, middle = discounted_return(reward[:4], ended[:4], valid[:4], GAMMA, np.zeros(3))
-    second, last = discounted_return(reward[4:], ended[4:], valid[4:], GAMMA, middle)
+    ends = EpisodeEnds(*lawful(generator.random((10, 3)) < 0.2, np.zeros((10, 3), bool), np.ones(3, bool)))
+    earlier, later = (EpisodeEnds(*(each[part] for each in ends)) for part in (slice(4), slice(4, None)))
+    whole, end = discounted_return(reward, ends, GAMMA, np.zeros(3))
+    first, middle = discounted_return(reward[:4], earlier, GAMMA, np.zeros(3))
+    second, last = discounted_return(reward[4:], later, GAMMA, middle)
     np.testing.assert_array_equal(whole, np.concatenate([first, second]))
     np.testing.assert_array_equal(end, last)

@@ -26,7 +26,7 @@ class OffPolicy(NamedTuple):
         self, gamma: float = GAMMA, lam: float = 1.0, rho_bar: float = 1.0, c_bar: float = 1.0
     ) -> tuple[Array, Array]:
         r = self.rows
-        return vtrace(r.reward, r.values, self.log_ratio, r.terminated, r.truncated, r.valid, gamma, lam, rho_bar, c_bar)
+        return vtrace(r.reward, r.values, self.log_ratio, r.ends, gamma, lam, rho_bar, c_bar)
 
 
 @st.composite
@@ -198,7 +198,7 @@ def test_ratios_beyond_all_floats_do_no_harm(log_ratio: float) -> None:
 @settings(max_examples=100, deadline=None)
 def test_complete_rows_are_those_whose_episode_ends_in_the_rollout(r: Rows) -> None:
     ended = r.terminated | r.truncated
-    found = complete(ended, r.valid)
+    found = complete(r.ends)
     for t, n in np.ndindex(*r.reward.shape):
         k = t
         while k < len(ended) and r.valid[k, n] and not ended[k, n]:
