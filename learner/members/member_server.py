@@ -159,6 +159,12 @@ class MemberServer:
             self._revoke_keys()
             self._reap(0.0)
 
+    def close(self) -> None:
+        """Forget the hub. The hub refers to this server, so else both would wait for the garbage collector, and so would
+        the file descriptors of what they hold.
+        """
+        del self._callbacks, self._ended
+
     def no_workers(self, workers: int, timeout_s: float) -> NoWorkers:
         """The error of a wait for so many workers that came to nothing: it says how to start one."""
         address = self._link.address

@@ -256,7 +256,7 @@ class StepHub:
             pipe.wake(WakeReason.MESSAGE)
         self._server.wait_until_all_left(deadline_s, POLL_S)
         self._local_workers.stop(max(0.0, deadline_s - self._clock()))
-        self._shared = None  # the server refers back to this hub: the memory must not wait for the garbage collector
+        self._server.close()
 
     # ---------------------------------------------------------------- inside
 
