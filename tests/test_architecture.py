@@ -1,8 +1,15 @@
-"""The rooms and their doors: who may import whom, and what stands nowhere but in its one place."""
+"""The rooms and their doors: which file may import which, and what may stand only in its one place.
+
+docs/architecture.md describes the rooms. Every import counts, also one inside a function or under TYPE_CHECKING.
+"""
+
+from __future__ import annotations
 
 import ast
 import subprocess
 import sys
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
 
@@ -14,11 +21,25 @@ FORBIDDEN = {
     "protocol": {"workers", "learner", "millrace"},
     "workers": {"learner", "millrace"},
     "learner": {"workers", "millrace"},
-    "millrace": set[str](),
+    "millrace": {"benchmarks", "tests"},
+}
+LEARNER = {  # what each room of the learner may import of the learner; train.py, run.py and the like may import all
+    "config": {"run_folder"},
+    "algorithms": {"config"},
+    "members": set[str](),
+    "rollouts": {"members", "run_folder"},
+    "vector_env": {"members"},
+    "run_folder": set[str](),
+    "recording": {"run_folder", "rollouts", "evaluate"},
+    "report": {"run_folder"},
 }
 MAY_PRINT = {"millrace/cli/main.py", "millrace/terminal.py"}
 MAY_UNPICKLE = {"protocol/env_spec.py"}
-MAY_IMPORT_TORCH = {f"protocol/policy/{name}.py" for name in ("encoder", "networks", "torch_distributions", "torch_policy")}
+TORCH_IN_PROTOCOL = "protocol/policy/"
+TORCH_INTERNALS = "learner/algorithms/kernels/"
+MOST_FILES = 16  # in a folder
+MOST_PARAMETERS = 8  # of a function; self and cls do not count
+MAY_TAKE_MORE = {"millrace/__init__.py:make_vec"}  # gymnasium's users expect keyword arguments
 
 
 def sources(*folders: str) -> list[str]:
@@ -30,18 +51,40 @@ def tree(source: str) -> ast.Module:
     return ast.parse((ROOT / source).read_text(), source)
 
 
-def imported(source: str) -> set[str]:
-    """Top-level names of all that a file imports, wherever in the file it does so."""
+def module(source: str) -> str:
+    return source.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+
+
+@cache
+def modules_imported(source: str) -> frozenset[str]:
+    """Dotted names of all that a file imports, wherever in the file it does so; `from a import b` gives `a.b`."""
     found = set()
     for node in ast.walk(tree(source)):
         match node:
             case ast.Import(names=names):
-                found |= {alias.name.partition(".")[0] for alias in names}
-            case ast.ImportFrom(module=str(module), level=0):
-                found.add(module.partition(".")[0])
+                found |= {alias.name for alias in names}
+            case ast.ImportFrom(module=str(name), level=0, names=names):
+                found |= {f"{name}.{alias.name}" for alias in names}
             case ast.ImportFrom():
                 raise AssertionError(f"{source}:{node.lineno} imports relatively")
-    return found
+    return frozenset(found)
+
+
+def imported(source: str) -> set[str]:
+    """Top-level names of all that a file imports."""
+    return {name.partition(".")[0] for name in modules_imported(source)}
+
+
+def files_imported(source: str, files: Mapping[str, str]) -> set[str]:
+    """The files that a file imports, of these (dotted name -> path)."""
+    found = set()
+    for imported_name in modules_imported(source):
+        name = imported_name
+        while name and name not in files:
+            name = name.rpartition(".")[0]
+        if name:
+            found.add(files[name])
+    return found - {source}
 
 
 def calls(source: str, name: str) -> list[str]:
@@ -56,6 +99,34 @@ def calls(source: str, name: str) -> list[str]:
     return found
 
 
+def circles(arrows: Mapping[str, set[str]]) -> list[list[str]]:
+    """Groups of files that import each other, directly or through others (Tarjan's strongly connected components)."""
+    index: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+    found: list[list[str]] = []
+
+    def visit(node: str) -> None:
+        index[node] = low[node] = len(index)
+        stack.append(node)
+        for target in arrows[node]:
+            if target not in index:
+                visit(target)
+                low[node] = min(low[node], low[target])
+            elif target in stack:
+                low[node] = min(low[node], index[target])
+        if low[node] == index[node]:
+            group = stack[stack.index(node) :]
+            del stack[stack.index(node) :]
+            if len(group) > 1:
+                found.append(sorted(group))
+
+    for node in list(arrows):
+        if node not in index:
+            visit(node)
+    return found
+
+
 @pytest.mark.parametrize("room", ROOMS)
 def test_the_arrows_point_one_way(room: str) -> None:
     assert sources(room)
@@ -63,10 +134,51 @@ def test_the_arrows_point_one_way(room: str) -> None:
         assert not imported(source) & FORBIDDEN[room], source
 
 
+def test_the_search_for_circles_finds_one() -> None:
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [["a", "b", "c"]]
+    assert not circles({"a": {"b", "c"}, "b": {"c"}, "c": set()})
+
+
+def test_no_files_import_each_other_in_a_circle() -> None:
+    files = {module(source): source for source in sources(*ROOMS)}
+    assert not circles({source: files_imported(source, files) for source in files.values()})
+
+
+@pytest.mark.parametrize("room", LEARNER)
+def test_a_room_of_the_learner_imports_only_what_it_may(room: str) -> None:
+    assert sources(f"learner/{room}")
+    for source in sources(f"learner/{room}"):
+        places = {name.split(".")[1] for name in modules_imported(source) if name.startswith("learner.")}
+        assert places <= LEARNER[room] | {room}, source
+
+
+def test_the_learner_has_no_room_without_a_rule() -> None:
+    assert {path.parent.name for path in (ROOT / "learner").glob("*/__init__.py")} == set(LEARNER)
+
+
 def test_torch_stays_with_the_learner() -> None:
     for source in sources(*ROOMS):
-        if not source.startswith("learner/") and source not in MAY_IMPORT_TORCH:
+        if not source.startswith(("learner/", TORCH_IN_PROTOCOL)):
             assert "torch" not in imported(source), source
+
+
+def test_torch_s_internals_are_used_in_one_room() -> None:
+    for source in sources(*ROOMS):
+        if not source.startswith(TORCH_INTERNALS):
+            assert not list(torch_internals(source)), source
+
+
+def torch_internals(source: str) -> Iterator[str]:
+    """Private names of torch that a file uses: `torch._x`, `torch.y._z`, or an import of such a name."""
+    for name in modules_imported(source):
+        first, *rest = name.split(".")
+        if first == "torch" and any(part.startswith("_") for part in rest):
+            yield name
+    for node in ast.walk(tree(source)):
+        if isinstance(node, ast.Attribute) and node.attr.startswith("_") and not node.attr.startswith("__"):
+            chain = ast.unparse(node)
+            if chain.startswith("torch."):
+                yield f"{source}:{node.lineno} {chain}"
 
 
 def test_nothing_is_pickled_but_in_the_one_guarded_place() -> None:
@@ -99,23 +211,47 @@ def test_no_folder_is_a_drawer_for_everything() -> None:
         assert not set(Path(source).parts) & {"utils", "common", "misc", "helpers"}, source
 
 
+def test_no_folder_holds_too_many_files() -> None:
+    found: dict[Path, int] = defaultdict(int)
+    for source in sources(*ROOMS):
+        found[Path(source).parent] += not source.endswith("__init__.py")
+    assert not {str(folder): count for folder, count in found.items() if count > MOST_FILES}
+
+
+def test_no_function_takes_too_many_parameters() -> None:
+    """A narrow record takes their place."""
+    for source in sources(*ROOMS):
+        for node in ast.walk(tree(source)):
+            if isinstance(node, ast.FunctionDef) and f"{source}:{node.name}" not in MAY_TAKE_MORE:
+                every = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+                names = [argument.arg for argument in every if argument.arg not in ("self", "cls")]
+                assert len(names) <= MOST_PARAMETERS, f"{source}:{node.lineno} {node.name}({', '.join(names)})"
+
+
 def test_every_file_says_first_what_it_holds() -> None:
     for source in sources(*ROOMS, "tests"):
         assert ast.get_docstring(tree(source)) or not (ROOT / source).read_text().strip(), source
 
 
+def test_every_public_name_of_millrace_is_documented() -> None:
+    import millrace
+
+    for name in millrace.__all__:
+        assert name == "__version__" or (getattr(millrace, name).__doc__ or "").strip(), name
+
+
 @pytest.mark.parametrize(
-    "module",
+    "name",
     [
         "workers.__main__",
         "millrace.cli.main",
-        "learner.algorithms",
         "learner.config.command_line",
         "learner.report.learning_curves",
         "learner.evaluate",
+        "learner.algorithms",
     ],
 )
-def test_what_must_start_quickly_imports_no_torch(module: str) -> None:
-    asks = f"import sys, {module}; assert not sys.modules.keys() & {{'torch', 'matplotlib', 'tensorboard'}}"
+def test_what_must_start_quickly_imports_no_torch(name: str) -> None:
+    asks = f"import sys, {name}; assert not sys.modules.keys() & {{'torch', 'matplotlib', 'tensorboard'}}"
     done = subprocess.run([sys.executable, "-c", asks], cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
