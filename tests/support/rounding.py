@@ -12,7 +12,8 @@ analysis", theorem 2.4 with λ = 4). The order of the sum, and so the processor 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -31,6 +32,39 @@ def growth(roundings: int) -> float:
     return math.expm1(4 * math.sqrt(roundings) * UNIT + roundings * UNIT**2 / (1 - UNIT))
 
 
+class Forward(NamedTuple):
+    """A float64 forward pass of an MLP, and the variance of the rounding errors of a float32 one."""
+
+    inputs: list[Array]  # [B, in] of each layer
+    variances: list[Array]
+    undecided: list[Array]  # True where rounding decides on which side of 0 the argument of a ReLU lies
+    out: Array  # [B, outputs]
+    out_variance: Array
+
+
+def forward_pass(layers: Sequence[tuple[Array, Array]], x: Array, relu: bool = False) -> Forward:
+    """See `forward_tolerance`, which explains the variance."""
+    h, variance = x.astype(np.float64), np.zeros(x.shape)
+    inputs, variances, undecided = [h], [variance], [np.zeros(x.shape, bool)]
+    for i, (weight, bias) in enumerate(layers):
+        w, b = weight.astype(np.float64), bias.astype(np.float64)
+        size = np.abs(h) @ np.abs(w).T + np.abs(b)
+        variance = variance @ (w**2).T + (w.shape[1] + 1) * (UNIT * size) ** 2
+        h = h @ w.T + b
+        if i < len(layers) - 1:
+            undecided.append(np.abs(h) <= tolerance_of(variance))
+            h = np.maximum(h, 0) if relu else np.tanh(h)
+            variance = variance + (ELEMENTWISE * UNIT * h) ** 2
+            inputs.append(h)
+            variances.append(variance)
+    return Forward(inputs, variances, undecided, h, variance)
+
+
+def tolerance_of(variance: Array) -> Array:
+    """How far two float32 results may differ, each of which has errors of this variance: 4 standard deviations."""
+    return np.asarray(4 * np.sqrt(2 * variance))
+
+
 def forward_tolerance(layers: Sequence[tuple[Array, Array]], x: Array, relu: bool = False) -> Array:
     """How far two float32 forward passes of the same MLP may differ, [B, outputs].
 
@@ -42,16 +76,109 @@ def forward_tolerance(layers: Sequence[tuple[Array, Array]], x: Array, relu: boo
 
     A test in `test_fused` shows that the loss of a single term exceeds it.
     """
-    h, variance = x.astype(np.float64), np.zeros(x.shape)
-    for i, (weight, bias) in enumerate(layers):
-        w, b = weight.astype(np.float64), bias.astype(np.float64)
-        size = np.abs(h) @ np.abs(w).T + np.abs(b)
-        variance = variance @ (w**2).T + (w.shape[1] + 1) * (UNIT * size) ** 2
-        h = h @ w.T + b
-        if i < len(layers) - 1:
-            h = np.maximum(h, 0) if relu else np.tanh(h)
-            variance = variance + (ELEMENTWISE * UNIT * h) ** 2
-    return np.asarray(4 * np.sqrt(2 * variance))
+    return tolerance_of(forward_pass(layers, x, relu).out_variance)
+
+
+def gradient_variances(
+    layers: Sequence[tuple[Array, Array]], x: Array, by_output: Array, by_output_variance: Array, relu: bool = False
+) -> list[tuple[Array, Array]]:
+    """The variance of the rounding errors of the gradient of an MLP, by weight and bias of each layer.
+
+    `by_output` [B, outputs] is the gradient by the outputs, with errors of `by_output_variance`. The rules are those of
+    `forward_tolerance`: a sum of n terms adds n (u s)², where s is the sum of their absolute values, and the factors of a
+    product hand their variances on. The slope of tanh is 1 - h², and so has 4 h² times the variance of h. The slope of ReLU
+    is exact, except where rounding decides on which side of 0 its argument lies; there it may be off by 1.
+    """
+    forward = forward_pass(layers, x, relu)
+    by_out, variance, rows = by_output, by_output_variance, len(x)
+    found: list[tuple[Array, Array]] = []
+    for i in reversed(range(len(layers))):
+        h, size = forward.inputs[i], np.abs(by_out)
+        weight = variance.T @ h**2 + (by_out**2).T @ forward.variances[i] + (rows + 1) * (UNIT * size.T @ np.abs(h)) ** 2
+        found.append((weight, variance.sum(0) + rows * (UNIT * size.sum(0)) ** 2))
+        w = layers[i][0].astype(np.float64)
+        by_h, variance = by_out @ w, variance @ w**2 + (w.shape[0] + 1) * (UNIT * size @ np.abs(w)) ** 2
+        if relu:
+            slope, slope_variance = (h > 0) * 1.0, forward.undecided[i] * 1.0
+        else:
+            slope, slope_variance = 1 - h**2, 4 * h**2 * forward.variances[i] + (ELEMENTWISE * UNIT) ** 2
+        variance = variance * (slope**2 + slope_variance) + by_h**2 * slope_variance
+        by_out = by_h * slope
+    return found[::-1]
+
+
+def variance_after(function: Callable[[Array], Array], params: Array, variance: Array) -> Array:
+    """The variance of the rounding errors of `function` [B, ...] of distribution parameters [B, P] with this variance.
+
+    A float32 log-probability, or its gradient, is that of slightly other parameters (ELEMENTWISE roundings of the largest of
+    the row), rounded ELEMENTWISE times itself. Each parameter is moved by one standard deviation, and what that changes in
+    the result, in float64, is squared and added up.
+    """
+    exact = function(params)
+    own = ELEMENTWISE * UNIT * np.maximum(1, np.abs(params).max(1))
+    total = (ELEMENTWISE * UNIT * exact) ** 2
+    for j in range(params.shape[1]):
+        moved = params.copy()
+        moved[:, j] += np.sqrt(variance[:, j] + own**2)
+        total = total + (function(moved) - exact) ** 2
+    return np.asarray(total)
+
+
+class ActorCriticTolerance(NamedTuple):
+    """How far two float32 computations may differ."""
+
+    log_prob: Array  # [B]
+    entropy: Array  # [B]
+    gradient: Array  # [P]
+
+
+def actor_critic_tolerance(
+    spec: PolicySpec, flat: Array, x: Array, action: Array, by_outputs: Sequence[Array]
+) -> ActorCriticTolerance:
+    """Of the log-probabilities and entropies of an MLP actor-critic, and of its gradient.
+
+    `flat` [P] are the parameters, `x` [B, D] the features; `by_outputs` are the gradients by log-probability, entropy and
+    value, [B] each. See `gradient_variances` and `variance_after`. If actor and critic share a trunk, the errors of their
+    two gradients depend on one another, and the variance of the sum is at most twice the sum of the variances.
+    """
+    fields, relu, rows = sum(parameter_layout(spec), ()), spec.activation == "relu", len(x)
+    weights, variances = named_views(flat.astype(np.float64), fields), np.zeros(total_size(fields))
+    of_field = named_views(variances, fields)
+    by_log_prob, by_entropy, by_value = (each.astype(np.float64) for each in by_outputs)
+
+    def add(names: list[str], by_output: Array, by_output_variance: Array) -> None:
+        layers = [(weights[f"{name}.weight"], weights[f"{name}.bias"]) for name in names]
+        for name, (weight, bias) in zip(
+            names, gradient_variances(layers, x, by_output, by_output_variance, relu), strict=True
+        ):
+            of_field[f"{name}.weight"] += weight
+            of_field[f"{name}.bias"] += bias
+
+    acting = [*hidden_names(spec), "actor.out"]
+    forward = forward_pass([(weights[f"{name}.weight"], weights[f"{name}.bias"]) for name in acting], x, relu)
+    params, variance, outputs = forward.out, forward.out_variance, forward.out.shape[1]
+    if "actor.log_std" in weights:
+        params = np.concatenate([params, np.broadcast_to(weights["actor.log_std"], params.shape)], -1)
+        variance = np.concatenate([variance, np.zeros_like(variance)], -1)
+
+    def of_distribution(which: int) -> Callable[[Array], Array]:
+        return lambda p: log_prob_and_entropy(spec.action, torch.tensor(p), torch.tensor(action))[which].numpy()
+
+    def gradient(p: Array) -> Array:
+        leaf = torch.tensor(p, requires_grad=True)
+        log_prob, entropy = log_prob_and_entropy(spec.action, leaf, torch.tensor(action))
+        total = (log_prob * torch.tensor(by_log_prob) + entropy * torch.tensor(by_entropy)).sum()
+        return torch.autograd.grad(total, leaf)[0].numpy()
+
+    by_params, by_params_variance = gradient(params), variance_after(gradient, params, variance)
+    add(acting, by_params[:, :outputs], by_params_variance[:, :outputs])
+    if "actor.log_std" in weights:
+        by_log_std = np.abs(by_params[:, outputs:]).sum(0)
+        of_field["actor.log_std"] += by_params_variance[:, outputs:].sum(0) + rows * (UNIT * by_log_std) ** 2
+    critic = [*hidden_names(spec, "" if spec.shared_net else "critic"), "critic.out"]
+    add(critic, by_value[:, None], np.zeros((rows, 1)))
+    of_log_prob, of_entropy = (tolerance_of(variance_after(of_distribution(i), params, variance)) for i in range(2))
+    return ActorCriticTolerance(of_log_prob, of_entropy, tolerance_of((1 + spec.shared_net) * variances))
 
 
 def network_layers(parameters: Mapping[str, torch.Tensor], names: Sequence[str]) -> list[tuple[Array, Array]]:
