@@ -124,6 +124,31 @@ def variance_after(function: Callable[[Array], Array], params: Array, variance: 
     return np.asarray(total)
 
 
+def params_variance(spec: PolicySpec, flat: Array, x: Array) -> tuple[Array, Array]:
+    """The distribution parameters [B, P] of an MLP policy in float64, and the variance of their rounding errors in float32.
+
+    `flat` holds the parameters of the policy, those needed to act first; `x` [B, D] are the features.
+    """
+    weights = named_views(flat.astype(np.float64), parameter_layout(spec)[0])
+    layers = [(weights[f"{name}.weight"], weights[f"{name}.bias"]) for name in (*hidden_names(spec), "actor.out")]
+    forward = forward_pass(layers, x, spec.activation == "relu")
+    if "actor.log_std" not in weights:
+        return forward.out, forward.out_variance
+    log_std = np.broadcast_to(weights["actor.log_std"], forward.out.shape)
+    zeros = np.zeros_like(forward.out)
+    return np.concatenate([forward.out, log_std], -1), np.concatenate([forward.out_variance, zeros], -1)
+
+
+def log_prob_tolerance(spec: PolicySpec, params: Array, action: Array, variance: Array | None = None) -> Array:
+    """How far two float32 log-probabilities [B] may differ, of parameters [B, P] with this variance (none: the same)."""
+
+    def log_prob(p: Array) -> Array:
+        return log_prob_and_entropy(spec.action, torch.tensor(p), torch.tensor(action))[0].numpy()
+
+    params = params.astype(np.float64)
+    return tolerance_of(variance_after(log_prob, params, np.zeros(params.shape) if variance is None else variance))
+
+
 class ActorCriticTolerance(NamedTuple):
     """How far two float32 computations may differ."""
 
@@ -154,31 +179,30 @@ def actor_critic_tolerance(
             of_field[f"{name}.weight"] += weight
             of_field[f"{name}.bias"] += bias
 
-    acting = [*hidden_names(spec), "actor.out"]
-    forward = forward_pass([(weights[f"{name}.weight"], weights[f"{name}.bias"]) for name in acting], x, relu)
-    params, variance, outputs = forward.out, forward.out_variance, forward.out.shape[1]
-    if "actor.log_std" in weights:
-        params = np.concatenate([params, np.broadcast_to(weights["actor.log_std"], params.shape)], -1)
-        variance = np.concatenate([variance, np.zeros_like(variance)], -1)
+    params, variance = params_variance(spec, flat, x)
+    outputs = len(weights["actor.out.bias"])
 
-    def of_distribution(which: int) -> Callable[[Array], Array]:
-        return lambda p: log_prob_and_entropy(spec.action, torch.tensor(p), torch.tensor(action))[which].numpy()
+    def entropy(p: Array) -> Array:
+        return log_prob_and_entropy(spec.action, torch.tensor(p), torch.tensor(action))[1].numpy()
 
     def gradient(p: Array) -> Array:
         leaf = torch.tensor(p, requires_grad=True)
-        log_prob, entropy = log_prob_and_entropy(spec.action, leaf, torch.tensor(action))
-        total = (log_prob * torch.tensor(by_log_prob) + entropy * torch.tensor(by_entropy)).sum()
-        return torch.autograd.grad(total, leaf)[0].numpy()
+        outcome = log_prob_and_entropy(spec.action, leaf, torch.tensor(action))
+        by = [torch.tensor(by_log_prob), torch.tensor(by_entropy)]
+        return torch.autograd.grad(outcome, leaf, by)[0].numpy()
 
     by_params, by_params_variance = gradient(params), variance_after(gradient, params, variance)
-    add(acting, by_params[:, :outputs], by_params_variance[:, :outputs])
+    add([*hidden_names(spec), "actor.out"], by_params[:, :outputs], by_params_variance[:, :outputs])
     if "actor.log_std" in weights:
         by_log_std = np.abs(by_params[:, outputs:]).sum(0)
         of_field["actor.log_std"] += by_params_variance[:, outputs:].sum(0) + rows * (UNIT * by_log_std) ** 2
     critic = [*hidden_names(spec, "" if spec.shared_net else "critic"), "critic.out"]
     add(critic, by_value[:, None], np.zeros((rows, 1)))
-    of_log_prob, of_entropy = (tolerance_of(variance_after(of_distribution(i), params, variance)) for i in range(2))
-    return ActorCriticTolerance(of_log_prob, of_entropy, tolerance_of((1 + spec.shared_net) * variances))
+    return ActorCriticTolerance(
+        log_prob_tolerance(spec, params, action, variance),
+        tolerance_of(variance_after(entropy, params, variance)),
+        tolerance_of((1 + spec.shared_net) * variances),
+    )
 
 
 def network_layers(parameters: Mapping[str, torch.Tensor], names: Sequence[str]) -> list[tuple[Array, Array]]:

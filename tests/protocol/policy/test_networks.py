@@ -23,6 +23,7 @@ from protocol.policy.numpy_policy import NumpyPolicy
 from protocol.policy.torch_distributions import log_prob_and_entropy
 from protocol.policy.torch_policy import TorchPolicy
 from protocol.specs import ActionSpec, Leaf, PolicySpec
+from tests.support.rounding import assert_within, log_prob_tolerance, params_variance, tolerance_of
 
 BOX = Leaf("x", "box", (2, 3), "float32")
 OBSERVATIONS = {
@@ -68,6 +69,11 @@ def random_weights(spec: PolicySpec, net: ActorCriticNetwork, generator: np.rand
     return net.flat.numpy()[: net.acting_size].copy(), buffers
 
 
+def params_tolerance(spec: PolicySpec, flat: Array, x: Array) -> Array:
+    """How far two float32 computations of the distribution parameters [B, P] may differ."""
+    return tolerance_of(params_variance(spec, flat, x)[1])
+
+
 @given(
     st.sampled_from(sorted(OBSERVATIONS)),
     st.sampled_from(sorted(ACTIONS)),
@@ -90,13 +96,13 @@ def test_numpy_and_torch_agree(
     x = normalize(x, *np.split(buffers, 2)) if normal else x
     expected = numpy_net(obs)[0]
     params, value = torch_net.forward(torch.tensor(x[0]))
-    np.testing.assert_allclose(params.detach(), expected, atol=1e-5, rtol=1e-5)
+    assert_within(params.detach().numpy(), expected, params_tolerance(spec, parameters, x[0]))
     np.testing.assert_array_equal(value.detach(), torch_net.value(torch.tensor(x[0])).detach())
 
     over = distribution(spec)
     actions = over.sample(expected, over.noise(generator, (7,)))
     log_prob, entropy = log_prob_and_entropy(spec.action, torch.tensor(expected), torch.tensor(actions))
-    np.testing.assert_allclose(log_prob, over.log_prob(expected, actions), atol=1e-5, rtol=1e-5)
+    assert_within(log_prob.numpy(), over.log_prob(expected, actions), log_prob_tolerance(spec, expected, actions))
     assert entropy.shape == (7,)
 
 
@@ -277,7 +283,9 @@ def test_torch_policy_acts_as_the_numpy_policy() -> None:
     numpy_policy = NumpyPolicy(it.spec)
     numpy_policy.load(it.net.flat.numpy()[: it.net.acting_size], it.buffers)
     obs = leaves(it.spec.observation, (2, 4), np.random.default_rng(0))
-    np.testing.assert_allclose(it.policy(obs), numpy_policy(obs), atol=1e-5, rtol=1e-5)
+    x = normalize(features(it.spec, obs), *np.split(it.buffers, 2)).reshape(8, -1)
+    tolerance = params_tolerance(it.spec, it.net.flat.numpy()[: it.net.acting_size], x)
+    assert_within(it.policy(obs).reshape(8, -1), numpy_policy(obs).reshape(8, -1), tolerance)
 
 
 def test_torch_policy_refuses_weights_of_another_size() -> None:
