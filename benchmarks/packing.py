@@ -143,7 +143,7 @@ def _send(address: str, token: Token, told: Connection) -> None:
 def encrypted(rounds: int) -> dict[str, float]:
     """Milliseconds of a rollout of frame stacks from before `encode` until after decoding, over CURVE and loopback TCP."""
     server, client = Key.new(), Key.new()
-    keyring = Keyring(server, ClientList().adding("w", client.public, datetime.now(UTC)))
+    keyring = Keyring(server, ClientList().with_client("w", client.public, datetime.now(UTC)))
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     link = LearnerLink("tcp://127.0.0.1:*", context, keyring)
     link.packed_bytes_limit = rollout_bytes(STACKS)

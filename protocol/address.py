@@ -1,7 +1,7 @@
-"""Addresses: which can be used, which only this machine can reach, and what to type on another machine.
+"""Addresses: which are valid, which only this machine can reach, and what to type on another machine.
 
-The law: what is not certainly of this machine alone counts as reachable by others. An IPv6 address stands in brackets. Pure,
-but for `needs_ipv6` and `resolves`, which ask the system's resolver about names.
+The law: an address counts as reachable by others unless it certainly is not. An IPv6 address stands in brackets. Pure,
+except for `needs_ipv6` and `resolves`, which ask the system's resolver about names.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ WILDCARDS = {"*", "0.0.0.0", "[::]", "[::ffff:0.0.0.0]"}
 
 
 def check_address(address: str) -> str:
-    """Return the address if it can be used. Raises `UsageError` in one line."""
+    """Return the address if it is valid. Raises `UsageError` in one line."""
     scheme, sep, rest = address.partition("://")
     if not sep or scheme not in {"inproc", "ipc", "tcp"} or not rest:
         raise UsageError(f"address {address}: expected inproc://NAME, ipc://PATH or tcp://HOST:PORT")
@@ -42,7 +42,7 @@ def _check_host(address: str, host: str) -> None:
 
 
 def host_of(address: str) -> str:
-    """The host of a tcp address, an IPv6 address in its brackets; empty for other transports."""
+    """The host of a tcp address, with brackets if it is an IPv6 address; empty for other transports."""
     scheme, _, rest = address.partition("://")
     return rest.rpartition(":")[0] if scheme == "tcp" else ""
 
@@ -54,28 +54,28 @@ def is_local(address: str) -> bool:
         return True
     try:
         return ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:  # a name; whatever it is resolved to, it is not ours to trust
+    except ValueError:  # a name may resolve to anything
         return False
 
 
 def needs_ipv6(address: str) -> bool:
-    """True for an IPv6 address, and for a name that has no other: with both, ZeroMQ would try IPv6 alone."""
+    """True for an IPv6 address, and for a name without an IPv4 address: with IPv6 on, ZeroMQ tries no IPv4 address."""
     host = host_of(address)
     if host.startswith("["):
         return True
-    return _is_name(host) and not _found(host, socket.AF_INET) and _found(host, socket.AF_INET6)
+    return _is_name(host) and not _has_address(host, socket.AF_INET) and _has_address(host, socket.AF_INET6)
 
 
 def resolves(address: str) -> bool:
-    """False if the address names a host that the system does not know, at least now."""
+    """False if the address names a host that the system cannot resolve now."""
     host = host_of(address)
-    return not _is_name(host) or _found(host, socket.AF_UNSPEC)
+    return not _is_name(host) or _has_address(host, socket.AF_UNSPEC)
 
 
 def advertised_address(bound: str, advertise: str, machine: str) -> str:
-    """What others type to reach a learner that listens at `bound`.
+    """The address to type on other machines to reach a learner that listens at `bound`.
 
-    `advertise` is the host to name; without it that of the address, and for one that means every interface `machine`.
+    The host is `advertise` if given, else `machine` if `bound` means every interface, else the host of `bound`.
     """
     scheme, _, rest = bound.partition("://")
     host, _, port = rest.rpartition(":")
@@ -86,7 +86,7 @@ def advertised_address(bound: str, advertise: str, machine: str) -> str:
 
 
 def worker_name(peer: bytes) -> bytes:
-    """The worker's name, with which its routing id begins; under a key a zero byte and more follow."""
+    """The worker's name: its routing id up to the first zero byte. With keys, a zero byte and more follow the name."""
     return peer.partition(b"\0")[0]
 
 
@@ -100,7 +100,7 @@ def _is_name(host: str) -> bool:
     return False
 
 
-def _found(host: str, family: socket.AddressFamily) -> bool:
+def _has_address(host: str, family: socket.AddressFamily) -> bool:
     try:
         return bool(socket.getaddrinfo(host, None, family))
     except OSError:

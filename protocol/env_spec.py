@@ -58,7 +58,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
         return EnvSpec(getattr(env, "__name__", type(env).__name__), kwargs or {}, cloudpickle.dumps(env))
 
-    def why_not(self, code: AllowedCode) -> str:
+    def rejection_reason(self, code: AllowedCode) -> str:
         """Why a worker that allows only this code cannot make it; empty if it can."""
         if self.factory is not None and code is not AllowedCode.CALLABLES:
             return (
@@ -107,13 +107,13 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         try:
             return make(f"{registrar}:{self.id}" if registrar and find_spec(registrar) else self.id)
         except (gymnasium.error.Error, ImportError, TypeError) as error:  # TypeError: keyword arguments it does not take
-            raise UsageError(_why_not_made(self.id, error)) from error
+            raise UsageError(_make_error(self.id, error)) from error
         except Exception as error:  # its constructor raised any exception
             line = f"environment {self.id} cannot be made: {type(error).__name__}: {first_line(error)}"
             raise UsageError(line, traceback.format_exc()) from error
 
 
-def _why_not_made(env_id: str, error: Exception) -> str:
+def _make_error(env_id: str, error: Exception) -> str:
     """One line for an environment that is not known, or whose package is missing."""
     module, colon, _ = env_id.partition(":")
     says = first_line(error)

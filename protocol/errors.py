@@ -1,7 +1,7 @@
 """Every error millrace knows, in two families.
 
     MillraceError
-    ├── OurError              raised: this side cannot go on; the command line prints its one line, exits with `exit_code`
+    ├── UserFacingError         raised: this side cannot go on; the command line prints its one line, exits with `exit_code`
     │   ├── UsageError            2   bad flag, unknown environment, unsupported space, folder that exists, …
     │   ├── Refused               2   the learner told this worker to leave
     │   └── RunError              1   the run cannot go on

@@ -137,7 +137,7 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
     learner_timeout_s: float = 30.0
     """a worker that received nothing from the learner for so long says Hello again"""
 
-    def why_not(self, code: AllowedCode) -> str:
+    def rejection_reason(self, code: AllowedCode) -> str:
         """Why a worker that allows only this code cannot take part; empty if it can."""
         if self.compress == "zstd" and (why := why_no_zstd()):
             return why
@@ -146,7 +146,7 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
                 f"encoder {self.policy.encoder.factory} imports a module, which this worker does not do for a learner it "
                 "cannot be sure of; give it a token (and not --no-code)"
             )
-        return self.env.why_not(code)
+        return self.env.rejection_reason(code)
 
 
 class StepSpec(msgspec.Struct, frozen=True, tag=True):
@@ -175,6 +175,6 @@ class StepSpec(msgspec.Struct, frozen=True, tag=True):
         """Number of the lane's first copy."""
         return sum(self.lanes[:lane])
 
-    def why_not(self, code: AllowedCode) -> str:
+    def rejection_reason(self, code: AllowedCode) -> str:
         """Why a worker that allows only this code cannot take part; empty if it can."""
-        return next((why for env in self.envs if (why := env.why_not(code))), "")
+        return next((why for env in self.envs if (why := env.rejection_reason(code))), "")

@@ -70,7 +70,7 @@ class WorkerOptions:
     feed_watchdog: Callable[[float], None] = _no_watchdog
     """called now and then with the time, unless the environment hangs"""
     shared_memory: InheritedDescriptors | None = None
-    """shared memory and bells, for a vector environment on this machine"""
+    """shared memory and wake pipes, for a vector environment on this machine"""
     make_collector: MakeCollector = make_local_collector
     """what collects in a run, and how it acts"""
 
@@ -241,7 +241,7 @@ class Worker:
         """Make a new collector or stepper; nothing of the old one is kept."""
         self._close_all()
         self._collector = self._stepper = None
-        if why := run.why_not(self._options.code):
+        if why := run.rejection_reason(self._options.code):
             self._do(self._session.decline(why))
             return
         try:

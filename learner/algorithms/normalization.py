@@ -66,7 +66,7 @@ class ObservationNormalizer:
         assert not self._enabled or buffer_size(spec) == 2 * len(self._box_features)
 
     def update(self, features: Floats, valid: npt.NDArray[np.bool_]) -> None:
-        """Count features [T, N, D], not yet normalised, of the rows [T, N] that are valid."""
+        """Count features [T, N, D], not yet normalized, of the rows [T, N] that are valid."""
         if self._enabled:
             self._moments.update(features[valid])
 

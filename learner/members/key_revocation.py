@@ -21,4 +21,4 @@ class KeyRevocation:
         if keyring is None or keyring.allowed is self._checked_against:
             return []
         self._checked_against = keyring.allowed  # before the check: the list may be replaced meanwhile
-        return [(peer, why) for peer in members if (why := self._link.why_not(peer))]
+        return [(peer, why) for peer in members if (why := self._link.rejection_reason(peer))]

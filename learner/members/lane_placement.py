@@ -1,4 +1,4 @@
-"""Which worker each lane lives with. Pure: no clock, no socket.
+"""Assignment of lanes to workers. Pure: no clock, no socket.
 
 The law: every lane has an owner as long as there are workers, and no worker has two lanes more than another. A lane moves
 only between its rollouts. Placement is computed again only after an event that can change it: with a thousand workers, to
@@ -30,7 +30,7 @@ class PlacedLane:
 
     @property
     def busy(self) -> int:
-        """How many of its tickets are with its worker: a busy lane cannot move."""
+        """Number of its tickets that its worker holds: a busy lane cannot move."""
         return 0
 
     def restart(self) -> None:

@@ -50,7 +50,8 @@ def record(
     """Play the policy of a run folder and write a dataset of at least `steps` env steps.
 
     `stochastic`: draw actions from the policy; otherwise take the most probable ones. `npy`: also write this file. `best`:
-    use the best policy of the run's own evaluations instead of the newest. Raises `OurError`; nothing is left behind then.
+    use the best policy of the run's own evaluations instead of the newest.
+    Raises `UserFacingError`; then it leaves no files.
     """
     policy, spec, env_spec = load_policy(run, "best" if best else "final")
     if npy is not None and not npy.parent.is_dir():

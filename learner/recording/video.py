@@ -33,7 +33,7 @@ def record_videos(
 ) -> tuple[Evaluation, list[Path]]:
     """Play greedy episodes and record a video of each.
 
-    Returns the evaluation and the videos. Raises `OurError` in one line.
+    Returns the evaluation and the videos. Raises `UserFacingError` in one line.
     """
     try:
         import moviepy  # noqa: F401

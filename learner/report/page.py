@@ -19,7 +19,7 @@ CONTENT_SECURITY_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-sr
 
 
 def write_page(runs: Sequence[Path], out: Path) -> Path:
-    """Write the page about these run folders. Returns `out`. Raises `OurError` in one line."""
+    """Write the page about these run folders. Returns `out`. Raises `UserFacingError` in one line."""
     if out.is_dir():
         raise UsageError(f"{out} is a folder; expected the file to write, as in: --out report.html")
     text = page(runs)

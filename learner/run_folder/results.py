@@ -48,7 +48,7 @@ class Best(msgspec.Struct, frozen=True, kw_only=True):
     env_steps: int
     """env steps of training when it was evaluated"""
     chosen_by: float
-    """the mean return by which it was chosen; as the highest of several it is too optimistic"""
+    """the mean return by which it was chosen; as the maximum of several means it is biased upwards"""
     evaluation: Evaluation
     """a second evaluation of the same policy, on other episodes"""
 

@@ -1,7 +1,7 @@
-"""A gymnasium space as plain data, and an observation as arrays. Pure.
+"""gymnasium spaces as plain data, and observations as arrays. Pure.
 
-A Dict or Tuple observation becomes one array per leaf, in the space's own order; leaves stay as they are (raw dtype), and
-only the policy turns them into features.
+A Dict or Tuple observation becomes one array per leaf, in the space's order. Leaves keep their raw dtype; only the policy
+turns them into features.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from protocol.specs import ActionSpec, Leaf
 
 OBSERVATIONS = "Box, Discrete, MultiBinary, MultiDiscrete, and Dict and Tuple of these"
 ACTIONS = "Discrete, MultiDiscrete, MultiBinary and Box"
-STORED_KINDS = "biuf"  # bool, integers, floats: what a frame may hold
+STORED_KINDS = "biuf"  # bool, integers, floats: the dtypes that a message can carry
 
 
 def observation_leaves(space: gymnasium.Space[Any]) -> tuple[Leaf, ...]:
@@ -29,13 +29,13 @@ def observation_leaves(space: gymnasium.Space[Any]) -> tuple[Leaf, ...]:
 
 
 def leaves_with_own_dtype(space: gymnasium.Space[Any]) -> tuple[Leaf, ...]:
-    """The same of an observation or an action, each array in its space's own dtype. Raises `UsageError`."""
+    """Describe each array of an observation or action, with the dtype of its space. Raises `UsageError`."""
     leaves = zip(observation_leaves(space), _walk(space, ()), strict=True)
     return tuple(msgspec.structs.replace(leaf, dtype=np.dtype(inner.dtype).name) for leaf, (_, inner) in leaves)
 
 
 def make_unflatten(space: gymnasium.Space[Any]) -> Callable[[Sequence[Any]], Any]:
-    """The inverse of `reader`: a function from leaves, in order, to an observation or an action."""
+    """The inverse of `make_flatten`: a function from leaves, in order, to an observation or an action."""
     paths = [path for path, _ in _walk(space, ())]
     if paths == [()]:
         return lambda leaves: leaves[0]
@@ -118,7 +118,7 @@ def make_flatten(space: gymnasium.Space[Any]) -> Callable[[Any], tuple[Any, ...]
 
 
 def make_action_converter(spec: ActionSpec) -> Callable[[Array], Array]:
-    """A function from stored actions [N, *action] to what the environment takes: shifted by `start`, or clipped."""
+    """A function from stored actions [N, *action] to actions of the environment: shifted by `start`, or clipped (Box)."""
     dtype = np.dtype(spec.dtype)
     if spec.kind == "box":
         low, high = (np.reshape(np.asarray(bound, np.float32), spec.shape) for bound in (spec.low, spec.high))

@@ -1,7 +1,7 @@
-"""The vectorised form that an environment brings along, gymnasium's `vector_entry_point`; or in one line why it cannot.
+"""An environment's own vectorized form: gymnasium's `vector_entry_point`.
 
-The law: it resets in the step after an episode's end (NEXT_STEP), as a loop over copies does. Of another way of resetting
-the last observations could not be told from first ones.
+The law: it resets in the step after an episode's end (NEXT_STEP), as a loop over env copies does. With another autoreset
+mode, final observations could not be distinguished from first ones.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from protocol.specs import ActionSpec, Leaf
 
 
 def make_native(env: EnvSpec, copies: int) -> VectorEnv[Any, Any, Any]:
-    """So many copies, stepped at once by the environment's own code. Raises `UsageError`."""
+    """Make a vector environment of `copies` env copies with the environment's own code. Raises `UsageError`."""
     if env.factory is not None:
         raise UsageError(f"environment {env.id}: vector native expected an id that gymnasium registers, got a callable")
     made = env.make_vectorized(copies)
@@ -31,7 +31,7 @@ def make_native(env: EnvSpec, copies: int) -> VectorEnv[Any, Any, Any]:
 
 
 def check_resets_next_step(env: VectorEnv[Any, Any, Any]) -> None:
-    """Raises `UsageError` for another way of resetting."""
+    """Raises `UsageError` unless the autoreset mode is NEXT_STEP."""
     mode = env.metadata.get("autoreset_mode")
     if mode not in {AutoresetMode.NEXT_STEP, AutoresetMode.NEXT_STEP.value}:
         raise UsageError(
@@ -41,11 +41,11 @@ def check_resets_next_step(env: VectorEnv[Any, Any, Any]) -> None:
 
 
 def check_native(env: EnvSpec, observation: tuple[Leaf, ...], action: ActionSpec) -> None:
-    """Raises `UsageError` unless its vectorised form can stand for copies with these spaces."""
+    """Raises `UsageError` unless the vectorized form has these spaces."""
     made = make_native(env, 1)
     try:
         check_spaces(
-            env, "its vectorised form", made.single_observation_space, made.single_action_space, observation, action
+            env, "its vectorized form", made.single_observation_space, made.single_action_space, observation, action
         )
     finally:
         made.close()
@@ -59,7 +59,7 @@ def check_spaces(
     observation: tuple[Leaf, ...],
     action: ActionSpec,
 ) -> None:
-    """Raises `UsageError` unless these spaces of a vectorised form say what one copy says."""
+    """Raises `UsageError` unless the spaces of a vectorized form equal those of one env copy."""
     if (observation_leaves(observed), action_spec(acted)) != (observation, action):
         line = (
             f"environment {env.id}: {whose} has other spaces than itself, {observed} and {acted}; {vector_alternative(env)}"
@@ -68,7 +68,7 @@ def check_spaces(
 
 
 def vector_alternative(env: EnvSpec) -> str:
-    """What to do where the vectorised form of this id cannot serve."""
+    """Advice for an id whose vectorized form cannot be used, as text for an error message."""
     if env.id.startswith("ALE/"):
         return f"take millrace/Atari-v0 --env-kwargs game {env.id[4:].partition('-')[0]}, or use --vector loop"
     return "use --vector loop"

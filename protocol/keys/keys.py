@@ -1,7 +1,7 @@
 """Keys, join tokens and the list of clients that may connect, as text and as records. Pure: no files, no sockets, no clock.
 
-The law: what is damaged is named as such and never half used; no text of ours (a repr, an error) holds a secret half; a key
-that is not on the list, or was revoked, may do nothing.
+The law: damaged text is reported and never used in part. No repr and no error contains a secret half. A key that is not on
+the list, or was revoked, gives no access.
 """
 
 from __future__ import annotations
@@ -23,50 +23,50 @@ from protocol.errors import UsageError
 
 KEY_BYTES = 32
 CHECK_BYTES = 4
-TOKEN_PREFIX = "millrace1."  # the number is the version of what follows
+TOKEN_PREFIX = "millrace1."  # the number is the version of the format
 TOKEN_CHARACTERS = len(TOKEN_PREFIX) + -(-(2 * KEY_BYTES + CHECK_BYTES) * 4 // 3)
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 LIST_HEADER = """\
-# The clients that may connect to learners of this machine. `millrace keys` edits it; a learner that runs reads it within
-# a second or two. A client with a date at `revoked`, or without an entry, is shut out, and cut off if it is connected.
+# The clients that may connect to learners of this machine. `millrace keys` edits it; a running learner reads it within
+# a second or two. A client with a date at `revoked`, or without an entry, cannot connect, and is disconnected if it is.
 """
 
 
 @dataclass(frozen=True)
 class Key:
-    """One CURVE key, both halves, 32 bytes each."""
+    """A CURVE key pair, 32 bytes each half."""
 
     public: bytes
     secret: bytes = field(repr=False)
 
     @staticmethod
     def new() -> Key:
-        """Drawn at random by libzmq's cryptography."""
+        """A new random key pair from libzmq."""
         public, secret = zmq.curve_keypair()
         return Key(zmq.utils.z85.decode(public), zmq.utils.z85.decode(secret))
 
     @staticmethod
-    def of_secret(secret: bytes) -> Key:
-        """The key of this secret half."""
+    def from_secret(secret: bytes) -> Key:
+        """The key pair with this secret half."""
         return Key(zmq.utils.z85.decode(zmq.curve_public(zmq.utils.z85.encode(secret))), secret)
 
 
 @dataclass(frozen=True)
 class Token:
-    """What a worker needs to join: whom to believe, and who it is."""
+    """A join token: the learner's public key, and the key pair of one client."""
 
     server: bytes
     """public key of the learner, 32 bytes"""
     client: Key
 
     def to_text(self) -> str:
-        """One line of letters, digits, `-` and `_`."""
+        """The token as one line of letters, digits, `-`, `_` and one `.`."""
         body = self.server + self.client.secret
         return TOKEN_PREFIX + base64.urlsafe_b64encode(body + _check(body)).decode().rstrip("=")
 
     @staticmethod
     def from_text(text: str, where: str) -> Token:
-        """From one line. Raises `UsageError` that names `where`, and never repeats the text: half of it is secret."""
+        """Parse a token. Raises `UsageError` that names `where` and never repeats the text, because half of it is secret."""
         text = text.strip()
         if not text:
             raise UsageError(f"{where} is empty: expected a join token, one line that begins with {TOKEN_PREFIX}")
@@ -86,9 +86,9 @@ class Token:
         except ValueError:
             raw = b""
         body = raw[: 2 * KEY_BYTES]
-        if Token(body[:KEY_BYTES], Key(b"", body[KEY_BYTES:])).to_text() != text:  # the checksum, and how it is written
+        if Token(body[:KEY_BYTES], Key(b"", body[KEY_BYTES:])).to_text() != text:  # compares the checksum and the spelling
             raise UsageError(f"{where}: the join token is damaged (its checksum does not fit); copy it again")
-        return Token(body[:KEY_BYTES], Key.of_secret(body[KEY_BYTES:]))
+        return Token(body[:KEY_BYTES], Key.from_secret(body[KEY_BYTES:]))
 
 
 def _check(body: bytes) -> bytes:
@@ -96,7 +96,7 @@ def _check(body: bytes) -> bytes:
 
 
 class Client(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """One client's public half, and what people know of it."""
+    """One client: name, public key, and dates."""
 
     name: str
     public: str
@@ -107,12 +107,12 @@ class Client(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
 
 @dataclass(frozen=True)
 class ClientList:
-    """Who may connect: every client there ever was, with the revoked ones marked."""
+    """The clients that may connect, and those that were revoked."""
 
     clients: tuple[Client, ...] = ()
 
-    def why_not(self, public: bytes) -> str:
-        """Why a message, or a handshake, under this key is refused; empty if it is not."""
+    def rejection_reason(self, public: bytes) -> str:
+        """Why messages and handshakes with this key are refused; empty if they are not."""
         client = self._known.get(public)
         if client is None:
             return f"its key {fingerprint(public)} is not allowed here"
@@ -127,7 +127,7 @@ class ClientList:
 
     @cached_property
     def _known(self) -> dict[bytes, Client]:
-        """By public key; of one that stands twice, the entry that was revoked."""
+        """Clients by public key. If a key occurs twice, a revoked entry wins."""
         return {bytes.fromhex(one.public): one for one in sorted(self.clients, key=lambda one: one.revoked is not None)}
 
     def valid(self, name: str) -> Client | None:
@@ -135,11 +135,11 @@ class ClientList:
         return next((client for client in self.clients if client.name == name and client.revoked is None), None)
 
     def names(self) -> list[str]:
-        """Of those that may connect."""
+        """Names of the clients that may connect."""
         return [client.name for client in self.clients if client.revoked is None]
 
-    def adding(self, name: str, public: bytes, made: datetime) -> ClientList:
-        """With one more. Raises `UsageError` if the name is taken, or the key was there before."""
+    def with_client(self, name: str, public: bytes, made: datetime) -> ClientList:
+        """The list with one more client. Raises `UsageError` if the name is taken or the key is on the list already."""
         check_name(name)
         if self.valid(name) is not None:
             raise UsageError(f"key {name} is there already; take another name, or revoke it first")
@@ -149,22 +149,24 @@ class ClientList:
             raise UsageError(f"public key {fingerprint(public)} ({known.name}) {state}")
         return ClientList((*self.clients, Client(name, public.hex(), made)))
 
-    def revoking(self, name: str, now: datetime) -> ClientList:
-        """Without this one. Raises `UsageError` if nobody of this name may connect."""
+    def with_revoked(self, name: str, now: datetime) -> ClientList:
+        """The list with this client revoked. Raises `UsageError` if no client of this name may connect."""
         victim = self.valid(name)
         if victim is None:
             before = any(client.name == name for client in self.clients)
-            raise UsageError(f"key {name}: {'revoked already' if before else 'there is none of this name'}{_those(self)}")
+            raise UsageError(
+                f"key {name}: {'revoked already' if before else 'there is none of this name'}{_describe_allowed(self)}"
+            )
         gone = msgspec.structs.replace(victim, revoked=now)
         return ClientList(tuple(gone if client is victim else client for client in self.clients))
 
     def to_toml(self) -> str:
-        """As text that `from_toml` reads."""
+        """The list as TOML, which `from_toml` reads."""
         return LIST_HEADER + "".join(f"\n{_toml_table(client)}" for client in self.clients)
 
     @staticmethod
     def from_toml(text: str, where: str) -> ClientList:
-        """From text. Raises `UsageError` that names `where`: a list that is not understood allows nobody."""
+        """Parse a list. Raises `UsageError` that names `where`: an invalid list allows nobody."""
         try:
             table: dict[str, Any] = tomllib.loads(text)
             clients = msgspec.convert(table.pop("client", []), tuple[Client, ...])
@@ -179,19 +181,19 @@ class ClientList:
 
 
 def _toml_table(client: Client) -> str:
-    """A client as a table of TOML. Names and public keys hold no character that TOML would escape."""
+    """A client as a TOML table. Names and public keys contain no character that TOML would escape."""
     lines = [f'name = "{client.name}"', f'public = "{client.public}"', f"made = {client.made}"]
     if client.revoked is not None:
         lines.append(f"revoked = {client.revoked}")
     return "\n".join(["[[client]]", *lines, ""])
 
 
-def _those(allowed: ClientList) -> str:
+def _describe_allowed(allowed: ClientList) -> str:
     return f"; those that may connect: {', '.join(allowed.names()) or 'none'}"
 
 
 def check_name(name: str, where: str = "") -> str:
-    """Return the name if a client may have it: it is part of a file's name."""
+    """Return the name if it is valid. It becomes part of a file name."""
     if not NAME.fullmatch(name):
         raise UsageError(
             f"{where}name {name[:70]!r}: expected 1 to 64 letters, digits, '.', '_' or '-', beginning with one of the former"
@@ -200,7 +202,7 @@ def check_name(name: str, where: str = "") -> str:
 
 
 def public_key(text: str, where: str) -> bytes:
-    """The 32 bytes of a public key that is written in hexadecimal digits."""
+    """Parse a public key from hexadecimal digits into 32 bytes. Raises `UsageError`."""
     try:
         key = bytes.fromhex(text) if text.isascii() and not re.search(r"\s", text) else b""
     except ValueError:
@@ -215,5 +217,5 @@ def public_key(text: str, where: str) -> bytes:
 
 
 def fingerprint(public: bytes) -> str:
-    """The beginning of a public key: enough for people to tell keys apart."""
+    """The first 12 hexadecimal digits of a public key, by which people distinguish keys."""
     return public.hex()[:12]

@@ -65,7 +65,7 @@ def answer(request: Sequence[bytes], keyring: Keyring) -> tuple[list[bytes], str
     if domain != DOMAIN or mechanism != b"CURVE" or len(key) != KEY_BYTES:
         return refused, f"expected CURVE, got {mechanism[:20]!r}"
     try:
-        why = keyring.why_not_enter(key)
+        why = keyring.rejection_reason(key)
     except Exception as error:  # whatever the error is, the client is refused
         why = f"its key cannot be looked up: {error}"
     return ([b"1.0", number, b"200", b"OK", key.hex().encode(), b""], "") if not why else (refused, why)

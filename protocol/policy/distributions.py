@@ -1,14 +1,14 @@
-"""Action distributions in numpy: what a worker needs to act. Pure: the noise is an argument.
+"""Action distributions in numpy, for workers. Pure: the noise is an argument.
 
-A network's output is `params` [..., P]. The noise of a whole rollout is drawn at once, so a step costs an addition and a
-comparison, and the log-probabilities of a whole rollout are computed at once from the stored params.
+A network's output is `params` [..., P]. The noise of a whole rollout is drawn in one call, so a step costs an addition and a
+comparison. The log-probabilities of a whole rollout are computed in one call from the stored params.
 
     Categorical   P = Σ sizes   logits; action = argmax(logits + Gumbel noise)               (Gumbel-max trick)
     Bernoulli     P = K         logits; action = logits + logistic noise > 0
     Gaussian      P = 2 D       mean, log standard deviation; action = mean + exp(log_std) · normal noise, not clipped
-    EpsilonGreedy P = n + 1     action values, ε; action = a uniform one where noise₀ < ε, else argmax
+    EpsilonGreedy P = n + 1     action values, ε; action = uniform at random where noise₀ < ε, else argmax
 
-`protocol.policy.networks` has the same log-probabilities in torch, with entropies; a test holds them equal.
+`protocol.policy.torch_distributions` computes the same log-probabilities in torch, and entropies; a test compares them.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Distribution(Protocol):
         ...
 
     def sample(self, params: Floats, noise: Floats) -> Array:
-        """A draw: deterministic in its arguments."""
+        """A sample: a deterministic function of `params` and `noise`."""
         ...
 
     def mode(self, params: Floats) -> Array:
@@ -48,7 +48,7 @@ class Distribution(Protocol):
 
 
 class Categorical:
-    """One choice (Discrete) or several independent ones (MultiDiscrete)."""
+    """A categorical distribution (Discrete), or several independent ones (MultiDiscrete)."""
 
     def __init__(self, sizes: tuple[int, ...], shape: tuple[int, ...]) -> None:
         self.params_size = sum(sizes)
@@ -62,7 +62,7 @@ class Categorical:
         return -np.log(np.maximum(exponential, _TINY))
 
     def sample(self, params: Floats, noise: Floats) -> Array:
-        """A draw, int64 from 0."""
+        """A sample, int64 from 0."""
         return self.mode(params + noise)
 
     def mode(self, params: Floats) -> Array:
@@ -98,21 +98,21 @@ class Bernoulli:
         return np.log(uniform) - np.log1p(-uniform)
 
     def sample(self, params: Floats, noise: Floats) -> Array:
-        """A draw of bits, int64."""
+        """Sampled bits, int64."""
         return self.mode(params + noise)
 
     def mode(self, params: Floats) -> Array:
-        """The more probable bits."""
+        """The most probable bits."""
         return (params > 0).astype(np.int64).reshape(*params.shape[:-1], *self._shape)
 
     def log_prob(self, params: Floats, action: Array) -> Floats:
-        """Log π(action) [...], summed over the bits: −softplus(−l) where 1, −softplus(l) where 0."""
+        """Log π(action) [...], summed over the bits: −softplus(−logit) for 1, −softplus(logit) for 0."""
         signed = np.where(action.reshape(params.shape) > 0, params, -params)
         return np.asarray(-np.logaddexp(np.float32(0), -signed).sum(-1))
 
 
 class Gaussian:
-    """A diagonal normal distribution (Box). Actions are stored as drawn and clipped only at the environment."""
+    """A diagonal normal distribution (Box). Actions are stored as sampled; only the action converter clips them."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         self._size = math.prod(shape)
@@ -124,7 +124,7 @@ class Gaussian:
         return generator.standard_normal((*shape, self._size), dtype=np.float32)
 
     def sample(self, params: Floats, noise: Floats) -> Array:
-        """A draw, float32."""
+        """A sample, float32."""
         drawn = params[..., : self._size] + np.exp(params[..., self._size :]) * noise
         return drawn.reshape(*params.shape[:-1], *self._shape)
 
@@ -140,7 +140,7 @@ class Gaussian:
 
 
 class EpsilonGreedy:
-    """The best of n actions, or with probability ε a uniform one (Discrete)."""
+    """The action with the highest value, or with probability ε an action drawn uniformly (Discrete)."""
 
     def __init__(self, actions: int) -> None:
         self.params_size = actions + 1
@@ -151,12 +151,12 @@ class EpsilonGreedy:
         return generator.random((*shape, 2), dtype=np.float32)
 
     def sample(self, params: Floats, noise: Floats) -> Array:
-        """A draw, int64 from 0."""
+        """A sample, int64 from 0."""
         uniform = (noise[..., 1] * self._actions).astype(np.int64)  # below n: float32 noise is at most 1 - 2**-24
         return np.where(noise[..., 0] < params[..., -1], uniform, self.mode(params))
 
     def mode(self, params: Floats) -> Array:
-        """The best action."""
+        """The action with the highest value."""
         return np.asarray(params[..., :-1].argmax(-1))
 
     def log_prob(self, params: Floats, action: Array) -> Floats:
@@ -167,7 +167,7 @@ class EpsilonGreedy:
 
 
 def distribution(spec: PolicySpec) -> Distribution:
-    """The distribution of such a policy over its actions."""
+    """The action distribution of this policy."""
     action = spec.action
     if spec.head == "q":
         return EpsilonGreedy(action.sizes[0])

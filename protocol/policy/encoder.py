@@ -1,12 +1,13 @@
-"""A torch module of the user's own between an observation and the rest of the network. Imports torch.
+"""The encoder: a user's torch module between the observation and the rest of the network. Imports torch.
 
 `module:factory` names a callable: factory(features, images) -> torch.nn.Module, where `features` is the number of features
 of all arrays of an observation that are not images, and `images` their shapes. The module is called with features
-[B, features] float32, normalised if they are, and then each image [B, *shape] uint8; it gives [B, K] float32. A core, hidden
-layers and heads follow as they do without it; actor and critic look through the same one.
+[B, features] float32 (normalized if the run normalizes observations), then each image [B, *shape] uint8. It returns [B, K]
+float32. The recurrent core, hidden layers and heads follow as they do without it. Actor and critic share one encoder.
 
-Its parameters live in the flat buffer with all others. It must keep nothing else: what is not a parameter (a running mean
-of BatchNorm) would not travel with the weights, and with dropout a worker would not act as the learner thinks it does.
+Its parameters are in the flat buffer with all others. It must have no other state: buffers (such as the running mean of
+BatchNorm) are not sent with the weights. It must not use dropout: the learner could not reproduce the worker's
+probabilities.
 """
 
 from __future__ import annotations
@@ -22,18 +23,18 @@ from protocol.specs import ActionSpec, EncoderSpec, Leaf, NamedShape, PolicySpec
 
 
 def describe_encoder(factory: str, observation: tuple[Leaf, ...], action: ActionSpec) -> EncoderSpec:
-    """Make one, to learn its parameters and its output's size. Raises `UsageError` in one line."""
+    """Make the encoder once to find its parameters and output size. Raises `UsageError` in one line."""
     spec = PolicySpec(observation, action)
     module = _make(factory, spec, seed=0)
-    return EncoderSpec(factory, _arrays(module), _output_size(factory, module, spec))
+    return EncoderSpec(factory, _parameter_shapes(module), _output_size(factory, module, spec))
 
 
 def make_encoder(spec: PolicySpec, seed: int) -> torch.nn.Module:
-    """The module of this policy, with the initial weights of this seed. Raises `UsageError` if it is another here."""
+    """The encoder of this policy with the initial weights of this seed. Raises `UsageError` if its parameters differ."""
     wanted = spec.encoder
     assert wanted is not None
     module = _make(wanted.factory, spec, seed)
-    arrays = _arrays(module)
+    arrays = _parameter_shapes(module)
     if arrays != wanted.arrays:
         ours, theirs = ({each.name: each.shape for each in of} for of in (arrays, wanted.arrays))
         name = next((name for name in [*ours, *theirs] if ours.get(name) != theirs.get(name)), "order")
@@ -44,7 +45,7 @@ def make_encoder(spec: PolicySpec, seed: int) -> torch.nn.Module:
     return module
 
 
-def _arrays(module: torch.nn.Module) -> tuple[NamedShape, ...]:
+def _parameter_shapes(module: torch.nn.Module) -> tuple[NamedShape, ...]:
     return tuple(NamedShape(name, tuple(parameter.shape)) for name, parameter in module.named_parameters())
 
 
@@ -53,7 +54,7 @@ def _make(factory: str, spec: PolicySpec, seed: int) -> torch.nn.Module:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         try:
-            module = _callable(factory)(feature_size(spec), images)
+            module = _import_factory(factory)(feature_size(spec), images)
         except UsageError:
             raise
         except Exception as error:
@@ -67,7 +68,7 @@ def _make(factory: str, spec: PolicySpec, seed: int) -> torch.nn.Module:
     return module.eval()
 
 
-def _callable(factory: str) -> Callable[[int, Sequence[tuple[int, ...]]], object]:
+def _import_factory(factory: str) -> Callable[[int, Sequence[tuple[int, ...]]], object]:
     module, _, name = factory.partition(":")
     if not module or not name:
         raise UsageError(f"encoder {factory}: expected module:factory, as in my_package.networks:encoder")
@@ -82,7 +83,7 @@ def _callable(factory: str) -> Callable[[int, Sequence[tuple[int, ...]]], object
 
 
 def _output_size(factory: str, module: torch.nn.Module, spec: PolicySpec) -> int:
-    """K, by trying it on two observations of zeros."""
+    """The output size K, found by a forward pass on two observations of zeros."""
     images = [torch.zeros(2, *leaf.shape, dtype=torch.uint8) for leaf in spec.observation if leaf.is_image]
     try:
         with torch.no_grad():

@@ -1,10 +1,10 @@
-"""A recurrent core: what a policy remembers of an episode. Pure; imports no torch.
+"""The recurrent core of a policy, in numpy. Pure; imports no torch.
 
-It stands between an observation's features and the hidden layers. Its state [..., S] belongs to an env copy: the law of a
-row says where it begins anew. Before `obs[t+1]` it is what `obs[t]` left behind where row t is valid, and zeros where it is
-not, because that row is the reset. So the final observation of an episode is still seen with the episode's memory.
+It stands between the features and the hidden layers. Each env copy has its own state [..., S]. The law of a row says where
+the state is reset: before `obs[t+1]` it is the state after `obs[t]` if row t is valid, and zeros if it is not, because that
+row is the reset. So the final observation of an episode is still processed with the state of its episode.
 
-LSTM (Hochreiter and Schmidhuber 1997) and GRU (Cho et al. 2014) as torch computes them, with its order of gates.
+LSTM (Hochreiter and Schmidhuber 1997) and GRU (Cho et al. 2014), computed as in torch, with torch's order of gates.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ GATES = {"lstm": 4, "gru": 3}
 
 
 def zero_state(spec: PolicySpec, *lead: int) -> Floats:
-    """Of copies whose episodes begin: [*lead, S]; S is 0 without a core."""
+    """The state at the beginning of an episode: zeros [*lead, S]. S is 0 without a core."""
     return np.zeros((*lead, spec.state_size), np.float32)
 
 
@@ -34,7 +34,7 @@ def core_shapes(spec: PolicySpec, inputs: int) -> tuple[tuple[int, int], tuple[i
 
 
 def advance(spec: PolicySpec, parameters: Mapping[str, npt.NDArray[Any]], x: Floats, state: Floats) -> Floats:
-    """See x [..., D] with `state` [..., S], which is moved on in place; what the core then says, [..., core_size]."""
+    """One step on input x [..., D]. Updates `state` [..., S] in place. Returns the output [..., core_size]."""
 
     def linear(name: str, values: Floats) -> Floats:
         out = np.matmul(values, parameters[f"{name}.weight"].T)
@@ -59,5 +59,5 @@ def advance(spec: PolicySpec, parameters: Mapping[str, npt.NDArray[Any]], x: Flo
 
 
 def _sigmoid(z: Floats) -> Floats:
-    """By tanh, which neither overflows nor depends on how many numbers are computed together."""
+    """The sigmoid by tanh, which does not overflow and gives the same bits for every array size."""
     return np.asarray(0.5 + 0.5 * np.tanh(np.float32(0.5) * z), np.float32)

@@ -1,13 +1,13 @@
 """Message <-> frames. Pure: bytes in, records out; bounded; no pickle.
 
-Frame 0 is the head, msgpack: [type's name, field, field, …] in the order of the record, each array in its place as
-[dtype, shape, index of its frame]. `Hello` and `Refuse` alone are maps, fields by name and the type's name under `type`:
-all versions must understand them. Frames 1… are the arrays' raw bytes, C-ordered, little-endian. Everything a peer says is
-checked before it is used: the number of frames and bytes, the head's size and nesting, every type, every shape. An array
-that arrives is a read-only view on the received frame: no copy.
+Frame 0 is the head, msgpack: [type's name, field, field, …] in the order of the record, each array in its place as [dtype,
+shape, index of its frame]. Only `Hello` and `Refuse` are maps: fields by name, and the type's name under `type`, because
+every version must understand them. Frames 1… are the arrays' raw bytes, C-ordered, little-endian. Everything that a peer
+sends is checked before it is used: the number of frames and bytes, the head's size and nesting, every type, every shape. A
+received array is a read-only view of its frame, not a copy.
 
-Arrays of a rollout may come packed (`packing.py`), as [dtype, shape, index, packings]; what a message's packed arrays come
-to together is bounded by the receiver.
+Arrays of a rollout may be packed (`compression.py`): [dtype, shape, index, packings]. The receiver limits the unpacked size
+of all packed arrays of a message together.
 """
 
 from __future__ import annotations
@@ -38,23 +38,28 @@ DTYPES = {
     name: np.dtype(name) for name in ("|b1", "|i1", "|u1", "<i2", "<u2", "<i4", "<u4", "<i8", "<u8", "<f2", "<f4", "<f8")
 }
 
-# What may be said, by position and by name. To msgspec a union of both is none: what the head is says which of them to take.
-Said = tuple[Any, Any]
-TO_WORKER: Said = (reduce(operator.or_, (kind for kind in get_args(ToWorker) if kind is not Refuse)), Refuse)
-TO_LEARNER: Said = (reduce(operator.or_, (kind for kind in get_args(ToLearner | Inquire) if kind is not Hello)), Hello)
-TO_OBSERVER: Said = (Status, Status)
+# Message types whose fields go by position, and those whose fields go by name. msgspec accepts no union of both.
+MessageTypes = tuple[Any, Any]
+TO_WORKER: MessageTypes = (reduce(operator.or_, (kind for kind in get_args(ToWorker) if kind is not Refuse)), Refuse)
+TO_LEARNER: MessageTypes = (
+    reduce(operator.or_, (kind for kind in get_args(ToLearner | Inquire) if kind is not Hello)),
+    Hello,
+)
+TO_OBSERVER: MessageTypes = (Status, Status)
 
-# msgspec builds its type information for a record at the first conversion to it, and crashes the process if two threads do
-# that at the same moment. So all of it is built here, where only one thread can be.
+# msgspec builds its type information for a record at the first conversion to it. It crashes the process if two threads do
+# that at the same time. So all of it is built here, at import, by one thread.
 for _kind in (*TO_WORKER, *TO_LEARNER, *TO_OBSERVER):
     with suppress(msgspec.ValidationError):
         msgspec.convert(None, _kind)
 
-assert sys.byteorder == "little", "millrace sends arrays as they lie in memory and knows little-endian machines only"
+assert sys.byteorder == "little", (
+    "millrace sends arrays in the byte order of memory and supports only little-endian machines"
+)
 
 
 def encode(message: ToLearner | Inquire | ToWorker | ToObserver, packing: Packing | None = None) -> list[Buffer]:
-    """Frames of a message. Arrays are not copied: do not change them afterwards. `packing`: for those of a rollout."""
+    """Frames of a message. Arrays are not copied: do not change them afterwards. `packing` applies to rollouts only."""
     frames: list[Buffer] = [b""]
     packing = packing if isinstance(message, Rollout) else None
 
@@ -67,7 +72,7 @@ def encode(message: ToLearner | Inquire | ToWorker | ToObserver, packing: Packin
         if packing is None:
             frames.append(raw_bytes(value))
             return described
-        frame, packings = packing.of(value)
+        frame, packings = packing.pack(value)
         frames.append(frame)
         return [*described, packings] if packings else described
 
@@ -79,27 +84,27 @@ def encode(message: ToLearner | Inquire | ToWorker | ToObserver, packing: Packin
 
 
 def decode_to_learner(frames: Sequence[Buffer], packed_bytes_limit: int = 0) -> ToLearner | Inquire:
-    """What a worker said, or an observer. Raises `BadMessage`, whatever the bytes.
+    """A message of a worker or an observer. Raises `BadMessage` for anything else, and no other error.
 
-    `packed_bytes_limit`: bytes to which its packed arrays may come, all together; 0: none may come packed.
+    `packed_bytes_limit`: unpacked size of all its packed arrays together, at most; 0 forbids packed arrays.
     """
     message: ToLearner | Inquire = _decode(frames, TO_LEARNER, packed_bytes_limit)
     return message
 
 
 def decode_to_worker(frames: Sequence[Buffer]) -> ToWorker:
-    """What the learner said. Raises `BadMessage`, whatever the bytes."""
+    """A message of the learner to a worker. Raises `BadMessage` for anything else, and no other error."""
     message: ToWorker = _decode(frames, TO_WORKER)
     return message
 
 
 def decode_to_observer(frames: Sequence[Buffer]) -> ToObserver:
-    """What the learner answered. Raises `BadMessage`, whatever the bytes."""
+    """The learner's answer to an observer. Raises `BadMessage` for anything else, and no other error."""
     message: ToObserver = _decode(frames, TO_OBSERVER)
     return message
 
 
-def _decode(frames: Sequence[Buffer], kinds: Said, packed_bytes_limit: int = 0) -> Any:
+def _decode(frames: Sequence[Buffer], kinds: MessageTypes, packed_bytes_limit: int = 0) -> Any:
     if not 1 <= len(frames) <= MAX_FRAMES:
         raise BadMessage(f"message expected 1 to {MAX_FRAMES} frames, got {len(frames)}")
     if len(frames[0]) > MAX_HEAD_BYTES:
@@ -135,20 +140,20 @@ def _decode(frames: Sequence[Buffer], kinds: Said, packed_bytes_limit: int = 0) 
             max_ext_len=0,
             strict_map_key=True,
         )
-        named = type(head) is dict and "type" in head  # msgspec takes a map without one for the only kind it may be
+        named = type(head) is dict and "type" in head  # without it msgspec would accept any map if there is only one type
         message = msgspec.convert(head, by_name if named else by_position, dec_hook=hook)
     except BadMessage:
         raise
-    except Exception as error:  # msgpack and msgspec raise a dozen types on hostile bytes; to us they are one
-        said = " ".join(_in_words(str(error), head, by_position).split())[:200]  # it quotes the peer
-        raise BadMessage(f"head is not a message of ours: {type(error).__name__}: {said}") from error
+    except Exception as error:  # msgpack and msgspec raise a dozen types for invalid bytes
+        reason = " ".join(_explain_validation_error(str(error), head, by_position).split())[:200]  # it quotes the peer
+        raise BadMessage(f"head is not a message of ours: {type(error).__name__}: {reason}") from error
     if len(used) != len(frames) - 1:
         raise BadMessage(f"{type(message).__name__}: expected {len(used)} arrays, got {len(frames) - 1} frames")
     return message
 
 
-def _in_words(error: str, head: object, kinds: Any) -> str:
-    """What msgspec says of a head that goes by position, with the names of fields, and their number without the type."""
+def _explain_validation_error(error: str, head: object, kinds: Any) -> str:
+    """The error text of msgspec with field names in place of positions, and the number of fields without the type's name."""
     match head:
         case [str() as name, *given]:
             kind = next((kind for kind in get_args(kinds) or (kinds,) if kind.__name__ == name), None)
@@ -163,7 +168,7 @@ def _in_words(error: str, head: object, kinds: Any) -> str:
 
 
 def _described(frames: Sequence[Buffer], value: object) -> tuple[np.dtype[Any], list[int], int, int, list[object] | None]:
-    """Dtype, shape, frame, bytes and packings of the array that `[dtype, shape, index]`, or one more, stands for."""
+    """Dtype, shape, frame index, size in bytes and packings of an array: `[dtype, shape, index]`, perhaps with packings."""
     if not (type(value) is list and 3 <= len(value) <= 4):
         raise BadMessage(f"array expected [dtype, shape, index], got {str(value)[:80]}")
     name, shape, index = value[:3]

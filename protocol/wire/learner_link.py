@@ -63,7 +63,7 @@ class LearnerLink:
             raise
         except zmq.ZMQError as error:
             self.close(linger_s=0.0)
-            raise UsageError(_why_not_bound(address, error)) from error
+            raise UsageError(_bind_error(address, error)) from error
         self.address = bytes(self._socket.get(zmq.LAST_ENDPOINT)).decode().rstrip("\0")
         """where workers connect, with the port that was chosen for `*`"""
 
@@ -96,9 +96,9 @@ class LearnerLink:
             except BadMessage as error:
                 yield peer, error
 
-    def why_not(self, peer: bytes) -> str:
+    def rejection_reason(self, peer: bytes) -> str:
         """Why this peer is not allowed any more; empty if it is."""
-        return "" if self.keyring is None else self.keyring.allowed.why_not(_key_of(peer))
+        return "" if self.keyring is None else self.keyring.allowed.rejection_reason(_key_of(peer))
 
     def speaker(self, peer: bytes) -> str:
         """The name to blame for what this peer sends: that of its key, or without keys its own."""
@@ -118,7 +118,7 @@ class LearnerLink:
 
     def _refuse_key(self, peer: bytes) -> bool:
         """Count and answer a message if its key is not allowed any more; whether it was not."""
-        why = self.why_not(peer)
+        why = self.rejection_reason(peer)
         if why:
             self.refused_messages += 1
             self.send(peer, encode(Refuse(why)))
@@ -165,7 +165,7 @@ def _key_of(peer: bytes) -> bytes:
         return b""
 
 
-def _why_not_bound(address: str, error: zmq.ZMQError) -> str:
+def _bind_error(address: str, error: zmq.ZMQError) -> str:
     match error.errno:
         case zmq.EADDRINUSE:
             return f"address {address} is in use; choose another port, or tcp://127.0.0.1:* for any free one"

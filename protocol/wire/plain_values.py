@@ -1,8 +1,8 @@
-"""Plain values <-> bytes: what an `info` holds and what a call gives, with their types kept. Pure; no pickle.
+"""Plain values <-> bytes, for `info` dicts and the results of calls. Types are kept. Pure; no pickle.
 
 Plain is None, bool, int, float, complex, str, bytes, list, tuple, dict, and numpy's scalars and arrays (of these dtypes,
-and of objects that are plain). Anything else is refused by name, or, where the caller asks so, travels as its `repr`
-and arrives as `Shown`: it is not silently taken for a string.
+and of objects that are plain). Anything else raises `TypeError`, or, if the caller asks for it, is sent as its `repr` and
+arrives as a `ReprString`, which cannot be confused with a string.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ DTYPE_KINDS = "biufcSUmM"
 MAX_DEPTH = 32
 MAX_REPR = 1000  # characters
 
-_TUPLE, _PAIRS, _ARRAY, _SCALAR, _OBJECTS, _INT, _COMPLEX, _SHOWN = range(1, 9)
+_TUPLE, _PAIRS, _ARRAY, _SCALAR, _OBJECTS, _INT, _COMPLEX, _REPR = range(1, 9)
 
 
 class ReprString(str):
@@ -29,28 +29,28 @@ class ReprString(str):
     __slots__ = ()
 
 
-def pack(value: object, show: bool = False) -> bytes:
-    """Bytes of a plain value. Raises `TypeError`, naming where it stands, for what is not plain; or shows its `repr`."""
-    return _pack(_folded(value, "", show, 0))
+def pack(value: object, use_repr: bool = False) -> bytes:
+    """Bytes of a plain value. Anything else is sent as its `repr` if `use_repr`, else raises `TypeError`."""
+    return _pack(_to_msgpack(value, "", use_repr, 0))
 
 
 def unpack(data: bytes | memoryview) -> Any:
-    """The value. Raises `BadMessage`, whatever the bytes."""
+    """The value of these bytes. Raises `BadMessage` for invalid bytes, and no other error."""
     try:
         return _unpack(data, 0)
     except BadMessage:
         raise
-    except Exception as error:  # msgpack and numpy raise a dozen types on hostile bytes; to us they are one
+    except Exception as error:  # msgpack and numpy raise a dozen types for invalid bytes
         raise BadMessage(f"not a plain value: {type(error).__name__}: {' '.join(str(error).split())[:200]}") from error
 
 
-def _pack(folded: object) -> bytes:
-    packed: bytes = msgpack.packb(folded)
+def _pack(value: object) -> bytes:
+    packed: bytes = msgpack.packb(value)
     return packed
 
 
-def _folded(value: Any, where: str, show: bool, depth: int) -> Any:
-    """The value in what msgpack knows: exact types only, so that nothing arrives as its base class."""
+def _to_msgpack(value: Any, where: str, use_repr: bool, depth: int) -> Any:
+    """The value in types that msgpack knows. Types are compared exactly, so that no subclass arrives as its base class."""
     if depth > MAX_DEPTH:
         raise TypeError(f"{where or 'value'}: expected at most {MAX_DEPTH} levels")
     kind = type(value)
@@ -59,15 +59,17 @@ def _folded(value: Any, where: str, show: bool, depth: int) -> Any:
     if kind is int:
         return value if -(2**63) <= value < 2**64 else msgpack.ExtType(_INT, str(value).encode())
     if kind is list:
-        return [_folded(inner, f"{where}[{i}]", show, depth + 1) for i, inner in enumerate(value)]
+        return [_to_msgpack(inner, f"{where}[{i}]", use_repr, depth + 1) for i, inner in enumerate(value)]
     if kind is tuple:
-        inside = [_folded(inner, f"{where}[{i}]", show, depth + 1) for i, inner in enumerate(value)]
+        inside = [_to_msgpack(inner, f"{where}[{i}]", use_repr, depth + 1) for i, inner in enumerate(value)]
         return msgpack.ExtType(_TUPLE, _pack(inside))
     if kind is dict:
-        inside = [_folded(inner, f"{where}.{key}" if where else str(key), show, depth + 1) for key, inner in value.items()]
+        inside = [
+            _to_msgpack(inner, f"{where}.{key}" if where else str(key), use_repr, depth + 1) for key, inner in value.items()
+        ]
         if all(type(key) is str for key in value):
             return dict(zip(value, inside, strict=True))
-        keys = [_folded(key, f"{where} key", show, depth + 1) for key in value]
+        keys = [_to_msgpack(key, f"{where} key", use_repr, depth + 1) for key in value]
         return msgpack.ExtType(_PAIRS, _pack([keys, inside]))
     if kind is complex:
         return msgpack.ExtType(_COMPLEX, _pack([value.real, value.imag]))
@@ -75,12 +77,14 @@ def _folded(value: Any, where: str, show: bool, depth: int) -> Any:
         if value.dtype.kind in DTYPE_KINDS:
             return msgpack.ExtType(_ARRAY, _pack([value.dtype.str, list(value.shape), value.tobytes()]))
         if value.dtype.kind == "O":
-            inside = [_folded(inner, f"{where}[{i}]", show, depth + 1) for i, inner in enumerate(value.ravel().tolist())]
+            inside = [
+                _to_msgpack(inner, f"{where}[{i}]", use_repr, depth + 1) for i, inner in enumerate(value.ravel().tolist())
+            ]
             return msgpack.ExtType(_OBJECTS, _pack([list(value.shape), inside]))
     if isinstance(value, np.generic) and value.dtype.kind in DTYPE_KINDS:
         return msgpack.ExtType(_SCALAR, _pack([value.dtype.str, value.tobytes()]))
-    if show:
-        return msgpack.ExtType(_SHOWN, repr(value)[:MAX_REPR].encode())
+    if use_repr:
+        return msgpack.ExtType(_REPR, repr(value)[:MAX_REPR].encode())
     raise TypeError(f"{where or 'value'}: expected plain data (numbers, strings, lists, dicts, arrays), got {kind.__name__}")
 
 
@@ -88,13 +92,13 @@ def _unpack(data: bytes | memoryview, depth: int) -> Any:
     if depth > MAX_DEPTH:
         raise BadMessage(f"plain value expected at most {MAX_DEPTH} levels")
 
-    def unfold(code: int, inside: bytes) -> Any:
-        return _unfold(code, inside, lambda inner: _unpack(inner, depth + 1))
+    def extension(code: int, inside: bytes) -> Any:
+        return _from_extension(code, inside, lambda inner: _unpack(inner, depth + 1))
 
-    return msgpack.unpackb(data, ext_hook=unfold, strict_map_key=True)
+    return msgpack.unpackb(data, ext_hook=extension, strict_map_key=True)
 
 
-def _unfold(code: int, data: bytes, inner: Callable[[bytes], Any]) -> Any:
+def _from_extension(code: int, data: bytes, inner: Callable[[bytes], Any]) -> Any:
     match code:
         case 1:
             return tuple(inner(data))
@@ -134,7 +138,7 @@ def _dtype(name: object) -> np.dtype[Any]:
 
 
 def repr_paths(value: object, where: str = "") -> list[str]:
-    """Where in the value something stands as its `repr` only."""
+    """The paths inside the value at which a `ReprString` stands."""
     match value:
         case ReprString():
             return [where]

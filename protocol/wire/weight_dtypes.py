@@ -1,8 +1,8 @@
-"""Weights as they travel: float32 as they are, or rounded to two bytes each. Pure; imports no torch.
+"""Dtypes in which weights are sent: float32, or rounded to two bytes each. Pure; imports no torch.
 
-`bfloat16` is the upper half of a float32, sent as uint16: its range, 8 bits of precision. `float16` is IEEE's: 11 bits, and
-nothing above 65,504. Both are rounded to the nearest, ties to even. The law: the policy acts under exactly what was sent, so
-its log-probabilities are those of the rounded weights; a weight that would become infinite is not sent.
+`bfloat16` is the upper half of a float32, sent as uint16: the range of float32, 8 bits of precision. `float16` is IEEE half
+precision: 11 bits, at most 65,504. Both round to nearest, ties to even. The law: the policy acts with exactly the weights
+that were sent, so its log-probabilities are those of the rounded weights. A weight that would become infinite is not sent.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from protocol.errors import RunError
 
 WeightsDtype = Literal["float32", "bfloat16", "float16"]
 
-# What would be rounded to infinity: halfway between the largest number and what would come next.
+# From here on values round to infinity: halfway between the largest number and the next power of two.
 BOUNDS = {"bfloat16": (2 - 2**-8) * 2.0**127, "float16": (2 - 2**-11) * 2.0**15}
 
 
 def to_wire_dtype(parameters: Floats, dtype: WeightsDtype) -> Array:
-    """The parameters [P] as they travel; float32 is not copied. Raises `RunError` if one of them does not fit."""
+    """Convert float32 parameters [P] for sending; float32 is not copied. Raises `RunError` if one is out of range."""
     if dtype == "float32" or parameters.size == 0:
         return parameters
     largest = max(float(parameters.max()), -float(parameters.min()))
-    if not largest < BOUNDS[dtype]:  # nor is NaN
+    if not largest < BOUNDS[dtype]:  # also true for NaN
         which = int(np.argmax(~(np.abs(parameters) < BOUNDS[dtype])))
         raise RunError(
             f"weights_dtype {dtype}: parameter {which} expected less than {BOUNDS[dtype]:g} either way, got "
@@ -35,14 +35,14 @@ def to_wire_dtype(parameters: Floats, dtype: WeightsDtype) -> Array:
         return parameters.astype(np.float16)
     bits = parameters.view(np.uint32)
     rounded = bits >> 16
-    rounded &= 1  # a tie goes to the even one: half a unit is added to odd numbers, just less to even ones
+    rounded &= 1  # ties to even: add half a unit to odd numbers, and slightly less to even ones
     rounded += 0x7FFF
     rounded += bits
     return rounded.view(np.uint16)[1::2].copy()
 
 
 def to_float32(parameters: Array) -> Floats:
-    """The float32 parameters [P] to act under, of those that arrived. Raises ValueError if nobody sends such."""
+    """Received parameters [P] as float32. Raises `ValueError` for a dtype that is never sent."""
     match parameters.dtype.str:
         case "<f4":
             return parameters

@@ -91,7 +91,7 @@ LIMITS: Mapping[tuple[ModuleType, str], str] = {
     (codec, "MAX_ITEMS"): "items of any list or map in the head",
     (codec, "MAX_DIMENSIONS"): "dimensions of an array",
     (packing, "MAX_STACK"): "frames of a stack that travels packed",
-    (packing, "LEAST_FRAME_BYTES"): "bytes of a frame of such a stack, at least",
+    (packing, "MIN_FRAME_BYTES"): "bytes of a frame of such a stack, at least",
     (session, "HELLO_FIRST_S"): "seconds from the first Hello to the second; each wait is twice as long as the last",
     (session, "HELLO_MOST_S"): "seconds between two Hello messages, at most",
     (held_rollouts, "REMEMBERED_TICKETS"): "finished tickets of a lane that a worker remembers, to know a late repeat",

@@ -32,5 +32,5 @@ class FakeLink:
         self.sent.append(frames)
         return True
 
-    def why_not(self, peer: bytes) -> str:
+    def rejection_reason(self, peer: bytes) -> str:
         return ""

@@ -1,4 +1,4 @@
-"""Atari games: one copy, the emulator's own vectorised form and envpool show the same screens, pay and end alike."""
+"""Atari games: one copy, the emulator's own vectorized form and envpool show the same screens, pay and end alike."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ BREAKOUT = EnvSpec("millrace/Atari-v0", {"game": "Breakout"})
 
 
 @pytest.mark.parametrize(("game", "max_frames", "flag"), [("Pong", 600, "truncated"), ("Breakout", 108_000, "terminated")])
-def test_the_vectorised_form_shows_rewards_and_ends_as_the_loop_does(
+def test_the_vectorized_form_shows_rewards_and_ends_as_the_loop_does(
     game: str, max_frames: int, flag: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Screens, flags and reset rows, of episodes that begin alike; Breakout's end by themselves, Pong's by the clock."""

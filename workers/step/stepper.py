@@ -34,7 +34,7 @@ class Stepper:
     def __init__(
         self, spec: StepSpec, shared_memory: InheritedDescriptors | None = None, *, allow_private_names: bool = True
     ) -> None:
-        """`shared_memory`: descriptors of shared memory and bells, if this process inherited them.
+        """`shared_memory`: file descriptors of shared memory and wake pipes, if this process inherited them.
 
         `allow_private_names`: a Call may use names that begin with an underscore.
         """
@@ -167,7 +167,7 @@ class Stepper:
 
 def pack_infos(infos: Infos) -> bytes:
     """The infos as bytes; no bytes if there are none."""
-    return pack(infos, show=True) if infos else b""
+    return pack(infos, use_repr=True) if infos else b""
 
 
 def _array(data: bytes) -> npt.NDArray[np.uint8]:

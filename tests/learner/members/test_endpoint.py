@@ -43,7 +43,7 @@ def test_what_others_can_reach_has_keys_made_by_itself(home: Path, bind: str) ->
     assert keyring is not None
     token = Token.from_text((home / "default.token").read_text(), "")
     assert token.server == keyring.key.public
-    assert not keyring.why_not_enter(token.client.public)
+    assert not keyring.rejection_reason(token.client.public)
     assert stat.S_IMODE(home.stat().st_mode) == 0o700
     again = keyring_for(Config(bind=bind), NOW)
     assert again is not None
@@ -105,8 +105,8 @@ def test_the_line_to_paste_is_the_whole_command(home: Path, monkeypatch: pytest.
 def test_throwaway_keys_fit_each_other_and_no_others() -> None:
     keyring, token = generate_run_keys("local", NOW)
     assert token.server == keyring.key.public
-    assert not keyring.why_not_enter(token.client.public)
-    assert keyring.why_not_enter(TOKEN.client.public)
+    assert not keyring.rejection_reason(token.client.public)
+    assert keyring.rejection_reason(TOKEN.client.public)
     keyring.refresh()
     assert keyring.allowed != ClientList()
 
@@ -154,12 +154,12 @@ def test_a_worker_runs_as_much_code_as_it_is_sure_of_its_learner() -> None:
     levels |= {allowed_code(address, None): (True, True) for address in INSIDE}
     assert set(levels) == set(AllowedCode)
     for code, (modules, callables) in levels.items():
-        assert (MODULE.why_not(code) == "") is modules
-        assert (CALLABLE.why_not(code) == "") is callables
-        assert not any(env.why_not(code) for env in REGISTERED)
-        assert not steps(*REGISTERED).why_not(code)
-        assert steps(*REGISTERED, MODULE).why_not(code) == MODULE.why_not(code)
-        assert steps(REGISTERED[0], CALLABLE).why_not(code) == CALLABLE.why_not(code)
+        assert (MODULE.rejection_reason(code) == "") is modules
+        assert (CALLABLE.rejection_reason(code) == "") is callables
+        assert not any(env.rejection_reason(code) for env in REGISTERED)
+        assert not steps(*REGISTERED).rejection_reason(code)
+        assert steps(*REGISTERED, MODULE).rejection_reason(code) == MODULE.rejection_reason(code)
+        assert steps(REGISTERED[0], CALLABLE).rejection_reason(code) == CALLABLE.rejection_reason(code)
 
 
 # ---------------------------------------------------------------- addresses

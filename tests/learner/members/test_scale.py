@@ -117,7 +117,7 @@ def test_keys_are_looked_at_once_for_each_state_of_their_list() -> None:
         keyring = Keyring()
         asked = 0
 
-        def why_not(self, peer: bytes) -> str:
+        def rejection_reason(self, peer: bytes) -> str:
             self.asked += 1
             return "revoked" if peer == b"b" and self.keyring.allowed == "newer" else ""
 

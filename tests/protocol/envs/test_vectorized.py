@@ -1,4 +1,4 @@
-"""`--vector native`: an environment's own vectorised form keeps the law of a row, step for step as the loop; refusals."""
+"""`--vector native`: an environment's own vectorized form keeps the law of a row, step for step as the loop; refusals."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_it_steps_as_the_loop_does_from_the_same_states() -> None:
     other.reset(seeds, no_pulse)
     began, ended = np.ones(N, bool), {"terminated": 0, "truncated": 0}
     for _ in range(300):
-        for n in np.flatnonzero(began):  # both begin where the vectorised one does
+        for n in np.flatnonzero(began):  # both begin where the vectorized one does
             loop_envs[n].unwrapped.state = states_of(together)[n]  # type: ignore[attr-defined]
         balance = (states_of(together)[:, 2:] @ [1.0, 0.5] > 0).astype(int)
         actions = np.where(np.arange(N) < N // 2, balance, generator.integers(2, size=N))
@@ -115,7 +115,7 @@ def test_auto_is_the_loop() -> None:
 
 
 class Vectorised(VectorEnv[Any, Any, Any]):
-    """A vectorised form of the countdown that cannot stand for it: it resets in another way, or has other spaces."""
+    """A vectorized form of the countdown that cannot stand for it: it resets in another way, or has other spaces."""
 
     def __init__(self, num_envs: int, mode: str = "NextStep", signs: int = 1) -> None:
         self.metadata = {"autoreset_mode": AutoresetMode(mode)}
@@ -136,12 +136,12 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("env", "why"),
     [
-        (EnvSpec("Pendulum-v1"), "Pendulum-v1 has no vectorised form of its own .*; use --vector loop"),
-        (EnvSpec(f"{TOY}Countdown-v0"), "has no vectorised form of its own"),
+        (EnvSpec("Pendulum-v1"), "Pendulum-v1 has no vectorized form of its own .*; use --vector loop"),
+        (EnvSpec(f"{TOY}Countdown-v0"), "has no vectorized form of its own"),
         (EnvSpec.of(Countdown), "vector native expected an id that gymnasium registers, got a callable"),
         (EnvSpec("CartPole-v1", {"sutton_barto_reward": True, "max_episode_steps": 3}), ""),
         (EnvSpec("test/Same-v0"), "autoreset_mode.* expected .*NEXT_STEP, got .*SAME_STEP"),
-        (EnvSpec("test/Other-v0"), r"its vectorised form has other spaces than itself, Box.*\(2,\).*; use --vector loop"),
+        (EnvSpec("test/Other-v0"), r"its vectorized form has other spaces than itself, Box.*\(2,\).*; use --vector loop"),
     ],
     ids=["none", "none of ours", "callable", "fits", "same step", "other spaces"],
 )

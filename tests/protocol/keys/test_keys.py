@@ -86,7 +86,7 @@ def test_no_error_and_no_repr_holds_a_secret() -> None:
 
 
 def test_a_public_key_is_that_of_its_secret() -> None:
-    assert Key.of_secret(LAB.secret) == LAB
+    assert Key.from_secret(LAB.secret) == LAB
     assert Key.new() != Key.new()
     assert public_key(LAB.public.hex(), "") == LAB.public
     for wrong in ("", "abc", "zz" * 32, LAB.public.hex()[:-2], LAB.public.hex() + "00", " " + LAB.public.hex()):
@@ -98,55 +98,55 @@ def test_a_public_key_is_that_of_its_secret() -> None:
 
 
 def both() -> ClientList:
-    return ClientList().adding("lab", LAB.public, NOW).adding("home", HOME.public, NOW)
+    return ClientList().with_client("lab", LAB.public, NOW).with_client("home", HOME.public, NOW)
 
 
 def test_who_is_not_on_the_list_may_nothing() -> None:
-    assert ClientList().why_not(LAB.public)
-    assert both().why_not(LAB.public) == both().why_not(HOME.public) == ""
-    assert both().why_not(SERVER.public) == f"its key {fingerprint(SERVER.public)} is not allowed here"
+    assert ClientList().rejection_reason(LAB.public)
+    assert both().rejection_reason(LAB.public) == both().rejection_reason(HOME.public) == ""
+    assert both().rejection_reason(SERVER.public) == f"its key {fingerprint(SERVER.public)} is not allowed here"
     for wrong in (b"", LAB.public[:-1], LAB.public + b"\0", LAB.secret):
-        assert both().why_not(wrong)
+        assert both().rejection_reason(wrong)
 
 
 def test_who_is_revoked_is_out_and_nobody_else() -> None:
-    after = both().revoking("lab", LATER)
-    assert after.why_not(LAB.public) == f"its key lab ({fingerprint(LAB.public)}) was revoked"
-    assert not after.why_not(HOME.public)
+    after = both().with_revoked("lab", LATER)
+    assert after.rejection_reason(LAB.public) == f"its key lab ({fingerprint(LAB.public)}) was revoked"
+    assert not after.rejection_reason(HOME.public)
     assert after.names() == ["home"]
-    again = after.adding("lab", SERVER.public, LATER)  # the name is free, the key is not
-    assert not again.why_not(SERVER.public)
-    assert again.why_not(LAB.public)
+    again = after.with_client("lab", SERVER.public, LATER)  # the name is free, the key is not
+    assert not again.rejection_reason(SERVER.public)
+    assert again.rejection_reason(LAB.public)
     with pytest.raises(UsageError, match="was revoked, and stays so"):
-        after.adding("other", LAB.public, LATER)
+        after.with_client("other", LAB.public, LATER)
 
 
 def test_a_key_that_stands_twice_is_out_if_it_was_revoked_once() -> None:
     twice = ClientList((Client("a", LAB.public.hex(), NOW), Client("b", LAB.public.hex(), NOW, revoked=LATER)))
-    assert "was revoked" in twice.why_not(LAB.public)
+    assert "was revoked" in twice.rejection_reason(LAB.public)
 
 
 def test_a_name_and_a_key_are_given_once() -> None:
     with pytest.raises(UsageError, match="key lab is there already"):
-        both().adding("lab", SERVER.public, NOW)
+        both().with_client("lab", SERVER.public, NOW)
     with pytest.raises(UsageError, match=r"\(lab\) is allowed already"):
-        both().adding("other", LAB.public, NOW)
+        both().with_client("other", LAB.public, NOW)
     with pytest.raises(UsageError, match="key x: there is none of this name; those that may connect: lab, home"):
-        both().revoking("x", NOW)
+        both().with_revoked("x", NOW)
     with pytest.raises(UsageError, match="revoked already"):
-        both().revoking("lab", NOW).revoking("lab", NOW)
+        both().with_revoked("lab", NOW).with_revoked("lab", NOW)
 
 
 @pytest.mark.parametrize("name", ["", "../lab", "a/b", ".hidden", "a b", "é", "x" * 65, "a\0", "-a"])
 def test_a_name_is_part_of_a_file_name_and_no_path(name: str, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="expected 1 to 64 letters"):
-        both().adding(name, SERVER.public, NOW)
+        both().with_client(name, SERVER.public, NOW)
     with pytest.raises(UsageError, match="expected 1 to 64 letters"):
         KeyFolder(tmp_path).token_path(name)
 
 
 def test_the_list_is_text_and_back() -> None:
-    for allowed in (ClientList(), both(), both().revoking("lab", LATER)):
+    for allowed in (ClientList(), both(), both().with_revoked("lab", LATER)):
         assert ClientList.from_toml(allowed.to_toml(), "") == allowed
     assert LAB.secret.hex() not in both().to_toml()
 
@@ -228,7 +228,7 @@ def test_a_token_opens_the_learner_that_made_it(folder: KeyFolder) -> None:
     allowed = folder.ensure_first_client(NOW)
     token = Token.from_text(folder.token_path("default").read_text(), "")
     assert token.server == folder.server().public
-    assert not allowed.why_not(token.client.public)
+    assert not allowed.rejection_reason(token.client.public)
     assert allowed.clients[0].made == NOW
     assert folder.ensure_first_client(LATER) == allowed, "there was a first client already"
 
@@ -245,7 +245,7 @@ def test_a_client_may_keep_its_secret_to_itself(folder: KeyFolder, tmp_path: Pat
     path, public = elsewhere.new_for_other_learner("lab", folder.server().public)
     folder.allow("lab", public, NOW)
     token = Token.from_text(path.read_text(), "")
-    assert not folder.allowed().why_not(token.client.public)
+    assert not folder.allowed().rejection_reason(token.client.public)
     assert token.server == folder.server().public
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     assert not folder.token_path("lab").exists()
@@ -309,13 +309,13 @@ def test_half_a_file_is_never_seen(folder: KeyFolder, monkeypatch: pytest.Monkey
 def test_a_list_that_changes_is_read_again(folder: KeyFolder) -> None:
     ring = Keyring(folder.server(), folder.ensure_first_client(NOW), folder)
     lab = Token.from_text(folder.new("lab", NOW).read_text(), "").client.public
-    assert ring.why_not_enter(lab)
+    assert ring.rejection_reason(lab)
     ring.refresh()
-    assert not ring.why_not_enter(lab)
+    assert not ring.rejection_reason(lab)
     folder.revoke("lab", LATER)
     ring.refresh()
-    assert "was revoked" in ring.why_not_enter(lab)
-    assert "was revoked" in ring.allowed.why_not(lab)
+    assert "was revoked" in ring.rejection_reason(lab)
+    assert "was revoked" in ring.allowed.rejection_reason(lab)
 
 
 @pytest.mark.parametrize("how", ["broken", "gone", "open to others", "a folder"])
@@ -334,15 +334,15 @@ def test_a_list_that_cannot_be_read_lets_nobody_in_and_throws_nobody_out(folder:
             folder.list_path.mkdir()
     for _ in range(2):
         ring.refresh()
-        assert "cannot be looked up" in ring.why_not_enter(lab)
-        assert not ring.allowed.why_not(lab)
+        assert "cannot be looked up" in ring.rejection_reason(lab)
+        assert not ring.allowed.rejection_reason(lab)
     if how == "a folder":
         folder.list_path.rmdir()
     folder.list_path.unlink(missing_ok=True)
     folder.allow("home", HOME.public, NOW)
     ring.refresh()
-    assert not ring.why_not_enter(HOME.public)
-    assert ring.why_not_enter(lab)
+    assert not ring.rejection_reason(HOME.public)
+    assert ring.rejection_reason(lab)
 
 
 # ---------------------------------------------------------------- where a token comes from

@@ -71,7 +71,7 @@ class Net:
         return link
 
     def keyed(self) -> LearnerLink:
-        allowed = ClientList().adding("lab", LAB.public, NOW).adding("home", HOME.public, NOW)
+        allowed = ClientList().with_client("lab", LAB.public, NOW).with_client("home", HOME.public, NOW)
         return self.learner(Keyring(SERVER, allowed))
 
     def worker(self, learner: LearnerLink | str, token: Token | None, name: str = "w0") -> WorkerLink:
@@ -137,7 +137,7 @@ def asked(key: bytes = LAB.public, domain: bytes = DOMAIN, mechanism: bytes = b"
     return [b"1.0", b"7", domain, b"10.0.0.7", b"", mechanism, key]
 
 
-KEYRING = Keyring(SERVER, ClientList().adding("lab", LAB.public, NOW))
+KEYRING = Keyring(SERVER, ClientList().with_client("lab", LAB.public, NOW))
 
 
 def test_a_key_on_the_list_is_let_in_under_its_own_name() -> None:
@@ -176,7 +176,7 @@ def test_a_list_that_raises_lets_nobody_in(monkeypatch: pytest.MonkeyPatch) -> N
     def broken(_: bytes) -> str:
         raise RuntimeError("disk on fire")
 
-    monkeypatch.setattr(KEYRING, "why_not_enter", broken)
+    monkeypatch.setattr(KEYRING, "rejection_reason", broken)
     reply, why = answer(asked(), KEYRING)
     assert reply[2] == b"400"
     assert "disk on fire" in why
@@ -258,7 +258,7 @@ def test_who_has_a_token_is_heard_and_answered(net: Net) -> None:
     assert message == hello("wörker")
     assert worker_name(peer) == "wörker".encode()
     assert learner.speaker(peer) == "lab"
-    assert learner.why_not(peer) == ""
+    assert learner.rejection_reason(peer) == ""
     assert learner.send(peer, encode(Rejoin(3)))
     assert worker.poll(DEADLINE_S)
     assert list(worker.receive()) == [Rejoin(3)]
@@ -358,7 +358,7 @@ def test_trouble_that_is_over_is_forgotten(net: Net) -> None:
     address = first.address
     first.close(0.0)
     first.context.term()  # then the port is free
-    learner = net.learner(Keyring(SERVER, ClientList().adding("lab", LAB.public, NOW)), address)
+    learner = net.learner(Keyring(SERVER, ClientList().with_client("lab", LAB.public, NOW)), address)
     worker.send(encode(hello()))
     until(lambda: worker.problem is None, worker)
     assert [message for _, message in heard(learner)] == [hello()]
@@ -628,7 +628,7 @@ def test_revoking_is_noticed_while_the_learner_learns(net: Net, tmp_path: Path) 
     folder.revoke("lab", NOW)
     keyring = learner.keyring
     assert keyring is not None
-    until(lambda: keyring.why_not_enter(lab.client.public) != "")  # nobody polls
+    until(lambda: keyring.rejection_reason(lab.client.public) != "")  # nobody polls
 
 
 # ---------------------------------------------------------------- rubbish and floods
@@ -673,7 +673,7 @@ def test_who_comes_under_ever_new_names_does_not_fill_the_memory() -> None:
 def test_an_ipv6_address_works_with_and_without_keys(net: Net) -> None:
     if not plain.has_ipv6:
         pytest.skip("no IPv6 here")
-    for keyring, mine in ((None, None), (Keyring(SERVER, ClientList().adding("lab", LAB.public, NOW)), token())):
+    for keyring, mine in ((None, None), (Keyring(SERVER, ClientList().with_client("lab", LAB.public, NOW)), token())):
         learner = net.learner(keyring, "tcp://[::1]:*")
         assert learner.address.startswith("tcp://[::1]:")
         worker = net.worker(learner, mine)

@@ -142,6 +142,6 @@ def test_a_setting_names_it_and_a_run_folder_keeps_it(tmp_path: Path) -> None:
 
 def test_a_worker_that_cannot_be_sure_of_the_learner_imports_no_encoder() -> None:
     run = run_spec(resolve("CartPole-v1", encoder=f"{HERE}:mixer"), EnvSpec("CartPole-v1"))
-    assert "imports a module" in run.why_not(AllowedCode.REGISTERED)
-    assert run.why_not(AllowedCode.MODULES) == ""
-    assert msgspec.structs.replace(run, policy=DISCRETE).why_not(AllowedCode.REGISTERED) == ""
+    assert "imports a module" in run.rejection_reason(AllowedCode.REGISTERED)
+    assert run.rejection_reason(AllowedCode.MODULES) == ""
+    assert msgspec.structs.replace(run, policy=DISCRETE).rejection_reason(AllowedCode.REGISTERED) == ""

@@ -100,7 +100,7 @@ def test_every_frame_is_sent_once() -> None:
 )
 def test_what_is_no_stack_goes_as_it_lies(array: npt.NDArray[Any]) -> None:
     assert pack_stack(array) is None
-    frame, names = Packing(stack=True).of(array)
+    frame, names = Packing(stack=True).pack(array)
     assert (bytes(frame), names) == (array.tobytes(), [])
 
 
@@ -334,7 +334,7 @@ def pictures(steps: int, copies: int, moving: bool = True) -> Bytes:
     ids=["both", "not stacked", "no stack", "stacked noise", "noise"],
 )
 def test_what_is_worth_it_is_compressed(obs: Bytes, stack: bool, names: list[str]) -> None:
-    frame, packings = Packing(stack=stack, zstd=True).of(obs)
+    frame, packings = Packing(stack=stack, zstd=True).pack(obs)
     assert packings == names
     if names:
         assert len(frame) < obs.nbytes * (0.1 if "zstd" in names else 0.4)
@@ -347,8 +347,8 @@ def test_what_is_worth_it_is_compressed(obs: Bytes, stack: bool, names: list[str
 @pytest.mark.parametrize("dtype", ["<i8", "<f4", "|b1", "<u2"])
 def test_arrays_of_any_kind_are_compressed_from_a_kilobyte_on(dtype: str) -> None:
     few, many = np.zeros(1023 // np.dtype(dtype).itemsize, dtype), np.ones((64, 32, 2), dtype)
-    assert Packing(zstd=True).of(few)[1] == []
-    frame, packings = Packing(zstd=True).of(many)
+    assert Packing(zstd=True).pack(few)[1] == []
+    frame, packings = Packing(zstd=True).pack(many)
     assert packings == ["zstd"]
     back = unpack_array(frame, packings, many.dtype, many.shape)
     assert (back.dtype, back.shape) == (many.dtype, many.shape)

@@ -58,7 +58,7 @@ def test_what_is_not_plain_is_named() -> None:
 
 
 def test_what_is_not_plain_is_shown_if_asked_so_and_can_be_found() -> None:
-    back = unpack(pack({"a": {"b": Odd()}, "c": "<odd>"}, show=True))
+    back = unpack(pack({"a": {"b": Odd()}, "c": "<odd>"}, use_repr=True))
     assert back == {"a": {"b": "<odd>"}, "c": "<odd>"}
     assert type(back["a"]["b"]) is ReprString
     assert repr_paths(back) == ["a.b"]
