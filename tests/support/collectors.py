@@ -13,6 +13,7 @@ from gymnasium.vector import SyncVectorEnv
 
 from learner.config.layers import resolve
 from millrace.launch.local_run import train
+from protocol.arrays import Array
 from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.policy.layout import acting_size, buffer_size
@@ -51,12 +52,17 @@ def with_env(run: RunSpec, env: str, **kwargs: Any) -> RunSpec:
     return msgspec.structs.replace(run, env=EnvSpec.of(env, kwargs))
 
 
-def random_policy(spec: PolicySpec) -> Policy:
-    """A policy with random weights, which are the same each time."""
+def random_weights(spec: PolicySpec) -> tuple[Array, Array]:
+    """Random parameters needed to act, and buffers, which are the same each time."""
     generator = np.random.default_rng(5)
-    policy = make_policy(spec)
     parameters = generator.normal(0, 0.3, acting_size(spec)).astype(np.float32)
-    policy.load(parameters, generator.uniform(0.5, 1.5, buffer_size(spec)).astype(np.float32))
+    return parameters, generator.uniform(0.5, 1.5, buffer_size(spec)).astype(np.float32)
+
+
+def random_policy(spec: PolicySpec) -> Policy:
+    """A policy with these weights."""
+    policy = make_policy(spec)
+    policy.load(*random_weights(spec))
     return policy
 
 

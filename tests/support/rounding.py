@@ -20,6 +20,7 @@ import torch
 
 from protocol.arrays import Array
 from protocol.policy.layout import hidden_names, named_views, parameter_layout, total_size
+from protocol.policy.networks import ActorCriticNetwork
 from protocol.policy.torch_distributions import log_prob_and_entropy
 from protocol.specs import PolicySpec
 
@@ -139,14 +140,21 @@ def params_variance(spec: PolicySpec, flat: Array, x: Array) -> tuple[Array, Arr
     return np.concatenate([forward.out, log_std], -1), np.concatenate([forward.out_variance, zeros], -1)
 
 
-def log_prob_tolerance(spec: PolicySpec, params: Array, action: Array, variance: Array | None = None) -> Array:
-    """How far two float32 log-probabilities [B] may differ, of parameters [B, P] with this variance (none: the same)."""
+def log_prob_variance(spec: PolicySpec, flat: Array, x: Array, action: Array) -> Array:
+    """The variance of the rounding errors of float32 log-probabilities [B] of an MLP policy; see `params_variance`."""
+    return _log_prob_variance(spec, *params_variance(spec, flat, x), action)
 
+
+def log_prob_tolerance(spec: PolicySpec, params: Array, action: Array) -> Array:
+    """How far two float32 log-probabilities [B] of the same parameters [B, P] may differ."""
+    return tolerance_of(_log_prob_variance(spec, params.astype(np.float64), np.zeros(params.shape), action))
+
+
+def _log_prob_variance(spec: PolicySpec, params: Array, variance: Array, action: Array) -> Array:
     def log_prob(p: Array) -> Array:
         return log_prob_and_entropy(spec.action, torch.tensor(p), torch.tensor(action))[0].numpy()
 
-    params = params.astype(np.float64)
-    return tolerance_of(variance_after(log_prob, params, np.zeros(params.shape) if variance is None else variance))
+    return variance_after(log_prob, params, variance)
 
 
 class ActorCriticTolerance(NamedTuple):
@@ -158,13 +166,20 @@ class ActorCriticTolerance(NamedTuple):
 
 
 def actor_critic_tolerance(
-    spec: PolicySpec, flat: Array, x: Array, action: Array, by_outputs: Sequence[Array]
+    spec: PolicySpec,
+    flat: Array,
+    x: Array,
+    action: Array,
+    by_outputs: Sequence[Array],
+    by_log_prob_variance: Array | float = 0.0,
+    by_value_variance: Array | float = 0.0,
 ) -> ActorCriticTolerance:
     """Of the log-probabilities and entropies of an MLP actor-critic, and of its gradient.
 
     `flat` [P] are the parameters, `x` [B, D] the features; `by_outputs` are the gradients by log-probability, entropy and
-    value, [B] each. See `gradient_variances` and `variance_after`. If actor and critic share a trunk, the errors of their
-    two gradients depend on one another, and the variance of the sum is at most twice the sum of the variances.
+    value, [B] each; two of them may have errors, of these variances. See `gradient_variances` and `variance_after`. If actor
+    and critic share a trunk, the errors of their two gradients depend on one another, and the variance of the sum is at most
+    twice the sum of the variances.
     """
     fields, relu, rows = sum(parameter_layout(spec), ()), spec.activation == "relu", len(x)
     weights, variances = named_views(flat.astype(np.float64), fields), np.zeros(total_size(fields))
@@ -185,21 +200,21 @@ def actor_critic_tolerance(
     def entropy(p: Array) -> Array:
         return log_prob_and_entropy(spec.action, torch.tensor(p), torch.tensor(action))[1].numpy()
 
-    def gradient(p: Array) -> Array:
+    def gradient(p: Array, by: Sequence[Array] = (by_log_prob, by_entropy)) -> Array:
         leaf = torch.tensor(p, requires_grad=True)
         outcome = log_prob_and_entropy(spec.action, leaf, torch.tensor(action))
-        by = [torch.tensor(by_log_prob), torch.tensor(by_entropy)]
-        return torch.autograd.grad(outcome, leaf, by)[0].numpy()
+        return torch.autograd.grad(outcome, leaf, [torch.tensor(each) for each in by])[0].numpy()
 
     by_params, by_params_variance = gradient(params), variance_after(gradient, params, variance)
+    by_params_variance += gradient(params, (np.ones(rows), np.zeros(rows))) ** 2 * np.reshape(by_log_prob_variance, (-1, 1))
     add([*hidden_names(spec), "actor.out"], by_params[:, :outputs], by_params_variance[:, :outputs])
     if "actor.log_std" in weights:
         by_log_std = np.abs(by_params[:, outputs:]).sum(0)
         of_field["actor.log_std"] += by_params_variance[:, outputs:].sum(0) + rows * (UNIT * by_log_std) ** 2
     critic = [*hidden_names(spec, "" if spec.shared_net else "critic"), "critic.out"]
-    add(critic, by_value[:, None], np.zeros((rows, 1)))
+    add(critic, by_value[:, None], np.zeros((rows, 1)) + np.reshape(by_value_variance, (-1, 1)))
     return ActorCriticTolerance(
-        log_prob_tolerance(spec, params, action, variance),
+        tolerance_of(_log_prob_variance(spec, params, variance, action)),
         tolerance_of(variance_after(entropy, params, variance)),
         tolerance_of((1 + spec.shared_net) * variances),
     )
@@ -211,6 +226,13 @@ def network_layers(parameters: Mapping[str, torch.Tensor], names: Sequence[str])
         (parameters[f"{name}.weight"].detach().numpy().copy(), parameters[f"{name}.bias"].detach().numpy().copy())
         for name in names
     ]
+
+
+def by_value_variance(net: ActorCriticNetwork, x: Array, by_value: Array, slope: float) -> Array:
+    """The variance of the errors of the gradient by value [B], where it is `slope` times the value less its target."""
+    names = [*hidden_names(net.spec, "" if net.spec.shared_net else "critic"), "critic.out"]
+    forward = forward_pass(network_layers(net.parameters, names), x, net.spec.activation == "relu")
+    return np.asarray(slope**2 * forward.out_variance[:, 0] + (ELEMENTWISE * UNIT * by_value) ** 2)
 
 
 def assert_within(found: Array, expected: Array, tolerance: Array) -> None:

@@ -16,6 +16,7 @@ from gymnasium.wrappers import OrderEnforcing, TimeLimit
 
 from protocol.arrays import Array
 from protocol.policy.distributions import distribution
+from protocol.policy.features import features, normalize
 from protocol.specs import Leaf, RunSpec
 from tests.support.collectors import (
     TOY,
@@ -25,9 +26,11 @@ from tests.support.collectors import (
     no_pulse,
     random_collector,
     random_policy,
+    random_weights,
     run_around,
     run_of,
 )
+from tests.support.rounding import assert_within, log_prob_variance, tolerance_of
 from workers.collect.collector import Collector
 from workers.collect.env_copies import copy_seeds
 from workers.collect.held_rollouts import Assignment
@@ -168,9 +171,14 @@ def test_an_environment_that_writes_into_its_action_does_not_change_the_rollout(
 @pytest.mark.parametrize("run", [DISCRETE, GAUSSIAN, TABLE, BITS], ids=["discrete", "gaussian", "table", "bits"])
 def test_log_probabilities_are_those_of_the_policy_in_these_observations(run: RunSpec) -> None:
     (rollout,) = collect(random_collector(run), run)
-    params = random_policy(run.policy)([leaf[:-1] for leaf in rollout.obs])
-    expected = distribution(run.policy).log_prob(params, rollout.action)
-    np.testing.assert_allclose(rollout.log_prob, expected, rtol=1e-4, atol=1e-5)
+    obs = [leaf[:-1] for leaf in rollout.obs]
+    expected = distribution(run.policy).log_prob(random_policy(run.policy)(obs), rollout.action)
+    parameters, buffers = random_weights(run.policy)
+    x = features(run.policy, obs)
+    x = normalize(x, *np.split(buffers, 2)) if run.policy.normalize_observations else x
+    rows = x.reshape(-1, x.shape[-1]), rollout.action.reshape(-1, *rollout.action.shape[2:])
+    tolerance = tolerance_of(log_prob_variance(run.policy, parameters, *rows))
+    assert_within(rollout.log_prob.ravel(), expected.ravel(), tolerance)
 
 
 def test_arrays_are_contiguous_and_never_written_again() -> None:

@@ -31,6 +31,14 @@ from tests.support.batches import (
     normal,
     shared,
 )
+from tests.support.rounding import (
+    ELEMENTWISE,
+    UNIT,
+    actor_critic_tolerance,
+    assert_within,
+    by_value_variance,
+    log_prob_variance,
+)
 
 EVERYTHING = PPOConfig(normalize_rewards=True, learning_rate_schedule="linear", clip_range_schedule="linear", n_epochs=3)
 
@@ -255,14 +263,28 @@ def test_a_step_follows_the_gradient_of_the_usual_loss(spec: PolicySpec) -> None
     else:
         usual = torch.distributions.Independent(torch.distributions.Normal(params[:, :2], params[:, 2:].exp()), 1)
         action = torch.randn((30, 2), generator=generator)
-    old = usual.log_prob(action).detach() + 0.2 * torch.randn(30, generator=generator)
-    ratio = (usual.log_prob(action) - old).exp()
+    log_prob = usual.log_prob(action)
+    old = log_prob.detach() + 0.2 * torch.randn(30, generator=generator)
+    ratio = (log_prob - old).exp()
     a = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
     policy_loss = -torch.min(ratio * a, ratio.clamp(0.9, 1.1) * a).mean()
+    by_log_prob = torch.autograd.grad(policy_loss, log_prob, retain_graph=True)[0].numpy()
     (policy_loss + 0.7 * (value - target).square().mean() - 0.3 * usual.entropy().mean()).backward()
     expected = algorithm.net.flat_grad.clone()
+    by_value = 1.4 / 30 * (value - target).detach().numpy()
+    arrays = algorithm.net.flat.numpy(), x.numpy(), action.numpy()
+    # The relative error of a ratio is the absolute error of its log-probability. The mean and the standard deviation of the
+    # advantages are sums of 30 terms, each at most as large as the largest advantage.
+    relative = log_prob_variance(spec, *arrays) + 2 * (30 + ELEMENTWISE) * UNIT**2 * float(a.abs().max()) ** 2
+    allowed = actor_critic_tolerance(
+        spec,
+        *arrays,
+        [by_log_prob, np.full(30, -0.3 / 30), by_value],
+        (np.abs(by_log_prob) + (by_log_prob != 0) / 30) ** 2 * relative,
+        by_value_variance(algorithm.net, x.numpy(), by_value, 1.4 / 30),
+    )
     measured = algorithm.step(Minibatch(x, (), action, old, advantage, target))
-    torch.testing.assert_close(algorithm.net.flat_grad, expected, atol=1e-5, rtol=1e-4)
+    assert_within(algorithm.net.flat_grad.numpy(), expected.numpy(), allowed.gradient)
     assert measured["clip_fraction"] > 0
     assert measured["policy_gradient_loss"] == pytest.approx(policy_loss.item(), rel=1e-4)
 
