@@ -1,7 +1,7 @@
 """A PPO minibatch update in three ways: the usual style, `PPO.step` with a graph, and `PPO.step` as `PPO.update` calls it.
 
 All do the same work on the same rows (4 observations, 2 actions, actor and critic 4-64-64-·, tanh): take the minibatch out
-of the batch, normalise advantages, clipped surrogate, value loss, entropy, approx_kl, clip fraction, gradient clipped by
+of the batch, normalize advantages, clipped surrogate, value loss, entropy, approx_kl, clip fraction, gradient clipped by
 its norm, Adam with eps 1e-5, losses read as numbers. The usual style is modules, `torch.distributions.Categorical`,
 `clip_grad_norm_` and Adam as it comes.
 """

@@ -10,7 +10,7 @@ from protocol.specs import ActionSpec, Leaf
 
 
 class EnvSpaces(NamedTuple):
-    """What an environment says of itself."""
+    """The spaces and the time limit of an environment."""
 
     observation: tuple[Leaf, ...]
     action: ActionSpec

@@ -184,7 +184,7 @@ class Journal:
         )
 
     def _stages(self, snapshot: HubSnapshot) -> dict[str, float]:
-        """Seconds in each stage: of the learner, and of all workers together, as their last heartbeats said."""
+        """Seconds in each stage: of the learner, and of all workers together, from their last heartbeats."""
         stages = {"learner_wait": snapshot.wait_s} | {f"learner_{name}": s for name, s in self._stages_s.items()}
         self._worker_stages_s |= snapshot.worker_stages()
         for worker_stages in self._worker_stages_s.values():

@@ -1,4 +1,4 @@
-"""What workers are told of a run: the environment's spaces, the policy that fits them, sizes and seed."""
+"""The run's description for workers: the environment's spaces, the policy that fits them, sizes and seed."""
 
 from __future__ import annotations
 

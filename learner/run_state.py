@@ -1,4 +1,4 @@
-"""Where a run stands: what a checkpoint holds besides the algorithm's own state, and how a resumed run reads it back."""
+"""The state of a run: what a checkpoint holds besides the algorithm's own state, and how a resumed run reads it back."""
 
 from __future__ import annotations
 

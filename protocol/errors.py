@@ -3,7 +3,7 @@
     MillraceError
     ├── UserFacingError         raised: this side cannot go on; the command line prints its one line, exits with `exit_code`
     │   ├── UsageError            2   bad flag, unknown environment, unsupported space, folder that exists, …
-    │   ├── Refused               2   the learner told this worker to leave
+    │   ├── Refused               2   the learner refused this worker
     │   └── RunError              1   the run cannot go on
     │       ├── CheckpointError   1   a checkpoint is missing, broken or of another format
     │       ├── NoWorkers         1   no worker is left, or none ever joined
@@ -45,7 +45,7 @@ class UsageError(UserFacingError):
 
 
 class Refused(UserFacingError):
-    """The learner told this worker to leave."""
+    """The learner refused this worker."""
 
     exit_code = 2
 

@@ -29,7 +29,7 @@ class State(Enum):
 
 
 class LearnerSilent:
-    """Event: the learner has said nothing for `learner_timeout_s` (or, while joining, for too long)."""
+    """Event: no message of the learner arrived for `learner_timeout_s` (or, while joining, for too long)."""
 
 
 class StopRequested:

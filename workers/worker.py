@@ -76,7 +76,7 @@ class WorkerOptions:
 
 
 class Worker:
-    """One worker, from its first Hello to its exit code."""
+    """A worker, from its first Hello until it exits."""
 
     def __init__(
         self,
@@ -203,7 +203,7 @@ class Worker:
                 raise _Abandoned
 
     def _pulse_from_env_code(self, session: int) -> None:
-        """The same, called while an order is executed."""
+        """As `_pulse`, but called by environment code while an order is executed."""
         if self._clock() >= self._pulse_due_s:
             with self._heartbeats.lock_reacquired():
                 self._pulse(session)

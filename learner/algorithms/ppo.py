@@ -91,7 +91,7 @@ class PPO(ActorCritic):
         )
 
     def metrics(self, epochs: Sequence[Sequence[Metrics]], estimates: Sequence[Estimates]) -> Metrics:
-        """Those of `ActorCritic`, and the loss, the KL divergence of the last epoch, the clip range and epochs so far."""
+        """The metrics of `ActorCritic`, the loss, the KL divergence of the last epoch, the clip range and epochs so far."""
         last = epochs[-1][-1]
         weighted = self.config.ent_coef * last["entropy_loss"] + self.config.vf_coef * last["value_loss"]
         return super().metrics(epochs, estimates) | {

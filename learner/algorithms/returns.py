@@ -25,7 +25,7 @@ class EpisodeEnds(NamedTuple):
 
     @classmethod
     def of(cls, batch: Batch) -> EpisodeEnds:
-        """Those of a batch, not copied."""
+        """The episode ends of a batch, without copying its arrays."""
         return cls(batch.terminated, batch.truncated, batch.valid)
 
     @property
@@ -34,7 +34,7 @@ class EpisodeEnds(NamedTuple):
         return self.terminated | self.truncated
 
     def columns(self, at: slice) -> EpisodeEnds:
-        """Those of some env copies."""
+        """The episode ends of some env copies (columns of [T, N])."""
         return EpisodeEnds(self.terminated[:, at], self.truncated[:, at], self.valid[:, at])
 
 

@@ -22,7 +22,7 @@ log = logging.getLogger("millrace.learner")
 
 
 class Listening(Protocol):
-    """What says where a learner listens: a run's `Config`, or a vector environment's `BindSettings`."""
+    """Settings that say where a learner listens: a run's `Config`, or a vector environment's `BindSettings`."""
 
     @property
     def bind(self) -> str:

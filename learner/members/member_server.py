@@ -35,30 +35,30 @@ AWAY_S = 0.5  # a learner that has not listened for longer was busy, or its proc
 
 
 class MemberRoster(Protocol):
-    """The pure half of a learner, which decides what is answered."""
+    """The pure part of a hub: messages in, answers out."""
 
     membership: Membership[Any]
 
     def reject_message(self, peer: bytes, why: str, now: float) -> list[Outgoing]:
-        """A message that could not be read."""
+        """Count a message that could not be read, and answer it."""
         ...
 
     def revoke(self, peer: bytes, why: str) -> list[Outgoing]:
-        """A member's key was revoked."""
+        """Remove a member whose key was revoked."""
         ...
 
     def remove_worker(self, worker: str, why: str) -> list[Outgoing]:
-        """A worker's process is known to be dead."""
+        """Remove a worker whose process has ended."""
         ...
 
     def remove_silent(self, now: float) -> list[Outgoing]:
-        """Judge silence."""
+        """Remove the members that have been silent for too long."""
         ...
 
 
 @dataclass(frozen=True)
 class ServerCallbacks:
-    """What a hub does itself."""
+    """The functions of a hub that the server calls."""
 
     message: Callable[[bytes, ToLearner, float], Sequence[Outgoing]]
     """answers a message (sender, message, now)"""
@@ -72,7 +72,7 @@ class ServerCallbacks:
 
 @dataclass(frozen=True)
 class ServerSettings:
-    """How the server of one hub differs from that of another."""
+    """The settings in which the servers of different hubs differ."""
 
     grace_s: float = AWAY_S
     """after the learner was away, silence is not judged for so long"""

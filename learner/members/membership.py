@@ -1,4 +1,4 @@
-"""Who is a member: joining, sessions, names, refusals, leaving. Pure: messages and `now` in, messages out.
+"""Membership of workers: joining, sessions, names, refusals, leaving. Pure: messages and `now` in, messages out.
 
 The law: one process has one session at a time. A repeated Hello is answered by the same Welcome. A Hello of a new attempt,
 or of another process under the same name, ends the session before it. A process that was refused stays refused. A worker
@@ -77,7 +77,7 @@ class Member:
         return [ticket for ticket, sent_at in self.tickets.items() if ticket not in held and seen > sent_at]
 
     def status(self, now: float) -> WorkerStatus:
-        """What `millrace status` shows of it."""
+        """The worker's row of `millrace status`."""
         heartbeat = self.heartbeat
         return WorkerStatus(
             worker=self.hello.worker,
@@ -121,11 +121,11 @@ class Membership(Generic[M]):
         return [member for member in self.members.values() if member.state is MemberState.ACTIVE]
 
     def status(self, now: float) -> tuple[WorkerStatus, ...]:
-        """What `millrace status` shows of the members, in the order in which they joined."""
+        """A row of `millrace status` for each member, in the order in which they joined."""
         return tuple(member.status(now) for member in sorted(self.members.values(), key=lambda member: member.join_number))
 
     def take_events(self) -> list[Event]:
-        """What has happened since the last call."""
+        """Return and clear the events since the last call."""
         events, self.events = self.events, []
         return events
 
@@ -226,10 +226,10 @@ class Membership(Generic[M]):
             out.append((member.peer, Drain(reason)))
         return out
 
-    def _refuse_and_remove(self, member: M, event: type, why: str, told: str) -> list[Outgoing]:
-        self.events.append(WorkerRefused(member.hello.worker, told))
+    def _refuse_and_remove(self, member: M, event: type, why: str, refusal: str) -> list[Outgoing]:
+        self.events.append(WorkerRefused(member.hello.worker, refusal))
         self.remove(member, event, why)
-        return [(member.peer, Refuse(told))]
+        return [(member.peer, Refuse(refusal))]
 
     def _remember_refusal(self, member: M, why: str) -> None:
         self._refused.pop(member.peer, None)

@@ -13,4 +13,4 @@ class ArrivedRollout:
 
     rollout: Rollout
     incarnation: int
-    """of its lane, when its ticket was dealt: the env copies start again with each incarnation"""
+    """incarnation of its lane when its ticket was dealt: each incarnation has new env copies"""

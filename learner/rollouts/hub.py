@@ -55,13 +55,13 @@ class HubSnapshot:
     progress: Progress
     """as of the last update"""
     version: int
-    """of the newest weights; -1 before any"""
+    """version of the newest weights; -1 before the first"""
     ledger: Ledger
     """a copy"""
     incarnations: list[int]
     """the next incarnation of each lane"""
     lags: list[int]
-    """of each rollout of the last `gather`"""
+    """lag of each rollout of the last `gather`"""
     lag_counts: Mapping[int, int]
     """how many rollouts were used, by lag, since this learner started"""
     wait_s: float
@@ -76,7 +76,7 @@ class HubSnapshot:
     refused_handshakes: int
 
     def worker_stages(self) -> dict[int, Mapping[str, float]]:
-        """Seconds in each stage, by session, as the workers' last heartbeats said."""
+        """Seconds in each stage, by session, from the workers' last heartbeats."""
         return {member.session: member.heartbeat.stages for member in self.members if member.heartbeat is not None}
 
     def worker_states(self) -> Counter[str]:
@@ -95,7 +95,7 @@ HubObserver = Callable[["Hub"], None]
 
 
 class Hub:
-    """Everything the loop knows of workers."""
+    """The training loop's view of its workers: gathers rollouts and publishes weights."""
 
     def __init__(
         self,
@@ -177,7 +177,7 @@ class Hub:
             log.warning("worker %s did not say goodbye within %.0f s", member.hello.worker, timeout_s)
 
     def waiting_for(self) -> str:
-        """What the learner waits for, in words."""
+        """A description of what the learner waits for, for the terminal."""
         roster = self.roster
         if not roster.members:
             return f"waiting for a worker to join at {self.link.address}{self._server.why_missing()}"
@@ -188,11 +188,11 @@ class Hub:
     # ---------------------------------------------------------------- what others ask and tell
 
     def report_progress(self, progress: Progress) -> None:
-        """How far the run is, for whoever asks for its status."""
+        """Store the progress of the run for `millrace status`."""
         self._progress = progress
 
     def workers_alive(self) -> int:
-        """How many processes step the environment."""
+        """Number of processes that step the environment."""
         count = self._processes.count
         return len(self.roster.members) if count is None else count()
 
@@ -205,7 +205,7 @@ class Hub:
         return self._weight_age.first_use_s()
 
     def snapshot(self) -> HubSnapshot:
-        """What the hub knows now."""
+        """A snapshot of the current state."""
         link, roster = self.link, self.roster
         return HubSnapshot(
             progress=self._progress,
@@ -257,7 +257,7 @@ class Hub:
             self._env_failures += 1
             allowed = self.settings.max_env_failures
             if self._env_failures > allowed:
-                counted = f"that was failure {self._env_failures}, at most {allowed} are borne"
+                counted = f"that was failure {self._env_failures}, at most {allowed} are allowed"
                 line = f"worker {event.worker} ({event.host}): {event.error}; {counted}"
                 self._failure = EnvironmentFailed(line, event.traceback)
 

@@ -30,7 +30,7 @@ class TicketedLane(PlacedLane):
 
     @property
     def busy(self) -> int:
-        """How many of its tickets are with its worker."""
+        """Number of its tickets that its worker holds."""
         return len(self.outstanding)
 
     def restart(self) -> None:
@@ -60,7 +60,7 @@ class Ticket:
     lane: int
     incarnation: int
     version: int
-    """of the newest weights when it was dealt"""
+    """version of the newest weights when it was dealt"""
     peer: bytes
 
 
@@ -88,7 +88,7 @@ class LaneQueue:
         self._move(lane, 1)
 
     def set_back(self, lane: TicketedLane) -> None:
-        """One of the lane's tickets was lost, or its rollout dropped."""
+        """Take back one advance: a ticket of the lane was lost, or its rollout was dropped."""
         self._move(lane, -1)
 
     def _move(self, lane: TicketedLane, by: int) -> None:

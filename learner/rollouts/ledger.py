@@ -26,11 +26,11 @@ class Ledger(msgspec.Struct, kw_only=True):
     transitions_used: int = 0
     transitions_stale: int = 0
     transitions_duplicate: int = 0
-    """of the second copy of rollouts that came twice"""
+    """transitions of rollouts that arrived a second time"""
     transitions_late: int = 0
-    """of rollouts of a session that had ended"""
+    """transitions of rollouts of a session that had ended"""
     transitions_invalid: int = 0
-    """of rollouts that broke the law of a row or did not fit the run"""
+    """transitions of rollouts that broke the law of a row or did not fit the run"""
 
     messages_bad: int = 0
     """messages that could not be read"""

@@ -62,7 +62,7 @@ class CollectingMember(Member):
     """rollouts and messages of it that could not be used"""
 
     def status(self, now: float) -> WorkerStatus:
-        """What `millrace status` shows of it."""
+        """The worker's row of `millrace status`."""
         return msgspec.structs.replace(super().status(now), version=self.acknowledged, strikes=self.strikes)
 
 
@@ -98,12 +98,12 @@ class Roster:
 
     @property
     def members(self) -> dict[bytes, CollectingMember]:
-        """By routing id."""
+        """Members by routing id."""
         return self.membership.members
 
     @property
     def events(self) -> list[Event]:
-        """What has happened and was not logged yet."""
+        """Events that were not logged yet."""
         return self.membership.events
 
     # ---------------------------------------------------------------- in
@@ -164,7 +164,7 @@ class Roster:
         return self._deal() if self.membership.remove_worker(worker, why) else []
 
     def revoke(self, peer: bytes, why: str) -> list[Outgoing]:
-        """A member's key was revoked: it is told so and removed at once, whatever it holds."""
+        """A member's key was revoked: send it the reason and remove it at once, even if it holds tickets."""
         return self.membership.revoke(peer, why) + self._deal()
 
     def remove_silent(self, now: float) -> list[Outgoing]:

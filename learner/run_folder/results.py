@@ -54,7 +54,7 @@ class Best(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
-    """How a run went: summary.json."""
+    """The results of a run: summary.json."""
 
     env: str
     algo: str

@@ -1,4 +1,4 @@
-"""Which rows of a batch belong to which lane. Pure.
+"""Layout of a batch: the rows of each lane. Pure.
 
 Row n of every array of a batch belongs to env copy n. A lane has consecutive rows; lane 0 has the first ones.
 """
@@ -19,7 +19,7 @@ class BatchLayout:
         self.num_envs = ends[-1]
         self.lanes = range(len(ends))
         self.rows = [slice(end - size, end) for end, size in zip(ends, lane_sizes, strict=True)]
-        """By lane."""
+        """Rows of each lane, by lane."""
         self._firsts = [rows.start for rows in self.rows]
 
     def copies(self, lane: int) -> range:

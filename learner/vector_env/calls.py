@@ -50,7 +50,7 @@ def call_results(name: str, answers: Mapping[int, Answer]) -> tuple[Any, ...]:
 
 
 def call_error(name: str, lane: int, answer: Returned) -> Exception:
-    """What a call raised, with the worker's traceback. An `AttributeError` keeps its type, as `hasattr` needs it."""
+    """The exception of a call, with the worker's traceback. An `AttributeError` keeps its type, as `hasattr` needs it."""
     line = f"call of {name!r}, lane {lane}: {answer.error}"
     missing = answer.error.startswith("AttributeError")
     error: Exception = AttributeError(line) if missing else EnvironmentFailed(line, answer.traceback)

@@ -37,40 +37,40 @@ LAST_WORDS_S = 0.1  # what a process sent before it ended may still be on its wa
 
 
 class LocalWorkers(Protocol):
-    """Worker processes of our own."""
+    """The worker processes that this program started."""
 
     def poll(self) -> Iterable[tuple[str, str]]:
-        """Those that have ended since the last call, and why; those that are due are started again."""
+        """Name and reason of each process that ended since the last call. Restarts the processes whose backoff is over."""
         ...
 
     def kill(self, name: str) -> bool:
-        """End one at once; False if it is none of ours."""
+        """Kill the process of this name. False if this program did not start it."""
         ...
 
     @property
     def count(self) -> int:
-        """How many are here, or will come back."""
+        """Number of processes that run or will be restarted."""
         ...
 
     def stop(self, timeout_s: float) -> None:
-        """End all."""
+        """Stop all processes within `timeout_s`."""
         ...
 
 
 class NoLocalWorkers:
-    """For a vector environment whose workers are all started elsewhere."""
+    """No local processes: all workers are started elsewhere."""
 
     def poll(self) -> Iterable[tuple[str, str]]:
-        """None has ended."""
+        """No process has ended."""
         return ()
 
     def kill(self, name: str) -> bool:
-        """None of ours."""
+        """No process to kill."""
         return False
 
     @property
     def count(self) -> int:
-        """None."""
+        """Zero processes."""
         return 0
 
     def stop(self, timeout_s: float) -> None:
@@ -79,7 +79,7 @@ class NoLocalWorkers:
 
 @dataclass(frozen=True)
 class SharedSteps:
-    """What steps through shared memory need: the memory, and the wake pipes of each worker that was handed it."""
+    """Resources of steps through shared memory: the memory, and the wake pipes of each worker that inherited it."""
 
     memory: SharedMemory
     wake_pipes: Mapping[str, tuple[WakePipe, WakePipe]]
@@ -219,7 +219,7 @@ class StepHub:
                 self._turn(POLL_S)
 
     def refuse_owner(self, lane: int, why: str) -> None:
-        """What this lane's worker sent cannot be used: refuse the worker."""
+        """Refuse this lane's worker because it sent something unusable."""
         if (member := self._roster.owner(lane)) is not None:
             log.warning("worker %s: %s", member.hello.worker, why)
             self._server.send(self._roster.reject_message(member.peer, why, self._clock()))
@@ -234,11 +234,11 @@ class StepHub:
         return self._roster.lanes[lane].started
 
     def incarnation(self, lane: int) -> int:
-        """How often the lane was started again on new env copies."""
+        """Number of times that the lane was restarted on new env copies."""
         return self._roster.lanes[lane].incarnation
 
     def rebalance(self) -> None:
-        """Every lane is about to begin anew: even out the lanes of the workers."""
+        """Even out the lanes of the workers. Call it when all lanes are about to be reset."""
         self._turn(0.0)
         self._wake_pipes.clear()
         self._server.send(self._roster.rebalance())
@@ -289,7 +289,7 @@ class StepHub:
         self._send_waiting_orders()
 
     def _on_event(self, event: Event) -> None:
-        """Let go of the lanes of a worker that has left."""
+        """Release the lanes of a worker that has left."""
         if isinstance(event, WorkerLeft):
             for lane in [lane for lane in self._wake_pipes if self._roster.owner(lane) is None]:
                 del self._wake_pipes[lane]

@@ -81,7 +81,7 @@ class StepRoster:
 
     @property
     def members(self) -> dict[bytes, Member]:
-        """By routing id."""
+        """Members by routing id."""
         return self.membership.members
 
     # ---------------------------------------------------------------- in
@@ -118,7 +118,7 @@ class StepRoster:
         return self.membership.refuse(member, SentUnusable, why)
 
     def revoke(self, peer: bytes, why: str) -> list[Outgoing]:
-        """A member's key was revoked: it is told so and removed at once, whatever it holds."""
+        """A member's key was revoked: send it the reason and remove it at once, even if it holds orders."""
         return self.membership.revoke(peer, why)
 
     def remove_worker(self, worker: str, why: str) -> list[Outgoing]:
@@ -138,13 +138,13 @@ class StepRoster:
     # ---------------------------------------------------------------- the vector environment's side
 
     def begin(self) -> None:
-        """The answers to the last orders were taken: forget them."""
+        """Forget the answers to the last orders; the caller has taken them."""
         self.answers.clear()
         self.shared_orders.clear()
         self.infos.clear()
 
     def place(self, lane: int, patient: bool) -> bool:
-        """See that the lane lives with a worker. False if there is none, or (`patient`) only such as have lanes already."""
+        """Assign the lane to a worker. False if there is none; if `patient`, also if every worker has a lane already."""
         if self.lanes[lane].owner is not None:
             return True
         candidates = [member for member in self.membership.active() if not (patient and member.lanes)]
@@ -157,7 +157,7 @@ class StepRoster:
         return self._placement.even_out(self.membership.active())
 
     def owner(self, lane: int) -> Member | None:
-        """The worker that the lane lives with."""
+        """The worker to which the lane is assigned, or None."""
         peer = self.lanes[lane].owner
         return None if peer is None else self.members[peer]
 

@@ -18,7 +18,7 @@ from protocol.keys.keys import public_key
 
 
 class Subcommand(NamedTuple):
-    """One of `millrace keys`."""
+    """A subcommand of `millrace keys`."""
 
     run: Callable[[list[str]], list[str]]
     usage: str

@@ -74,7 +74,7 @@ def observer_name() -> str:
 
 
 def ask(link: WorkerLink, timeout_s: float, clock: Callable[[], float] = time.monotonic) -> Status:
-    """One answer. Raises `RunError` when none comes within `timeout_s`."""
+    """Ask the learner for its status. Raises `RunError` if no answer comes within `timeout_s`."""
     deadline_s = clock() + timeout_s
     while (left_s := deadline_s - clock()) > 0:
         link.send(encode(Inquire()))

@@ -7,11 +7,11 @@ import os
 from protocol.keys.key_folder import TOKEN_VARIABLE
 from workers.__main__ import main as run_worker
 
-FINAL_EXIT_CODES = (0, 2)  # it was told to leave, or refused; after any other code it is started again
+FINAL_EXIT_CODES = (0, 2)  # the learner asked it to leave, or refused it; after any other code it is started again
 
 
 class WorkerHost:
-    """The actor."""
+    """The Ray actor that runs a worker."""
 
     def run(self, address: str, token: str, processes: int) -> int:
         """Run the worker program until it leaves; its exit code. `token` may be empty.

@@ -136,7 +136,7 @@ def listen(settings: VectorEnvSettings, resources: ExitStack) -> ListeningVector
 
 
 def _keys(where: BindSettings, transport: str) -> tuple[Keyring | None, Token | None]:
-    """Who may connect, and the token of local workers."""
+    """The keyring of the learner, and the token of local workers."""
     if not where.bind:
         return temporary_keys(transport, where.keys, insecure=where.insecure)
     check_address(advertised_address("tcp://*:1", where.advertise, "machine"))

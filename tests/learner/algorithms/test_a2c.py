@@ -108,7 +108,7 @@ def test_a_constant_baseline_is_the_same_in_both(value: float) -> None:
     torch.testing.assert_close(one.net.flat_grad, other.net.flat_grad, atol=1e-6, rtol=1e-4)
 
 
-def test_a_constant_baseline_changes_nothing_that_is_normalised() -> None:
+def test_a_constant_baseline_changes_nothing_that_is_normalized() -> None:
     one, other = a2c(**FREE, normalize_advantage=True), reinforce(**FREE, baseline=False)
     constant_critic(one, 5.0)
     rows = whole(batch(one, 0))

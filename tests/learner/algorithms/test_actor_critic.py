@@ -248,7 +248,7 @@ def test_loss_gradients_are_used_only_for_the_loss_that_they_are_of() -> None:
 
 
 @pytest.mark.parametrize("optimizer", ["rmsprop", "adam"])
-def test_the_optimisers_are_torchs_on_each_array_of_the_network(optimizer: str) -> None:
+def test_the_optimizers_are_torchs_on_each_array_of_the_network(optimizer: str) -> None:
     """RMSProp with ε 1e-5 outside the square root and α 0.99, as Stable-Baselines3's A2C has it; gradients cut to 0.5."""
     algorithm = make("a2c", optimizer=optimizer, learning_rate=0.01, max_grad_norm=0.5)
     usual = [array.detach().clone().requires_grad_() for array in algorithm.net.parameters.values()]

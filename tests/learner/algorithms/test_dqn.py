@@ -243,7 +243,7 @@ def test_gradients_are_shortened_and_cut_as_asked(settings: dict[str, Any], boun
         assert gradient.abs().max().item() == pytest.approx(0.01, rel=1e-4)
 
 
-def test_optimisers_differ_as_they_should() -> None:
+def test_optimizers_differ_as_they_should() -> None:
     settings: dict[str, dict[str, Any]] = {"adam": {}, "amsgrad": {"amsgrad": True}, "adamw": {"optimizer": "adamw"}}
     made = {name: dqn(changed(PLAIN, **own)) for name, own in settings.items()}
     start = made["adam"].net.flat.clone()

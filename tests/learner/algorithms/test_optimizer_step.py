@@ -1,4 +1,4 @@
-"""A step without the ceremony has the bits of the optimiser's own, and leaves a state that the optimiser goes on from."""
+"""A step without the ceremony has the bits of the optimizer's own, and leaves a state that the optimizer goes on from."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ KINDS: dict[str, Callable[[list[Tensor]], Optimizer]] = {
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
-def test_bits_are_the_optimisers(kind: str) -> None:
+def test_bits_are_the_optimizers(kind: str) -> None:
     generator = torch.Generator().manual_seed(0)
     start = torch.randn(1001, generator=generator)
     flats = [start.clone() for _ in range(2)]

@@ -114,7 +114,7 @@ def test_auto_is_the_loop() -> None:
 # ------------------------------------------------------------------------------------------------ refusals
 
 
-class Vectorised(VectorEnv[Any, Any, Any]):
+class Vectorized(VectorEnv[Any, Any, Any]):
     """A vectorized form of the countdown that cannot stand for it: it resets in another way, or has other spaces."""
 
     def __init__(self, num_envs: int, mode: str = "NextStep", signs: int = 1) -> None:
@@ -129,7 +129,7 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> None:
     registry = dict(gymnasium.registry)
     monkeypatch.setattr("gymnasium.envs.registration.registry", registry)
     for name, kwargs in {"Same": {"mode": "SameStep"}, "Other": {"signs": 2}}.items():
-        entry = {"entry_point": lambda **_: Countdown(), "vector_entry_point": Vectorised}
+        entry = {"entry_point": lambda **_: Countdown(), "vector_entry_point": Vectorized}
         gymnasium.register(f"test/{name}-v0", kwargs=kwargs, **entry)  # type: ignore[arg-type]
 
 
