@@ -228,6 +228,35 @@ def network_layers(parameters: Mapping[str, torch.Tensor], names: Sequence[str])
     ]
 
 
+def q_gradient_tolerance(
+    spec: PolicySpec, flat: Array, x: Array, by_value: Array, by_value_variance: Array | float = 0.0
+) -> Array:
+    """How far two float32 gradients [P] may differ; x [B, D], `by_value` [B, A] is the gradient by the action values, and
+    `by_value_variance` [B, A] that of its errors.
+
+    With dueling, Q = V + A − mean A: a sum over the actions adds A roundings. V and A share the trunk, so that their errors
+    depend on one another, and the variance of their sum is at most twice the sum of their variances.
+    """
+    fields, actions = parameter_layout(spec)[0], by_value.shape[1]
+    variances = np.zeros(total_size(fields))
+    weights, of_field = named_views(flat.astype(np.float64), fields), named_views(variances, fields)
+    by_top = {"q.out": by_value}
+    variance = by_value_variance + (UNIT * by_value) ** 2  # it is rounded to float32
+    if spec.dueling:
+        by_top = {"q.out": by_value - by_value.mean(1, keepdims=True), "q.value": by_value.sum(1, keepdims=True)}
+        variance = variance.sum(1, keepdims=True) + (actions + 1) * (UNIT * np.abs(by_value).sum(1, keepdims=True)) ** 2
+    for top, by_output in by_top.items():
+        names = [*hidden_names(spec), top]
+        layers = [(weights[f"{name}.weight"], weights[f"{name}.bias"]) for name in names]
+        found = gradient_variances(
+            layers, x, by_output, np.broadcast_to(variance, by_output.shape), spec.activation == "relu"
+        )
+        for name, (weight, bias) in zip(names, found, strict=True):
+            of_field[f"{name}.weight"] += weight
+            of_field[f"{name}.bias"] += bias
+    return tolerance_of(len(by_top) * variances)
+
+
 def by_value_variance(net: ActorCriticNetwork, x: Array, by_value: Array, slope: float) -> Array:
     """The variance of the errors of the gradient by value [B], where it is `slope` times the value less its target."""
     names = [*hidden_names(net.spec, "" if net.spec.shared_net else "critic"), "critic.out"]

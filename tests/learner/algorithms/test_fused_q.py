@@ -21,13 +21,13 @@ from learner.algorithms.kernels.fused import FusedQNetwork
 from learner.algorithms.replay import Sample
 from learner.config.hyperparameters import DQNConfig
 from protocol.arrays import Array
-from protocol.policy.layout import hidden_names, named_views, parameter_layout, total_size
+from protocol.policy.layout import hidden_names, parameter_layout, total_size
 from protocol.policy.networks import QNetwork
 from protocol.specs import PolicySpec
 from tests.learner.algorithms.test_dqn import batch
 from tests.support.batches import BOX, DISCRETE, IMAGE, no_pulse
 from tests.support.finite_differences import is_the_slope
-from tests.support.rounding import UNIT, assert_within, forward_tolerance, gradient_variances, network_layers, tolerance_of
+from tests.support.rounding import UNIT, assert_within, forward_tolerance, network_layers, q_gradient_tolerance
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -40,32 +40,6 @@ def _one_thread() -> Iterator[None]:
 
 def policy(net: tuple[int, ...], activation: Any = "tanh", dueling: bool = False) -> PolicySpec:
     return msgspec.structs.replace(DISCRETE, head="q", net=net, activation=activation, dueling=dueling)
-
-
-def gradient_tolerance(spec: PolicySpec, flat: Array, x: Array, by_value: Array) -> Array:
-    """How far two float32 gradients [P] may differ; x [B, D], `by_value` [B, A] is the gradient by the action values.
-
-    With dueling, Q = V + A − mean A: a sum over the actions adds A roundings. V and A share the trunk, so that their errors
-    depend on one another, and the variance of their sum is at most twice the sum of their variances.
-    """
-    fields, actions = parameter_layout(spec)[0], by_value.shape[1]
-    variances = np.zeros(total_size(fields))
-    weights, of_field = named_views(flat, fields), named_views(variances, fields)
-    by_top = {"q.out": by_value}
-    roundings = (UNIT * np.abs(by_value)) ** 2  # of `by_value` to float32
-    if spec.dueling:
-        by_top = {"q.out": by_value - by_value.mean(1, keepdims=True), "q.value": by_value.sum(1, keepdims=True)}
-        roundings = (actions + 1) * (UNIT * np.abs(by_value).sum(1, keepdims=True)) ** 2
-    for top, by_output in by_top.items():
-        names = [*hidden_names(spec), top]
-        layers = [(weights[f"{name}.weight"], weights[f"{name}.bias"]) for name in names]
-        found = gradient_variances(
-            layers, x, by_output, np.broadcast_to(roundings, by_output.shape), spec.activation == "relu"
-        )
-        for name, (weight, bias) in zip(names, found, strict=True):
-            of_field[f"{name}.weight"] += weight
-            of_field[f"{name}.bias"] += bias
-    return tolerance_of(len(by_top) * variances)
 
 
 def outputs_and_gradients(spec: PolicySpec, rows: int, seed: int) -> None:
@@ -88,7 +62,7 @@ def outputs_and_gradients(spec: PolicySpec, rows: int, seed: int) -> None:
         tolerance = tolerance + of_value[0] + tolerance.mean(1, keepdims=True) + 8 * UNIT * np.abs(found).max()
     assert_within(found, values.detach().numpy().T, tolerance.T)
     without.backward(by_value.astype(np.float32))
-    assert_within(net.flat_grad.numpy(), expected, gradient_tolerance(spec, net.flat.numpy(), x, by_value.T))
+    assert_within(net.flat_grad.numpy(), expected, q_gradient_tolerance(spec, net.flat.numpy(), x, by_value.T))
 
 
 @given(
