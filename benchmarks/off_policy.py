@@ -1,6 +1,6 @@
 """The effect of V-trace: A2C and IMPALA on CartPole-v1, with new and old weights (`python -m benchmarks.off_policy`).
 
-The law: two runs differ only in the algorithm, `max_lag` and the seed. With `max_lag` 0 both algorithms compute the same
+Rule: two runs differ only in the algorithm, `max_lag` and the seed. With `max_lag` 0 both algorithms compute the same
 update. With 8, rollouts may be eight versions old when they are used; A2C ignores this, and V-trace corrects for it. The
 actual lag of a run is measured. These are whole runs of `millrace.train`. The figure is docs/off_policy.png.
 """

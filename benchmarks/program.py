@@ -1,6 +1,6 @@
 """`millrace bench [NAME [flags]]`, or `python -m benchmarks.program`: runs one benchmark, or all of them in turn.
 
-The law: each benchmark is a module with a `main` and runs in its own process, so it does not inherit threads, imports or
+Rule: each benchmark is a module with a `main` and runs in its own process, so it does not inherit threads, imports or
 memory of another. It prints its results and writes them to `benchmarks/results`.
 """
 

@@ -1,6 +1,6 @@
 """Programs that train CartPole-v1 with the same settings: millrace, as its command line runs it, and other systems.
 
-The law: all get the same hyperparameters, one torch thread, and a process tree of their own with a cold start. The first
+Rule: all get the same hyperparameters, one torch thread, and a process tree of their own with a cold start. The first
 lines of each program in `benchmarks/peers` say which settings that system does not have.
 """
 

@@ -1,10 +1,10 @@
 """One learner before 10, 100 and 1,000 simulated workers: `python -m benchmarks.scale`.
 
-The learner's side is the real one (link, roster, hub, stacking into a batch); its update does nothing. The workers are
+The learner's side is the real one (link, coordinator, hub, stacking into a batch); its update does nothing. The workers are
 `simulated.py`: real sockets over loopback TCP, real messages, rollouts of 9 KB, answered at once. One lane for each worker,
 one rollout of every lane for each update. CPU is that of the learner's whole process, ZeroMQ's thread included.
 
-The law: not one rollout may be lost, and the CPU that a rollout costs must not grow with the number of workers.
+Rule: not one rollout may be lost, and the CPU that a rollout costs must not grow with the number of workers.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from rich.table import Table
 from benchmarks.simulated import POLICY, VERSIONS, run_spec, simulate, table
 from benchmarks.writing import write
 from learner.rollouts.hub import Hub, HubSettings
-from learner.rollouts.roster import Roster
+from learner.rollouts.ticket_coordinator import TicketCoordinator
 from protocol.policy.layout import acting_size, buffer_size
 from protocol.rollout import stack_rollouts
 from protocol.wire.learner_link import LearnerLink
@@ -72,8 +72,8 @@ def learn(workers: int, seconds: float, transport: str, folder: Path, told: Conn
     me = psutil.Process()
     run = run_spec(workers)
     link = LearnerLink(f"ipc://{folder}/learner" if transport == "ipc" else "tcp://127.0.0.1:*")
-    roster = Roster(run, rollouts_per_update=workers, max_lag=0, worker_timeout_s=10, first_session=1)
-    hub = Hub(link, roster, HubSettings(no_workers_timeout_s=60, stall_timeout_s=30, max_env_failures=0))
+    coordinator = TicketCoordinator(run, rollouts_per_update=workers, max_lag=0, worker_timeout_s=10, first_session=1)
+    hub = Hub(link, coordinator, HubSettings(no_workers_timeout_s=60, stall_timeout_s=30, max_env_failures=0))
     parameters = np.zeros(acting_size(POLICY), np.float32)
     buffers = np.zeros(buffer_size(POLICY), np.float32)
     published_s: list[float] = []
@@ -92,17 +92,17 @@ def learn(workers: int, seconds: float, transport: str, folder: Path, told: Conn
         stack_rollouts([arrived.rollout for arrived in hub.gather()])
         publish()
     warm_mb = _resident_mb(me)
-    first, bytes_before, used_before = len(published_s), link.received.bytes, roster.ledger.used
+    first, bytes_before, used_before = len(published_s), link.received.bytes, coordinator.ledger.used
     cpu_s, python_s, began_s = time.process_time(), time.thread_time(), time.monotonic()
     while time.monotonic() - began_s < seconds and len(published_s) < VERSIONS:
         stack_rollouts([arrived.rollout for arrived in hub.gather()])
         publish()
     took_s = time.monotonic() - began_s
     cpu_s, python_s = time.process_time() - cpu_s, time.thread_time() - python_s
-    used = roster.ledger.used - used_before
+    used = coordinator.ledger.used - used_before
     received_bytes = link.received.bytes - bytes_before
     growth_mb = _resident_mb(me) - warm_mb
-    counts = roster.ledger.counts()
+    counts = coordinator.ledger.counts()
     lost = counts["lost"] + counts["stale"] + sum(counts[f"transitions_{why}"] for why in ("duplicate", "late", "invalid"))
     lost += counts["messages_bad"] + abs(counts["issued"] - counts["used"] - counts["outstanding"])
     for _ in range(2):  # so that the weights measured last arrive

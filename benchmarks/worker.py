@@ -20,12 +20,12 @@ from rich.table import Table
 from benchmarks.writing import write
 from learner.config.layers import resolve
 from learner.rollouts.hub import Hub, HubSettings
-from learner.rollouts.roster import Roster
+from learner.rollouts.ticket_coordinator import TicketCoordinator
 from learner.run_spec import run_spec
 from protocol.env_spec import EnvSpec
 from protocol.policy.layout import buffer_size, parameter_layout, total_size
 from protocol.wire.learner_link import LearnerLink
-from workers.host import WorkerCommand, WorkerProcess
+from workers.supervisor import WorkerCommand, WorkerProcess
 
 CASES = {
     "MLP, CartPole-v1": EnvSpec("CartPole-v1"),
@@ -39,8 +39,8 @@ def start_one(env: EnvSpec) -> tuple[float, float]:
     acting, _ = parameter_layout(run.policy)
     with tempfile.TemporaryDirectory() as folder:
         link = LearnerLink(f"ipc://{folder}/learner")
-        roster = Roster(run, rollouts_per_update=1, max_lag=0, worker_timeout_s=60, first_session=1)
-        hub = Hub(link, roster, HubSettings(no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=0))
+        coordinator = TicketCoordinator(run, rollouts_per_update=1, max_lag=0, worker_timeout_s=60, first_session=1)
+        hub = Hub(link, coordinator, HubSettings(no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=0))
         hub.publish(0, np.zeros(total_size(acting), np.float32), np.zeros(buffer_size(run.policy), np.float32))
         began_s = time.perf_counter()
         worker = WorkerProcess(WorkerCommand(link.address, "w0", Path(folder) / "log"))

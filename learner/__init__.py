@@ -1,1 +1,1 @@
-"""Learns: the loop, the roster of workers, the algorithms. Open train.py first. Never imports workers."""
+"""Learns: the loop, the coordinator of workers, the algorithms. Open train.py first. Never imports workers."""

@@ -1,6 +1,6 @@
 """What a run writes while it goes on: metrics, checkpoints, the policy, the summary.
 
-The law: a checkpoint is written between two updates, never within one, and holds everything that the next update depends
+Rule: a checkpoint is written between two updates, never within one, and holds everything that the next update depends
 on. A disk that is full costs a warning, never the run.
 """
 
@@ -14,7 +14,7 @@ from learner.algorithms import Algorithm
 from learner.config.config import Config
 from learner.evaluations import Evaluations, warn_on_error
 from learner.recording.training_recorder import TrainingRecorder
-from learner.rollouts.arrived_rollout import ArrivedRollout
+from learner.rollouts.accepted_rollout import AcceptedRollout
 from learner.rollouts.hub import HubSnapshot
 from learner.run_folder import checkpoint
 from learner.run_folder.episode_window import EpisodeWindow
@@ -75,7 +75,7 @@ class Journal:
             training_return=self._window.return_mean if self._window.full else None,
         )
 
-    def gathered(self, rollouts: Sequence[ArrivedRollout]) -> None:
+    def gathered(self, rollouts: Sequence[AcceptedRollout]) -> None:
         """Record the episodes of these rollouts, if the run records episodes. An update will use them next."""
         if self._recorder is not None:
             self._recorder.add(rollouts)

@@ -1,6 +1,6 @@
 """The learner's `/metrics` for Prometheus, by Prometheus's naming conventions.
 
-The law: the training loop publishes a whole snapshot in one assignment now and then, and never waits. The server's threads
+Rule: the training loop publishes a whole snapshot in one assignment now and then, and never waits. The server's threads
 read the newest snapshot and nothing else. Labels have few values, all of them ours: no names of workers, paths or keys.
 """
 

@@ -1,4 +1,4 @@
-"""One learner, put together from its parts: link, roster, hub, service, algorithm, journal.
+"""One learner, put together from its parts: link, coordinator, hub, service, algorithm, journal.
 
 It is made in two steps. `set_up` settles what needs no PyTorch: the environment's spaces and the run folder. A launcher then
 starts its worker processes, and they are ready by the time that `Run` has imported PyTorch. Who the workers are, this file
@@ -21,9 +21,9 @@ from learner.config.config import Config
 from learner.env_spaces import EnvSpaces, env_spaces
 from learner.interrupts import Interrupts
 from learner.members.endpoint import join_lines, keyring_for
-from learner.members.worker_processes import WorkerProcesses
+from learner.members.process_callbacks import ProcessCallbacks
 from learner.rollouts.hub import Hub, HubObserver, HubSettings
-from learner.rollouts.roster import Roster
+from learner.rollouts.ticket_coordinator import TicketCoordinator
 from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import Interrupted, RunFolder
 from learner.service import RolloutService
@@ -70,7 +70,7 @@ class Run:
         self,
         setup: RunSetup,
         link: LearnerLink,
-        processes: WorkerProcesses,
+        processes: ProcessCallbacks,
         watch: Watch,
         observer: HubObserver,
     ) -> None:
@@ -96,7 +96,7 @@ class Run:
         if setup.resumed:
             state = restore(self.folder, self.algorithm)
             self.folder.write_config(config)
-        roster = Roster(
+        coordinator = TicketCoordinator(
             spec,
             rollouts_per_update=config.lanes,
             max_lag=config.max_lag,
@@ -109,7 +109,7 @@ class Run:
             config.no_workers_timeout_s, config.stall_timeout_s, config.max_env_failures, config.weights_dtype
         )
         self._interrupts = Interrupts()
-        hub = Hub(link, roster, settings, processes, self._check_interrupt, observer)
+        hub = Hub(link, coordinator, settings, processes, self._check_interrupt, observer)
         self.service = RolloutService(hub, spec, processes.expected)
         self.journal = Journal(config, self.folder, spec, self.algorithm, self.service, state, watch)
         self.folder.keep()
@@ -146,7 +146,7 @@ def serve(config: Config, resume: Path | None, watch: Watch) -> Path:
         stack.callback(link.close)
         observer = stack.enter_context(prometheus_observer(config))
         setup = stack.enter_context(set_up(config, EnvSpec.of(config.env, config.env_kwargs), resume))
-        run = Run(setup, link, WorkerProcesses(), watch, observer)
+        run = Run(setup, link, ProcessCallbacks(), watch, observer)
         for line in join_lines(link.address, config.advertise, keyring):
             log.warning("%s", line)
         run.train(config.min_workers or 1)

@@ -1,13 +1,13 @@
 """The workers as a training loop sees them: wait for workers, publish, gather, evaluate, drain, take a snapshot.
 
 This is all that `learner.train` knows of the rest. Who starts worker processes is not known here either: the launchers in
-`millrace` pass them in as `WorkerProcesses`.
+`millrace` pass them in as `ProcessCallbacks`.
 """
 
 from __future__ import annotations
 
 from learner.evaluate import evaluate
-from learner.rollouts.arrived_rollout import ArrivedRollout
+from learner.rollouts.accepted_rollout import AcceptedRollout
 from learner.rollouts.hub import Hub, HubSnapshot
 from learner.run_folder.progress import Progress
 from learner.run_folder.results import Evaluation
@@ -35,7 +35,7 @@ class RolloutService:
         """
         self._hub.publish(version, parameters, buffers)
 
-    def gather(self) -> list[ArrivedRollout]:
+    def gather(self) -> list[AcceptedRollout]:
         """Wait for the rollouts of the next update. Raises `RunError` when the run cannot go on."""
         return self._hub.gather()
 

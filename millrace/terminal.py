@@ -1,6 +1,6 @@
 """Shows the progress of a run: as a live block on a terminal, as a line every few seconds elsewhere, or as JSON.
 
-The law: it never slows the run (at most five redraws a second), the last progress is always shown, and a reader that has
+Rule: it never slows the run (at most five redraws a second), the last progress is always shown, and a reader that has
 gone (`| head`) does not end the run. Warnings of the log are shown above the block.
 """
 

@@ -1,6 +1,6 @@
 """Addresses: which are valid, which only this machine can reach, and what to type on another machine.
 
-The law: an address counts as reachable by others unless it certainly is not. An IPv6 address stands in brackets. Pure,
+Rule: an address counts as reachable by others unless it certainly is not. An IPv6 address stands in brackets. Pure,
 except for `needs_ipv6` and `resolves`, which ask the system's resolver about names.
 """
 

@@ -12,7 +12,7 @@
     │       └── EnvironmentFailed 1   the environment raised too often; the text carries the worker's own traceback
     └── TheirError            counted and answered, never raised into the loop: a peer sent something wrong
         ├── BadMessage            not a valid message: shape, size, type or version
-        └── BadRollout            a rollout that breaks the law of a row
+        └── BadRollout            a rollout that breaks the row format
 
 A message is one line: who, what, expected, got, what to do next.
 """
@@ -83,4 +83,4 @@ class BadMessage(PeerError):
 
 
 class BadRollout(PeerError):
-    """A rollout that breaks the law of a row or does not fit the run."""
+    """A rollout that breaks the row format or does not fit the run."""

@@ -1,6 +1,6 @@
 """Limits how often a log line is repeated. Pure: `now` is an argument.
 
-The law: a peer that causes log lines can neither cause many of them nor make this table grow.
+Rule: a peer that causes log lines can neither cause many of them nor make this table grow.
 """
 
 from __future__ import annotations

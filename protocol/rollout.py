@@ -1,4 +1,4 @@
-"""The law of a row. Pure: arrays in, arrays out.
+"""The row format. Pure: arrays in, arrays out.
 
 Row t says: in `obs[t]` we did `action[t]`, got `reward[t]` and saw `obs[t+1]`, wherever `valid[t]`. This is gymnasium's
 NEXT_STEP autoreset: the step after an episode's end only resets that copy, so its row holds no transition and is not valid.
@@ -75,7 +75,7 @@ def rollout_bytes(run: RunSpec) -> int:
 
 
 def validate(rollout: Rollout, run: RunSpec) -> None:
-    """Raise `BadRollout`, in one line, if the rollout does not fit the run or breaks the law of a row."""
+    """Raise `BadRollout`, in one line, if the rollout does not fit the run or breaks the row format."""
     T, N = run.rollout_steps, run.copies
     action = run.policy.action
     expected: list[tuple[str, Array, tuple[int, ...], str]] = [

@@ -1,6 +1,7 @@
 """The worker program: `python -m workers ADDRESS` or `millrace worker ADDRESS`. Imports torch only for an image policy.
 
-Exit codes: 0 drained, asked to leave, or its host has ended; 1 failed, or no learner answered; 2 refused, or bad usage.
+Exit codes: 0 drained, asked to leave, or its supervisor has ended; 1 failed, or no learner answered; 2 refused, or bad
+usage.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ from protocol.keys.key_folder import TOKEN_VARIABLE, read_token
 from protocol.keys.keys import Token
 from protocol.wire.shared_memory import InheritedDescriptors
 from protocol.wire.worker_link import WorkerLink
-from workers.host import EXIT_NO_LEARNER, Host, WorkerCommand, WorkerProcess, core_flags
 from workers.security import allowed_code, checked_token
 from workers.session import NO_LEARNER, Session
+from workers.supervisor import EXIT_NO_LEARNER, Supervisor, WorkerCommand, WorkerProcess, core_flags
 from workers.watchdog import Watchdog
 from workers.worker import Worker, WorkerOptions, identity, parent_is_gone
 
@@ -41,7 +42,7 @@ def main(argv: list[str] | None = None, prog: str = "python -m workers") -> int:
     try:
         token = checked_token(flags.address, read_token(flags.token), insecure=flags.insecure)
         if flags.processes != 1:
-            return _host(flags, token)
+            return _supervise(flags, token)
         link = WorkerLink(flags.address, flags.name, token=token)
     except UserFacingError as error:
         sys.stderr.write(f"worker {flags.name}: {error}\n")
@@ -104,7 +105,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     faults.add_argument(
         "--parent", type=int, default=0, metavar="PID", help="leave when the process PID is no longer the parent"
     )
-    parser.add_argument("--handed", default="", help=argparse.SUPPRESS)  # file descriptors of shared memory, from its host
+    parser.add_argument("--handed", default="", help=argparse.SUPPRESS)  # descriptors of shared memory
     return parser
 
 
@@ -125,13 +126,13 @@ def _work(flags: argparse.Namespace, link: WorkerLink, code: AllowedCode) -> int
     if watchdog:
         watchdog.stop()
     if flags.parent and parent_is_gone(flags.parent):
-        _remove_socket_of_killed_host(flags.address)
+        _remove_socket_of_killed_parent(flags.address)
     if left.exit_code:
         sys.stderr.write(f"worker {flags.name}: {_explained(left.reason, link)}\n")
     return EXIT_NO_LEARNER if flags.parent and left.reason.startswith(NO_LEARNER) else left.exit_code
 
 
-def _host(flags: argparse.Namespace, token: Token | None) -> int:
+def _supervise(flags: argparse.Namespace, token: Token | None) -> int:
     """Run many workers, each in a process of its own, and watch them here; the exit code."""
     if flags.processes < 1:
         raise UsageError(f"processes expected int >= 1, got {flags.processes}")
@@ -144,7 +145,7 @@ def _host(flags: argparse.Namespace, token: Token | None) -> int:
         return WorkerProcess(WorkerCommand(flags.address, f"{flags.name}-{name}", token=token, flags=own_flags))
 
     signals = _count_signals()
-    return Host(start, flags.processes).run(lambda: len(signals), lambda line: log.warning("%s", line))
+    return Supervisor(start, flags.processes).run(lambda: len(signals), lambda line: log.warning("%s", line))
 
 
 def _count_signals() -> list[int]:
@@ -155,8 +156,8 @@ def _count_signals() -> list[int]:
     return received
 
 
-def _remove_socket_of_killed_host(address: str) -> None:
-    """Remove the socket, and the folder that the host made for it: a killed host could not."""
+def _remove_socket_of_killed_parent(address: str) -> None:
+    """Remove the socket, and the folder that the learner made for it: a killed learner could not."""
     scheme, _, path = address.partition("://")
     if scheme == "ipc" and Path(path).parent.name.startswith("millrace-"):
         Path(path).unlink(missing_ok=True)

@@ -1,6 +1,6 @@
 """Heartbeats from a second thread while the first thread runs the environment's code, where a step may take minutes.
 
-The law: only one thread at a time uses the link and the session. The first thread holds their lock, and releases it only
+Rule: only one thread at a time uses the link and the session. The first thread holds their lock, and releases it only
 while it runs the environment's code; meanwhile the second thread acquires it now and then, for a moment.
 """
 

@@ -1,6 +1,6 @@
 """Security rules of a worker: to which learner it connects, and which code it runs for that learner. Pure.
 
-The law: a learner that is authenticated by its key, or that only this user can be (ipc, inproc), is trusted. A learner on
+Rule: a learner that is authenticated by its key, or that only this user can be (ipc, inproc), is trusted. A learner on
 this machine is trusted a little. Any other is not trusted, and the worker connects to it only with --insecure.
 """
 

@@ -1,6 +1,6 @@
 """The worker's half of the conversation. Pure: messages and `now` in, effects out; no socket, clock, thread or environment.
 
-The law: a rollout starts only under weights at least as new as its ticket asks for. A message that is lost does no harm,
+Rule: a rollout starts only under weights at least as new as its ticket asks for. A message that is lost does no harm,
 because the next Heartbeat lists all tickets that this worker holds, and the learner sends again what is missing. What a
 worker holds is in `collect/held_rollouts.py` and `step/held_orders.py`.
 """

@@ -1,6 +1,6 @@
 """Runs a session: connects it with the link, the collector or stepper, and signals. All decisions are the session's.
 
-The law: the worker reads all messages before a rollout starts, and again between env steps, so it answers while it collects
+Rule: the worker reads all messages before a rollout starts, and again between env steps, so it answers while it collects
 and acts under the newest weights that it holds. Every failure of the environment is reported to the learner. In a vector
 environment, where one step may take as long as the caller allows, a second thread sends the heartbeats.
 """

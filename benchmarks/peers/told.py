@@ -1,6 +1,6 @@
 """What every peer's program shares: the settings it is given, a line for each update, and when the task is solved.
 
-The law: all peers are asked the same question by the same code: greedy episodes, as often as ours are. Seconds spent here
+Rule: all peers are asked the same question by the same code: greedy episodes, as often as ours are. Seconds spent here
 count as theirs, as they do for ours.
 """
 

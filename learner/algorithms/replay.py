@@ -5,7 +5,7 @@ terminated, and the slot of the next observation. So each observation is stored 
 from slot to slot when they are drawn. A slot without a row holds the final observation of a truncated episode, or the
 newest observation of an env copy, whose row comes with its next rollout.
 
-The law: rows that are not valid are never stored. A row's next observation is newer than the row, and the ring overwrites
+Rule: rows that are not valid are never stored. A row's next observation is newer than the row, and the ring overwrites
 the oldest slot first. So a row that is still stored always finds the rows that follow it.
 """
 

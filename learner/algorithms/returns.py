@@ -1,6 +1,6 @@
 """Returns and advantages. Pure: arrays [T, N] in, arrays [T, N] out; T steps of N env copies.
 
-Every function follows the law of a row (`protocol.rollout`): row t bootstraps from `values[t+1]`, the value of `obs[t+1]`,
+Every function follows the row format (`protocol.rollout`): row t bootstraps from `values[t+1]`, the value of `obs[t+1]`,
 which is the true final observation of a truncated episode. Nothing flows across the end of an episode. A row that is not
 valid gives zero and affects no other row, whatever its contents.
 """

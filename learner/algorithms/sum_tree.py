@@ -1,6 +1,6 @@
 """A sum tree: draws indices in proportion to their weights and changes weights, in logarithmic time. numpy, vectorized.
 
-The law: every inner node is the sum of its two children and is computed again when one of them changes. So the tree is a
+Rule: every inner node is the sum of its two children and is computed again when one of them changes. So the tree is a
 function of its leaves, bit for bit, and rounding errors do not accumulate.
 """
 

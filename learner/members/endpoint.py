@@ -1,6 +1,6 @@
 """Where a learner listens, who may connect, and what to type on another machine.
 
-The law: an address that other machines can reach needs keys, unless the user says `insecure`. Keys are made automatically at
+Rule: an address that other machines can reach needs keys, unless the user says `insecure`. Keys are made automatically at
 first use. On loopback they are needed only if a key folder was named. Between processes that share a file or memory, the
 operating system decides who may connect.
 """

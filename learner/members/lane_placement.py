@@ -1,6 +1,6 @@
 """Assignment of lanes to workers. Pure: no clock, no socket.
 
-The law: every lane has an owner as long as there are workers, and no worker has two lanes more than another. A lane moves
+Rule: every lane has an owner as long as there are workers, and no worker has two lanes more than another. A lane moves
 only between its rollouts. Placement is computed again only after an event that can change it: with a thousand workers, to
 look at all of them at each rollout would cost more than the rollout.
 """

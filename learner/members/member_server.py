@@ -1,6 +1,6 @@
 """The server of members: what every learner does for the workers that are connected to it. A shell: link, clock and log.
 
-The law: the inbox is emptied before silence is judged, and a learner that was away listens for a while first. So a long
+Rule: the inbox is emptied before silence is judged, and a learner that was away listens for a while first. So a long
 update, or a stopped process, never costs a healthy worker its membership.
 """
 
@@ -34,7 +34,7 @@ from protocol.wire.learner_link import LearnerLink
 AWAY_S = 0.5  # a learner that has not listened for longer was busy, or its process was stopped
 
 
-class MemberRoster(Protocol):
+class MemberCoordinator(Protocol):
     """The pure part of a hub: messages in, answers out."""
 
     membership: Membership[Any]
@@ -88,7 +88,7 @@ class MemberServer:
     def __init__(
         self,
         link: LearnerLink,
-        roster: MemberRoster,
+        coordinator: MemberCoordinator,
         callbacks: ServerCallbacks,
         ended: Callable[[], Iterable[tuple[str, str]]],
         settings: ServerSettings | None = None,
@@ -97,8 +97,8 @@ class MemberServer:
         """`ended` names the workers whose processes have ended since the last call, each with the reason."""
         self.listened_s = clock()
         """when this last listened"""
-        self._link, self._roster, self._callbacks, self._ended = link, roster, callbacks, ended
-        self._membership = roster.membership
+        self._link, self._coordinator, self._callbacks, self._ended = link, coordinator, callbacks, ended
+        self._membership = coordinator.membership
         self._settings, self._clock = settings or ServerSettings(), clock
         self._log, self._keys = MemberLog(link, clock), KeyRevocation(link)
         self._judge_silence_from_s = self.listened_s
@@ -116,7 +116,7 @@ class MemberServer:
             self._judge_silence_from_s = now + self._settings.grace_s
         self.listened_s = now
         if now >= self._judge_silence_from_s:
-            self.send(self._roster.remove_silent(now))
+            self.send(self._coordinator.remove_silent(now))
 
     def receive(self, timeout_s: float) -> None:
         """Wait at most `timeout_s` for messages and answer all that have come."""
@@ -126,7 +126,7 @@ class MemberServer:
             now = self._clock()
             if isinstance(message, BadMessage):
                 self.complain(peer, f"message from {worker_name(peer)[:40]!r}: {message}")
-                self.send(self._roster.reject_message(peer, str(message), now))
+                self.send(self._coordinator.reject_message(peer, str(message), now))
             elif isinstance(message, Inquire):
                 self._link.send(peer, encode(self._callbacks.status(now)))
             else:
@@ -182,14 +182,14 @@ class MemberServer:
 
     def _revoke_keys(self) -> None:
         for peer, why in self._keys.revoked(self._membership.members):
-            self.send(self._roster.revoke(peer, why))
+            self.send(self._coordinator.revoke(peer, why))
 
     def _reap(self, last_words_s: float) -> None:
         """Remove the workers whose processes have ended."""
         for worker, why in self._ended():
             if last_words_s:
                 self.receive(last_words_s)
-            self.send(self._roster.remove_worker(worker, why))
+            self.send(self._coordinator.remove_worker(worker, why))
 
     def _frames(self, message: ToWorker) -> Sequence[Buffer]:
         """Frames of a message. Weights are encoded once, however many workers there are."""

@@ -1,6 +1,6 @@
 """Membership of workers: joining, sessions, names, refusals, leaving. Pure: messages and `now` in, messages out.
 
-The law: one process has one session at a time. A repeated Hello is answered by the same Welcome. A Hello of a new attempt,
+Rule: one process has one session at a time. A repeated Hello is answered by the same Welcome. A Hello of a new attempt,
 or of another process under the same name, ends the session before it. A process that was refused stays refused. A worker
 that is silent for too long is removed.
 """

@@ -1,6 +1,6 @@
 """Rows of rollouts -> whole episodes. Pure: arrays in, arrays out.
 
-The law: every valid row is in exactly one whole episode, or waits for its episode to end (`waiting`), or is counted as left
+Rule: every valid row is in exactly one whole episode, or waits for its episode to end (`waiting`), or is counted as left
 out (`left_out`). A reset row is in no episode. An episode that spans several rollouts is assembled only if all of them
 arrived, in order, from the same incarnation of their lane, so no episode has a hole.
 """

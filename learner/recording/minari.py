@@ -1,6 +1,6 @@
 """Writes a Minari dataset. Minari is an optional dependency and is imported only when it is needed.
 
-The law: the dataset is there whole or not at all; if writing fails, everything that Minari made for it is removed. At most
+Rule: the dataset is there whole or not at all; if writing fails, everything that Minari made for it is removed. At most
 about `CHUNK_BYTES` of episodes are held in memory. Images are stored as they are, not as JPEG.
 """
 

@@ -1,6 +1,6 @@
 """A .npy file with a row [observation, action] for each step: float32, flattened (what the teaching notebooks read).
 
-The law: the file is there whole or not at all.
+Rule: the file is there whole or not at all.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """`millrace record`: episodes of a run's policy as a Minari dataset, and if wanted as a .npy file of rows.
 
-The law: a dataset consists of whole episodes with raw rewards, and is there whole or not at all. Episodes are played one
+Rule: a dataset consists of whole episodes with raw rewards, and is there whole or not at all. Episodes are played one
 after another on one env copy, so that short ones are not favored. Each has its own reset seed, which is stored with it. The
 last episode is finished, so a dataset may have more steps than requested. Only if it would double their number, it is cut,
 and its last step is marked truncated.

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from learner.recording.episodes import EpisodeAssembler
 from learner.recording.minari import MinariDataset
-from learner.rollouts.arrived_rollout import ArrivedRollout
+from learner.rollouts.accepted_rollout import AcceptedRollout
 from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import make_action_converter
 from protocol.specs import PolicySpec
@@ -30,7 +30,7 @@ class TrainingRecorder:
             self._env.close()
             raise
 
-    def add(self, rollouts: Sequence[ArrivedRollout]) -> None:
+    def add(self, rollouts: Sequence[AcceptedRollout]) -> None:
         """Add the rollouts of an update."""
         for arrived in rollouts:
             for episode in self._assembler.add(arrived.rollout, arrived.incarnation):

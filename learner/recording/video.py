@@ -1,6 +1,6 @@
 """`millrace evaluate --video`: greedy episodes as mp4 files, by gymnasium's RecordVideo, whose packages are optional.
 
-The law: a video is in the folder whole or not at all. Its name has the seed and the number of the episode, so the same
+Rule: a video is in the folder whole or not at all. Its name has the seed and the number of the episode, so the same
 episode overwrites its old video.
 """
 

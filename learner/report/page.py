@@ -1,6 +1,6 @@
 """The report: one HTML page that compares runs.
 
-The law: the page is one file. It loads nothing from the network and runs no script; its Content-Security-Policy forbids
+Rule: the page is one file. It loads nothing from the network and runs no script; its Content-Security-Policy forbids
 both. All its data come from the run folders, and text from them is escaped. The same runs give the same bytes.
 """
 

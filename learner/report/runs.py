@@ -1,6 +1,6 @@
 """The data of the page: what is read from each run folder, and which runs form a group.
 
-The law: a run that has not finished is described as far as its metrics go. Runs form a group if all their settings but the
+Rule: a run that has not finished is described as far as its metrics go. Runs form a group if all their settings but the
 seed and the folder are the same.
 """
 

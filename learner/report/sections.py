@@ -1,6 +1,6 @@
 """The sections of the page, as HTML text: results, curves, videos, settings. Pure but for reading the videos.
 
-The law: text from run folders is escaped.
+Rule: text from run folders is escaped.
 """
 
 from __future__ import annotations

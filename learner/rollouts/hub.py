@@ -1,6 +1,6 @@
-"""The hub: all that the training loop knows of workers. A shell round the roster. `gather` is the only place that waits.
+"""The hub: link, ticket coordinator and clock together. `gather` is the only place where a training loop waits.
 
-The law: every wait has a deadline and says what it waits for.
+Rule: every wait has a deadline and says what it waits for.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from learner.members.events import EnvironmentRaised, Event
 from learner.members.member_server import MemberServer, ServerCallbacks
 from learner.members.membership import Outgoing
+from learner.members.process_callbacks import ProcessCallbacks
 from learner.members.states import MemberState
-from learner.members.worker_processes import WorkerProcesses
-from learner.rollouts.arrived_rollout import ArrivedRollout
+from learner.rollouts.accepted_rollout import AcceptedRollout
 from learner.rollouts.ledger import Ledger
-from learner.rollouts.roster import CollectingMember, Roster
 from learner.rollouts.status import status
+from learner.rollouts.ticket_coordinator import CollectingMember, TicketCoordinator
 from learner.rollouts.weight_age import WeightAge
 from learner.run_folder.progress import Progress
 from protocol.address import worker_name
@@ -100,17 +100,17 @@ class Hub:
     def __init__(
         self,
         link: LearnerLink,
-        roster: Roster,
+        coordinator: TicketCoordinator,
         settings: HubSettings,
-        processes: WorkerProcesses | None = None,
+        processes: ProcessCallbacks | None = None,
         check_interrupt: Callable[[], None] = lambda: None,
         observer: HubObserver = lambda hub: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """`check_interrupt` is called while the hub waits: what it raises ends the wait."""
-        self.link, self.roster, self.settings = link, roster, settings
-        link.packed_bytes_limit = rollout_bytes(roster.run)
-        self._processes = processes or WorkerProcesses()
+        self.link, self.coordinator, self.settings = link, coordinator, settings
+        link.packed_bytes_limit = rollout_bytes(coordinator.run)
+        self._processes = processes or ProcessCallbacks()
         self._check_interrupt, self._observer, self._clock = check_interrupt, observer, clock
         self._wait_s = 0.0  # seconds spent waiting for rollouts
         self._lags: list[int] = []  # lag of each rollout of the last `gather`
@@ -120,7 +120,7 @@ class Hub:
         self._failure: EnvironmentFailed | None = None
         self._no_members_since_s: float | None = None
         callbacks = ServerCallbacks(self._answer, self._status, self._on_event)
-        self._server = MemberServer(link, roster, callbacks, self._processes.ended, clock=clock)
+        self._server = MemberServer(link, coordinator, callbacks, self._processes.ended, clock=clock)
 
     # ---------------------------------------------------------------- what the loop calls
 
@@ -135,25 +135,25 @@ class Hub:
         """
         sent = to_wire_dtype(parameters, self.settings.weights_dtype)
         self._weight_age.published(version, self._clock())
-        self._server.send(self.roster.publish(version, sent, buffers))
+        self._server.send(self.coordinator.publish(version, sent, buffers))
 
-    def gather(self) -> list[ArrivedRollout]:
+    def gather(self) -> list[AcceptedRollout]:
         """The rollouts of the next update. Raises `NoWorkers`, `Stalled` or `EnvironmentFailed`."""
         started_s = logged_s = progress_s = self._clock()
         stall_timeout_s = self.settings.stall_timeout_s
         self._turn(0.0)
         while True:
-            ready = len(self.roster.ready)
-            taken = self.roster.take()
-            self._server.send(self.roster.deal())
+            ready = len(self.coordinator.ready)
+            taken = self.coordinator.take()
+            self._server.send(self.coordinator.deal())
             if taken is not None:
                 self._wait_s += self._clock() - started_s
-                self._lags = [self.roster.version - arrived.rollout.version for arrived in taken]
+                self._lags = [self.coordinator.version - arrived.rollout.version for arrived in taken]
                 self._weight_age.used(self._lags)
                 return taken
             self._turn(POLL_S)
             now = self._clock()
-            if len(self.roster.ready) > ready:
+            if len(self.coordinator.ready) > ready:
                 progress_s = now
             if now - progress_s > stall_timeout_s:
                 raise Stalled(f"no rollout came for {stall_timeout_s:.0f} s; {self.waiting_for()}")
@@ -171,18 +171,18 @@ class Hub:
 
     def drain(self, reason: str, timeout_s: float = 5.0) -> None:
         """Ask every worker to leave and wait for their Goodbye, at most `timeout_s`. Late rollouts are counted."""
-        self._server.send(self.roster.drain(reason))
+        self._server.send(self.coordinator.drain(reason))
         self._server.wait_until_all_left(self._clock() + timeout_s, POLL_S)
-        for member in self.roster.members.values():
+        for member in self.coordinator.members.values():
             log.warning("worker %s did not say goodbye within %.0f s", member.hello.worker, timeout_s)
 
     def waiting_for(self) -> str:
         """A description of what the learner waits for, for the terminal."""
-        roster = self.roster
-        if not roster.members:
+        coordinator = self.coordinator
+        if not coordinator.members:
             return f"waiting for a worker to join at {self.link.address}{self._server.why_missing()}"
-        late = sorted({roster.members[ticket.peer].hello.worker for ticket in roster.tickets.values()})
-        have, need = len(roster.ready), roster.rollouts_per_update
+        late = sorted({coordinator.members[ticket.peer].hello.worker for ticket in coordinator.tickets.values()})
+        have, need = len(coordinator.ready), coordinator.rollouts_per_update
         return f"waiting for rollouts: have {have} of {need}, outstanding with {', '.join(late) or 'nobody'}"
 
     # ---------------------------------------------------------------- what others ask and tell
@@ -194,7 +194,7 @@ class Hub:
     def workers_alive(self) -> int:
         """Number of processes that step the environment."""
         count = self._processes.count
-        return len(self.roster.members) if count is None else count()
+        return len(self.coordinator.members) if count is None else count()
 
     def lag_histogram(self) -> dict[str, int]:
         """How many rollouts were used by lag, from the smallest; a JSON object has strings for keys."""
@@ -206,16 +206,16 @@ class Hub:
 
     def snapshot(self) -> HubSnapshot:
         """A snapshot of the current state."""
-        link, roster = self.link, self.roster
+        link, coordinator = self.link, self.coordinator
         return HubSnapshot(
             progress=self._progress,
-            version=roster.version,
-            ledger=roster.ledger.copy(),
-            incarnations=roster.incarnations(),
+            version=coordinator.version,
+            ledger=coordinator.ledger.copy(),
+            incarnations=coordinator.incarnations(),
             lags=self._lags,
             lag_counts=self._weight_age.lags.copy(),
             wait_s=self._wait_s,
-            members=tuple(roster.members.values()),
+            members=tuple(coordinator.members.values()),
             received=(link.received.messages, link.received.bytes),
             sent=(link.sent.messages, link.sent.bytes),
             refused_messages=link.refused_messages,
@@ -238,18 +238,18 @@ class Hub:
 
     def _answer(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
         if not isinstance(message, Rollout):
-            return self.roster.receive(peer, message, now)
+            return self.coordinator.receive(peer, message, now)
         try:
-            validate(message, self.roster.run)
+            validate(message, self.coordinator.run)
         except BadRollout as error:
             why = f"worker {worker_name(peer).decode(errors='replace')}: rollout of ticket {message.ticket}: {error}"
             self._server.complain(peer, why)
-            return self.roster.reject_rollout(peer, message, why, now)
+            return self.coordinator.reject_rollout(peer, message, why, now)
         self._weight_age.arrived(worker_name(peer).decode(errors="replace"), message.version, now)
-        return self.roster.receive(peer, message, now)
+        return self.coordinator.receive(peer, message, now)
 
     def _status(self, now: float) -> Status:
-        return status(self.roster, self._progress, now)
+        return status(self.coordinator, self._progress, now)
 
     def _on_event(self, event: Event) -> None:
         """Count failures of environments; too many end the run."""
@@ -263,7 +263,7 @@ class Hub:
 
     def _check_members(self) -> None:
         """Raise `NoWorkers` when there was no member for too long."""
-        if self.roster.members:
+        if self.coordinator.members:
             self._no_members_since_s = None
             return
         now, timeout_s = self._clock(), self.settings.no_workers_timeout_s

@@ -1,6 +1,6 @@
-"""A lane and a ticket as the roster of a run keeps them, and the order in which lanes get tickets. No clock, no messages.
+"""A lane and a ticket as the coordinator keeps them, and the order in which lanes get tickets. No clock, no messages.
 
-The law: a lane has one owner at a time. A new owner starts it afresh: its incarnation rises, and its rollouts are counted
+Rule: a lane has one owner at a time. A new owner starts it afresh: its incarnation rises, and its rollouts are counted
 from 0 again.
 """
 

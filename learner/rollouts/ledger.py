@@ -30,7 +30,7 @@ class Ledger(msgspec.Struct, kw_only=True):
     transitions_late: int = 0
     """transitions of rollouts of a session that had ended"""
     transitions_invalid: int = 0
-    """transitions of rollouts that broke the law of a row or did not fit the run"""
+    """transitions of rollouts that broke the row format or did not fit the run"""
 
     messages_bad: int = 0
     """messages that could not be read"""

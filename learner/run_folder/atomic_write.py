@@ -1,6 +1,6 @@
 """Writes files that are there whole or not at all.
 
-The law: a file is written beside the target under a name that ends with `.tmp`, flushed to the disk, and then renamed to the
+Rule: a file is written beside the target under a name that ends with `.tmp`, flushed to the disk, and then renamed to the
 target; the folder is flushed too. If anything fails, the target stays as it was and the temporary file is removed.
 """
 

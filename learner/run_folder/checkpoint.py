@@ -1,6 +1,6 @@
 """Checkpoints of a run: `checkpoints/<env steps>.pt`. The training loop decides when to write one.
 
-The law: a checkpoint is there whole or not at all; the newest whole one is used; and reading one executes no code
+Rule: a checkpoint is there whole or not at all; the newest whole one is used; and reading one executes no code
 (`weights_only`). A state therefore consists of tensors and plain data; a numpy generator is stored as its
 `bit_generator.state`. torch's loader does not detect damaged data, so the checksums of the file (a zip archive) are verified
 first.

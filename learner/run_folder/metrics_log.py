@@ -1,6 +1,6 @@
 """The metrics of a run on disk: metrics.jsonl and TensorBoard.
 
-The law: a file ends with a whole row. A resumed run first removes the rows that its checkpoint knows nothing of, so no curve
+Rule: a file ends with a whole row. A resumed run first removes the rows that its checkpoint knows nothing of, so no curve
 covers the same env steps twice.
 """
 

@@ -12,7 +12,7 @@
       summary.json          the results of the run (results.py)
       workers/              the logs of local worker processes
 
-The law: a file is there whole or not at all. The same policy gives the same bytes. Nothing is pickled.
+Rule: a file is there whole or not at all. The same policy gives the same bytes. Nothing is pickled.
 """
 
 from __future__ import annotations

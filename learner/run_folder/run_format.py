@@ -1,6 +1,6 @@
 """The format version of a run folder: run.json, written when the folder is made.
 
-The law: a folder of the current format or an older one can be evaluated, reported and resumed; a newer one is rejected in
+Rule: a folder of the current format or an older one can be evaluated, reported and resumed; a newer one is rejected in
 one line. Format 1 had no run.json. Raise `RUN_FORMAT` when older code could not read a folder of the new one.
 """
 

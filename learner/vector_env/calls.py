@@ -7,7 +7,7 @@ from typing import Any
 
 from learner.vector_env.batch_layout import BatchLayout
 from learner.vector_env.lane_orders import call_order
-from learner.vector_env.step_roster import MakeOrder
+from learner.vector_env.order_coordinator import MakeOrder
 from protocol.errors import EnvironmentFailed
 from protocol.messages import Answer, Returned
 from protocol.wire.plain_values import unpack

@@ -1,6 +1,6 @@
 """A `gymnasium.vector.VectorEnv` whose env copies live in worker processes, on this machine or on others.
 
-The law: the results are, bit for bit, those of `gymnasium.vector.SyncVectorEnv` for the same seeds and actions, whichever
+Rule: the results are, bit for bit, those of `gymnasium.vector.SyncVectorEnv` for the same seeds and actions, whichever
 way they travel. A lost worker is always reported, as truncated copies or as an error; it is never hidden.
 """
 
@@ -24,9 +24,9 @@ from learner.vector_env.calls import assign_orders, call_orders, call_results
 from learner.vector_env.infos import Infos, unpack_infos
 from learner.vector_env.lane_orders import packed, reset_order, step_order
 from learner.vector_env.lost_lanes import RESET_ATTEMPTS, UNKNOWN_REASON, LostLanes, replacement_seeds, worker_lost
+from learner.vector_env.order_coordinator import MakeOrder
 from learner.vector_env.spec import VectorEnvDescription
 from learner.vector_env.step_hub import StepHub
-from learner.vector_env.step_roster import MakeOrder
 from protocol.arrays import Array
 from protocol.envs.spaces import make_flatten
 from protocol.errors import BadMessage, UsageError, WorkerLost

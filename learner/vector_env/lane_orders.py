@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from learner.vector_env.step_roster import MakeOrder
+from learner.vector_env.order_coordinator import MakeOrder
 from protocol.arrays import Array, Bytes
 from protocol.messages import Call, LaneLife, Reset, Step
 from protocol.wire.plain_values import pack

@@ -1,6 +1,6 @@
 """What becomes of lanes whose worker was lost. Pure.
 
-The law: each loss is reported in exactly one step result, as truncated copies, or it is raised. The new copies of a lost
+Rule: each loss is reported in exactly one step result, as truncated copies, or it is raised. The new copies of a lost
 lane are reset before they step.
 """
 

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from learner.vector_env.step_roster import StepRoster
+from learner.vector_env.order_coordinator import OrderCoordinator
 from protocol.messages import Status
 
 
-def status(roster: StepRoster, now: float) -> Status:
+def status(coordinator: OrderCoordinator, now: float) -> Status:
     """What a vector environment knows now. It has no weights, no target and no ledger."""
-    members = roster.members.values()
+    members = coordinator.members.values()
     return Status(
-        env=", ".join(dict.fromkeys(env.id for env in roster.spec.envs)),
+        env=", ".join(dict.fromkeys(env.id for env in coordinator.spec.envs)),
         version=-1,
         env_steps=sum(member.heartbeat.steps for member in members if member.heartbeat is not None),
         total_steps=0,
@@ -18,6 +18,6 @@ def status(roster: StepRoster, now: float) -> Status:
         return_mean=None,
         lag_mean=0.0,
         lag_max=0,
-        workers=roster.membership.status(now),
+        workers=coordinator.membership.status(now),
         ledger={},
     )

@@ -1,6 +1,6 @@
-"""The hub of a vector environment: a shell round its roster and shared memory. Only `wait_for_answers` waits.
+"""The hub of a vector environment: a shell round its coordinator and shared memory. Only `wait_for_answers` waits.
 
-The law: every wait has a deadline. When it passes, the workers that have not answered are given up, and killed if they are
+Rule: every wait has a deadline. When it passes, the workers that have not answered are given up, and killed if they are
 child processes of ours. So a wait ends with every lane answered or lost. Silence is judged only while the hub listens: the
 caller may take as long as it likes between two waits.
 """
@@ -16,8 +16,8 @@ from typing import Protocol
 
 from learner.members.events import Event, WorkerLeft
 from learner.members.member_server import MemberServer, ServerCallbacks, ServerSettings
+from learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator
 from learner.vector_env.status import status
-from learner.vector_env.step_roster import MakeOrder, StepRoster
 from protocol.address import worker_name
 from protocol.errors import EnvironmentFailed
 from protocol.messages import Answer
@@ -111,7 +111,7 @@ class StepHub:
         that is silent for so long while the hub listens is given up; infinite where the end of a process is known otherwise.
         """
         self._link = link
-        self._roster = StepRoster(spec, first_session, worker_timeout_s)
+        self._coordinator = OrderCoordinator(spec, first_session, worker_timeout_s)
         self._local_workers: LocalWorkers = local_workers or NoLocalWorkers()
         self._shared, self._spin_s, self._clock = shared, spin_s, clock
         self._spin_wait = SpinWait()
@@ -128,9 +128,9 @@ class StepHub:
         # server's short grace: after a long suspension even its connection must be made anew.
         settings = ServerSettings(grace_s=worker_timeout_s, last_words_s=LAST_WORDS_S, log_tracebacks=False)
         callbacks = ServerCallbacks(
-            self._roster.receive, lambda now: status(self._roster, now), self._on_event, self._wake_sleeping
+            self._coordinator.receive, lambda now: status(self._coordinator, now), self._on_event, self._wake_sleeping
         )
-        self._server = MemberServer(link, self._roster, callbacks, self._local_workers.poll, settings, clock)
+        self._server = MemberServer(link, self._coordinator, callbacks, self._local_workers.poll, settings, clock)
 
     @property
     def address(self) -> str:
@@ -140,7 +140,7 @@ class StepHub:
     @property
     def worker_count(self) -> int:
         """Number of workers that have joined."""
-        return len(self._roster.members)
+        return len(self._coordinator.members)
 
     def call_while_waiting(self, callback: Callable[[], None]) -> None:
         """Call this now and then while waiting; what it raises ends the wait."""
@@ -150,7 +150,7 @@ class StepHub:
 
     def send_orders(self, makes: Mapping[int, MakeOrder]) -> None:
         """Send an order to each of these lanes. Lanes that have no worker are placed while `wait_for_answers` waits."""
-        self._roster.begin()
+        self._coordinator.begin()
         self.stepped.clear()
         self._waiting_orders = dict(makes)
         self._waiting_since_s = self._clock()
@@ -159,20 +159,20 @@ class StepHub:
     def shares(self, lane: int) -> bool:
         """Whether a step of this lane may go through shared memory: its worker was handed the memory."""
         if lane not in self._wake_pipes:
-            member = self._roster.owner(lane)
-            if member is None or not self._roster.lanes[lane].started or self._shared is None:
+            member = self._coordinator.owner(lane)
+            if member is None or not self._coordinator.lanes[lane].started or self._shared is None:
                 return False
             self._wake_pipes[lane] = self._shared.wake_pipes.get(member.hello.worker)
         return self._wake_pipes[lane] is not None
 
     def step_shared(self, lanes: Sequence[int]) -> None:
         """Step these lanes with the actions that are in shared memory."""
-        self._roster.begin()
+        self._coordinator.begin()
         self.stepped.clear()
         assert self._shared is not None
         memory = self._shared.memory
         for lane in lanes:
-            self._under_way[lane] = self._roster.shared_orders[lane] = number = memory.ordered(lane) + 1
+            self._under_way[lane] = self._coordinator.shared_orders[lane] = number = memory.ordered(lane) + 1
             memory.order(lane, number)
         for lane in lanes:
             pipes = self._wake_pipes[lane]
@@ -191,15 +191,15 @@ class StepHub:
         for lane in list(self._under_way):
             if lane in self._under_way:  # not lost while another was waited for
                 self._wait_for_shared_step(lane, deadline_s)
-        while self._waiting_orders or self._roster.orders:
+        while self._waiting_orders or self._coordinator.orders:
             self._turn(POLL_S)
             if self._clock() > deadline_s:
                 self._give_up(timeout_s)
         if self._clock() > self._listen_due_s:
             self._turn(0.0)
-        if self._roster.failures:
+        if self._coordinator.failures:
             self._raise_failure()
-        return dict(self._roster.answers)
+        return dict(self._coordinator.answers)
 
     def infos(self, lane: int, timeout_s: float) -> bytes:
         """The packed infos of a lane that was stepped through shared memory."""
@@ -209,9 +209,9 @@ class StepHub:
             return packed
         deadline_s = self._clock() + timeout_s
         while True:
-            if (packed := self._roster.infos.get(lane)) is not None:
+            if (packed := self._coordinator.infos.get(lane)) is not None:
                 return packed
-            if lane not in self._roster.shared_orders:
+            if lane not in self._coordinator.shared_orders:
                 return b""  # its worker is gone, and the lane is in `take_lost`
             if self._clock() > deadline_s:
                 self._give_up_lane(lane, "did not send its infos in time")
@@ -220,28 +220,28 @@ class StepHub:
 
     def refuse_owner(self, lane: int, why: str) -> None:
         """Refuse this lane's worker because it sent something unusable."""
-        if (member := self._roster.owner(lane)) is not None:
+        if (member := self._coordinator.owner(lane)) is not None:
             log.warning("worker %s: %s", member.hello.worker, why)
-            self._server.send(self._roster.reject_message(member.peer, why, self._clock()))
+            self._server.send(self._coordinator.reject_message(member.peer, why, self._clock()))
 
     def take_lost(self) -> dict[int, str]:
         """Lanes whose env copies were lost since the last call, and why."""
-        lost, self._roster.lost = self._roster.lost, {}
+        lost, self._coordinator.lost = self._coordinator.lost, {}
         return lost
 
     def is_started(self, lane: int) -> bool:
         """Whether the lane's env copies are with a worker."""
-        return self._roster.lanes[lane].started
+        return self._coordinator.lanes[lane].started
 
     def incarnation(self, lane: int) -> int:
         """Number of times that the lane was restarted on new env copies."""
-        return self._roster.lanes[lane].incarnation
+        return self._coordinator.lanes[lane].incarnation
 
     def rebalance(self) -> None:
         """Even out the lanes of the workers. Call it when all lanes are about to be reset."""
         self._turn(0.0)
         self._wake_pipes.clear()
-        self._server.send(self._roster.rebalance())
+        self._server.send(self._coordinator.rebalance())
 
     def wait_for(self, workers: int, timeout_s: float) -> None:
         """Wait until so many workers have joined. Raises `NoWorkers`."""
@@ -249,9 +249,9 @@ class StepHub:
 
     def close(self, timeout_s: float) -> None:
         """Ask every worker to leave, wait a moment for their Goodbye, and end those that are ours."""
-        busy = bool(self._under_way or self._roster.orders)
+        busy = bool(self._under_way or self._coordinator.orders)
         deadline_s = self._clock() + (min(BUSY_S, timeout_s) if busy else timeout_s)
-        self._server.send(self._roster.drain("the vector environment was closed"))
+        self._server.send(self._coordinator.drain("the vector environment was closed"))
         for pipe, _ in self._shared.wake_pipes.values() if self._shared is not None else ():
             pipe.wake(WakeReason.MESSAGE)
         self._server.wait_until_all_left(deadline_s, POLL_S)
@@ -291,17 +291,17 @@ class StepHub:
     def _on_event(self, event: Event) -> None:
         """Release the lanes of a worker that has left."""
         if isinstance(event, WorkerLeft):
-            for lane in [lane for lane in self._wake_pipes if self._roster.owner(lane) is None]:
+            for lane in [lane for lane in self._wake_pipes if self._coordinator.owner(lane) is None]:
                 del self._wake_pipes[lane]
                 self._step_ended(lane)
 
     def _send_waiting_orders(self) -> None:
-        awaited = len(self._roster.membership.active()) < self._local_workers.count  # one of ours has yet to join
+        awaited = len(self._coordinator.membership.active()) < self._local_workers.count  # one of ours has yet to join
         patient = awaited and self._clock() - self._waiting_since_s < self._patience_s
         for lane, make in list(self._waiting_orders.items()):
-            if self._roster.place(lane, patient):
+            if self._coordinator.place(lane, patient):
                 del self._waiting_orders[lane]
-                self._server.send(self._roster.order(lane, make))
+                self._server.send(self._coordinator.order(lane, make))
 
     def _wake_sleeping(self, peer: bytes) -> None:
         """Wake a worker that was sent a message: it may sleep until its next step through shared memory."""
@@ -310,20 +310,22 @@ class StepHub:
 
     def _give_up(self, timeout_s: float) -> None:
         """The deadline has passed: give up every worker that has not answered."""
-        if self._waiting_orders and not self._roster.orders:
+        if self._waiting_orders and not self._coordinator.orders:
             self._waiting_orders.clear()
             raise self._server.no_workers(1, timeout_s)
-        for order in list(self._roster.orders.values()):
+        for order in list(self._coordinator.orders.values()):
             self._give_up_lane(order.lane, f"did not answer within {timeout_s:g} s")
 
     def _give_up_lane(self, lane: int, why: str) -> None:
-        member = self._roster.owner(lane)
+        member = self._coordinator.owner(lane)
         if member is not None:
             killed = self._local_workers.kill(member.hello.worker)
-            self._server.send(self._roster.remove_worker(member.hello.worker, f"{why}, and was killed" if killed else why))
+            self._server.send(
+                self._coordinator.remove_worker(member.hello.worker, f"{why}, and was killed" if killed else why)
+            )
 
     def _raise_failure(self) -> None:
-        failure, self._roster.failures = self._roster.failures[0], []
+        failure, self._coordinator.failures = self._coordinator.failures[0], []
         error = EnvironmentFailed(f"worker {failure.worker} ({failure.host}): {failure.error}", failure.traceback)
         error.add_note(failure.traceback)
         raise error

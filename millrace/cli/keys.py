@@ -1,6 +1,6 @@
 """`millrace keys`: who may join the learners of this machine. Returns lines; the command line prints them.
 
-The law: a secret is printed only where it was asked for by name.
+Rule: a secret is printed only where it was asked for by name.
 """
 
 from __future__ import annotations

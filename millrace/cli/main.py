@@ -1,6 +1,6 @@
 """The command line: finds the command, runs it, and turns an error into one line and an exit code.
 
-The law: bad usage is one line on stderr and exit code 2. A run that failed is one line (and the worker's traceback below it,
+Rule: bad usage is one line on stderr and exit code 2. A run that failed is one line (and the worker's traceback below it,
 if there is one) and exit code 1. Ctrl-C is exit code 130. A traceback of millrace itself is shown with --debug only. Each
 command imports what it needs when it runs, so that `--help` answers at once.
 """

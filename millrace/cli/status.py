@@ -1,6 +1,6 @@
 """`millrace status ADDRESS`: ask a learner how its run is, and print the answer. Needs only a worker's packages.
 
-The law: whoever may connect may ask, and asking changes nothing; a learner that does not answer within the deadline is an
+Rule: whoever may connect may ask, and asking changes nothing; a learner that does not answer within the deadline is an
 error of one line; nothing that a peer has named can control the terminal.
 """
 
@@ -29,7 +29,7 @@ DROPS = {
     "stale": "rollouts too old",
     "transitions_duplicate": "transitions sent twice",
     "transitions_late": "transitions of sessions that had ended",
-    "transitions_invalid": "transitions that broke the law of a row",
+    "transitions_invalid": "transitions that broke the row format",
     "messages_bad": "messages that could not be read",
 }
 """What was dropped, by its name in the ledger."""

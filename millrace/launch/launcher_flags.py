@@ -1,6 +1,6 @@
 """The command line of a launcher: its own flags, and behind `--` the flags of the learner that it starts.
 
-The law: what a cluster would refuse later is refused here, before anything is written or started.
+Rule: what a cluster would refuse later is refused here, before anything is written or started.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ The learner collects from a single worker, which is a thread of this process. Th
 vector environment, whose workers are processes. So tickets, ledger, rows, checkpoints and errors are those of every run, and
 a lane gets the same seeds and random numbers as with `--inference workers`.
 
-The law: whatever happens, no worker, thread, socket file or folder of ours is left behind.
+Rule: whatever happens, no worker, thread, socket file or folder of ours is left behind.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ import zmq
 
 from learner.config.config import Config
 from learner.members.endpoint import BindSettings
-from learner.members.worker_processes import WorkerProcesses
+from learner.members.process_callbacks import ProcessCallbacks
 from learner.run import Run, Watch, prometheus_observer, set_up
 from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.settings import VectorEnvSettings
-from millrace.launch.local_workers import private_address, worker_flags
+from millrace.launch.local_worker_options import private_address, worker_flags
 from millrace.launch.vector import listen
 from protocol.env_spec import EnvSpec
 from protocol.policy.policy import Policy, make_policy
@@ -30,7 +30,7 @@ from protocol.wire.learner_link import LearnerLink
 from workers.collect.collector import Collector
 from workers.collect.split_vector_env import SplitVectorEnv
 from workers.env_loop import Pulse
-from workers.host import Host, WorkerThread
+from workers.supervisor import Supervisor, WorkerThread
 
 
 def train(
@@ -66,15 +66,15 @@ def train(
             policy = acting_policy(spec.policy, torch_device(config), spec.images_dtype)
             return Collector(spec, policy, lanes.open_lane, lanes.step_all)
 
-        host = Host(lambda name: WorkerThread(link.address, name, context, collector), 1, prefix="inference")
-        stack.callback(host.stop)
-        stack.callback(host.ask_to_leave)  # asked a second time, it leaves at once
+        supervisor = Supervisor(lambda name: WorkerThread(link.address, name, context, collector), 1, prefix="inference")
+        stack.callback(supervisor.stop)
+        stack.callback(supervisor.ask_to_leave)  # asked a second time, it leaves at once
 
         def ended() -> list[tuple[str, str]]:
             lanes.raise_if_no_workers()
-            return host.poll()
+            return supervisor.poll()
 
-        processes = WorkerProcesses(ended, lambda: env.workers, 0 if elsewhere else config.workers)
+        processes = ProcessCallbacks(ended, lambda: env.workers, 0 if elsewhere else config.workers)
         run = Run(setup, link, processes, watch, observer)
         run.train(1)
         return run.folder.path

@@ -1,6 +1,6 @@
 """A run on this machine: the learner in this process, and worker processes (over inproc: threads) that it starts.
 
-The law: whatever happens, no worker, socket file or temporary folder is left behind.
+Rule: whatever happens, no worker, socket file or temporary folder is left behind.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from pathlib import Path
 import zmq
 
 from learner.config.config import Config
-from learner.members.worker_processes import WorkerProcesses
+from learner.members.process_callbacks import ProcessCallbacks
 from learner.run import Run, Watch, prometheus_observer, set_up
-from millrace.launch.local_workers import private_address, temporary_keys, worker_flags
+from millrace.launch.local_worker_options import private_address, temporary_keys, worker_flags
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
 from protocol.keys.keys import Token
 from protocol.wire.learner_link import LearnerLink
-from workers.host import Host, Running, WorkerCommand, WorkerProcess, WorkerThread
+from workers.supervisor import Running, Supervisor, WorkerCommand, WorkerProcess, WorkerThread
 
 
 def train(config: Config, resume: Path | None, watch: Watch, factory: Callable[..., object] | None = None) -> Path:
@@ -43,9 +43,9 @@ def train(config: Config, resume: Path | None, watch: Watch, factory: Callable[.
         observer = stack.enter_context(prometheus_observer(config))
         env = EnvSpec.of(config.env if factory is None else factory, config.env_kwargs)
         setup = stack.enter_context(set_up(config, env, resume))
-        host = Host(_starter(config, link.address, token, context, setup.folder.path), config.workers)
-        stack.callback(host.stop)
-        run = Run(setup, link, WorkerProcesses(host.poll, expected=config.workers), watch, observer)
+        supervisor = Supervisor(_starter(config, link.address, token, context, setup.folder.path), config.workers)
+        stack.callback(supervisor.stop)
+        run = Run(setup, link, ProcessCallbacks(supervisor.poll, expected=config.workers), watch, observer)
         run.train(config.min_workers or config.workers)
         return run.folder.path
 

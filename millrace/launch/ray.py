@@ -1,6 +1,6 @@
 """`millrace launch ray`: the learner runs in this process, on a node of a Ray cluster; the workers run in Ray actors.
 
-The law: an actor runs the worker program and nothing else. Ray alone restarts actors and chooses their nodes. When the
+Rule: an actor runs the worker program and nothing else. Ray alone restarts actors and chooses their nodes. When the
 learner has ended, so have the actors.
 """
 

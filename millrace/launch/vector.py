@@ -1,6 +1,6 @@
 """Start a vector environment: with worker processes on this machine, or with workers that are started elsewhere.
 
-The law: whatever happens, no worker, socket file or folder of ours is left behind.
+Rule: whatever happens, no worker, socket file or folder of ours is left behind.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.settings import VectorEnvSettings
 from learner.vector_env.spec import VectorEnvDescription, describe
 from learner.vector_env.step_hub import SharedSteps, StepHub
-from millrace.launch.local_workers import WorkerFlags, private_address, temporary_keys
+from millrace.launch.local_worker_options import WorkerFlags, private_address, temporary_keys
 from protocol.address import advertised_address, check_address
 from protocol.cpu_cores import usable_cores
 from protocol.errors import UsageError
@@ -29,7 +29,7 @@ from protocol.keys.keys import Token
 from protocol.wire.learner_link import LearnerLink
 from protocol.wire.shared_memory import SUPPORTED, InheritedDescriptors, SharedMemory
 from protocol.wire.wake_up import SPIN_S, WakePipe
-from workers.host import Host, Running, WorkerCommand, WorkerProcess, WorkerThread
+from workers.supervisor import Running, Supervisor, WorkerCommand, WorkerProcess, WorkerThread
 
 log = logging.getLogger("millrace.learner")
 
@@ -72,18 +72,18 @@ class ListeningVectorEnv:
     def start(self, flags: WorkerFlags) -> ZmqVectorEnv:
         """Start the local workers with these flags. Call it once; it does not wait until workers have joined."""
         settings, count = self.settings, self.settings.local_workers
-        host = Host(self._starter(flags), count) if count else None
+        supervisor = Supervisor(self._starter(flags), count) if count else None
         hub = StepHub(
             self.link,
             self.description.step,
             first_session=int.from_bytes(os.urandom(6), "little"),
-            local_workers=host,
+            local_workers=supervisor,
             shared=self.shared,
             worker_timeout_s=WORKER_TIMEOUT_S if settings.listen.bind else math.inf,
             spin_s=SPIN_S if count < usable_cores() else 0.0,  # only if a core is left for the learner
         )
         self.resources.callback(hub.close, CLOSE_TIMEOUT_S)
-        if host is None:
+        if supervisor is None:
             for line in join_lines(self.link.address, settings.listen.advertise, self.keyring):
                 log.warning("%s", line)
         return ZmqVectorEnv(
@@ -113,7 +113,7 @@ class ListeningVectorEnv:
 
 
 def listen(settings: VectorEnvSettings, resources: ExitStack) -> ListeningVectorEnv:
-    """BindSettings the address. Closing `resources`, or the environment that is started, releases all that was acquired."""
+    """Bind the address. Closing `resources`, or the environment that is started, releases all that was acquired."""
     where, transport, count = settings.listen, settings.transport, settings.local_workers
     if where.bind and settings.workers:
         raise UsageError(f"workers expected 0 with a bind address, for they are started elsewhere, got {settings.workers}")

@@ -1,7 +1,7 @@
 """envpool's compiled environments under gymnasium's ids.
 
-The law: an id means the same environment as in gymnasium: its spaces must be gymnasium's, and its time limit is. This file
-maps ids to envpool tasks and makes the env copies; `workers/collect/envpool_copies.py` keeps the law of a row.
+Rule: an id means the same environment as in gymnasium: its spaces must be gymnasium's, and its time limit is. This file
+maps ids to envpool tasks and makes the env copies; `workers/collect/envpool_copies.py` keeps the row format.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """An environment's own vectorized form: gymnasium's `vector_entry_point`.
 
-The law: it resets in the step after an episode's end (NEXT_STEP), as a loop over env copies does. With another autoreset
+Rule: it resets in the step after an episode's end (NEXT_STEP), as a loop over env copies does. With another autoreset
 mode, final observations could not be distinguished from first ones.
 """
 

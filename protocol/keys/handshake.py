@@ -1,6 +1,6 @@
 """Explains failed handshakes, from the events of libzmq's monitor. Pure, except for `peer_host`.
 
-The law: the learner knows what was wrong with a client. A worker learns from libzmq only whether its key was refused, the
+Rule: the learner knows what was wrong with a client. A worker learns from libzmq only whether its key was refused, the
 one problem that a retry cannot solve. It sees every other problem as a connection that was closed, so its log names the
 likely causes, and it tries again.
 """

@@ -4,7 +4,7 @@
     allowed.toml    the clients that may connect: public halves, names, dates
     NAME.token      the join token of a client that was made here: secret
 
-The law: a file is written completely, with mode 0600, under a temporary name and then renamed, so no reader sees a partial
+Rule: a file is written completely, with mode 0600, under a temporary name and then renamed, so no reader sees a partial
 file or one that others can read. A secret that others can read is not used. If the list cannot be read, no new client can
 connect.
 """

@@ -1,6 +1,6 @@
 """Keys, join tokens and the list of clients that may connect, as text and as records. Pure: no files, no sockets, no clock.
 
-The law: damaged text is reported and never used in part. No repr and no error contains a secret half. A key that is not on
+Rule: damaged text is reported and never used in part. No repr and no error contains a secret half. A key that is not on
 the list, or was revoked, gives no access.
 """
 

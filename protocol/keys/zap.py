@@ -1,6 +1,6 @@
 """CURVE and ZAP: which clients may connect to the learner's port, and the log of those that may not.
 
-The law: fail closed. A CURVE server without a ZAP handler accepts every client that knows its public key, unless the server
+Rule: fail closed. A CURVE server without a ZAP handler accepts every client that knows its public key, unless the server
 sets a domain *and* enforces it. We do both, and start the handler before the port is bound. The answer to a request is a
 pure function that cannot raise: it refuses what it does not understand. libzmq asks ZAP only at the handshake; the link
 checks for every message that its key is still allowed.

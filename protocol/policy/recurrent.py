@@ -1,6 +1,6 @@
 """The recurrent core of a policy, in numpy. Pure; imports no torch.
 
-It stands between the features and the hidden layers. Each env copy has its own state [..., S]. The law of a row says where
+It stands between the features and the hidden layers. Each env copy has its own state [..., S]. The row format says where
 the state is reset: before `obs[t+1]` it is the state after `obs[t]` if row t is valid, and zeros if it is not, because that
 row is the reset. So the final observation of an episode is still processed with the state of its episode.
 

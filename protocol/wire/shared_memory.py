@@ -1,6 +1,6 @@
 """Memory that a learner shares with worker processes of the same machine, for the steps of a vector environment.
 
-The law: each counter of a lane has one writer. The learner writes the actions and then raises `ordered`; the worker writes
+Rule: each counter of a lane has one writer. The learner writes the actions and then raises `ordered`; the worker writes
 the results of the step and then raises `answered` to the same number; only then does the other side read. The memory is an
 unlinked file and the wake-up pipes have no names: child processes inherit the descriptors, so nothing is left behind when a
 process dies. Linux only; elsewhere everything travels as messages.

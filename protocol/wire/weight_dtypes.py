@@ -1,7 +1,7 @@
 """Dtypes in which weights are sent: float32, or rounded to two bytes each. Pure; imports no torch.
 
 `bfloat16` is the upper half of a float32, sent as uint16: the range of float32, 8 bits of precision. `float16` is IEEE half
-precision: 11 bits, at most 65,504. Both round to nearest, ties to even. The law: the policy acts with exactly the weights
+precision: 11 bits, at most 65,504. Both round to nearest, ties to even. Rule: the policy acts with exactly the weights
 that were sent, so its log-probabilities are those of the rounded weights. A weight that would become infinite is not sent.
 """
 

@@ -1,6 +1,6 @@
 """A real Docker Engine for one test: it runs in namespaces of its own and ends with them.
 
-The law: its network, mounts and processes are separate, so that nothing of this machine changes (no bridge, no
+Rule: its network, mounts and processes are separate, so that nothing of this machine changes (no bridge, no
 firewall rule) and nothing outlives it. It cannot reach a registry. It needs root; `why_not` says what is missing.
 """
 

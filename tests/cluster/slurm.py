@@ -1,6 +1,6 @@
 """A Slurm cluster on this one machine: munged, slurmctld and two nodes with two cores each, all on loopback, in one folder.
 
-The law: an installed Slurm's files are neither read nor changed; no daemon and no job remains when the cluster is closed.
+Rule: an installed Slurm's files are neither read nor changed; no daemon and no job remains when the cluster is closed.
 """
 
 from __future__ import annotations

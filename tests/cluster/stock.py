@@ -1,6 +1,6 @@
 """What the images are built from without a registry: a small Debian with Python as the base image, and a folder of wheels.
 
-The law: both are made once, by debootstrap and by pip with its configuration, and kept in `.cluster` beside the sources, or
+Rule: both are made once, by debootstrap and by pip with its configuration, and kept in `.cluster` beside the sources, or
 in the folder that MILLRACE_CLUSTER names.
 """
 

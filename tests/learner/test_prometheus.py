@@ -1,4 +1,4 @@
-"""What Prometheus reads: the roster's and the ledger's own numbers, well formed, and there only when asked for."""
+"""What Prometheus reads: the coordinator's and the ledger's own numbers, well formed, and there only when asked for."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from protocol.messages import Drain
 from protocol.policy.policy import make_policy
 from protocol.wire.codec import encode
 from protocol.wire.learner_link import LearnerLink
-from tests.learner.rollouts.test_roster import A, B, C, Learner
+from tests.learner.rollouts.test_ticket_coordinator import A, B, C, Learner
 from tests.support.fake_ends import run_spec
 from workers.collect.collector import Collector
 
@@ -64,7 +64,8 @@ class Scraped:
         self.exposition = MetricsCollector(Config(env="CartPole-v1"), lambda: self.now)
         asked = itertools.count()
         self.hub = Hub(
-            self.link, self.learner.roster, HubSettings(no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=0),
+            self.link, self.learner.coordinator,
+            HubSettings(no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=0),
             observer=self.exposition.observe, clock=lambda: 2 * PULSE_S * next(asked),
         )  # fmt: skip
 
@@ -99,19 +100,19 @@ def test_before_the_learner_has_begun_it_tells_what_it_is(scraped: Scraped) -> N
     assert dict(labels) == {"env": "CartPole-v1", "algo": "ppo", "seed": "1"}
 
 
-def test_the_numbers_are_those_of_the_roster_and_the_ledger(scraped: Scraped) -> None:
+def test_the_numbers_are_those_of_the_coordinator_and_the_ledger(scraped: Scraped) -> None:
     learning, hub = scraped.learner, scraped.hub
     for name in (A, B, C):
         learning.joins(name)
     learning.publish(0)
     learning.deliver_all()
-    assert learning.roster.take()
+    assert learning.coordinator.take()
     hub._weight_age.used([0, 0, 3])
     learning.publish(1)
-    learning.roster.remove_worker("a", "was killed")
-    learning.roster.reject_message(B, "rubbish", 0.0)
+    learning.coordinator.remove_worker("a", "was killed")
+    learning.coordinator.reject_message(B, "rubbish", 0.0)
     found = scraped.metrics()
-    ledger = learning.roster.ledger.counts()
+    ledger = learning.coordinator.ledger.counts()
     assert ledger["lost"] > 0
     assert by(found, "millrace_tickets_total", "reason") == {name: ledger[name] for name in ("used", "stale", "lost")}
     assert found["millrace_tickets_issued_total", ()] == ledger["issued"]
@@ -128,7 +129,7 @@ def test_the_numbers_are_those_of_the_roster_and_the_ledger(scraped: Scraped) ->
         "0": 2, "1": 2, "2": 2, "4": 3, "8": 3, "16": 3, "32": 3, "+Inf": 3,
     }  # fmt: skip
     assert (found["millrace_rollout_lag_versions_count", ()], found["millrace_rollout_lag_versions_sum", ()]) == (3, 3)
-    learning.roster.drain("done")
+    learning.coordinator.drain("done")
     assert by(scraped.metrics(), "millrace_workers", "state") == {"active": 0, "spare": 0, "draining": 2}
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from learner.config.layers import resolve
 from learner.torch_setup import threads
-from millrace.launch.local_workers import worker_cores
+from millrace.launch.local_worker_options import worker_cores
 from protocol import cpu_cores as counting
 from protocol.cpu_cores import usable_cores
 from protocol.errors import UsageError

@@ -1,4 +1,4 @@
-"""The law of a row holds for every kind of env copies: a loop, SyncVectorEnv, gymnasium's vectorized CartPole."""
+"""The row format holds for every kind of env copies: a loop, SyncVectorEnv, gymnasium's vectorized CartPole."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ import pytest
 
 from learner.members import membership
 from learner.members import states as standing
-from learner.rollouts import roster
+from learner.rollouts import ticket_coordinator
 from protocol import env_spec, messages, rollout, specs
 from protocol.keys import handshake
 from protocol.messages import PROTOCOL_VERSION, Collect, Hello, Permit, Received, Rollout, ToLearner, ToWorker, Weights
@@ -95,7 +95,7 @@ LIMITS: Mapping[tuple[ModuleType, str], str] = {
     (session, "HELLO_FIRST_S"): "seconds from the first Hello to the second; each wait is twice as long as the last",
     (session, "HELLO_MOST_S"): "seconds between two Hello messages, at most",
     (held_rollouts, "REMEMBERED_TICKETS"): "finished tickets of a lane that a worker remembers, to know a late repeat",
-    (roster, "STRIKES"): "messages or rollouts that cannot be used, after which a worker is refused",
+    (ticket_coordinator, "STRIKES"): "messages or rollouts that cannot be used, after which a worker is refused",
     (membership, "REMEMBERED_REFUSALS"): "refused processes that the learner remembers, so that they do not come back",
     (handshake, "HANDSHAKE_MS"): "milliseconds that a handshake may take",
     (sockets, "LINGER_MS"): "milliseconds for which a closing socket still sends queued messages",
@@ -282,7 +282,7 @@ def test_every_record_that_travels_is_described() -> None:
 
 
 def test_every_limit_is_in_the_document() -> None:
-    for module in (codec, sockets, packing, session, held_rollouts, roster, messages, rollout, specs):
+    for module in (codec, sockets, packing, session, held_rollouts, ticket_coordinator, messages, rollout, specs):
         for name in re.findall(r"^(MAX_\w+) = ", inspect.getsource(module), re.MULTILINE):
             assert (module, name) in LIMITS, f"say in LIMITS what {name} bounds"
 

@@ -45,7 +45,7 @@ def no_pulse() -> None:
 
 
 def remembering(algorithm: Acting, obs: Array, valid: Array, state: Array) -> Array:
-    """Params [T, N, P] of the algorithm's policy, which begins with `state` [N, S] and forgets by the law of a row."""
+    """Params [T, N, P] of the algorithm's policy, which begins with `state` [N, S] and forgets by the row format."""
     policy = NumpyPolicy(algorithm.policy)
     policy.load(*algorithm.weights())
     now, found = state[None].copy(), []

@@ -84,7 +84,7 @@ def sync_vector_env_over(makes: Sequence[Callable[[], gymnasium.Env[Any, Any]]])
 def collect(
     collector: Collector, run: RunSpec, sequence: int = 0, lanes: Iterable[int] = (0,), incarnation: int = 0
 ) -> list[Rollout]:
-    """Rollout number `sequence` of each lane, after a check that it keeps the law of a row."""
+    """Rollout number `sequence` of each lane, after a check that it keeps the row format."""
     assignments = [Assignment(100 + lane, lane, incarnation, sequence) for lane in lanes]
     rollouts = collector.collect(assignments, VERSION, SESSION, no_pulse)
     for assignment, rollout in zip(assignments, rollouts, strict=True):

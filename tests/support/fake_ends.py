@@ -17,7 +17,7 @@ import numpy as np
 
 from learner.members.membership import Outgoing
 from learner.rollouts.ledger import Ledger
-from learner.rollouts.roster import Roster
+from learner.rollouts.ticket_coordinator import TicketCoordinator
 from protocol.env_spec import EnvSpec
 from protocol.messages import Rollout, ToLearner, ToWorker
 from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
@@ -65,7 +65,7 @@ class Faults:
     loss: float = 0.0
     repeat: float = 0.0
     delay_s: float = 0.05
-    spoiled: float = 0.0  # rollouts that break the law of a row
+    spoiled: float = 0.0  # rollouts that break the row format
     deaths: int = 0
     freezes: int = 0
     late_joiners: int = 0
@@ -103,7 +103,7 @@ class World:
         self.updates = 0
         self.epoch = 0
         self.checkpoint: tuple[Ledger, int, list[int]] = (Ledger(), 0, [0] * lanes)
-        self.roster = self._learner()
+        self.coordinator = self._learner()
         for number in range(workers):
             self.spawn(f"w{number}".encode())
         self._schedule_faults(workers)
@@ -166,9 +166,9 @@ class World:
     def _hears(self, peer: bytes, message: ToLearner) -> None:
         faulty = self.now < self.faults.until_s and self.random.random() < self.faults.spoiled
         if faulty and isinstance(message, Rollout):
-            self.to_workers(self.roster.reject_rollout(peer, message, "spoiled", self.now))
+            self.to_workers(self.coordinator.reject_rollout(peer, message, "spoiled", self.now))
         else:
-            self.to_workers(self.roster.receive(peer, message, self.now))
+            self.to_workers(self.coordinator.receive(peer, message, self.now))
         self.check()
         self._learn()
 
@@ -213,7 +213,7 @@ class World:
 
     # ------------------------------------------------------------ learner
 
-    def _learner(self) -> Roster:
+    def _learner(self) -> TicketCoordinator:
         ledger, version, incarnations = self.checkpoint
         ledger = msgspec.structs.replace(ledger)
         ledger.lost += ledger.outstanding  # of the learner that died
@@ -221,7 +221,7 @@ class World:
         self.used = {ticket for ticket in self.used if ticket < ledger.issued}
         self.updates = version
         self.updating = False
-        roster = Roster(
+        coordinator = TicketCoordinator(
             self.run,
             rollouts_per_update=self.per_update,
             max_lag=self.max_lag,
@@ -230,24 +230,24 @@ class World:
             ledger=ledger,
             incarnations=incarnations,
         )
-        self.roster = roster
-        self.to_workers(roster.publish(version, PARAMETERS, BUFFERS))
-        return roster
+        self.coordinator = coordinator
+        self.to_workers(coordinator.publish(version, PARAMETERS, BUFFERS))
+        return coordinator
 
     def restart_learner(self) -> None:
         self.epoch += 1  # whatever was under way is lost with its connections
         self._learner()
 
     def _tick(self) -> None:
-        self.to_workers(self.roster.remove_silent(self.now))
+        self.to_workers(self.coordinator.remove_silent(self.now))
         self._learn()
 
     def _learn(self) -> None:
         """Take a batch if there is one; publish new weights a little later."""
         if self.updating:
             return
-        taken = self.roster.take()
-        self.to_workers(self.roster.deal())
+        taken = self.coordinator.take()
+        self.to_workers(self.coordinator.deal())
         if taken is None:
             return
         assert len(taken) == self.per_update
@@ -255,20 +255,20 @@ class World:
         for rollout in rollouts:
             assert rollout.ticket not in self.used, "a ticket was used twice"
             self.used.add(rollout.ticket)
-            assert 0 <= self.roster.version - rollout.version <= self.max_lag
+            assert 0 <= self.coordinator.version - rollout.version <= self.max_lag
         if self.max_lag == 0 and self.per_update == self.run.lanes:
             assert sorted(rollout.lane for rollout in rollouts) == list(range(self.run.lanes))
         self.updating = True
-        roster = self.roster
+        coordinator = self.coordinator
 
         def publish() -> None:
-            if self.roster is not roster:
+            if self.coordinator is not coordinator:
                 return
             self.updates += 1
             self.updating = False
-            self.to_workers(roster.publish(self.updates, PARAMETERS, BUFFERS))
+            self.to_workers(coordinator.publish(self.updates, PARAMETERS, BUFFERS))
             if self.random.random() < 0.3:
-                self.checkpoint = (msgspec.structs.replace(roster.ledger), self.updates, roster.incarnations())
+                self.checkpoint = (msgspec.structs.replace(coordinator.ledger), self.updates, coordinator.incarnations())
             self._learn()
 
         self.at(self.random.uniform(0.0, 0.3), publish)
@@ -303,7 +303,7 @@ class World:
             name = self.random.choice(sorted(self.workers))
             del self.workers[name]
             if self.random.random() < 0.5:  # the host sees it at once; else only silence tells
-                self.to_workers(self.roster.remove_worker(name.decode(), "killed"))
+                self.to_workers(self.coordinator.remove_worker(name.decode(), "killed"))
             self.at(self.random.uniform(0.1, 8.0), lambda: self.spawn(name) if name not in self.workers else None)
 
     def _freeze_one(self) -> None:
@@ -325,21 +325,21 @@ class World:
     # ------------------------------------------------------------ the rules
 
     def check(self) -> None:
-        roster, ledger = self.roster, self.roster.ledger
-        in_flight = len(roster.tickets) + len(roster.ready)
+        coordinator, ledger = self.coordinator, self.coordinator.ledger
+        in_flight = len(coordinator.tickets) + len(coordinator.ready)
         assert ledger.issued == ledger.used + ledger.stale + ledger.lost + in_flight, "the ledger does not balance"
-        assert ledger.transitions_waiting == sum(arrived.rollout.env_steps for arrived in roster.ready), (
+        assert ledger.transitions_waiting == sum(arrived.rollout.env_steps for arrived in coordinator.ready), (
             "transitions do not balance"
         )
-        bound = self.per_update * (roster.version + 1 + self.max_lag)
+        bound = self.per_update * (coordinator.version + 1 + self.max_lag)
         assert ledger.used + in_flight <= bound, "more tickets than the bound allows"
-        for lane in roster.lanes:
-            owners = [member for member in roster.members.values() if lane.number in member.lanes]
+        for lane in coordinator.lanes:
+            owners = [member for member in coordinator.members.values() if lane.number in member.lanes]
             assert len(owners) == (lane.owner is not None), "a lane has two owners"
             assert all(owner.peer == lane.owner for owner in owners)
-        for number, ticket in roster.tickets.items():
-            assert number in roster.members[ticket.peer].tickets, "an outstanding ticket is with nobody"
-            assert roster.lanes[ticket.lane].owner == ticket.peer, "a ticket of a lane that its worker does not own"
+        for number, ticket in coordinator.tickets.items():
+            assert number in coordinator.members[ticket.peer].tickets, "an outstanding ticket is with nobody"
+            assert coordinator.lanes[ticket.lane].owner == ticket.peer, "a ticket of a lane that its worker does not own"
         if self.epoch == 0:
             for worker in self.workers.values():
                 holds = worker.session.held_count()

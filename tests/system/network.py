@@ -1,6 +1,6 @@
 """Hosts with addresses of their own on this one machine: network namespaces, joined by a switch that is one, too.
 
-The law: nothing outside the namespaces made here is touched, and they are gone when the network is closed. Needs root, `ip`
+Rule: nothing outside the namespaces made here is touched, and they are gone when the network is closed. Needs root, `ip`
 and `nft`; `why_not` says what is missing.
 """
 

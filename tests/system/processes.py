@@ -1,6 +1,6 @@
 """Learners and workers as real processes: started, watched, stopped, and none of them left behind.
 
-The law: every wait has a deadline, and says what it waited for and what was said instead; a process that a test started is
+Rule: every wait has a deadline, and says what it waited for and what was said instead; a process that a test started is
 dead when the test is over, whatever the test did to it.
 """
 

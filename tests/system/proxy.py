@@ -1,6 +1,6 @@
 """A TCP proxy in the way of a connection: it delays, slices, resets, or swallows everything. Also a process of its own.
 
-The law: bytes keep their order and none is changed; only when they arrive, in what pieces, and whether at all, is its own.
+Rule: bytes keep their order and none is changed; only when they arrive, in what pieces, and whether at all, is its own.
 What it is told holds for connections that are open, too.
 """
 

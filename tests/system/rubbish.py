@@ -1,6 +1,6 @@
 """A peer that talks rubbish: bytes that are not ZeroMQ's, and ZeroMQ messages that are not ours. Also a process of its own.
 
-The law: what it says follows from the seed.
+Rule: what it says follows from the seed.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A run that trains, ready for its fault; how long it took until training went on; and its end.
 
-The law: at its end every ticket and every transition is accounted for, whatever was done to it.
+Rule: at its end every ticket and every transition is accounted for, whatever was done to it.
 """
 
 from __future__ import annotations

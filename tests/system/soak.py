@@ -1,6 +1,6 @@
 """`python -m tests.system.soak`: eight workers on two hosts learn CartPole, and every two seconds something goes wrong.
 
-The law: whatever happens, training ends, the policy is as good as without faults, every ticket and transition is accounted
+Rule: whatever happens, training ends, the policy is as good as without faults, every ticket and transition is accounted
 for, and nothing is left behind. What goes wrong, and when, follows from the seed. Exit code 1 when it falls short.
 """
 

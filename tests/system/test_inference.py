@@ -234,7 +234,7 @@ def test_an_environment_that_hangs_is_given_up(tmp_path: Path, caplog: pytest.Lo
 
 
 def test_no_worker_joins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("workers.host.sys.executable", "/bin/false")
+    monkeypatch.setattr("workers.supervisor.sys.executable", "/bin/false")
     began_s = time.monotonic()
     with pytest.raises(NoWorkers, match="waited 1 s for 2 workers"):
         run(tmp_path, "CartPole-v1", no_workers_timeout_s=1.0, **SMALL, **IN_LEARNER)

@@ -225,7 +225,7 @@ def test_nan_ends_the_run_naming_where(tmp_path: Path) -> None:
 
 def test_nobody_comes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Workers that cannot even start: the run ends by its deadline and says what it waited for."""
-    monkeypatch.setattr("workers.host.sys.executable", "/bin/false")
+    monkeypatch.setattr("workers.supervisor.sys.executable", "/bin/false")
     with pytest.raises(NoWorkers, match="waited 1 s for 2 workers"):
         run(tmp_path, "CartPole-v1", no_workers_timeout_s=1.0, **SMALL)
 

@@ -1,4 +1,4 @@
-"""Collects rollouts that keep the law of a row (`protocol/rollout.py`), from a policy and the env copies of lanes.
+"""Collects rollouts that keep the row format (`protocol/rollout.py`), from a policy and the env copies of lanes.
 
 Lanes that are collected together are stepped in lock-step, with one forward pass for all of them [L, N, ·]. The rollout of
 a lane depends on the run's seed, the lane, its incarnation and the weights, and on nothing else: not on the other lanes.

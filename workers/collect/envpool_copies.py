@@ -1,8 +1,8 @@
 """The env copies of one lane in envpool, with time limits that are applied here.
 
-The law is NextStep autoreset, which envpool keeps, and exact flags, which it does not: it reports an episode that terminates
-in the last step of its time limit as truncated only. So envpool gets a limit of one step more, and never reaches it: a copy
-that has made all its steps is truncated here, and reset explicitly in the next step.
+The rule is NextStep autoreset, which envpool keeps, and exact flags, which it does not: it reports an episode that
+terminates in the last step of its time limit as truncated only. So envpool gets a limit of one step more, and never
+reaches it: a copy that has made all its steps is truncated here, and reset explicitly in the next step.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The tickets that a worker holds and the rollouts that it keeps, lane by lane. Pure.
 
-The law: a ticket is collected once. Its rollout is kept until the learner has received it, and sent again when the learner
+Rule: a ticket is collected once. Its rollout is kept until the learner has received it, and sent again when the learner
 asks for it again. So a worker holds at most what the learner has outstanding, and its memory is bounded.
 """
 

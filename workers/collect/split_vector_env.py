@@ -1,6 +1,6 @@
 """One vector environment split into lanes: the workers of the vector environment step its env copies, a collector acts.
 
-The law: a lane returns, bit for bit, what a loop over its copies would return. The seeds and actions of its copies are its
+Rule: a lane returns, bit for bit, what a loop over its copies would return. The seeds and actions of its copies are its
 own, and autoreset is NextStep for the vector environment as for the loop.
 """
 

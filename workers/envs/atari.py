@@ -1,6 +1,6 @@
 """Atari games with the preprocessing of Mnih et al. (2015): every fourth screen, grayscale, 84 × 84, the last four.
 
-The law: an observation is a stack of screens [4, 84, 84], whichever program steps the game. A single game, the vectorized
+Rule: an observation is a stack of screens [4, 84, 84], whichever program steps the game. A single game, the vectorized
 form of the emulator and envpool differ only in their random numbers, and in the frames before an episode's first screen:
 zeros, except that envpool repeats the first screen. An episode starts with up to 30 no-op actions. Rewards are not clipped.
 """

@@ -1,6 +1,6 @@
 """A cart that balances two links, one on top of the other: the equations of motion and the environment.
 
-The law: q = (x, θ, φ). Both angles are absolute, 0 is upright and positive is towards +x. At the end of each massless link
+Rule: q = (x, θ, φ). Both angles are absolute, 0 is upright and positive is towards +x. At the end of each massless link
 is a mass M with inertia I. The Lagrangian
 
     L = ½ m ẋ² + ½ M (v₁² + v₂²) + ½ I (θ̇² + φ̇²) − M g l (2 cos θ + cos φ),   v₁, v₂ the speeds of the two masses,

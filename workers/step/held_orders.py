@@ -1,6 +1,6 @@
 """The orders (Reset, Step, Call) of a vector environment that a worker holds, lane by lane. Pure: messages in, messages out.
 
-The law: tickets rise with every order of a lane, and each order is executed once. The answer is kept until the lane's next
+Rule: tickets rise with every order of a lane, and each order is executed once. The answer is kept until the lane's next
 order. When an order arrives again, because its answer was lost, the same answer is sent again.
 """
 

@@ -1,6 +1,6 @@
 """The env copies of one lane of a vector environment, in any of the autoreset modes of `workers/env_loop.py`.
 
-The law: observations, rewards, flags and infos are, bit for bit, those of `gymnasium.vector.SyncVectorEnv` over the same
+Rule: observations, rewards, flags and infos are, bit for bit, those of `gymnasium.vector.SyncVectorEnv` over the same
 copies.
 """
 

@@ -1,6 +1,6 @@
 """Log-probabilities and entropies of actions with their gradients derived by hand, in numpy.
 
-The law: they are those of `log_prob_and_entropy` (`protocol.policy.torch_distributions`) and autograd, except for rounding.
+Rule: they are those of `log_prob_and_entropy` (`protocol.policy.torch_distributions`) and autograd, except for rounding.
 Parameters are [P, B], a column for each of B rows; actions are [B, k]. `forward` keeps what `backward` needs.
 """
 

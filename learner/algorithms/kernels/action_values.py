@@ -1,6 +1,6 @@
 """Action values of a minibatch and their gradient: by autograd, or in numpy where the network is a small MLP on the CPU.
 
-The law: both give the same numbers, except for rounding. Which one is used depends on the policy, the device and the size of
+Rule: both give the same numbers, except for rounding. Which one is used depends on the policy, the device and the size of
 the minibatch, never on time. Each has its own kind of array: torch tensors, or numpy arrays.
 """
 

@@ -1,6 +1,6 @@
 """Actor-critics and action values without a graph: forward pass and gradient in numpy, on the flat parameters.
 
-The law: outputs and gradients are those of `protocol.policy.networks` and autograd, except for rounding, for every kind of
+Rule: outputs and gradients are those of `protocol.policy.networks` and autograd, except for rounding, for every kind of
 action. A minibatch of a small network spends its time on the graph, the dispatcher and the allocator, not on arithmetic.
 Here an update is a few dozen calls on arrays that are reused. For large networks the matrix products take the time, and
 torch is as fast.

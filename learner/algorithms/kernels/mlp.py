@@ -1,6 +1,6 @@
 """MLPs without a graph: several side by side, forward and backward, in arrays that are reused from minibatch to minibatch.
 
-The law: outputs and gradients are those of the formulas below, except for rounding. How rows are divided into chunks depends
+Rule: outputs and gradients are those of the formulas below, except for rounding. How rows are divided into chunks depends
 only on their number, so the same minibatch gives the same bits.
 
 Arrays are [S, n, B]: S networks side by side, and one column for each of B rows, so that inner loops are long. Each chunk of

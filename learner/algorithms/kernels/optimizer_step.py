@@ -1,6 +1,6 @@
 """A step of torch's Adam, AdamW or RMSprop on one flat tensor, without the overhead of `Optimizer.step`.
 
-The law: the same kernels on the same state, so the same bits as `Optimizer.step`, with one exception: denormal numbers count
+Rule: the same kernels on the same state, so the same bits as `Optimizer.step`, with one exception: denormal numbers count
 as zero during the step. The state stays the optimizer's own: the optimizer saves and loads it.
 
 For a small network the overhead of `Optimizer.step` takes longer than the kernel. Besides, making an optimizer and calling

@@ -40,7 +40,7 @@ class Row(NamedTuple):
 
 
 class Stream:
-    """One env copy that ends now and then, as the law of a row has it."""
+    """One env copy that ends now and then, as the row format has it."""
 
     def __init__(self, generator: np.random.Generator, ends: float, counter: Iterator[int]) -> None:
         self._generator, self._ends, self._counter = generator, ends, counter

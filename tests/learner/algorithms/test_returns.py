@@ -34,7 +34,7 @@ class Rows(NamedTuple):
 
 
 def lawful(terminated: Array, truncated: Array, first: Array) -> tuple[Array, Array, Array]:
-    """Flags that keep the law of a row: the row after an end is not valid and ends nothing."""
+    """Flags that keep the row format: the row after an end is not valid and ends nothing."""
     terminated, truncated, valid = terminated.copy(), truncated.copy(), np.ones_like(terminated)
     valid[0] = first
     for t in range(len(valid)):

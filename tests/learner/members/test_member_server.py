@@ -7,13 +7,13 @@ from typing import cast
 import pytest
 
 from learner.members.member_server import AWAY_S, MemberServer, ServerCallbacks, ServerSettings
+from learner.vector_env.order_coordinator import OrderCoordinator
 from learner.vector_env.status import status
 from learner.vector_env.step_hub import StepHub
-from learner.vector_env.step_roster import StepRoster
 from protocol.errors import NoWorkers
 from protocol.messages import PROTOCOL_VERSION, Goodbye, Heartbeat, Hello
 from protocol.wire.learner_link import LearnerLink
-from tests.learner.vector_env.test_step_roster import SPEC
+from tests.learner.vector_env.test_order_coordinator import SPEC
 from tests.support.fake_link import FakeLink
 
 TIMEOUT_S, POLL_S = 5.0, 0.1
@@ -25,10 +25,10 @@ class Served:
     def __init__(self, settings: ServerSettings | None = None) -> None:
         self.link = FakeLink()
         self.ended: list[tuple[str, str]] = []
-        self.roster = StepRoster(SPEC, 1, TIMEOUT_S)
-        callbacks = ServerCallbacks(self.roster.receive, lambda now: status(self.roster, now), lambda event: None)
+        self.coordinator = OrderCoordinator(SPEC, 1, TIMEOUT_S)
+        callbacks = ServerCallbacks(self.coordinator.receive, lambda now: status(self.coordinator, now), lambda event: None)
         link = cast(LearnerLink, self.link)
-        self.server = MemberServer(link, self.roster, callbacks, self._ended, settings, lambda: self.link.now)
+        self.server = MemberServer(link, self.coordinator, callbacks, self._ended, settings, lambda: self.link.now)
         self.link.inbox.append((b"w0", Hello(PROTOCOL_VERSION, "w0", "host", 1, 1, "fake", 1)))
         self.server.listen(POLL_S)
 
@@ -41,7 +41,7 @@ class Served:
         until_s = self.link.now + seconds
         while self.link.now < until_s - POLL_S / 2:
             self.server.listen(POLL_S)
-        return bool(self.roster.members)
+        return bool(self.coordinator.members)
 
 
 def test_a_silent_worker_is_removed_while_the_server_listens() -> None:
@@ -98,7 +98,7 @@ def test_the_last_words_of_a_process_that_has_ended_are_heard() -> None:
 
     served.link.poll = comes_late  # type: ignore[method-assign]
     served.server.listen(POLL_S)
-    assert not served.roster.members
+    assert not served.coordinator.members
     assert "(the last one left: told to stop)" in str(served.server.no_workers(1, 1.0))
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from learner.members.key_revocation import KeyRevocation
 from protocol.messages import Heartbeat
-from tests.learner.rollouts.test_roster import Learner
+from tests.learner.rollouts.test_ticket_coordinator import Learner
 
 FEW, MANY = 8, 512
 
@@ -47,17 +47,17 @@ def crowd(workers: int, max_lag: int = 0) -> Learner:
 
 def of_rollout(learner: Learner, number: int | None = None) -> int:
     """Lines for the arrival of one rollout, and for a look whether an update can be made of all."""
-    learner.roster.remove_silent(learner.now)
-    while learner.roster.take() is not None:  # what is there already
+    learner.coordinator.remove_silent(learner.now)
+    while learner.coordinator.take() is not None:  # what is there already
         pass
     number = learner.tickets()[0] if number is None else number
-    rollout, peer = learner.rollout_of(number), learner.roster.tickets[number].peer
+    rollout, peer = learner.rollout_of(number), learner.coordinator.tickets[number].peer
 
     def arrives() -> None:
-        learner.roster.receive(peer, rollout, learner.now)
-        learner.roster.take()
-        learner.roster.deal()
-        learner.roster.remove_silent(learner.now)
+        learner.coordinator.receive(peer, rollout, learner.now)
+        learner.coordinator.take()
+        learner.coordinator.deal()
+        learner.coordinator.remove_silent(learner.now)
 
     return lines(arrives)
 
@@ -71,7 +71,7 @@ def test_an_account_costs_as_much_whatever_the_number_of_workers() -> None:
     def of_account(learner: Learner) -> int:
         (ticket,) = learner.tickets(b"w1")
         account = Heartbeat(learner.session(b"w1"), 0, 1, (ticket,), 0, {}, 0)
-        return lines(lambda: learner.roster.receive(b"w1", account, learner.now))
+        return lines(lambda: learner.coordinator.receive(b"w1", account, learner.now))
 
     assert of_account(crowd(MANY)) <= of_account(crowd(FEW)) + 5
 
@@ -80,15 +80,15 @@ def test_while_a_lane_waits_to_move_the_rollouts_of_others_cost_no_more() -> Non
     def waiting(workers: int) -> Learner:
         learner = crowd(2 * workers)
         for number in range(workers):  # half of them leave; the others have two lanes each, until somebody comes
-            learner.roster.remove_worker(f"w{number}", "gone")
+            learner.coordinator.remove_worker(f"w{number}", "gone")
         learner.joins(b"newcomer", pid=9998)  # is given the lane whose rollout has come
         learner.joins(b"another", pid=9999)
-        assert sum(lane.moving for lane in learner.roster.lanes) == 1
+        assert sum(lane.moving for lane in learner.coordinator.lanes) == 1
         return learner
 
     def of_another(learner: Learner) -> int:
-        (moving,) = [lane for lane in learner.roster.lanes if lane.moving]
-        tickets = learner.roster.tickets.items()
+        (moving,) = [lane for lane in learner.coordinator.lanes if lane.moving]
+        tickets = learner.coordinator.tickets.items()
         return of_rollout(learner, next(number for number, ticket in tickets if ticket.peer != moving.owner))
 
     assert of_another(waiting(MANY // 2)) <= of_another(waiting(FEW)) + 5
@@ -96,17 +96,17 @@ def test_while_a_lane_waits_to_move_the_rollouts_of_others_cost_no_more() -> Non
 
 def test_silence_is_judged_when_it_can_have_come_about_and_not_before() -> None:
     learner = crowd(MANY)
-    learner.roster.remove_silent(0.0)
+    learner.coordinator.remove_silent(0.0)
     learner.now = 4.0
     for number in range(1, MANY):
         learner.beats(b"w%d" % number)
-    assert lines(lambda: learner.roster.remove_silent(4.9)) < 20
-    learner.roster.remove_silent(5.1)
-    assert b"w0" not in learner.roster.members
-    assert len(learner.roster.members) == MANY - 1
-    assert lines(lambda: learner.roster.remove_silent(8.9)) < 20
-    learner.roster.remove_silent(9.1)
-    assert not learner.roster.members
+    assert lines(lambda: learner.coordinator.remove_silent(4.9)) < 20
+    learner.coordinator.remove_silent(5.1)
+    assert b"w0" not in learner.coordinator.members
+    assert len(learner.coordinator.members) == MANY - 1
+    assert lines(lambda: learner.coordinator.remove_silent(8.9)) < 20
+    learner.coordinator.remove_silent(9.1)
+    assert not learner.coordinator.members
 
 
 def test_keys_are_looked_at_once_for_each_state_of_their_list() -> None:

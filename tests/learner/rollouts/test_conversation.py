@@ -47,7 +47,7 @@ def test_every_rule_holds_over_a_hostile_network(block: int) -> None:
 def test_without_faults_nothing_is_lost_or_said_twice() -> None:
     world = World(1, Faults(until_s=0.0), workers=2, lanes=4, max_lag=0, per_update=4)
     world.play(updates=200)
-    counts = world.roster.ledger.counts()
+    counts = world.coordinator.ledger.counts()
     assert counts["lost"] == counts["stale"] == counts["transitions_duplicate"] == counts["transitions_late"] == 0
     assert counts["used"] == 4 * 200
 
@@ -55,7 +55,7 @@ def test_without_faults_nothing_is_lost_or_said_twice() -> None:
 def test_lost_messages_cost_no_transition() -> None:
     """Loss alone, without a death: every rollout is said again until it arrives."""
     world = World(5, Faults(loss=0.05, until_s=0.0), workers=2, lanes=4, max_lag=1, per_update=4)
-    world.roster.worker_timeout_s = 1e9
+    world.coordinator.worker_timeout_s = 1e9
     world.play(updates=100, limit_s=4000.0)
-    assert world.roster.ledger.lost == 0
-    assert world.roster.ledger.used == 4 * 100
+    assert world.coordinator.ledger.lost == 0
+    assert world.coordinator.ledger.used == 4 * 100

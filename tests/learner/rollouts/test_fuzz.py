@@ -37,5 +37,5 @@ def test_a_hundred_thousand_hostile_messages_raise_one_error_and_leave_no_memory
         refused += says is not None
         understood += says is None
     assert refused > 0.6 * MESSAGES
-    assert understood > 0.05 * MESSAGES  # those of other sessions: the roster's to judge
+    assert understood > 0.05 * MESSAGES  # those of other sessions: the coordinator's to judge
     assert process.memory_info().rss / 2**20 - before_mb < GROWTH_MB

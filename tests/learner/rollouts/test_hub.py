@@ -1,4 +1,4 @@
-"""The shell round the roster, over a link and a clock that are not real: when silence counts, and what is sent."""
+"""The shell round the coordinator, over a link and a clock that are not real: when silence counts, and what is sent."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from learner.members.member_server import AWAY_S
 from learner.rollouts.hub import POLL_S, PULSE_S, Hub, HubSettings
-from learner.rollouts.roster import Roster
+from learner.rollouts.ticket_coordinator import TicketCoordinator
 from protocol.errors import RunError
 from protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello, Weights
 from protocol.rollout import rollout_bytes
@@ -25,10 +25,12 @@ WORKER_TIMEOUT_S = 3.0
 
 def hub_with_a_worker(weights_dtype: WeightsDtype = "float32") -> tuple[FakeLink, Hub, Heartbeat]:
     link = FakeLink()
-    roster = Roster(run_spec(lanes=1), rollouts_per_update=1, max_lag=0, worker_timeout_s=WORKER_TIMEOUT_S, first_session=1)
+    coordinator = TicketCoordinator(
+        run_spec(lanes=1), rollouts_per_update=1, max_lag=0, worker_timeout_s=WORKER_TIMEOUT_S, first_session=1
+    )
     hub = Hub(
         cast(LearnerLink, link),
-        roster,
+        coordinator,
         HubSettings(no_workers_timeout_s=60.0, stall_timeout_s=600.0, max_env_failures=0, weights_dtype=weights_dtype),
         clock=lambda: link.now,
     )
@@ -46,7 +48,7 @@ def listen(hub: Hub, link: FakeLink, seconds: float) -> None:
 
 def test_a_message_may_unpack_to_a_rollout_of_the_run_and_no_more() -> None:
     link, hub, _ = hub_with_a_worker()
-    assert link.packed_bytes_limit == rollout_bytes(hub.roster.run) > 0
+    assert link.packed_bytes_limit == rollout_bytes(hub.coordinator.run) > 0
 
 
 @pytest.mark.parametrize(("dtype", "sent"), [("float32", "<f4"), ("bfloat16", "<u2"), ("float16", "<f2")])
@@ -73,15 +75,15 @@ def test_weights_that_do_not_fit_are_not_published() -> None:
     link.sent.clear()
     with pytest.raises(RunError, match="weights_dtype float16: parameter 1 expected less than 65520"):
         hub.publish(0, np.array([1, -70_000], np.float32), np.zeros(0, np.float32))
-    assert (hub.roster.version, link.sent) == (-1, [])
+    assert (hub.coordinator.version, link.sent) == (-1, [])
 
 
 def test_a_silent_worker_is_given_up_while_the_learner_listens() -> None:
     link, hub, _ = hub_with_a_worker()
     listen(hub, link, WORKER_TIMEOUT_S - 2 * POLL_S)
-    assert hub.roster.members
+    assert hub.coordinator.members
     listen(hub, link, 4 * POLL_S)
-    assert not hub.roster.members
+    assert not hub.coordinator.members
 
 
 def test_a_learner_that_was_stopped_listens_before_it_judges() -> None:
@@ -89,17 +91,17 @@ def test_a_learner_that_was_stopped_listens_before_it_judges() -> None:
     link, hub, heartbeat = hub_with_a_worker()
     link.now += 2 * WORKER_TIMEOUT_S
     hub.pulse()
-    assert hub.roster.members, "the worker was given up before what it had said could arrive"
+    assert hub.coordinator.members, "the worker was given up before what it had said could arrive"
     link.inbox.append((b"w0", heartbeat))
     listen(hub, link, 2 * AWAY_S)
-    assert hub.roster.members
+    assert hub.coordinator.members
 
 
 def test_a_learner_that_was_stopped_judges_after_a_while() -> None:
     link, hub, _ = hub_with_a_worker()
     link.now += 2 * WORKER_TIMEOUT_S
     listen(hub, link, AWAY_S + 2 * POLL_S)
-    assert not hub.roster.members
+    assert not hub.coordinator.members
 
 
 def test_a_flood_of_an_ended_session_is_one_line(caplog: pytest.LogCaptureFixture) -> None:

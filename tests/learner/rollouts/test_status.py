@@ -24,17 +24,17 @@ from protocol.messages import Goodbye, Heartbeat, Inquire, Status
 from protocol.wire.codec import encode
 from protocol.wire.learner_link import LearnerLink
 from protocol.wire.worker_link import WorkerLink
-from tests.learner.rollouts.test_roster import Learner
+from tests.learner.rollouts.test_ticket_coordinator import Learner
 
 PROGRESS = Progress(env_steps=1_000, total_steps=10_000, steps_per_s=50.0, return_mean=12.5, lag_mean=0.5, lag_max=2)
 
 
 def told(learner: Learner) -> Status:
-    return status(learner.roster, PROGRESS, learner.now)
+    return status(learner.coordinator, PROGRESS, learner.now)
 
 
 def counts(learner: Learner, peer: bytes, steps: int, resident: int = 0) -> None:
-    seen = learner.roster.members[peer].replies
+    seen = learner.coordinator.members[peer].replies
     held = tuple(learner.tickets(peer))
     learner.says(peer, Heartbeat(learner.session(peer), seen, 0, held, steps, {}, resident))
 
@@ -45,15 +45,15 @@ def test_it_tells_of_the_run_and_of_every_worker_in_the_order_of_joining() -> No
     learner.joins(b"a", host="far")
     learner.deliver_all()
     found = told(learner)
-    assert (found.env, found.version) == (learner.roster.run.env.id, 0)
+    assert (found.env, found.version) == (learner.coordinator.run.env.id, 0)
     assert (found.env_steps, found.total_steps, found.return_mean, found.lag_max) == (1_000, 10_000, 12.5, 2)
     assert [(w.worker, w.host, w.pid, w.standing) for w in found.workers] == [
         ("b", "host", 7, "active"),
         ("a", "far", 1, "active"),
     ]
     assert sorted(lane for worker in found.workers for lane in worker.lanes) == [0, 1, 2]
-    assert found.ledger == learner.roster.ledger.counts()
-    learner.roster.drain("done")
+    assert found.ledger == learner.coordinator.ledger.counts()
+    learner.coordinator.drain("done")
     assert {worker.standing for worker in told(learner).workers} == {"draining"}
 
 
@@ -91,9 +91,9 @@ def test_weights_count_as_held_when_the_worker_says_so() -> None:
 def test_asking_changes_nothing() -> None:
     learner = Learner()
     learner.joins(b"a")
-    before = (repr(vars(learner.roster)), repr(learner.roster.members))
+    before = (repr(vars(learner.coordinator)), repr(learner.coordinator.members))
     told(learner)
-    assert before == (repr(vars(learner.roster)), repr(learner.roster.members))
+    assert before == (repr(vars(learner.coordinator)), repr(learner.coordinator.members))
 
 
 # ------------------------------------------------------------------------------------------------ over a socket
@@ -109,7 +109,7 @@ def context() -> Iterator[zmq.Context[zmq.Socket[bytes]]]:
 def test_a_learner_answers_one_who_is_no_worker(context: zmq.Context[zmq.Socket[bytes]]) -> None:
     learner = Learner()
     link = LearnerLink("tcp://127.0.0.1:*", context)
-    hub = Hub(link, learner.roster, HubSettings(no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=0))
+    hub = Hub(link, learner.coordinator, HubSettings(no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=0))
     hub.report_progress(PROGRESS)
     asking = WorkerLink(link.address, observer_name(), context)
     found: list[Status] = []
@@ -122,8 +122,8 @@ def test_a_learner_answers_one_who_is_no_worker(context: zmq.Context[zmq.Socket[
     thread.join(10.0)
     asking.close(0)
     link.close(0)
-    assert found == [status(learner.roster, PROGRESS, 0.0)]
-    assert not learner.roster.members
+    assert found == [status(learner.coordinator, PROGRESS, 0.0)]
+    assert not learner.coordinator.members
 
 
 def test_nobody_there_is_said_at_the_deadline(context: zmq.Context[zmq.Socket[bytes]]) -> None:
@@ -175,11 +175,11 @@ def test_one_whose_session_has_ended_is_told_to_join_again_and_that_is_an_event(
     learner = Learner()
     learner.joins(b"a")
     late = learner.rollout_of(learner.tickets()[0])
-    learner.roster.remove_worker("a", "was killed")
-    learner.roster.events.clear()
+    learner.coordinator.remove_worker("a", "was killed")
+    learner.coordinator.events.clear()
     learner.says(b"a", late)
-    assert learner.roster.events == [RejoinRequested("a", late.session, 1)]
-    assert "1 transitions that it sent are counted, not used" in describe(learner.roster.events[0])
+    assert learner.coordinator.events == [RejoinRequested("a", late.session, 1)]
+    assert "1 transitions that it sent are counted, not used" in describe(learner.coordinator.events[0])
 
 
 def test_a_rollout_that_is_too_old_is_an_event() -> None:
@@ -188,9 +188,9 @@ def test_a_rollout_that_is_too_old_is_an_event() -> None:
     learner.deliver_all()
     learner.publish(1)
     learner.publish(2)
-    learner.roster.events.clear()
-    assert learner.roster.take() is None
-    stale = [event for event in learner.roster.events if isinstance(event, RolloutDropped)]
+    learner.coordinator.events.clear()
+    assert learner.coordinator.take() is None
+    stale = [event for event in learner.coordinator.events if isinstance(event, RolloutDropped)]
     assert stale
     assert stale[0].lag == 2
     assert "2 versions old" in describe(stale[0])
@@ -242,10 +242,10 @@ def test_what_is_unusual_about_a_worker_is_shown() -> None:
     learner = Learner(lanes=1)
     for name in (b"w0", b"w1"):
         learner.joins(name)
-    learner.roster.reject_message(b"w1", "rubbish", learner.now)
+    learner.coordinator.reject_message(b"w1", "rubbish", learner.now)
     text = as_table(told(learner))
     assert "spare" in text
     assert "w1 (1 strikes)" in text
     assert "none" in text
-    learner.roster.drain("done")
+    learner.coordinator.drain("done")
     assert "draining" in as_table(told(learner))

@@ -1,4 +1,4 @@
-"""`--vector envpool`: what envpool steps keeps the law of a row, step for step as the loop, with exact flags; refusals."""
+"""`--vector envpool`: what envpool steps keeps the row format, step for step as the loop, with exact flags; refusals."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def observations(row: StepResult) -> Any:
     return np.asarray(row.leaves[0])
 
 
-# ------------------------------------------------------------------------------------------------ the law of a row
+# ------------------------------------------------------------------------------------------------ the row format
 
 
 @here

@@ -1,4 +1,4 @@
-"""`--vector native`: an environment's own vectorized form keeps the law of a row, step for step as the loop; refusals."""
+"""`--vector native`: an environment's own vectorized form keeps the row format, step for step as the loop; refusals."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def native(run: RunSpec) -> RunSpec:
     return msgspec.structs.replace(run, vector="native")
 
 
-# ------------------------------------------------------------------------------------------------ the law of a row
+# ------------------------------------------------------------------------------------------------ the row format
 
 
 def test_it_steps_as_the_loop_does_from_the_same_states() -> None:

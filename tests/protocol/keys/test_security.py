@@ -16,7 +16,7 @@ import zmq
 
 from learner.members.membership import REMEMBERED_REFUSALS
 from learner.rollouts.hub import Hub, HubSettings
-from learner.rollouts.roster import Roster
+from learner.rollouts.ticket_coordinator import TicketCoordinator
 from protocol.address import worker_name
 from protocol.errors import BadMessage, RunError, UsageError
 from protocol.keys.handshake import NO_ZEROMQ, ConnectionProblem, PendingHandshakes, connection_problem, handshake_failure
@@ -488,12 +488,14 @@ def test_an_eavesdropper_reads_everything_without_keys_and_nothing_with_them(net
 # ---------------------------------------------------------------- a session is bound to its key
 
 
-def roster(workers: int = 2) -> Roster:
-    return Roster(run_spec(workers), rollouts_per_update=workers, max_lag=0, worker_timeout_s=60.0, first_session=1000)
+def coordinator(workers: int = 2) -> TicketCoordinator:
+    return TicketCoordinator(
+        run_spec(workers), rollouts_per_update=workers, max_lag=0, worker_timeout_s=60.0, first_session=1000
+    )
 
 
 def hub_of(link: LearnerLink) -> Hub:
-    hub = Hub(link, roster(), HubSettings(no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=3))
+    hub = Hub(link, coordinator(), HubSettings(no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=3))
     hub.publish(0, PARAMETERS, BUFFERS)
     return hub
 
@@ -513,19 +515,19 @@ def test_another_key_cannot_speak_in_a_workers_session_nor_take_it_over(net: Net
     hub = hub_of(learner)
     worker = net.worker(learner, token(LAB))
     worker.send(encode(hello()))
-    serve(hub, lambda: len(hub.roster.members) == 1)
-    ((peer, member),) = hub.roster.members.items()
+    serve(hub, lambda: len(hub.coordinator.members) == 1)
+    ((peer, member),) = hub.coordinator.members.items()
     routing_id = peer.rpartition(b"\0")[0]
     lanes = set(member.lanes)
     thief = net.raw(learner, token(HOME), routing_id)
     for message in (Heartbeat(member.session, 0, 0, (), 0, {}, 0), hello(life=2)):
         thief.send_multipart(encode(message))
-    serve(hub, lambda: len(hub.roster.members) == 2)
-    assert hub.roster.members[peer] is member, "the session was replaced"
+    serve(hub, lambda: len(hub.coordinator.members) == 2)
+    assert hub.coordinator.members[peer] is member, "the session was replaced"
     assert member.heartbeat is None, "another key's heartbeat was taken for this one's"
     assert member.hello.life == 1
     assert member.lanes <= lanes
-    other = next(m for p, m in hub.roster.members.items() if p != peer)
+    other = next(m for p, m in hub.coordinator.members.items() if p != peer)
     assert other.session != member.session
     assert learner.speaker(other.peer) == "home"
 
@@ -564,14 +566,14 @@ def test_two_workers_of_one_name_and_two_keys_do_not_disturb_each_other(net: Net
     workers = [net.worker(learner, token(client)) for client in (LAB, HOME)]
     for number, worker in enumerate(workers):
         worker.send(encode(hello(life=number)))
-    serve(hub, lambda: len(hub.roster.members) == 2)
+    serve(hub, lambda: len(hub.coordinator.members) == 2)
     for worker in workers:
         assert worker.poll(DEADLINE_S)
         got = list(worker.receive())
         assert {type(message) for message in got} <= {Welcome, Weights, Collect}
         session = next(message.session for message in got if isinstance(message, Welcome))
         worker.send(encode(Heartbeat(session, 0, 0, (), 0, {}, 0)))
-    serve(hub, lambda: all(member.heartbeat is not None for member in hub.roster.members.values()))
+    serve(hub, lambda: all(member.heartbeat is not None for member in hub.coordinator.members.values()))
 
 
 def test_the_table_of_who_spoke_last_stays_small(net: Net, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -593,11 +595,11 @@ def test_who_is_revoked_is_cut_off_at_once_and_told(net: Net, tmp_path: Path, ca
     workers = [net.worker(learner, one, f"w{number}") for number, one in enumerate(tokens)]
     for number, worker in enumerate(workers):
         worker.send(encode(hello(f"w{number}", number)))
-    serve(hub, lambda: len(hub.roster.members) == 2)
-    session = min(member.session for member in hub.roster.members.values())
+    serve(hub, lambda: len(hub.coordinator.members) == 2)
+    session = min(member.session for member in hub.coordinator.members.values())
     folder.revoke("lab", NOW)
-    serve(hub, lambda: len(hub.roster.members) == 1, *workers)
-    (left,) = hub.roster.members.values()
+    serve(hub, lambda: len(hub.coordinator.members) == 1, *workers)
+    (left,) = hub.coordinator.members.values()
     assert left.hello.worker == "w1"
     assert left.lanes == {0, 1}, "the lanes of the one that was cut off are nobody's"
 
@@ -610,7 +612,7 @@ def test_who_is_revoked_is_cut_off_at_once_and_told(net: Net, tmp_path: Path, ca
     workers[0].send(encode(hello("w0", 9)))  # its connection is still there
     workers[0].send(encode(Heartbeat(session, 0, 0, (), 0, {}, 0)))
     serve(hub, lambda: learner.refused_messages == 2)
-    assert len(hub.roster.members) == 1
+    assert len(hub.coordinator.members) == 1
     assert workers[0].poll(DEADLINE_S)
     assert all(isinstance(message, Refuse) for message in workers[0].receive())
 
@@ -641,8 +643,8 @@ def test_rubbish_makes_few_lines_and_ends_a_session(net: Net, caplog: pytest.Log
     worker.send(encode(hello()))
     for _ in range(200):
         worker.send([b"rubbish"])
-    serve(hub, lambda: hub.roster.ledger.messages_bad == 200)
-    assert not hub.roster.members
+    serve(hub, lambda: hub.coordinator.ledger.messages_bad == 200)
+    assert not hub.coordinator.members
     assert len([line for line in lines(caplog, "millrace.learner") if "message from" in line]) == 1
 
 
@@ -658,7 +660,7 @@ def test_strangers_make_few_lines(net: Net, caplog: pytest.LogCaptureFixture) ->
 
 def test_who_comes_under_ever_new_names_does_not_fill_the_memory() -> None:
     logging.disable(logging.CRITICAL)
-    learner = roster()
+    learner = coordinator()
     for number in range(3 * REMEMBERED_REFUSALS):
         peer = b"w%d" % number
         learner.receive(peer, hello(f"w{number}", number), 0.0)

@@ -1,4 +1,4 @@
-"""The recurrent core: torch's own arithmetic, carried by the lane, begun anew by the row law; and what it is for."""
+"""The recurrent core: torch's own arithmetic, carried by the lane, begun anew by the row format; and what it is for."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ from protocol.rollout import Rollout
 
 
 @dataclass(frozen=True, slots=True)
-class ArrivedRollout:
+class AcceptedRollout:
     """A rollout that was accepted."""
 
     rollout: Rollout

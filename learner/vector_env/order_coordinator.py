@@ -1,6 +1,6 @@
 """The learner's half of the conversation of a vector environment. Pure: messages and `now` in, messages out.
 
-The law: an order goes to one lane, and a lane has one order at a time. The order is answered, or its lane is lost with its
+Rule: an order goes to one lane, and a lane has one order at a time. The order is answered, or its lane is lost with its
 worker. A lost lane starts again on new env copies, in its next incarnation. An order that a Heartbeat shows to be lost on
 the way is sent again. Steps through shared memory are no orders here; only their infos come as messages, where they are
 too long for the shared memory.
@@ -56,7 +56,7 @@ class SteppedLane(PlacedLane):
         self.incarnation += 1
 
 
-class StepRoster:
+class OrderCoordinator:
     """Members, lanes, orders and their answers."""
 
     def __init__(self, spec: StepSpec, first_session: int, worker_timeout_s: float = math.inf) -> None:

@@ -1,6 +1,6 @@
 """What a learner needs to start workers on this machine: an address, keys, their flags, their cores.
 
-The law: a socket file lies in a folder of its own that only this user can enter (0700), and is removed with it.
+Rule: a socket file lies in a folder of its own that only this user can enter (0700), and is removed with it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from learner.members.endpoint import generate_run_keys
 from protocol.errors import UsageError
 from protocol.keys.key_folder import Keyring, chosen_key_folder
 from protocol.keys.keys import Token
-from workers.host import core_flags
+from workers.supervisor import core_flags
 
 WorkerFlags = Callable[[str], tuple[list[str], Path | None]]
 """From a worker's name to the flags of its process, and the file for its stderr (None: ours)."""

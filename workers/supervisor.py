@@ -1,8 +1,8 @@
 """Starts, watches, restarts and stops the workers of this machine. Knows nothing of their conversation with the learner.
 
-The law: a worker that left on purpose (exit code 0), was refused (2) or found no learner (EXIT_NO_LEARNER) is not started
+Rule: a worker that left on purpose (exit code 0), was refused (2) or found no learner (EXIT_NO_LEARNER) is not started
 again. Any other is restarted with backoff: the pause doubles with each death, and is reset once a worker has run for
-`HEALTHY_S`. No worker outlives its host.
+`HEALTHY_S`. No worker outlives its supervisor.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from workers.worker import MakeCollector, Worker, WorkerOptions, identity, make_
 BACKOFF_FIRST_S, BACKOFF_MOST_S, HEALTHY_S = 0.5, 30.0, 30.0
 POLL_S = 0.1
 LEAVE_WITHIN_S = 30.0  # after the request to leave: a rollout of a slow environment takes long
-EXIT_NO_LEARNER = 69  # EX_UNAVAILABLE of sysexits: no learner answered. Only a host gets this code, anybody else gets 1
+EXIT_NO_LEARNER = 69  # EX_UNAVAILABLE of sysexits: no learner answered. A supervisor gets this code, others get 1
 
 
 class Running(Protocol):
@@ -189,7 +189,7 @@ class _WorkerSlot:
     exit_code: int = 0  # of the last one that ended
 
 
-class Host:
+class Supervisor:
     """N workers, w0 to wN-1."""
 
     def __init__(

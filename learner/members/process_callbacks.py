@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class WorkerProcesses:
+class ProcessCallbacks:
     """The worker processes of this program; by default there are none."""
 
     ended: Callable[[], Iterable[tuple[str, str]]] = lambda: ()

@@ -1,6 +1,6 @@
 """The learner's half of the conversation. Pure: messages and `now` in, messages out; no socket, clock, thread or torch.
 
-The law: a ticket is the permission for one rollout on one lane, and is dealt to the least advanced lane while
+Rule: a ticket is the permission for one rollout on one lane, and is dealt to the least advanced lane while
 
     used + outstanding < rollouts_per_update * (version + 1 + max_lag)
 
@@ -20,7 +20,7 @@ from learner.members.events import EnvironmentRaised, Event, RolloutDropped
 from learner.members.lane_placement import LanePlacement
 from learner.members.membership import Member, Membership, Outgoing
 from learner.members.states import MemberState, SentUnusable
-from learner.rollouts.arrived_rollout import ArrivedRollout
+from learner.rollouts.accepted_rollout import AcceptedRollout
 from learner.rollouts.lanes import LaneQueue, Ticket, TicketedLane
 from learner.rollouts.ledger import Ledger
 from protocol.messages import (
@@ -66,7 +66,7 @@ class CollectingMember(Member):
         return msgspec.structs.replace(super().status(now), version=self.acknowledged, strikes=self.strikes)
 
 
-class Roster:
+class TicketCoordinator:
     """Members, lanes, tickets and the ledger."""
 
     def __init__(
@@ -91,7 +91,7 @@ class Roster:
         self.membership: Membership[CollectingMember] = Membership(run, CollectingMember, self._removed, first_session)
         self.lanes = [TicketedLane(n, incarnations[n] if incarnations else 0) for n in range(run.lanes)]
         self.tickets: dict[int, Ticket] = {}
-        self.ready: list[ArrivedRollout] = []
+        self.ready: list[AcceptedRollout] = []
         self._placement, self._queue = LanePlacement(self.lanes, _by_joining), LaneQueue(self.lanes)
         self._oldest_ready = version  # no rollout that is ready is older
         self._weights: Weights | None = None
@@ -180,7 +180,7 @@ class Roster:
         out = [out for member in self.membership.active() for out in self._offer(member)]
         return out + self._deal()
 
-    def take(self) -> list[ArrivedRollout] | None:
+    def take(self) -> list[AcceptedRollout] | None:
         """The rollouts of the next update, or None while there are too few. Stale ones are dropped and counted."""
         if self.version - self._oldest_ready > self.max_lag:
             self._drop_stale()
@@ -249,7 +249,7 @@ class Roster:
         lane.outstanding.remove(ticket.number)
         lane.arrived(rollout.sequence)
         self._placement.ticket_ended(member)
-        self.ready.append(ArrivedRollout(rollout, ticket.incarnation))
+        self.ready.append(AcceptedRollout(rollout, ticket.incarnation))
         self._oldest_ready = min(self._oldest_ready, rollout.version)
         return self._offer(member) + self._deal()
 

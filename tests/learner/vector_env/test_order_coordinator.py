@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from learner.members.events import WorkerLeft, WorkerRefused
+from learner.vector_env.order_coordinator import OrderCoordinator
 from learner.vector_env.status import status
-from learner.vector_env.step_roster import StepRoster
 from protocol.env_spec import EnvSpec
 from protocol.messages import (
     PROTOCOL_VERSION,
@@ -40,9 +40,9 @@ SPEC = StepSpec(
 )
 
 
-def step_roster(*peers: bytes) -> StepRoster:
+def order_coordinator(*peers: bytes) -> OrderCoordinator:
     """With these workers, one lane each, all of them stepped once."""
-    made = StepRoster(SPEC, 100, TIMEOUT_S)
+    made = OrderCoordinator(SPEC, 100, TIMEOUT_S)
     for peer in peers:
         made.receive(peer, Hello(PROTOCOL_VERSION, peer.decode(), "host", 1, 1, "fake", 1), 0.0)
     for lane in range(len(peers)):
@@ -66,7 +66,7 @@ def stepped(order: object, **changes: object) -> Stepped:
     return msgspec.structs.replace(answer, **changes)
 
 
-def in_memory(made: StepRoster, lane: int, number: int) -> Stepped:
+def in_memory(made: OrderCoordinator, lane: int, number: int) -> Stepped:
     """What its worker says when the infos of that order do not fit into shared memory."""
     member = made.owner(lane)
     assert member is not None
@@ -74,7 +74,7 @@ def in_memory(made: StepRoster, lane: int, number: int) -> Stepped:
 
 
 def test_an_order_is_answered_once() -> None:
-    made = step_roster(A)
+    made = order_coordinator(A)
     ((_, order),) = made.order(0, step)
     made.receive(A, stepped(order), 0.0)
     assert list(made.answers) == [0]
@@ -98,7 +98,7 @@ def test_an_order_is_answered_once() -> None:
     ids=str,
 )
 def test_an_answer_that_does_not_fit_is_refused_and_its_lane_is_lost(changes: dict[str, object]) -> None:
-    made = step_roster(A, B)
+    made = order_coordinator(A, B)
     ((_, order),) = made.order(0, step)
     ((_, said),) = made.receive(A, stepped(order, **changes), 0.0)
     assert isinstance(said, Refuse)
@@ -111,7 +111,7 @@ def test_an_answer_that_does_not_fit_is_refused_and_its_lane_is_lost(changes: di
 
 
 def test_infos_too_long_for_shared_memory_are_those_of_the_step_under_way() -> None:
-    made = step_roster(A)
+    made = order_coordinator(A)
     made.shared_orders[0] = 7
     assert made.receive(A, in_memory(made, 0, 7), 0.0) == []
     assert made.infos == {0: b"words"}
@@ -120,14 +120,14 @@ def test_infos_too_long_for_shared_memory_are_those_of_the_step_under_way() -> N
 
 @pytest.mark.parametrize("number", [6, 8])
 def test_infos_of_another_step_are_not_used(number: int) -> None:
-    made = step_roster(A)
+    made = order_coordinator(A)
     made.shared_orders[0] = 7
     assert made.receive(A, in_memory(made, 0, number), 0.0) == []
     assert (made.infos, made.answers) == ({}, {})
 
 
 def test_infos_that_nobody_waits_for_are_not_used() -> None:
-    made = step_roster(A)
+    made = order_coordinator(A)
     made.receive(A, in_memory(made, 0, 1), 0.0)
     assert (made.infos, made.answers) == ({}, {})
     made.shared_orders[0] = 1
@@ -137,7 +137,7 @@ def test_infos_that_nobody_waits_for_are_not_used() -> None:
 
 
 def test_infos_of_anothers_lane_or_an_earlier_life_are_not_used() -> None:
-    made = step_roster(A, B)
+    made = order_coordinator(A, B)
     made.shared_orders[0] = made.shared_orders[1] = 7
     theirs = in_memory(made, 1, 7)
     made.receive(A, msgspec.structs.replace(theirs, session=in_memory(made, 0, 7).session), 0.0)
@@ -148,7 +148,7 @@ def test_infos_of_anothers_lane_or_an_earlier_life_are_not_used() -> None:
 
 
 def test_nothing_but_a_step_is_answered_beside_shared_memory() -> None:
-    made = step_roster(A)
+    made = order_coordinator(A)
     made.shared_orders[0] = 7
     session = in_memory(made, 0, 7).session
     ((_, said),) = made.receive(A, Returned(session, -7, 0, 0, NOTHING, "", ""), 0.0)
@@ -159,12 +159,12 @@ def test_nothing_but_a_step_is_answered_beside_shared_memory() -> None:
 # ---------------------------------------------------------------- silence
 
 
-def beat(made: StepRoster, peer: bytes, now: float, steps: int = 0) -> None:
+def beat(made: OrderCoordinator, peer: bytes, now: float, steps: int = 0) -> None:
     made.receive(peer, Heartbeat(made.members[peer].session, 0, -1, (), steps, {}, 0), now)
 
 
 def test_whoever_is_silent_while_it_is_listened_to_is_given_up() -> None:
-    made = step_roster(A, B)
+    made = order_coordinator(A, B)
     beat(made, A, 3.0)
     made.remove_silent(TIMEOUT_S + 1)
     assert list(made.members) == [A]
@@ -174,14 +174,14 @@ def test_whoever_is_silent_while_it_is_listened_to_is_given_up() -> None:
 
 
 def test_where_an_end_is_known_otherwise_nobody_is_silent() -> None:
-    made = step_roster(A)
+    made = order_coordinator(A)
     made.worker_timeout_s = float("inf")
     made.remove_silent(1e9)
     assert made.lost == {}
 
 
 def test_a_worker_that_was_given_up_is_told_to_join_again() -> None:
-    made = step_roster(A)
+    made = order_coordinator(A)
     session = made.members[A].session
     made.remove_silent(TIMEOUT_S + 1)
     assert made.receive(A, Heartbeat(session, 0, -1, (), 0, {}, 0), 9.0) == [(A, Rejoin(session))]
@@ -189,14 +189,14 @@ def test_a_worker_that_was_given_up_is_told_to_join_again() -> None:
 
 
 def test_one_whose_key_was_revoked_is_told_so_and_forgotten() -> None:
-    made = step_roster(A)
+    made = order_coordinator(A)
     assert made.revoke(A, "its key was revoked") == [(A, Refuse("its key was revoked"))]
     assert made.lost == {0: "worker a (host) was shut out: its key was revoked"}
     assert isinstance(made.membership.take_events()[0], WorkerRefused)
 
 
 def test_what_was_lost_on_the_way_is_said_again() -> None:
-    made = step_roster(A)
+    made = order_coordinator(A)
     ((_, order),) = made.order(0, step)
     session = made.members[A].session
     said: list[list[object]] = []
@@ -215,7 +215,7 @@ def order_ticket(order: object) -> int:
 
 
 def test_it_says_how_it_is() -> None:
-    made = step_roster(B, A)
+    made = order_coordinator(B, A)
     beat(made, B, 10.0, steps=100)
     beat(made, B, 12.0, steps=300)
     beat(made, A, 12.0, steps=50)

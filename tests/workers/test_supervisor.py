@@ -6,7 +6,15 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from workers.host import BACKOFF_FIRST_S, BACKOFF_MOST_S, EXIT_NO_LEARNER, HEALTHY_S, LEAVE_WITHIN_S, POLL_S, Host
+from workers.supervisor import (
+    BACKOFF_FIRST_S,
+    BACKOFF_MOST_S,
+    EXIT_NO_LEARNER,
+    HEALTHY_S,
+    LEAVE_WITHIN_S,
+    POLL_S,
+    Supervisor,
+)
 
 
 @dataclass
@@ -33,7 +41,7 @@ class Machine:
     def __init__(self, workers: int = 1) -> None:
         self.now = 0.0
         self.started: list[tuple[str, FakeRunning]] = []
-        self.host = Host(self.start, workers, lambda: self.now)
+        self.host = Supervisor(self.start, workers, lambda: self.now)
 
     def start(self, name: str) -> FakeRunning:
         self.started.append((name, FakeRunning()))
@@ -132,7 +140,7 @@ def test_every_request_to_stop_is_passed_on_and_a_worker_that_does_not_leave_is_
         if "wait" in worker.requests:
             worker.end = (-9, "was killed")
 
-    monkeypatch.setattr("workers.host.time.sleep", sleeps)
+    monkeypatch.setattr("workers.supervisor.time.sleep", sleeps)
     assert machine.host.run(lambda: requests, lambda line: None) == 1
     assert worker.requests == ["stop", "stop", "stop", "wait"]
     assert machine.now == pytest.approx(1 + LEAVE_WITHIN_S, abs=5 * POLL_S)

@@ -13,7 +13,7 @@ from learner.members.events import EnvironmentRaised, WorkerJoined, WorkerLeft, 
 from learner.members.membership import Outgoing
 from learner.members.states import TABLE, MemberState, SentUnusable, TimedOut
 from learner.rollouts.ledger import Ledger
-from learner.rollouts.roster import STRIKES, Roster
+from learner.rollouts.ticket_coordinator import STRIKES, TicketCoordinator
 from protocol.messages import (
     PROTOCOL_VERSION,
     Collect,
@@ -44,7 +44,7 @@ TIMEOUT_S = 5.0
 
 
 class Learner:
-    """A roster, and shorthand for what workers say to it. Every call checks that the ledger balances."""
+    """A coordinator, and shorthand for what workers say to it. Every call checks that the ledger balances."""
 
     def __init__(
         self,
@@ -55,7 +55,7 @@ class Learner:
         incarnations: Sequence[int] = (),
         publish: bool = True,
     ) -> None:
-        self.roster = Roster(
+        self.coordinator = TicketCoordinator(
             run_spec(lanes),
             rollouts_per_update=lanes if per_update is None else per_update,
             max_lag=max_lag,
@@ -69,25 +69,25 @@ class Learner:
             self.publish(0)
 
     def publish(self, version: int) -> list[Outgoing]:
-        return self.balanced(self.roster.publish(version, PARAMETERS, BUFFERS))
+        return self.balanced(self.coordinator.publish(version, PARAMETERS, BUFFERS))
 
     def says(self, peer: bytes, message: ToLearner) -> list[Outgoing]:
-        return self.balanced(self.roster.receive(peer, message, self.now))
+        return self.balanced(self.coordinator.receive(peer, message, self.now))
 
     def joins(self, peer: bytes, *, pid: int = 1, attempt: int = 1, host: str = "host") -> list[Outgoing]:
         return self.says(peer, Hello(PROTOCOL_VERSION, peer.decode(), host, pid, 1000 * len(host) + pid, "fake", attempt))
 
     def session(self, peer: bytes) -> int:
-        return self.roster.members[peer].session
+        return self.coordinator.members[peer].session
 
     def tickets(self, peer: bytes | None = None) -> list[int]:
         """Numbers of the tickets that are with this worker, or with any."""
-        return sorted(number for number, ticket in self.roster.tickets.items() if peer in (None, ticket.peer))
+        return sorted(number for number, ticket in self.coordinator.tickets.items() if peer in (None, ticket.peer))
 
     def rollout_of(self, number: int, sequence: int | None = None, version: int | None = None) -> Rollout:
         """The rollout of an outstanding ticket, as its worker would send it."""
-        ticket = self.roster.tickets[number]
-        lane = self.roster.lanes[ticket.lane]
+        ticket = self.coordinator.tickets[number]
+        lane = self.coordinator.lanes[ticket.lane]
         expected = lane.below + sorted(lane.outstanding).index(number)
         return fake_rollout(
             self.session(ticket.peer),
@@ -98,7 +98,7 @@ class Learner:
         )
 
     def delivers(self, number: int) -> list[Outgoing]:
-        return self.says(self.roster.tickets[number].peer, self.rollout_of(number))
+        return self.says(self.coordinator.tickets[number].peer, self.rollout_of(number))
 
     def deliver_all(self) -> None:
         for number in self.tickets():
@@ -109,11 +109,11 @@ class Learner:
     ) -> list[Outgoing]:
         """A Heartbeat: by default of a worker that lost nothing."""
         held = self.tickets(peer) if tickets is None else tickets
-        seen = self.roster.members[peer].replies if replies is None else replies
+        seen = self.coordinator.members[peer].replies if replies is None else replies
         return self.says(peer, Heartbeat(self.session(peer), seen, version, tuple(held), 0, {}, 0))
 
     def take(self) -> list[Rollout]:
-        taken = self.roster.take()
+        taken = self.coordinator.take()
         assert taken is not None
         self.balanced([])
         return [arrived.rollout for arrived in taken]
@@ -122,14 +122,14 @@ class Learner:
         """A whole synchronous update: everything delivered, taken, published."""
         self.deliver_all()
         taken = self.take()
-        self.publish(self.roster.version + 1)
+        self.publish(self.coordinator.version + 1)
         return taken
 
     def balanced(self, outs: list[Outgoing]) -> list[Outgoing]:
-        roster, ledger = self.roster, self.roster.ledger
-        in_flight = len(roster.tickets) + len(roster.ready)
+        coordinator, ledger = self.coordinator, self.coordinator.ledger
+        in_flight = len(coordinator.tickets) + len(coordinator.ready)
         assert ledger.issued == ledger.used + ledger.stale + ledger.lost + in_flight
-        assert ledger.transitions_waiting == len(roster.ready)  # a fake rollout is one transition
+        assert ledger.transitions_waiting == len(coordinator.ready)  # a fake rollout is one transition
         return outs
 
 
@@ -147,7 +147,7 @@ def kinds(outs: Sequence[Outgoing], peer: bytes) -> list[type]:
 
 
 def lanes_of(learner: Learner, peer: bytes) -> set[int]:
-    return learner.roster.members[peer].lanes
+    return learner.coordinator.members[peer].lanes
 
 
 # -------------------------------------------------------------------- joining
@@ -157,14 +157,14 @@ def test_hello_is_answered_by_welcome_weights_and_collect_in_this_order() -> Non
     learner = Learner(lanes=2)
     outs = learner.joins(A)
     assert kinds(outs, A) == [Welcome, Weights, Collect]
-    assert of(outs, Welcome) == [Welcome(100, 1, learner.roster.run)]
-    assert learner.roster.events == [WorkerJoined("a", "host", 1)]
+    assert of(outs, Welcome) == [Welcome(100, 1, learner.coordinator.run)]
+    assert learner.coordinator.events == [WorkerJoined("a", "host", 1)]
 
 
 def test_before_the_first_weights_a_worker_is_welcomed_and_given_nothing() -> None:
     learner = Learner(publish=False)
     assert kinds(learner.joins(A), A) == [Welcome]
-    assert learner.roster.ledger.issued == 0
+    assert learner.coordinator.ledger.issued == 0
     assert kinds(learner.publish(0), A) == [Weights, Collect]
 
 
@@ -173,7 +173,7 @@ def test_a_repeated_hello_is_answered_by_the_same_welcome() -> None:
     first = of(learner.joins(A), Welcome)
     again = learner.joins(A)
     assert again == [(A, first[0])]
-    assert learner.roster.ledger.lost == 0
+    assert learner.coordinator.ledger.lost == 0
 
 
 def test_a_repeated_hello_is_a_sign_of_life() -> None:
@@ -181,16 +181,16 @@ def test_a_repeated_hello_is_a_sign_of_life() -> None:
     learner.joins(A)
     learner.now = TIMEOUT_S
     learner.joins(A)
-    learner.roster.remove_silent(TIMEOUT_S + 1)
-    assert A in learner.roster.members
+    learner.coordinator.remove_silent(TIMEOUT_S + 1)
+    assert A in learner.coordinator.members
 
 
 def test_a_later_attempt_of_the_same_process_begins_a_new_session() -> None:
     learner = Learner(lanes=2)
     learner.joins(A)
     outs = learner.joins(A, attempt=2)
-    assert of(outs, Welcome) == [Welcome(101, 2, learner.roster.run)]
-    assert learner.roster.ledger.lost == 2
+    assert of(outs, Welcome) == [Welcome(101, 2, learner.coordinator.run)]
+    assert learner.coordinator.ledger.lost == 2
     assert {permit.incarnation for permit in permits(outs)} == {1}
 
 
@@ -208,8 +208,8 @@ def test_the_same_name_from_another_process_replaces_the_old_one(pid: int, host:
     outs = learner.joins(A, pid=pid, host=host)
     assert kinds(outs, A) == [Welcome, Weights, Collect]
     assert learner.session(A) == 101
-    assert learner.roster.ledger.lost == 2
-    assert WorkerLeft("a", f"replaced by process {pid}", 2, False) in learner.roster.events
+    assert learner.coordinator.ledger.lost == 2
+    assert WorkerLeft("a", f"replaced by process {pid}", 2, False) in learner.coordinator.events
 
 
 def test_the_one_that_was_replaced_is_told_why_when_it_comes_back() -> None:
@@ -219,14 +219,14 @@ def test_the_one_that_was_replaced_is_told_why_when_it_comes_back() -> None:
     learner.joins(A, pid=2)
     (refuse,) = of(learner.joins(A, pid=1, attempt=2), Refuse)
     assert "give each worker a name of its own" in refuse.reason
-    assert learner.roster.members[A].hello.pid == 2
+    assert learner.coordinator.members[A].hello.pid == 2
 
 
 def test_a_name_that_is_not_the_routing_id_is_refused() -> None:
     learner = Learner()
     (refuse,) = of(learner.says(A, Hello(PROTOCOL_VERSION, "b", "host", 1, 1001, "fake", 1)), Refuse)
     assert "routing id" in refuse.reason
-    assert learner.roster.members == {}
+    assert learner.coordinator.members == {}
 
 
 def test_another_protocol_is_refused_and_says_what_to_do() -> None:
@@ -234,8 +234,8 @@ def test_another_protocol_is_refused_and_says_what_to_do() -> None:
     outs = learner.says(A, Hello(PROTOCOL_VERSION + 1, "a", "host", 1, 1001, "fake", 1))
     (refuse,) = of(outs, Refuse)
     assert f"expected {PROTOCOL_VERSION}, got {PROTOCOL_VERSION + 1}" in refuse.reason
-    assert learner.roster.members == {}
-    assert isinstance(learner.roster.events[0], WorkerRefused)
+    assert learner.coordinator.members == {}
+    assert isinstance(learner.coordinator.events[0], WorkerRefused)
 
 
 @pytest.mark.parametrize("known", [False, True], ids=["unknown worker", "earlier session"])
@@ -251,7 +251,7 @@ def test_a_last_word_of_no_session_of_ours_is_not_answered() -> None:
     learner = Learner()
     learner.joins(A)
     assert learner.says(A, Goodbye(5, "bye", ())) == learner.says(A, Failure(5, "broke", "", None)) == []
-    assert A in learner.roster.members
+    assert A in learner.coordinator.members
 
 
 # -------------------------------------------------------------------- the ticket law
@@ -260,17 +260,17 @@ def test_a_last_word_of_no_session_of_ours_is_not_answered() -> None:
 @pytest.mark.parametrize("max_lag", [0, 1, 4])
 @pytest.mark.parametrize(("lanes", "per_update"), [(2, 2), (3, 1), (1, 3), (4, 3)])
 def test_tickets_are_dealt_while_used_and_outstanding_are_below_the_bound(max_lag: int, lanes: int, per_update: int) -> None:
-    """The law: used + outstanding < per_update * (version + 1 + max_lag). As many as it allows are dealt, never more."""
+    """Rule: used + outstanding < per_update * (version + 1 + max_lag). As many as it allows are dealt, never more."""
     learner = Learner(lanes, max_lag, per_update)
     learner.joins(A)
     for version in range(1, 6):
-        ledger = learner.roster.ledger
+        ledger = learner.coordinator.ledger
         assert ledger.used + ledger.outstanding == per_update * (version + max_lag)
-        while len(learner.roster.ready) < per_update:
+        while len(learner.coordinator.ready) < per_update:
             learner.delivers(learner.tickets()[0])
         assert ledger.used + ledger.outstanding == per_update * (version + max_lag)
         learner.take()
-        assert learner.roster.deal() == []
+        assert learner.coordinator.deal() == []
         learner.publish(version)
 
 
@@ -280,11 +280,11 @@ def test_a_stale_drop_makes_room_for_a_fresh_ticket() -> None:
     learner.delivers(1)
     learner.publish(1)
     learner.publish(2)  # ticket 1 was acted under version 0: staler than max_lag
-    issued = learner.roster.ledger.issued
-    assert learner.roster.take() is None
-    outs = learner.balanced(learner.roster.deal())
-    assert learner.roster.ledger.stale == 1
-    assert learner.roster.ledger.transitions_stale == 1
+    issued = learner.coordinator.ledger.issued
+    assert learner.coordinator.take() is None
+    outs = learner.balanced(learner.coordinator.deal())
+    assert learner.coordinator.ledger.stale == 1
+    assert learner.coordinator.ledger.transitions_stale == 1
     assert [permit.ticket for permit in permits(outs)] == [issued]
     assert [permit.lane for permit in permits(outs)] == [1]  # the lane whose rollout was dropped
 
@@ -296,7 +296,7 @@ def test_a_rollout_exactly_max_lag_old_is_used() -> None:
     learner.publish(1)
     learner.publish(2)
     assert [rollout.version for rollout in learner.take()] == [0]
-    assert learner.roster.ledger.stale == 0
+    assert learner.coordinator.ledger.stale == 0
 
 
 def test_the_least_advanced_lane_is_dealt_to_first() -> None:
@@ -304,9 +304,9 @@ def test_the_least_advanced_lane_is_dealt_to_first() -> None:
     learner.joins(A)
     order = []
     for version in range(1, 7):
-        order += [learner.roster.tickets[number].lane for number in learner.tickets()]
+        order += [learner.coordinator.tickets[number].lane for number in learner.tickets()]
         learner.update()
-        assert learner.roster.version == version
+        assert learner.coordinator.version == version
     assert order == [0, 1, 2, 0, 1, 2]
 
 
@@ -314,8 +314,8 @@ def test_a_lane_that_fell_behind_catches_up() -> None:
     learner = Learner(lanes=2, max_lag=0, per_update=2)
     learner.joins(A)
     learner.delivers(1)
-    member = learner.roster.members[A]
-    outs = learner.balanced(learner.roster.reject_rollout(A, learner.rollout_of(0), "broken", 0.0))
+    member = learner.coordinator.members[A]
+    outs = learner.balanced(learner.coordinator.reject_rollout(A, learner.rollout_of(0), "broken", 0.0))
     assert [permit.lane for permit in permits(outs)] == [0]
     assert member.strikes == 1
 
@@ -336,13 +336,13 @@ def test_in_a_synchronous_run_no_lane_gets_two_tickets_in_a_round_while_another_
     learner.joins(A)
     learner.delivers(learner.tickets()[0])  # lane 0 is done with its round
     learner.joins(B)  # a lane moves to B, at a rollout boundary
-    round_lanes = [arrived.rollout.lane for arrived in learner.roster.ready] + [
-        t.lane for t in learner.roster.tickets.values()
+    round_lanes = [arrived.rollout.lane for arrived in learner.coordinator.ready] + [
+        t.lane for t in learner.coordinator.tickets.values()
     ]
     assert sorted(round_lanes) == [0, 1, 2]
     learner.says(A, Goodbye(learner.session(A), "bye", ()))
-    round_lanes = [arrived.rollout.lane for arrived in learner.roster.ready] + [
-        t.lane for t in learner.roster.tickets.values()
+    round_lanes = [arrived.rollout.lane for arrived in learner.coordinator.ready] + [
+        t.lane for t in learner.coordinator.tickets.values()
     ]
     assert sorted(round_lanes) == [0, 1, 2]
 
@@ -351,11 +351,11 @@ def test_while_the_least_advanced_lane_is_moving_no_other_takes_its_place() -> N
     learner = Learner(lanes=2, max_lag=1, per_update=1)  # two tickets: one for each lane
     learner.joins(A)
     learner.joins(B)  # lane 1 waits for its ticket to end
-    (moving,) = [lane for lane in learner.roster.lanes if lane.moving]
+    (moving,) = [lane for lane in learner.coordinator.lanes if lane.moving]
     learner.publish(1)  # room for one more; both lanes stand at 1, lane 0 goes first
-    assert learner.roster.lanes[0].progress == 2 or moving.number == 0
+    assert learner.coordinator.lanes[0].progress == 2 or moving.number == 0
     learner.publish(2)  # room for another: it would be the moving lane's turn
-    other = learner.roster.lanes[1 - moving.number]
+    other = learner.coordinator.lanes[1 - moving.number]
     assert moving.progress == 1
     assert other.progress <= 2
 
@@ -363,8 +363,8 @@ def test_while_the_least_advanced_lane_is_moving_no_other_takes_its_place() -> N
 def test_when_every_worker_is_lost_no_ticket_is_dealt_until_one_joins() -> None:
     learner = Learner(lanes=2)
     learner.joins(A)
-    assert learner.balanced(learner.roster.remove_worker("a", "killed")) == []
-    assert learner.roster.deal() == []
+    assert learner.balanced(learner.coordinator.remove_worker("a", "killed")) == []
+    assert learner.coordinator.deal() == []
     outs = learner.joins(B)
     assert {(permit.lane, permit.incarnation) for permit in permits(outs)} == {(0, 1), (1, 1)}
 
@@ -383,7 +383,7 @@ def test_a_ticket_is_used_once_and_a_repeat_is_counted() -> None:
     learner.says(A, rollout)
     assert [r.ticket for r in learner.take()] == [0]
     learner.says(A, rollout)
-    ledger = learner.roster.ledger
+    ledger = learner.coordinator.ledger
     assert (ledger.used, ledger.transitions_used, ledger.transitions_duplicate) == (1, 1, 2)
 
 
@@ -391,9 +391,9 @@ def test_a_late_rollout_of_an_ended_session_is_counted_and_answered_by_rejoin() 
     learner = Learner(lanes=1)
     learner.joins(A)
     rollout = learner.rollout_of(0)
-    learner.roster.remove_worker("a", "killed")
+    learner.coordinator.remove_worker("a", "killed")
     assert learner.says(A, rollout) == [(A, Rejoin(100))]
-    assert (learner.roster.ledger.transitions_late, learner.roster.ready) == (1, [])
+    assert (learner.coordinator.ledger.transitions_late, learner.coordinator.ready) == (1, [])
 
 
 def test_a_rollout_under_older_weights_than_its_ticket_asks_for_is_not_used() -> None:
@@ -403,7 +403,7 @@ def test_a_rollout_under_older_weights_than_its_ticket_asks_for_is_not_used() ->
     newest = learner.tickets()[-1]
     outs = learner.says(A, learner.rollout_of(newest, version=0))
     assert [permit.lane for permit in permits(outs)] == [0]  # dealt again
-    assert learner.roster.ledger.transitions_invalid == 1
+    assert learner.coordinator.ledger.transitions_invalid == 1
 
 
 @pytest.mark.parametrize("change", [{"version": 7}, {"lane": 1}], ids=["weights that do not exist", "another lane"])
@@ -411,9 +411,9 @@ def test_a_rollout_that_does_not_fit_its_ticket_is_not_used(change: dict[str, in
     learner = Learner(lanes=2)
     learner.joins(A)
     learner.says(A, msgspec.structs.replace(learner.rollout_of(0), **change))
-    ledger = learner.roster.ledger
-    assert (learner.roster.ready, ledger.transitions_invalid, ledger.lost) == ([], 1, 1)
-    assert learner.roster.members[A].strikes == 1
+    ledger = learner.coordinator.ledger
+    assert (learner.coordinator.ready, ledger.transitions_invalid, ledger.lost) == ([], 1, 1)
+    assert learner.coordinator.members[A].strikes == 1
 
 
 def test_a_rollout_of_another_workers_ticket_is_not_used_and_costs_that_worker_nothing() -> None:
@@ -423,9 +423,9 @@ def test_a_rollout_of_another_workers_ticket_is_not_used_and_costs_that_worker_n
     learner.update()
     (theirs,) = learner.tickets(B)
     learner.says(A, msgspec.structs.replace(learner.rollout_of(theirs), session=learner.session(A)))
-    assert learner.roster.ready == []
+    assert learner.coordinator.ready == []
     assert learner.tickets(B) == [theirs]
-    assert (learner.roster.members[A].strikes, learner.roster.members[B].strikes) == (1, 0)
+    assert (learner.coordinator.members[A].strikes, learner.coordinator.members[B].strikes) == (1, 0)
 
 
 # -------------------------------------------------------------------- lanes
@@ -437,11 +437,11 @@ def test_a_lost_workers_tickets_and_lanes_are_dealt_to_the_living_with_a_higher_
     learner.joins(B)
     learner.update()
     (lost,) = learner.tickets(A)
-    lane = learner.roster.tickets[lost].lane
-    before = learner.roster.lanes[lane].incarnation
-    outs = learner.balanced(learner.roster.remove_worker("a", "killed"))
+    lane = learner.coordinator.tickets[lost].lane
+    before = learner.coordinator.lanes[lane].incarnation
+    outs = learner.balanced(learner.coordinator.remove_worker("a", "killed"))
     assert [(p.lane, p.incarnation) for p in permits(outs, B)] == [(lane, before + 1)]
-    assert lost not in learner.roster.tickets
+    assert lost not in learner.coordinator.tickets
     assert lanes_of(learner, B) == {0, 1}
 
 
@@ -450,7 +450,7 @@ def test_a_new_life_of_a_lane_has_received_nothing() -> None:
     learner.joins(A)
     learner.update()
     learner.joins(B)
-    outs = learner.roster.remove_worker("a", "killed")
+    outs = learner.coordinator.remove_worker("a", "killed")
     (collect,) = of(outs, Collect, B)
     assert collect.received == (Received(0, 1, 0, ()),)
 
@@ -460,10 +460,10 @@ def test_a_lane_that_was_never_started_keeps_its_incarnation_when_moved() -> Non
     learner.joins(A)
     learner.joins(B)
     assert lanes_of(learner, B) == {1}
-    assert [lane.incarnation for lane in learner.roster.lanes] == [0, 0]
+    assert [lane.incarnation for lane in learner.coordinator.lanes] == [0, 0]
     learner.update()
     (number,) = learner.tickets(B)
-    assert learner.roster.tickets[number].incarnation == 0
+    assert learner.coordinator.tickets[number].incarnation == 0
 
 
 def test_lanes_even_out_to_a_newcomer_only_at_a_rollout_boundary() -> None:
@@ -474,10 +474,10 @@ def test_lanes_even_out_to_a_newcomer_only_at_a_rollout_boundary() -> None:
     outs = learner.delivers(3)  # lane 3 is at its boundary
     assert of(outs, Release, A) == [Release(learner.session(A), (LaneLife(3, 0),))]
     assert lanes_of(learner, B) == {3}
-    assert learner.roster.lanes[3].incarnation == 1
+    assert learner.coordinator.lanes[3].incarnation == 1
     learner.update()
     assert len(lanes_of(learner, A)) == len(lanes_of(learner, B)) == 2
-    assert learner.roster.ledger.lost == 0
+    assert learner.coordinator.ledger.lost == 0
 
 
 def test_release_travels_before_what_the_lanes_new_owner_is_told() -> None:
@@ -512,15 +512,17 @@ def test_more_workers_than_lanes_stand_by() -> None:
 def test_a_lane_has_one_owner_whoever_comes_and_goes() -> None:
     learner = Learner(lanes=5)
     for step, peer in enumerate([A, B, C, A, B, A, C, B] * 4):
-        if peer in learner.roster.members and step % 3:
-            learner.balanced(learner.roster.remove_worker(peer.decode(), "killed"))
+        if peer in learner.coordinator.members and step % 3:
+            learner.balanced(learner.coordinator.remove_worker(peer.decode(), "killed"))
         else:
             learner.joins(peer, pid=step)
-        if learner.roster.members:
+        if learner.coordinator.members:
             learner.update()
-            owned = [n for member in learner.roster.members.values() for n in member.lanes]
+            owned = [n for member in learner.coordinator.members.values() for n in member.lanes]
             assert sorted(owned) == [0, 1, 2, 3, 4]
-            assert all(learner.roster.lanes[n].owner == m.peer for m in learner.roster.members.values() for n in m.lanes)
+            assert all(
+                learner.coordinator.lanes[n].owner == m.peer for m in learner.coordinator.members.values() for n in m.lanes
+            )
 
 
 # -------------------------------------------------------------------- weights
@@ -614,7 +616,7 @@ def test_a_lost_collect_is_said_again_only_when_a_reply_said_after_it_has_been_s
     assert of(learner.beats(A, tickets=[], replies=1), Collect) == []  # the repeat may be on its way
     assert of(learner.beats(A, tickets=[], replies=2), Collect) == [first]  # reply 2 was said after it
     assert of(learner.beats(A, tickets=[0]), Collect) == []
-    assert learner.roster.ledger.issued == 1
+    assert learner.coordinator.ledger.issued == 1
 
 
 def test_lost_weights_are_said_again_only_when_a_reply_said_after_them_has_been_seen() -> None:
@@ -640,7 +642,7 @@ def test_a_lost_rollout_is_asked_for_again() -> None:
     learner.beats(A)
     outs = learner.beats(A, tickets=[1])
     assert permits(outs) == [Permit(0, 0, 0)]
-    assert learner.roster.ledger.lost == 0
+    assert learner.coordinator.ledger.lost == 0
 
 
 def test_lost_collects_of_several_versions_are_said_again_each_under_its_own() -> None:
@@ -676,16 +678,16 @@ def test_a_reply_leaves_out_lanes_that_live_elsewhere() -> None:
 def test_a_bad_rollout_is_counted_and_its_ticket_dealt_again() -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
-    outs = learner.balanced(learner.roster.reject_rollout(A, learner.rollout_of(0), "obs are NaN", 0.0))
+    outs = learner.balanced(learner.coordinator.reject_rollout(A, learner.rollout_of(0), "obs are NaN", 0.0))
     assert permits(outs) == [Permit(1, 0, 0)]
-    ledger = learner.roster.ledger
+    ledger = learner.coordinator.ledger
     assert (ledger.lost, ledger.transitions_invalid, ledger.outstanding) == (1, 1, 1)
 
 
 def test_a_bad_rollout_is_let_go_by_its_worker() -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
-    (collect,) = of(learner.roster.reject_rollout(A, learner.rollout_of(0), "obs are NaN", 0.0), Collect)
+    (collect,) = of(learner.coordinator.reject_rollout(A, learner.rollout_of(0), "obs are NaN", 0.0), Collect)
     assert collect.received == (Received(0, 0, 1, ()),)
 
 
@@ -695,41 +697,41 @@ def test_a_worker_that_keeps_sending_rubbish_is_refused_and_what_it_held_is_deal
     learner.joins(A)
     outs: list[Outgoing] = []
     for strike in range(STRIKES):
-        assert A in learner.roster.members, strike
+        assert A in learner.coordinator.members, strike
         if kind == "rollout":
             rollout = learner.rollout_of(learner.tickets()[0])
-            outs = learner.balanced(learner.roster.reject_rollout(A, rollout, "not understood", 0.0))
+            outs = learner.balanced(learner.coordinator.reject_rollout(A, rollout, "not understood", 0.0))
         else:
-            outs = learner.balanced(learner.roster.reject_message(A, "not understood", 0.0))
+            outs = learner.balanced(learner.coordinator.reject_message(A, "not understood", 0.0))
     assert outs == [(A, Refuse("not understood"))]
-    assert A not in learner.roster.members
-    assert learner.roster.ledger.outstanding == 0
-    assert learner.roster.ledger.messages_bad == (STRIKES if kind == "message" else 0)
-    assert WorkerRefused("a", "not understood") in learner.roster.events
+    assert A not in learner.coordinator.members
+    assert learner.coordinator.ledger.outstanding == 0
+    assert learner.coordinator.ledger.messages_bad == (STRIKES if kind == "message" else 0)
+    assert WorkerRefused("a", "not understood") in learner.coordinator.events
 
 
 def test_one_that_was_refused_stays_refused_and_another_process_of_its_name_may_join() -> None:
     learner = Learner(lanes=1)
     learner.joins(A, pid=1)
     for _ in range(STRIKES):
-        learner.roster.reject_message(A, "rubbish", 0.0)
+        learner.coordinator.reject_message(A, "rubbish", 0.0)
     assert learner.joins(A, pid=1, attempt=2) == [(A, Refuse("rubbish"))]
     assert kinds(learner.joins(A, pid=2), A) == [Welcome, Weights, Collect]
 
 
 def test_rubbish_of_a_stranger_is_counted_and_refused() -> None:
     learner = Learner()
-    ((peer, refuse),) = learner.roster.reject_message(b"stranger", "no head", 0.0)
+    ((peer, refuse),) = learner.coordinator.reject_message(b"stranger", "no head", 0.0)
     assert isinstance(refuse, Refuse)
-    assert (peer, learner.roster.ledger.messages_bad, learner.roster.members) == (b"stranger", 1, {})
+    assert (peer, learner.coordinator.ledger.messages_bad, learner.coordinator.members) == (b"stranger", 1, {})
 
 
 def test_whatever_dtype_a_bad_rollouts_flags_have_they_are_counted_without_raising() -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
     bad = msgspec.structs.replace(learner.rollout_of(0), valid=np.full((1, 1), 9.0, np.float32))
-    learner.balanced(learner.roster.reject_rollout(A, bad, "valid expected bool", 0.0))
-    assert learner.roster.ledger.transitions_invalid == 0
+    learner.balanced(learner.coordinator.reject_rollout(A, bad, "valid expected bool", 0.0))
+    assert learner.coordinator.ledger.transitions_invalid == 0
 
 
 def test_a_late_bad_rollout_of_an_ended_session_does_not_touch_the_ticket_of_the_same_number() -> None:
@@ -737,9 +739,9 @@ def test_a_late_bad_rollout_of_an_ended_session_does_not_touch_the_ticket_of_the
     learner = Learner(lanes=1)
     learner.joins(A)
     late = fake_rollout(session=5, lane=0, ticket=0, version=0, sequence=3)
-    learner.balanced(learner.roster.reject_rollout(A, late, "obs are NaN", 0.0))
+    learner.balanced(learner.coordinator.reject_rollout(A, late, "obs are NaN", 0.0))
     assert learner.tickets(A) == [0]
-    assert learner.roster.lanes[0].ahead == set()
+    assert learner.coordinator.lanes[0].ahead == set()
 
 
 @pytest.mark.parametrize("sequence", [-1, 1, 1 << 62])
@@ -748,8 +750,8 @@ def test_a_rollout_whose_sequence_cannot_be_is_not_used(sequence: int) -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
     learner.says(A, learner.rollout_of(0, sequence=sequence))
-    assert learner.roster.lanes[0].ahead == set()
-    assert learner.roster.ledger.transitions_invalid == 1
+    assert learner.coordinator.lanes[0].ahead == set()
+    assert learner.coordinator.ledger.transitions_invalid == 1
 
 
 # -------------------------------------------------------------------- leaving
@@ -760,9 +762,9 @@ def test_goodbye_forgets_the_worker_and_deals_what_it_held() -> None:
     learner.joins(A)
     learner.joins(B)
     outs = learner.says(A, Goodbye(learner.session(A), "told to stop", (0, 1)))
-    assert A not in learner.roster.members
+    assert A not in learner.coordinator.members
     assert {permit.lane for permit in permits(outs, B)} == {0, 1}
-    assert learner.roster.events[-1] == WorkerLeft("a", "left: told to stop", 2, True)
+    assert learner.coordinator.events[-1] == WorkerLeft("a", "left: told to stop", 2, True)
 
 
 def test_failure_forgets_the_worker_and_its_traceback_is_kept_for_the_log() -> None:
@@ -770,10 +772,10 @@ def test_failure_forgets_the_worker_and_its_traceback_is_kept_for_the_log() -> N
     learner.joins(A)
     learner.joins(B)
     outs = learner.says(A, Failure(learner.session(A), "ValueError: x", "Traceback: …", 0))
-    assert A not in learner.roster.members
+    assert A not in learner.coordinator.members
     assert [permit.incarnation for permit in permits(outs, B)] == [1]
-    assert EnvironmentRaised("a", "host", 0, "ValueError: x", "Traceback: …") in learner.roster.events
-    assert learner.roster.events[-1] == WorkerLeft("a", "broke: ValueError: x", 1, False)
+    assert EnvironmentRaised("a", "host", 0, "ValueError: x", "Traceback: …") in learner.coordinator.events
+    assert learner.coordinator.events[-1] == WorkerLeft("a", "broke: ValueError: x", 1, False)
 
 
 def test_silence_is_judged_in_tick_only() -> None:
@@ -783,18 +785,18 @@ def test_silence_is_judged_in_tick_only() -> None:
     assert of(learner.publish(1), Rejoin) == []
     learner.joins(B)
     learner.beats(A)  # it was only slow to be heard
-    learner.roster.remove_silent(1000.0)
-    assert A in learner.roster.members
+    learner.coordinator.remove_silent(1000.0)
+    assert A in learner.coordinator.members
 
 
 def test_a_silent_worker_is_forgotten_by_tick() -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
-    assert learner.roster.remove_silent(TIMEOUT_S) == []
-    assert A in learner.roster.members
-    learner.balanced(learner.roster.remove_silent(TIMEOUT_S + 0.1))
-    assert learner.roster.members == {}
-    assert learner.roster.events[-1] == WorkerLeft("a", "silent for 5 s", 1, False)
+    assert learner.coordinator.remove_silent(TIMEOUT_S) == []
+    assert A in learner.coordinator.members
+    learner.balanced(learner.coordinator.remove_silent(TIMEOUT_S + 0.1))
+    assert learner.coordinator.members == {}
+    assert learner.coordinator.events[-1] == WorkerLeft("a", "silent for 5 s", 1, False)
 
 
 @pytest.mark.parametrize("kind", ["heartbeat", "rollout", "rubbish"])
@@ -808,44 +810,44 @@ def test_any_message_of_the_session_is_a_sign_of_life(kind: str) -> None:
         case "rollout":
             learner.delivers(0)
         case _:
-            learner.roster.reject_message(A, "rubbish", learner.now)
-    learner.roster.remove_silent(4.0 + TIMEOUT_S)
-    assert A in learner.roster.members
+            learner.coordinator.reject_message(A, "rubbish", learner.now)
+    learner.coordinator.remove_silent(4.0 + TIMEOUT_S)
+    assert A in learner.coordinator.members
 
 
 def test_drain_asks_everybody_to_leave_and_deals_no_more() -> None:
     learner = Learner(lanes=2)
     learner.joins(A)
     learner.joins(B)
-    assert learner.balanced(learner.roster.drain("finished")) == [(A, Drain("finished")), (B, Drain("finished"))]
+    assert learner.balanced(learner.coordinator.drain("finished")) == [(A, Drain("finished")), (B, Drain("finished"))]
     learner.deliver_all()
-    issued = learner.roster.ledger.issued
+    issued = learner.coordinator.ledger.issued
     learner.take()
-    assert learner.publish(1) == learner.roster.deal() == []
-    assert learner.roster.ledger.issued == issued
+    assert learner.publish(1) == learner.coordinator.deal() == []
+    assert learner.coordinator.ledger.issued == issued
 
 
 def test_what_a_draining_worker_still_delivers_is_counted_and_can_be_used() -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
-    learner.roster.drain("finished")
+    learner.coordinator.drain("finished")
     assert learner.delivers(0) == []
     assert len(learner.take()) == 1
     assert learner.says(A, Goodbye(100, "finished", ())) == []
-    assert learner.roster.members == {}
+    assert learner.coordinator.members == {}
 
 
 def test_a_lost_drain_is_said_again_at_each_heartbeat() -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
-    learner.roster.drain("finished")
+    learner.coordinator.drain("finished")
     assert learner.beats(A) == [(A, Drain("finished"))]
 
 
 def test_whoever_says_hello_to_a_draining_learner_is_told_to_leave() -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
-    learner.roster.drain("finished")
+    learner.coordinator.drain("finished")
     assert learner.joins(B) == [(B, Drain("finished"))]
     assert learner.joins(A, attempt=2) == [(A, Drain("finished"))]
 
@@ -853,18 +855,18 @@ def test_whoever_says_hello_to_a_draining_learner_is_told_to_leave() -> None:
 def test_a_draining_worker_that_falls_silent_is_forgotten() -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
-    learner.roster.drain("finished")
-    assert learner.balanced(learner.roster.remove_silent(TIMEOUT_S + 0.1)) == []
-    assert learner.roster.members == {}
+    learner.coordinator.drain("finished")
+    assert learner.balanced(learner.coordinator.remove_silent(TIMEOUT_S + 0.1)) == []
+    assert learner.coordinator.members == {}
 
 
 def test_gone_does_not_wait_for_silence() -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
     learner.joins(B)
-    outs = learner.balanced(learner.roster.remove_worker("a", "killed by signal 9"))
+    outs = learner.balanced(learner.coordinator.remove_worker("a", "killed by signal 9"))
     assert [permit.lane for permit in permits(outs, B)] == [0]
-    assert learner.roster.remove_worker("a", "again") == []
+    assert learner.coordinator.remove_worker("a", "again") == []
 
 
 # -------------------------------------------------------------------- the ledger and the checkpoint
@@ -877,13 +879,13 @@ def test_every_ticket_ends_as_used_stale_or_lost() -> None:
     learner.delivers(0)
     learner.publish(1)
     learner.publish(2)
-    learner.roster.take()  # 0 was stale
-    learner.roster.deal()
-    learner.roster.remove_worker("a", "killed")
+    learner.coordinator.take()  # 0 was stale
+    learner.coordinator.deal()
+    learner.coordinator.remove_worker("a", "killed")
     learner.joins(B)
     learner.deliver_all()
     learner.take()
-    counts = learner.roster.ledger.counts()
+    counts = learner.coordinator.ledger.counts()
     assert counts["stale"] == 1
     assert counts["lost"] >= 1
     assert counts["used"] == 2
@@ -898,9 +900,9 @@ def test_every_transition_that_arrived_is_used_or_counted_under_a_reason() -> No
     learner.says(A, rollout)  # duplicate
     learner.take()
     learner.publish(1)
-    learner.roster.reject_rollout(A, learner.rollout_of(1), "NaN", 0.0)  # invalid
+    learner.coordinator.reject_rollout(A, learner.rollout_of(1), "NaN", 0.0)  # invalid
     learner.says(A, msgspec.structs.replace(rollout, session=5))  # late
-    counts = learner.roster.ledger.counts()
+    counts = learner.coordinator.ledger.counts()
     named = ("used", "duplicate", "invalid", "late")
     assert [counts[f"transitions_{name}"] for name in named] == [1, 1, 1, 1]
     assert counts["transitions_received"] == 4
@@ -909,13 +911,13 @@ def test_every_transition_that_arrived_is_used_or_counted_under_a_reason() -> No
 
 def test_incarnations_for_a_checkpoint_name_no_life_that_was_dealt_a_ticket() -> None:
     learner = Learner(lanes=3, per_update=1)  # one ticket a round
-    assert learner.roster.incarnations() == [0, 0, 0]
+    assert learner.coordinator.incarnations() == [0, 0, 0]
     learner.joins(A)
-    assert learner.roster.incarnations() == [1, 0, 0]
+    assert learner.coordinator.incarnations() == [1, 0, 0]
     learner.update()
-    assert learner.roster.incarnations() == [1, 1, 0]
-    learner.roster.remove_worker("a", "killed")
-    assert learner.roster.incarnations() == [1, 1, 0]
+    assert learner.coordinator.incarnations() == [1, 1, 0]
+    learner.coordinator.remove_worker("a", "killed")
+    assert learner.coordinator.incarnations() == [1, 1, 0]
 
 
 def test_no_life_is_lived_twice_across_resumes() -> None:
@@ -931,9 +933,9 @@ def test_no_life_is_lived_twice_across_resumes() -> None:
             assert not fresh & lives
             lives |= fresh
             learner.update()
-            learner.roster.remove_worker(peer.decode(), "killed")
-        version, ledger = learner.roster.version, msgspec.structs.replace(learner.roster.ledger)
-        incarnations = learner.roster.incarnations()
+            learner.coordinator.remove_worker(peer.decode(), "killed")
+        version, ledger = learner.coordinator.version, msgspec.structs.replace(learner.coordinator.ledger)
+        incarnations = learner.coordinator.incarnations()
         ledger.lost += ledger.outstanding
 
 
@@ -949,7 +951,7 @@ def test_a_resumed_learner_counts_tickets_on() -> None:
 
 
 def standing_of(learner: Learner, peer: bytes) -> MemberState:
-    member = learner.roster.members.get(peer)
+    member = learner.coordinator.members.get(peer)
     return MemberState.UNKNOWN if member is None else member.state
 
 
@@ -958,7 +960,7 @@ def in_standing(standing: MemberState) -> Learner:
     if standing is not MemberState.UNKNOWN:
         learner.joins(A)
     if standing is MemberState.DRAINING:
-        learner.roster.drain("finished")
+        learner.coordinator.drain("finished")
     assert standing_of(learner, A) is standing
     return learner
 
@@ -991,10 +993,10 @@ def test_the_table_names_the_standing_that_follows(standing: MemberState, messag
 def test_the_table_names_the_standing_that_follows_an_event(standing: MemberState, event: type) -> None:
     learner = in_standing(standing)
     if event is TimedOut:
-        learner.roster.remove_silent(1e6)
+        learner.coordinator.remove_silent(1e6)
     else:
         for _ in range(STRIKES):
-            learner.roster.reject_message(A, "rubbish", 0.0)
+            learner.coordinator.reject_message(A, "rubbish", 0.0)
     assert standing_of(learner, A) is TABLE[standing][event] is MemberState.UNKNOWN
 
 
@@ -1003,13 +1005,13 @@ def test_why_one_was_silent_is_told_once_it_is_known() -> None:
     learner.joins(b"a")
     learner.joins(b"b")
     learner.now += TIMEOUT_S + 1
-    learner.balanced(learner.roster.remove_silent(learner.now))
-    learner.roster.events.clear()
+    learner.balanced(learner.coordinator.remove_silent(learner.now))
+    learner.coordinator.events.clear()
     for _ in range(2):
-        learner.balanced(learner.roster.remove_worker("a", "was ended: too slow"))
-    assert learner.roster.events == [WorkerLeft("a", "was ended: too slow", 0, False)]
+        learner.balanced(learner.coordinator.remove_worker("a", "was ended: too slow"))
+    assert learner.coordinator.events == [WorkerLeft("a", "was ended: too slow", 0, False)]
     learner.joins(b"b", attempt=2)
     learner.says(b"b", Goodbye(learner.session(b"b"), "told to stop", ()))
-    learner.roster.events.clear()
-    learner.balanced(learner.roster.remove_worker("b", "ended with exit code 0"))
-    assert learner.roster.events == []
+    learner.coordinator.events.clear()
+    learner.balanced(learner.coordinator.remove_worker("b", "ended with exit code 0"))
+    assert learner.coordinator.events == []
