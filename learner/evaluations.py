@@ -89,7 +89,7 @@ class Evaluations:
         return self._service.evaluate(parameters, buffers, self._settings.episodes, seed + self._settings.seed)
 
     def _keep_if_best(self, found: Evaluation, env_steps: int) -> None:
-        """Of equal evaluations the first one is kept: it needed the fewest steps."""
+        """Keep the evaluation if it is the best. A tie keeps the earlier one, which needed fewer steps."""
         if self.best is None or found.return_mean > self.best[0]:
             self.best = [found.return_mean, env_steps]
             weights = self._algorithm.weights()

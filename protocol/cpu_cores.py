@@ -1,4 +1,4 @@
-"""How many cores this process may use: the cores it may run on, or the CPU quota of its container if that is less."""
+"""The number of cores that this process may use: its CPU affinity, or the CPU quota of its container if that is less."""
 
 from __future__ import annotations
 

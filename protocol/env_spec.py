@@ -51,7 +51,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @staticmethod
     def of(env: str | Callable[[], object], kwargs: dict[str, Scalar] | None = None) -> EnvSpec:
-        """From an id, or from a callable that takes `kwargs` and returns a `gymnasium.Env`."""
+        """Make a spec from an id, or from a callable that takes `kwargs` and returns a `gymnasium.Env`."""
         if isinstance(env, str):
             return EnvSpec(env, kwargs or {})
         import cloudpickle

@@ -31,7 +31,7 @@ class Leaf(msgspec.Struct, frozen=True):
 
 
 class ActionSpec(msgspec.Struct, frozen=True):
-    """What the policy chooses."""
+    """The action space of the policy."""
 
     kind: Literal["discrete", "multidiscrete", "multibinary", "box"]
     shape: tuple[int, ...]

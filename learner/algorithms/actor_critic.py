@@ -40,7 +40,7 @@ CHUNK_ROWS = 1024  # observations that are evaluated together where no gradient 
 
 
 class Estimates(NamedTuple):
-    """What an algorithm makes of a batch before it computes losses. Arrays are [T, ΣN]."""
+    """Targets and advantages of a batch, computed before the losses. Arrays are [T, ΣN]."""
 
     advantage: Floats
     target: Floats  # what the values are fitted to

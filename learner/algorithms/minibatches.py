@@ -80,7 +80,7 @@ class Minibatch(NamedTuple):
 
 
 class LossInput(NamedTuple):
-    """What a loss is computed from: B rows of a minibatch, and what the network says of them now.
+    """Input of a loss: B rows of a minibatch, and the network's present outputs for them.
 
     Tensors for `ActorCritic.loss`; for `ActorCritic.loss_gradients` tensors or numpy arrays.
     """

@@ -1,4 +1,4 @@
-"""What the updates of all algorithms share: schedules, and the check that metrics are finite."""
+"""Parts that the updates of all algorithms share: schedules, and the check that metrics are finite."""
 
 from __future__ import annotations
 

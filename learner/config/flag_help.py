@@ -113,7 +113,7 @@ def _fields(record: msgspec.Struct, names: Sequence[str]) -> list[tuple[str, Any
 
 
 def _metavar(name: str, hint: Any) -> str | None:
-    """How the help shows the values of a flag. None: as tyro does by itself."""
+    """Placeholder for the values of a flag in the help text. None: tyro's default."""
     options = get_args(hint)
     if name in METAVARS or NoneType not in options:
         return METAVARS.get(name)

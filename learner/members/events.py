@@ -1,4 +1,4 @@
-"""What happens among the workers, for the log and for the hub, which decides whether the run can go on. Plain data.
+"""Events of workers, for the log and for the hub, which decides whether the run can go on. Plain data.
 
 `json_name` is the `event` field of a line of `--log-json`. Programs read these names: they must not change.
 """

@@ -1,4 +1,4 @@
-"""What the learner asks about the worker processes that this program started. The program that starts them answers."""
+"""The learner's interface to the worker processes that this program started."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a report or a plot reads from a run folder: its configuration, its metrics, and the learning curve. Reads files."""
+"""Data for a report or a plot, read from a run folder: its configuration, its metrics and learning curve. Reads files."""
 
 from __future__ import annotations
 

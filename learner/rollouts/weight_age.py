@@ -39,9 +39,9 @@ class WeightAge:
         self.lags.update(lags)
 
     def histogram(self) -> dict[str, int]:
-        """How many rollouts were used, by lag, from the smallest; a JSON object has strings for keys."""
+        """Number of rollouts that were used, by lag, from the smallest; a JSON object has strings for keys."""
         return {str(lag): self.lags[lag] for lag in sorted(self.lags)}
 
     def first_use_s(self) -> dict[str, float]:
-        """Of each worker, the median of the seconds from publishing weights to its first rollout under them."""
+        """For each worker, the median number of seconds from publishing weights to its first rollout under them."""
         return {worker: median(seconds) for worker, seconds in sorted(self._first_use_s.items())}

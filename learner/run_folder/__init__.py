@@ -1,1 +1,1 @@
-"""What a run writes and reads: checkpoints, metrics, policies."""
+"""The files of a run: checkpoints, metrics, policies."""

@@ -1,4 +1,4 @@
-"""How far a run is, and the names under which its numbers are logged.
+"""The progress of a run, and the names under which its numbers are logged.
 
 The names are those of Stable-Baselines3 where it has one. The x axis is env steps.
 """
@@ -16,7 +16,7 @@ Row = Mapping[str, float | None]
 
 
 class Progress(msgspec.Struct, frozen=True, kw_only=True):
-    """How far a run is: what the terminal shows and the metrics record after each update."""
+    """The progress of a run, which the terminal shows and the metrics record after each update."""
 
     run: str = ""
     """path of the run folder"""

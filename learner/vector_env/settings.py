@@ -1,4 +1,4 @@
-"""What a caller of `millrace.make_vec` asks for, as one record that is handed from the public function to its users."""
+"""The arguments of `millrace.make_vec` as one record."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from protocol.specs import Leaf, StepSpec
 
 @dataclass(frozen=True)
 class VectorEnvDescription:
-    """What workers need to know, and what the vector environment shows of a single env copy."""
+    """The description for workers, and the spaces and properties of a single env copy."""
 
     step: StepSpec
     observation_space: gymnasium.Space[Any]

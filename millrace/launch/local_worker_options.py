@@ -1,4 +1,4 @@
-"""What a learner needs to start workers on this machine: an address, keys, their flags, their cores.
+"""Local workers of a learner: an address, keys, their flags, their cores.
 
 Rule: a socket file lies in a folder of its own that only this user can enter (0700), and is removed with it.
 """

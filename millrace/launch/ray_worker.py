@@ -1,4 +1,4 @@
-"""What runs in a Ray actor for `millrace launch ray`: the worker program. Imports neither Ray nor torch."""
+"""The worker program in a Ray actor, for `millrace launch ray`. Imports neither Ray nor torch."""
 
 from __future__ import annotations
 

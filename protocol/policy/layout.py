@@ -124,7 +124,7 @@ def acting_size(spec: PolicySpec) -> int:
 
 
 def total_size(fields: Sequence[Field]) -> int:
-    """How many numbers these fields hold together."""
+    """The total number of parameters in these fields."""
     return sum(math.prod(field.shape) for field in fields)
 
 

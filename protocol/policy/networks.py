@@ -150,7 +150,7 @@ class FlatNetwork:
         return torch.relu(out) if self._relu else torch.tanh(out)
 
     def use_bfloat16_convolutions(self) -> None:
-        """From now on process images in bfloat16, with copies of the current parameters and without gradients."""
+        """Process images in bfloat16 from now on, with copies of the current parameters and without gradients."""
         with torch.no_grad():
             self._images = [image.in_bfloat16() for image in self._convolutions()]
 

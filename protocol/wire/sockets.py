@@ -32,7 +32,7 @@ def set_options(socket: zmq.Socket[bytes], address: str, curve: bool) -> None:
     socket.handshake_ivl = HANDSHAKE_MS
     socket.connect_timeout = 2000
     socket.tcp_maxrt = UNACKNOWLEDGED_MS
-    # A host that vanished while nothing was on its way: nobody would notice, and its connection would stay for ever.
+    # Without keepalive, the connection to a host that vanished while idle would stay forever.
     socket.tcp_keepalive, socket.tcp_keepalive_idle, socket.tcp_keepalive_intvl, socket.tcp_keepalive_cnt = 1, 15, 5, 3
     socket.ipv6 = needs_ipv6(address)
     # Credit bounds what is under way (one Weights, a few tickets and their rollouts) far below these.
@@ -60,7 +60,7 @@ def receive_frames(socket: zmq.Socket[bytes], said_by: list[str] | None = None) 
 
 
 def send_frames(socket: zmq.Socket[bytes], frames: Sequence[Buffer]) -> None:
-    """What `send_multipart` does, which reckons flags and checks types anew for each frame: half of what sending costs."""
+    """Faster `send_multipart`, whose checks of flags and types for each frame are half the cost of sending."""
     for frame in frames[:-1]:
         socket.send(frame, AND_MORE, copy=False)
     socket.send(frames[-1], NOT_WAITING, copy=False)
@@ -69,18 +69,18 @@ def send_frames(socket: zmq.Socket[bytes], frames: Sequence[Buffer]) -> None:
 def _user(frame: zmq.Frame) -> str:
     try:
         return str(frame.get("User-Id"))
-    except zmq.ZMQError:  # there is none, which must not happen: nobody has such a key
+    except zmq.ZMQError:  # no key is present, which must not happen; no client has this key
         return ""
 
 
 @dataclass
 class Traffic:
-    """What went one way. The bytes are those of the frames, before encryption; the worker's name is one of them."""
+    """Traffic in one direction. Bytes count all frames before encryption, the worker's name included."""
 
     messages: int = 0
     bytes: int = 0
 
     def add(self, frames: Sequence[Buffer]) -> None:
-        """One message more."""
+        """Count one more message."""
         self.messages += 1
         self.bytes += sum(map(len, frames))

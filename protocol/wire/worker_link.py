@@ -41,7 +41,7 @@ class WorkerLink:
         context: zmq.Context[zmq.Socket[bytes]] | None = None,
         token: Token | None = None,
     ) -> None:
-        """With a token (only over tcp) it connects only to the learner of that token."""
+        """With a token (only over tcp) the link connects only to the learner of that token."""
         check_address(address)
         longest = 255 - (TAG_CHARACTERS + 1)
         if not 1 <= len(name.encode()) <= longest or "\0" in name:

@@ -46,11 +46,11 @@ class Stepper:
         self._lanes: dict[int, SteppedLane] = {}
         self._executed: dict[int, int] = {}  # lane -> number of the newest order through shared memory that was executed
         self._memory = None if shared_memory is None else SharedMemory(spec, shared_memory.memory)
-        self._bell_in = None if shared_memory is None else WakePipe(read_fd=shared_memory.to_worker)
-        self._bell_out = None if shared_memory is None else WakePipe(write_fd=shared_memory.to_learner)
+        self._wake_in = None if shared_memory is None else WakePipe(read_fd=shared_memory.to_worker)
+        self._wake_out = None if shared_memory is None else WakePipe(write_fd=shared_memory.to_learner)
         self._cores = usable_cores()
         self._awake = SpinWait()
-        self._spin_s = 0.0  # how long to spin before the next wait for the bell
+        self._spin_s = 0.0  # how long to spin before the next wait for the wake pipe
 
     def execute(self, order: Order, pulse: Pulse) -> Answer:
         """The answer to the order. Raises `LaneFailed`, and what `pulse` raises; the lane is then closed."""
@@ -74,13 +74,13 @@ class Stepper:
         return _stepped(order, lane.rows, pack_infos(infos))
 
     def serve_shared_memory(self, timeout_s: float, pulse: Pulse, session: int, send: Callable[[Stepped], None]) -> bool:
-        """Execute the orders in shared memory until `timeout_s` have passed; True if the bell announced a message.
+        """Execute the orders in shared memory until `timeout_s` have passed; True if the wake pipe announced a message.
 
-        Spinning is faster than waiting for the bell. At most `cores - 1` workers spin, so that the learner keeps one core:
-        those that finished first. So the core of the last worker is free, and not asleep, when it rings for the learner.
+        Spinning is faster than a wait for the pipe. At most `cores - 1` workers spin, so that the learner keeps one core:
+        those that finished first. So the core of the last worker is free, and not asleep, when it wakes the learner.
         """
         assert self._memory is not None
-        assert self._bell_in is not None
+        assert self._wake_in is not None
         until = perf_counter() + timeout_s
         while True:
             stepped = [self._serve_lane(lane, pulse, session, send) for lane in list(self._lanes)]
@@ -89,7 +89,7 @@ class Stepper:
                     return False
                 self._awake.wait(self._has_order, self._spin_s)
                 continue
-            announced = self._bell_in.wait(max(0.0, until - perf_counter()))
+            announced = self._wake_in.wait(max(0.0, until - perf_counter()))
             if announced is not WakeReason.STEP:
                 return announced is WakeReason.MESSAGE
 
@@ -105,7 +105,7 @@ class Stepper:
     def _serve_lane(self, number: int, pulse: Pulse, session: int, send: Callable[[Stepped], None]) -> bool:
         memory, lane = self._memory, self._lanes[number]
         assert memory is not None
-        assert self._bell_out is not None
+        assert self._wake_out is not None
         order = memory.ordered(number)
         if order == self._executed[number]:
             return False
@@ -121,7 +121,7 @@ class Stepper:
             send(_stepped(step, lane.rows, infos))
         pending = memory.unanswered_orders()
         if not pending or not CAN_SPIN:
-            self._bell_out.wake()
+            self._wake_out.wake()
         finished_before = len(memory.lanes) - len(self._lanes) - pending
         self._spin_s = SPIN_S if finished_before < self._cores - 1 else 0.0
         return True

@@ -1,4 +1,4 @@
-"""Shared memory's words, its bells, and waiting awake."""
+"""Words in shared memory, wake pipes, and spinning."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ pytestmark = pytest.mark.skipif(not SUPPORTED, reason="needs Linux")
 
 
 @pytest.fixture
-def bell() -> Iterator[WakePipe]:
+def pipe() -> Iterator[WakePipe]:
     made = WakePipe()
     yield made
     made.close()
 
 
-def test_a_bell_tells_a_message_from_a_step_and_forgets_what_it_told(bell: WakePipe) -> None:
-    assert bell.wait(0) is WakeReason.NONE
-    bell.wake()
-    bell.wake(WakeReason.MESSAGE)
-    bell.wake()
-    assert bell.wait(0) is WakeReason.MESSAGE
-    assert bell.wait(0) is WakeReason.NONE
-    bell.wake()
-    assert bell.wait(0) is WakeReason.STEP
+def test_a_wake_pipe_distinguishes_messages_from_steps_and_forgets_what_it_reported(pipe: WakePipe) -> None:
+    assert pipe.wait(0) is WakeReason.NONE
+    pipe.wake()
+    pipe.wake(WakeReason.MESSAGE)
+    pipe.wake()
+    assert pipe.wait(0) is WakeReason.MESSAGE
+    assert pipe.wait(0) is WakeReason.NONE
+    pipe.wake()
+    assert pipe.wait(0) is WakeReason.STEP
 
 
-def test_ringing_never_waits_and_never_fails(bell: WakePipe) -> None:
+def test_waking_never_waits_and_never_fails(pipe: WakePipe) -> None:
     for _ in range(100_000):  # more than a pipe holds
-        bell.wake()
-    assert bell.wait(0) is WakeReason.STEP
-    ours = WakePipe(write_fd=os.dup(bell.write_fd))
-    bell.close()
+        pipe.wake()
+    assert pipe.wait(0) is WakeReason.STEP
+    ours = WakePipe(write_fd=os.dup(pipe.write_fd))
+    pipe.close()
     ours.wake()  # nobody is left to hear it
     ours.close()
 
