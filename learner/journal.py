@@ -1,4 +1,4 @@
-"""What a run writes while it goes on: metrics, checkpoints, the policy, the summary.
+"""The files that a run writes while it trains: metrics, checkpoints, the policy, the summary.
 
 Rule: a checkpoint is written between two updates, never within one, and holds everything that the next update depends
 on. A disk that is full costs a warning, never the run.
@@ -125,7 +125,7 @@ class Journal:
             log.warning("%s", self._recorder.close())
 
     def progress(self) -> Progress:
-        """How far the run is."""
+        """The progress of the run."""
         snapshot = self._service.snapshot()
         wall_s = self._wall_s()
         here_s = wall_s - self._wall_before_s

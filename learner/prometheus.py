@@ -47,7 +47,7 @@ STATES = ("active", "spare", "draining")
 
 
 class MetricsSnapshot(msgspec.Struct, frozen=True, kw_only=True):
-    """What the learner knew at one moment."""
+    """State of the learner at one moment."""
 
     at_s: float = 0.0
     """seconds since 1970; 0: the learner has not begun"""

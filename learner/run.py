@@ -39,7 +39,7 @@ Watch = Callable[[Progress], None]
 
 @dataclass(frozen=True)
 class RunSetup:
-    """What is settled before the workers start."""
+    """The parts of a run that exist before the workers start."""
 
     config: Config
     env: EnvSpec

@@ -61,15 +61,15 @@ class RolloutService:
         self._hub.report_progress(progress)
 
     def snapshot(self) -> HubSnapshot:
-        """What is known of workers, tickets and rollouts now."""
+        """A snapshot of workers, tickets and rollouts."""
         return self._hub.snapshot()
 
     def workers_alive(self) -> int:
-        """How many processes step the environment."""
+        """Number of processes that step the environment."""
         return self._hub.workers_alive()
 
     def lag_histogram(self) -> dict[str, int]:
-        """How many rollouts were used, by their lag, since this learner started."""
+        """Number of rollouts that were used, by lag, since this learner started."""
         return self._hub.lag_histogram()
 
     def first_use_s(self) -> dict[str, float]:

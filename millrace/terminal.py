@@ -201,7 +201,7 @@ def detail_rows(progress: Progress) -> dict[str, str]:
 
 
 def _kind(name: str) -> str:
-    """What a count of the ledger counts: transitions or messages by its prefix, else tickets."""
+    """The unit of a count of the ledger: transitions or messages by its prefix, else tickets."""
     first, _, rest = name.partition("_")
     return first if rest and first in ("transitions", "messages") else "tickets"
 

@@ -87,7 +87,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Identity:
-    """Who this worker is."""
+    """The identity of this worker: its name, host and process."""
 
     worker: str
     host: str

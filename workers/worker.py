@@ -37,7 +37,7 @@ log = logging.getLogger("millrace.worker")
 
 PULSE_S = 0.05  # time between two looks for messages while environments are stepped
 IDLE_S = 0.5  # longest wait while idle, so that a signal or the end of the parent process is noticed
-AFTER_BELL_S = 0.02  # longest wait for a message after the bell in shared memory, which is faster than the message
+AFTER_WAKE_UP_S = 0.02  # longest wait for a message after a wake-up, which is faster than the message
 STATM = Path("/proc/self/statm")  # pages: all, resident, …
 
 MakeCollector = Callable[[RunSpec], Collector]
@@ -61,7 +61,7 @@ def _no_watchdog(now: float) -> None: ...
 
 @dataclass(frozen=True)
 class WorkerOptions:
-    """How a worker depends on its process."""
+    """The options of a worker that depend on its process."""
 
     code: AllowedCode = AllowedCode.MODULES
     """how much code the learner may make it run"""
@@ -188,7 +188,7 @@ class Worker:
             self._fail(error)
         self._waited_s += self._clock() - began_s - (stepper.stages["step"] - stepped_s)
         self._update_statistics()
-        return AFTER_BELL_S if message_announced else 0.0
+        return AFTER_WAKE_UP_S if message_announced else 0.0
 
     def _pulse(self, session: int) -> None:
         """Every `PULSE_S`, handle messages and send what is due. Raises `_Abandoned` once the work is no longer wanted."""

@@ -1,4 +1,4 @@
-"""Where a learner listens, who may connect, and what to type on another machine.
+"""The learner's endpoint: its address, who may connect, and the command for workers on another machine.
 
 Rule: an address that other machines can reach needs keys, unless the user says `insecure`. Keys are made automatically at
 first use. On loopback they are needed only if a key folder was named. Between processes that share a file or memory, the

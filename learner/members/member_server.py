@@ -173,7 +173,7 @@ class MemberServer:
         return NoWorkers(f"waited {timeout_s:g} s for {workers} workers at {address}, {joined}; start one: {start}")
 
     def why_missing(self) -> str:
-        """Why workers may be missing, in parentheses; empty if nothing is known."""
+        """The known reasons why workers may be missing, in parentheses; empty if there are none."""
         if self._last_turned_away:
             return f" (the last one {self._last_turned_away})"
         return f" ({self._link.refused} were not let in; the log says why)" if self._link.refused else ""

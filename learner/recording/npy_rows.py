@@ -21,7 +21,7 @@ from protocol.errors import RunError
 
 
 class NpyRows:
-    """As a context: collects rows in a temporary file and writes the .npy file at the end, unless the body raises."""
+    """Context manager: collects rows in a temporary file and writes the .npy file at the end, unless the body raises."""
 
     def __init__(self, target: Path | None) -> None:
         """`target`: the file to write; None: none, and every method does nothing."""

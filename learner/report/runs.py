@@ -163,7 +163,7 @@ def _letters(i: int) -> str:
 
 
 def _results(path: Path, rows: Sequence[dict[str, Any]]) -> RunResults:
-    """From summary.json, or from the newest row of metrics if the run has not finished."""
+    """The results from summary.json, or from the newest row of metrics if the run has not finished."""
     summary = RunFolder(path).summary()
     if summary is not None:
         return RunResults(

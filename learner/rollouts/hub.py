@@ -50,7 +50,7 @@ class HubSettings:
 
 @dataclass(frozen=True)
 class HubSnapshot:
-    """What the hub knows at one moment, for metrics, checkpoints and status. Cheap to make."""
+    """State of the hub at one moment, for metrics, checkpoints and status. Cheap to make."""
 
     progress: Progress
     """as of the last update"""
@@ -80,7 +80,7 @@ class HubSnapshot:
         return {member.session: member.heartbeat.stages for member in self.members if member.heartbeat is not None}
 
     def worker_states(self) -> Counter[str]:
-        """How many workers are active, draining, or spare: active without a lane."""
+        """Number of workers that are active, draining, or spare (active without a lane)."""
         return Counter(_state(member) for member in self.members)
 
 
@@ -197,11 +197,11 @@ class Hub:
         return len(self.coordinator.members) if count is None else count()
 
     def lag_histogram(self) -> dict[str, int]:
-        """How many rollouts were used by lag, from the smallest; a JSON object has strings for keys."""
+        """Number of rollouts that were used, by lag, from the smallest; a JSON object has strings for keys."""
         return self._weight_age.histogram()
 
     def first_use_s(self) -> dict[str, float]:
-        """Of each worker, the median of the seconds from publishing weights to its first rollout under them."""
+        """For each worker, the median number of seconds from publishing weights to its first rollout under them."""
         return self._weight_age.first_use_s()
 
     def snapshot(self) -> HubSnapshot:

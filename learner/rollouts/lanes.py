@@ -65,7 +65,7 @@ class Ticket:
 
 
 class LaneQueue:
-    """Which lane gets the next ticket: the least advanced; of equals, the one with the lowest number.
+    """Selects the lane for the next ticket: the least advanced; in a tie, the one with the lowest number.
 
     An entry of the heap may be out of date; then the heap also holds a newer one of the same lane.
     """

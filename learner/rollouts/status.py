@@ -8,7 +8,7 @@ from protocol.messages import Status
 
 
 def status(coordinator: TicketCoordinator, progress: Progress, now: float) -> Status:
-    """What the learner knows now; `progress` is that of the last update."""
+    """The status message of a run; `progress` is that of the last update."""
     return Status(
         env=coordinator.run.env.id,
         version=coordinator.version,

@@ -1,4 +1,4 @@
-"""What becomes of lanes whose worker was lost. Pure.
+"""Bookkeeping of lanes whose worker was lost. Pure.
 
 Rule: each loss is reported in exactly one step result, as truncated copies, or it is raised. The new copies of a lost
 lane are reset before they step.

@@ -7,7 +7,7 @@ from protocol.messages import Status
 
 
 def status(coordinator: OrderCoordinator, now: float) -> Status:
-    """What a vector environment knows now. It has no weights, no target and no ledger."""
+    """The status message of a vector environment. It has no weights, no target and no ledger."""
     members = coordinator.members.values()
     return Status(
         env=", ".join(dict.fromkeys(env.id for env in coordinator.spec.envs)),

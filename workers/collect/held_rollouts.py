@@ -28,7 +28,7 @@ class Assignment:
 
 @dataclass
 class _HeldLane:
-    """What the worker holds for one lane."""
+    """Tickets and rollouts that the worker holds for one lane."""
 
     incarnation: int
     sequence: int = 0  # of the next rollout
@@ -60,7 +60,7 @@ class HeldRollouts:
         return None
 
     def startable(self, version: int) -> tuple[Assignment, ...]:
-        """Of every lane the oldest ticket that may be collected under this version, in the order of the lanes."""
+        """The oldest ticket of each lane that may be collected under this version, in the order of the lanes."""
         assignments = []
         for number, lane in sorted(self._lanes.items()):
             startable = [ticket for ticket, lowest in lane.tickets.items() if lowest <= version]

@@ -14,7 +14,7 @@ from protocol.messages import Answer, LaneLife, Order
 
 @dataclass
 class _OrderedLane:
-    """What the worker holds for one lane."""
+    """Orders that the worker holds for one lane."""
 
     incarnation: int
     newest: int  # highest ticket

@@ -74,7 +74,7 @@ class SteppedLane:
         rows.reward[:], rows.terminated[:], rows.truncated[:] = loop.reward, loop.terminated, loop.truncated
 
     def call(self, copies: Sequence[int], name: str, args: Sequence[Any], kwargs: dict[str, Any]) -> list[Any]:
-        """For each of these copies, the attribute of this name, or its result if it can be called. Raises what it raises."""
+        """The attribute of each of these copies, or its result if it can be called. Its exceptions are not caught."""
         results = []
         for n in copies:
             attribute = self._loop.envs[n].get_wrapper_attr(name)

@@ -48,7 +48,7 @@ class ActionValues(Protocol):
 
 
 class AutogradActionValues:
-    """With autograd, on any device."""
+    """Action values with autograd, on any device."""
 
     def __init__(self, net: QNetwork) -> None:
         self._net = net
@@ -87,7 +87,7 @@ class AutogradActionValues:
 
 
 class FusedActionValues:
-    """In numpy, by `FusedQNetwork`."""
+    """Action values in numpy, by `FusedQNetwork`."""
 
     def __init__(self, net: QNetwork) -> None:
         self._gradient = net.flat_grad.numpy()
