@@ -108,6 +108,60 @@ def gradient_variances(
     return found[::-1]
 
 
+def core_tolerance(core: str, parameters: Mapping[str, Array], x: Array, state: Array) -> tuple[Array, Array]:
+    """How far two float32 computations of a recurrent core may differ: outputs [T, C, H] and last state [C, S].
+
+    `parameters` are those of the two linear maps into the gates, `x` [T, C, D], `state` [C, S]. The rules are those of
+    `forward_tolerance`. A sigmoid or tanh hands a variance on by the square of its slope; a product a b has the variance
+    a² var b + b² var a; and a sum of two products adds ELEMENTWISE roundings of the sum of their absolute values.
+    """
+    (w, b), (u, d) = (
+        [np.asarray(parameters[f"core.{name}.{kind}"], np.float64) for kind in ("weight", "bias")]
+        for name in ("input", "state")
+    )
+    H, step = u.shape[1], ELEMENTWISE * UNIT
+    h, c = state[:, :H].astype(np.float64), state[:, H:].astype(np.float64)
+    h_variance, c_variance = np.zeros(h.shape), np.zeros(c.shape)
+    outputs: list[Array] = []
+
+    def sigmoid(z: Array, variance: Array) -> tuple[Array, Array]:
+        gate = 1 / (1 + np.exp(-z))
+        return gate, (gate * (1 - gate)) ** 2 * variance + step**2  # by tanh: its errors are relative to 1
+
+    def tanh(z: Array, variance: Array) -> tuple[Array, Array]:
+        found = np.tanh(z)
+        return found, (1 - found**2) ** 2 * variance + (step * found) ** 2
+
+    for row in x.astype(np.float64):
+        n = w.shape[1] + H + 2
+        from_input, from_state = row @ w.T + b, h @ u.T + d
+        input_variance = n * (UNIT * (np.abs(row) @ np.abs(w).T + np.abs(b))) ** 2
+        state_variance = h_variance @ (u**2).T + n * (UNIT * (np.abs(h) @ np.abs(u).T + np.abs(d))) ** 2
+        if core == "lstm":
+            z, variance = from_input + from_state, input_variance + state_variance
+            (i, vi), (f, vf), (g, vg), (o, vo) = (
+                activation(z[:, k * H : (k + 1) * H], variance[:, k * H : (k + 1) * H])
+                for k, activation in enumerate((sigmoid, sigmoid, tanh, sigmoid))
+            )
+            rounded = (step * (np.abs(f * c) + np.abs(i * g))) ** 2
+            c_variance = f**2 * c_variance + c**2 * vf + i**2 * vg + g**2 * vi + rounded
+            c = f * c + i * g
+            squashed, vs = tanh(c, c_variance)
+            h, h_variance = o * squashed, o**2 * vs + squashed**2 * vo
+        else:
+            gates, variances = sigmoid((from_input + from_state)[:, : 2 * H], (input_variance + state_variance)[:, : 2 * H])
+            (r, k), (vr, vk) = np.split(gates, 2, -1), np.split(variances, 2, -1)
+            a, p = from_input[:, 2 * H :], from_state[:, 2 * H :]
+            rounded = (step * (np.abs(a) + np.abs(r * p))) ** 2
+            v = input_variance[:, 2 * H :] + r**2 * state_variance[:, 2 * H :] + p**2 * vr + rounded
+            new, vn = tanh(a + r * p, v)
+            rounded = (step * (np.abs(h) + np.abs(new))) ** 2
+            h_variance = (1 - k) ** 2 * vn + k**2 * h_variance + (h - new) ** 2 * vk + rounded
+            h = new + k * (h - new)
+        outputs.append(h_variance)
+    return tolerance_of(np.stack(outputs)), tolerance_of(np.concatenate([h_variance, c_variance], -1))
+
+
 def variance_after(function: Callable[[Array], Array], params: Array, variance: Array) -> Array:
     """The variance of the rounding errors of `function` [B, ...] of distribution parameters [B, P] with this variance.
 
