@@ -127,8 +127,8 @@ class Worker:
         while self._handled_stop_requests < self._options.stop_requests():
             self._handled_stop_requests += 1
             self._do(self._session.stop())
-        if (trouble := self._link.problem) is not None and trouble.final:
-            self._do(self._session.refused(trouble.line))
+        if (problem := self._link.problem) is not None and problem.final:
+            self._do(self._session.refused(problem.line))
         if not arrived:
             return
         for message in self._link.receive():

@@ -27,7 +27,7 @@ log = logging.getLogger("millrace.cli.keys")
 DEFAULT_FOLDER = "~/.config/millrace/keys"
 FOLDER_VARIABLE, TOKEN_VARIABLE = "MILLRACE_KEYS", "MILLRACE_TOKEN"
 FIRST_CLIENT = "default"
-OTHERS_MODE = 0o077
+OTHERS_MODE = 0o077  # permission bits of group and others
 
 
 def chosen_key_folder(flag: str) -> Path | None:

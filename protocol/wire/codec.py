@@ -38,8 +38,8 @@ DTYPES = {
     name: np.dtype(name) for name in ("|b1", "|i1", "|u1", "<i2", "<u2", "<i4", "<u4", "<i8", "<u8", "<f2", "<f4", "<f8")
 }
 
-# Message types whose fields go by position, and those whose fields go by name. msgspec accepts no union of both.
 MessageTypes = tuple[Any, Any]
+"""types whose fields go by position, and types whose fields go by name: msgspec accepts no union of both"""
 TO_WORKER: MessageTypes = (reduce(operator.or_, (kind for kind in get_args(ToWorker) if kind is not Refuse)), Refuse)
 TO_LEARNER: MessageTypes = (
     reduce(operator.or_, (kind for kind in get_args(ToLearner | Inquire) if kind is not Hello)),

@@ -41,7 +41,7 @@ RUN = msgspec.structs.replace(run_of("CartPole-v1", T=40, N=8), learner_timeout_
 class FakeLink:
     """Says one message each time it is asked, and keeps what is answered."""
 
-    address, trouble = "fake", None
+    address, problem = "fake", None
 
     def __init__(self, messages: Sequence[ToWorker], stack: bool = False) -> None:
         self.packing = Packing(stack=stack)

@@ -39,7 +39,7 @@ def test_waking_never_waits_and_never_fails(pipe: WakePipe) -> None:
     assert pipe.wait(0) is WakeReason.STEP
     ours = WakePipe(write_fd=os.dup(pipe.write_fd))
     pipe.close()
-    ours.wake()  # nobody is left to hear it
+    ours.wake()  # no reader is left
     ours.close()
 
 
