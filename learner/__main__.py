@@ -23,7 +23,7 @@ LINE_EVERY_S = 10.0
 
 
 def main(argv: list[str]) -> int:
-    """Serve until the run is over; the exit code."""
+    """Serve until the run is over. Returns the exit code."""
     handler = logging.StreamHandler()
     plain = logging.Formatter("%(asctime)s learner: %(message)s")
     handler.setFormatter(JsonLines() if "--log-json" in argv else plain)

@@ -1,6 +1,6 @@
 """Evaluations of one run: each version at most once, the best policy kept, and that one evaluated again at the end.
 
-The best of several evaluations flatters its policy: it was chosen by them. So the summary reports the best policy by a
+The highest of several evaluations is biased upwards. So the summary reports the best policy by a
 second evaluation, on other episodes.
 """
 

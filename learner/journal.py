@@ -102,7 +102,7 @@ class Journal:
 
     def save(self) -> None:
         """Write a checkpoint and the policy."""
-        state = self._state().checkpoint(self._algorithm)
+        state = self._state().checkpoint_content(self._algorithm)
         self._saved_s = time.monotonic()
         self._episodes_since_save = 0
         warn_on_error(lambda: checkpoint.save(self._folder.path, state, self.env_steps, self._checkpoints.keep))

@@ -115,7 +115,7 @@ class Run:
         self.folder.keep()
 
     def train(self, workers: int) -> None:
-        """Wait for so many workers, then train to the end. Raises `Interrupted`, or `MillraceError` in one line."""
+        """Wait for this number of `workers`, then train to the end. Raises `Interrupted`, or `MillraceError` in one line."""
         from learner.train import train
 
         try:
@@ -137,7 +137,7 @@ class Run:
 def serve(config: Config, resume: Path | None, watch: Watch) -> Path:
     """The learner alone, listening at `config.bind` for workers that are started elsewhere. Returns its run folder."""
     if config.inference == "learner":
-        raise UsageError("inference learner: python -m learner has no part that steps lanes; start it as millrace learner")
+        raise UsageError("--inference learner does not work with python -m learner; use millrace learner")
     keyring = keyring_for(config, datetime.now(UTC).replace(microsecond=0))
     with ExitStack() as stack:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()

@@ -30,7 +30,7 @@ class RunState(msgspec.Struct, kw_only=True):
     best: list[float] | None = None
     """Mean return and env steps of the best evaluation. Its policy is in the run folder."""
 
-    def checkpoint(self, algorithm: Algorithm) -> dict[str, Any]:
+    def checkpoint_content(self, algorithm: Algorithm) -> dict[str, Any]:
         """The content of a checkpoint: plain data and tensors."""
         return {"past": msgspec.to_builtins(self), "algorithm": algorithm.state_dict()}
 

@@ -25,7 +25,7 @@ class RolloutService:
         self._hub, self._spec = hub, spec
 
     def wait_for_workers(self, count: int) -> None:
-        """Wait until so many workers have joined. Raises `NoWorkers` when they do not come in time."""
+        """Wait until this number of `workers` have joined. Raises `NoWorkers` when they do not come in time."""
         self._hub.wait_for(count)
 
     def publish(self, version: int, parameters: Floats, buffers: Floats) -> None:

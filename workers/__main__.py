@@ -36,7 +36,7 @@ log = logging.getLogger("millrace.worker")
 
 
 def main(argv: list[str] | None = None, prog: str = "python -m workers") -> int:
-    """Run one worker, or with --processes many; the exit code. `prog` is the name of the program in its usage text."""
+    """Run one worker, or with --processes many. Returns the exit code. `prog`: name in the usage text."""
     flags = _parser(prog).parse_args(argv)
     logging.basicConfig(level=logging.INFO, format=f"%(asctime)s worker {flags.name}: %(message)s", stream=sys.stderr)
     try:
@@ -77,7 +77,8 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     network.add_argument(
         "--insecure",
         action="store_true",
-        help="connect to a learner on another machine without a token; anybody may answer, so no code is accepted",
+        help="connect to a learner on another machine without a token; the learner is not authenticated, so this worker "
+        "runs only environments that are registered here (as with --no-code)",
     )
     network.add_argument(
         "--no-code",
@@ -102,15 +103,14 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         metavar="S",
         help="exit when a step of one env copy takes longer than S seconds; 0: no limit (default: %(default)g)",
     )
-    faults.add_argument(
-        "--parent", type=int, default=0, metavar="PID", help="leave when the process PID is no longer the parent"
-    )
+    # Internal flags: for the process that starts workers.
+    parser.add_argument("--parent", type=int, default=0, help=argparse.SUPPRESS)  # leave when this is no longer the parent
     parser.add_argument("--handed", default="", help=argparse.SUPPRESS)  # descriptors of shared memory
     return parser
 
 
 def _work(flags: argparse.Namespace, link: WorkerLink, code: AllowedCode) -> int:
-    """Run one worker in this process; the exit code."""
+    """Run one worker in this process. Returns the exit code."""
     if flags.core is not None:
         os.sched_setaffinity(0, {flags.core})
     watchdog = Watchdog(flags.step_timeout_s) if flags.step_timeout_s else None
@@ -133,9 +133,9 @@ def _work(flags: argparse.Namespace, link: WorkerLink, code: AllowedCode) -> int
 
 
 def _supervise(flags: argparse.Namespace, token: Token | None) -> int:
-    """Run many workers, each in a process of its own, and watch them here; the exit code."""
+    """Run many workers, each in a process of its own, and watch them here. Returns the exit code."""
     if flags.processes < 1:
-        raise UsageError(f"processes expected int >= 1, got {flags.processes}")
+        raise UsageError(f"processes: expected int >= 1, got {flags.processes}")
     cores = sorted(os.sched_getaffinity(0)) if flags.pin else []
     passed = ["--join-timeout-s", str(flags.join_timeout_s), "--step-timeout-s", str(flags.step_timeout_s)]
     passed += [flag for flag, is_set in (("--insecure", flags.insecure), ("--no-code", flags.no_code)) if is_set]

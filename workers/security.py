@@ -1,7 +1,8 @@
 """Security rules of a worker: to which learner it connects, and which code it runs for that learner. Pure.
 
-Rule: a learner that is authenticated by its key, or that only this user can be (ipc, inproc), is trusted. A learner on
-this machine is trusted a little. Any other is not trusted, and the worker connects to it only with --insecure.
+Rule: a worker runs pickled callables only for a learner that a token authenticates, or that is reached over ipc or inproc.
+Over TCP without a token, it imports modules for a learner on this machine. For a learner on another machine it runs only
+environments that are registered here, and it connects to it without a token only with --insecure.
 """
 
 from __future__ import annotations

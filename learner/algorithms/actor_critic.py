@@ -221,7 +221,7 @@ class ActorCritic:
         return LossInput(minibatch.action, minibatch.log_prob, advantage, raw, minibatch.target, *outputs)
 
     def _gradient(self, rows: LossInput) -> Metrics:
-        """Write the gradient by the weights into `net.flat_grad`; the metrics of the loss and the gradient's norm."""
+        """Write the gradient by the weights into `net.flat_grad`. Returns the loss metrics and the gradient norm."""
         gradient = self.net.flat_grad
         if isinstance(rows.value, np.ndarray):
             assert self._fused is not None

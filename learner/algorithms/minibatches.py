@@ -70,7 +70,10 @@ class Minibatch(NamedTuple):
         )
 
     def select_columns(self, columns: Tensor, mask: Tensor) -> Minibatch:
-        """The rows of whole columns, in time order, where `mask` [T, ΣN] is True; the core processes the other rows too."""
+        """A minibatch of those rows of the given columns where `mask` [T, ΣN] is True, in time order.
+
+        The recurrent core still runs over all rows of the columns.
+        """
         assert self.recurrent is not None
         state, keep_state, _ = self.recurrent
         rows = rows_of_columns(len(keep_state), keep_state.shape[1], columns)

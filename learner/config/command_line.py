@@ -25,8 +25,8 @@ class RunFlags(Config, frozen=True, kw_only=True):
     ENV, if there is one) or none.
     """
     resume: Path | None = None
-    """Run folder to continue from its newest checkpoint. auto: the newest run of this ENV, algo and seed in run_dir; a new
-    run if there is none.
+    """Continue this run folder from its newest checkpoint. auto: continue the newest run in --run-dir with the same ENV,
+    --algo and --seed, or start a new run if there is none.
     """
     log_json: bool = False
     """Log to stderr as JSON, one event per line, instead of text."""
@@ -49,7 +49,7 @@ def _read_layers(command: str, argv: list[str], resumed: Path | None = None) -> 
     The settings of a resumed run lie below the flags. The flags are parsed more than once, because the layers below them
     depend on some of them (--config, --preset, --resume, --algo, ENV).
     """
-    argv = _none_as_tyro_wants_it(argv)
+    argv = _none_for_tyro(argv)
     without_help = [flag for flag in argv if flag not in ("-h", "--help")]
     parse = functools.partial(parse_flags, RunFlags, command=command, hint=algorithms_with)
     first = parse(without_help, default=RunFlags(algo=""), ignore_unknown=True)
@@ -68,7 +68,7 @@ def _read_layers(command: str, argv: list[str], resumed: Path | None = None) -> 
     return validate(override(config, {"env_kwargs": base.env_kwargs | config.env_kwargs}, "")), flags.resume
 
 
-def _none_as_tyro_wants_it(argv: list[str]) -> list[str]:
+def _none_for_tyro(argv: list[str]) -> list[str]:
     """`--core none`, as it stands in a TOML file, becomes `--core None`; likewise all settings whose default may be None."""
     records = [Config(), *(kind() for kind in HYPERPARAMETERS.values())]
     optional = {f"--{name}" for record in records for name in record.__struct_fields__ if getattr(record, name) is None}

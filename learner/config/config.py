@@ -43,7 +43,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     seed: Natural = 1
     """Seed of all random numbers of the run."""
     workers: Count = 2
-    """Number of worker processes on this machine."""
+    """Number of worker processes on this machine (train only)."""
     envs: Count = 8
     """Number of env copies, summed over all workers. Must be a multiple of lanes."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -85,12 +85,12 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     elsewhere. The learner always computes in float32.
     """
     torch_threads: Count | None = None
-    """Number of PyTorch threads in the learner. none: 1 for small MLPs, else the number of cores, less one for each local
-    worker if max_lag is above 0. Another number changes the last bits of results.
+    """Number of PyTorch threads in the learner. none: chosen automatically: 1 for a small MLP, otherwise all cores, minus
+    one per local worker if max_lag is above 0. Another number changes the last bits of results.
     """
     pin_workers: bool | None = None
-    """Keep each local worker process on one core. none: do so if max_lag is 0 and the number of workers is a multiple of the
-    number of cores.
+    """Keep each local worker process on one core (train only). none: do so if max_lag is 0 and the number of workers is a
+    multiple of the number of cores.
     """
     min_workers: Natural = 0
     """Start training when this many workers have joined. 0: wait for all local workers (train), for one worker (learner)."""
@@ -98,13 +98,17 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     # ------------------------------------------------------------------------------------------------------------ network
 
     transport: Literal["inproc", "ipc", "tcp"] = "ipc"
-    """How local workers are connected. inproc: as threads of this process. ipc: local sockets. tcp: TCP on 127.0.0.1."""
+    """How local workers are connected (train only). inproc: as threads of this process. ipc: local sockets. tcp: TCP on
+    127.0.0.1.
+    """
     bind: str = "tcp://127.0.0.1:5555"
-    """Address at which `millrace learner` listens for workers. With tcp://0.0.0.0:5555 other machines can join; this needs
-    keys.
+    """Address at which the learner listens for workers (learner only). With tcp://0.0.0.0:5555 other machines can join; this
+    needs keys.
     """
     advertise: str = ""
-    """Host name or IP address at which workers on other machines reach this one. Default: the name of this machine."""
+    """Host name or IP address at which workers on other machines reach this one (learner only). Default: the name of this
+    machine.
+    """
     keys: str = ""
     """Key folder. Default: MILLRACE_KEYS, else ~/.config/millrace/keys. If a folder is named here or in MILLRACE_KEYS, TCP
     connections on this machine need keys too.

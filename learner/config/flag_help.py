@@ -49,7 +49,7 @@ METAVARS = {
 """How the help shows the values of a flag, where tyro's own way is hard to read."""
 DESCRIPTIONS = {
     "train": "Train a policy on this machine. Flags override --config and presets.",
-    "learner": "Train with workers started elsewhere. Flags override --config and presets.",
+    "learner": "Listen at --bind and train with the workers that connect. Flags override --config and presets.",
 }
 WIDEST_COLUMNS = 120  # tyro puts boxes of a wider help side by side, which mixes up their order
 TYPE_NAMES = {bool: "True,False", int: "INT", float: "FLOAT", str: "STR", Path: "PATH"}

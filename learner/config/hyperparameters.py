@@ -122,8 +122,8 @@ class ImpalaConfig(RecurrentHyperparameters, frozen=True):
     vtrace_lambda: Fraction = 1.0
     """λ of V-trace. 1: as in the paper. 0: one step."""
     rho_bar: Positive = 1.0
-    """ρ̄ of V-trace: importance weights of TD errors are clipped to this. It decides of which policy values are learned:
-    without clipping, of the newest one.
+    """ρ̄ of V-trace: importance weights of TD errors are clipped to this. The larger it is, the closer the
+    learned values are to those of the newest policy (without clipping: exactly those).
     """
     c_bar: Positive = 1.0
     """c̄ of V-trace: importance weights of traces are clipped to this. It decides how far back a TD error has effect."""

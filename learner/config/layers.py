@@ -37,7 +37,10 @@ def resolve(
 
 
 def config_from_toml(text: str, where: str = "config.toml") -> Config:
-    """The settings that `Config.to_toml` wrote, over the defaults (no preset). Raises `UsageError` that names `where`."""
+    """The settings that `Config.to_toml` wrote, over the defaults (no preset). Raises `UsageError`.
+
+    `where`: the file's name for error messages.
+    """
     return validate(_override_from_toml(Config(), _parse_toml(text, where), where), where)
 
 

@@ -19,12 +19,12 @@ class MemberLog:
         self._link, self._clock = link, clock
         self._limit = LogRateLimiter()
 
-    def complain(self, peer: bytes, line: str) -> None:
+    def warn_limited(self, peer: bytes, line: str) -> None:
         """Warn about what a peer sent, unless there was a line about it a short while ago."""
         if (kept_back := self._limit.due(self._link.speaker(peer), self._clock())) is not None:
             log.warning("%s%s", line, suppressed_note(kept_back))
 
-    def tell(self, level: int, event: Event, line: str) -> None:
+    def log_event(self, level: int, event: Event, line: str) -> None:
         """Log an event. Requests to join again are limited: after a restart of the learner they come in floods."""
         kept_back: int | None = 0
         if isinstance(event, RejoinRequested):

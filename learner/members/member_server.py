@@ -1,7 +1,7 @@
 """The server of members: what every learner does for the workers that are connected to it. A shell: link, clock and log.
 
-Rule: the inbox is emptied before silence is judged, and a learner that was away listens for a while first. So a long
-update, or a stopped process, never costs a healthy worker its membership.
+Rule: the inbox is emptied before silent workers are removed, and a learner that was away listens for a while first. So a
+long update, or a stopped process, never costs a healthy worker its membership.
 """
 
 from __future__ import annotations
@@ -75,8 +75,8 @@ class ServerSettings:
     """The settings in which the servers of different hubs differ."""
 
     grace_s: float = AWAY_S
-    """after the learner was away, silence is not judged for so long"""
-    last_words_s: float = 0.0
+    """for how long, after the learner was away, no worker is removed as silent"""
+    last_messages_wait_s: float = 0.0
     """how long to wait for the last messages of a process that has ended"""
     log_tracebacks: bool = True
     """whether the traceback of an environment is logged; if not, the hub raises it"""
@@ -101,7 +101,7 @@ class MemberServer:
         self._membership = coordinator.membership
         self._settings, self._clock = settings or ServerSettings(), clock
         self._log, self._keys = MemberLog(link, clock), KeyRevocation(link)
-        self._judge_silence_from_s = self.listened_s
+        self._remove_silent_from_s = self.listened_s
         self._last_turned_away = ""  # what became of the last worker that did not stay
         self._encoded: tuple[ToWorker, Sequence[Buffer]] | None = None
 
@@ -109,13 +109,13 @@ class MemberServer:
         """Wait at most `timeout_s` for messages, answer all that have come, and remove the members that are gone."""
         self.receive(timeout_s)
         self._revoke_keys()
-        self._reap(self._settings.last_words_s)
+        self._remove_ended_processes(self._settings.last_messages_wait_s)
         now = self._clock()
         if now - self.listened_s > timeout_s + AWAY_S:
             # Messages of the meantime may still lie in the kernel: if we were stopped, so was ZeroMQ's thread.
-            self._judge_silence_from_s = now + self._settings.grace_s
+            self._remove_silent_from_s = now + self._settings.grace_s
         self.listened_s = now
-        if now >= self._judge_silence_from_s:
+        if now >= self._remove_silent_from_s:
             self.send(self._coordinator.remove_silent(now))
 
     def receive(self, timeout_s: float) -> None:
@@ -125,7 +125,7 @@ class MemberServer:
         for peer, message in self._link.receive():
             now = self._clock()
             if isinstance(message, BadMessage):
-                self.complain(peer, f"message from {worker_name(peer)[:40]!r}: {message}")
+                self.warn_limited(peer, f"message from {worker_name(peer)[:40]!r}: {message}")
                 self.send(self._coordinator.reject_message(peer, str(message), now))
             elif isinstance(message, Inquire):
                 self._link.send(peer, encode(self._callbacks.status(now)))
@@ -135,17 +135,19 @@ class MemberServer:
     def send(self, messages: Sequence[Outgoing]) -> None:
         """Send these messages, then log what has happened."""
         for peer, message in messages:
-            if self._link.send(peer, self._frames(message)):  # if not, it is gone or does not read: it will be silent
+            if self._link.send(
+                peer, self._frames(message)
+            ):  # a failed send is ignored: such a worker is soon removed as silent
                 self._callbacks.sent(peer)
         if self._membership.events:
             self._log_events()
 
-    def complain(self, peer: bytes, line: str) -> None:
+    def warn_limited(self, peer: bytes, line: str) -> None:
         """Warn about what a peer sent; few lines for each peer."""
-        self._log.complain(peer, line)
+        self._log.warn_limited(peer, line)
 
     def wait_for(self, workers: int, timeout_s: float, turn: Callable[[], None]) -> None:
-        """Call `turn`, which listens, until so many workers have joined. Raises `NoWorkers` after `timeout_s`."""
+        """Call `turn`, which listens, until this number of `workers` have joined. Raises `NoWorkers` after `timeout_s`."""
         deadline_s = self._clock() + timeout_s
         while len(self._membership.members) < workers:
             if self._clock() > deadline_s:
@@ -153,11 +155,11 @@ class MemberServer:
             turn()
 
     def wait_until_all_left(self, deadline_s: float, poll_s: float) -> None:
-        """Listen until no member is left, at most until the deadline. Silence is not judged."""
+        """Listen until no member is left, at most until the deadline. Silent workers are not removed."""
         while self._membership.members and self._clock() < deadline_s:
             self.receive(poll_s)
             self._revoke_keys()
-            self._reap(0.0)
+            self._remove_ended_processes(0.0)
 
     def close(self) -> None:
         """Forget the hub. The hub refers to this server, so else both would wait for the garbage collector, and so would
@@ -166,13 +168,13 @@ class MemberServer:
         del self._callbacks, self._ended
 
     def no_workers(self, workers: int, timeout_s: float) -> NoWorkers:
-        """The error of a wait for so many workers that came to nothing: it says how to start one."""
+        """The error when fewer than `workers` have joined within `timeout_s`: it says how to start one."""
         address = self._link.address
         start = f"python -m workers {address}{'' if self._link.keyring is None else ' --token FILE'}"
-        joined = f"{len(self._membership.members)} joined{self.why_missing()}"
+        joined = f"{len(self._membership.members)} joined{self.missing_reason()}"
         return NoWorkers(f"waited {timeout_s:g} s for {workers} workers at {address}, {joined}; start one: {start}")
 
-    def why_missing(self) -> str:
+    def missing_reason(self) -> str:
         """The known reasons why workers may be missing, in parentheses; empty if there are none."""
         if self._last_turned_away:
             return f" (the last one {self._last_turned_away})"
@@ -184,11 +186,11 @@ class MemberServer:
         for peer, why in self._keys.revoked(self._membership.members):
             self.send(self._coordinator.revoke(peer, why))
 
-    def _reap(self, last_words_s: float) -> None:
+    def _remove_ended_processes(self, last_messages_wait_s: float) -> None:
         """Remove the workers whose processes have ended."""
         for worker, why in self._ended():
-            if last_words_s:
-                self.receive(last_words_s)
+            if last_messages_wait_s:
+                self.receive(last_messages_wait_s)
             self.send(self._coordinator.remove_worker(worker, why))
 
     def _frames(self, message: ToWorker) -> Sequence[Buffer]:
@@ -212,5 +214,5 @@ class MemberServer:
                     line, expected = f"worker {worker} ({host}): {error}", True
                 case _:
                     pass
-            self._log.tell(logging.INFO if expected else logging.WARNING, event, line)
+            self._log.log_event(logging.INFO if expected else logging.WARNING, event, line)
             self._callbacks.event(event)

@@ -70,7 +70,7 @@ class Member:
         """
         self.heartbeat = heartbeat
         steps, since_s = self.measured
-        if self.heard_s - since_s >= MEASURE_S:  # a heartbeat that new weights cause comes too early to measure by
+        if self.heard_s - since_s >= MEASURE_S:  # new weights trigger an extra heartbeat, too early to measure speed
             self.steps_per_s = (heartbeat.steps - steps) / (self.heard_s - since_s) if since_s else 0.0
             self.measured = heartbeat.steps, self.heard_s
         held, seen = set(heartbeat.tickets), min(heartbeat.replies, self.replies)
@@ -129,8 +129,8 @@ class Membership(Generic[M]):
         events, self.events = self.events, []
         return events
 
-    def sender(self, peer: bytes, message: ToLearner, now: float) -> M | None:
-        """The member that sent this message in its current session; None if there is none."""
+    def member_of_session(self, peer: bytes, message: ToLearner, now: float) -> M | None:
+        """The member that sent this message in its current session, or None. Also records when the member was heard."""
         member = self.members.get(peer)
         if member is None or isinstance(message, Hello) or member.session != message.session:
             return None

@@ -33,7 +33,9 @@ from protocol.wire.weight_dtypes import WeightsDtype, to_wire_dtype
 log = logging.getLogger("millrace.learner")
 
 POLL_S = 0.1
-PULSE_S = 0.003  # a minibatch may take a tenth of it, and listening as long as a minibatch
+PULSE_S = (
+    0.003  # least interval between two pulses: a minibatch may take a tenth of it, and listening as long as a minibatch
+)
 LOG_WAITING_EVERY_S = 10.0
 
 
@@ -125,7 +127,7 @@ class Hub:
     # ---------------------------------------------------------------- what the loop calls
 
     def wait_for(self, workers: int) -> None:
-        """Wait until so many workers have joined. Raises `NoWorkers` after `no_workers_timeout_s`."""
+        """Wait until this number of `workers` have joined. Raises `NoWorkers` after `no_workers_timeout_s`."""
         self._server.wait_for(workers, self.settings.no_workers_timeout_s, lambda: self._turn(POLL_S))
 
     def publish(self, version: int, parameters: Array, buffers: Array) -> None:
@@ -162,9 +164,9 @@ class Hub:
                 log.warning("%s", self.waiting_for())
 
     def pulse(self) -> None:
-        """Empty the inbox, then judge silence, unless that was just done. Called between minibatches.
+        """Empty the inbox, then remove workers that have been silent for too long, unless that was just done.
 
-        Never waits, never ends the run.
+        Called between minibatches. Never waits, never ends the run.
         """
         if self._clock() - self._server.listened_s >= PULSE_S:
             self._listen(0.0)
@@ -180,7 +182,7 @@ class Hub:
         """A description of what the learner waits for, for the terminal."""
         coordinator = self.coordinator
         if not coordinator.members:
-            return f"waiting for a worker to join at {self.link.address}{self._server.why_missing()}"
+            return f"waiting for a worker to join at {self.link.address}{self._server.missing_reason()}"
         late = sorted({coordinator.members[ticket.peer].hello.worker for ticket in coordinator.tickets.values()})
         have, need = len(coordinator.ready), coordinator.rollouts_per_update
         return f"waiting for rollouts: have {have} of {need}, outstanding with {', '.join(late) or 'nobody'}"
@@ -243,7 +245,7 @@ class Hub:
             validate(message, self.coordinator.run)
         except BadRollout as error:
             why = f"worker {worker_name(peer).decode(errors='replace')}: rollout of ticket {message.ticket}: {error}"
-            self._server.complain(peer, why)
+            self._server.warn_limited(peer, why)
             return self.coordinator.reject_rollout(peer, message, why, now)
         self._weight_age.arrived(worker_name(peer).decode(errors="replace"), message.version, now)
         return self.coordinator.receive(peer, message, now)
@@ -257,7 +259,7 @@ class Hub:
             self._env_failures += 1
             allowed = self.settings.max_env_failures
             if self._env_failures > allowed:
-                counted = f"that was failure {self._env_failures}, at most {allowed} are allowed"
+                counted = f"failure {self._env_failures}; max_env_failures allows {allowed}"
                 line = f"worker {event.worker} ({event.host}): {event.error}; {counted}"
                 self._failure = EnvironmentFailed(line, event.traceback)
 
@@ -270,4 +272,4 @@ class Hub:
         if self._no_members_since_s is None:
             self._no_members_since_s = now
         if now - self._no_members_since_s > timeout_s:
-            raise NoWorkers(f"no worker for {timeout_s:.0f} s at {self.link.address}{self._server.why_missing()}")
+            raise NoWorkers(f"no worker for {timeout_s:.0f} s at {self.link.address}{self._server.missing_reason()}")

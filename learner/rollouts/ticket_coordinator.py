@@ -114,7 +114,7 @@ class TicketCoordinator:
             return self._join(peer, message, now)
         if isinstance(message, Rollout):
             self.ledger.transitions_received += message.env_steps
-        member = self.membership.sender(peer, message, now)
+        member = self.membership.member_of_session(peer, message, now)
         if member is None:
             if isinstance(message, Rollout):
                 self.ledger.transitions_late += message.env_steps
@@ -177,7 +177,7 @@ class TicketCoordinator:
         """New weights: offer them to every worker, and deal the tickets that they allow."""
         self.version = version
         self._weights = Weights(version, parameters, buffers)
-        out = [out for member in self.membership.active() for out in self._offer(member)]
+        out = [out for member in self.membership.active() for out in self._send_newest_weights(member)]
         return out + self._deal()
 
     def take(self) -> list[AcceptedRollout] | None:
@@ -210,7 +210,7 @@ class TicketCoordinator:
         if member is None:
             return welcome
         self._placement.joined()
-        return welcome + self._offer(member) + self._deal()
+        return welcome + self._send_newest_weights(member) + self._deal()
 
     def _strike(self, member: CollectingMember, why: str, now: float) -> list[Outgoing]:
         """Count something that could not be used; after too many the worker is refused."""
@@ -233,7 +233,7 @@ class TicketCoordinator:
         ticket = self.tickets.get(rollout.ticket)
         if ticket is None:
             self.ledger.transitions_duplicate += rollout.env_steps
-            return self._offer(member)
+            return self._send_newest_weights(member)
         if (
             ticket.peer != member.peer
             or ticket.lane != rollout.lane
@@ -251,7 +251,7 @@ class TicketCoordinator:
         self._placement.ticket_ended(member)
         self.ready.append(AcceptedRollout(rollout, ticket.incarnation))
         self._oldest_ready = min(self._oldest_ready, rollout.version)
-        return self._offer(member) + self._deal()
+        return self._send_newest_weights(member) + self._deal()
 
     def _heartbeat(self, member: CollectingMember, heartbeat: Heartbeat) -> list[Outgoing]:
         """Answer a heartbeat. Send again what it shows to be lost on the way."""
@@ -263,7 +263,7 @@ class TicketCoordinator:
         seen = min(heartbeat.replies, member.replies)
         if member.sending is not None and seen > member.sending_since:
             member.sending = None
-        out = self._offer(member)
+        out = self._send_newest_weights(member)
         out += self._collect(member, lost)
         member.replies += 1
         out.append((peer, HeartbeatReply(member.session, member.replies, self._received(member.lanes))))
@@ -274,7 +274,7 @@ class TicketCoordinator:
         if member.sending is not None and version >= member.sending:
             member.sending = None
 
-    def _offer(self, member: CollectingMember) -> list[Outgoing]:
+    def _send_newest_weights(self, member: CollectingMember) -> list[Outgoing]:
         """The newest weights, unless the worker has them or older ones are still on their way."""
         newest = self._weights
         if newest is None or member.sending is not None or member.acknowledged >= newest.version:

@@ -155,7 +155,12 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
             raise WorkerLost(f"lanes {sorted(awaiting_reset)} were lost with their worker; call reset() first")
         self._stepping = [lane for lane in self._layout.lanes if lane not in lost]
         self._pending = "step"
-        if fit and self._memory is not None and not awaiting_reset and all(map(self._hub.shares, self._stepping)):
+        if (
+            fit
+            and self._memory is not None
+            and not awaiting_reset
+            and all(map(self._hub.uses_shared_memory, self._stepping))
+        ):
             for array, leaf in zip(self._memory.actions, arrays, strict=True):
                 array[:] = leaf
             self._hub.step_shared(self._stepping)
@@ -347,6 +352,6 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
 
 
 def _call_in_process(pid: int, function: Callable[[], None]) -> None:
-    """Call it if this is the process of that id: a forked child has a copy of the environment, and not the workers."""
+    """Call `function` only in process `pid`: a forked child inherits this object, but does not own the workers."""
     if os.getpid() == pid:
         function()

@@ -43,7 +43,7 @@ MakeOrder = Callable[[int, int, LaneLife], Order]
 
 
 @dataclass
-class SteppedLane(PlacedLane):
+class OrderedLane(PlacedLane):
     """A lane whose env copies are stepped by orders."""
 
     started: bool = False
@@ -63,7 +63,7 @@ class OrderCoordinator:
         self.spec = spec
         self.worker_timeout_s = worker_timeout_s
         self.membership: Membership[Member] = Membership(spec, Member, self._removed, first_session)
-        self.lanes = [SteppedLane(lane) for lane in range(len(spec.lanes))]
+        self.lanes = [OrderedLane(lane) for lane in range(len(spec.lanes))]
         self.orders: dict[int, Order] = {}
         """orders that were sent and not answered, by ticket"""
         self.answers: dict[int, Answer] = {}
@@ -90,7 +90,7 @@ class OrderCoordinator:
         """Answer a message."""
         if isinstance(message, Hello):
             return self.membership.join(peer, message, now)[0]
-        member = self.membership.sender(peer, message, now)
+        member = self.membership.member_of_session(peer, message, now)
         if member is None:
             return self.membership.answer_ended_session(peer, message)
         match message:

@@ -1,8 +1,8 @@
 """The hub of a vector environment: a shell round its coordinator and shared memory. Only `wait_for_answers` waits.
 
 Rule: every wait has a deadline. When it passes, the workers that have not answered are given up, and killed if they are
-child processes of ours. So a wait ends with every lane answered or lost. Silence is judged only while the hub listens: the
-caller may take as long as it likes between two waits.
+child processes of ours. So a wait ends with every lane answered or lost. Workers that have been silent for too long
+are removed only while the hub listens: the caller may take as long as it likes between two waits.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from protocol.wire.wake_up import SpinWait, WakePipe, WakeReason
 log = logging.getLogger("millrace.learner")
 
 POLL_S = 0.05  # between two checks whether a child process has ended
-LISTEN_EVERY_S = 0.5  # heartbeats are answered so often while steps go through shared memory
-PATIENCE_S = 10.0  # a lost lane waits so long for its worker's successor, and no longer than half the timeout: then it moves
-# to a worker that has lanes already
+LISTEN_EVERY_S = 0.5  # interval of answers to heartbeats while steps go through shared memory
+PATIENCE_S = 10.0  # how long a lost lane waits for a restarted worker (at most half the timeout) before it goes to a worker
+# that already has lanes
 BUSY_S = 1.0  # how long closing waits for a step under way: the step may hang, and its result is not used
-LAST_WORDS_S = 0.1  # what a process sent before it ended may still be on its way
+LAST_MESSAGES_WAIT_S = 0.1  # messages that a process sent before it ended may still be on their way
 
 
 class LocalWorkers(Protocol):
@@ -126,7 +126,7 @@ class StepHub:
         self._listen_due_s = 0.0
         # To lose a worker costs the user's episodes. So a worker has its whole timeout to be heard again, not only the
         # server's short grace: after a long suspension even its connection must be made anew.
-        settings = ServerSettings(grace_s=worker_timeout_s, last_words_s=LAST_WORDS_S, log_tracebacks=False)
+        settings = ServerSettings(grace_s=worker_timeout_s, last_messages_wait_s=LAST_MESSAGES_WAIT_S, log_tracebacks=False)
         callbacks = ServerCallbacks(
             self._coordinator.receive, lambda now: status(self._coordinator, now), self._on_event, self._wake_sleeping
         )
@@ -156,7 +156,7 @@ class StepHub:
         self._waiting_since_s = self._clock()
         self._send_waiting_orders()
 
-    def shares(self, lane: int) -> bool:
+    def uses_shared_memory(self, lane: int) -> bool:
         """Whether a step of this lane may go through shared memory: its worker was handed the memory."""
         if lane not in self._wake_pipes:
             member = self._coordinator.owner(lane)
@@ -244,7 +244,7 @@ class StepHub:
         self._server.send(self._coordinator.rebalance())
 
     def wait_for(self, workers: int, timeout_s: float) -> None:
-        """Wait until so many workers have joined. Raises `NoWorkers`."""
+        """Wait until this number of `workers` have joined. Raises `NoWorkers`."""
         self._server.wait_for(workers, timeout_s, lambda: self._turn(POLL_S))
 
     def close(self, timeout_s: float) -> None:

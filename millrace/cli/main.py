@@ -33,7 +33,7 @@ class Command(NamedTuple):
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command line; the exit code."""
+    """Run the command line. Returns the exit code."""
     argv = sys.argv[1:] if argv is None else argv
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # last: a module of the user is found here and hides no installed module
@@ -356,7 +356,7 @@ def _internal_error(argv: list[str], error: Exception) -> int:
 
 
 def _failed(argv: list[str], exit_code: int) -> int:
-    """Print the traceback if --debug was given; the exit code."""
+    """Print the traceback if --debug was given. Returns the exit code."""
     if "--debug" in argv:
         import traceback
 

@@ -29,7 +29,7 @@ DROPS = {
     "stale": "rollouts too old",
     "transitions_duplicate": "transitions sent twice",
     "transitions_late": "transitions of sessions that had ended",
-    "transitions_invalid": "transitions that broke the row format",
+    "transitions_invalid": "invalid transitions (wrong shape, dtype, value or reset row)",
     "messages_bad": "messages that could not be read",
 }
 """What was dropped, by its name in the ledger."""
@@ -38,11 +38,15 @@ LEFT_ALIGNED = ("worker", "host", "lanes")  # columns of words; columns of numbe
 
 def status(argv: list[str], out: TextIO) -> None:
     """Run the command. Raises `UsageError`, or `RunError` when the learner does not answer."""
-    arguments = Arguments("status", "Show the workers of a run: their speed, memory and silence, and what was dropped.")
+    arguments = Arguments(
+        "status", "Show the workers of a run (speed, memory, seconds since the last message), and what was dropped."
+    )
     arguments.flag("address", metavar="ADDRESS", help="where the learner listens, as in tcp://HOST:5555")
     arguments.flag("--watch", action="store_true", help="ask again every second, until Ctrl-C or the end of the learner")
     arguments.flag("--json", action="store_true", help="print one line of JSON instead of a table")
-    arguments.flag("--timeout-s", type=float, default=5.0, metavar="FLOAT", help="seconds to wait (default: 5)")
+    arguments.flag(
+        "--timeout-s", type=float, default=5.0, metavar="FLOAT", help="seconds to wait for the learner's answer (default: 5)"
+    )
     arguments.flag(
         "--token", default="", metavar="FILE",
         help=f"file of a join token, if workers need one; if not given, {TOKEN_VARIABLE}",

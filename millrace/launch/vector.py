@@ -64,7 +64,7 @@ class ListeningVectorEnv:
     context: zmq.Context[zmq.Socket[bytes]]
     keyring: Keyring | None
     token: Token | None
-    """of local workers"""
+    """Token of local workers."""
     shared: SharedSteps | None
     """with local workers"""
     resources: ExitStack
@@ -129,7 +129,7 @@ def listen(settings: VectorEnvSettings, resources: ExitStack) -> ListeningVector
     resources.callback(link.close, 0.5)
     shared = None
     if settings.shared_memory and SUPPORTED and count and transport != "inproc":
-        to_learner = WakePipe()  # one for all: the worker that finishes a step last rings it
+        to_learner = WakePipe()  # one for all: the worker that finishes a step last writes to it
         shared = SharedSteps(SharedMemory(description.step), {f"w{n}": (WakePipe(), to_learner) for n in range(count)})
         resources.callback(shared.close)
     return ListeningVectorEnv(settings, description, link, context, keyring, token, shared, resources)

@@ -60,7 +60,7 @@ def test_the_next_update_is_the_same_as_without_a_stop(tmp_path: Path, env: str)
     folder = RunFolder.create(config)
     straight.update(first, lambda: None)
     straight.update(second, lambda: None)
-    checkpoint.save(folder.path, RunState(version=2).checkpoint(straight), env_steps=2, keep=3)
+    checkpoint.save(folder.path, RunState(version=2).checkpoint_content(straight), env_steps=2, keep=3)
     metrics = straight.update(third, lambda: None)
 
     resumed = algorithm()
@@ -81,7 +81,7 @@ def test_tickets_of_the_learner_that_died_are_lost_and_the_ledger_balances(tmp_p
     algorithm = PPO(ppo(config), run.policy, total_steps=1, seed=1)
     folder = RunFolder.create(config)
     state = RunState(ledger=Ledger(issued=10, used=6, transitions_received=80, transitions_used=60))
-    checkpoint.save(folder.path, state.checkpoint(algorithm), env_steps=60, keep=1)
+    checkpoint.save(folder.path, state.checkpoint_content(algorithm), env_steps=60, keep=1)
     ledger = restore(folder, algorithm).ledger
     assert (ledger.lost, ledger.outstanding, ledger.transitions_late, ledger.transitions_waiting) == (4, 0, 20, 0)
 
@@ -91,7 +91,7 @@ def test_a_checkpoint_of_another_network_is_refused_in_one_line(tmp_path: Path) 
     run = run_spec(config, EnvSpec("CartPole-v1"))
     folder = RunFolder.create(config)
     narrower = PPO(ppo(config), run.policy, total_steps=1, seed=1)
-    checkpoint.save(folder.path, RunState().checkpoint(narrower), env_steps=0, keep=1)
+    checkpoint.save(folder.path, RunState().checkpoint_content(narrower), env_steps=0, keep=1)
     wider = resolve("CartPole-v1", net=(32, 32), run_dir=str(tmp_path))
     other = PPO(ppo(wider), run_spec(wider, EnvSpec("CartPole-v1")).policy, total_steps=1, seed=1)
     with pytest.raises(CheckpointError, match="expected the state of this configuration") as failure:

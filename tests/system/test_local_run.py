@@ -205,7 +205,7 @@ def test_an_environment_that_raises_ends_the_run_with_its_own_traceback(tmp_path
     assert "worker w" in str(failure.value)
 
 
-def test_an_environment_that_raises_once_is_borne(tmp_path: Path) -> None:
+def test_a_run_continues_after_an_environment_raised_once(tmp_path: Path) -> None:
     once = str(tmp_path / "raised")
     folder = run(
         tmp_path, "workers.envs.toy:Raises-v0", env_kwargs={"once": once, "after": 30}, workers=1, steps=2_000, **SMALL

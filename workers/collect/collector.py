@@ -84,7 +84,7 @@ class Collector:
         self._policy = policy
         self._open_copies, self._step_all = open_copies, step_all
         self._distribution = distribution(run.policy)
-        self._write = make_action_converter(run.policy.action)
+        self._to_env_action = make_action_converter(run.policy.action)
         self._lanes: dict[int, CollectedLane] = {}
         self._to_close: list[CollectedLane] = []  # released by a pulse, when their copies may be in the middle of a step
         self._collecting = False
@@ -106,7 +106,7 @@ class Collector:
             lanes = [self._lane_for(assignment, pulse) for assignment in assignments]
             rows = self._new_rows(lanes)
             try:
-                self._fill(rows, lanes, pulse)
+                self._act_and_step(rows, lanes, pulse)
             except (LaneFailed, EnvironmentFailed, IndexError):  # an invalid row explains the error that followed
                 done = len(rows.step_end_s)
                 for i, lane in enumerate(lanes):
@@ -168,7 +168,7 @@ class Collector:
             step_end_s=[],
         )
 
-    def _fill(self, rows: _Rows, lanes: Sequence[CollectedLane], pulse: Pulse) -> None:
+    def _act_and_step(self, rows: _Rows, lanes: Sequence[CollectedLane], pulse: Pulse) -> None:
         """Step all lanes T times."""
         is_recurrent = rows.state.size > 0
         resets = np.stack([lane.ended for lane in lanes])  # [L, N] row t is not valid
@@ -184,7 +184,7 @@ class Collector:
             with np.errstate(all="ignore"):  # a NaN is reported once the rollout is complete
                 params = self._policy([leaf[:, t] for leaf in rows.obs], rows.state)
                 action = self._distribution.sample(params, rows.noise[:, t])
-                taken = self._write(action)
+                taken = self._to_env_action(action)
             rows.params[:, t] = params
             rows.action[:, t] = action
             acted = perf_counter()

@@ -42,9 +42,9 @@ class EnvCopies(Protocol):
     """N env copies. Whatever the environment raises arrives as `CopyRaised`; what `pulse` raises passes through."""
 
     observation_space: gymnasium.Space[Any]
-    """of one copy"""
+    """Observation space of one copy."""
     action_space: gymnasium.Space[Any]
-    """of one copy"""
+    """Action space of one copy."""
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:
         """Start episodes in all copies, with a seed for each."""

@@ -38,7 +38,9 @@ class _HeldLane:
 
 
 class HeldRollouts:
-    """Tickets to collect and rollouts to keep, of all lanes of a worker in one session."""
+    """What a worker holds in one session: tickets whose rollouts are still to be collected, and rollouts that the learner
+    has not confirmed.
+    """
 
     def __init__(self) -> None:
         self._lanes: dict[int, _HeldLane] = {}

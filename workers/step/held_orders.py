@@ -13,7 +13,7 @@ from protocol.messages import Answer, LaneLife, Order
 
 
 @dataclass
-class _OrderedLane:
+class _HeldLane:
     """Orders that the worker holds for one lane."""
 
     incarnation: int
@@ -26,14 +26,14 @@ class HeldOrders:
     """Orders to execute and answers to keep, of all lanes of a worker in one session."""
 
     def __init__(self) -> None:
-        self._lanes: dict[int, _OrderedLane] = {}
+        self._lanes: dict[int, _HeldLane] = {}
 
     def take(self, order: Order) -> Answer | None:
         """Take an order that has arrived. Returns an answer to send again, if any."""
         lane = self._lanes.get(order.lane)
         if lane is None or order.incarnation > lane.incarnation or order.ticket > lane.newest:
             if lane is None or order.incarnation >= lane.incarnation:
-                self._lanes[order.lane] = _OrderedLane(order.incarnation, order.ticket, order)
+                self._lanes[order.lane] = _HeldLane(order.incarnation, order.ticket, order)
             return None
         return lane.answer if lane.answer is not None and lane.answer.ticket == order.ticket else None
 

@@ -76,8 +76,8 @@ class Stepper:
     def serve_shared_memory(self, timeout_s: float, pulse: Pulse, session: int, send: Callable[[Stepped], None]) -> bool:
         """Execute the orders in shared memory until `timeout_s` have passed; True if the wake pipe announced a message.
 
-        Spinning is faster than a wait for the pipe. At most `cores - 1` workers spin, so that the learner keeps one core:
-        those that finished first. So the core of the last worker is free, and not asleep, when it wakes the learner.
+        Spinning is faster than a wait for the pipe. At most `cores - 1` workers spin, the first to finish. The last
+        does not spin, so its core is free for the learner when it wakes the learner.
         """
         assert self._memory is not None
         assert self._wake_in is not None

@@ -1,4 +1,4 @@
-"""The server of members, over a link and a clock that are not real: silence is judged only after listening."""
+"""The server of members, over a link and a clock that are not real: silent workers are removed only after listening."""
 
 from __future__ import annotations
 
@@ -86,8 +86,8 @@ def test_a_vector_environments_worker_has_its_whole_timeout_to_be_heard() -> Non
     assert hub.worker_count == 0
 
 
-def test_the_last_words_of_a_process_that_has_ended_are_heard() -> None:
-    served = Served(ServerSettings(last_words_s=POLL_S))
+def test_the_last_messages_of_a_process_that_has_ended_are_received() -> None:
+    served = Served(ServerSettings(last_messages_wait_s=POLL_S))
     served.ended.append(("w0", "was killed"))
     waiting = served.link.poll
 

@@ -94,7 +94,7 @@ def test_while_a_lane_waits_to_move_the_rollouts_of_others_cost_no_more() -> Non
     assert of_another(waiting(MANY // 2)) <= of_another(waiting(FEW)) + 5
 
 
-def test_silence_is_judged_when_it_can_have_come_about_and_not_before() -> None:
+def test_silent_workers_are_removed_when_a_timeout_may_have_passed_and_not_before() -> None:
     learner = crowd(MANY)
     learner.coordinator.remove_silent(0.0)
     learner.now = 4.0

@@ -778,7 +778,7 @@ def test_failure_forgets_the_worker_and_its_traceback_is_kept_for_the_log() -> N
     assert learner.coordinator.events[-1] == WorkerLeft("a", "broke: ValueError: x", 1, False)
 
 
-def test_silence_is_judged_in_tick_only() -> None:
+def test_silent_workers_are_removed_in_tick_only() -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
     learner.now = 1000.0
