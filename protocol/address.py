@@ -73,7 +73,7 @@ def resolves(address: str) -> bool:
 
 
 def advertised_address(bound: str, advertise: str, machine: str) -> str:
-    """The address to type on other machines to reach a learner that listens at `bound`.
+    """The address at which other machines reach a learner that listens at `bound`.
 
     The host is `advertise` if given, else `machine` if `bound` means every interface, else the host of `bound`.
     """

@@ -10,7 +10,7 @@
     │       ├── WorkerLost        1   a worker is gone, and env copies with it, where none may be lost
     │       ├── Stalled           1   a deadline passed; the text says what was waited for
     │       └── EnvironmentFailed 1   the environment raised too often; the text carries the worker's own traceback
-    └── TheirError            counted and answered, never raised into the loop: a peer sent something wrong
+    └── PeerError             counted and answered, never raised into the loop: a peer sent something wrong
         ├── BadMessage            not a valid message: shape, size, type or version
         └── BadRollout            a rollout that breaks the row format
 

@@ -21,7 +21,7 @@ class MemberLog:
 
     def warn_limited(self, peer: bytes, line: str) -> None:
         """Warn about what a peer sent, unless there was a line about it a short while ago."""
-        if (kept_back := self._limit.due(self._link.speaker(peer), self._clock())) is not None:
+        if (kept_back := self._limit.due(self._link.name_for_log(peer), self._clock())) is not None:
             log.warning("%s%s", line, suppressed_note(kept_back))
 
     def log_event(self, level: int, event: Event, line: str) -> None:

@@ -1,7 +1,8 @@
 """envpool's compiled environments under gymnasium's ids.
 
-Rule: an id means the same environment as in gymnasium: its spaces must be gymnasium's, and its time limit is. This file
-maps ids to envpool tasks and makes the env copies; `workers/collect/envpool_copies.py` keeps the row format.
+Rule: an id means the same environment as in gymnasium. Spaces that differ from gymnasium's are an error, and gymnasium's
+time limit applies. This file maps ids to envpool tasks and makes the env copies; the row format is kept by
+`workers/collect/envpool_copies.py`.
 """
 
 from __future__ import annotations
@@ -38,10 +39,10 @@ class EnvpoolSpec(NamedTuple):
     """steps after which `workers.collect.envpool_copies` truncates an episode; envpool itself does not"""
     observation_space: gymnasium.Space[Any]
     action_space: gymnasium.Space[Any]
-    """both of one copy"""
+    """Observation and action space of one copy."""
 
     def make(self, seeds: Sequence[int]) -> VectorEnv[Any, Any, Any]:
-        """Make one env copy for each seed; envpool takes seeds only here. One thread: each core has its own worker."""
+        """Make one env copy per seed: envpool accepts seeds only at creation. It uses one thread; each core has a worker."""
         import envpool
 
         options = {**self.options, "num_threads": 1, "env_seed": list(seeds)}
@@ -53,7 +54,7 @@ class EnvpoolSpec(NamedTuple):
 
 @contextmanager
 def _ignore_warnings() -> Iterator[None]:
-    """Ignore warnings, such as those about bounds that float32 rounds. Filters are global: one thread at a time."""
+    """Ignore warnings, such as those about rounded bounds. Warning filters are global, so a lock admits one thread."""
     with _WARNINGS_LOCK, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
@@ -88,7 +89,7 @@ def envpool_spec(env: EnvSpec) -> EnvpoolSpec:
 def _task_and_options(env: EnvSpec, known: gymnasium.envs.registration.EnvSpec) -> tuple[str, dict[str, Any]]:
     """Task and options in envpool: from the entry point's attribute `envpool`, or the same as in gymnasium.
 
-    An id that somebody else registered under a name of envpool is another environment: its task is empty.
+    The task is empty if the id of an envpool task was registered by another package: it is another environment.
     """
     creator = load_env_creator(known.entry_point) if isinstance(known.entry_point, str) else known.entry_point
     if (translate := getattr(creator, "envpool", None)) is not None:

@@ -1,7 +1,7 @@
 """An environment's own vectorized form: gymnasium's `vector_entry_point`.
 
-Rule: it resets in the step after an episode's end (NEXT_STEP), as a loop over env copies does. With another autoreset
-mode, final observations could not be distinguished from first ones.
+Rule: its autoreset mode must be NEXT_STEP: it resets in the step after the end of an episode, as a loop over env copies
+does. With another mode, last and first observations of episodes could not be distinguished.
 """
 
 from __future__ import annotations

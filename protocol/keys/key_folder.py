@@ -151,10 +151,10 @@ class Keyring:
     """The learner's key and the current list of clients. Two threads read it; `refresh` replaces the list as one object."""
 
     def __init__(self, key: Key, allowed: ClientList, folder: KeyFolder | None = None) -> None:
-        """Without a folder the list never changes."""
+        """`folder`: where the list is read again; None: the list never changes."""
         self.key, self.allowed, self.folder = key, allowed, folder
         self.read_error = ""
-        """why the list cannot be read now; then no client can join, and connected ones stay"""
+        """Why the list cannot be read now; empty if it can. If not, no client can join; connected clients stay."""
         self._read_state = self._file_state()
 
     def refresh(self) -> None:
@@ -195,8 +195,8 @@ class Keyring:
 def read_token(flag: str) -> Token | None:
     """The token from the flag's file, or else from the environment variable; None if neither is set.
 
-    The environment variable holds a file name or the token itself. It is removed, so that processes which an env copy starts
-    do not inherit it. Raises `UsageError`.
+    The environment variable holds a file name or the token itself. It is removed, so that processes
+    that an environment starts do not inherit it. Raises `UsageError`.
     """
     given = os.environ.pop(TOKEN_VARIABLE, "").strip()
     if flag.startswith("millrace1."):
@@ -216,7 +216,7 @@ def read_token(flag: str) -> Token | None:
 
 
 def _read_secret(path: Path, what: str) -> str:
-    """The text of a file that nobody else can read. A pipe, such as `<(pass show millrace)`, is accepted."""
+    """The text of a file that only its owner can read. A pipe, such as `<(pass show millrace)`, is accepted."""
     try:
         with path.open("rb") as file:
             mode = os.fstat(file.fileno()).st_mode

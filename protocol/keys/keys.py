@@ -131,7 +131,7 @@ class ClientList:
         return {bytes.fromhex(one.public): one for one in sorted(self.clients, key=lambda one: one.revoked is not None)}
 
     def valid(self, name: str) -> Client | None:
-        """The client of this name that may connect."""
+        """The client of this name that may connect, or None."""
         return next((client for client in self.clients if client.name == name and client.revoked is None), None)
 
     def names(self) -> list[str]:
@@ -142,10 +142,10 @@ class ClientList:
         """The list with one more client. Raises `UsageError` if the name is taken or the key is on the list already."""
         check_name(name)
         if self.valid(name) is not None:
-            raise UsageError(f"key {name} is there already; take another name, or revoke it first")
+            raise UsageError(f"key {name} exists already; choose another name, or revoke it first")
         known = next((client for client in self.clients if client.public == public.hex()), None)
         if known is not None:
-            state = "is allowed already" if known.revoked is None else "was revoked, and stays so; make a new one"
+            state = "is allowed already" if known.revoked is None else "was revoked, which is final; make a new key"
             raise UsageError(f"public key {fingerprint(public)} ({known.name}) {state}")
         return ClientList((*self.clients, Client(name, public.hex(), made)))
 
@@ -155,7 +155,7 @@ class ClientList:
         if victim is None:
             before = any(client.name == name for client in self.clients)
             raise UsageError(
-                f"key {name}: {'revoked already' if before else 'there is none of this name'}{_describe_allowed(self)}"
+                f"key {name}: {'it is revoked already' if before else 'no key has this name'}{_describe_allowed(self)}"
             )
         gone = msgspec.structs.replace(victim, revoked=now)
         return ClientList(tuple(gone if client is victim else client for client in self.clients))

@@ -34,7 +34,10 @@ def core_shapes(spec: PolicySpec, inputs: int) -> tuple[tuple[int, int], tuple[i
 
 
 def advance(spec: PolicySpec, parameters: Mapping[str, npt.NDArray[Any]], x: Floats, state: Floats) -> Floats:
-    """One step on input x [..., D]. Updates `state` [..., S] in place. Returns the output [..., core_size]."""
+    """Advance the core by one step with input x [..., D]. Returns the output [..., core_size].
+
+    Updates `state` [..., S] in place.
+    """
 
     def linear(name: str, values: Floats) -> Floats:
         out = np.matmul(values, parameters[f"{name}.weight"].T)

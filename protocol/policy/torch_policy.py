@@ -16,12 +16,12 @@ from protocol.specs import ImagesDtype, PolicySpec
 
 
 class TorchPolicy:
-    """Acts like `NumpyPolicy`, with images and encoders. Lanes pass one by one, so each gets the bits it would get alone."""
+    """Acts like `NumpyPolicy`, also on images. Lanes are computed one by one: their results do not depend on other lanes."""
 
     def __init__(
         self, spec: PolicySpec, device: str = "cpu", *, together: bool = False, images: ImagesDtype = "float32"
     ) -> None:
-        """`together`: pass all lanes at once, for a caller that always has all of them. `images`: precision for images."""
+        """`together`: compute all lanes at once; the caller always passes all. `images`: precision for images."""
         self.spec = spec
         self._images_dtype = images
         self._device, self._together = device, together

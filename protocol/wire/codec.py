@@ -39,7 +39,7 @@ DTYPES = {
 }
 
 MessageTypes = tuple[Any, Any]
-"""types whose fields go by position, and types whose fields go by name: msgspec accepts no union of both"""
+"""Types encoded as arrays, and types encoded as maps. msgspec accepts no union of both kinds."""
 TO_WORKER: MessageTypes = (reduce(operator.or_, (kind for kind in get_args(ToWorker) if kind is not Refuse)), Refuse)
 TO_LEARNER: MessageTypes = (
     reduce(operator.or_, (kind for kind in get_args(ToLearner | Inquire) if kind is not Hello)),
@@ -140,7 +140,7 @@ def _decode(frames: Sequence[Buffer], kinds: MessageTypes, packed_bytes_limit: i
             max_ext_len=0,
             strict_map_key=True,
         )
-        named = type(head) is dict and "type" in head  # without it msgspec would accept any map if there is only one type
+        named = type(head) is dict and "type" in head  # with only one type, msgspec would accept a map without it
         message = msgspec.convert(head, by_name if named else by_position, dec_hook=hook)
     except BadMessage:
         raise

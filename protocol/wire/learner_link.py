@@ -100,8 +100,8 @@ class LearnerLink:
         """Why this peer is not allowed any more; empty if it is."""
         return "" if self.keyring is None else self.keyring.allowed.rejection_reason(_key_of(peer))
 
-    def speaker(self, peer: bytes) -> str:
-        """The name to blame for what this peer sends: that of its key, or without keys its own."""
+    def name_for_log(self, peer: bytes) -> str:
+        """The name for log lines about this peer: that of its key, or without keys the one it gave itself."""
         return (
             worker_name(peer).decode(errors="replace")
             if self.keyring is None

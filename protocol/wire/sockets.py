@@ -52,7 +52,7 @@ def receive_frames(socket: zmq.Socket[bytes], said_by: list[str] | None = None) 
             if said_by is not None and not frames:
                 said_by[:] = [_user(frame)]
             more = frame.more
-            if len(frames) < MAX_FRAMES + 2:  # the sender's name, and one too many
+            if len(frames) < MAX_FRAMES + 2:  # + sender's name, + one that shows there were too many
                 frames.append(frame.buffer if len(frame) >= COPY_BELOW_BYTES else frame.bytes)
     except zmq.Again:
         return None

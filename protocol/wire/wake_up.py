@@ -53,7 +53,7 @@ class WakePipe:
     def wait(self, timeout_s: float) -> WakeReason:
         """Sleep until woken, at most `timeout_s`. Of several reasons, `MESSAGE` is returned before `STEP`.
 
-        After a step that was noticed without sleeping, the pipe still wakes the next sleeper, once and without need.
+        If the reader noticed a step without sleeping, its byte is still in the pipe, and the next `wait` returns at once.
         """
         if not self._poll.poll(timeout_s * 1000):
             return WakeReason.NONE

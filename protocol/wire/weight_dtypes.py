@@ -21,21 +21,21 @@ BOUNDS = {"bfloat16": (2 - 2**-8) * 2.0**127, "float16": (2 - 2**-11) * 2.0**15}
 
 
 def to_wire_dtype(parameters: Floats, dtype: WeightsDtype) -> Array:
-    """Convert float32 parameters [P] for sending; float32 is not copied. Raises `RunError` if one is out of range."""
+    """Convert float32 parameters [P] to `dtype`; float32 is not copied. Raises `RunError` if one is out of range."""
     if dtype == "float32" or parameters.size == 0:
         return parameters
     largest = max(float(parameters.max()), -float(parameters.min()))
     if not largest < BOUNDS[dtype]:  # also true for NaN
         which = int(np.argmax(~(np.abs(parameters) < BOUNDS[dtype])))
         raise RunError(
-            f"weights_dtype {dtype}: parameter {which} expected less than {BOUNDS[dtype]:g} either way, got "
-            f"{parameters[which]:g}; resume with another weights_dtype, or learn more slowly"
+            f"weights_dtype {dtype}: parameter {which}: expected an absolute value below {BOUNDS[dtype]:g}, got "
+            f"{parameters[which]:g}; resume with another weights_dtype, or with a smaller learning rate"
         )
     if dtype == "float16":
         return parameters.astype(np.float16)
     bits = parameters.view(np.uint32)
     rounded = bits >> 16
-    rounded &= 1  # ties to even: add half a unit to odd numbers, and slightly less to even ones
+    rounded &= 1  # round half to even: odd numbers get half a unit, even ones slightly less
     rounded += 0x7FFF
     rounded += bits
     return rounded.view(np.uint16)[1::2].copy()

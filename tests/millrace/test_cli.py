@@ -324,7 +324,7 @@ def test_keys_are_made_shown_allowed_and_revoked(tmp_path: Path, capsys: Capture
     assert re.search(r"^lab .* revoked \d{4}", shown[2])
     assert re.search(r"^home .* may connect$", shown[3])
     line = refusal(capsys, "keys", "revoke", "lab", *here)
-    assert line == "key lab: revoked already; those that may connect: home"
+    assert line == "key lab: it is revoked already; those that may connect: home"
     assert "expected a public key of 64 hexadecimal digits, got 1 characters" in refusal(
         capsys, "keys", "allow", "x", "y", *here
     )

@@ -117,7 +117,7 @@ def test_who_is_revoked_is_out_and_nobody_else() -> None:
     again = after.with_client("lab", SERVER.public, LATER)  # the name is free, the key is not
     assert not again.rejection_reason(SERVER.public)
     assert again.rejection_reason(LAB.public)
-    with pytest.raises(UsageError, match="was revoked, and stays so"):
+    with pytest.raises(UsageError, match="was revoked, which is final"):
         after.with_client("other", LAB.public, LATER)
 
 
@@ -127,11 +127,11 @@ def test_a_key_that_stands_twice_is_out_if_it_was_revoked_once() -> None:
 
 
 def test_a_name_and_a_key_are_given_once() -> None:
-    with pytest.raises(UsageError, match="key lab is there already"):
+    with pytest.raises(UsageError, match="key lab exists already"):
         both().with_client("lab", SERVER.public, NOW)
     with pytest.raises(UsageError, match=r"\(lab\) is allowed already"):
         both().with_client("other", LAB.public, NOW)
-    with pytest.raises(UsageError, match="key x: there is none of this name; those that may connect: lab, home"):
+    with pytest.raises(UsageError, match="key x: no key has this name; those that may connect: lab, home"):
         both().with_revoked("x", NOW)
     with pytest.raises(UsageError, match="revoked already"):
         both().with_revoked("lab", NOW).with_revoked("lab", NOW)

@@ -257,7 +257,7 @@ def test_who_has_a_token_is_heard_and_answered(net: Net) -> None:
     ((peer, message),) = heard(learner)
     assert message == hello("wörker")
     assert worker_name(peer) == "wörker".encode()
-    assert learner.speaker(peer) == "lab"
+    assert learner.name_for_log(peer) == "lab"
     assert learner.rejection_reason(peer) == ""
     assert learner.send(peer, encode(Rejoin(3)))
     assert worker.poll(DEADLINE_S)
@@ -529,7 +529,7 @@ def test_another_key_cannot_speak_in_a_workers_session_nor_take_it_over(net: Net
     assert member.lanes <= lanes
     other = next(m for p, m in hub.coordinator.members.items() if p != peer)
     assert other.session != member.session
-    assert learner.speaker(other.peer) == "home"
+    assert learner.name_for_log(other.peer) == "home"
 
 
 def test_what_is_meant_for_one_key_is_not_sent_to_another(net: Net) -> None:

@@ -69,7 +69,9 @@ def test_what_would_become_infinite_is_refused_and_named(dtype: WeightsDtype) ->
     kept = to_float32(to_wire_dtype(np.array([below, -below]), dtype))
     assert (kept == np.array([1, -1]) * float(torch.finfo(TORCHS[dtype]).max)).all()
     for wrong in (bound, -bound, np.float32(np.inf), -np.float32(np.inf), np.float32(np.nan)):
-        with pytest.raises(RunError, match=rf"^weights_dtype {dtype}: parameter 2 expected less than .*, got .*; resume"):
+        with pytest.raises(
+            RunError, match=rf"^weights_dtype {dtype}: parameter 2: expected an absolute value below .*, got .*; resume"
+        ):
             to_wire_dtype(np.array([0, 1, wrong, 0], np.float32), dtype)
 
 
