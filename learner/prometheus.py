@@ -52,20 +52,20 @@ class MetricsSnapshot(msgspec.Struct, frozen=True, kw_only=True):
     at_s: float = 0.0
     """seconds since 1970; 0: the learner has not begun"""
     progress: Progress = Progress()
-    """as of the last update"""
+    """Progress as of the last update."""
     version: int = -1
     ledger: Mapping[str, int] = {}
     workers: Mapping[str, int] = {}
-    """how many are in each state"""
+    """Number of workers in each state."""
     lags: Mapping[int, int] = {}
-    """rollouts that updates used, by lag in versions"""
+    """Number of rollouts that updates used, by lag in versions."""
     received: tuple[int, int] = (0, 0)
-    """messages, bytes"""
+    """Number of messages and of bytes."""
     sent: tuple[int, int] = (0, 0)
     refused_messages: int = 0
-    """messages under revoked keys"""
+    """Number of messages under revoked keys."""
     refused_handshakes: int = 0
-    """handshakes that failed"""
+    """Number of handshakes that failed."""
 
 
 class MetricsCollector(Collector):

@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-INTERVAL_S = 0.25  # between two calls of the second thread: a Heartbeat is at most so much late
+INTERVAL_S = 0.25  # between two calls of the second thread: a Heartbeat is late by at most this time
 
 
 class HeartbeatThread:

@@ -63,12 +63,12 @@ class WorkerCommand:
     address: str
     name: str
     log: Path | None = None
-    """file for its stderr; None: nowhere"""
+    """File for the worker's stderr. None: the supervisor's own stderr."""
     token: Token | None = None
     flags: Sequence[str] = ()
-    """further flags of `python -m workers`"""
+    """Further flags of `python -m workers`."""
     shared_memory: InheritedDescriptors | None = None
-    """file descriptors that it inherits, to step a vector environment through shared memory"""
+    """File descriptors that the worker inherits, to step a vector environment through shared memory."""
 
 
 class WorkerProcess:

@@ -64,15 +64,15 @@ class WorkerOptions:
     """The options of a worker that depend on its process."""
 
     code: AllowedCode = AllowedCode.MODULES
-    """how much code the learner may make it run"""
+    """Which code the learner may make the worker run."""
     stop_requests: Callable[[], int] = _no_stop_requests
-    """counts the requests to leave"""
+    """Returns the number of requests to leave."""
     feed_watchdog: Callable[[float], None] = _no_watchdog
-    """called now and then with the time, unless the environment hangs"""
+    """Called regularly with the time, unless the environment hangs."""
     shared_memory: InheritedDescriptors | None = None
-    """shared memory and wake pipes, for a vector environment on this machine"""
+    """Shared memory and wake pipes, for a vector environment on this machine."""
     make_collector: MakeCollector = make_local_collector
-    """what collects in a run, and how it acts"""
+    """Makes the collector of a run, with the policy that acts."""
 
 
 class Worker:

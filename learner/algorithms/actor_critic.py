@@ -148,7 +148,7 @@ class ActorCritic:
         return self.config.vf_coef
 
     def minibatch_count(self, rows: int) -> int:
-        """Into how many minibatches of nearly equal size an epoch of so many rows is divided."""
+        """Number of minibatches, of nearly equal size, in an epoch of `rows` rows."""
         return 1
 
     def stops(self, metrics: Metrics) -> bool:
@@ -244,7 +244,7 @@ class ActorCritic:
         return dict(zip((*numbers, "grad_norm"), read, strict=True))
 
     def count_update(self, batch: Batch, observations: Observations, epochs: int) -> None:
-        """Count an update of so many epochs with this batch: steps, versions, observation statistics."""
+        """Count an update of `epochs` epochs with this batch: steps, versions, observation statistics."""
         self.env_steps += batch.env_steps
         self.version += 1
         # Workers acted on the batch under the statistics published before it, and the losses must see the observations as
@@ -381,7 +381,7 @@ class ActorCritic:
             yield rows.select_columns(chosen, self._to_device(mask))
 
     def _in_numpy(self, rows: int) -> bool:
-        """Whether the network is evaluated in numpy for a minibatch of so many rows."""
+        """Whether the network is evaluated in numpy for a minibatch of `rows` rows."""
         return self._fused is not None and rows <= MAX_ROWS
 
     def _shuffled(self, index: Array) -> Array:

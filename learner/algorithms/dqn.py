@@ -44,7 +44,7 @@ LOSSES = {"huber": loss_gradients.huber_loss, "squared": loss_gradients.squared_
 
 
 def exploration_rate(config: DQNConfig, env_steps: int) -> float:
-    """ε after so many env steps of all env copies together."""
+    """ε after `env_steps` env steps, summed over all env copies."""
     start, end, done = config.epsilon_start, config.epsilon_end, env_steps / config.epsilon_steps
     return end + (start - end) * (max(0.0, 1 - done) if config.epsilon_schedule == "linear" else math.exp(-done))
 

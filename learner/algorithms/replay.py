@@ -44,7 +44,7 @@ class Sample(NamedTuple):
 
 
 def memory_bytes(observation: Sequence[Leaf], size: int, prioritized: bool) -> int:
-    """The memory of a replay buffer with so many slots."""
+    """Memory of a replay buffer with `size` slots, in bytes."""
     row = sum(int(np.prod(leaf.shape)) * np.dtype(leaf.dtype).itemsize for leaf in observation)
     return size * (row + ROW.itemsize) + (SumTree.memory_bytes(size) if prioritized else 0)
 

@@ -27,7 +27,7 @@ class SumTree:
 
     @staticmethod
     def memory_bytes(size: int) -> int:
-        """The memory of a tree of so many weights."""
+        """Memory of a tree of `size` weights, in bytes."""
         return 2 * max(size, 2) * np.dtype(np.float64).itemsize
 
     @property

@@ -22,11 +22,11 @@ class PlacedLane:
 
     number: int
     incarnation: int = 0
-    """rises when the lane starts again on new env copies"""
+    """Incremented when the lane starts again on new env copies."""
     owner: bytes | None = None
-    """routing id of the worker"""
+    """Routing id of the lane's worker; None: no worker has the lane."""
     moving: bool = False
-    """the lane waits for its last tickets to end before it moves to another worker"""
+    """Whether the lane waits for its last tickets to end before it moves to another worker."""
 
     @property
     def busy(self) -> int:

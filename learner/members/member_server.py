@@ -61,13 +61,13 @@ class ServerCallbacks:
     """The functions of a hub that the server calls."""
 
     message: Callable[[bytes, ToLearner, float], Sequence[Outgoing]]
-    """answers a message (sender, message, now)"""
+    """Answers a message; called with (sender, message, now)."""
     status: Callable[[float], Status]
-    """answers `millrace status`"""
+    """Answers `millrace status`."""
     event: Callable[[Event], None]
-    """called with each event, after it was logged"""
+    """Called with each event, after it was logged."""
     sent: Callable[[bytes], None] = lambda peer: None
-    """called with the receiver of each message that was sent"""
+    """Called with the receiver of each message that was sent."""
 
 
 @dataclass(frozen=True)
@@ -75,11 +75,11 @@ class ServerSettings:
     """The settings in which the servers of different hubs differ."""
 
     grace_s: float = AWAY_S
-    """for how long, after the learner was away, no worker is removed as silent"""
+    """For how long, after the learner was away, no worker is removed as silent."""
     last_messages_wait_s: float = 0.0
-    """how long to wait for the last messages of a process that has ended"""
+    """How long to wait for the last messages of a process that has ended."""
     log_tracebacks: bool = True
-    """whether the traceback of an environment is logged; if not, the hub raises it"""
+    """Whether the traceback of an environment is logged; if not, the hub raises it."""
 
 
 class MemberServer:
@@ -96,7 +96,7 @@ class MemberServer:
     ) -> None:
         """`ended` names the workers whose processes have ended since the last call, each with the reason."""
         self.listened_s = clock()
-        """when this last listened"""
+        """Time at which the server last listened."""
         self._link, self._coordinator, self._callbacks, self._ended = link, coordinator, callbacks, ended
         self._membership = coordinator.membership
         self._settings, self._clock = settings or ServerSettings(), clock

@@ -44,24 +44,24 @@ class Member:
     """A worker as the learner sees it."""
 
     peer: bytes
-    """routing id"""
+    """Routing id of the worker."""
     hello: Hello
     session: int
     join_number: int
-    """rises with each worker that joins"""
+    """Number of this member in the order of joining."""
     heard_s: float
-    """when its last message came"""
+    """Time of the worker's last message."""
     state: MemberState = MemberState.ACTIVE
     lanes: set[int] = field(default_factory=set)
     tickets: dict[int, int] = field(default_factory=dict)
-    """each ticket that it holds, with `replies` at the time when the ticket was last sent"""
+    """Tickets that the worker holds; for each, the value of `replies` when the ticket was last sent."""
     replies: int = 0
-    """heartbeat replies that were sent"""
+    """Number of heartbeat replies that were sent."""
     heartbeat: Heartbeat | None = None
-    """the newest"""
+    """Newest heartbeat."""
     steps_per_s: float = 0.0
     measured: tuple[int, float] = (0, 0.0)
-    """env steps in the heartbeat that its speed was last measured by, and when that came"""
+    """Env steps in the heartbeat by which the speed was last measured, and the time when it arrived."""
 
     def record_heartbeat(self, heartbeat: Heartbeat) -> list[int]:
         """Keep the heartbeat. Returns the tickets that were lost on the way.

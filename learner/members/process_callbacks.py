@@ -11,8 +11,8 @@ class ProcessCallbacks:
     """The worker processes of this program; by default there are none."""
 
     ended: Callable[[], Iterable[tuple[str, str]]] = lambda: ()
-    """names of the workers whose processes have ended since the last call, each with the reason; it may raise"""
+    """Returns (name, reason) of the workers whose processes have ended since the last call. It may raise."""
     count: Callable[[], int] | None = None
-    """how many processes step the environment; None: as many as there are members"""
+    """Returns the number of processes that step the environment. None: one per member."""
     expected: int = 0
-    """how many processes the user asked for; 0: any number"""
+    """Number of processes that the user asked for. 0: any number."""

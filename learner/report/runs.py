@@ -49,9 +49,9 @@ class Run:
     algo: str
     seed: int
     settings: dict[str, str]
-    """all settings of config.toml, as text"""
+    """All settings of config.toml, as text."""
     algorithm_settings: frozenset[str]
-    """names of those that belong to the algorithm"""
+    """Names of the settings that belong to the algorithm."""
     results: RunResults
     curve: Curve | None
     """None before the first episode has ended"""
@@ -65,9 +65,9 @@ class RunGroup:
 
     env: str
     name: str
-    """the algorithm, and a letter if the environment has several groups of it"""
+    """Name of the algorithm, and a letter if the environment has several groups of that algorithm."""
     differences: str
-    """the settings that distinguish it from those groups; empty if there are none"""
+    """Settings that distinguish this group from those groups; empty if there are none."""
     color: int
     """number of its color; groups of the same environment have different ones"""
     runs: tuple[Run, ...]

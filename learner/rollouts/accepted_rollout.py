@@ -13,4 +13,4 @@ class AcceptedRollout:
 
     rollout: Rollout
     incarnation: int
-    """incarnation of its lane when its ticket was dealt: each incarnation has new env copies"""
+    """Incarnation of the lane when its ticket was dealt. Each incarnation has new env copies."""

@@ -47,7 +47,7 @@ class HubSettings:
     stall_timeout_s: float
     max_env_failures: int
     weights_dtype: WeightsDtype = "float32"
-    """dtype in which parameters travel"""
+    """Dtype in which parameters are sent."""
 
 
 @dataclass(frozen=True)
@@ -55,26 +55,26 @@ class HubSnapshot:
     """State of the hub at one moment, for metrics, checkpoints and status. Cheap to make."""
 
     progress: Progress
-    """as of the last update"""
+    """Progress as of the last update."""
     version: int
-    """version of the newest weights; -1 before the first"""
+    """Version of the newest weights; -1 before the first."""
     ledger: Ledger
-    """a copy"""
+    """Copy of the hub's ledger."""
     incarnations: list[int]
-    """the next incarnation of each lane"""
+    """Next incarnation of each lane."""
     lags: list[int]
-    """lag of each rollout of the last `gather`"""
+    """Lag of each rollout of the last `gather`."""
     lag_counts: Mapping[int, int]
-    """how many rollouts were used, by lag, since this learner started"""
+    """Number of rollouts used since this learner started, by lag."""
     wait_s: float
-    """seconds spent waiting for rollouts since this learner started"""
+    """Seconds spent waiting for rollouts since this learner started."""
     members: tuple[CollectingMember, ...]
     received: tuple[int, int]
-    """messages, bytes"""
+    """Number of messages and of bytes."""
     sent: tuple[int, int]
-    """messages, bytes"""
+    """Number of messages and of bytes."""
     refused_messages: int
-    """messages under keys that were revoked"""
+    """Number of messages under revoked keys."""
     refused_handshakes: int
 
     def worker_stages(self) -> dict[int, Mapping[str, float]]:

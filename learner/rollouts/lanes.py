@@ -18,15 +18,15 @@ class TicketedLane(PlacedLane):
     """A lane on which workers collect rollouts."""
 
     progress: int = 0
-    """tickets used or outstanding"""
+    """Number of tickets used or outstanding."""
     started: bool = False
-    """a ticket of this incarnation was dealt"""
+    """Whether a ticket of this incarnation was dealt."""
     outstanding: set[int] = field(default_factory=set)
-    """tickets that are with its worker"""
+    """Tickets that the lane's worker holds."""
     below: int = 0
-    """every rollout of this incarnation with a smaller sequence number has arrived"""
+    """Every rollout of this incarnation with a smaller sequence number has arrived."""
     ahead: set[int] = field(default_factory=set)
-    """sequence numbers that have arrived out of order"""
+    """Sequence numbers that have arrived out of order."""
 
     @property
     def busy(self) -> int:
@@ -60,7 +60,7 @@ class Ticket:
     lane: int
     incarnation: int
     version: int
-    """version of the newest weights when it was dealt"""
+    """Version of the newest weights when the ticket was dealt."""
     peer: bytes
 
 

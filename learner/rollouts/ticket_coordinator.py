@@ -53,13 +53,13 @@ class CollectingMember(Member):
     """A worker as the learner of a run sees it."""
 
     acknowledged: int = -1
-    """newest version that it is known to have"""
+    """Newest version that the worker is known to have."""
     sending: int | None = None
-    """version of the Weights that were sent and are not acknowledged"""
+    """Version of the weights that were sent and are not acknowledged."""
     sending_since: int = 0
-    """`replies` when they were sent"""
+    """Value of `replies` when those weights were sent."""
     strikes: int = 0
-    """rollouts and messages of it that could not be used"""
+    """Number of the worker's rollouts and messages that could not be used."""
 
     def status(self, now: float) -> WorkerStatus:
         """The worker's row of `millrace status`."""

@@ -47,7 +47,7 @@ class OrderedLane(PlacedLane):
     """A lane whose env copies are stepped by orders."""
 
     started: bool = False
-    """an order of this incarnation was sent: its env copies exist, and can be lost"""
+    """Whether an order of this incarnation was sent. If so, its env copies exist and can be lost."""
 
     def restart(self) -> None:
         """The lane left its worker."""
@@ -65,17 +65,17 @@ class OrderCoordinator:
         self.membership: Membership[Member] = Membership(spec, Member, self._removed, first_session)
         self.lanes = [OrderedLane(lane) for lane in range(len(spec.lanes))]
         self.orders: dict[int, Order] = {}
-        """orders that were sent and not answered, by ticket"""
+        """Orders that were sent and not answered, by ticket."""
         self.answers: dict[int, Answer] = {}
-        """answers by lane, until the next orders"""
+        """Answers by lane, until the next orders."""
         self.shared_orders: dict[int, int] = {}
-        """by lane: the number of its newest order through shared memory"""
+        """Number of the newest order through shared memory, by lane."""
         self.infos: dict[int, bytes] = {}
-        """by lane: the packed infos of such an order, where they came as a message"""
+        """Packed infos of such an order, by lane, if they came as a message."""
         self.lost: dict[int, str] = {}
-        """lanes whose env copies are gone, and why, until the vector environment takes note of them"""
+        """Lanes whose env copies are gone, with the reason, until the vector environment has handled them."""
         self.failures: list[EnvironmentRaised] = []
-        """environments that raised"""
+        """Errors of environments that raised."""
         self._placement = LanePlacement(self.lanes, _by_name)
         self._tickets = 0
 

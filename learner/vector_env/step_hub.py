@@ -83,7 +83,7 @@ class SharedSteps:
 
     memory: SharedMemory
     wake_pipes: Mapping[str, tuple[WakePipe, WakePipe]]
-    """by worker name: the pipe that wakes the worker, and the pipe by which it wakes us"""
+    """Pipe that wakes the worker, and pipe by which it wakes us; by worker name."""
 
     def close(self) -> None:
         """Close all file descriptors."""
@@ -108,7 +108,7 @@ class StepHub:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """`spin_s`: how long to wait awake for a step through shared memory before sleeping. `worker_timeout_s`: a worker
-        that is silent for so long while the hub listens is given up; infinite where the end of a process is known otherwise.
+        that is silent for longer while the hub listens is given up; infinite where the end of a process is known otherwise.
         """
         self._link = link
         self._coordinator = OrderCoordinator(spec, first_session, worker_timeout_s)
@@ -120,7 +120,7 @@ class StepHub:
         self._patience_s = PATIENCE_S
         self._while_waiting: Callable[[], None] = lambda: None
         self.stepped: set[int] = set()
-        """lanes whose last step, through shared memory, is done"""
+        """Lanes whose last step, through shared memory, is done."""
         self._under_way: dict[int, int] = {}  # lane -> number of its order through shared memory
         self._wake_pipes: dict[int, tuple[WakePipe, WakePipe] | None] = {}  # lane -> its worker's pipes, if it has any
         self._listen_due_s = 0.0

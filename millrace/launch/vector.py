@@ -66,7 +66,7 @@ class ListeningVectorEnv:
     token: Token | None
     """Token of local workers."""
     shared: SharedSteps | None
-    """with local workers"""
+    """Shared memory and wake pipes, for local workers only."""
     resources: ExitStack
 
     def start(self, flags: WorkerFlags) -> ZmqVectorEnv:

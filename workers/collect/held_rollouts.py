@@ -22,7 +22,7 @@ class Assignment:
     ticket: int
     lane: int
     incarnation: int
-    """if the worker has another incarnation of the lane, the lane starts anew"""
+    """If the worker has another incarnation of the lane, the lane starts on new env copies."""
     sequence: int
 
 

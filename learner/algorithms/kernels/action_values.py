@@ -123,6 +123,6 @@ class FusedActionValues:
 
 
 def action_values(net: QNetwork, rows: int) -> ActionValues:
-    """The faster of the two for minibatches of so many rows."""
+    """The faster of the two implementations for minibatches of `rows` rows."""
     small = net.flat.is_cpu and rows <= fused.MAX_ROWS and fused.can_fuse(net.spec)
     return FusedActionValues(net) if small else AutogradActionValues(net)

@@ -120,7 +120,7 @@ class _Workspace:
 
 
 class _MinibatchPlan:
-    """The calls for a minibatch of so many rows: each chunk in turn, then the sums of the chunks' gradients."""
+    """The calls for minibatches of one size: each chunk in turn, then the sums of the chunks' gradients."""
 
     def __init__(
         self, rows: int, hidden: Sequence[Linear], heads: Sequence[Head], relu: bool, workspace: _Workspace
