@@ -310,7 +310,7 @@ def test_unsupported_settings_are_refused_in_one_line(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "learner", "CartPole-v1", "--inference", "learner", "--run-dir", str(tmp_path / "runs")]
     refused = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert refused.returncode == 2
-    assert "start it as millrace learner" in refused.stderr
+    assert "use millrace learner" in refused.stderr
     assert not (tmp_path / "runs").exists()
 
 
