@@ -14,8 +14,8 @@ from learner.algorithms import Algorithm
 from learner.config.config import Config
 from learner.evaluations import Evaluations, warn_on_error
 from learner.recording.training_recorder import TrainingRecorder
-from learner.rollouts.accepted_rollout import AcceptedRollout
 from learner.rollouts.hub import HubSnapshot
+from learner.rollouts.lanes import AcceptedRollout
 from learner.run_folder import checkpoint
 from learner.run_folder.episode_window import EpisodeWindow
 from learner.run_folder.metrics_log import MetricsLog

@@ -7,8 +7,8 @@ This is all that `learner.train` knows of the rest. Who starts worker processes 
 from __future__ import annotations
 
 from learner.evaluate import evaluate
-from learner.rollouts.accepted_rollout import AcceptedRollout
 from learner.rollouts.hub import Hub, HubSnapshot
+from learner.rollouts.lanes import AcceptedRollout
 from learner.run_folder.progress import Progress
 from learner.run_folder.results import Evaluation
 from protocol.arrays import Floats

@@ -1,8 +1,8 @@
 """Ends a process whose environment hangs, even if it hangs in C code and holds the interpreter's lock.
 
 Rule: when nobody calls `feed` for `timeout_s`, the process writes the stack of each of its threads to stderr and exits at
-once with exit code 1; its host then starts another. The timer is a C thread of Python's faulthandler, which does not need
-the interpreter's lock. Setting it takes about 50 µs, so `feed` does so only now and then.
+once with exit code 1; its supervisor then starts another. The timer is a C thread of Python's faulthandler, which does not
+need the interpreter's lock. Setting it takes about 50 µs, so `feed` does so only now and then.
 """
 
 from __future__ import annotations

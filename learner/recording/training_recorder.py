@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from learner.recording.episodes import EpisodeAssembler
 from learner.recording.minari import MinariDataset
-from learner.rollouts.accepted_rollout import AcceptedRollout
+from learner.rollouts.lanes import AcceptedRollout
 from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import make_action_converter
 from protocol.specs import PolicySpec

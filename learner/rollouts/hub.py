@@ -16,7 +16,7 @@ from learner.members.member_server import MemberServer, ServerCallbacks
 from learner.members.membership import Outgoing
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.members.states import MemberState
-from learner.rollouts.accepted_rollout import AcceptedRollout
+from learner.rollouts.lanes import AcceptedRollout
 from learner.rollouts.ledger import Ledger
 from learner.rollouts.status import status
 from learner.rollouts.ticket_coordinator import CollectingMember, TicketCoordinator
@@ -33,9 +33,8 @@ from protocol.wire.weight_dtypes import WeightsDtype, to_wire_dtype
 log = logging.getLogger("millrace.learner")
 
 POLL_S = 0.1
-PULSE_S = (
-    0.003  # least interval between two pulses: a minibatch may take a tenth of it, and listening as long as a minibatch
-)
+# Least interval between two pulses. A minibatch may take only a tenth of it, and one pulse takes as long as a minibatch.
+PULSE_S = 0.003
 LOG_WAITING_EVERY_S = 10.0
 
 

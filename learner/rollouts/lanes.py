@@ -1,4 +1,4 @@
-"""A lane and a ticket as the coordinator keeps them, and the order in which lanes get tickets. No clock, no messages.
+"""The coordinator's records of lanes, tickets and accepted rollouts, and the order in which lanes get tickets. Pure.
 
 Rule: a lane has one owner at a time. A new owner starts it afresh: its incarnation rises, and its rollouts are counted
 from 0 again.
@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from learner.members.lane_placement import PlacedLane
+from protocol.rollout import Rollout
 
 
 @dataclass
@@ -62,6 +63,15 @@ class Ticket:
     version: int
     """Version of the newest weights when the ticket was dealt."""
     peer: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class AcceptedRollout:
+    """A rollout that was accepted, with what the learner knows about it and its message does not carry."""
+
+    rollout: Rollout
+    incarnation: int
+    """Incarnation of the lane when its ticket was dealt. Each incarnation has new env copies."""
 
 
 class LaneQueue:

@@ -5,8 +5,9 @@ Rule: a ticket is the permission for one rollout on one lane, and is dealt to th
     used + outstanding < rollouts_per_update * (version + 1 + max_lag)
 
 A lane has one owner at a time and moves only between rollouts. Its new owner starts it afresh: its incarnation rises. When a
-worker is lost, its lanes and tickets are dealt again: that is the whole of failure handling. What a Heartbeat shows to be
-lost on the way is sent again. Every ticket and every transition is counted in the ledger.
+worker is lost, its lanes go to other workers, and new tickets are dealt in place of its tickets. There is no other failure
+handling. If a Heartbeat shows that a message was lost on the way, the message is sent again. Every ticket and every
+transition is counted in the ledger.
 """
 
 from __future__ import annotations
@@ -20,8 +21,7 @@ from learner.members.events import EnvironmentRaised, Event, RolloutDropped
 from learner.members.lane_placement import LanePlacement
 from learner.members.membership import Member, Membership, Outgoing
 from learner.members.states import MemberState, SentUnusable
-from learner.rollouts.accepted_rollout import AcceptedRollout
-from learner.rollouts.lanes import LaneQueue, Ticket, TicketedLane
+from learner.rollouts.lanes import AcceptedRollout, LaneQueue, Ticket, TicketedLane
 from learner.rollouts.ledger import Ledger
 from protocol.messages import (
     Array,
@@ -136,7 +136,7 @@ class TicketCoordinator:
                 return self._deal()
 
     def reject_message(self, peer: bytes, why: str, now: float) -> list[Outgoing]:
-        """A message that could not be read."""
+        """Count a message that could not be read, and answer it."""
         self.ledger.messages_bad += 1
         member = self.members.get(peer)
         if member is None:
@@ -144,7 +144,7 @@ class TicketCoordinator:
         return self._strike(member, why, now) + self._deal()
 
     def reject_rollout(self, peer: bytes, rollout: Rollout, why: str, now: float) -> list[Outgoing]:
-        """A rollout that cannot be used: its ticket is lost."""
+        """Count a rollout that cannot be used. Its ticket is lost."""
         member = self.members.get(peer)
         steps = int(rollout.valid.sum()) if rollout.valid.dtype == bool else 0
         self.ledger.transitions_received += steps
@@ -168,13 +168,16 @@ class TicketCoordinator:
         return self.membership.revoke(peer, why) + self._deal()
 
     def remove_silent(self, now: float) -> list[Outgoing]:
-        """Judge silence. Call it only when every message that has arrived was given to `receive`."""
+        """Remove workers that were silent for longer than `worker_timeout_s`.
+
+        Call it only when every message that has arrived was given to `receive`.
+        """
         return self._deal() if self.membership.remove_silent(now, self.worker_timeout_s) else []
 
     # ---------------------------------------------------------------- the learner's side
 
     def publish(self, version: int, parameters: Array, buffers: Array) -> list[Outgoing]:
-        """New weights: offer them to every worker, and deal the tickets that they allow."""
+        """Set the newest weights. Send them to the workers that can take them now; deal the tickets that they allow."""
         self.version = version
         self._weights = Weights(version, parameters, buffers)
         out = [out for member in self.membership.active() for out in self._send_newest_weights(member)]
@@ -254,7 +257,7 @@ class TicketCoordinator:
         return self._send_newest_weights(member) + self._deal()
 
     def _heartbeat(self, member: CollectingMember, heartbeat: Heartbeat) -> list[Outgoing]:
-        """Answer a heartbeat. Send again what it shows to be lost on the way."""
+        """Answer a heartbeat. If it shows that messages were lost on the way, send them again."""
         lost = member.record_heartbeat(heartbeat)
         peer = member.peer
         if member.state is MemberState.DRAINING:
@@ -314,7 +317,7 @@ class TicketCoordinator:
         self.ledger.lost += 1
 
     def _deal(self) -> list[Outgoing]:
-        """Place lanes that have no owner, even out, and deal tickets to the least advanced lanes."""
+        """Give lanes without an owner to workers, balance the lanes, and deal tickets to the least advanced lanes."""
         if self._weights is None or self.membership.draining is not None or not self.members:
             return []
         out = self._placement.place(self.members.values())

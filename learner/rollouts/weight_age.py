@@ -1,7 +1,8 @@
-"""How old the weights were that rollouts were acted under, and how long new weights take to be used. Pure.
+"""Measures the lag of rollouts, and how long new weights take to reach the environments. Pure.
 
-The lag of a rollout is the learner's version minus the rollout's version, when the rollout is used. The time from publishing
-weights to the arrival of a worker's first rollout under them is what the network, the worker and one rollout take together.
+The lag of a rollout is the learner's version minus the rollout's version, when the rollout is used. The first-use time of a
+worker runs from publishing weights to the arrival of its first rollout under them. It contains the time on the network, the
+time in the worker and the time that one rollout takes.
 """
 
 from __future__ import annotations

@@ -122,12 +122,15 @@ class OrderCoordinator:
         return self.membership.revoke(peer, why)
 
     def remove_worker(self, worker: str, why: str) -> list[Outgoing]:
-        """A worker's process has ended, or it is given up."""
+        """Remove a worker whose process has ended, or for which the learner waits no longer."""
         self.membership.remove_worker(worker, why)
         return []
 
     def remove_silent(self, now: float) -> list[Outgoing]:
-        """Judge silence. Call it only when every message that has arrived was given to `receive`."""
+        """Remove workers that were silent for longer than `worker_timeout_s`.
+
+        Call it only when every message that has arrived was given to `receive`.
+        """
         self.membership.remove_silent(now, self.worker_timeout_s)
         return []
 
