@@ -10,7 +10,7 @@ import logging
 from collections.abc import Callable
 
 from learner.algorithms import Algorithm
-from learner.config.settings import EvaluationSettings
+from learner.config.run_rules import EvaluationSettings
 from learner.run_folder.results import Best, Evaluation
 from learner.run_folder.run_folder import RunFolder
 from learner.service import RolloutService

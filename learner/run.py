@@ -1,8 +1,7 @@
-"""One learner, put together from its parts: link, coordinator, hub, service, algorithm, journal.
+"""Makes a learner of its parts: link, coordinator, hub, service, algorithm, recorder.
 
-It is made in two steps. `set_up` settles what needs no PyTorch: the environment's spaces and the run folder. A launcher then
-starts its worker processes, and they are ready by the time that `Run` has imported PyTorch. Who the workers are, this file
-does not know.
+This takes two steps. `set_up` does what needs no PyTorch: it reads the environment's spaces and makes the run folder. Then a
+launcher starts its worker processes; they start up while `Run` imports PyTorch. This file does not know who the workers are.
 """
 
 from __future__ import annotations
@@ -81,7 +80,7 @@ class Run:
         import torch
 
         from learner.algorithms import algorithm_class
-        from learner.journal import Journal
+        from learner.run_recorder import RunRecorder
         from learner.run_spec import run_spec
         from learner.run_state import RunState, restore
         from learner.torch_setup import threads, torch_device
@@ -111,23 +110,26 @@ class Run:
         self._interrupts = Interrupts()
         hub = Hub(link, coordinator, settings, processes, self._check_interrupt, observer)
         self.service = RolloutService(hub, spec, processes.expected)
-        self.journal = Journal(config, self.folder, spec, self.algorithm, self.service, state, watch)
+        self.recorder = RunRecorder(config, self.folder, spec, self.algorithm, self.service, state, watch)
         self.folder.keep()
 
     def train(self, workers: int) -> None:
-        """Wait for this number of `workers`, then train to the end. Raises `Interrupted`, or `MillraceError` in one line."""
+        """Wait for this number of `workers`, then train to the end.
+
+        Raises `Interrupted` if the user interrupts the run, and `MillraceError`, with a one-line message, if it fails.
+        """
         from learner.train import train
 
         try:
             with self._interrupts:
-                train(self.algorithm, self.service, self.journal, workers)
+                train(self.algorithm, self.service, self.recorder, workers)
         except BaseException as error:
             reason = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error)
             self.service.drain(reason, timeout_s=2.0)
-            self.journal.finish(reason)
+            self.recorder.finish(reason)
             raise
         finally:
-            self.journal.close()
+            self.recorder.close()
 
     def _check_interrupt(self) -> None:
         if self._interrupts.received:
@@ -135,7 +137,7 @@ class Run:
 
 
 def serve(config: Config, resume: Path | None, watch: Watch) -> Path:
-    """The learner alone, listening at `config.bind` for workers that are started elsewhere. Returns its run folder."""
+    """Train with workers that are started elsewhere and join at `config.bind`. Returns the run folder."""
     if config.inference == "learner":
         raise UsageError("--inference learner does not work with python -m learner; use millrace learner")
     keyring = keyring_for(config, datetime.now(UTC).replace(microsecond=0))

@@ -9,37 +9,38 @@ from __future__ import annotations
 import time
 
 from learner.algorithms import Algorithm
-from learner.journal import Journal
 from learner.run_folder.run_folder import Interrupted
+from learner.run_recorder import RunRecorder
 from learner.service import RolloutService
 from protocol.errors import RunError
 from protocol.rollout import stack_rollouts
 
 
-def train(algorithm: Algorithm, service: RolloutService, journal: Journal, workers: int) -> str:
-    """Learn until the journal gives a reason to stop; return that reason.
+def train(algorithm: Algorithm, service: RolloutService, recorder: RunRecorder, workers: int) -> str:
+    """Train until `recorder` gives a reason to stop. Returns that reason.
 
-    `workers`: how many to wait for before the first rollout. When the run cannot go on (no worker is left, the environment
-    raised too often, the user interrupted it), the state after the last whole update is saved before the error is raised.
+    `workers`: number of workers to wait for before the first rollout. If the run cannot go on (no worker is left, the
+    environment raised too often, the user interrupted the run), the state after the last whole update is saved. Then the
+    error is raised.
     """
-    journal.save()
-    if journal.stop_reason() is None:
+    recorder.save()
+    if recorder.stop_reason() is None:
         service.wait_for_workers(workers)
-        service.publish(journal.version, *algorithm.weights())
-    while (reason := journal.stop_reason()) is None:
+        service.publish(recorder.version, *algorithm.weights())
+    while (reason := recorder.stop_reason()) is None:
         try:
             arrived = service.gather()
         except (RunError, Interrupted):
-            journal.save()
+            recorder.save()
             raise
-        journal.gathered(arrived)
+        recorder.gathered(arrived)
         began_s = time.monotonic()
         batch = stack_rollouts([one.rollout for one in arrived])
         metrics = algorithm.update(batch, service.pulse)
-        service.publish(journal.version + 1, *algorithm.weights())
-        journal.updated(batch, metrics, time.monotonic() - began_s)
-    journal.save()
+        service.publish(recorder.version + 1, *algorithm.weights())
+        recorder.updated(batch, metrics, time.monotonic() - began_s)
+    recorder.save()
     service.drain(reason)
-    journal.conclude()
-    journal.finish(reason)
+    recorder.conclude()
+    recorder.finish(reason)
     return reason

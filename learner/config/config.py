@@ -14,7 +14,7 @@ from msgspec import Meta
 from tyro.conf import Positional
 
 from learner.config.hyperparameters import Hyperparameters, PPOConfig
-from learner.config.settings import CheckpointPolicy, EvaluationSettings, StopRule
+from learner.config.run_rules import CheckpointPolicy, EvaluationSettings, StopRule
 from protocol.specs import ImagesDtype
 from protocol.wire.weight_dtypes import WeightsDtype
 

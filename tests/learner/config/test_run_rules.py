@@ -1,11 +1,11 @@
-"""The narrow records: what they take from the configuration, and what they decide."""
+"""The small settings records: what they take from the configuration, and what they decide."""
 
 from typing import Any
 
 import pytest
 
 from learner.config.config import Config
-from learner.config.settings import CheckpointPolicy, EvaluationSettings, StopRule
+from learner.config.run_rules import CheckpointPolicy, EvaluationSettings, StopRule
 
 
 def reason(rule: StopRule, **numbers: Any) -> str | None:

@@ -1,6 +1,6 @@
-"""Narrow records of settings: what one part of a run needs, taken from `Config`. Pure.
+"""Small settings records, one for each part of a run: when to stop, when to write a checkpoint, when to evaluate. Pure.
 
-Each record decides its own question (stop? write a checkpoint?) from numbers that the caller gives.
+`Config` makes them. A record decides its own question from numbers that the caller gives.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""The files that a run writes while it trains: metrics, checkpoints, the policy, the summary.
+"""Metrics, checkpoints, evaluations and the decision to stop: everything that a run does between two updates.
 
-Rule: a checkpoint is written between two updates, never within one, and holds everything that the next update depends
-on. A disk that is full costs a warning, never the run.
+Rule: a checkpoint is written between two updates, never during one, and holds everything that the next update depends on.
+If the disk is full, the run logs a warning and goes on.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from protocol.specs import RunSpec
 log = logging.getLogger("millrace.learner")
 
 
-class Journal:
-    """The written side of one run."""
+class RunRecorder:
+    """Counts the updates of one run, evaluates its policy, writes its files, and decides when it ends."""
 
     def __init__(
         self,
@@ -54,7 +54,7 @@ class Journal:
         self._confirmed: Best | None = None
         self._window = EpisodeWindow.from_state(state.episodes)
         self._metrics = MetricsLog(folder.path, state.env_steps)
-        self._recorder = _recorder(config, folder, spec)
+        self._episode_recorder = _episode_recorder(config, folder, spec)
         self._stages_s = {"update": 0.0, "other": 0.0}
         self._worker_stages_s: dict[int, Mapping[str, float]] = {}  # by session; workers that have left count too
         self._wall_before_s, self._steps_before = state.wall_s, state.env_steps
@@ -77,8 +77,8 @@ class Journal:
 
     def gathered(self, rollouts: Sequence[AcceptedRollout]) -> None:
         """Record the episodes of these rollouts, if the run records episodes. An update will use them next."""
-        if self._recorder is not None:
-            self._recorder.add(rollouts)
+        if self._episode_recorder is not None:
+            self._episode_recorder.add(rollouts)
 
     def updated(self, batch: Batch, metrics: Mapping[str, float], update_s: float) -> None:
         """An update was made and published: count it, evaluate and write what is due."""
@@ -121,8 +121,8 @@ class Journal:
     def close(self) -> None:
         """Close the metrics, and the dataset if episodes were recorded. Also for a run that was cut short."""
         self._metrics.close()
-        if self._recorder is not None:
-            log.warning("%s", self._recorder.close())
+        if self._episode_recorder is not None:
+            log.warning("%s", self._episode_recorder.close())
 
     def progress(self) -> Progress:
         """The progress of the run."""
@@ -196,7 +196,7 @@ class Journal:
         return self._wall_before_s + time.monotonic() - self._started_s
 
 
-def _recorder(config: Config, folder: RunFolder, spec: RunSpec) -> TrainingRecorder | None:
+def _episode_recorder(config: Config, folder: RunFolder, spec: RunSpec) -> TrainingRecorder | None:
     if not config.record:
         return None
     about = f"All whole training episodes of millrace run {folder.path.resolve().name}, as acted."
