@@ -112,7 +112,7 @@ def _play(
 def load_policy(run: Path, which: Which = "final") -> tuple[Policy, PolicySpec, EnvSpec]:
     """The policy of a run folder, its spec, and the environment for which it was trained.
 
-    Raises `UsageError` in one line.
+    Raises `UsageError`, with a one-line message, if the folder or the policy cannot be read.
     """
     card, parameters, buffers = RunFolder.open(run).read_policy(which)
     policy = make_policy(card.policy)

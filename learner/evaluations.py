@@ -42,7 +42,7 @@ class Evaluations:
         self.best = best
         """Mean return and env steps of the best evaluation during training."""
         self.note = ""
-        """The newest evaluation in one line for the user."""
+        """The newest evaluation as one line of text for the user."""
         self._settings, self._folder, self._spec = settings, folder, spec
         self._algorithm, self._service = algorithm, service
         self._version = -1  # of the weights that `newest` evaluated

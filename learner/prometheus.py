@@ -193,7 +193,7 @@ def _by_reason(name: str, text: str, counts: Mapping[str, int]) -> CounterMetric
 def metrics_server(config: Config) -> Iterator[HubObserver]:
     """Serve `/metrics` at `metrics_bind` until the context ends. Yields the observer that the hub must call.
 
-    Raises `UsageError` in one line if the port is in use.
+    Raises `UsageError`, with a one-line message, if the port is in use.
     """
     collector = MetricsCollector(config)
     registry = CollectorRegistry()

@@ -15,7 +15,7 @@ WILDCARDS = {"*", "0.0.0.0", "[::]", "[::ffff:0.0.0.0]"}
 
 
 def check_address(address: str) -> str:
-    """Return the address if it is valid. Raises `UsageError` in one line."""
+    """Return the address. Raises `UsageError`, with a one-line message, if it is not valid."""
     scheme, sep, rest = address.partition("://")
     if not sep or scheme not in {"inproc", "ipc", "tcp"} or not rest:
         raise UsageError(f"address {address}: expected inproc://NAME, ipc://PATH or tcp://HOST:PORT")

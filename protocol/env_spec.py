@@ -20,7 +20,8 @@ from gymnasium.vector import VectorEnv
 
 from protocol.errors import UsageError, first_line
 
-# The module that registers the ids of a namespace; gymnasium imports it as it imports the module in `module:EnvId`.
+# By namespace: the module that registers its environments. The id is then passed to gymnasium as `module:id`, so that
+# gymnasium imports the module.
 REGISTERING_MODULES = {"millrace": "workers.envs", "ALE": "ale_py"}
 Scalar = bool | int | float | str
 _Made = TypeVar("_Made")

@@ -75,7 +75,7 @@ def rollout_bytes(run: RunSpec) -> int:
 
 
 def validate(rollout: Rollout, run: RunSpec) -> None:
-    """Raise `BadRollout`, in one line, if the rollout does not fit the run or breaks the row format."""
+    """Check a rollout. Raises `BadRollout`, with a one-line message, if it does not fit the run or breaks the row format."""
     T, N = run.rollout_steps, run.copies
     action = run.policy.action
     expected: list[tuple[str, Array, tuple[int, ...], str]] = [

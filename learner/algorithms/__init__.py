@@ -32,11 +32,11 @@ class Algorithm(Protocol):
 
     @staticmethod
     def policy_spec(config: Any, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
-        """The policy to train. Raises `UsageError` in one line when the algorithm does not support these spaces."""
+        """The policy to train. Raises `UsageError`, with a one-line message, if the algorithm cannot use these spaces."""
         ...
 
     def __init__(self, config: Any, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
-        """`config` is the record of `HYPERPARAMETERS`. Raises `UsageError` when this machine cannot do what it asks for."""
+        """`config` is a record of `HYPERPARAMETERS`. Raises `UsageError` if this machine cannot do what it asks for."""
         ...
 
     def update(self, batch: Batch, pulse: Callable[[], None]) -> dict[str, float]:

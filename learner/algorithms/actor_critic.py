@@ -303,7 +303,10 @@ class ActorCritic:
     def _evaluate_in_chunks(
         self, observations: Observations, steps: int, function: Callable[[NetworkInput, Index], Tensor], pulse: Pulse
     ) -> Floats:
-        """One number for each observation of the first steps, [steps, ΣN], computed without a graph."""
+        """Apply `function` to the observations of the first `steps` steps, in chunks and without gradients.
+
+        `function` returns one number for each row. Returns [steps, ΣN]. `pulse` is called after each chunk.
+        """
         found = torch.empty(steps * observations.raw_features.shape[1], device=self.net.flat.device)
         with torch.no_grad():
             for columns, rows in self._chunks(steps, observations.raw_features.shape[1]):
@@ -312,7 +315,10 @@ class ActorCritic:
         return np.asarray(found.cpu().numpy()).reshape(steps, -1)
 
     def _chunks(self, steps: int, columns: int) -> Iterator[tuple[Index, Index]]:
-        """Columns and rows of chunks of about CHUNK_ROWS rows: consecutive rows, or whole columns if there is a core."""
+        """The columns and rows of each chunk, which has about CHUNK_ROWS rows.
+
+        A chunk holds consecutive rows; with a recurrent core it holds whole columns.
+        """
         if self.policy.core is None:
             for at in range(0, steps * columns, CHUNK_ROWS):
                 yield slice(None), slice(at, min(at + CHUNK_ROWS, steps * columns))

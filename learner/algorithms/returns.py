@@ -86,11 +86,11 @@ def vtrace(
     goes_on = ends.valid & ~ends.ended
     goes_on[-1] = False
     ahead = np.zeros_like(delta)  # vs − V of the next row, where the episode goes on in this rollout
-    found = delta.copy()  # vs − V
+    vs_minus_v = delta.copy()
     for t in range(T - 2, -1, -1):
-        ahead[t] = np.where(goes_on[t], found[t + 1], zero)
-        found[t] += discount * mix * c[t] * ahead[t]
-    target = np.where(ends.valid, found + values[:-1], zero)
+        ahead[t] = np.where(goes_on[t], vs_minus_v[t + 1], zero)
+        vs_minus_v[t] += discount * mix * c[t] * ahead[t]
+    target = np.where(ends.valid, vs_minus_v + values[:-1], zero)
     return target, delta + rho * discount * mix * ahead
 
 
@@ -107,9 +107,9 @@ def discounted_return(reward: Floats, ends: EpisodeEnds, gamma: float, start: Do
     `start` [N] is G of the row before the first, 0 where an episode begins. Returns G [T, N] float64 (0 where the row is
     not valid) and the `start` [N] of the next rollout of these copies.
     """
-    found = np.zeros(reward.shape)
+    returns = np.zeros(reward.shape)
     last, ended = start, ends.ended
     for t in range(len(reward)):
-        found[t] = np.where(ends.valid[t], reward[t] + gamma * last, 0)
-        last = np.where(ended[t], 0, found[t])
-    return found, last
+        returns[t] = np.where(ends.valid[t], reward[t] + gamma * last, 0)
+        last = np.where(ended[t], 0, returns[t])
+    return returns, last

@@ -35,7 +35,10 @@ class RunFlags(Config, frozen=True, kw_only=True):
 
 
 def read_config(command: str, argv: list[str]) -> tuple[Config, Path | None]:
-    """The settings from all layers, and the run folder to resume, if any. Raises `UsageError` in one line."""
+    """The settings from all layers, and the run folder to resume, if any.
+
+    Raises `UsageError`, with a one-line message, if a setting or a file is not valid.
+    """
     config, resume = _read_layers(command, argv)
     if resume != AUTO:
         return config, resume

@@ -40,7 +40,7 @@ def parse_flags(
     """The record of type `kind` that these flags describe. `default` holds the values of flags that are not given.
 
     `hint` gets the name of an unknown setting and returns a text for the error message, or an empty string. Raises
-    `UsageError` in one line, and SystemExit(0) after `--help`.
+    `UsageError`, with a one-line message, if a flag is not valid, and SystemExit(0) after `--help`.
     """
     rejection = io.StringIO()
     try:

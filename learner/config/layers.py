@@ -26,7 +26,9 @@ from protocol.errors import UsageError
 def resolve(
     env: str = "", *, file: Path | None = None, resume: Path | None = None, preset: str = "auto", **keywords: Any
 ) -> Config:
-    """The settings of a run from all layers, validated. Raises `UsageError` in one line.
+    """The settings of a run from all layers, validated.
+
+    Raises `UsageError`, with a one-line message, if a setting or a file is not valid.
 
     `file`: a TOML file of settings. `resume`: a run folder; its config.toml takes the place of file and preset.
     `preset`: "auto" (that of the environment, if there is one), "none", the environment whose preset to take, or a whole run

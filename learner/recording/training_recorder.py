@@ -1,4 +1,4 @@
-"""`--record`: the whole episodes of training as a Minari dataset."""
+"""`--record`: writes the whole episodes of training as a Minari dataset."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ class TrainingRecorder:
     """
 
     def __init__(self, dataset_id: str, env_spec: EnvSpec, spec: PolicySpec, about: str) -> None:
-        """`about`: the description of the dataset. Raises `UsageError` in one line if the dataset cannot be made."""
+        """`about`: the description of the dataset.
+
+        Raises `UsageError`, with a one-line message, if the dataset cannot be made.
+        """
         self._env = env_spec.make()
         self._assembler = EpisodeAssembler(make_action_converter(spec.action))
         self._id = dataset_id
@@ -38,7 +41,7 @@ class TrainingRecorder:
                 self._episodes += 1
 
     def close(self) -> str:
-        """Write the rest. Returns one line that describes the dataset. There is no dataset without a whole episode."""
+        """Finish the dataset. Returns one line that describes it. Without a whole episode, no dataset is written."""
         try:
             if self._episodes:
                 self._dataset.close()

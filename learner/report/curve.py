@@ -49,7 +49,7 @@ class RunFiles(NamedTuple):
 
 
 def read_run_files(run: Path, purpose: Literal["plot", "report on"]) -> RunFiles:
-    """Read a run folder. Raises `UsageError` in one line, which names the purpose."""
+    """Read a run folder. Raises `UsageError`, with a one-line message that names `purpose`, if it cannot be read."""
     check_format(run)
     try:
         config = tomllib.loads((run / "config.toml").read_text())

@@ -35,7 +35,7 @@ GREY = "#555555"
 
 
 def read_curve(run: Path) -> Curve:
-    """The learning curve of a run folder. Raises `UsageError` in one line."""
+    """The learning curve of a run folder. Raises `UsageError`, with a one-line message, if the folder has none."""
     curve = read_run_files(run, "plot").curve()
     if curve is None:
         raise UsageError(f"run {run}: nothing to plot, no episode has ended yet")

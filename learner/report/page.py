@@ -19,7 +19,10 @@ CONTENT_SECURITY_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-sr
 
 
 def write_page(runs: Sequence[Path], out: Path) -> Path:
-    """Write the page about these run folders. Returns `out`. Raises `UserFacingError` in one line."""
+    """Write the page about these run folders. Returns `out`.
+
+    Raises `UserFacingError`, with a one-line message, if a folder cannot be read or `out` cannot be written.
+    """
     if out.is_dir():
         raise UsageError(f"{out} is a folder; expected the file to write, as in: --out report.html")
     text = page(runs)
@@ -31,7 +34,7 @@ def write_page(runs: Sequence[Path], out: Path) -> Path:
 
 
 def page(runs: Sequence[Path]) -> str:
-    """The page as HTML text. Raises `UsageError` in one line for a run folder that cannot be read."""
+    """The page as HTML text. Raises `UsageError`, with a one-line message, if a run folder cannot be read."""
     report = group_runs([read_run(run) for run in dict.fromkeys(runs)])
     style = Path(__file__).with_name("style.css").read_text()
     body = [

@@ -107,7 +107,7 @@ class ReportData:
 
 
 def read_run(path: Path) -> Run:
-    """Read a run folder. Raises `UsageError` in one line."""
+    """Read a run folder. Raises `UsageError`, with a one-line message, if it cannot be read."""
     files = read_run_files(path, "report on")
     return Run(
         path=path,

@@ -341,5 +341,5 @@ class TicketCoordinator:
 
 
 def _by_joining(member: Member) -> int:
-    """Among workers with equally few lanes, the one that joined first gets the next."""
+    """Sort key: the next lane goes to the worker with the fewest lanes; in a tie, to the one that joined first."""
     return member.join_number

@@ -75,7 +75,7 @@ def newest(folder: Path) -> tuple[Checkpoint, list[str]]:
 
 
 def load(path: Path) -> Checkpoint:
-    """Read one checkpoint file. Raises `CheckpointError` in one line."""
+    """Read one checkpoint file. Raises `CheckpointError`, with a one-line message, if it is broken."""
     try:
         return _read(path)
     except _Unreadable as error:

@@ -49,7 +49,7 @@ class MetricsLog:
     def write(self, progress: Progress, train: Mapping[str, float]) -> None:
         """Add a row. `train`: the metrics of the algorithm, and of an evaluation if there was one.
 
-        Raises `RunError` in one line when the disk does not take it; the rows before it stay readable.
+        Raises `RunError`, with a one-line message, if the disk does not take the row. The rows before it stay readable.
         """
         row = progress.row(train)
         self._table.append(_json_line(row))

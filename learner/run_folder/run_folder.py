@@ -176,7 +176,10 @@ class RunFolder:
         self._write(POLICY_JSON, msgspec.json.format(msgspec.json.encode(description), indent=2) + b"\n")
 
     def read_policy(self, which: Which = "final") -> tuple[PolicyDescription, Floats, Floats]:
-        """Read policy.json, and the parameters and buffers for `Policy.load`. Raises `UsageError` in one line."""
+        """Read policy.json, and the parameters and buffers for `Policy.load`.
+
+        Raises `UsageError`, with a one-line message, if they cannot be read.
+        """
         from safetensors import SafetensorError
         from safetensors.numpy import load
 

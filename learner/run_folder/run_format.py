@@ -33,7 +33,7 @@ def write_format(folder: Path) -> None:
 
 
 def check_format(folder: Path) -> int:
-    """The format of a run folder. Raises `UsageError` in one line if this version of millrace cannot read it."""
+    """The format of a run folder. Raises `UsageError`, with a one-line message, if this millrace cannot read it."""
     try:
         found = msgspec.json.decode((folder / RUN_FILE).read_bytes(), type=RunFormat)
     except (FileNotFoundError, NotADirectoryError):

@@ -226,12 +226,12 @@ class OrderCoordinator:
 
 
 def _by_name(member: Member) -> tuple[int, str]:
-    """Among workers with equally few lanes, the next lane goes by name, not by who was faster to join."""
+    """Sort key: the next lane goes to the worker with the fewest lanes; in a tie, to the first name in this order."""
     return len(member.hello.worker), member.hello.worker
 
 
 def check(answer: Answer, order: Order, spec: StepSpec) -> None:
-    """Raise `BadMessage`, in one line, if the answer is not one to this order."""
+    """Check that the answer belongs to this order. Raises `BadMessage`, with a one-line message, if it does not."""
     if (answer.lane, answer.incarnation) != (order.lane, order.incarnation):
         raise BadMessage(f"answer expected of lane {order.lane}, got lane {answer.lane}")
     if isinstance(answer, Returned):

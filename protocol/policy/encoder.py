@@ -23,7 +23,10 @@ from protocol.specs import ActionSpec, EncoderSpec, Leaf, NamedShape, PolicySpec
 
 
 def describe_encoder(factory: str, observation: tuple[Leaf, ...], action: ActionSpec) -> EncoderSpec:
-    """Make the encoder once to find its parameters and output size. Raises `UsageError` in one line."""
+    """Make the encoder once to find its parameters and output size.
+
+    Raises `UsageError`, with a one-line message, if it cannot be made or its output does not fit.
+    """
     spec = PolicySpec(observation, action)
     module = _make(factory, spec, seed=0)
     return EncoderSpec(factory, _parameter_shapes(module), _output_size(factory, module, spec))

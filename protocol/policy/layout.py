@@ -44,8 +44,8 @@ SMALL = (Conv(16, 3, 1), Conv(32, 3, 2))
 def convolutions(leaf: Leaf) -> tuple[tuple[Conv, ...], tuple[int, int, int], int]:
     """For an image: its convolutions, its shape as (channels, height, width), and the size of the flattened output.
 
-    The last dimension holds the channels unless it is larger than the first. Images of 36 pixels and more get the network
-    of Mnih et al. (2015), smaller ones two 3 x 3 convolutions.
+    The last dimension holds the channels, unless it is larger than the first. If both sides of the image have at least 36
+    pixels, it gets the convolutions of Mnih et al. (2015), otherwise two 3 x 3 convolutions.
     """
     first, _, last = leaf.shape
     chw = (last, *leaf.shape[:2]) if last <= first else leaf.shape

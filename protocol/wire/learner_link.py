@@ -80,15 +80,15 @@ class LearnerLink:
 
     def receive(self) -> Iterator[tuple[bytes, ToLearner | Inquire | BadMessage]]:
         """Messages that have arrived, each with its sender; at most MAX_MESSAGES. An unreadable one comes as its error."""
-        said_by: list[str] | None = None if self.keyring is None else []
+        sender_keys: list[str] | None = None if self.keyring is None else []
         for _ in range(MAX_MESSAGES):  # a flood must not block the learner
-            frames = receive_frames(self._socket, said_by)
+            frames = receive_frames(self._socket, sender_keys)
             if frames is None:
                 return
             self.received.add(frames)
             peer = bytes(frames[0])
-            if said_by is not None:
-                peer = self._peer(peer, said_by[0])
+            if sender_keys is not None:
+                peer = self._peer(peer, sender_keys[0])
                 if self._refuse_key(peer):
                     continue
             try:

@@ -35,22 +35,23 @@ def set_options(socket: zmq.Socket[bytes], address: str, curve: bool) -> None:
     # Without keepalive, the connection to a host that vanished while idle would stay forever.
     socket.tcp_keepalive, socket.tcp_keepalive_idle, socket.tcp_keepalive_intvl, socket.tcp_keepalive_cnt = 1, 15, 5, 3
     socket.ipv6 = needs_ipv6(address)
-    # Credit bounds what is under way (one Weights, a few tickets and their rollouts) far below these.
+    # These limits are never reached: at most one Weights message, a few tickets and their rollouts are on their way.
     socket.sndhwm = socket.rcvhwm = QUEUE
 
 
-def receive_frames(socket: zmq.Socket[bytes], said_by: list[str] | None = None) -> list[Buffer] | None:
-    """The next message's frames, or None. Of one with too many it keeps enough to show that, and throws the rest away.
+def receive_frames(socket: zmq.Socket[bytes], sender_keys: list[str] | None = None) -> list[Buffer] | None:
+    """The frames of the next message, or None if no message has arrived.
 
-    `said_by`, if given, is filled with the key of each frame's sender, as libzmq proved it in the handshake.
+    At most `MAX_FRAMES` + 2 frames are kept, so that the caller can see that there were too many. If `sender_keys` is given,
+    its content is replaced by one key: that of the message's sender, which libzmq proved in the handshake.
     """
     frames: list[Buffer] = []
     try:
         more = True
         while more:
             frame = socket.recv(NOT_WAITING, copy=False)
-            if said_by is not None and not frames:
-                said_by[:] = [_user(frame)]
+            if sender_keys is not None and not frames:
+                sender_keys[:] = [_user(frame)]
             more = frame.more
             if len(frames) < MAX_FRAMES + 2:  # + sender's name, + one that shows there were too many
                 frames.append(frame.buffer if len(frame) >= COPY_BELOW_BYTES else frame.bytes)

@@ -75,11 +75,11 @@ class Collector:
         open_copies: OpenEnvCopies = open_env_copies,
         step_all: StepAll = no_step_for_all,
     ) -> None:
-        """`step_all` is for env copies that one vector environment steps together, in whichever lane they are."""
+        """`step_all`: steps the env copies of all lanes at once, if one vector environment holds them all."""
         self.steps = 0
-        """env steps collected, which are the valid rows"""
+        """number of env steps collected; rows that are not valid do not count"""
         self.stages = {"open": 0.0, "act": 0.0, "step": 0.0}
-        """seconds spent opening lanes (making and first resetting copies), choosing actions, stepping copies"""
+        """seconds spent opening lanes (making copies and their first reset), choosing actions and stepping copies"""
         self._run = run
         self._policy = policy
         self._open_copies, self._step_all = open_copies, step_all
@@ -94,10 +94,10 @@ class Collector:
         self._policy.load(parameters, buffers)
 
     def collect(self, assignments: Sequence[Assignment], version: int, session: int, pulse: Pulse) -> list[Rollout]:
-        """One rollout for each assignment, in their order. Each assignment must be of another lane.
+        """Collect one rollout for each assignment. Returns them in the order of the assignments.
 
-        `pulse` is called at every step and may raise. When it raises, or an environment does (`LaneFailed`), these lanes
-        are closed, and the unfinished rollouts are dropped.
+        Each assignment must name a different lane. `pulse` is called at every step and may raise. If `pulse` raises, or an
+        environment does (`LaneFailed`), these lanes are closed and the unfinished rollouts are dropped.
         """
         if len({assignment.lane for assignment in assignments}) < len(assignments):
             raise ValueError(f"collect expected one assignment for each lane, got {assignments}")
@@ -107,7 +107,8 @@ class Collector:
             rows = self._new_rows(lanes)
             try:
                 self._act_and_step(rows, lanes, pulse)
-            except (LaneFailed, EnvironmentFailed, IndexError):  # an invalid row explains the error that followed
+            except (LaneFailed, EnvironmentFailed, IndexError):
+                # An invalid observation or reward may have caused the error. Then `check_values` raises the clearer one.
                 done = len(rows.step_end_s)
                 for i, lane in enumerate(lanes):
                     lane.check_values([array[i, : done + 1] for array in rows.obs], rows.reward[i, :done])

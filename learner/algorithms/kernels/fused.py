@@ -1,9 +1,9 @@
-"""Actor-critics and action values without a graph: forward pass and gradient in numpy, on the flat parameters.
+"""Actor-critics and Q-networks in numpy: forward pass and gradient by hand, without autograd, on the flat parameters.
 
 Rule: outputs and gradients are those of `protocol.policy.networks` and autograd, except for rounding, for every kind of
-action. A minibatch of a small network spends its time on the graph, the dispatcher and the allocator, not on arithmetic.
-Here an update is a few dozen calls on arrays that are reused. For large networks the matrix products take the time, and
-torch is as fast.
+action. With a small network, torch spends most of the time of a minibatch on its graph, its dispatcher and its allocator,
+not on arithmetic. Here an update is a few dozen calls on arrays that are reused. With a large network the matrix products
+take most of the time, and torch is as fast.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from protocol.policy.layout import hidden_names, named_views, parameter_layout, 
 from protocol.specs import PolicySpec
 
 MAX_ROWS = 16_384  # rows of a minibatch: the arrays of a forward pass take memory
-MAX_UNITS = 256  # units of a layer: above, products take nearly all the time (`python -m benchmarks.update`)
+MAX_UNITS = 256  # units of a layer; in larger layers, matrix products take nearly all the time (`benchmarks.update`)
 
 
 def can_fuse(spec: PolicySpec) -> bool:
@@ -30,7 +30,7 @@ def can_fuse(spec: PolicySpec) -> bool:
 
 
 class FusedActorCritic:
-    """`ActorCriticNetwork` in numpy, on the same flat parameters and gradients."""
+    """Computes in numpy what `ActorCriticNetwork` computes in torch, on the same flat parameters and gradients."""
 
     def __init__(self, spec: PolicySpec, flat: Array, flat_grad: Array) -> None:
         """`flat`, `flat_grad`: [P], see `protocol.policy.layout`. `backward` writes `flat_grad`; others update `flat`."""
@@ -55,7 +55,10 @@ class FusedActorCritic:
         return log_prob, entropy, value[0]
 
     def backward(self, by_log_prob: Array, by_entropy: Array, by_value: Array) -> None:
-        """Write the gradient of every parameter, from the gradients [B] by the outputs of the last forward pass."""
+        """Write the gradient of the loss with respect to every parameter.
+
+        Arguments: its gradients [B] with respect to the outputs of the last `forward`.
+        """
         self._mlp.backward((self._actions.backward(by_log_prob, by_entropy), by_value[None]))
 
     def value(self, x: Array) -> Array:
@@ -66,7 +69,7 @@ class FusedActorCritic:
 
 
 class FusedQNetwork:
-    """`QNetwork` in numpy, on the same flat parameters and gradients."""
+    """Computes in numpy what `QNetwork` computes in torch, on the same flat parameters and gradients."""
 
     def __init__(self, spec: PolicySpec, flat: Array, flat_grad: Array) -> None:
         """`flat`, `flat_grad`: [P], see `protocol.policy.layout`. `backward` writes `flat_grad`; others update `flat`."""
@@ -85,7 +88,10 @@ class FusedQNetwork:
         return advantage
 
     def backward(self, gradient: Array) -> None:
-        """Write the gradient of every parameter, from the gradient [n, B] by the action values of the last forward pass."""
+        """Write the gradient of the loss with respect to every parameter.
+
+        `gradient` [n, B]: its gradient with respect to the action values of the last `forward`.
+        """
         if self._dueling:
             self._mlp.backward((gradient - _mean(gradient), np.add.reduce(gradient, 0, keepdims=True)))
         else:
