@@ -33,8 +33,8 @@ def record_videos(
 ) -> tuple[Evaluation, list[Path]]:
     """Play greedy episodes and record a video of each.
 
-    Returns the evaluation and the paths of the videos. Raises `UserFacingError`, with a one-line message, if videos cannot be
-    made.
+    Returns the evaluation and the paths of the videos. Raises `UserFacingError`, with a one-line message, if videos cannot
+    be made.
     """
     try:
         import moviepy  # noqa: F401
