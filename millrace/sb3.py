@@ -56,7 +56,7 @@ class Sb3VecEnv(VecEnv):
         seeds = self._seeds if any(seed is not None for seed in self._seeds) else None
         options = self._options[0] or None
         if any(options_of_copy != self._options[0] for options_of_copy in self._options):
-            raise ValueError("set_options expected the same options for every copy")
+            raise ValueError("set_options: expected the same options for every copy, got different ones")
         observation, infos = self.env.reset(seed=seeds, options=options)
         self.reset_infos = self._info_list(infos)
         self._reset_seeds()

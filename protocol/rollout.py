@@ -88,40 +88,40 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
         ("state", rollout.state[None], (1, N, run.policy.state_size), "float32"),  # [step, copy, …], as errors name it
     ]
     if len(rollout.obs) != len(run.policy.observation):
-        raise BadRollout(f"obs expected {len(run.policy.observation)} arrays, got {len(rollout.obs)}")
+        raise BadRollout(f"obs: expected {len(run.policy.observation)} arrays, got {len(rollout.obs)}")
     for leaf, array in zip(run.policy.observation, rollout.obs, strict=True):
         expected.append((_named(leaf), array, (T + 1, N, *leaf.shape), leaf.dtype))
     for name, array, shape, dtype in expected:
         if array.shape != shape or array.dtype != np.dtype(dtype):
             raise BadRollout(
-                f"{name} expected {dtype}{list(shape)}, got {array.dtype}{list(array.shape)}; "
+                f"{name}: expected {dtype}{list(shape)}, got {array.dtype}{list(array.shape)}; "
                 "is its environment the same version?"
             )
         if array.dtype.kind == "b" and array.size and array.view(np.uint8).max() > 1:
-            raise BadRollout(f"{name} expected bytes 0 and 1, got {array.view(np.uint8).max()}")
+            raise BadRollout(f"{name}: expected bytes 0 and 1, got {array.view(np.uint8).max()}")
         if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise BadRollout(f"{name} {describe_first_non_finite(array)}")
+            raise BadRollout(f"{name}: {describe_first_non_finite(array)}")
     if not 0 <= rollout.lane < run.lanes:
-        raise BadRollout(f"lane expected 0 to {run.lanes - 1}, got {rollout.lane}")
+        raise BadRollout(f"lane: expected 0 to {run.lanes - 1}, got {rollout.lane}")
     for leaf, array in zip(run.policy.observation, rollout.obs, strict=True):
         if leaf.sizes:
             counts = array - np.reshape(leaf.start, leaf.shape)
             if (counts < 0).any() or (counts >= np.reshape(leaf.sizes, leaf.shape)).any():
-                raise BadRollout(f"{_named(leaf)} expected values of its space, got {array.min()} to {array.max()}")
+                raise BadRollout(f"{_named(leaf)}: expected values of its space, got {array.min()} to {array.max()}")
     choices = np.reshape(action.sizes, action.shape) if action.sizes else 2
     if action.kind != "box" and ((rollout.action < 0).any() or (rollout.action >= choices).any()):
         raise BadRollout(
-            f"action expected 0 to {max(action.sizes, default=2) - 1}, got {rollout.action.min()} to {rollout.action.max()}"
+            f"action: expected 0 to {max(action.sizes, default=2) - 1}, got {rollout.action.min()} to {rollout.action.max()}"
         )
     ended = rollout.terminated | rollout.truncated
     if (rollout.valid[1:] == ended[:-1]).any():
         t, n = np.argwhere(rollout.valid[1:] == ended[:-1])[0]
-        raise BadRollout(f"valid expected {not ended[t, n]} at step {t + 1}, copy {n}, got {bool(rollout.valid[t + 1, n])}")
+        raise BadRollout(f"valid: expected {not ended[t, n]} at step {t + 1}, copy {n}, got {bool(rollout.valid[t + 1, n])}")
     if len(rollout.episodes) != int(np.count_nonzero(ended & rollout.valid)):
-        raise BadRollout(f"episodes expected {int(np.count_nonzero(ended & rollout.valid))}, got {len(rollout.episodes)}")
+        raise BadRollout(f"episodes: expected {int(np.count_nonzero(ended & rollout.valid))}, got {len(rollout.episodes)}")
     for episode in rollout.episodes:
         if not (math.isfinite(episode.reward) and episode.length > 0 and 0 <= episode.seconds < math.inf):
-            raise BadRollout(f"episode expected a finite return, a length and a duration, got {episode}")
+            raise BadRollout(f"episode: expected a finite return, a length and a duration, got {episode}")
 
 
 def _named(leaf: Leaf) -> str:

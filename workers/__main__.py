@@ -135,7 +135,7 @@ def _work(flags: argparse.Namespace, link: WorkerLink, code: AllowedCode) -> int
 def _supervise(flags: argparse.Namespace, token: Token | None) -> int:
     """Run many workers, each in a process of its own, and watch them here. Returns the exit code."""
     if flags.processes < 1:
-        raise UsageError(f"processes expected int >= 1, got {flags.processes}")
+        raise UsageError(f"processes: expected int >= 1, got {flags.processes}")
     cores = sorted(os.sched_getaffinity(0)) if flags.pin else []
     passed = ["--join-timeout-s", str(flags.join_timeout_s), "--step-timeout-s", str(flags.step_timeout_s)]
     passed += [flag for flag, is_set in (("--insecure", flags.insecure), ("--no-code", flags.no_code)) if is_set]

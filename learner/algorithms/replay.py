@@ -230,7 +230,7 @@ class ReplayBuffer:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`, bit for bit. Raises ValueError if its size is another."""
         if state["size"] != self.size:
-            raise ValueError(f"replay_size expected {state['size']}, got {self.size}")
+            raise ValueError(f"replay_size: expected {state['size']}, got {self.size}")
         self._written, self._highest = state["written"], state["highest"]
         used = min(self._written, self.size)
         self._is_row[used:] = False

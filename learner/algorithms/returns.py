@@ -47,7 +47,7 @@ def gae(reward: Floats, values: Floats, ends: EpisodeEnds, gamma: float, gae_lam
     The returns to fit V to are A + values[:-1].
     """
     T, N = reward.shape
-    assert values.shape == (T + 1, N), f"values expected {(T + 1, N)}, got {values.shape}"
+    assert values.shape == (T + 1, N), f"values: expected {(T + 1, N)}, got {values.shape}"
     bootstrap = np.where(ends.terminated, np.float32(0), values[1:])
     advantage = np.where(ends.valid, reward + np.float32(gamma) * bootstrap - values[:-1], np.float32(0))
     carried = (ends.valid & ~ends.ended) * np.float32(gamma * gae_lambda)
@@ -76,7 +76,7 @@ def vtrace(
     With λ = 1, as in the paper, v′ is vs; with π = μ, A is `gae` and vs is A + V, for any λ.
     """
     T, N = reward.shape
-    assert values.shape == (T + 1, N), f"values expected {(T + 1, N)}, got {values.shape}"
+    assert values.shape == (T + 1, N), f"values: expected {(T + 1, N)}, got {values.shape}"
     zero, discount, mix = np.float32(0), np.float32(gamma), np.float32(vtrace_lambda)
     log_ratio = np.where(ends.valid, log_ratio, zero)
     rho = np.exp(np.minimum(log_ratio, np.float32(math.log(rho_bar))))  # clipped first: exp cannot overflow

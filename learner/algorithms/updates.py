@@ -13,7 +13,7 @@ def check_finite(metrics: Mapping[str, float], update: int, advice: str) -> None
     for name, number in metrics.items():
         if not math.isfinite(number):
             raise RunError(
-                f"learner: update {update}: {name} expected finite, got {number}; this step was not taken; try {advice}"
+                f"learner: update {update}: {name}: expected finite, got {number}; this step was not taken; try {advice}"
             )
 
 

@@ -19,8 +19,8 @@ from protocol.errors import UsageError
 REWORDINGS = {
     r"invalid literal for int\(\) with base 10: ": "expected a whole number, got ",
     r"could not convert string to float: ": "expected a number, got ",
-    r"^Error parsing (\S+): ": r"\1 ",
-    r"^invalid choice (\S+) for argument '(\S+)'\. Expected one of \((.*)\)$": r"\2 expected one of \3, got \1",
+    r"^Error parsing (\S+): ": r"\1: ",
+    r"^invalid choice (\S+) for argument '(\S+)'\. Expected one of \((.*)\)$": r"\2: expected one of \3, got \1",
     r"^Missing from millrace [\w ]+: ?(.*) \(required\)$": r"missing: \1",
 }
 """Patterns of tyro's messages, and our wording of each."""

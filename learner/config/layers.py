@@ -147,7 +147,7 @@ def _override_from_toml(config: Config, table: dict[str, Any], where: str) -> Co
     of_run = {name: value for name, value in table.items() if name not in HYPERPARAMETERS}
     of_algorithm = table.get(algo, {})
     if not isinstance(of_algorithm, dict):
-        raise UsageError(f"{where}: {algo} expected a table, [{algo}], got {of_algorithm}")
+        raise UsageError(f"{where}: {algo}: expected a table, [{algo}], got {of_algorithm}")
     if misplaced := of_run.keys() & set(msgspec.structs.asdict(config.algorithm)):
         raise UsageError(f"{where}: {min(misplaced)} is a setting of the algorithm; put it in the table [{algo}]")
     if misplaced := of_algorithm.keys() & set(msgspec.structs.asdict(config)):

@@ -60,11 +60,11 @@ def validate(config: Config, where: str = "") -> Config:
 
 def _check_learner_inference(config: Config, at: str) -> None:
     if config.compress != "none":
-        wrong = f"compress expected none, got {config.compress}; rollouts are made beside the learner"
+        wrong = f"compress: expected none, got {config.compress}; rollouts are made beside the learner"
     elif config.max_lag:
-        wrong = f"max_lag expected 0, got {config.max_lag}; the policy acts under the newest weights"
+        wrong = f"max_lag: expected 0, got {config.max_lag}; the policy acts under the newest weights"
     elif config.vector not in {"auto", "loop"}:
-        wrong = f"vector expected auto or loop, got {config.vector}; its workers step copies one by one"
+        wrong = f"vector: expected auto or loop, got {config.vector}; its workers step copies one by one"
     else:
         return
     raise UsageError(f"{at}inference learner: {wrong}")
@@ -77,8 +77,8 @@ def _reworded(message: str, settings: dict[str, Any]) -> str:
     record = HYPERPARAMETERS[settings["algo"]] if name in settings["algorithm"] else Config
     given = settings["algorithm"].get(name, settings.get(name))
     if expected.startswith("Invalid enum value"):
-        return f"{name} expected one of {', '.join(_choices(get_type_hints(record)[name]))}, got {given!r}"
-    return f"{name} {expected.replace('`', '').replace('Expected', 'expected').partition(', got ')[0]}, got {given!r}"
+        return f"{name}: expected one of {', '.join(_choices(get_type_hints(record)[name]))}, got {given!r}"
+    return f"{name}: {expected.replace('`', '').replace('Expected', 'expected').partition(', got ')[0]}, got {given!r}"
 
 
 def _choices(hint: Any) -> list[str]:

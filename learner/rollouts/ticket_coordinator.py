@@ -244,7 +244,7 @@ class TicketCoordinator:
             or not self.lanes[ticket.lane].expects(rollout.sequence)
         ):
             self.ledger.transitions_received -= rollout.env_steps  # `reject_rollout` counts it
-            why = f"ticket {ticket.number} expected lane {ticket.lane} under version {ticket.version} or newer, "
+            why = f"ticket {ticket.number}: expected lane {ticket.lane} under version {ticket.version} or newer, "
             why += f"got lane {rollout.lane}, version {rollout.version}, sequence {rollout.sequence}"
             return self.reject_rollout(member.peer, rollout, why, member.heard_s)
         del self.tickets[ticket.number], member.tickets[ticket.number]

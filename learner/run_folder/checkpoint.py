@@ -119,7 +119,7 @@ def _check_plain(value: object, where: str) -> None:
             pass
         case _ if type(value) not in (bool, int, float, str, bytes, type(None)):
             raise TypeError(
-                f"checkpoint: {where} expected tensors and plain data, got {type(value).__module__}.{type(value).__name__}"
+                f"checkpoint: {where}: expected tensors and plain data, got {type(value).__module__}.{type(value).__name__}"
             )
 
 

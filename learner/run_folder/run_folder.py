@@ -199,7 +199,7 @@ class RunFolder:
             shape = arrays[name].shape if name in arrays else "nothing"
             if name not in expected_shapes or shape != expected_shapes[name] or arrays[name].dtype != np.float32:
                 expected = f"float32 {expected_shapes[name]}" if name in expected_shapes else "no such array"
-                raise UsageError(f"policy of run {self.path}: {name} expected {expected}, got {shape}")
+                raise UsageError(f"policy of run {self.path}: {name}: expected {expected}, got {shape}")
         parameters = _flat([arrays[field.name] for field in acting])
         return description, parameters, _flat([arrays[name] for name in description.buffers])
 

@@ -22,7 +22,7 @@ def seed_list(seed: int | Sequence[int | None] | None, num_envs: int) -> list[in
         return [int(seed) + n for n in range(num_envs)]
     seeds = [None if one is None else int(one) for one in seed]
     if len(seeds) != num_envs:
-        raise ValueError(f"seed expected one for each of {num_envs} copies, got {len(seeds)}")
+        raise ValueError(f"seed: expected one for each of {num_envs} copies, got {len(seeds)}")
     return seeds
 
 
@@ -35,9 +35,9 @@ def take_reset_mask(options: dict[str, Any] | None, num_envs: int) -> tuple[Bool
         return np.ones(num_envs, bool), options
     mask = options["reset_mask"]
     if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
-        raise TypeError(f"options['reset_mask'] expected an array of bool, got {getattr(mask, 'dtype', type(mask))}")
+        raise TypeError(f"options['reset_mask']: expected an array of bool, got {getattr(mask, 'dtype', type(mask))}")
     if mask.shape != (num_envs,) or not mask.any():
-        raise ValueError(f"options['reset_mask'] expected shape ({num_envs},) and at least one True, got {mask}")
+        raise ValueError(f"options['reset_mask']: expected shape ({num_envs},) and at least one True, got {mask}")
     return mask, {key: value for key, value in options.items() if key != "reset_mask"}
 
 
@@ -54,10 +54,10 @@ def action_arrays(
         array = np.asarray(value)
         if array.ndim == 0 or len(array) != num_envs:
             raise (ValueError if array.ndim else TypeError)(
-                f"actions expected one for each of {num_envs} copies, got shape {list(array.shape)}"
+                f"actions: expected one for each of {num_envs} copies, got shape {list(array.shape)}"
             )
         if array.dtype.kind not in "biuf":
-            raise TypeError(f"actions expected numbers, got {array.dtype}")
+            raise TypeError(f"actions: expected numbers, got {array.dtype}")
         fit = fit and array.shape[1:] == leaf.shape and (array.dtype == leaf.dtype or np.can_cast(array.dtype, leaf.dtype))
         arrays.append(array)
     return arrays, fit

@@ -33,7 +33,7 @@ class BatchLayout:
     def lane_of(self, copy: int) -> int:
         """The lane of an env copy. Raises `IndexError` if there is no such copy."""
         if not 0 <= copy < self.num_envs:
-            raise IndexError(f"copy expected 0 to {self.num_envs - 1}, got {copy}")
+            raise IndexError(f"copy: expected 0 to {self.num_envs - 1}, got {copy}")
         return bisect_right(self._firsts, copy) - 1
 
     def by_lane(self, copies: Iterable[int]) -> dict[int, list[int]]:

@@ -58,7 +58,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         `on_close` is called once: by `close`, when this object is garbage collected, or when the interpreter exits.
         """
         if on_worker_loss not in ("truncate", "raise"):
-            raise UsageError(f"on_worker_loss expected 'truncate' or 'raise', got {on_worker_loss!r}")
+            raise UsageError(f"on_worker_loss: expected 'truncate' or 'raise', got {on_worker_loss!r}")
         step = description.step
         self.num_envs = N = len(step.copies)
         self.metadata = description.metadata
@@ -254,7 +254,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         if not isinstance(values, list | tuple):
             values = [values] * self.num_envs
         if len(values) != self.num_envs:
-            raise ValueError(f"values expected one for each of {self.num_envs} copies, got {len(values)}")
+            raise ValueError(f"values: expected one for each of {self.num_envs} copies, got {len(values)}")
         self.assign_some(range(self.num_envs), name, values)
 
     def assign_some(self, copies: Sequence[int], name: str, values: Sequence[Any]) -> None:

@@ -168,7 +168,7 @@ class OrderCoordinator:
         """Send an order to a lane that was placed."""
         member, record = self.owner(lane), self.lanes[lane]
         if member is None:
-            raise ValueError(f"lane {lane} expected a worker, has none")
+            raise ValueError(f"lane {lane}: expected a worker, got none")
         self._tickets += 1
         order = make(member.session, self._tickets, LaneLife(lane, record.incarnation))
         record.started = True
@@ -195,7 +195,7 @@ class OrderCoordinator:
     def _long_infos(self, member: Member, answer: Answer) -> list[Outgoing]:
         """Infos of a step through shared memory. They count only if they belong to the lane's newest order."""
         if not isinstance(answer, Stepped):
-            why = "an answer to an order through shared memory expected Stepped, got Returned"
+            why = "answer to an order through shared memory: expected Stepped, got Returned"
             return self.reject_message(member.peer, why, member.heard_s)
         mine = answer.lane in member.lanes and self.lanes[answer.lane].incarnation == answer.incarnation
         if mine and self.shared_orders.get(answer.lane) == -answer.ticket:
@@ -233,12 +233,12 @@ def _by_name(member: Member) -> tuple[int, str]:
 def check(answer: Answer, order: Order, spec: StepSpec) -> None:
     """Check that the answer belongs to this order. Raises `BadMessage`, with a one-line message, if it does not."""
     if (answer.lane, answer.incarnation) != (order.lane, order.incarnation):
-        raise BadMessage(f"answer expected of lane {order.lane}, got lane {answer.lane}")
+        raise BadMessage(f"answer: expected one from lane {order.lane}, got one from lane {answer.lane}")
     if isinstance(answer, Returned):
         return
     N = spec.lanes[answer.lane]
     if len(answer.obs) != len(spec.observation):
-        raise BadMessage(f"obs expected {len(spec.observation)} arrays, got {len(answer.obs)}")
+        raise BadMessage(f"obs: expected {len(spec.observation)} arrays, got {len(answer.obs)}")
     expected = [
         *((f"obs {leaf.path}".strip(), leaf.dtype, leaf.shape) for leaf in spec.observation),
         ("reward", "float64", ()), ("terminated", "bool", ()), ("truncated", "bool", ()),
@@ -246,6 +246,6 @@ def check(answer: Answer, order: Order, spec: StepSpec) -> None:
     found = [*answer.obs, answer.reward, answer.terminated, answer.truncated]
     for (name, dtype, shape), array in zip(expected, found, strict=True):
         if array.shape != (N, *shape) or array.dtype != np.dtype(dtype):
-            raise BadMessage(f"{name} expected {dtype}{[N, *shape]}, got {array.dtype}{list(array.shape)}")
+            raise BadMessage(f"{name}: expected {dtype}{[N, *shape]}, got {array.dtype}{list(array.shape)}")
         if array.dtype.kind == "b" and array.size and array.view(np.uint8).max() > 1:
-            raise BadMessage(f"{name} expected bytes 0 and 1, got {array.view(np.uint8).max()}")
+            raise BadMessage(f"{name}: expected bytes 0 and 1, got {array.view(np.uint8).max()}")

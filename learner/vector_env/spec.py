@@ -37,11 +37,9 @@ def describe(settings: VectorEnvSettings, learner_timeout_s: float = math.inf) -
     envs, lanes = settings.envs, settings.lane_count
     N = len(envs)
     if not envs or (settings.num_envs is not None and settings.num_envs != N):
-        raise UsageError(
-            f"num_envs expected at least 1, and the number of environments if a list is given, got {settings.num_envs}"
-        )
+        raise UsageError(f"num_envs: expected at least 1 and, with a list, its length ({N}), got {settings.num_envs}")
     if not 1 <= lanes <= N:
-        raise UsageError(f"lanes expected 1 to num_envs ({N}), got {lanes}; each lane lives in one worker")
+        raise UsageError(f"lanes: expected 1 to num_envs ({N}), got {lanes}; each lane lives in one worker")
     env_specs = {env: EnvSpec.of(env, settings.kwargs) for env in dict.fromkeys(envs)}
     different = list({(spec.id, spec.factory): spec for spec in env_specs.values()}.values())
     index = {(spec.id, spec.factory): n for n, spec in enumerate(different)}
@@ -76,4 +74,4 @@ def _autoreset_mode(mode: AutoresetMode | str) -> Literal["NextStep", "SameStep"
         return AutoresetMode(mode).value
     except ValueError as error:
         modes = ", ".join(known.value for known in AutoresetMode)
-        raise UsageError(f"autoreset_mode expected one of {modes}, got {mode!r}") from error
+        raise UsageError(f"autoreset_mode: expected one of {modes}, got {mode!r}") from error

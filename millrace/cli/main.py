@@ -309,7 +309,7 @@ def _bench(argv: list[str]) -> int:
 
 def _at_least(name: str, value: int, least: int) -> None:
     if value < least:
-        raise UsageError(f"{name} expected int >= {least}, got {value}")
+        raise UsageError(f"{name}: expected int >= {least}, got {value}")
 
 
 GROUPS = {

@@ -31,7 +31,7 @@ def read_flags(
     separator = words.index("--") if "--" in words else len(words)
     flags, rest = parse_flags(kind, words[:separator], f"launch {launcher}"), words[separator + 1 :]
     if flags.workers < 1:
-        raise UsageError(f"workers expected int >= 1, got {flags.workers}")
+        raise UsageError(f"workers: expected int >= 1, got {flags.workers}")
     if not DNS_LABEL.fullmatch(flags.name):
         raise UsageError(f"name {flags.name!r}: expected small letters, digits and dashes, at most 40, as in my-run")
     for flag in rest:

@@ -37,7 +37,7 @@ def private_address(transport: str, stack: ExitStack) -> str:
             stack.callback(shutil.rmtree, folder, ignore_errors=True)
             return f"ipc://{folder}/learner"
         case _:
-            raise UsageError(f"transport expected ipc, tcp or inproc, got {transport!r}")
+            raise UsageError(f"transport: expected ipc, tcp or inproc, got {transport!r}")
 
 
 def temporary_keys(transport: str, keys: str, *, insecure: bool) -> tuple[Keyring | None, Token | None]:

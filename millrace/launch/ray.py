@@ -28,7 +28,7 @@ def launch(flags: RayFlags, rest: Sequence[str], watch: Watch) -> Path:
     """Train; the run folder. `rest` are the user's flags for the learner. Raises `UserFacingError`."""
     for name in ("processes", "port"):
         if getattr(flags, name) < 1:
-            raise UsageError(f"{name} expected int >= 1, got {getattr(flags, name)}")
+            raise UsageError(f"{name}: expected int >= 1, got {getattr(flags, name)}")
     with _ray_cluster(flags.address) as host:
         bind = f"tcp://{f'[{host}]' if ':' in host else host}:{flags.port}"
         config, resume = read_config("learner", learner_flags(flags.env, rest, bind, "runs"))

@@ -22,7 +22,7 @@ def script(flags: SlurmFlags, rest: Sequence[str]) -> str:
             raise UsageError(f"{text!r}: sbatch takes no spaces, quotes or % in its options; choose another name")
     for name in ("cpus", "save_s"):
         if getattr(flags, name) < 1:
-            raise UsageError(f"{name} expected int >= 1, got {getattr(flags, name)}")
+            raise UsageError(f"{name}: expected int >= 1, got {getattr(flags, name)}")
     options = {
         "job-name": flags.name,
         "ntasks": str(1 + flags.workers),

@@ -116,7 +116,7 @@ def listen(settings: VectorEnvSettings, resources: ExitStack) -> ListeningVector
     """Bind the address. Closing `resources`, or the environment that is started, releases all that was acquired."""
     where, transport, count = settings.listen, settings.transport, settings.local_workers
     if where.bind and settings.workers:
-        raise UsageError(f"workers expected 0 with a bind address, for they are started elsewhere, got {settings.workers}")
+        raise UsageError(f"workers: expected 0, got {settings.workers}; with a bind address, start the workers yourself")
     # Local workers end with this process, which sees at once when one of them ends: neither side needs a timeout.
     description = describe(settings, LEARNER_TIMEOUT_S if where.bind else math.inf)
     address = where.bind or private_address(transport, resources)

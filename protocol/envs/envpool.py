@@ -63,7 +63,7 @@ def _ignore_warnings() -> Iterator[None]:
 def envpool_spec(env: EnvSpec) -> EnvpoolSpec:
     """How envpool makes the environment of this id. Raises `UsageError` if it cannot."""
     if env.factory is not None:
-        raise UsageError(f"environment {env.id}: vector envpool expected an id that gymnasium registers, got a callable")
+        raise UsageError(f"environment {env.id}: vector envpool: expected an id that gymnasium registers, got a callable")
     try:
         import envpool
     except ImportError as error:

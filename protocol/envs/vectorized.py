@@ -20,7 +20,7 @@ from protocol.specs import ActionSpec, Leaf
 def make_native(env: EnvSpec, copies: int) -> VectorEnv[Any, Any, Any]:
     """Make a vector environment of `copies` env copies with the environment's own code. Raises `UsageError`."""
     if env.factory is not None:
-        raise UsageError(f"environment {env.id}: vector native expected an id that gymnasium registers, got a callable")
+        raise UsageError(f"environment {env.id}: vector native: expected an id that gymnasium registers, got a callable")
     made = env.make_vectorized(copies)
     try:
         check_resets_next_step(made)
@@ -35,7 +35,7 @@ def check_resets_next_step(env: VectorEnv[Any, Any, Any]) -> None:
     mode = env.metadata.get("autoreset_mode")
     if mode not in {AutoresetMode.NEXT_STEP, AutoresetMode.NEXT_STEP.value}:
         raise UsageError(
-            f"vector environment {env}: metadata['autoreset_mode'] expected {AutoresetMode.NEXT_STEP}, got {mode}; "
+            f"vector environment {env}: metadata['autoreset_mode']: expected {AutoresetMode.NEXT_STEP}, got {mode}; "
             "make it with autoreset_mode=AutoresetMode.NEXT_STEP"
         )
 

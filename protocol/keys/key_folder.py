@@ -201,7 +201,7 @@ def read_token(flag: str) -> Token | None:
     given = os.environ.pop(TOKEN_VARIABLE, "").strip()
     if flag.startswith("millrace1."):
         raise UsageError(
-            f"--token expected a file, got the token itself, which others can now see; put it in a file or {TOKEN_VARIABLE}"
+            f"--token: expected a file, got the token itself, which others can now see; put it in a file or {TOKEN_VARIABLE}"
         )
     if flag:
         return Token.from_text(_read_secret(Path(flag).expanduser(), "token"), f"token {flag}")

@@ -42,7 +42,7 @@ def make_encoder(spec: PolicySpec, seed: int) -> torch.nn.Module:
         ours, theirs = ({each.name: each.shape for each in of} for of in (arrays, wanted.arrays))
         name = next((name for name in [*ours, *theirs] if ours.get(name) != theirs.get(name)), "order")
         raise UsageError(
-            f"encoder {wanted.factory}: parameter {name} expected {theirs.get(name, 'none')} as the learner has it, got "
+            f"encoder {wanted.factory}: parameter {name}: expected {theirs.get(name, 'none')} as the learner has it, got "
             f"{ours.get(name, 'none')}; install the same version of it here and there"
         )
     return module

@@ -33,7 +33,7 @@ class NumpyPolicy:
         """Use these weights from now on, without a copy. Raises ValueError if their sizes do not fit the spec."""
         if parameters.shape != (total_size(self._fields),) or buffers.shape != (buffer_size(self.spec),):
             raise ValueError(
-                f"weights expected {total_size(self._fields)} parameters and {buffer_size(self.spec)} buffers, "
+                f"weights: expected {total_size(self._fields)} parameters and {buffer_size(self.spec)} buffers, "
                 f"got {parameters.shape} and {buffers.shape}"
             )
         self._parameters = named_views(parameters, self._fields)

@@ -33,7 +33,7 @@ class TorchPolicy:
         count = self._net.acting_size
         if parameters.shape != (count,) or buffers.shape != (buffer_size(self.spec),):
             raise ValueError(
-                f"weights expected {count} parameters and {buffer_size(self.spec)} buffers, "
+                f"weights: expected {count} parameters and {buffer_size(self.spec)} buffers, "
                 f"got {parameters.shape} and {buffers.shape}"
             )
         self._net.flat[:count].copy_(torch.tensor(parameters))

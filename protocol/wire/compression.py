@@ -71,7 +71,7 @@ def unpack_array(frame: Frame, packings: Sequence[object], dtype: np.dtype[Any],
         case ["stack", "zstd"]:
             return unpack_stack(_decompressed(frame, 0, size + size // MIN_FRAME_BYTES), dtype, shape)
         case _:
-            raise BadMessage(f"packings expected stack, zstd or both in this order, got {str(packings)[:80]}")
+            raise BadMessage(f"packings: expected stack, zstd or both in this order, got {str(packings)[:80]}")
 
 
 def why_no_zstd() -> str:
@@ -102,7 +102,7 @@ def _decompressed(frame: Frame, least: int, most: int) -> bytes:
     try:
         held = zstandard.frame_content_size(frame)  # -1: not declared
         if not least <= held <= most:
-            raise BadMessage(f"zstd expected a frame that says it holds {least} to {most} bytes, got {held}")
+            raise BadMessage(f"zstd: expected a frame that says it holds {least} to {most} bytes, got {held}")
         return zstandard.ZstdDecompressor().decompress(frame, allow_extra_data=False)
     except zstandard.ZstdError as error:
         raise BadMessage(f"zstd: {' '.join(str(error).split())[:200]}") from error
@@ -132,22 +132,22 @@ def unpack_stack(payload: Frame, dtype: np.dtype[Any], shape: Sequence[int]) -> 
     """Unpack a payload into a read-only frame stack. Raises `BadMessage`."""
     if not _may_be_stack(dtype, shape):
         expected = f"uint8 [T+1, N, 2 to {MAX_STACK}, H, W, …] with frames of {MIN_FRAME_BYTES} bytes or more"
-        raise BadMessage(f"stack expected {expected}, got {dtype.str}{list(shape)}")
+        raise BadMessage(f"stack: expected {expected}, got {dtype.str}{list(shape)}")
     steps, copies, k = shape[:3]
     frame_bytes, bit_count = math.prod(shape[3:]), copies * (steps - 1)
     bit_bytes = (bit_count + 7) // 8
     fewest = bit_bytes + copies * (steps - 1 + k) * frame_bytes
     if len(payload) < fewest:
-        raise BadMessage(f"stack {list(shape)} expected at least {fewest} bytes, got {len(payload)}")
+        raise BadMessage(f"stack {list(shape)}: expected at least {fewest} bytes, got {len(payload)}")
     received = np.frombuffer(payload, np.uint8)
     bits = np.unpackbits(received[:bit_bytes], bitorder="little")
     if bits[bit_count:].any():
-        raise BadMessage(f"stack {list(shape)} expected {bit_count} bits and then zeros, got others")
+        raise BadMessage(f"stack {list(shape)}: expected zeros after the first {bit_count} bits, got ones")
     shifted = bits[:bit_count].reshape(copies, steps - 1).view(bool)
     frame_count = copies * steps * k - (k - 1) * int(np.count_nonzero(shifted))
     total = bit_bytes + frame_count * frame_bytes
     if len(payload) != total:
-        raise BadMessage(f"stack {list(shape)} expected {total} bytes by its bits, got {len(payload)}")
+        raise BadMessage(f"stack {list(shape)}: expected {total} bytes, according to its bits, got {len(payload)}")
     sent = np.full((copies, steps), k)
     sent[:, 1:] -= (k - 1) * shifted
     last = sent.cumsum().reshape(copies, steps) - 1

@@ -52,7 +52,7 @@ def _pack(value: object) -> bytes:
 def _to_msgpack(value: Any, where: str, use_repr: bool, depth: int) -> Any:
     """The value in types that msgpack knows. Types are compared exactly, so that no subclass arrives as its base class."""
     if depth > MAX_DEPTH:
-        raise TypeError(f"{where or 'value'}: expected at most {MAX_DEPTH} levels")
+        raise TypeError(f"{where or 'value'}: expected at most {MAX_DEPTH} levels, got more")
     kind = type(value)
     if value is None or kind in (bool, float, str, bytes):
         return value
@@ -90,7 +90,7 @@ def _to_msgpack(value: Any, where: str, use_repr: bool, depth: int) -> Any:
 
 def _unpack(data: bytes | memoryview, depth: int) -> Any:
     if depth > MAX_DEPTH:
-        raise BadMessage(f"plain value expected at most {MAX_DEPTH} levels")
+        raise BadMessage(f"plain value: expected at most {MAX_DEPTH} levels, got more")
 
     def extension(code: int, inside: bytes) -> Any:
         return _from_extension(code, inside, lambda inner: _unpack(inner, depth + 1))
@@ -109,7 +109,7 @@ def _from_extension(code: int, data: bytes, inner: Callable[[bytes], Any]) -> An
             dtype, shape, raw = inner(data)
             kind = _dtype(dtype)
             if len(raw) != math.prod(shape) * kind.itemsize:
-                raise BadMessage(f"array {dtype}{shape} expected {math.prod(shape) * kind.itemsize} bytes, got {len(raw)}")
+                raise BadMessage(f"array {dtype}{shape}: expected {math.prod(shape) * kind.itemsize} bytes, got {len(raw)}")
             return np.frombuffer(raw, kind).reshape(shape).copy() if raw else np.zeros(shape, kind)
         case 4:
             dtype, raw = inner(data)
@@ -127,13 +127,13 @@ def _from_extension(code: int, data: bytes, inner: Callable[[bytes], Any]) -> An
         case 8:
             return ReprString(data.decode())
         case _:
-            raise BadMessage(f"plain value expected one of ours, got extension {code}")
+            raise BadMessage(f"plain value: expected one of ours, got extension {code}")
 
 
 def _dtype(name: object) -> np.dtype[Any]:
     kind = np.dtype(str(name))
     if kind.kind not in DTYPE_KINDS:
-        raise BadMessage(f"array dtype expected one of plain data, got {str(name)[:20]!r}")
+        raise BadMessage(f"array dtype: expected one of plain data, got {str(name)[:20]!r}")
     return kind
 
 

@@ -63,7 +63,7 @@ class SharedMemory:
         if fd is None:
             os.ftruncate(self.fd, size)
         elif os.fstat(fd).st_size != size:
-            raise ValueError(f"shared memory expected {size} bytes, got {os.fstat(fd).st_size}")
+            raise ValueError(f"shared memory: expected {size} bytes, got {os.fstat(fd).st_size}")
         memory = mmap.mmap(self.fd, size)
         self._words = memoryview(memory)[: 2 * CACHE_LINE_BYTES * lanes].cast("q")
         numbers = np.frombuffer(memory, np.int64, 2 * WORDS * lanes).reshape(lanes, 2, WORDS)[:, :, 0]

@@ -51,4 +51,4 @@ def to_float32(parameters: Array) -> Floats:
         case "<u2":
             return (parameters.astype(np.uint32) << 16).view(np.float32)
         case other:
-            raise ValueError(f"weights expected float32, float16 or bfloat16 as uint16, got {other}")
+            raise ValueError(f"weights: expected float32, float16 or bfloat16 as uint16, got {other}")

@@ -80,7 +80,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
             "train: unknown flag --core; it is one of ppo, a2c, impala alone",
         ),
         (["train", "CartPole-v1", "more"], "train: unexpected argument more"),
-        (["train", "CartPole-v1", "--workers", "0"], "workers expected int >= 1, got 0"),
+        (["train", "CartPole-v1", "--workers", "0"], "workers: expected int >= 1, got 0"),
         (["train", "CartPole-v1", "--envs", "6"], "6 envs cannot be shared evenly among 4 lanes; take 4 or 8, or 3 lanes"),
         (["train", "CartPole-v1", "--algo", "pp0"], f"algo pp0: expected one of {ALGORITHMS}; did you mean ppo?"),
         (
@@ -93,13 +93,13 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
         (["report"], "report: which runs? expected run folders, as in: millrace report runs/*"),
         (["report", "/no"], "run /no: expected a run folder to report on, got no such folder"),
         (["record", "/no", "--out", "cartpole/expert-v0"], "run /no: no such folder"),
-        (["record", "/no", "--out", "cartpole/expert-v0", "--steps", "0"], "steps expected int >= 1, got 0"),
-        (["record", "/no", "--out", "cartpole/expert-v0", "--seed", "-1"], "seed expected int >= 0, got -1"),
+        (["record", "/no", "--out", "cartpole/expert-v0", "--steps", "0"], "steps: expected int >= 1, got 0"),
+        (["record", "/no", "--out", "cartpole/expert-v0", "--seed", "-1"], "seed: expected int >= 0, got -1"),
         (
             ["record", "/no", "--out", "cartpole/expert-v0", "--step", "9"],
             "record: unknown flag --step; did you mean --steps?",
         ),
-        (["evaluate", "/no", "--episodes", "0"], "episodes expected int >= 1, got 0"),
+        (["evaluate", "/no", "--episodes", "0"], "episodes: expected int >= 1, got 0"),
         (["evaluate", "/no", "--video"], "run /no: no such folder"),
         (["evaluate", "/no"], "run /no: no such folder"),
         (["evaluate", "/no", "--episode", "3"], "evaluate: unknown flag --episode; did you mean --episodes?"),
@@ -125,9 +125,9 @@ def test_bad_usage_is_one_exact_line(asked: list[Any], capsys: Captured, argv: l
 @pytest.mark.parametrize(
     ("argv", "says"),
     [
-        (["train", "CartPole-v1", "--workers", "two"], "--workers expected a whole number, got 'two'"),
-        (["train", "CartPole-v1", "--learning-rate", "x"], "--learning-rate expected a number, got 'x'"),
-        (["train", "CartPole-v1", "--transport", "udp"], "--transport expected one of 'inproc', 'ipc', 'tcp', got 'udp'"),
+        (["train", "CartPole-v1", "--workers", "two"], "--workers: expected a whole number, got 'two'"),
+        (["train", "CartPole-v1", "--learning-rate", "x"], "--learning-rate: expected a number, got 'x'"),
+        (["train", "CartPole-v1", "--transport", "udp"], "--transport: expected one of 'inproc', 'ipc', 'tcp', got 'udp'"),
         (["train", "CartPole-v1", "--seed"], "'--seed'"),
         (["evaluate"], "missing: RUN"),
         (["record", "runs/a"], "--out"),

@@ -33,13 +33,13 @@ def launched(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
     [
         ([""], "expected kubernetes, slurm or ray"),
         (["kubernetes"], "missing"),
-        (["kubernetes", "CartPole-v1", "--workers", "0"], "workers expected int >= 1, got 0"),
+        (["kubernetes", "CartPole-v1", "--workers", "0"], "workers: expected int >= 1, got 0"),
         (["kubernetes", "CartPole-v1", "--name", "My_Run"], "expected small letters, digits and dashes"),
         (["kubernetes", "CartPole-v1", "--", "--lerning-rate", "1"], "unknown flag --lerning-rate"),
         (["kubernetes", "CartPole-v1", "--", "--bind=tcp://*:1"], "--bind=tcp://*:1 is the launcher's to set"),
         (["kubernetes", "CartPole-v1", "--", "--metrics-bind", "*:1"], "--metrics-bind is the launcher's to set"),
         (["slurm", "CartPole-v1", "--folder", "/a folder"], "sbatch takes no spaces, quotes or %"),
-        (["slurm", "CartPole-v1", "--cpus", "0"], "cpus expected int >= 1, got 0"),
+        (["slurm", "CartPole-v1", "--cpus", "0"], "cpus: expected int >= 1, got 0"),
     ],
 )
 def test_what_a_cluster_would_refuse_later_is_refused_at_once(

@@ -183,7 +183,7 @@ def native_cartpole(run: RunSpec, lane: int, pulse: object) -> VectorCopies:
 @pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.DISABLED])
 def test_other_autoreset_modes_are_refused(mode: AutoresetMode) -> None:
     env = SyncVectorEnv([Scripted] * 2, autoreset_mode=mode)
-    with pytest.raises(UsageError, match=r"autoreset_mode.* expected .*NEXT_STEP, got .*; make it with"):
+    with pytest.raises(UsageError, match=r"autoreset_mode.*: expected .*NEXT_STEP, got .*; make it with"):
         VectorCopies(env)
 
 

@@ -303,9 +303,9 @@ def test_an_occupied_port_leaves_no_folder(tmp_path: Path) -> None:
 
 
 def test_unsupported_settings_are_refused_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="inference learner: max_lag expected 0, got 1"):
+    with pytest.raises(UsageError, match="inference learner: max_lag: expected 0, got 1"):
         resolve("CartPole-v1", max_lag=1, **IN_LEARNER)
-    with pytest.raises(UsageError, match="inference expected one of workers, learner, got 'gpu'"):
+    with pytest.raises(UsageError, match="inference: expected one of workers, learner, got 'gpu'"):
         resolve("CartPole-v1", inference="gpu")
     command = [sys.executable, "-m", "learner", "CartPole-v1", "--inference", "learner", "--run-dir", str(tmp_path / "runs")]
     refused = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)

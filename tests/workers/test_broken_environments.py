@@ -133,7 +133,7 @@ def answer(good: int, observation: Any, reward: Any = 1.0, space: Any = None) ->
 def test_an_observation_that_does_not_fit_is_refused_before_it_is_kept(good: int, observation: Any, got: str) -> None:
     when = ["first reset", "step 0"][good]
     assert answer(good, observation).startswith(
-        f"lane 0, copy 0, {when}: observation expected float32[1] as its space says, got {got}; fix"
+        f"lane 0, copy 0, {when}: observation: expected float32[1] as its space says, got {got}; fix"
     )
 
 

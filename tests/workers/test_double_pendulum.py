@@ -380,7 +380,7 @@ def test_step_and_render_want_a_reset_first() -> None:
      {"force_limit_N": np.inf}, {"track_m": -1}, {"angle_limit_rad": np.nan}, {"start_spread": -1}, {"start_spread": 0.5}],
 )  # fmt: skip
 def test_constants_that_make_no_sense_are_refused(keywords: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=f"{next(iter(keywords))} expected"):
+    with pytest.raises(ValueError, match=f"{next(iter(keywords))}: expected"):
         CartDoublePendulum(**keywords)
 
 

@@ -89,7 +89,7 @@ class CollectedLane:
                 ):
                     raise LaneFailed(
                         self.number,
-                        f"copy {n}, {when}: {_name(leaf)} expected {wanted}{list(leaf.shape)} as its space says, "
+                        f"copy {n}, {when}: {_name(leaf)}: expected {wanted}{list(leaf.shape)} as its space says, "
                         f"got {array.dtype}{list(array.shape)}; fix the environment or its observation_space",
                     )
 

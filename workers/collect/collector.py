@@ -100,7 +100,7 @@ class Collector:
         environment does (`LaneFailed`), these lanes are closed and the unfinished rollouts are dropped.
         """
         if len({assignment.lane for assignment in assignments}) < len(assignments):
-            raise ValueError(f"collect expected one assignment for each lane, got {assignments}")
+            raise ValueError(f"collect: expected one assignment for each lane, got {assignments}")
         self._collecting = True
         try:
             lanes = [self._lane_for(assignment, pulse) for assignment in assignments]

@@ -43,7 +43,7 @@ class SplitVectorEnv:
         """Step the copies of all lanes, with actions [L, N, *action]: `StepAll` of a `Collector`."""
         order = sorted(range(len(lanes)), key=lanes.__getitem__)
         if [lanes[i] for i in order] != list(range(self._lanes)):
-            raise ValueError(f"lanes expected all {self._lanes} of the vector environment at once, got {sorted(lanes)}")
+            raise ValueError(f"lanes: expected all {self._lanes} of the vector environment at once, got {sorted(lanes)}")
         in_order = actions[order].reshape(-1, *actions.shape[2:])  # [L · N, *action]
         observation, reward, terminated, truncated, infos = self._wait(lambda: self.env.step(in_order), pulse)
         self._result = StepResult(self._read(observation), reward, terminated, truncated, infos.get("worker_lost"))

@@ -47,7 +47,7 @@ class Physics:
         for name, value in vars(self).items():
             positive = name in {"cart_kg", "link_kg", "link_m"}
             if not (value > 0 if positive else value >= 0) or not math.isfinite(value):
-                raise ValueError(f"{name} expected a finite number {'above' if positive else 'of at least'} 0, got {value}")
+                raise ValueError(f"{name}: expected a finite number {'above' if positive else 'of at least'} 0, got {value}")
 
 
 def accelerations(physics: Physics) -> Accelerations:
@@ -180,9 +180,9 @@ class CartDoublePendulum(gymnasium.Env[Floats, Floats]):
             "angle_limit_rad": angle_limit_rad,
         }.items():  # fmt: skip
             if not 0 < value < math.inf:
-                raise ValueError(f"{name} expected a finite number above 0, got {value}")
+                raise ValueError(f"{name}: expected a finite number above 0, got {value}")
         if not 0 <= start_spread < min(track_m, angle_limit_rad):
-            raise ValueError(f"start_spread expected from 0 to below track_m and angle_limit_rad, got {start_spread}")
+            raise ValueError(f"start_spread: expected from 0 to below track_m and angle_limit_rad, got {start_spread}")
         self.render_mode = render_mode
         self.metadata = self.metadata | {"render_fps": round(1 / dt_s)}
         self.force_limit_N, self.dt_s, self.substeps = force_limit_N, dt_s, substeps
@@ -215,7 +215,7 @@ class CartDoublePendulum(gymnasium.Env[Floats, Floats]):
         push = float(action[0])
         if not -1 <= push <= 1:
             if not math.isfinite(push):
-                raise ValueError(f"CartDoublePendulum: action expected a finite number from -1 to 1, got {push}")
+                raise ValueError(f"CartDoublePendulum: action: expected a finite number from -1 to 1, got {push}")
             push = math.copysign(1.0, push)
         force, h = self.force_limit_N * push, self.dt_s / self.substeps
         for _ in range(self.substeps):

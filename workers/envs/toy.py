@@ -315,7 +315,7 @@ class Spaces(gymnasium.Env[Any, Any]):
         """Show another random observation. The reward is the sum of the action."""
         box = isinstance(self.action_space, spaces.Box)
         if not self.action_space.contains(np.asarray(action) if box else action):  # a scalar Box iterates as scalars
-            raise ValueError(f"action expected in {self.action_space}, got {action!r} of type {type(action).__name__}")
+            raise ValueError(f"action: expected one of {self.action_space}, got {action!r} of type {type(action).__name__}")
         self._steps += 1
         return self.observation_space.sample(), float(np.sum(action)), False, self._steps == 4, {}
 

@@ -138,7 +138,7 @@ class _CheckedLeafSink(_LeafSink):
             array = np.asarray(value)
             if array.shape != leaf.shape or not np.can_cast(array.dtype, stored.dtype, "same_kind"):
                 raise ValueError(
-                    f"observation {leaf.path}".strip() + f" expected {leaf.dtype}{list(leaf.shape)} as its space says, "
+                    f"observation {leaf.path}".strip() + f": expected {leaf.dtype}{list(leaf.shape)} as its space says, "
                     f"got {array.dtype}{list(array.shape)}"
                 )
         super().__setitem__(copy, observation)

@@ -172,7 +172,7 @@ def test_a_loss_that_is_not_finite_is_named_and_stops_before_the_weights(name: s
     algorithm.update(batch(algorithm, 0), no_pulse)
     before, rows = algorithm.net.flat.clone(), batch(algorithm, 1)
     (rows.reward if broken == "reward" else rows.obs[0])[:] = 3e38 if broken == "reward" else np.nan
-    with pytest.raises(RunError, match=r"update 1: \w+ expected finite, got"), np.errstate(all="ignore"):
+    with pytest.raises(RunError, match=r"update 1: \w+: expected finite, got"), np.errstate(all="ignore"):
         algorithm.update(rows, no_pulse)
     assert torch.equal(algorithm.net.flat, before)
 

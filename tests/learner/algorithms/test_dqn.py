@@ -497,7 +497,7 @@ def test_a_loss_that_is_not_finite_is_named_and_stops_before_the_weights() -> No
     before = made.net.flat.clone()
     broken = batch(1)
     broken.reward[:] = 3e38
-    with pytest.raises(RunError, match=r"update 2: loss expected finite, got inf; .* not taken"):
+    with pytest.raises(RunError, match=r"update 2: loss: expected finite, got inf; .* not taken"):
         made.update(broken, no_pulse)
         for _ in range(20):
             made.update(broken, no_pulse)

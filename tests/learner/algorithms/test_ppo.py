@@ -237,7 +237,7 @@ def test_a_loss_that_is_not_finite_is_named_and_stops_before_the_weights(name: s
     before = algorithm.net.flat.clone()
     broken = batch(algorithm, 1)
     getattr(broken, name)[broken.valid] = 3e38 if name == "reward" else -np.inf
-    with pytest.raises(RunError, match=r"update 1: \w+ expected finite, got"), np.errstate(all="ignore"):
+    with pytest.raises(RunError, match=r"update 1: \w+: expected finite, got"), np.errstate(all="ignore"):
         algorithm.update(broken, no_pulse)
     assert torch.equal(algorithm.net.flat, before)
 

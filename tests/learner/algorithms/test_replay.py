@@ -387,7 +387,7 @@ def test_a_saved_state_does_not_change_with_the_replay() -> None:
 
 
 def test_a_state_of_another_size_is_refused() -> None:
-    with pytest.raises(ValueError, match="replay_size expected 50, got 40"):
+    with pytest.raises(ValueError, match="replay_size: expected 50, got 40"):
         replay(40).load_state_dict(replay(50).state_dict())
 
 

@@ -91,26 +91,26 @@ def test_env_kwargs_are_merged(tmp_path: Path) -> None:
 def test_a_whole_number_may_be_written_in_powers_of_ten(tmp_path: Path) -> None:
     assert resolve("CartPole-v1", steps=1e6).steps == 1_000_000
     assert resolve("CartPole-v1", file=written(tmp_path, "steps = 3e5")).steps == 300_000
-    assert "steps expected int" in refusal(steps=1.5)
+    assert "steps: expected int" in refusal(steps=1.5)
 
 
 @pytest.mark.parametrize(
     ("keywords", "says"),
     [
-        ({"workers": 0}, "workers expected int >= 1, got 0"),
-        ({"workers": "two"}, "workers expected int, got 'two'"),
-        ({"steps": 0}, "steps expected int >= 1, got 0"),
-        ({"max_lag": -1}, "max_lag expected int >= 0, got -1"),
+        ({"workers": 0}, "workers: expected int >= 1, got 0"),
+        ({"workers": "two"}, "workers: expected int, got 'two'"),
+        ({"steps": 0}, "steps: expected int >= 1, got 0"),
+        ({"max_lag": -1}, "max_lag: expected int >= 0, got -1"),
         ({"envs": 6}, "6 envs cannot be shared evenly among 4 lanes; take 4 or 8, or 3 lanes"),
         ({"envs": 2}, "2 envs cannot be shared evenly among 4 lanes; take 4, or 2 lanes"),
-        ({"transport": "udp"}, "transport expected one of inproc, ipc, tcp, got 'udp'"),
-        ({"activation": "gelu"}, "activation expected one of tanh, relu, got 'gelu'"),
-        ({"learning_rate": -1.0}, "learning_rate expected float > 0.0, got -1.0"),
-        ({"target_return": "high"}, "target_return expected float or \"none\", got 'high'"),
+        ({"transport": "udp"}, "transport: expected one of inproc, ipc, tcp, got 'udp'"),
+        ({"activation": "gelu"}, "activation: expected one of tanh, relu, got 'gelu'"),
+        ({"learning_rate": -1.0}, "learning_rate: expected float > 0.0, got -1.0"),
+        ({"target_return": "high"}, "target_return: expected float or \"none\", got 'high'"),
         ({"learning_rat": 1.0}, "unknown setting learning_rat; did you mean learning_rate?"),
         ({"algo": "dqn", "core": "gru"}, "unknown setting core; it is one of ppo, a2c, impala alone"),
         ({"algo": "reinforce", "core": "gru"}, "unknown setting core; it is one of ppo, a2c, impala alone"),
-        ({"core": "rnn"}, "core expected one of lstm, gru, none, got 'rnn'"),
+        ({"core": "rnn"}, "core: expected one of lstm, gru, none, got 'rnn'"),
         ({"algo": "pp0"}, "algo pp0: expected one of ppo"),
         ({"bind": "0.0.0.0:5555"}, "address 0.0.0.0:5555: expected inproc://NAME, ipc://PATH or tcp://HOST:PORT"),
         ({"file": Path("/no/such.toml")}, "config file /no/such.toml cannot be read: No such file or directory"),
@@ -127,9 +127,9 @@ def test_bad_values_are_refused_in_one_line(keywords: dict[str, Any], says: str)
         ("[ppo]\nlearning_rat = 3", "unknown setting learning_rat; did you mean learning_rate?"),
         ("learning_rate = 3", "learning_rate is a setting of the algorithm; put it in the table [ppo]"),
         ("[ppo]\nsteps = 3", "steps is a setting of the run; put it above the table [ppo]"),
-        ("ppo = 3", "ppo expected a table, [ppo], got 3"),
-        ("seed = -1", "seed expected int >= 0, got -1"),
-        ("env_kwargs = 3", "env_kwargs expected table, got 3"),
+        ("ppo = 3", "ppo: expected a table, [ppo], got 3"),
+        ("seed = -1", "seed: expected int >= 0, got -1"),
+        ("env_kwargs = 3", "env_kwargs: expected table, got 3"),
         ("algorithm = 3", "unknown setting algorithm"),
         ("a =", "is not TOML"),
     ],
@@ -205,6 +205,6 @@ def test_no_setting_of_an_algorithm_hides_one_of_the_run() -> None:
 
 
 def test_rollouts_that_do_not_travel_are_not_compressed() -> None:
-    assert "compress expected none, got zstd" in refusal(inference="learner", compress="zstd")
-    assert "compress expected one of none, zstd, got 'gzip'" in refusal(compress="gzip")
+    assert "compress: expected none, got zstd" in refusal(inference="learner", compress="zstd")
+    assert "compress: expected one of none, zstd, got 'gzip'" in refusal(compress="gzip")
     assert resolve("CartPole-v1", compress="none").compress == "none"

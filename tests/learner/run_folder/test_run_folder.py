@@ -128,7 +128,7 @@ def test_a_policy_that_does_not_fit_its_card_is_refused(tmp_path: Path) -> None:
     card = tmp_path / "policy.json"
     whole = card.read_text()
     card.write_text(whole.replace('"net": [\n      8', '"net": [\n      9'))
-    with pytest.raises(UsageError, match=r"actor\.0\.bias expected float32 \(9,\), got \(8,\)"):
+    with pytest.raises(UsageError, match=r"actor\.0\.bias: expected float32 \(9,\), got \(8,\)"):
         folder.read_policy()
     card.write_text(whole.replace('"format": 1', '"format": 2'))
     with pytest.raises(UsageError, match="expected format 1, got 2"):

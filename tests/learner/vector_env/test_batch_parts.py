@@ -23,7 +23,7 @@ def test_lanes_have_consecutive_rows() -> None:
     assert [list(layout.copies(lane)) for lane in layout.lanes] == [[0, 1, 2], [3], [4, 5]]
     assert layout.by_lane([0, 2, 5]) == {0: [0, 2], 2: [1]}
     for wrong in (-1, 6):
-        with pytest.raises(IndexError, match=f"copy expected 0 to 5, got {wrong}"):
+        with pytest.raises(IndexError, match=f"copy: expected 0 to 5, got {wrong}"):
             layout.lane_of(wrong)
 
 

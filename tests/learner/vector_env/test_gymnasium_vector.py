@@ -158,7 +158,7 @@ def test_a_reset_mask_leaves_the_other_copies_unchanged() -> None:
                 env.reset(options={"reset_mask": wrong})
         assert env.step(np.zeros(3, np.int64))[1].tolist() == [1.0] * 3
         for actions, error in (np.zeros(2, np.int64), ValueError), (np.zeros(4, np.int64), ValueError), (0, TypeError):
-            with pytest.raises(error, match="actions expected one for each of 3 copies"):
+            with pytest.raises(error, match="actions: expected one for each of 3 copies"):
                 env.step(actions)
 
 
@@ -213,7 +213,7 @@ def test_attributes_can_be_set_before_the_first_reset_but_not_with_a_wrong_numbe
         assert env.get_attr("gravity") == (9.81, 3.72, 8.87, 1.62)
         env.reset(seed=1)
         for wrong in ([1.0, 2.0], (1.0,) * 5, []):
-            with pytest.raises(ValueError, match="values expected one for each of 4 copies"):
+            with pytest.raises(ValueError, match="values: expected one for each of 4 copies"):
                 env.set_attr("gravity", wrong)
         assert env.get_attr("gravity") == (9.81, 3.72, 8.87, 1.62)
         env.set_attr("gravity", 9.8)

@@ -226,15 +226,15 @@ def test_a_status_request_is_answered_while_it_steps() -> None:
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"num_envs": 0}, "num_envs expected at least 1"),
-        ({"lanes": 9}, "lanes expected 1 to num_envs"),
-        ({"transport": "pigeon"}, "transport expected"),
-        ({"bind": "tcp://127.0.0.1:*"}, "workers expected 0 with a bind address"),
+        ({"num_envs": 0}, "num_envs: expected at least 1"),
+        ({"lanes": 9}, "lanes: expected 1 to num_envs"),
+        ({"transport": "pigeon"}, "transport: expected"),
+        ({"bind": "tcp://127.0.0.1:*"}, "workers: expected 0, got "),
         ({"workers": None, "bind": "tcp://127.0.0.1:*", "env": lambda: None}, "factory"),
         ({"workers": None, "bind": "tcp://0.0.0.0:*", "insecure": True, "keys": "k"}, "got both"),
         ({"workers": None, "bind": "tcp://0.0.0.0:*", "advertise": "host:7"}, "expected an IPv6 address in brackets"),
-        ({"autoreset_mode": "Never"}, "autoreset_mode expected"),
-        ({"on_worker_loss": "shrug"}, "on_worker_loss expected"),
+        ({"autoreset_mode": "Never"}, "autoreset_mode: expected"),
+        ({"on_worker_loss": "shrug"}, "on_worker_loss: expected"),
         ({"env": "NoSuchEnv-v7"}, "is not registered"),
         ({"env": "workers.envs.toy:Spaces-v0", "observation": "text"}, "is not supported"),
     ],
@@ -264,9 +264,9 @@ def test_calls_in_the_wrong_order_raise_the_errors_of_gymnasium() -> None:
         for mask, error in ([True, False], TypeError), (np.zeros(2, bool), ValueError), (np.ones(3, bool), ValueError):
             with pytest.raises(error):
                 env.reset(options={"reset_mask": mask})
-        with pytest.raises(ValueError, match="seed expected one for each"):
+        with pytest.raises(ValueError, match="seed: expected one for each"):
             env.reset(seed=[1])
-        with pytest.raises(ValueError, match="actions expected one for each"):
+        with pytest.raises(ValueError, match="actions: expected one for each"):
             env.reset(), env.step(np.zeros(3, np.int64))
     env.close()
     with pytest.raises(gymnasium.error.ClosedEnvironmentError):

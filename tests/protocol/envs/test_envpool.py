@@ -164,7 +164,7 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> None:
     [
         (EnvSpec(f"{TOY}Countdown-v0"), "envpool has none of this name; use --vector loop"),
         (EnvSpec("Acrobot-v1"), "envpool has none of this name"),  # it means somebody else's
-        (EnvSpec.of(Countdown), "vector envpool expected an id that gymnasium registers, got a callable"),
+        (EnvSpec.of(Countdown), "vector envpool: expected an id that gymnasium registers, got a callable"),
         (
             EnvSpec("CartPole-v1", {"sutton_barto_reward": True}),
             "cannot make it: .*'sutton_barto_reward'; use --vector loop",
@@ -191,5 +191,5 @@ def test_where_envpool_is_not_installed_a_line_says_how_to(monkeypatch: pytest.M
 
 
 def test_where_the_policy_acts_beside_the_learner_there_is_no_pool() -> None:
-    with pytest.raises(UsageError, match="inference learner: vector expected auto or loop, got envpool"):
+    with pytest.raises(UsageError, match="inference learner: vector: expected auto or loop, got envpool"):
         resolve("CartPole-v1", vector="envpool", inference="learner")

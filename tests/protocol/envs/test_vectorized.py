@@ -138,9 +138,9 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> None:
     [
         (EnvSpec("Pendulum-v1"), "Pendulum-v1 has no vectorized form of its own .*; use --vector loop"),
         (EnvSpec(f"{TOY}Countdown-v0"), "has no vectorized form of its own"),
-        (EnvSpec.of(Countdown), "vector native expected an id that gymnasium registers, got a callable"),
+        (EnvSpec.of(Countdown), "vector native: expected an id that gymnasium registers, got a callable"),
         (EnvSpec("CartPole-v1", {"sutton_barto_reward": True, "max_episode_steps": 3}), ""),
-        (EnvSpec("test/Same-v0"), "autoreset_mode.* expected .*NEXT_STEP, got .*SAME_STEP"),
+        (EnvSpec("test/Same-v0"), "autoreset_mode.*: expected .*NEXT_STEP, got .*SAME_STEP"),
         (EnvSpec("test/Other-v0"), r"its vectorized form has other spaces than itself, Box.*\(2,\).*; use --vector loop"),
     ],
     ids=["none", "none of ours", "callable", "fits", "same step", "other spaces"],
@@ -156,7 +156,7 @@ def test_what_cannot_be_stepped_at_once_is_refused_in_one_line(env: EnvSpec, why
 
 
 def test_where_the_policy_acts_beside_the_learner_copies_are_stepped_one_by_one() -> None:
-    with pytest.raises(UsageError, match="inference learner: vector expected auto or loop, got native"):
+    with pytest.raises(UsageError, match="inference learner: vector: expected auto or loop, got native"):
         resolve("CartPole-v1", vector="native", inference="learner")
-    with pytest.raises(UsageError, match="vector expected one of auto, loop, native, envpool, got 'sync'"):
+    with pytest.raises(UsageError, match="vector: expected one of auto, loop, native, envpool, got 'sync'"):
         resolve("CartPole-v1", vector="sync")

@@ -91,10 +91,10 @@ def test_one_that_is_different_here_is_refused() -> None:
     assert spec.encoder is not None
     first, *rest = spec.encoder.arrays
     other = msgspec.structs.replace(spec.encoder, arrays=(NamedShape(first.name, (7, 4)), *rest))
-    with pytest.raises(UsageError, match=rf"parameter {first.name} expected \(7, 4\) as the learner has it, got \(12, 4\)"):
+    with pytest.raises(UsageError, match=rf"parameter {first.name}: expected \(7, 4\) as the learner has it, got \(12, 4\)"):
         ActorCriticNetwork(msgspec.structs.replace(spec, encoder=other))
     more = msgspec.structs.replace(spec.encoder, arrays=(*spec.encoder.arrays, NamedShape("more", (1,))))
-    with pytest.raises(UsageError, match=r"parameter more expected \(1,\) as the learner has it, got none"):
+    with pytest.raises(UsageError, match=r"parameter more: expected \(1,\) as the learner has it, got none"):
         ActorCriticNetwork(msgspec.structs.replace(spec, encoder=more))
 
 

@@ -165,8 +165,8 @@ def test_a_state_that_does_not_fit_is_refused() -> None:
     run = run_of("CartPole-v1", T=2, N=3, core="gru", core_size=5)
     (good,) = collect(random_collector(run), run)
     for state, says in [
-        (np.zeros((3, 4), np.float32), r"state expected float32\[1, 3, 5\], got float32\[1, 3, 4\]"),
-        (np.full((3, 5), np.nan, np.float32), "state expected finite values, got nan at step 0, copy 0"),
+        (np.zeros((3, 4), np.float32), r"state: expected float32\[1, 3, 5\], got float32\[1, 3, 4\]"),
+        (np.full((3, 5), np.nan, np.float32), "state: expected finite values, got nan at step 0, copy 0"),
     ]:
         with pytest.raises(BadRollout, match=says):
             validate(msgspec.structs.replace(good, state=state), run)

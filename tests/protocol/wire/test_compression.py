@@ -259,27 +259,27 @@ def test_the_hand_made_stack_is_a_good_one() -> None:
     [
         (b"", ["stack"], U1, SHAPE, "expected at least 2564 bytes, got 0"),
         (payload_of()[:-1], ["stack"], U1, SHAPE, "expected at least 2564 bytes, got 2563"),
-        (payload_of() + b"\0", ["stack"], U1, SHAPE, "expected 2564 bytes by its bits, got 2565"),
-        (payload_of(0xFFFF_FFFE), ["stack"], U1, SHAPE, "expected 2756 bytes by its bits, got 2564"),
-        (payload_of(frames=43), ["stack"], U1, SHAPE, "expected 2564 bytes by its bits, got 2756"),
-        (b"\xff\xff\xff\xff" + bytes(64 * 38), ["stack"], U1, [16, 2, 4, 8, 8], "expected 30 bits and then zeros"),
-        (payload_of(), ["stack"], np.dtype(np.int8), SHAPE, "stack expected uint8"),
-        (payload_of(), ["stack"], np.dtype(bool), SHAPE, "stack expected uint8"),
-        (payload_of(), ["stack"], U1, [17, 2, 17, 8, 8], "stack expected uint8"),
-        (payload_of(), ["stack"], U1, [17, 2, 1, 8, 8], "stack expected uint8"),
-        (payload_of(), ["stack"], U1, [17, 2, 4, 64], "stack expected uint8"),
-        (payload_of(), ["stack"], U1, [2**20, 2**20, 16, 7, 9], "stack expected uint8"),
-        (payload_of(), ["stack"], U1, [0, 2, 4, 8, 8], "stack expected uint8"),
-        (payload_of(), ["stack"], U1, [1, 2, 4, 8, 8], "stack expected uint8"),
-        (payload_of(), ["stack"], U1, [17, 0, 4, 8, 8], "stack expected uint8"),
-        (payload_of(), ["stack"], U1, [17, 2, 4, 8, 0], "stack expected uint8"),
+        (payload_of() + b"\0", ["stack"], U1, SHAPE, "expected 2564 bytes, according to its bits, got 2565"),
+        (payload_of(0xFFFF_FFFE), ["stack"], U1, SHAPE, "expected 2756 bytes, according to its bits, got 2564"),
+        (payload_of(frames=43), ["stack"], U1, SHAPE, "expected 2564 bytes, according to its bits, got 2756"),
+        (b"\xff\xff\xff\xff" + bytes(64 * 38), ["stack"], U1, [16, 2, 4, 8, 8], "expected zeros after the first 30 bits"),
+        (payload_of(), ["stack"], np.dtype(np.int8), SHAPE, "stack: expected uint8"),
+        (payload_of(), ["stack"], np.dtype(bool), SHAPE, "stack: expected uint8"),
+        (payload_of(), ["stack"], U1, [17, 2, 17, 8, 8], "stack: expected uint8"),
+        (payload_of(), ["stack"], U1, [17, 2, 1, 8, 8], "stack: expected uint8"),
+        (payload_of(), ["stack"], U1, [17, 2, 4, 64], "stack: expected uint8"),
+        (payload_of(), ["stack"], U1, [2**20, 2**20, 16, 7, 9], "stack: expected uint8"),
+        (payload_of(), ["stack"], U1, [0, 2, 4, 8, 8], "stack: expected uint8"),
+        (payload_of(), ["stack"], U1, [1, 2, 4, 8, 8], "stack: expected uint8"),
+        (payload_of(), ["stack"], U1, [17, 0, 4, 8, 8], "stack: expected uint8"),
+        (payload_of(), ["stack"], U1, [17, 2, 4, 8, 0], "stack: expected uint8"),
         (payload_of(), ["stack"], U1, [2**10, 2**10, 2, 8, 8], "expected at least"),
-        (payload_of(), [], U1, SHAPE, "packings expected"),
-        (payload_of(), ["stack", "stack"], U1, SHAPE, "packings expected"),
-        (payload_of(), ["pickle"], U1, SHAPE, "packings expected"),
-        (payload_of(), [b"stack"], U1, SHAPE, "packings expected"),
-        (payload_of(), [["stack"]], U1, SHAPE, "packings expected"),
-        (payload_of(), ["x" * 100_000], U1, SHAPE, "packings expected"),
+        (payload_of(), [], U1, SHAPE, "packings: expected"),
+        (payload_of(), ["stack", "stack"], U1, SHAPE, "packings: expected"),
+        (payload_of(), ["pickle"], U1, SHAPE, "packings: expected"),
+        (payload_of(), [b"stack"], U1, SHAPE, "packings: expected"),
+        (payload_of(), [["stack"]], U1, SHAPE, "packings: expected"),
+        (payload_of(), ["x" * 100_000], U1, SHAPE, "packings: expected"),
     ],
 )
 def test_what_is_not_quite_a_packed_array_is_refused(
@@ -417,7 +417,7 @@ def test_bombs_and_other_broken_frames_are_refused_before_memory_is_taken_for_th
 
 def test_packings_are_undone_in_one_order_only() -> None:
     for packings in (["zstd", "stack"], ["zstd", "zstd"], ["stack", "zstd", "zstd"], []):
-        with pytest.raises(BadMessage, match="packings expected"):
+        with pytest.raises(BadMessage, match="packings: expected"):
             unpack_array(ZEROS, packings, U1, SHAPE)
 
 

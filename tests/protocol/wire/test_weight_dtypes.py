@@ -82,5 +82,5 @@ def test_no_parameters_are_no_trouble() -> None:
 
 @pytest.mark.parametrize("dtype", [np.float64, np.int8, np.uint32, bool])
 def test_weights_of_another_kind_are_not_acted_under(dtype: Any) -> None:
-    with pytest.raises(ValueError, match="weights expected float32, float16 or bfloat16 as uint16"):
+    with pytest.raises(ValueError, match="weights: expected float32, float16 or bfloat16 as uint16"):
         to_float32(np.zeros(3, dtype))
