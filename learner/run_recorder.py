@@ -25,6 +25,7 @@ from learner.run_folder.run_folder import RunFolder
 from learner.run_folder.versions import versions
 from learner.run_state import RunState
 from learner.service import RolloutService
+from protocol.bounds import Stages
 from protocol.rollout import Batch
 from protocol.specs import RunSpec
 
@@ -56,7 +57,7 @@ class RunRecorder:
         self._metrics = MetricsLog(folder.path, state.env_steps)
         self._episode_recorder = _episode_recorder(config, folder, spec)
         self._stages_s = {"update": 0.0, "other": 0.0}
-        self._worker_stages_s: dict[int, Mapping[str, float]] = {}  # by session; workers that have left count too
+        self._worker_stages_s: dict[int, Stages] = {}  # by session; workers that have left count too
         self._wall_before_s, self._steps_before = state.wall_s, state.env_steps
         self._started_s = self._saved_s = time.monotonic()
         self._episodes_since_save = 0

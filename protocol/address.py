@@ -9,6 +9,7 @@ from __future__ import annotations
 import ipaddress
 import socket
 
+from protocol.bounds import MAX_NAME, one_line
 from protocol.errors import UsageError
 
 WILDCARDS = {"*", "0.0.0.0", "[::]", "[::ffff:0.0.0.0]"}
@@ -88,6 +89,11 @@ def advertised_address(bound: str, advertise: str, machine: str) -> str:
 def worker_name(peer: bytes) -> bytes:
     """The worker's name: its routing id up to the first zero byte. With keys, a zero byte and more follow the name."""
     return peer.partition(b"\0")[0]
+
+
+def name_for_people(peer: bytes) -> str:
+    """The worker's name as text without control characters, for logs and errors. A stranger's may be any bytes."""
+    return one_line(worker_name(peer).decode(errors="replace"), MAX_NAME)
 
 
 def _is_name(host: str) -> bool:

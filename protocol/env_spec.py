@@ -23,6 +23,7 @@ from protocol.errors import UsageError, first_line
 # By namespace: the module that registers its environments. The id is then passed to gymnasium as `module:id`, so that
 # gymnasium imports the module.
 REGISTERING_MODULES = {"millrace": "workers.envs", "ALE": "ale_py"}
+MAX_CALLABLE_BYTES = 1 << 26
 Scalar = bool | int | float | str
 _Made = TypeVar("_Made")
 
@@ -40,6 +41,24 @@ class AllowedCode(Enum):
     """also pickled callables: the learner's key is known, or only this user can have started it"""
 
 
+class PickledCallable:
+    """A callable, pickled by cloudpickle. It travels in a frame of its own."""
+
+    __slots__ = ("data",)
+
+    def __init__(self, data: bytes) -> None:
+        self.data = data
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, PickledCallable) and other.data == self.data
+
+    def __hash__(self) -> int:
+        return hash(self.data)
+
+    def __repr__(self) -> str:
+        return f"PickledCallable({len(self.data)} bytes)"
+
+
 class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The environment: a gymnasium id, or a factory that the learner pickled."""
 
@@ -47,17 +66,26 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """any id that `gymnasium.make` takes: `CartPole-v1`, `ALE/Pong-v5`, `my_package.envs:MyEnv-v0`"""
     kwargs: dict[str, Scalar] = {}
     """keyword arguments of `gymnasium.make`"""
-    factory: bytes | None = None
+    factory: PickledCallable | None = None
     """a cloudpickled callable that returns one environment; `id` is then only its name"""
 
     @staticmethod
     def of(env: str | Callable[[], object], kwargs: dict[str, Scalar] | None = None) -> EnvSpec:
-        """Make a spec from an id, or from a callable that takes `kwargs` and returns a `gymnasium.Env`."""
+        """Make a spec from an id, or from a callable that takes `kwargs` and returns a `gymnasium.Env`.
+
+        Raises `UsageError` for a callable that is too large to send.
+        """
         if isinstance(env, str):
             return EnvSpec(env, kwargs or {})
         import cloudpickle
 
-        return EnvSpec(getattr(env, "__name__", type(env).__name__), kwargs or {}, cloudpickle.dumps(env))
+        name, data = getattr(env, "__name__", type(env).__name__), cloudpickle.dumps(env)
+        if len(data) > MAX_CALLABLE_BYTES:
+            raise UsageError(
+                f"environment {name}: expected its callable to pickle to at most {MAX_CALLABLE_BYTES:,} bytes, got "
+                f"{len(data):,}; let it load its data when it is called, from a file that every worker can read"
+            )
+        return EnvSpec(name, kwargs or {}, PickledCallable(data))
 
     def rejection_reason(self, code: AllowedCode) -> str:
         """Why a worker that allows only this code cannot make it; empty if it can."""
@@ -79,7 +107,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if self.factory is not None:
             import cloudpickle
 
-            env = cloudpickle.loads(self.factory)(**self.kwargs, **extra)
+            env = cloudpickle.loads(self.factory.data)(**self.kwargs, **extra)
             if not isinstance(env, gymnasium.Env):
                 raise UsageError(f"env factory {self.id}: expected it to return a gymnasium.Env, got {type(env).__name__}")
             return env

@@ -1,18 +1,38 @@
 """The messages, as small frozen records. `README.md` says who may send which message, and when.
 
 A session lasts from the `Welcome` of a worker until it leaves or is given up. A message of another session is counted and
-not used.
+not used. Every field has a bound (`protocol/bounds.py`), which decoding checks.
 """
 
 from __future__ import annotations
 
+from typing import Annotated, Literal
+
 import msgspec
+from msgspec import Meta
 
 from protocol.arrays import Array
-from protocol.rollout import Rollout
-from protocol.specs import RunSpec, StepSpec
+from protocol.bounds import (
+    MAX_SEEDS,
+    MAX_TICKETS,
+    MAX_WORKERS,
+    Count,
+    Line,
+    Name,
+    Natural,
+    Pid,
+    Seconds,
+    Stages,
+    Text,
+    Tickets,
+    Version,
+    Whole,
+)
+from protocol.rollout import Episode, Rollout
+from protocol.space_spec import EnvDescription
+from protocol.specs import DescribeSpec, RunSpec, StepSpec
 
-PROTOCOL_VERSION = 3
+PROTOCOL_VERSION = 4
 
 
 class Message(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unknown_fields=True):
@@ -22,149 +42,247 @@ class Message(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unk
 class Hello(Message, frozen=True, array_like=False):  # a map, as in every version, so that any two can part politely
     """May I join? Repeated with backoff until it is answered."""
 
-    protocol: int
-    worker: str
+    protocol: Natural
+    worker: Name
     """the worker's name; also its routing id"""
-    host: str
-    pid: int
-    life: int
-    """drawn at random by each process (pids repeat in containers)"""
-    software: str
-    attempt: int
+    host: Line
+    pid: Pid
+    process_nonce: Natural = msgspec.field(name="life")  # the name on the wire, as in every version
+    """drawn at random for each process, for pids repeat in containers; a secret of the worker, its supervisor and learner"""
+    software: Line
+    attempt: Natural
     """counts how often this process has started to join: a repeated Hello keeps the number, a new start raises it"""
 
 
 class Welcome(Message, frozen=True):
-    """You may join. It says what to do: collect rollouts (`RunSpec`) or step env copies (`StepSpec`)."""
+    """You may join. It says what to do: describe the environment, collect rollouts, or step env copies on order."""
 
-    session: int
-    attempt: int
+    session: Natural
+    attempt: Natural
     """`attempt` of the Hello that this answers"""
-    run: RunSpec | StepSpec
+    run: DescribeSpec | RunSpec | StepSpec
 
 
 class Refuse(Message, frozen=True, array_like=False):  # a map, as Hello is
     """Leave, with exit code 2."""
 
-    reason: str
+    reason: Line
 
 
 class Rejoin(Message, frozen=True):
     """I do not know this session, because I restarted or gave you up: say Hello again."""
 
-    session: int
+    session: Natural
 
 
 class Weights(Message, frozen=True):
     """The newest weights. They carry no session, so that one encoding serves all workers."""
 
-    version: int
+    version: Natural
     parameters: Array
     """[P] the parameters needed to act: float32, or rounded to float16 or bfloat16 (which is sent as uint16)"""
     buffers: Array
     """[B] float32, observation mean and standard deviation if observations are normalized, and ε for action values"""
+    env_attributes: Array | None = None
+    """[bytes] uint8, `protocol.wire.plain_values`: attributes that every env copy gets when its next rollout starts, by
+    name
+    """
 
 
 class Permit(msgspec.Struct, frozen=True, array_like=True):
     """A ticket as it travels: permission for one rollout, on this lane and incarnation."""
 
-    ticket: int
-    lane: int
-    incarnation: int
+    ticket: Natural
+    lane: Natural
+    incarnation: Natural
 
 
 class Received(msgspec.Struct, frozen=True, array_like=True):
-    """The learner has all rollouts of this lane and incarnation whose sequence is below `below`, and those in `ahead`."""
+    """The rollouts of this lane and incarnation that the learner has."""
 
-    lane: int
-    incarnation: int
-    below: int
-    ahead: tuple[int, ...] = ()
-    """sequences that have arrived although an earlier one is missing"""
+    lane: Natural
+    incarnation: Natural
+    next_sequence: Natural
+    """every rollout with a smaller sequence number has arrived"""
+    out_of_order: Tickets = ()
+    """larger sequence numbers that have arrived although an earlier one is missing"""
 
 
 class Collect(Message, frozen=True):
     """Permission for one rollout on each of these lanes, under weights at least as new as `version`."""
 
-    session: int
-    version: int
-    permits: tuple[Permit, ...]
+    session: Natural
+    version: Natural
+    permits: Annotated[tuple[Permit, ...], Meta(max_length=MAX_TICKETS)]
     received: tuple[Received, ...]
     """one entry for each lane of this worker; a lane that is not listed belongs to another worker"""
 
 
-class LaneLife(msgspec.Struct, frozen=True, array_like=True):
+class LaneIncarnation(msgspec.Struct, frozen=True, array_like=True):
     """A lane, and how often it has been started on new env copies."""
 
-    lane: int
-    incarnation: int
+    lane: Natural
+    incarnation: Natural
 
 
 class Release(Message, frozen=True):
     """These lanes belong to other workers now: close them."""
 
-    session: int
-    lanes: tuple[LaneLife, ...]
+    session: Natural
+    lanes: tuple[LaneIncarnation, ...]
 
 
 class Heartbeat(Message, frozen=True):
     """What the worker holds. The learner compares it with its own records and sends again what was lost."""
 
-    session: int
-    replies: int
+    session: Natural
+    replies: Natural
     """number of the last HeartbeatReply received; what the learner sent before that has arrived or is lost"""
-    version: int
+    version: Version
     """version of the newest weights held; -1 before the first"""
-    tickets: tuple[int, ...]
+    tickets: Tickets
     """tickets that are held and not finished"""
-    steps: int
+    steps: Natural
     """env steps since the worker started"""
-    stages: dict[str, float]
+    stages: Stages
     """seconds spent in each stage since the worker started"""
-    resident_bytes: int
+    resident_bytes: Natural
     """resident memory of the worker's process; 0 if it is not known"""
 
 
 class HeartbeatReply(Message, frozen=True):
     """The learner is alive, and this is what it has received of each of your lanes."""
 
-    session: int
-    number: int
+    session: Natural
+    number: Natural
     received: tuple[Received, ...]
 
 
 class Drain(Message, frozen=True):
     """Finish the current rollout, send it, and leave."""
 
-    reason: str
+    reason: Line
 
 
 class Goodbye(Message, frozen=True):
     """I leave on purpose, and did not finish these tickets."""
 
-    session: int
-    reason: str
-    tickets: tuple[int, ...]
+    session: Natural
+    reason: Line
+    tickets: Tickets
 
 
 class Failure(Message, frozen=True):
     """My environment, or my own code, raised an exception; I leave."""
 
-    session: int
-    error: str
-    traceback: str
-    lane: int | None
+    session: Natural
+    error: Line
+    traceback: Text
+    lane: Natural | None
+
+
+Doing = Literal["starting", "waiting", "describing", "making", "resetting", "stepping", "evaluating", "closing"]
+"""What a worker does, as its supervisor sees it. Environment code runs in all of these except `starting` and `waiting`."""
+
+
+class WorkerActivity(msgspec.Struct, frozen=True, array_like=True):
+    """A running worker, as its supervisor sees it."""
+
+    worker: Name
+    process_nonce: Natural
+    doing: Doing
+    for_s: Seconds
+    """seconds since it started to do this"""
+    env_calls: Natural
+    """calls of the environment (make, reset, step) that have returned since the worker started"""
+
+
+class WorkerExit(msgspec.Struct, frozen=True, array_like=True):
+    """A worker whose process has ended."""
+
+    worker: Name
+    process_nonce: Natural
+    reason: Line
+    """how it ended: an exit code, a signal, or a timeout that its supervisor enforced, by the name of its flag"""
+    failed: bool
+    """whether the environment, or the worker, is to blame: it did not leave on purpose"""
+
+
+class Alive(Message, frozen=True):
+    """A supervisor speaks for its workers. It is believed if it knows a worker's nonce and uses the same key."""
+
+    running: Annotated[tuple[WorkerActivity, ...], Meta(max_length=MAX_WORKERS)]
+    ended: Annotated[tuple[WorkerExit, ...], Meta(max_length=MAX_WORKERS)]
+    """those that ended a short while ago; repeated, because a message may be lost"""
+
+
+class Described(Message, frozen=True):
+    """The environment of a `DescribeSpec`."""
+
+    session: Natural
+    description: EnvDescription
+
+
+class Evaluate(Message, frozen=True):
+    """Play one episode for each seed, on copies of their own, under weights of this version. Answered by `Evaluated`."""
+
+    session: Natural
+    ticket: Natural
+    version: Natural
+    seeds: Annotated[tuple[Natural, ...], Meta(min_length=1, max_length=MAX_SEEDS)]
+    """reset seed of each episode; all are stepped together, and those that ended stay in the batch, unused"""
+    greedy: bool
+    """true: take the most probable actions; false: draw them, from a generator that is seeded by the first seed"""
+    most_steps: Count
+    """an episode that reaches this number of steps is cut"""
+    send_rows: bool
+    """also send every row, as `EpisodeRows`"""
+    send_frames: bool
+    """also send what the environment renders, as `EpisodeRows`"""
+
+
+class EpisodeRows(Message, frozen=True):
+    """Some consecutive rows of one episode of an `Evaluate`. They keep the row format; L is their number."""
+
+    session: Natural
+    ticket: Natural
+    episode: Natural
+    """index of its seed"""
+    first_step: Natural
+    """step of the episode at which the first row stands, from 0"""
+    obs: tuple[Array, ...]
+    """one array [L+1, *leaf] for each leaf of the observation"""
+    action: Array
+    """[L, *action]"""
+    reward: Array
+    """[L] float64, raw"""
+    terminated: Array
+    """[L] bool"""
+    truncated: Array
+    """[L] bool"""
+    frames: Array | None = None
+    """[L+1, H, W, 3] uint8, what the environment rendered"""
+
+
+class Evaluated(Message, frozen=True):
+    """The episodes of an `Evaluate`, in the order of its seeds."""
+
+    session: Natural
+    ticket: Natural
+    episodes: Annotated[tuple[Episode, ...], Meta(max_length=MAX_SEEDS)]
+    cut: Annotated[tuple[bool, ...], Meta(max_length=MAX_SEEDS)]
+    """whether the episode was cut at `most_steps`"""
 
 
 class Reset(Message, frozen=True):
     """Start episodes in these copies of the lane. Answered by `Stepped`. A new incarnation starts on new copies."""
 
-    session: int
-    ticket: int
+    session: Natural
+    ticket: Natural
     """rises with every order; an order is executed once, and answered again if it is repeated"""
-    lane: int
-    incarnation: int
-    copies: tuple[int, ...]
+    lane: Natural
+    incarnation: Natural
+    copies: tuple[Natural, ...]
     """which of the lane's copies, from 0"""
     seeds: tuple[int | None, ...]
     """one seed for each of `copies`"""
@@ -175,10 +293,10 @@ class Reset(Message, frozen=True):
 class Step(Message, frozen=True):
     """Step every copy of the lane. Answered by `Stepped`."""
 
-    session: int
-    ticket: int
-    lane: int
-    incarnation: int
+    session: Natural
+    ticket: Natural
+    lane: Natural
+    incarnation: Natural
     actions: tuple[Array, ...]
     """one array [N, *leaf] for each leaf of the action"""
 
@@ -186,13 +304,13 @@ class Step(Message, frozen=True):
 class Call(Message, frozen=True):
     """Call, read or set an attribute of these copies of the lane. Answered by `Returned`."""
 
-    session: int
-    ticket: int
-    lane: int
-    incarnation: int
-    copies: tuple[int, ...]
+    session: Natural
+    ticket: Natural
+    lane: Natural
+    incarnation: Natural
+    copies: tuple[Natural, ...]
     """which of the lane's copies, from 0"""
-    name: str
+    name: Line
     """name of the attribute, which any of the wrappers may have; an attribute that is not callable is read"""
     assign: bool
     """true: set the attribute"""
@@ -203,11 +321,11 @@ class Call(Message, frozen=True):
 class Stepped(Message, frozen=True):
     """The result of a Reset or a Step, for every copy of the lane."""
 
-    session: int
-    ticket: int
+    session: Natural
+    ticket: Whole
     """ticket of the order; below 0: a step through shared memory whose infos did not fit there"""
-    lane: int
-    incarnation: int
+    lane: Natural
+    incarnation: Natural
     obs: tuple[Array, ...]
     """one array [N, *leaf] for each leaf of the observation"""
     reward: Array
@@ -223,15 +341,15 @@ class Stepped(Message, frozen=True):
 class Returned(Message, frozen=True):
     """The result of a Call."""
 
-    session: int
-    ticket: int
-    lane: int
-    incarnation: int
+    session: Natural
+    ticket: Natural
+    lane: Natural
+    incarnation: Natural
     results: Array
     """[bytes] uint8, `protocol.wire.plain_values`: a list with one result for each copy"""
-    error: str
+    error: Line
     """type and message of the exception, in one line, if the call raised; else empty"""
-    traceback: str
+    traceback: Text
     """where it was raised, as text"""
 
 
@@ -246,7 +364,7 @@ class WorkerStatus(msgspec.Struct, frozen=True):
     """its name"""
     host: str
     pid: int
-    standing: str
+    state: str
     """active, or draining"""
     lanes: tuple[int, ...]
     """its lanes; none if it is a spare worker"""
@@ -264,6 +382,10 @@ class WorkerStatus(msgspec.Struct, frozen=True):
     """resident memory of its process; 0 if it is not known"""
     strikes: int
     """how many of its messages and rollouts could not be used"""
+    doing: str = ""
+    """what it does, as its supervisor says; empty if it has none"""
+    doing_s: float = 0.0
+    """for how many seconds it has done that"""
 
 
 class Status(Message, frozen=True):
@@ -285,20 +407,25 @@ class Status(Message, frozen=True):
     lag_max: int
     """largest lag of the rollouts of the last update, in versions"""
     workers: tuple[WorkerStatus, ...]
-    """in the order in which they joined"""
+    """in the order in which they joined; of very many, the first"""
     ledger: dict[str, int]
     """counts of what happened to every ticket, transition and message"""
+    workers_left_out: int = 0
+    """number of workers that are not in `workers`, because the message would be too long"""
 
 
-ToLearner = Hello | Rollout | Heartbeat | Goodbye | Failure | Stepped | Returned
-ToWorker = Welcome | Refuse | Rejoin | Weights | Collect | Release | HeartbeatReply | Drain | Reset | Step | Call
+ToLearner = (
+    Hello | Alive | Described | Rollout | Heartbeat | Goodbye | Failure | EpisodeRows | Evaluated | Stepped | Returned
+)
+ToWorker = Welcome | Refuse | Rejoin | Weights | Collect | Release | Evaluate | HeartbeatReply | Drain | Reset | Step | Call
 Order = Reset | Step | Call
 Answer = Stepped | Returned
 ToObserver = Status
 
 __all__ = [
-    "PROTOCOL_VERSION", "Answer", "Array", "Call", "Collect", "Drain", "Failure", "Goodbye", "Heartbeat", "HeartbeatReply",
-    "Hello", "Inquire", "LaneLife", "Message", "Order", "Permit", "Received", "Refuse", "Rejoin", "Release", "Reset",
-    "Returned", "Rollout", "Status", "Step", "Stepped", "ToLearner", "ToObserver", "ToWorker", "Weights", "Welcome",
+    "PROTOCOL_VERSION", "Alive", "Answer", "Array", "Call", "Collect", "Described", "Doing", "Drain", "EpisodeRows",
+    "Evaluate", "Evaluated", "Failure", "Goodbye", "Heartbeat", "HeartbeatReply", "Hello", "Inquire", "LaneIncarnation",
+    "Message", "Order", "Permit", "Received", "Refuse", "Rejoin", "Release", "Reset", "Returned", "Rollout", "Status",
+    "Step", "Stepped", "ToLearner", "ToObserver", "ToWorker", "Weights", "Welcome", "WorkerActivity", "WorkerExit",
     "WorkerStatus",
 ]  # fmt: skip

@@ -19,27 +19,32 @@ import numpy as np
 import numpy.typing as npt
 
 from protocol.arrays import Array, Bools, Floats
+from protocol.bounds import Count, Natural, Real, Seconds
 from protocol.errors import BadRollout
 from protocol.specs import Leaf, RunSpec
+
+LARGEST_REWARD = float(np.finfo(np.float32).max)
 
 
 class Episode(msgspec.Struct, frozen=True, array_like=True):
     """An episode that ended in this rollout, in raw rewards."""
 
-    reward: float
+    reward: Real
     """the return: undiscounted sum of raw rewards"""
-    length: int
-    seconds: float
+    length: Count
+    seconds: Seconds
+    facts: tuple[float, ...] = ()
+    """one number for each name in `RunSpec.facts`, from the info of the episode's last step; NaN where it had none"""
 
 
 class Rollout(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unknown_fields=True):
     """T steps of a lane of N env copies, all acted under one version."""
 
-    session: int
-    lane: int
-    ticket: int
-    version: int
-    sequence: int
+    session: Natural
+    lane: Natural
+    ticket: Natural
+    version: Natural
+    sequence: Natural
     """counts the rollouts of this lane and incarnation, from 0"""
     obs: tuple[Array, ...]
     """one array [T+1, N, *leaf] for each leaf of the observation"""
@@ -58,6 +63,10 @@ class Rollout(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unk
     state: Array
     """[N, S] float32: state of the recurrent core before obs[0]; S is 0 without a core"""
     episodes: tuple[Episode, ...] = ()
+    mask: Array | None = None
+    """[T+1, N, choices] bool: which actions were allowed in `obs`; none unless `RunSpec.masked`"""
+    extras: tuple[Array, ...] = ()
+    """one array [T, N, *shape] for each of `RunSpec.extras`"""
 
     @property
     def env_steps(self) -> int:
@@ -91,6 +100,14 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
         raise BadRollout(f"obs: expected {len(run.policy.observation)} arrays, got {len(rollout.obs)}")
     for leaf, array in zip(run.policy.observation, rollout.obs, strict=True):
         expected.append((_named(leaf), array, (T + 1, N, *leaf.shape), leaf.dtype))
+    if (rollout.mask is not None) != run.masked:
+        raise BadRollout(f"mask: expected {'one' if run.masked else 'none'}")
+    if rollout.mask is not None:
+        expected.append(("mask", rollout.mask, (T + 1, N, sum(action.sizes)), "bool"))
+    if len(rollout.extras) != len(run.extras):
+        raise BadRollout(f"extras: expected {len(run.extras)} arrays, got {len(rollout.extras)}")
+    for extra, array in zip(run.extras, rollout.extras, strict=True):
+        expected.append((f"extra {extra.name}", array, (T, N, *extra.shape), extra.dtype))
     for name, array, shape, dtype in expected:
         if array.shape != shape or array.dtype != np.dtype(dtype):
             raise BadRollout(
@@ -119,9 +136,14 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
         raise BadRollout(f"valid: expected {not ended[t, n]} at step {t + 1}, copy {n}, got {bool(rollout.valid[t + 1, n])}")
     if len(rollout.episodes) != int(np.count_nonzero(ended & rollout.valid)):
         raise BadRollout(f"episodes: expected {int(np.count_nonzero(ended & rollout.valid))}, got {len(rollout.episodes)}")
+    steps_so_far = (rollout.sequence + 1) * T  # of this incarnation of the lane
     for episode in rollout.episodes:
-        if not (math.isfinite(episode.reward) and episode.length > 0 and 0 <= episode.seconds < math.inf):
-            raise BadRollout(f"episode: expected a finite return, a length and a duration, got {episode}")
+        if episode.length > steps_so_far:
+            raise BadRollout(f"episode: expected at most {steps_so_far} steps, got {episode.length}")
+        if abs(episode.reward) > episode.length * LARGEST_REWARD:
+            raise BadRollout(f"episode: expected a return of {episode.length} rewards of float32, got {episode.reward}")
+        if len(episode.facts) != len(run.facts):
+            raise BadRollout(f"episode: expected {len(run.facts)} facts, got {len(episode.facts)}")
 
 
 def _named(leaf: Leaf) -> str:

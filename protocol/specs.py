@@ -114,6 +114,34 @@ class PolicySpec(msgspec.Struct, frozen=True):
         return self.encoder is None and any(leaf.is_image for leaf in self.observation)
 
 
+class ExtraArray(msgspec.Struct, frozen=True, array_like=True):
+    """A further array of a rollout: [T, N, *shape]."""
+
+    name: str
+    shape: tuple[int, ...]
+    dtype: str
+
+
+Vector = Literal["loop", "native", "envpool"]
+
+
+class DescribeSpec(msgspec.Struct, frozen=True, tag=True):
+    """A learner that does not know its environment yet. The worker makes one copy, describes it and closes it."""
+
+    env: EnvSpec
+    vector: Vector = "loop"
+    """the form that must have the same spaces as one env copy, which the worker checks"""
+    render_mode: str | None = None
+    """passed to the copy"""
+    heartbeat_s: float = 1.0
+    learner_timeout_s: float = 30.0
+    """a worker that received nothing from the learner for so long says Hello again"""
+
+    def rejection_reason(self, code: AllowedCode) -> str:
+        """Why a worker that allows only this code cannot take part; empty if it can."""
+        return self.env.rejection_reason(code)
+
+
 class RunSpec(msgspec.Struct, frozen=True, tag=True):
     """Everything that a worker needs to know about a run for which it collects rollouts."""
 
@@ -125,7 +153,7 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
     """N, env copies in a lane"""
     lanes: int
     seed: int
-    vector: Literal["loop", "native", "envpool"] = "loop"
+    vector: Vector = "loop"
     """how the copies of a lane are stepped: one after another (`loop`), or together, by the environment's own vectorized
     form (`native`) or by envpool's
     """
@@ -133,6 +161,12 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
     """whether workers also compress the larger arrays of their rollouts"""
     images_dtype: ImagesDtype = "float32"
     """precision in which workers process images with the built-in convolutions"""
+    masked: bool = False
+    """whether rollouts carry a mask of the allowed actions"""
+    facts: tuple[str, ...] = ()
+    """names of numbers that the environment reports in `info` when an episode ends"""
+    extras: tuple[ExtraArray, ...] = ()
+    """further arrays of each rollout"""
     heartbeat_s: float = 1.0
     learner_timeout_s: float = 30.0
     """a worker that received nothing from the learner for so long says Hello again"""

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from protocol.bounds import MAX_TICKETS, Stage, last_text, one_line
 from protocol.messages import (
     PROTOCOL_VERSION,
     Answer,
@@ -21,7 +22,7 @@ from protocol.messages import (
     Heartbeat,
     HeartbeatReply,
     Hello,
-    LaneLife,
+    LaneIncarnation,
     Order,
     Received,
     Refuse,
@@ -35,7 +36,7 @@ from protocol.messages import (
     Weights,
     Welcome,
 )
-from protocol.specs import RunSpec, StepSpec
+from protocol.specs import DescribeSpec, RunSpec, StepSpec
 from workers.collect.held_rollouts import Assignment, HeldRollouts
 from workers.states import TABLE, LearnerSilent, State, StopRequested, WorkerFailed, WorkFinished
 from workers.step.held_orders import HeldOrders
@@ -55,14 +56,14 @@ class Send:
 class StartSession:
     """Effect: a new session starts; close every env copy of the last one."""
 
-    run: RunSpec | StepSpec
+    run: DescribeSpec | RunSpec | StepSpec
 
 
 @dataclass(frozen=True)
 class CloseLanes:
     """Effect: close the env copies of these lanes."""
 
-    lanes: tuple[LaneLife, ...]
+    lanes: tuple[LaneIncarnation, ...]
 
 
 @dataclass(frozen=True)
@@ -92,9 +93,21 @@ class Identity:
     worker: str
     host: str
     pid: int
-    life: int
+    process_nonce: int
     """random number that tells this process, or thread, from any other of the same name"""
     software: str
+
+    def hello(self, attempt: int) -> Hello:
+        """The Hello of this attempt to join."""
+        return Hello(
+            PROTOCOL_VERSION,
+            worker=self.worker,
+            host=one_line(self.host),
+            pid=self.pid,
+            process_nonce=self.process_nonce,
+            software=one_line(self.software),
+            attempt=attempt,
+        )
 
 
 @dataclass(frozen=True)
@@ -103,7 +116,7 @@ class Statistics:
 
     steps: int = 0
     """env steps since the worker started"""
-    stages: Mapping[str, float] = field(default_factory=dict)
+    stages: Mapping[Stage, float] = field(default_factory=dict)
     """seconds in each stage"""
     resident_bytes: int = 0
     """resident memory of this process"""
@@ -129,7 +142,7 @@ class _SessionState:
         """Tickets that are not yet collected or executed."""
         return (*self.rollouts.tickets(), *self.orders.tickets())
 
-    def lanes(self) -> tuple[LaneLife, ...]:
+    def lanes(self) -> tuple[LaneIncarnation, ...]:
         """The lanes of this worker."""
         return (*self.rollouts.lanes(), *self.orders.lanes())
 
@@ -142,7 +155,7 @@ class Session:
     ) -> None:
         self.identity = identity
         self.state = State.JOINING
-        self.run: RunSpec | StepSpec | None = None
+        self.run: DescribeSpec | RunSpec | StepSpec | None = None
         self.session = 0
         self._statistics = Statistics()
         self._join_timeout_s = join_timeout_s
@@ -204,8 +217,7 @@ class Session:
                     return []
                 self._due_s = now + self._backoff_s
                 self._backoff_s = min(2 * self._backoff_s, HELLO_MOST_S)
-                who = self.identity
-                return [Send(Hello(PROTOCOL_VERSION, who.worker, who.host, who.pid, who.life, who.software, self._attempt))]
+                return [Send(self.identity.hello(self._attempt))]
         assert self.run is not None
         if now - self._last_heard_s > self.run.learner_timeout_s:
             return self._rejoin(LearnerSilent(), f"the learner was silent for {self.run.learner_timeout_s:.0f} s", now)
@@ -237,12 +249,12 @@ class Session:
         """The environment, or this worker, raised: report it to the learner, and leave."""
         effects: list[Effect] = []
         if self.state in (State.READY, State.DRAINING):
-            effects.append(Send(Failure(self.session, error, traceback, lane)))
+            effects.append(Send(Failure(self.session, one_line(error), last_text(traceback), lane)))
         return [] if self.state is State.LEFT else effects + self._leave(WorkerFailed(), 1, error)
 
     def decline(self, reason: str) -> list[Effect]:
         """Leave a run in which this worker cannot take part."""
-        return [Send(Goodbye(self.session, reason, ())), *self._leave(WorkerFailed(), 2, reason)]
+        return [Send(Goodbye(self.session, one_line(reason), ())), *self._leave(WorkerFailed(), 2, reason)]
 
     def refused(self, reason: str) -> list[Effect]:
         """Leave, because the learner's endpoint rejects this worker for good."""
@@ -330,10 +342,10 @@ class Session:
         """Drop the rollouts that the learner has received, and the lanes that it does not list: their Release was lost."""
         self._current.rollouts.forget_received(received)
         listed = {of_lane.lane for of_lane in received}
-        return self._release([life for life in self._current.lanes() if life.lane not in listed])
+        return self._release([lane for lane in self._current.lanes() if lane.lane not in listed])
 
-    def _release(self, lives: Sequence[LaneLife]) -> list[Effect]:
-        released = (*self._current.rollouts.release(lives), *self._current.orders.release(lives))
+    def _release(self, lanes: Sequence[LaneIncarnation]) -> list[Effect]:
+        released = (*self._current.rollouts.release(lanes), *self._current.orders.release(lanes))
         return [CloseLanes(released)] if released else []
 
     def _heartbeat(self) -> Heartbeat:
@@ -341,7 +353,7 @@ class Session:
             session=self.session,
             replies=self._current.replies,
             version=self._current.version,
-            tickets=self._current.unfinished(),
+            tickets=self._current.unfinished()[:MAX_TICKETS],
             steps=self._statistics.steps,
             stages=dict(self._statistics.stages),
             resident_bytes=self._statistics.resident_bytes,
@@ -355,7 +367,7 @@ class Session:
         return [] if self._current.in_progress else self._goodbye()
 
     def _goodbye(self) -> list[Effect]:
-        goodbye = Send(Goodbye(self.session, self._reason, self._current.unfinished()))
+        goodbye = Send(Goodbye(self.session, one_line(self._reason), self._current.unfinished()[:MAX_TICKETS]))
         return [goodbye, *self._leave(WorkFinished(), 0, self._reason)]
 
     def _leave(self, event: object, exit_code: int, reason: str) -> list[Effect]:

@@ -8,6 +8,7 @@ from protocol.messages import (
     Call,
     Collect,
     Drain,
+    Evaluate,
     HeartbeatReply,
     Refuse,
     Rejoin,
@@ -57,6 +58,7 @@ TABLE: dict[State, dict[type, State]] = {
     State.READY: {
         Weights: State.READY,
         Collect: State.READY,
+        Evaluate: State.READY,
         Reset: State.READY,
         Step: State.READY,
         Call: State.READY,

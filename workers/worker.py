@@ -18,11 +18,12 @@ from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from protocol.bounds import Stages
 from protocol.env_spec import AllowedCode
 from protocol.errors import BadMessage, UserFacingError, first_line
 from protocol.messages import Order, Stepped, Weights
 from protocol.policy.policy import make_policy
-from protocol.specs import RunSpec, StepSpec
+from protocol.specs import DescribeSpec, RunSpec, StepSpec
 from protocol.wire.codec import encode
 from protocol.wire.shared_memory import InheritedDescriptors
 from protocol.wire.weight_dtypes import to_float32
@@ -31,7 +32,7 @@ from workers.collect.collector import Collector
 from workers.env_errors import LaneFailed
 from workers.heartbeat_thread import HeartbeatThread
 from workers.session import CloseLanes, Effect, Identity, Leave, Send, Session, StartSession, Statistics, Task
-from workers.step.stepper import MAX_TRACEBACK, Stepper
+from workers.step.stepper import Stepper
 
 log = logging.getLogger("millrace.worker")
 
@@ -217,11 +218,11 @@ class Worker:
         detail = error.detail if isinstance(error, UserFacingError) else traceback.format_exc()
         lane = error.lane if isinstance(error, LaneFailed) else None
         log.error("%s\n%s", error, detail)
-        self._do(self._session.fail(_line(error), detail[-MAX_TRACEBACK:], lane))
+        self._do(self._session.fail(_line(error), detail, lane))
 
     def _update_statistics(self) -> None:
         if (source := self._collector or self._stepper) is not None:
-            stages = {**source.stages, "wait": self._waited_s}
+            stages: Stages = {**source.stages, "wait": self._waited_s}
             self._session.update_statistics(Statistics(source.steps, stages, self._resident_bytes))
 
     def _do(self, effects: list[Effect]) -> None:
@@ -233,11 +234,11 @@ class Worker:
                     self._start_session(run)
                 case CloseLanes(lanes):
                     if (owner := self._collector or self._stepper) is not None:
-                        owner.close([life.lane for life in lanes])
+                        owner.close([lane.lane for lane in lanes])
                 case Leave():
                     self._left = effect
 
-    def _start_session(self, run: RunSpec | StepSpec) -> None:
+    def _start_session(self, run: DescribeSpec | RunSpec | StepSpec) -> None:
         """Make a new collector or stepper; nothing of the old one is kept."""
         self._close_all()
         self._collector = self._stepper = None

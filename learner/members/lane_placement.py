@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from learner.members.membership import Member, Outgoing
-from protocol.messages import LaneLife, Release
+from protocol.messages import LaneIncarnation, Release
 
 
 @dataclass
@@ -101,7 +101,7 @@ class LanePlacement(Generic[L]):
                 lane.moving, self._waiting_for = True, fullest
                 break
             fullest.lanes.remove(lane.number)
-            out.append((fullest.peer, Release(fullest.session, (LaneLife(lane.number, lane.incarnation),))))
+            out.append((fullest.peer, Release(fullest.session, (LaneIncarnation(lane.number, lane.incarnation),))))
             lane.restart()
             self._give(lane, emptiest)
         return out

@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import msgspec
+
 from learner.members.events import (
     EnvironmentRaised,
     Event,
@@ -25,7 +27,7 @@ from learner.members.events import (
 from learner.members.key_revocation import KeyRevocation
 from learner.members.member_log import MemberLog
 from learner.members.membership import Membership, Outgoing
-from protocol.address import worker_name
+from protocol.address import name_for_people
 from protocol.errors import BadMessage, NoWorkers
 from protocol.messages import Inquire, Status, ToLearner, ToWorker, Weights
 from protocol.wire.codec import Buffer, encode
@@ -125,10 +127,10 @@ class MemberServer:
         for peer, message in self._link.receive():
             now = self._clock()
             if isinstance(message, BadMessage):
-                self.warn_limited(peer, f"message from {worker_name(peer)[:40]!r}: {message}")
+                self.warn_limited(peer, f"message from {name_for_people(peer)!r}: {message}")
                 self.send(self._coordinator.reject_message(peer, str(message), now))
             elif isinstance(message, Inquire):
-                self._link.send(peer, encode(self._callbacks.status(now)))
+                self._link.send(peer, _status_frames(self._callbacks.status(now)))
             else:
                 self.send(self._callbacks.message(peer, message, now))
 
@@ -216,3 +218,14 @@ class MemberServer:
                     pass
             self._log.log_event(logging.INFO if expected else logging.WARNING, event, line)
             self._callbacks.event(event)
+
+
+def _status_frames(status: Status) -> Sequence[Buffer]:
+    """Frames of a status. If it is too long for a message, the last workers are left out, and their number is given."""
+    while True:
+        try:
+            return encode(status)
+        except ValueError:
+            kept = len(status.workers) // 2
+            left_out = status.workers_left_out + len(status.workers) - kept
+            status = msgspec.structs.replace(status, workers=status.workers[:kept], workers_left_out=left_out)

@@ -12,11 +12,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
+import msgspec
+
 from learner.members.events import Event, RejoinRequested, WorkerJoined, WorkerLeft, WorkerRefused
 from learner.members.states import TABLE, KeyRevoked, MemberState, TimedOut
-from protocol.address import worker_name
+from protocol.address import name_for_people, worker_name
+from protocol.bounds import one_line
 from protocol.messages import (
     PROTOCOL_VERSION,
+    Alive,
     Drain,
     Failure,
     Goodbye,
@@ -68,7 +72,7 @@ class Member:
 
         A ticket is lost if it was sent before a reply that the worker has seen, and the worker does not hold it.
         """
-        self.heartbeat = heartbeat
+        self.heartbeat = msgspec.structs.replace(heartbeat, tickets=())  # what is kept of it is small
         steps, since_s = self.measured
         if self.heard_s - since_s >= MEASURE_S:  # new weights trigger an extra heartbeat, too early to measure speed
             self.steps_per_s = (heartbeat.steps - steps) / (self.heard_s - since_s) if since_s else 0.0
@@ -83,7 +87,7 @@ class Member:
             worker=self.hello.worker,
             host=self.hello.host,
             pid=self.hello.pid,
-            standing=self.state.value,
+            state=self.state.value,
             lanes=tuple(sorted(self.lanes)),
             tickets=len(self.tickets),
             steps=heartbeat.steps if heartbeat else 0,
@@ -114,7 +118,7 @@ class Membership(Generic[M]):
         self._joins = 0
         self._none_silent_before_s = -math.inf  # until then no member can have been silent for too long
         self._removed_for_silence: set[str] = set()  # names, until they join again
-        self._refused: dict[bytes, tuple[int, str]] = {}  # the life (process) that was refused, and why
+        self._refused: dict[bytes, tuple[int, str]] = {}  # the process (by its nonce) that was refused, and why
 
     def active(self) -> list[M]:
         """The members that are given work, in the order in which they joined."""
@@ -132,37 +136,37 @@ class Membership(Generic[M]):
     def member_of_session(self, peer: bytes, message: ToLearner, now: float) -> M | None:
         """The member that sent this message in its current session, or None. Also records when the member was heard."""
         member = self.members.get(peer)
-        if member is None or isinstance(message, Hello) or member.session != message.session:
+        if member is None or isinstance(message, Hello | Alive) or member.session != message.session:
             return None
         member.heard_s = now
         return member
 
     def answer_ended_session(self, peer: bytes, message: ToLearner) -> list[Outgoing]:
         """The answer to a message of a session that has ended: join again, unless the worker leaves anyway."""
-        if isinstance(message, Hello | Goodbye | Failure):
+        if isinstance(message, Hello | Alive | Goodbye | Failure):
             return []
         late = message.env_steps if isinstance(message, Rollout) else 0
-        self.events.append(RejoinRequested(worker_name(peer).decode(errors="replace")[:40], message.session, late))
+        self.events.append(RejoinRequested(name_for_people(peer), message.session, late))
         return [(peer, Rejoin(message.session))]
 
     def join(self, peer: bytes, hello: Hello, now: float) -> tuple[list[Outgoing], M | None]:
         """Answer a Hello. Returns the answer, and the member if one has joined by it."""
         why = ""
         if hello.protocol != PROTOCOL_VERSION:
-            why = f"protocol expected {PROTOCOL_VERSION}, got {hello.protocol}; install the learner's version of millrace"
+            why = f"protocol: expected {PROTOCOL_VERSION}, got {hello.protocol}; install the learner's version of millrace"
         elif hello.worker.encode() != worker_name(peer):
-            why = f"name expected {worker_name(peer)[:40]!r}, as in its routing id, got {hello.worker[:40]!r}"
+            why = f"name: expected {name_for_people(peer)!r}, as in its routing id, got {hello.worker[:40]!r}"
         if why:
             self.events.append(WorkerRefused(hello.worker, why))
-            return [(peer, Refuse(why))], None
-        life, why = self._refused.get(peer, (-1, ""))
-        if life == hello.life:
-            return [(peer, Refuse(why))], None
+            return [(peer, Refuse(one_line(why)))], None
+        refused, why = self._refused.get(peer, (-1, ""))
+        if refused == hello.process_nonce:
+            return [(peer, Refuse(one_line(why)))], None
         if self.draining is not None:
-            return [(peer, Drain(self.draining))], None
+            return [(peer, Drain(one_line(self.draining)))], None
         member = self.members.get(peer)
         if member is not None:
-            same_process = member.hello.life == hello.life
+            same_process = member.hello.process_nonce == hello.process_nonce
             if same_process and hello.attempt == member.hello.attempt:
                 member.heard_s = now
                 return [(peer, Welcome(member.session, hello.attempt, self._run))], None
@@ -223,16 +227,16 @@ class Membership(Generic[M]):
         out: list[Outgoing] = []
         for member in self.active():
             member.state = TABLE[member.state][Drain]
-            out.append((member.peer, Drain(reason)))
+            out.append((member.peer, Drain(one_line(reason))))
         return out
 
     def _refuse_and_remove(self, member: M, event: type, why: str, refusal: str) -> list[Outgoing]:
         self.events.append(WorkerRefused(member.hello.worker, refusal))
         self.remove(member, event, why)
-        return [(member.peer, Refuse(refusal))]
+        return [(member.peer, Refuse(one_line(refusal)))]
 
     def _remember_refusal(self, member: M, why: str) -> None:
         self._refused.pop(member.peer, None)
-        self._refused[member.peer] = (member.hello.life, why)
+        self._refused[member.peer] = (member.hello.process_nonce, why)
         if len(self._refused) > REMEMBERED_REFUSALS:
             del self._refused[next(iter(self._refused))]

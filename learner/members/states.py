@@ -4,7 +4,20 @@ from __future__ import annotations
 
 from enum import Enum
 
-from protocol.messages import Drain, Failure, Goodbye, Heartbeat, Hello, Returned, Rollout, Stepped
+from protocol.messages import (
+    Alive,
+    Described,
+    Drain,
+    EpisodeRows,
+    Evaluated,
+    Failure,
+    Goodbye,
+    Heartbeat,
+    Hello,
+    Returned,
+    Rollout,
+    Stepped,
+)
 
 
 class MemberState(Enum):
@@ -32,8 +45,12 @@ TABLE: dict[MemberState, dict[type, MemberState]] = {
     MemberState.UNKNOWN: {Hello: MemberState.ACTIVE},
     MemberState.ACTIVE: {
         Hello: MemberState.ACTIVE,
+        Alive: MemberState.ACTIVE,
+        Described: MemberState.ACTIVE,
         Rollout: MemberState.ACTIVE,
         Heartbeat: MemberState.ACTIVE,
+        EpisodeRows: MemberState.ACTIVE,
+        Evaluated: MemberState.ACTIVE,
         Stepped: MemberState.ACTIVE,
         Returned: MemberState.ACTIVE,
         Goodbye: MemberState.UNKNOWN,
@@ -44,8 +61,12 @@ TABLE: dict[MemberState, dict[type, MemberState]] = {
         Drain: MemberState.DRAINING,
     },
     MemberState.DRAINING: {
+        Alive: MemberState.DRAINING,
+        Described: MemberState.DRAINING,
         Rollout: MemberState.DRAINING,
         Heartbeat: MemberState.DRAINING,
+        EpisodeRows: MemberState.DRAINING,
+        Evaluated: MemberState.DRAINING,
         Stepped: MemberState.DRAINING,
         Returned: MemberState.DRAINING,
         Goodbye: MemberState.UNKNOWN,

@@ -22,8 +22,9 @@ from learner.rollouts.status import status
 from learner.rollouts.ticket_coordinator import CollectingMember, TicketCoordinator
 from learner.rollouts.weight_age import WeightAge
 from learner.run_folder.progress import Progress
-from protocol.address import worker_name
+from protocol.address import name_for_people
 from protocol.arrays import Array
+from protocol.bounds import Stages
 from protocol.errors import BadRollout, EnvironmentFailed, NoWorkers, Stalled
 from protocol.messages import Rollout, Status, ToLearner
 from protocol.rollout import rollout_bytes, validate
@@ -76,7 +77,7 @@ class HubSnapshot:
     """Number of messages under revoked keys."""
     refused_handshakes: int
 
-    def worker_stages(self) -> dict[int, Mapping[str, float]]:
+    def worker_stages(self) -> dict[int, Stages]:
         """Seconds in each stage, by session, from the workers' last heartbeats."""
         return {member.session: member.heartbeat.stages for member in self.members if member.heartbeat is not None}
 
@@ -243,10 +244,10 @@ class Hub:
         try:
             validate(message, self.coordinator.run)
         except BadRollout as error:
-            why = f"worker {worker_name(peer).decode(errors='replace')}: rollout of ticket {message.ticket}: {error}"
+            why = f"worker {name_for_people(peer)}: rollout of ticket {message.ticket}: {error}"
             self._server.warn_limited(peer, why)
             return self.coordinator.reject_rollout(peer, message, why, now)
-        self._weight_age.arrived(worker_name(peer).decode(errors="replace"), message.version, now)
+        self._weight_age.arrived(name_for_people(peer), message.version, now)
         return self.coordinator.receive(peer, message, now)
 
     def _status(self, now: float) -> Status:

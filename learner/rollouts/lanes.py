@@ -24,9 +24,9 @@ class TicketedLane(PlacedLane):
     """Whether a ticket of this incarnation was dealt."""
     outstanding: set[int] = field(default_factory=set)
     """Tickets that the lane's worker holds."""
-    below: int = 0
+    next_sequence: int = 0
     """Every rollout of this incarnation with a smaller sequence number has arrived."""
-    ahead: set[int] = field(default_factory=set)
+    out_of_order: set[int] = field(default_factory=set)
     """Sequence numbers that have arrived out of order."""
 
     @property
@@ -39,18 +39,19 @@ class TicketedLane(PlacedLane):
         super().restart()
         if self.started:
             self.incarnation += 1
-            self.started, self.below, self.ahead = False, 0, set()
+            self.started, self.next_sequence, self.out_of_order = False, 0, set()
 
     def expects(self, sequence: int) -> bool:
         """Whether an outstanding rollout can have this sequence number."""
-        return self.below <= sequence < self.below + len(self.ahead) + len(self.outstanding) and sequence not in self.ahead
+        end = self.next_sequence + len(self.out_of_order) + len(self.outstanding)
+        return self.next_sequence <= sequence < end and sequence not in self.out_of_order
 
     def arrived(self, sequence: int) -> None:
         """The rollout with this sequence number has arrived."""
-        self.ahead.add(sequence)
-        while self.below in self.ahead:
-            self.ahead.remove(self.below)
-            self.below += 1
+        self.out_of_order.add(sequence)
+        while self.next_sequence in self.out_of_order:
+            self.out_of_order.remove(self.next_sequence)
+            self.next_sequence += 1
 
 
 @dataclass(frozen=True)

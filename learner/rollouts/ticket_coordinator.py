@@ -23,10 +23,15 @@ from learner.members.membership import Member, Membership, Outgoing
 from learner.members.states import MemberState, SentUnusable
 from learner.rollouts.lanes import AcceptedRollout, LaneQueue, Ticket, TicketedLane
 from learner.rollouts.ledger import Ledger
+from protocol.bounds import escaped, one_line
 from protocol.messages import (
+    Alive,
     Array,
     Collect,
+    Described,
     Drain,
+    EpisodeRows,
+    Evaluated,
     Failure,
     Goodbye,
     Heartbeat,
@@ -124,14 +129,14 @@ class TicketCoordinator:
                 return self._rollout(member, message)
             case Heartbeat():
                 return self._heartbeat(member, message)
-            case Stepped() | Returned():
-                return []  # answers to orders, which a run does not give
+            case Stepped() | Returned() | Described() | Evaluated() | EpisodeRows() | Alive():
+                return []  # answers to orders that a run does not give
             case Goodbye(_, reason):
                 self.membership.remove(member, Goodbye, f"left: {reason}")
                 return self._deal()
             case Failure(_, error, traceback, lane):
                 hello = member.hello
-                self.events.append(EnvironmentRaised(hello.worker, hello.host, lane, error, traceback))
+                self.events.append(EnvironmentRaised(hello.worker, hello.host, lane, error, escaped(traceback)))
                 self.membership.remove(member, Failure, f"broke: {error}")
                 return self._deal()
 
@@ -140,7 +145,7 @@ class TicketCoordinator:
         self.ledger.messages_bad += 1
         member = self.members.get(peer)
         if member is None:
-            return [(peer, Refuse(f"not understood: {why}"))]
+            return [(peer, Refuse(one_line(f"not understood: {why}")))]
         return self._strike(member, why, now) + self._deal()
 
     def reject_rollout(self, peer: bytes, rollout: Rollout, why: str, now: float) -> list[Outgoing]:
@@ -261,7 +266,7 @@ class TicketCoordinator:
         lost = member.record_heartbeat(heartbeat)
         peer = member.peer
         if member.state is MemberState.DRAINING:
-            return [(peer, Drain(self.membership.draining or ""))]
+            return [(peer, Drain(one_line(self.membership.draining or "")))]
         self._acknowledge(member, min(heartbeat.version, self.version))
         seen = min(heartbeat.replies, member.replies)
         if member.sending is not None and seen > member.sending_since:
@@ -289,7 +294,7 @@ class TicketCoordinator:
 
     def _received(self, lanes: set[int]) -> tuple[Received, ...]:
         mine = [self.lanes[number] for number in lanes]
-        return tuple(Received(lane.number, lane.incarnation, lane.below, tuple(lane.ahead)) for lane in mine)
+        return tuple(Received(lane.number, lane.incarnation, lane.next_sequence, tuple(lane.out_of_order)) for lane in mine)
 
     def _collect(self, member: CollectingMember, tickets: Sequence[int]) -> list[Outgoing]:
         """Collect messages for these outstanding tickets: one for each version that they were dealt under."""

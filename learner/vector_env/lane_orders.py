@@ -11,7 +11,7 @@ import numpy as np
 
 from learner.vector_env.order_coordinator import MakeOrder
 from protocol.arrays import Array, Bytes
-from protocol.messages import Call, LaneLife, Reset, Step
+from protocol.messages import Call, LaneIncarnation, Reset, Step
 from protocol.wire.plain_values import pack
 
 
@@ -23,7 +23,7 @@ def packed(value: object) -> Bytes:
 def reset_order(copies: Sequence[int], seeds: Sequence[int | None], options: Bytes) -> MakeOrder:
     """Begin episodes in these copies of the lane, with one seed each. `options` are packed."""
 
-    def make(session: int, ticket: int, life: LaneLife) -> Reset:
+    def make(session: int, ticket: int, life: LaneIncarnation) -> Reset:
         return Reset(session, ticket, life.lane, life.incarnation, tuple(copies), tuple(seeds), options)
 
     return make
@@ -33,7 +33,7 @@ def step_order(actions: Sequence[Array]) -> MakeOrder:
     """Step all copies of the lane with these actions: [N, *leaf] each."""
     leaves = tuple(array.copy() for array in actions)
 
-    def make(session: int, ticket: int, life: LaneLife) -> Step:
+    def make(session: int, ticket: int, life: LaneIncarnation) -> Step:
         return Step(session, ticket, life.lane, life.incarnation, leaves)
 
     return make
@@ -43,7 +43,7 @@ def call_order(copies: Sequence[int], name: str, arguments: object, *, assign: b
     """Get or call the attribute of this name in these copies of the lane, or assign to it."""
     packed_arguments = packed(arguments)
 
-    def make(session: int, ticket: int, life: LaneLife) -> Call:
+    def make(session: int, ticket: int, life: LaneIncarnation) -> Call:
         return Call(session, ticket, life.lane, life.incarnation, tuple(copies), name, assign, packed_arguments)
 
     return make

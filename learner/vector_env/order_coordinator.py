@@ -18,16 +18,21 @@ from learner.members.events import EnvironmentRaised
 from learner.members.lane_placement import LanePlacement, PlacedLane
 from learner.members.membership import Member, Membership, Outgoing
 from learner.members.states import MemberState, SentUnusable
+from protocol.bounds import escaped, one_line
 from protocol.errors import BadMessage
 from protocol.messages import (
+    Alive,
     Answer,
+    Described,
     Drain,
+    EpisodeRows,
+    Evaluated,
     Failure,
     Goodbye,
     Heartbeat,
     HeartbeatReply,
     Hello,
-    LaneLife,
+    LaneIncarnation,
     Order,
     Received,
     Refuse,
@@ -38,7 +43,7 @@ from protocol.messages import (
 )
 from protocol.specs import StepSpec
 
-MakeOrder = Callable[[int, int, LaneLife], Order]
+MakeOrder = Callable[[int, int, LaneIncarnation], Order]
 """Makes an order for a lane from the session, the ticket, and the lane's number and incarnation."""
 
 
@@ -101,12 +106,12 @@ class OrderCoordinator:
             case Goodbye(_, reason):
                 self.membership.remove(member, Goodbye, f"left: {reason}")
             case Failure(_, error, traceback, lane):
-                failure = EnvironmentRaised(member.hello.worker, member.hello.host, lane, error, traceback)
+                failure = EnvironmentRaised(member.hello.worker, member.hello.host, lane, error, escaped(traceback))
                 self.failures.append(failure)
                 self.membership.events.append(failure)
                 self.membership.remove(member, Failure, f"broke: {error}")
-            case Rollout():
-                why = "it sent a rollout, and a vector environment collects none"
+            case Rollout() | Described() | Evaluated() | EpisodeRows() | Alive():
+                why = f"it sent {type(message).__name__}, which a vector environment does not ask for"
                 return self.membership.refuse(member, SentUnusable, why)
         return []
 
@@ -114,7 +119,7 @@ class OrderCoordinator:
         """A message that could not be read, or an answer that does not fit: its sender is refused."""
         member = self.members.get(peer)
         if member is None:
-            return [(peer, Refuse(f"not understood: {why}"))]
+            return [(peer, Refuse(one_line(f"not understood: {why}")))]
         return self.membership.refuse(member, SentUnusable, why)
 
     def revoke(self, peer: bytes, why: str) -> list[Outgoing]:
@@ -170,7 +175,7 @@ class OrderCoordinator:
         if member is None:
             raise ValueError(f"lane {lane}: expected a worker, got none")
         self._tickets += 1
-        order = make(member.session, self._tickets, LaneLife(lane, record.incarnation))
+        order = make(member.session, self._tickets, LaneIncarnation(lane, record.incarnation))
         record.started = True
         self.orders[order.ticket] = order
         member.tickets[order.ticket] = member.replies
@@ -206,7 +211,7 @@ class OrderCoordinator:
         """Answer a heartbeat. Send again the orders that it shows to be lost on the way."""
         lost = member.record_heartbeat(heartbeat)
         if member.state is MemberState.DRAINING:
-            return [(member.peer, Drain(self.membership.draining or ""))]
+            return [(member.peer, Drain(one_line(self.membership.draining or "")))]
         out: list[Outgoing] = []
         for ticket in lost:
             member.tickets[ticket] = member.replies

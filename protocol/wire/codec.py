@@ -23,16 +23,19 @@ import msgpack
 import msgspec
 import numpy as np
 
+from protocol.bounds import one_line
+from protocol.env_spec import MAX_CALLABLE_BYTES, PickledCallable
 from protocol.errors import BadMessage
-from protocol.messages import Hello, Inquire, Refuse, Rollout, Status, ToLearner, ToObserver, ToWorker
+from protocol.messages import Described, Hello, Inquire, Refuse, Rollout, Status, ToLearner, ToObserver, ToWorker
+from protocol.space_spec import check_size
 from protocol.wire.compression import Packing, raw_bytes, unpack_array
 
 Buffer = bytes | memoryview
 
 MAX_FRAMES = 64
-MAX_HEAD_BYTES = 1 << 20  # Welcome carries a pickled factory at most this large
+MAX_HEAD_BYTES = 1 << 20
 MAX_FRAME_BYTES = 1 << 30
-MAX_ITEMS = 1 << 16
+MAX_ITEMS = 1 << 16  # in a list or map of a worker's message; of the learner's, its head bounds them
 MAX_DIMENSIONS = 8
 DTYPES = {
     name: np.dtype(name) for name in ("|b1", "|i1", "|u1", "<i2", "<u2", "<i4", "<u4", "<i8", "<u8", "<f2", "<f4", "<f8")
@@ -64,6 +67,8 @@ def encode(message: ToLearner | Inquire | ToWorker | ToObserver, packing: Packin
     packing = packing if isinstance(message, Rollout) else None
 
     def hook(value: object) -> object:
+        if isinstance(value, PickledCallable):
+            value = np.frombuffer(value.data, np.uint8)
         if not isinstance(value, np.ndarray):
             raise TypeError(f"{type(message).__name__} cannot carry a {type(value).__name__}")
         if value.dtype.str not in DTYPES:
@@ -94,7 +99,7 @@ def decode_to_learner(frames: Sequence[Buffer], packed_bytes_limit: int = 0) -> 
 
 def decode_to_worker(frames: Sequence[Buffer]) -> ToWorker:
     """A message of the learner to a worker. Raises `BadMessage` for anything else, and no other error."""
-    message: ToWorker = _decode(frames, TO_WORKER)
+    message: ToWorker = _decode(frames, TO_WORKER, max_items=MAX_HEAD_BYTES)
     return message
 
 
@@ -104,7 +109,7 @@ def decode_to_observer(frames: Sequence[Buffer]) -> ToObserver:
     return message
 
 
-def _decode(frames: Sequence[Buffer], kinds: MessageTypes, packed_bytes_limit: int = 0) -> Any:
+def _decode(frames: Sequence[Buffer], kinds: MessageTypes, packed_bytes_limit: int = 0, max_items: int = MAX_ITEMS) -> Any:
     if not 1 <= len(frames) <= MAX_FRAMES:
         raise BadMessage(f"message expected 1 to {MAX_FRAMES} frames, got {len(frames)}")
     if len(frames[0]) > MAX_HEAD_BYTES:
@@ -130,13 +135,17 @@ def _decode(frames: Sequence[Buffer], kinds: MessageTypes, packed_bytes_limit: i
             return unpack_array(frame, packings, dtype, shape)
         if size != len(frame):
             raise BadMessage(f"array {dtype.str}{shape} expected {size} bytes, got {len(frame)}")
+        if wanted is PickledCallable:
+            if size > MAX_CALLABLE_BYTES:
+                raise BadMessage(f"callable expected at most {MAX_CALLABLE_BYTES} bytes, got {size}")
+            return PickledCallable(bytes(frame))
         return np.ndarray(shape, dtype, frame if type(frame) is bytes else memoryview(frame).toreadonly())
 
     try:
         head = msgpack.unpackb(
             frames[0],
-            max_array_len=MAX_ITEMS,
-            max_map_len=MAX_ITEMS,
+            max_array_len=max_items,
+            max_map_len=max_items,
             max_ext_len=0,
             strict_map_key=True,
         )
@@ -145,8 +154,10 @@ def _decode(frames: Sequence[Buffer], kinds: MessageTypes, packed_bytes_limit: i
     except BadMessage:
         raise
     except Exception as error:  # msgpack and msgspec raise a dozen types for invalid bytes
-        reason = " ".join(_explain_validation_error(str(error), head, by_position).split())[:200]  # it quotes the peer
+        reason = one_line(" ".join(_explain_validation_error(str(error), head, by_position).split()), 200)  # quotes the peer
         raise BadMessage(f"head is not a message of ours: {type(error).__name__}: {reason}") from error
+    if isinstance(message, Described):
+        check_size(message.description)
     if len(used) != len(frames) - 1:
         raise BadMessage(f"{type(message).__name__}: expected {len(used)} arrays, got {len(frames) - 1} frames")
     return message

@@ -17,7 +17,7 @@ from collections.abc import Iterator, Sequence
 
 import zmq
 
-from protocol.address import check_address, worker_name
+from protocol.address import check_address, name_for_people
 from protocol.errors import BadMessage, RunError, UsageError
 from protocol.keys.key_folder import Keyring
 from protocol.keys.zap import AuthenticatorThread
@@ -102,11 +102,7 @@ class LearnerLink:
 
     def name_for_log(self, peer: bytes) -> str:
         """The name for log lines about this peer: that of its key, or without keys the one it gave itself."""
-        return (
-            worker_name(peer).decode(errors="replace")
-            if self.keyring is None
-            else self.keyring.allowed.name_of(_key_of(peer))
-        )
+        return name_for_people(peer) if self.keyring is None else self.keyring.allowed.name_of(_key_of(peer))
 
     def _peer(self, routing_id: bytes, key: str) -> bytes:
         """The peer that uses this routing id now."""
@@ -125,7 +121,7 @@ class LearnerLink:
             if (kept_back := self._log_limiter.due(why, time.monotonic())) is not None:
                 log.warning(
                     "worker %s is not heard: %s%s",
-                    worker_name(peer).decode(errors="replace"),
+                    name_for_people(peer),
                     why,
                     suppressed_note(kept_back),
                 )

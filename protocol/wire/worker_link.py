@@ -14,6 +14,7 @@ from typing import TypeVar
 import zmq
 
 from protocol.address import check_address, is_local, resolves
+from protocol.bounds import MAX_NAME, one_line
 from protocol.errors import BadMessage, UsageError
 from protocol.keys.handshake import WORKER_EVENTS, ConnectionProblem, connection_problem
 from protocol.keys.keys import Token
@@ -43,9 +44,11 @@ class WorkerLink:
     ) -> None:
         """With a token (only over tcp) the link connects only to the learner of that token."""
         check_address(address)
-        longest = 255 - (TAG_CHARACTERS + 1)
-        if not 1 <= len(name.encode()) <= longest or "\0" in name:
-            raise UsageError(f"worker name {name[:40]!r}: expected 1 to {longest} bytes, got {len(name.encode())}")
+        if not 1 <= len(name.encode()) <= MAX_NAME or one_line(name, MAX_NAME) != name:
+            raise UsageError(
+                f"worker name {name[:40]!r}: expected 1 to {MAX_NAME} bytes without control characters, got "
+                f"{len(name.encode())} bytes"
+            )
         self.address, self.token = address, token
         self.problem: ConnectionProblem | None = None
         """why there is no connection, if known"""

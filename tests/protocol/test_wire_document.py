@@ -9,11 +9,12 @@ import ast
 import inspect
 import re
 import textwrap
+import typing
 from collections.abc import Mapping
 from enum import Enum
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -22,7 +23,7 @@ import pytest
 from learner.members import membership
 from learner.members import states as standing
 from learner.rollouts import ticket_coordinator
-from protocol import env_spec, messages, rollout, specs
+from protocol import bounds, env_spec, messages, rollout, space_spec, specs
 from protocol.keys import handshake
 from protocol.messages import PROTOCOL_VERSION, Collect, Hello, Permit, Received, Rollout, ToLearner, ToWorker, Weights
 from protocol.wire import codec, sockets
@@ -37,11 +38,17 @@ BEGIN, END = "<!-- generated {name}: `make docs` writes what follows -->", "<!--
 RECORDS: tuple[type, ...] = (
     messages.Permit,
     messages.Received,
-    messages.LaneLife,
+    messages.LaneIncarnation,
+    messages.WorkerActivity,
+    messages.WorkerExit,
     messages.WorkerStatus,
     rollout.Episode,
+    space_spec.EnvDescription,
+    *typing.get_args(space_spec.SpaceSpec),
+    specs.DescribeSpec,
     specs.RunSpec,
     specs.StepSpec,
+    specs.ExtraArray,
     env_spec.EnvSpec,
     specs.PolicySpec,
     specs.EncoderSpec,
@@ -67,7 +74,6 @@ WORDS: Mapping[str, str] = {
     "number": "counts the replies of this session, from 1",
     "permits": "the tickets, each for one rollout",
     "received": "one entry for each lane of this worker; a lane that is not listed belongs to another worker",
-    "below": "every sequence below this has arrived",
     "lanes": "the lanes (in `RunSpec`: their number)",
     "run": "the run that the worker joins",
     "episodes": "the episodes that ended in this rollout",
@@ -82,6 +88,21 @@ WORDS: Mapping[str, str] = {
     "activation": "activation function of the hidden layers",
     "kind": "the gymnasium space it comes from",
     "shape": "without T and N",
+    "dtype": "numpy's name of the dtype",
+    "low": "lower bounds",
+    "high": "upper bounds",
+    "n": "number of values",
+    "start": "the smallest value",
+    "worker": "the worker's name",
+    "process_nonce": "`life` of the worker's Hello",
+    "doing": "what it does; environment code runs in all of these except `starting` and `waiting`",
+    "running": "its workers that run",
+    "description": "the environment",
+    "keys": "the keys, in the order of the space",
+    "spaces": "the inner spaces, in order",
+    "name": "its name",
+    "reward": "raw rewards",
+    "render_mode": "gymnasium's render mode; empty if none",
 }
 # What each limit bounds. A new MAX_* constant without a line here fails a test.
 LIMITS: Mapping[tuple[ModuleType, str], str] = {
@@ -90,6 +111,16 @@ LIMITS: Mapping[tuple[ModuleType, str], str] = {
     (codec, "MAX_FRAME_BYTES"): "bytes of any one frame: the connection is closed before more is read",
     (codec, "MAX_ITEMS"): "items of any list or map in the head",
     (codec, "MAX_DIMENSIONS"): "dimensions of an array",
+    (bounds, "MAX_NAME"): "characters of a `Name`",
+    (bounds, "MAX_LINE"): "characters of a `Line`",
+    (bounds, "MAX_TEXT"): "characters of a `Text`",
+    (bounds, "MAX_TICKETS"): "tickets in one message",
+    (bounds, "MAX_WORKERS"): "workers that one supervisor speaks for",
+    (bounds, "MAX_SEEDS"): "episodes of one Evaluate",
+    (space_spec, "MAX_LEAVES"): "arrays of an observation or an action",
+    (space_spec, "MAX_DEPTH"): "levels of Dict and Tuple spaces",
+    (space_spec, "MAX_ELEMENTS"): "elements of all arrays of a space together",
+    (env_spec, "MAX_CALLABLE_BYTES"): "bytes of a pickled callable",
     (packing, "MAX_STACK"): "frames of a stack that travels packed",
     (packing, "MIN_FRAME_BYTES"): "bytes of a frame of such a stack, at least",
     (session, "HELLO_FIRST_S"): "seconds from the first Hello to the second; each wait is twice as long as the last",
@@ -127,8 +158,12 @@ def fields_of(kind: type) -> list[tuple[str, str, str, str]]:
             meaning = after.value.value
         default = "" if node.value is None else ast.unparse(node.value)
         rows.append((node.target.id, ast.unparse(node.annotation), default, meaning))
-    assert [row[0] for row in rows] == [field.name for field in msgspec.structs.fields(kind)]
-    return rows
+    fields = msgspec.structs.fields(kind)
+    assert [row[0] for row in rows] == [field.name for field in fields]
+    return [
+        (field.encode_name, row[1], "" if field.required else row[2], row[3])
+        for field, row in zip(fields, rows, strict=True)
+    ]
 
 
 def record(kind: type[msgspec.Struct]) -> str:
@@ -222,7 +257,26 @@ def part_limits() -> str:
     return "\n".join(lines) + "\n"
 
 
+def part_types() -> str:
+    """A row for each bounded type: its base and its bounds."""
+    lines = ["| type | is | bounds |", "|---|---|---|"]
+    for module in (bounds, space_spec, messages):
+        for name, kind in vars(module).items():
+            if kind is getattr(bounds, name, None) and module is not bounds:
+                continue
+            if typing.get_origin(kind) is typing.Annotated:
+                base, meta = typing.get_args(kind)
+                told = {"ge": "at least", "le": "at most", "min_length": "length at least", "max_length": "length at most"}
+                limits = [f"{said} {limit}" for key, said in told.items() if (limit := getattr(meta, key)) is not None]
+                limits += ["no control characters"] if meta.pattern else []
+                lines.append(f"| `{name}` | `{getattr(base, '__name__', base)}` | {', '.join(limits)} |")
+            elif typing.get_origin(kind) is Literal:
+                lines.append(f"| `{name}` | `str` | one of {', '.join(f'`{one}`' for one in typing.get_args(kind))} |")
+    return "\n".join(lines) + "\n"
+
+
 PARTS = {
+    "types": part_types,
     "version": part_version,
     "example": part_example,
     "dtypes": part_dtypes,
@@ -277,13 +331,16 @@ def test_every_record_that_travels_is_described() -> None:
     for kind in described:
         for field in msgspec.structs.fields(kind):
             for name in re.findall(r"\b[A-Z]\w+", str(field.type)):
-                if isinstance(inner := getattr(messages, name, getattr(specs, name, None)), type):
+                if isinstance(inner := getattr(messages, name, getattr(specs, name, getattr(space_spec, name, None))), type):
                     assert inner in described or not issubclass(inner, msgspec.Struct), f"{kind.__name__}.{field.name}"
 
 
 def test_every_limit_is_in_the_document() -> None:
-    for module in (codec, sockets, packing, session, held_rollouts, ticket_coordinator, messages, rollout, specs):
-        for name in re.findall(r"^(MAX_\w+) = ", inspect.getsource(module), re.MULTILINE):
+    for module in (
+        bounds, space_spec, env_spec, codec, sockets, packing, session, held_rollouts, ticket_coordinator, messages, rollout,
+        specs,
+    ):  # fmt: skip
+        for name in re.findall(r"^(MAX_\w+)(?:, MAX_\w+)* = ", inspect.getsource(module), re.MULTILINE):
             assert (module, name) in LIMITS, f"say in LIMITS what {name} bounds"
 
 
@@ -301,7 +358,7 @@ def test_a_worker_is_told_by_its_table_what_to_do_with_every_message() -> None:
 
 
 def test_a_difference_is_noticed() -> None:
-    text = DOCUMENT.read_text(encoding="utf-8").replace("| `sequence` | `int`", "| `sequence` | `str`")
+    text = DOCUMENT.read_text(encoding="utf-8").replace("| `sequence` | `Natural`", "| `sequence` | `str`")
     assert rewritten(text) != text
 
 
@@ -318,7 +375,8 @@ def test_from_the_document_alone_a_head_can_be_read(kind: type[msgspec.Struct]) 
     head = msgspec.to_builtins(kind(**fields))
     if kind in (Hello, messages.Refuse):
         assert "A map; `type` is" in text
-        assert (places, head) == ({}, {"type": kind.__name__} | fields)
+        wire_names = dict(zip(kind.__struct_encode_fields__, fields.values(), strict=True))
+        assert (places, head) == ({}, {"type": kind.__name__} | wire_names)
     else:
         assert head == [kind.__name__, *fields.values()]
         assert {name: head[place] for name, place in places.items()} == fields

@@ -20,7 +20,7 @@ from protocol.messages import (
     Heartbeat,
     HeartbeatReply,
     Hello,
-    LaneLife,
+    LaneIncarnation,
     Permit,
     Received,
     Refuse,
@@ -181,7 +181,7 @@ def test_welcome_to_another_session_of_the_same_attempt_starts_anew() -> None:
 def test_every_other_message_while_joining_is_ignored() -> None:
     session = joining()
     session.tick(0.0)
-    for message in (weights(0), collect((0, 0)), HeartbeatReply(0, 1, ()), Release(0, (LaneLife(0, 0),)), Rejoin(0)):
+    for message in (weights(0), collect((0, 0)), HeartbeatReply(0, 1, ()), Release(0, (LaneIncarnation(0, 0),)), Rejoin(0)):
         assert session.handle(message, 0.1) == []
     assert (session.state, session.held_count()) == (State.JOINING, 0)
 
@@ -362,10 +362,10 @@ def test_a_rollout_acknowledges_the_weights_it_was_acted_under() -> None:
 def test_a_heartbeat_every_heartbeat_s_lists_all_tickets() -> None:
     session = ready(collect((7, 0), (8, 1), version=9))
     session.handle(HeartbeatReply(SESSION, 4, lanes(0, 1)), 0.5)
-    session.update_statistics(Statistics(120, {"env": 0.5}, 0))
+    session.update_statistics(Statistics(120, {"step": 0.5}, 0))
     assert session.tick(0.9) == []
     (heartbeat,) = sent(session.tick(1.0), Heartbeat)
-    assert heartbeat == Heartbeat(SESSION, 4, 0, (7, 8), 120, {"env": 0.5}, 0)
+    assert heartbeat == Heartbeat(SESSION, 4, 0, (7, 8), 120, {"step": 0.5}, 0)
     assert session.next_due_s() == 2.0
 
 
@@ -405,14 +405,14 @@ def test_a_ticket_of_an_older_incarnation_is_ignored() -> None:
 def test_release_closes_the_lane_and_drops_its_tickets_and_rollouts() -> None:
     session = ready(collect((0, 0), (1, 1)))
     collected(session)
-    assert session.handle(Release(SESSION, (LaneLife(0, 0),)), 0.1) == [CloseLanes((LaneLife(0, 0),))]
+    assert session.handle(Release(SESSION, (LaneIncarnation(0, 0),)), 0.1) == [CloseLanes((LaneIncarnation(0, 0),))]
     assert session.held_count() == 1
-    assert session.handle(Release(SESSION, (LaneLife(0, 0),)), 0.2) == []  # a repeat
+    assert session.handle(Release(SESSION, (LaneIncarnation(0, 0),)), 0.2) == []  # a repeat
 
 
 def test_a_late_release_does_not_close_a_later_incarnation() -> None:
     session = ready(collect((0, 0), incarnation=2))
-    assert session.handle(Release(SESSION, (LaneLife(0, 1),)), 0.1) == []
+    assert session.handle(Release(SESSION, (LaneIncarnation(0, 1),)), 0.1) == []
     assert session.held_count() == 1
 
 
@@ -423,13 +423,13 @@ def test_a_late_release_does_not_close_a_later_incarnation() -> None:
 )
 def test_a_lane_missing_from_received_is_closed(message: ToWorker) -> None:
     session = ready(collect((0, 0), (1, 1)))
-    assert session.handle(message, 1.0) == [CloseLanes((LaneLife(0, 0),))]
+    assert session.handle(message, 1.0) == [CloseLanes((LaneIncarnation(0, 0),))]
 
 
 def test_a_rollout_of_a_lane_that_was_released_while_it_was_collected_is_not_sent() -> None:
     session = ready(collect((0, 0), (1, 1)))
     task = task_of(session)
-    session.handle(Release(SESSION, (LaneLife(0, 0),)), 0.1)
+    session.handle(Release(SESSION, (LaneIncarnation(0, 0),)), 0.1)
     assert [rollout.lane for rollout in sent(session.finished(fake_rollouts(task)), Rollout)] == [1]
 
 
@@ -442,7 +442,7 @@ def test_nothing_of_a_session_outlives_it() -> None:
     session.finished(rollouts)
     session.handle(HeartbeatReply(SESSION, 9, lanes(0, 1)), 0.1)
     closed, *_ = session.handle(Rejoin(SESSION), 1.0)
-    assert closed == CloseLanes((LaneLife(0, 0), LaneLife(1, 0)))
+    assert closed == CloseLanes((LaneIncarnation(0, 0), LaneIncarnation(1, 0)))
     assert session.held_count() == 0
     session.handle(Welcome(12, 2, RUN), 1.1)
     assert session.held_count() == 0
@@ -470,7 +470,7 @@ def test_a_message_of_another_session_is_ignored() -> None:
     for message in (
         msgspec.structs.replace(collect((5, 0)), session=other),
         HeartbeatReply(other, 7, ()),
-        Release(other, (LaneLife(0, 0),)),
+        Release(other, (LaneIncarnation(0, 0),)),
         Rejoin(other),
     ):
         assert session.handle(message, 1.0) == []
@@ -482,7 +482,7 @@ def test_rejoin_is_answered_by_hello_at_once() -> None:
     session = ready(collect((0, 0)))
     effects = session.handle(Rejoin(SESSION), 3.0)
     assert session.state is State.JOINING
-    assert effects[0] == CloseLanes((LaneLife(0, 0),))
+    assert effects[0] == CloseLanes((LaneIncarnation(0, 0),))
     assert hello_attempt(effects) == 2
 
 
@@ -653,7 +653,7 @@ EVERY_MESSAGE: list[ToWorker] = [
     Rejoin(SESSION),
     weights(5),
     collect((50, 0)),
-    Release(SESSION, (LaneLife(0, 0),)),
+    Release(SESSION, (LaneIncarnation(0, 0),)),
     HeartbeatReply(SESSION, 1, lanes(0)),
     Drain("finished"),
     Reset(SESSION, 60, 0, 0, (0,), (None,), np.zeros(0, np.uint8)),

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from protocol.arrays import Array, Floats
+from protocol.bounds import Stages
 from protocol.envs.envpool import envpool_spec
 from protocol.envs.spaces import make_action_converter
 from protocol.envs.vectorized import make_native
@@ -78,7 +79,7 @@ class Collector:
         """`step_all`: steps the env copies of all lanes at once, if one vector environment holds them all."""
         self.steps = 0
         """number of env steps collected; rows that are not valid do not count"""
-        self.stages = {"open": 0.0, "act": 0.0, "step": 0.0}
+        self.stages: Stages = {"open": 0.0, "act": 0.0, "step": 0.0}
         """seconds spent opening lanes (making copies and their first reset), choosing actions and stepping copies"""
         self._run = run
         self._policy = policy

@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from protocol.messages import LaneLife, Permit, Received, Rollout
+from protocol.messages import LaneIncarnation, Permit, Received, Rollout
 
 REMEMBERED_TICKETS = 64  # finished tickets of a lane, to recognize a late repeat of their Collect
 
@@ -87,7 +87,7 @@ class HeldRollouts:
             if lane is None or lane.incarnation != of_lane.incarnation:
                 continue
             for ticket, rollout in list(lane.kept.items()):
-                if rollout.sequence < of_lane.below or rollout.sequence in of_lane.ahead:
+                if rollout.sequence < of_lane.next_sequence or rollout.sequence in of_lane.out_of_order:
                     del lane.kept[ticket]
                     lane.finished.append(ticket)
 
@@ -95,16 +95,16 @@ class HeldRollouts:
         """Tickets that are not yet collected."""
         return tuple(ticket for lane in self._lanes.values() for ticket in lane.tickets)
 
-    def lanes(self) -> tuple[LaneLife, ...]:
+    def lanes(self) -> tuple[LaneIncarnation, ...]:
         """The lanes of this worker."""
-        return tuple(LaneLife(number, lane.incarnation) for number, lane in self._lanes.items())
+        return tuple(LaneIncarnation(number, lane.incarnation) for number, lane in self._lanes.items())
 
-    def release(self, lives: Sequence[LaneLife]) -> list[LaneLife]:
+    def release(self, lanes: Sequence[LaneIncarnation]) -> list[LaneIncarnation]:
         """Drop these lanes. Returns those that were here, in this or an earlier incarnation."""
         released = []
-        for life in lives:
-            lane = self._lanes.get(life.lane)
-            if lane is not None and lane.incarnation <= life.incarnation:
-                del self._lanes[life.lane]
-                released.append(LaneLife(life.lane, lane.incarnation))
+        for old in lanes:
+            lane = self._lanes.get(old.lane)
+            if lane is not None and lane.incarnation <= old.incarnation:
+                del self._lanes[old.lane]
+                released.append(LaneIncarnation(old.lane, lane.incarnation))
         return released

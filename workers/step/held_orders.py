@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from protocol.messages import Answer, LaneLife, Order
+from protocol.messages import Answer, LaneIncarnation, Order
 
 
 @dataclass
@@ -54,16 +54,16 @@ class HeldOrders:
         """Tickets of the orders that are not yet executed."""
         return tuple(lane.order.ticket for lane in self._lanes.values() if lane.order is not None)
 
-    def lanes(self) -> tuple[LaneLife, ...]:
+    def lanes(self) -> tuple[LaneIncarnation, ...]:
         """The lanes of this worker."""
-        return tuple(LaneLife(number, lane.incarnation) for number, lane in self._lanes.items())
+        return tuple(LaneIncarnation(number, lane.incarnation) for number, lane in self._lanes.items())
 
-    def release(self, lives: Sequence[LaneLife]) -> list[LaneLife]:
+    def release(self, lanes: Sequence[LaneIncarnation]) -> list[LaneIncarnation]:
         """Drop these lanes. Returns those that were here, in this or an earlier incarnation."""
         released = []
-        for life in lives:
-            lane = self._lanes.get(life.lane)
-            if lane is not None and lane.incarnation <= life.incarnation:
-                del self._lanes[life.lane]
-                released.append(LaneLife(life.lane, lane.incarnation))
+        for old in lanes:
+            lane = self._lanes.get(old.lane)
+            if lane is not None and lane.incarnation <= old.incarnation:
+                del self._lanes[old.lane]
+                released.append(LaneIncarnation(old.lane, lane.incarnation))
         return released

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from protocol.bounds import Stages, last_text, one_line
 from protocol.cpu_cores import usable_cores
 from protocol.errors import UsageError, first_line
 from protocol.messages import Answer, Array, Call, Order, Reset, Returned, Step, Stepped
@@ -24,8 +25,6 @@ from protocol.wire.wake_up import CAN_SPIN, SPIN_S, SpinWait, WakePipe, WakeReas
 from workers.env_errors import CopyRaised, lane_failed
 from workers.env_loop import Infos, Pulse
 from workers.step.stepped_lane import Rows, SteppedLane, new_rows
-
-MAX_TRACEBACK = 20_000  # characters
 
 
 class Stepper:
@@ -40,7 +39,7 @@ class Stepper:
         """
         self.steps = 0
         """env steps made"""
-        self.stages = {"open": 0.0, "step": 0.0}
+        self.stages: Stages = {"open": 0.0, "step": 0.0}
         """seconds spent making and resetting copies, and stepping them"""
         self._spec, self._allow_private_names = spec, allow_private_names
         self._lanes: dict[int, SteppedLane] = {}
@@ -208,7 +207,7 @@ def _call(order: Call, lane: SteppedLane, allow_private_names: bool) -> Returned
     except Exception as raised:
         packed, error, detail = (
             b"",
-            f"{type(raised).__name__}: {first_line(raised)}",
-            traceback.format_exc()[-MAX_TRACEBACK:],
+            one_line(f"{type(raised).__name__}: {first_line(raised)}"),
+            last_text(traceback.format_exc()),
         )
     return Returned(order.session, order.ticket, order.lane, order.incarnation, _array(packed), error, detail)

@@ -12,7 +12,7 @@ import pytest
 from learner.config.config import Config
 from learner.members.endpoint import generate_run_keys, join_lines, keyring_for
 from protocol.address import advertised_address, check_address, is_local, needs_ipv6, resolves
-from protocol.env_spec import AllowedCode, EnvSpec
+from protocol.env_spec import AllowedCode, EnvSpec, PickledCallable
 from protocol.errors import UsageError
 from protocol.keys.key_folder import KeyFolder
 from protocol.keys.keys import ClientList, Key, Token
@@ -136,7 +136,7 @@ def test_a_socket_file_needs_no_token(address: str) -> None:
     assert checked_token(address, TOKEN, insecure=False) is None, "the environment may hold one for other learners"
 
 
-MODULE, CALLABLE = EnvSpec("os:Env-v0"), EnvSpec("mine", factory=b"pickle")
+MODULE, CALLABLE = EnvSpec("os:Env-v0"), EnvSpec("mine", factory=PickledCallable(b"pickle"))
 REGISTERED = [EnvSpec("CartPole-v1"), EnvSpec("ALE/Pong-v5"), EnvSpec("millrace/CartDoublePendulum-v0")]
 
 

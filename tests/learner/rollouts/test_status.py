@@ -47,14 +47,14 @@ def test_it_tells_of_the_run_and_of_every_worker_in_the_order_of_joining() -> No
     found = told(learner)
     assert (found.env, found.version) == (learner.coordinator.run.env.id, 0)
     assert (found.env_steps, found.total_steps, found.return_mean, found.lag_max) == (1_000, 10_000, 12.5, 2)
-    assert [(w.worker, w.host, w.pid, w.standing) for w in found.workers] == [
+    assert [(w.worker, w.host, w.pid, w.state) for w in found.workers] == [
         ("b", "host", 7, "active"),
         ("a", "far", 1, "active"),
     ]
     assert sorted(lane for worker in found.workers for lane in worker.lanes) == [0, 1, 2]
     assert found.ledger == learner.coordinator.ledger.counts()
     learner.coordinator.drain("done")
-    assert {worker.standing for worker in told(learner).workers} == {"draining"}
+    assert {worker.state for worker in told(learner).workers} == {"draining"}
 
 
 def test_silence_is_counted_from_the_last_message() -> None:

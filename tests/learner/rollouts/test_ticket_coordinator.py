@@ -23,7 +23,7 @@ from protocol.messages import (
     Heartbeat,
     HeartbeatReply,
     Hello,
-    LaneLife,
+    LaneIncarnation,
     Permit,
     Received,
     Refuse,
@@ -88,7 +88,7 @@ class Learner:
         """The rollout of an outstanding ticket, as its worker would send it."""
         ticket = self.coordinator.tickets[number]
         lane = self.coordinator.lanes[ticket.lane]
-        expected = lane.below + sorted(lane.outstanding).index(number)
+        expected = lane.next_sequence + sorted(lane.outstanding).index(number)
         return fake_rollout(
             self.session(ticket.peer),
             ticket.lane,
@@ -472,7 +472,7 @@ def test_lanes_even_out_to_a_newcomer_only_at_a_rollout_boundary() -> None:
     assert of(learner.joins(B), Release) == []  # every lane is in the middle of a rollout
     assert lanes_of(learner, B) == set()
     outs = learner.delivers(3)  # lane 3 is at its boundary
-    assert of(outs, Release, A) == [Release(learner.session(A), (LaneLife(3, 0),))]
+    assert of(outs, Release, A) == [Release(learner.session(A), (LaneIncarnation(3, 0),))]
     assert lanes_of(learner, B) == {3}
     assert learner.coordinator.lanes[3].incarnation == 1
     learner.update()
@@ -741,7 +741,7 @@ def test_a_late_bad_rollout_of_an_ended_session_does_not_touch_the_ticket_of_the
     late = fake_rollout(session=5, lane=0, ticket=0, version=0, sequence=3)
     learner.balanced(learner.coordinator.reject_rollout(A, late, "obs are NaN", 0.0))
     assert learner.tickets(A) == [0]
-    assert learner.coordinator.lanes[0].ahead == set()
+    assert learner.coordinator.lanes[0].out_of_order == set()
 
 
 @pytest.mark.parametrize("sequence", [-1, 1, 1 << 62])
@@ -750,7 +750,7 @@ def test_a_rollout_whose_sequence_cannot_be_is_not_used(sequence: int) -> None:
     learner = Learner(lanes=1)
     learner.joins(A)
     learner.says(A, learner.rollout_of(0, sequence=sequence))
-    assert learner.coordinator.lanes[0].ahead == set()
+    assert learner.coordinator.lanes[0].out_of_order == set()
     assert learner.coordinator.ledger.transitions_invalid == 1
 
 

@@ -17,7 +17,7 @@ from protocol.messages import (
     Goodbye,
     Heartbeat,
     Hello,
-    LaneLife,
+    LaneIncarnation,
     Order,
     Refuse,
     Rejoin,
@@ -54,7 +54,7 @@ def order_coordinator(*peers: bytes) -> OrderCoordinator:
     return made
 
 
-def step(session: int, ticket: int, life: LaneLife) -> Order:
+def step(session: int, ticket: int, life: LaneIncarnation) -> Order:
     return Step(session, ticket, life.lane, life.incarnation, (np.zeros(1, np.int64),))
 
 

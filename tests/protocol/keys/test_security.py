@@ -45,8 +45,8 @@ NOW = datetime(2026, 11, 21, 10, tzinfo=UTC)
 SERVER, LAB, HOME, STRANGER = (Key.new() for _ in range(4))
 
 
-def hello(worker: str = "w0", life: int = 1) -> Hello:
-    return Hello(PROTOCOL_VERSION, worker, "host", 1, life, "fake", 1)
+def hello(worker: str = "w0", process_nonce: int = 1) -> Hello:
+    return Hello(PROTOCOL_VERSION, worker, "host", 1, process_nonce, "fake", 1)
 
 
 def token(client: Key = LAB, server: Key = SERVER) -> Token:
@@ -520,12 +520,12 @@ def test_another_key_cannot_speak_in_a_workers_session_nor_take_it_over(net: Net
     routing_id = peer.rpartition(b"\0")[0]
     lanes = set(member.lanes)
     thief = net.raw(learner, token(HOME), routing_id)
-    for message in (Heartbeat(member.session, 0, 0, (), 0, {}, 0), hello(life=2)):
+    for message in (Heartbeat(member.session, 0, 0, (), 0, {}, 0), hello(process_nonce=2)):
         thief.send_multipart(encode(message))
     serve(hub, lambda: len(hub.coordinator.members) == 2)
     assert hub.coordinator.members[peer] is member, "the session was replaced"
     assert member.heartbeat is None, "another key's heartbeat was taken for this one's"
-    assert member.hello.life == 1
+    assert member.hello.process_nonce == 1
     assert member.lanes <= lanes
     other = next(m for p, m in hub.coordinator.members.items() if p != peer)
     assert other.session != member.session
@@ -538,7 +538,7 @@ def test_what_is_meant_for_one_key_is_not_sent_to_another(net: Net) -> None:
     worker.send(encode(hello()))
     ((mine, _),) = heard(learner)
     thief = net.raw(learner, token(HOME), mine.rpartition(b"\0")[0])
-    thief.send_multipart(encode(hello(life=2)))
+    thief.send_multipart(encode(hello(process_nonce=2)))
     ((theirs, _),) = heard(learner)
     assert mine != theirs
     assert not learner.send(mine, encode(Rejoin(1)))
@@ -565,7 +565,7 @@ def test_two_workers_of_one_name_and_two_keys_do_not_disturb_each_other(net: Net
     hub = hub_of(learner)
     workers = [net.worker(learner, token(client)) for client in (LAB, HOME)]
     for number, worker in enumerate(workers):
-        worker.send(encode(hello(life=number)))
+        worker.send(encode(hello(process_nonce=number)))
     serve(hub, lambda: len(hub.coordinator.members) == 2)
     for worker in workers:
         assert worker.poll(DEADLINE_S)

@@ -1,0 +1,64 @@
+"""Bounds of everything that a peer sends, as types for the fields of messages. Pure.
+
+Rule: every text, number and list in a message has a bound, and decoding refuses what exceeds it. So a peer can neither fill
+the memory nor a log, nor write control characters to a terminal. A sender makes its own texts fit (`one_line`, `text`).
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+MAX_NAME, MAX_LINE, MAX_TEXT = 200, 1_000, 64_000  # characters
+LARGEST = 2**53  # every whole number up to here is exact as a float64 too
+MAX_TICKETS = 1 << 16  # in one message
+MAX_WORKERS = 1_024  # that one supervisor speaks for
+MAX_SEEDS = 1_024  # in one order to evaluate
+
+_NO_CONTROL = r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]*\Z"
+
+Name = Annotated[str, Meta(max_length=MAX_NAME, pattern=_NO_CONTROL)]
+Line = Annotated[str, Meta(max_length=MAX_LINE, pattern=_NO_CONTROL)]
+Text = Annotated[str, Meta(max_length=MAX_TEXT)]
+"""Several lines, as a traceback. It may hold control characters: `escaped` makes it safe to show."""
+Natural = Annotated[int, Meta(ge=0, le=LARGEST)]
+Count = Annotated[int, Meta(ge=1, le=LARGEST)]
+Whole = Annotated[int, Meta(ge=-LARGEST, le=LARGEST)]
+Version = Annotated[int, Meta(ge=-1, le=LARGEST)]
+Pid = Annotated[int, Meta(ge=0, le=2**31)]
+Seconds = Annotated[float, Meta(ge=0, le=1e9)]
+Real = Annotated[float, Meta(ge=-1.7976931348623157e308, le=1.7976931348623157e308)]
+"""A finite number."""
+Tickets = Annotated[tuple[Natural, ...], Meta(max_length=MAX_TICKETS)]
+
+Stage = Literal["open", "act", "step", "evaluate", "wait"]
+"""Stages in which a worker spends its time."""
+Stages = dict[Stage, Seconds]
+
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+_CONTROL_EXCEPT_NEWLINE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+
+
+def one_line(text: str, most: int = MAX_LINE) -> str:
+    """The text as a `Line`, or as a `Name`: control characters are escaped (`\\x1b`), and what is too long is cut."""
+    return _cut(_CONTROL.sub(_escape, text), most)
+
+
+def escaped(text: str) -> str:
+    """A text of several lines without control characters, safe to show."""
+    return _CONTROL_EXCEPT_NEWLINE.sub(_escape, text)
+
+
+def last_text(text: str) -> str:
+    """The text as a `Text`: of one that is too long, the end, where a traceback says what was raised."""
+    return escaped(text)[-MAX_TEXT:]
+
+
+def _escape(match: re.Match[str]) -> str:
+    return match[0].encode("unicode_escape").decode()
+
+
+def _cut(text: str, most: int) -> str:
+    return text if len(text) <= most else f"{text[: most - 1]}…"

@@ -1,0 +1,125 @@
+"""An environment as plain data: its spaces with exact bounds, its metadata and its time limit. It travels in `Described`.
+
+Rule: sizes are checked before anything of that size is allocated. `check_size` is called on what a peer sent, before the
+spaces are made.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from protocol.arrays import Array
+from protocol.bounds import Count, Name, Natural, Text, Whole
+from protocol.errors import BadMessage
+
+MAX_LEAVES = 48  # arrays of an observation: a rollout sends each in a frame of its own
+MAX_DEPTH = 8
+MAX_ELEMENTS = 1 << 24  # of all leaves of a space together
+
+Shape = Annotated[tuple[Natural, ...], Meta(max_length=8)]
+Dtype = Literal[
+    "bool", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float16", "float32", "float64"
+]
+
+
+class BoxSpace(msgspec.Struct, frozen=True, tag=True, array_like=True):
+    """`gymnasium.spaces.Box`. `low` and `high` have the dtype of the space."""
+
+    shape: Shape
+    dtype: Dtype
+    low: Array
+    """[*shape], or [] if all lower bounds are equal"""
+    high: Array
+    """[*shape], or [] if all upper bounds are equal"""
+
+
+class DiscreteSpace(msgspec.Struct, frozen=True, tag=True, array_like=True):
+    """`gymnasium.spaces.Discrete`."""
+
+    n: Count
+    start: Whole
+    dtype: Dtype
+
+
+class MultiDiscreteSpace(msgspec.Struct, frozen=True, tag=True, array_like=True):
+    """`gymnasium.spaces.MultiDiscrete`."""
+
+    dtype: Dtype
+    nvec: Array
+    """[*shape] int64"""
+    start: Array
+    """[*shape] int64"""
+
+
+class MultiBinarySpace(msgspec.Struct, frozen=True, tag=True, array_like=True):
+    """`gymnasium.spaces.MultiBinary`."""
+
+    shape: Shape
+
+
+class DictSpace(msgspec.Struct, frozen=True, tag=True, array_like=True):
+    """`gymnasium.spaces.Dict`."""
+
+    keys: Annotated[tuple[Name, ...], Meta(max_length=MAX_LEAVES)]
+    spaces: Annotated[
+        tuple[BoxSpace | DiscreteSpace | MultiDiscreteSpace | MultiBinarySpace | DictSpace | TupleSpace, ...],
+        Meta(max_length=MAX_LEAVES),
+    ]
+
+
+class TupleSpace(msgspec.Struct, frozen=True, tag=True, array_like=True):
+    """`gymnasium.spaces.Tuple`."""
+
+    spaces: Annotated[
+        tuple[BoxSpace | DiscreteSpace | MultiDiscreteSpace | MultiBinarySpace | DictSpace | TupleSpace, ...],
+        Meta(max_length=MAX_LEAVES),
+    ]
+
+
+SpaceSpec = BoxSpace | DiscreteSpace | MultiDiscreteSpace | MultiBinarySpace | DictSpace | TupleSpace
+
+
+class EnvDescription(msgspec.Struct, frozen=True, array_like=True):
+    """All that the learner knows of the environment."""
+
+    observation: SpaceSpec
+    action: SpaceSpec
+    metadata: Array
+    """[bytes] uint8, `protocol.wire.plain_values`: `Env.metadata` as far as it is plain data"""
+    spec: Text
+    """gymnasium's `EnvSpec` as JSON; empty if the environment has none, or one that JSON cannot hold"""
+    longest_episode: Natural
+    """time limit in env steps; 0 if there is none"""
+    render_mode: Name
+
+
+def check_size(description: EnvDescription) -> None:
+    """Raise `BadMessage` if the spaces exceed the limits of leaves, nesting or elements. Allocates nothing."""
+    for name, space in (("observation", description.observation), ("action", description.action)):
+        leaves = list(_leaves(space, 0))
+        if len(leaves) > MAX_LEAVES:
+            raise BadMessage(f"{name} space: expected at most {MAX_LEAVES} arrays, got {len(leaves)}")
+        elements = sum(leaves)
+        if elements > MAX_ELEMENTS:
+            raise BadMessage(f"{name} space: expected at most {MAX_ELEMENTS} elements, got {elements}")
+
+
+def _leaves(space: SpaceSpec, depth: int) -> Iterator[int]:
+    """The number of elements of each array."""
+    if depth > MAX_DEPTH:
+        raise BadMessage(f"space: expected at most {MAX_DEPTH} levels of Dict and Tuple, got more")
+    match space:
+        case DictSpace(_, spaces) | TupleSpace(spaces):
+            for inner in spaces:
+                yield from _leaves(inner, depth + 1)
+        case BoxSpace(shape) | MultiBinarySpace(shape):
+            yield math.prod(shape)
+        case MultiDiscreteSpace(_, nvec):
+            yield nvec.size
+        case DiscreteSpace():
+            yield 1
