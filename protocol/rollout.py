@@ -138,10 +138,11 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
         raise BadRollout(f"episodes: expected {int(np.count_nonzero(ended & rollout.valid))}, got {len(rollout.episodes)}")
     steps_so_far = (rollout.sequence + 1) * T  # of this incarnation of the lane
     for episode in rollout.episodes:
-        if episode.length > steps_so_far:
-            raise BadRollout(f"episode: expected at most {steps_so_far} steps, got {episode.length}")
-        if abs(episode.reward) > episode.length * LARGEST_REWARD:
-            raise BadRollout(f"episode: expected a return of {episode.length} rewards of float32, got {episode.reward}")
+        whole = 0 < episode.length <= steps_so_far and 0 <= episode.seconds < math.inf
+        if not (whole and abs(episode.reward) <= episode.length * LARGEST_REWARD):  # false for NaN too
+            raise BadRollout(
+                f"episode: expected a finite return of 1 to {steps_so_far} float32 rewards and a duration, got {episode}"
+            )
         if len(episode.facts) != len(run.facts):
             raise BadRollout(f"episode: expected {len(run.facts)} facts, got {len(episode.facts)}")
 

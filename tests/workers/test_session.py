@@ -15,6 +15,7 @@ from protocol.messages import (
     Call,
     Collect,
     Drain,
+    Evaluate,
     Failure,
     Goodbye,
     Heartbeat,
@@ -659,6 +660,7 @@ EVERY_MESSAGE: list[ToWorker] = [
     Reset(SESSION, 60, 0, 0, (0,), (None,), np.zeros(0, np.uint8)),
     Step(SESSION, 61, 0, 0, (np.zeros(1),)),
     Call(SESSION, 62, 0, 0, (0,), "render_mode", False, np.zeros(0, np.uint8)),
+    Evaluate(SESSION, 63, 5, (1, 2), True, 100, False, False),
 ]
 
 

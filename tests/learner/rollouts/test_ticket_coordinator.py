@@ -16,8 +16,12 @@ from learner.rollouts.ledger import Ledger
 from learner.rollouts.ticket_coordinator import STRIKES, TicketCoordinator
 from protocol.messages import (
     PROTOCOL_VERSION,
+    Alive,
     Collect,
+    Described,
     Drain,
+    EpisodeRows,
+    Evaluated,
     Failure,
     Goodbye,
     Heartbeat,
@@ -35,7 +39,9 @@ from protocol.messages import (
     ToLearner,
     Weights,
     Welcome,
+    WorkerActivity,
 )
+from protocol.space_spec import EnvDescription, MultiBinarySpace
 from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollout, run_spec
 
 M = TypeVar("M")
@@ -973,6 +979,10 @@ EVERY_MESSAGE: list[ToLearner] = [
     Failure(100, "broke", "", None),
     Stepped(100, 0, 0, 0, (), *(np.zeros(1) for _ in range(4))),
     Returned(100, 0, 0, 0, np.zeros(0, np.uint8), "", ""),
+    Described(100, EnvDescription(*[MultiBinarySpace((1,))] * 2, np.zeros(0, np.uint8), "", 0, "")),
+    EpisodeRows(100, 0, 0, 0, (), *(np.zeros(1) for _ in range(4))),
+    Evaluated(100, 0, (), ()),
+    Alive((WorkerActivity("a", 1001, "stepping", 1.0, 1),), ()),
 ]
 
 

@@ -189,7 +189,13 @@ def test_values_that_are_not_of_the_space_are_refused() -> None:
     assert altered(observation="discrete", obs=lambda o: (o[0] + 100,)).startswith("obs: expected ")
     assert altered(observation="multidiscrete", obs=lambda o: (o[0] + 100,)).startswith("obs: expected ")
     assert altered(action_space="multibinary", action=lambda a: a + 2).startswith("action: expected 0 to 1, got ")
-    assert altered(episodes=lambda e: (Episode(float("nan"), 1, 1.0), *e[1:])).startswith(
-        "episode: expected a finite return"
-    )
-    assert altered(episodes=lambda e: (Episode(1.0, 0, 1.0), *e[1:])).startswith("episode: expected a finite return")
+
+    def with_episode(episode: Episode) -> str:
+        return altered(episodes=lambda episodes: (episode, *episodes[1:]))
+
+    for impossible in (
+        Episode(float("nan"), 1, 1.0), Episode(1.0, 0, 1.0), Episode(1e308, 1, 1.0), Episode(1.0, 10_000, 1.0),
+        Episode(1.0, 1, float("nan")), Episode(1.0, 1, -1.0),
+    ):  # fmt: skip
+        assert with_episode(impossible).startswith("episode: expected a finite return"), impossible
+    assert with_episode(Episode(1.0, 1, 1.0, (1.0,))) == "episode: expected 0 facts, got 1"
