@@ -979,7 +979,7 @@ EVERY_MESSAGE: list[ToLearner] = [
     Failure(100, "broke", "", None),
     Stepped(100, 0, 0, 0, (), *(np.zeros(1) for _ in range(4))),
     Returned(100, 0, 0, 0, np.zeros(0, np.uint8), "", ""),
-    Described(100, EnvDescription(*[MultiBinarySpace((1,))] * 2, np.zeros(0, np.uint8), "", 0, "")),
+    Described(100, EnvDescription(MultiBinarySpace((1,)), MultiBinarySpace((1,)), np.zeros(0, np.uint8), "", 0, "")),
     EpisodeRows(100, 0, 0, 0, (), *(np.zeros(1) for _ in range(4))),
     Evaluated(100, 0, (), ()),
     Alive((WorkerActivity("a", 1001, "stepping", 1.0, 1),), ()),
