@@ -64,7 +64,8 @@ until [ -s "$address" ] || ! kill -0 "$learner" 2>/dev/null; do sleep 0.2; done
     "${{millrace[@]}}" worker "$(cat "$address")" --token "$token" --join-timeout-s 600 &
 workers=$!
 
-# SIGTERM to the learner's step: it writes a checkpoint and tells the workers to leave. A signal to srun would kill them.
+# Before the time limit: send SIGTERM to the learner's job step, not to srun, which would kill its tasks. The learner then
+# writes a checkpoint and tells the workers to leave.
 again=0
 trap 'again=1; scancel --signal=TERM "$SLURM_JOB_ID.0"' USR1  # {flags.save_s} s before the time limit
 trap : TERM  # scancel: Slurm signals both steps itself
