@@ -1,4 +1,4 @@
-"""The mathematics of learning. No sockets, no files.
+"""The learning algorithms. No sockets, no files.
 
 Each algorithm is one class in one file. Its settings are one record in `learner.config.hyperparameters`. `ALGORITHMS` here
 and `HYPERPARAMETERS` there list them by name. Importing this module does not import torch; calling `algorithm_class` does.
@@ -25,7 +25,7 @@ ALGORITHMS = {
 
 
 class Algorithm(Protocol):
-    """What the training loop of `learner.train` needs of an algorithm."""
+    """The interface of an algorithm, as the training loop of `learner.train` uses it."""
 
     whole_episodes: ClassVar[bool]
     """True if the algorithm learns only from whole episodes: a run whose rollouts are too short for one is refused."""
@@ -47,7 +47,7 @@ class Algorithm(Protocol):
         ...
 
     def weights(self) -> tuple[Floats, Floats]:
-        """Copies of the acting parameters [P] and of the policy's buffers, both float32, as `Weights` carries them."""
+        """Copies of the acting parameters [P] and of the policy's buffers, both float32, for a `Weights` message."""
         ...
 
     def state_dict(self) -> dict[str, Any]:

@@ -23,7 +23,7 @@ class A2C(ActorCritic):
         return self.config.normalize_advantage
 
     def estimate(self, batch: Batch, observations: Observations, reward: Floats, pulse: Pulse) -> Estimates:
-        """Generalized advantage estimates, and their sums with the values as targets."""
+        """Generalized advantage estimates A, and the targets A + V."""
         config, values = self.config, self.values(observations, pulse)
         advantage = gae(reward, values, EpisodeEnds.of(batch), config.gamma, config.gae_lambda)
         return Estimates(advantage, advantage + values[:-1], values, batch.valid, {})

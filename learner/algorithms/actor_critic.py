@@ -43,30 +43,31 @@ class Estimates(NamedTuple):
     """Targets and advantages of a batch, computed before the losses. Arrays are [T, ΣN]."""
 
     advantage: Floats
-    target: Floats  # what the values are fitted to
-    values: Floats  # [T+1, ΣN] the values that both were computed with
-    mask: Bools  # True for the rows to learn from, all of them valid
+    target: Floats  # the critic is trained to predict these
+    values: Floats  # [T+1, ΣN] the values from which advantages and targets were computed
+    mask: Bools  # True for the rows to learn from; all of these are valid
     metrics: Metrics  # without the prefix "train/"
 
 
 class ActorCritic:
     """The network, the optimizer, schedules and running statistics, and the update that uses them.
 
-    A subclass defines `estimate`, and `loss` unless the policy gradient with a squared value loss is right.
+    A subclass defines `estimate`. It also defines `loss`, unless its loss is the policy gradient with a squared value loss.
 
     How a gradient is computed: `loss` is written with ordinary torch operations, and autograd differentiates it. A built-in
-    algorithm also defines `loss_gradients`: the same loss with its derivatives by the network's outputs, derived by hand. If
-    there is one, it is always used instead of `loss`, and the derivatives go backward through the network
+    algorithm also defines `loss_gradients`: the same loss, and its derivatives with respect to the network's outputs,
+    derived by hand. If a class has `loss_gradients`, it is always used instead of `loss`. The backward pass through the
+    network is then computed
 
-    - in numpy (`kernels.fused`) where the network is a small MLP on the CPU and the minibatch has at most `MAX_ROWS` rows,
-    - by autograd everywhere else (images, recurrent cores, custom encoders, large layers or minibatches, GPUs).
+    - in numpy (`kernels.fused`) if the network is a small MLP on the CPU and the minibatch has at most `MAX_ROWS` rows,
+    - by autograd in all other cases (images, recurrent cores, custom encoders, large layers or minibatches, GPUs).
 
-    A subclass that overrides `loss` and not `loss_gradients` gets autograd for its loss. Both ways give the same numbers
-    except for rounding, which the tests bound. Which one is used never depends on time.
+    A subclass that overrides `loss` and not `loss_gradients` gets autograd for its loss. Both ways give the same numbers,
+    except for rounding errors, which the tests limit. The choice never depends on measured time.
     """
 
     whole_episodes: ClassVar[bool] = False  # see `Algorithm`
-    n_epochs = 1  # times an update uses each row
+    n_epochs = 1  # how many times an update uses each row
     estimates_each_epoch: ClassVar[bool] = False  # True: `estimate` is called before each epoch, under the newest weights
     shuffles_single_minibatch: ClassVar[bool] = False  # whether an epoch of one minibatch shuffles its rows
 
@@ -136,9 +137,9 @@ class ActorCritic:
         return policy_loss + self.vf_coef * value_loss + self.config.ent_coef * entropy_loss, numbers
 
     def loss_gradients(self, rows: LossInput) -> tuple[Numbers, OutputGradients]:
-        """The numbers of `loss`, and the derivatives of the loss by log-probabilities, entropies and values.
+        """The results of `loss`, and the derivatives of the loss with respect to log-probabilities, entropies and values.
 
-        Takes and gives tensors without a graph, or numpy arrays.
+        Arguments and results are tensors without a graph, or numpy arrays.
         """
         return loss_gradients.policy_gradient_and_value(rows, ent_coef=self.config.ent_coef, vf_coef=self.vf_coef)
 
@@ -221,7 +222,7 @@ class ActorCritic:
         return LossInput(minibatch.action, minibatch.log_prob, advantage, raw, minibatch.target, *outputs)
 
     def _gradient(self, rows: LossInput) -> Metrics:
-        """Write the gradient by the weights into `net.flat_grad`. Returns the loss metrics and the gradient norm."""
+        """Write the gradient of the weights into `net.flat_grad`. Returns the loss metrics and the gradient norm."""
         gradient = self.net.flat_grad
         if isinstance(rows.value, np.ndarray):
             assert self._fused is not None
@@ -247,9 +248,9 @@ class ActorCritic:
         """Count an update of `epochs` epochs with this batch: steps, versions, observation statistics."""
         self.env_steps += batch.env_steps
         self.version += 1
-        # Workers acted on the batch under the statistics published before it, and the losses must see the observations as
-        # the workers did: else the ratio is not 1 where the policy has not moved. So the statistics change only now. They
-        # are published together with the weights.
+        # Workers acted under the statistics that were published before this batch. The losses must normalize observations
+        # with the same statistics: otherwise the probability ratio would not be 1 for an unchanged policy. So the
+        # statistics change only after the update. They are published together with the weights.
         self._normalizer.update(observations.raw_features[:-1], batch.valid)
         self._buffers = self._normalizer.buffers()
 
@@ -365,10 +366,10 @@ class ActorCritic:
         return rows.select_columns(self._to_device(np.arange(mask.shape[1])), self._to_device(mask))
 
     def minibatches(self, rows: Minibatch, mask: Bools, count: int) -> Iterator[Minibatch]:
-        """Each row where `mask` [T, ΣN] is True once, at random, in `count` minibatches of nearly equal size.
+        """Shuffle the rows where `mask` [T, ΣN] is True into `count` minibatches of nearly equal size. Each row occurs once.
 
-        With a core whole columns stay together, because it learns from the rows that follow. Then there are at most as many
-        minibatches as columns.
+        With a core, whole columns stay together, because the core learns from rows that follow each other. Then there are at
+        most as many minibatches as columns.
         """
         if not mask.any():
             return
@@ -432,7 +433,7 @@ def make_optimizer(kind: Literal["adam", "rmsprop"], net: ActorCriticNetwork, le
 
 
 def _loss_gradients_are_of_this_loss(algorithm: type[ActorCritic]) -> bool:
-    """False for a class that overrides `loss` without overriding `loss_gradients` too."""
+    """False for a class that overrides `loss` but not `loss_gradients`."""
     for owner in algorithm.__mro__:
         if "loss_gradients" in vars(owner):
             return True

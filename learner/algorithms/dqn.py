@@ -2,8 +2,8 @@
 
 No sockets, no files, no clock; seeded. An update adds a batch to the replay buffer and makes a fixed number of gradient
 steps, so how often a transition is used is a setting and does not depend on speed. The buffer holds raw observations. They
-are normalized when they are drawn, by the statistics of that moment. ε falls with the env steps used and is published with
-the weights. With one torch thread on a CPU the same batches give the same bits, also after `load_state_dict`.
+are normalized when they are drawn, with the current statistics. ε falls with the number of env steps used and is published
+with the weights. With one torch thread on a CPU the same batches give the same bits, also after `load_state_dict`.
 """
 
 from __future__ import annotations
@@ -148,9 +148,9 @@ class DQN:
         return measured
 
     def targets(self, sample: Sample) -> Any:
-        """The targets [B] of the action values:  Σ γⁱ r + γᵏ Q′(s′, a′), where the task has not terminated (there γᵏ is 0).
+        """The targets [B] of the action values:  Σ γⁱ r + γᵏ Q′(s′, a′). γᵏ is 0 if the task has terminated.
 
-        a′ = argmax Q′(s′, ·), or argmax Q(s′, ·) if double (van Hasselt et al. 2016), with Q′ the target network.
+        a′ = argmax Q′(s′, ·), or argmax Q(s′, ·) if double (van Hasselt et al. 2016). Q′ is the target network.
         """
         inputs, values = self._inputs(sample.next_leaves), self._target_values
         if self.config.double:
@@ -161,7 +161,7 @@ class DQN:
         return values.to_array(sample.reward) + values.to_array(sample.discount) * value
 
     def _inputs(self, leaves: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Features [B, D], normalized by the present statistics, and images [B, *leaf] uint8."""
+        """Features [B, D], normalized with the current statistics, and images [B, *leaf] uint8."""
         x = features(self.policy, leaves)
         if self.policy.normalize_observations:
             x = normalize(x, *np.split(self._statistics, 2))

@@ -22,7 +22,7 @@ class Impala(ActorCritic):
 
     config: ImpalaConfig
     estimates_each_epoch = True
-    shuffles_single_minibatch = True  # a rule that older runs depend on to repeat bit for bit
+    shuffles_single_minibatch = True  # kept so that older runs can be repeated bit for bit
 
     def __init__(
         self, config: ImpalaConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu"

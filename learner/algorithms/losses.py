@@ -1,8 +1,8 @@
-"""Losses of ordinary autograd, and what is measured of them. Pure: tensors [B] in, tensors of no dimension out.
+"""The losses, for autograd, and metrics about them. Pure: tensors [B] in, tensors of no dimension out.
 
 B is the number of rows of a minibatch. All of them are valid: rows are masked where minibatches are selected.
-`kernels.loss_gradients` has the same losses with gradients derived by hand. What both need also takes numpy arrays: `ratio`,
-`standardized`, `approx_kl`, `clip_fraction`.
+`kernels.loss_gradients` has the same losses with gradients derived by hand. It also uses `ratio`, `standardized`,
+`approx_kl` and `clip_fraction`, so these functions take numpy arrays too.
 """
 
 from __future__ import annotations
@@ -80,10 +80,10 @@ def value_loss(value: Tensor, target: Tensor) -> Tensor:
 
 
 def clipped_value_loss(value: Tensor, target: Tensor, old_value: Tensor, clip_range: float) -> Tensor:
-    """The value loss of OpenAI's PPO: a value gains nothing by moving further than `clip_range` from `old_value`.
+    """The value loss of OpenAI's PPO: moving further than `clip_range` from `old_value` does not lower it.
 
-    L = E[max((V − G)², (clip(V, V_old−ε, V_old+ε) − G)²)].  Stable-Baselines3 takes only the second square. That has no
-    gradient for a value that moved too far in the wrong direction either.
+    L = E[max((V − G)², (clip(V, V_old−ε, V_old+ε) − G)²)].  Stable-Baselines3 takes only the second square, which also has
+    no gradient for a value that moved too far in the wrong direction.
     """
     clipped = old_value + (value - old_value).clamp(-clip_range, clip_range)
     return torch.maximum((value - target).square(), (clipped - target).square()).mean()

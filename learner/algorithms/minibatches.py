@@ -1,7 +1,7 @@
-"""Rows of a batch as the network takes them, and the selection of minibatches from them.
+"""Rows of a batch in the form of the network's input, and the selection of minibatches from them.
 
-A batch has T rows of each of ΣN env copies (columns); row and column numbers count them as one flat sequence of T · ΣN rows
-in time order. B is the number of rows of a minibatch, and C the number of its columns where the policy has a recurrent core.
+A batch has T rows for each of ΣN env copies (columns). Row numbers count the rows as one flat sequence of T · ΣN rows in
+time order. B is the number of rows of a minibatch, and C the number of its columns if the policy has a recurrent core.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Observations(NamedTuple):
 
 
 class Minibatch(NamedTuple):
-    """B rows of a batch: tensors, or numpy arrays where the network is evaluated in numpy (`kernels.fused`)."""
+    """B rows of a batch: tensors, or numpy arrays if the network is evaluated in numpy (`kernels.fused`)."""
 
     features: Any  # [B, D] float32, normalized
     images: tuple[Any, ...]  # [B, *leaf] uint8 each
@@ -57,7 +57,7 @@ class Minibatch(NamedTuple):
         return Minibatch(features.numpy(), (), action.numpy(), log_prob.numpy(), advantage.numpy(), target.numpy())
 
     def select(self, rows: Any, input_rows: Tensor | None = None, recurrent: RecurrentInput | None = None) -> Minibatch:
-        """A copy of some rows. `input_rows`: the rows that the network takes, where a core needs more than these."""
+        """A copy of some rows. `input_rows`: the rows of the network's input, if a core needs more rows than these."""
         input_rows = rows if input_rows is None else input_rows
         return Minibatch(
             self.features[input_rows],

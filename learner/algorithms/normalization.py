@@ -90,8 +90,8 @@ class ObservationNormalizer:
 class RewardScaler:
     """Divides rewards by the running standard deviation of the discounted return (Engstrom et al. 2020); no shift.
 
-    The return of each env copy continues from rollout to rollout of its lane. It starts at 0
-    with each episode and in a fresh lane.
+    The return of each env copy continues from one rollout of its lane to the next. It starts at 0
+    with each episode and when a lane gets new env copies.
     """
 
     def __init__(self, gamma: float) -> None:

@@ -51,11 +51,11 @@ class PPO(ActorCritic):
         return self.config.normalize_advantage
 
     def stops(self, metrics: Metrics) -> bool:
-        """Whether the policy has moved further than 1.5 times `target_kl` from the one that acted."""
+        """Whether the KL divergence from the policy that acted is more than 1.5 times `target_kl`."""
         return metrics["approx_kl"] > self._kl_limit
 
     def estimate(self, batch: Batch, observations: Observations, reward: Floats, pulse: Pulse) -> Estimates:
-        """Generalized advantage estimates, and their sums with the values as targets."""
+        """Generalized advantage estimates A, and the targets A + V."""
         config, values = self.config, self.values(observations, pulse)
         advantage = gae(reward, values, EpisodeEnds.of(batch), config.gamma, config.gae_lambda)
         return Estimates(advantage, advantage + values[:-1], values, batch.valid, {})

@@ -1,8 +1,8 @@
 """REINFORCE (Williams 1992). Its settings: `learner.config.hyperparameters`. No sockets, no files, no clock.
 
-An update is one gradient step on the rows whose episode ends within the rollout: all the reward that follows them is known.
-Other rows are dropped and counted. The return of a truncated episode continues with the baseline's value of its final
-observation; without a baseline it ends there.
+An update is one gradient step on the rows whose episode ends within the rollout, because the rewards that follow them are
+all known. Other rows are dropped and counted. The return of a truncated episode continues with the baseline's value of its
+final observation; without a baseline it ends there.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class REINFORCE(ActorCritic):
         return self.config.normalize_returns
 
     def estimate(self, batch: Batch, observations: Observations, reward: Floats, pulse: Pulse) -> Estimates:
-        """Monte-Carlo returns as targets; less the baseline's values they are the advantages."""
+        """The targets are Monte-Carlo returns. The advantages are these returns minus the baseline's values."""
         T, N = reward.shape
         values = self.values(observations, pulse) if self.config.baseline else np.zeros((T + 1, N), np.float32)
         ends = EpisodeEnds.of(batch)

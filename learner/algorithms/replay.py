@@ -50,7 +50,10 @@ def memory_bytes(observation: Sequence[Leaf], size: int, prioritized: bool) -> i
 
 
 def check_fits_memory(observation: Sequence[Leaf], size: int, prioritized: bool) -> None:
-    """Raise `UsageError` that names a size that fits. Twice the memory is needed, because a checkpoint is a copy."""
+    """Raise `UsageError`, which names a size that fits, if the memory is too small for the buffer and a copy of it.
+
+    A checkpoint makes such a copy.
+    """
     needed, free = 2 * memory_bytes(observation, size, prioritized), available_bytes()
     if free is None or needed <= free:
         return
@@ -138,10 +141,10 @@ class ReplayBuffer:
         self._newest[lane] = np.where(ended, NO_SLOT, written[-1])
 
     def _continues(self, first: Sequence[Array], newest: Ints | None, room: int) -> tuple[Bools, Ints]:
-        """[N] whether a copy's rollout begins with the newest observation stored for it, and where that was written.
+        """[N] whether a copy's rollout begins with the newest observation that is stored for it; [N] where that was written.
 
         The observations are compared, because a rollout between the two may have been dropped. The stored observation must
-        also be new enough that the ring does not overwrite it now.
+        also be so new that adding this rollout does not overwrite it.
         """
         if newest is None:
             newest = np.full(len(first[0]), NO_SLOT)
@@ -160,7 +163,7 @@ class ReplayBuffer:
     # ---------------------------------------------------------------- reading
 
     def sample(self, count: int, beta: float = 1.0) -> Sample:
-        """Draw transitions with replacement. `beta`: how much the weights correct for drawing by priority; 1 is fully."""
+        """Draw transitions with replacement. `beta`: how much the weights correct for the priorities; 1 corrects fully."""
         slots, weight = self._uniform(count) if self._tree is None else self._by_priority(self._tree, count, beta)
         row = self._row[slots]
         reward, discount, last = self._follow(row)
@@ -189,11 +192,11 @@ class ReplayBuffer:
         return slots, (weight / weight.max()).astype(np.float32)
 
     def _follow(self, row: Array) -> tuple[Doubles, Doubles, Ints]:
-        """Follow each row for up to n steps: the discounted rewards, γᵏ (0 if the task ended), and the slot reached."""
+        """Follow each row for up to n steps. Returns the discounted reward, γᵏ (0 if the task ended) and the last slot."""
         reward, discount, at = row["reward"].astype(np.float64), self._gamma * ~row["terminated"], row["follows"]
         for _ in range(self._n_step - 1):
             row = self._row[at]
-            going = row["is_row"]  # else stay there; a terminated row follows itself with discount 0
+            going = row["is_row"]  # without a row, stay at this slot; a terminated row follows itself with discount 0
             reward += np.where(going, discount * row["reward"], 0)
             discount = np.where(going, discount * self._gamma * ~row["terminated"], discount)
             at = np.where(going, row["follows"], at)
@@ -228,7 +231,7 @@ class ReplayBuffer:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a `state_dict`, bit for bit. Raises ValueError if its size is another."""
+        """Continue from a `state_dict`, bit for bit. Raises ValueError if it has another size."""
         if state["size"] != self.size:
             raise ValueError(f"replay_size: expected {state['size']}, got {self.size}")
         self._written, self._highest = state["written"], state["highest"]

@@ -1,8 +1,8 @@
 """Returns and advantages. Pure: arrays [T, N] in, arrays [T, N] out; T steps of N env copies.
 
 Every function follows the row format (`protocol.rollout`): row t bootstraps from `values[t+1]`, the value of `obs[t+1]`,
-which is the true final observation of a truncated episode. Nothing flows across the end of an episode. A row that is not
-valid gives zero and affects no other row, whatever its contents.
+which is the true final observation of a truncated episode. No function adds rewards or values across the end of an episode.
+A row that is not valid gives zero and does not affect other rows, whatever it contains.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def gae(reward: Floats, values: Floats, ends: EpisodeEnds, gamma: float, gae_lam
         δₜ = rₜ + γ V(sₜ₊₁) [not terminated] − V(sₜ)
         Aₜ = δₜ + γλ Aₜ₊₁ [neither terminated nor truncated]
 
-    The returns to fit V to are A + values[:-1].
+    The targets of V are A + values[:-1].
     """
     T, N = reward.shape
     assert values.shape == (T + 1, N), f"values: expected {(T + 1, N)}, got {values.shape}"
@@ -95,7 +95,7 @@ def vtrace(
 
 
 def complete(ends: EpisodeEnds) -> Bools:
-    """[T, N] True for valid rows whose episode ends within the rollout, so that all the reward that follows is known."""
+    """[T, N] True for valid rows whose episode ends within the rollout, so that all rewards that follow are known."""
     return np.asarray(np.logical_or.accumulate((ends.ended & ends.valid)[::-1])[::-1] & ends.valid)
 
 

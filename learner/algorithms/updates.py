@@ -9,7 +9,7 @@ from protocol.errors import RunError
 
 
 def check_finite(metrics: Mapping[str, float], update: int, advice: str) -> None:
-    """Raise `RunError` that names the first metric that is not finite. Call it before the step is taken."""
+    """Raise `RunError`, which names the first metric that is not finite, if there is one. Call it before the step."""
     for name, number in metrics.items():
         if not math.isfinite(number):
             raise RunError(
@@ -18,5 +18,5 @@ def check_finite(metrics: Mapping[str, float], update: int, advice: str) -> None
 
 
 def scheduled(first: float, schedule: str, remaining: float) -> float:
-    """The value of a setting when this fraction of the run remains: `linear` falls to 0, `constant` stays."""
+    """The value of a setting when this fraction of the run remains: `linear` falls to 0, `constant` does not change."""
     return first * (remaining if schedule == "linear" else 1)

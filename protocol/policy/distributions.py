@@ -1,7 +1,7 @@
 """Action distributions in numpy, for workers. Pure: the noise is an argument.
 
-A network's output is `params` [..., P]. The noise of a whole rollout is drawn in one call, so a step costs an addition and a
-comparison. The log-probabilities of a whole rollout are computed in one call from the stored params.
+A network's output is `params` [..., P]. The noise of a whole rollout is drawn in one call, so a step needs only an addition
+and a comparison. The log-probabilities of a whole rollout are computed in one call from the stored params.
 
     Categorical   P = Σ sizes   logits; action = argmax(logits + Gumbel noise)               (Gumbel-max trick)
     Bernoulli     P = K         logits; action = logits + logistic noise > 0

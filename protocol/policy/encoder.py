@@ -2,11 +2,12 @@
 
 `module:factory` names a callable: factory(features, images) -> torch.nn.Module, where `features` is the number of features
 of all arrays of an observation that are not images, and `images` their shapes. The module is called with features
-[B, features] float32 (normalized if the run normalizes observations), then each image [B, *shape] uint8. It returns [B, K]
-float32. The recurrent core, hidden layers and heads follow as they do without it. Actor and critic share one encoder.
+[B, features] float32 (normalized if the run normalizes observations), then each image [B, *shape] uint8. It returns
+[B, K] float32. The recurrent core, the hidden layers and the heads follow, as without an encoder. Actor and critic share one
+encoder.
 
-Its parameters are in the flat buffer with all others. It must have no other state: buffers (such as the running mean of
-BatchNorm) are not sent with the weights. It must not use dropout: the learner could not reproduce the worker's
+The encoder's parameters are in the flat buffer with all others. It must have no other state: buffers (such as the running
+mean of BatchNorm) are not sent with the weights. It must not use dropout: the learner could not reproduce the worker's
 probabilities.
 """
 

@@ -1,6 +1,6 @@
 """From observations to features, the numbers that a network takes as input. Pure; imports no torch.
 
-The learner and the workers both compute features here, so that a network sees the same numbers everywhere.
+The learner and the workers both use this file, so that a network gets the same input everywhere.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Where each parameter stands in the flat buffer. Pure; imports no torch.
+"""The position of each parameter in the flat buffer. Pure; imports no torch.
 
-All parameters of a policy live in one flat float32 buffer. Those needed to act come first, so that publishing copies one
-prefix and loading makes views of the received frame. `parameter_layout` is the only place that says where each array stands;
-the torch modules of `protocol.policy.networks` are views of the same layout.
+All parameters of a policy are in one flat float32 buffer. The parameters that are needed to act come first. So publishing
+copies the first part of the buffer, and loading makes views of the received frame. Only `parameter_layout` defines the
+positions. The parameters of the networks in `protocol.policy.networks` are views with the same layout.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Field(NamedTuple):
     name: str
     shape: tuple[int, ...]
     gain: float
-    """of the orthogonal initialization; 0: starts at zero (biases, log standard deviations), or as its encoder sets it"""
+    """gain of the orthogonal initialization; 0: starts at zero (biases, log standard deviations), or set by the encoder"""
 
 
 class Conv(NamedTuple):
@@ -57,7 +57,7 @@ def convolutions(leaf: Leaf) -> tuple[tuple[Conv, ...], tuple[int, int, int], in
 
 
 def parameter_layout(spec: PolicySpec) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
-    """The fields needed to act, and those of the critic, which follow. Linear weights are [out, in]."""
+    """The fields that are needed to act, and then those of the critic. Linear weights are [out, in]."""
     acting: list[Field] = []
     width = feature_size(spec)
     if spec.encoder is not None:

@@ -1,7 +1,8 @@
 """Keeps freed memory in the process, for networks that need the same megabytes in every pass.
 
-Without it, glibc returns the end of its heap to the system after each pass, and the system hands it out again page by page,
-each page zeroed. That costs a third of the time in which a network acts on batches of 64 images.
+By default, glibc returns the end of its heap to the system after each pass. In the next pass, the system gives the memory
+back page by page and fills each page with zeros. This takes a third of the time in which a network acts on batches of 64
+images.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 
 
 def keep_freed_memory() -> bool:
-    """Set this for the whole process, from now on. False if the C library cannot (only glibc can)."""
+    """Keep freed memory in the whole process from now on. Returns False if the C library cannot do this (only glibc can)."""
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError, TypeError):  # another library, another system

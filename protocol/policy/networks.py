@@ -1,8 +1,8 @@
-"""The networks in torch, with which the learner learns and workers with images act.
+"""The networks in torch. The learner trains them, and workers with images act with them.
 
-Every parameter stands where `protocol.policy.layout` says, in one flat float32 tensor, and every gradient in a second one;
-the named arrays are views of the two. So the gradient's norm is one norm, Adam is one kernel, and publishing copies one
-prefix. Features come from `protocol.policy.features` (numpy), already normalized.
+All parameters are in one flat float32 tensor, in the layout of `protocol.policy.layout`, and all gradients in a second one.
+The named arrays are views of these two. So the gradient norm is the norm of one tensor, Adam is one kernel, and publishing
+copies the first part of one tensor. Features come from `protocol.policy.features` (numpy) and are already normalized.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class RecurrentInput(NamedTuple):
 
 
 class MLP(torch.autograd.Function):
-    """Hidden layers and a linear head as one node of autograd's graph, which is most of the time of a small network.
+    """Hidden layers and a linear head as one node of autograd's graph: with many nodes, small networks are slow.
 
     Forward: h₀ = x [B, D];  hᵢ = φ(hᵢ₋₁ Wᵢᵀ + bᵢ);  output = h Wᵀ + b [B, O].
     Backward: with g = ∂L/∂(pre-activation), ∂L/∂W = gᵀ h, ∂L/∂b = Σ g, ∂L/∂h = g W; φ' is 1 − h² (tanh) or h > 0 (ReLU).
@@ -81,7 +81,7 @@ class Convolutions(NamedTuple):
     bfloat16: bool = False  # parameters are bfloat16, and the first weight is divided by 255
 
     def in_bfloat16(self) -> Convolutions:
-        """The same with bfloat16 copies of the parameters, in channels-last format: half the time of any other way."""
+        """The same with bfloat16 copies of the parameters, in channels-last format, which takes half the time of others."""
         (first, bias), *others = ((weight.to(torch.bfloat16), bias.to(torch.bfloat16)) for weight, bias in self.parameters)
         *convs, out = [(first / 255, bias), *others]
         channels_last = [(weight.contiguous(memory_format=torch.channels_last), bias) for weight, bias in convs]
@@ -101,7 +101,7 @@ class FlatNetwork:
     """Named parameters that are views of one flat tensor, and the layers before the heads: encoder, convolutions, core."""
 
     def __init__(self, spec: PolicySpec, device: str | torch.device = "cpu", *, seed: int = 0) -> None:
-        """Initialize each field orthogonally with its gain, or with zeros if the gain is 0; `seed` decides the draw."""
+        """Initialize each field orthogonally with its gain, or with zeros if the gain is 0. The values depend on `seed`."""
         acting, critic = parameter_layout(spec)
         self.spec = spec
         self.fields = (*acting, *critic)
@@ -194,7 +194,7 @@ class FlatNetwork:
 
 
 class ActorCriticNetwork(FlatNetwork):
-    """An actor and a critic: an MLP each, or two heads on one; both on one core, if there is one."""
+    """An actor and a critic: each has its own MLP, or they share one. If there is a recurrent core, they share it."""
 
     def __init__(self, spec: PolicySpec, device: str | torch.device = "cpu", *, seed: int = 0) -> None:
         super().__init__(spec, device, seed=seed)

@@ -1,4 +1,4 @@
-"""The interface of everything that acts, and the choice of an implementation for a spec."""
+"""The interface of acting policies, and the choice of an implementation for a spec."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Policy(Protocol):
         ...
 
     def __call__(self, leaves: Sequence[Array], state: Floats | None = None) -> Floats:
-        """Distribution parameters of the actions for these observations. Without `state`, they begin their episodes."""
+        """Distribution parameters for these observations. Without `state`, each observation is the first of its episode."""
         ...
 
 

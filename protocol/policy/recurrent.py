@@ -1,8 +1,9 @@
 """The recurrent core of a policy, in numpy. Pure; imports no torch.
 
-It stands between the features and the hidden layers. Each env copy has its own state [..., S]. The row format says where
-the state is reset: before `obs[t+1]` it is the state after `obs[t]` if row t is valid, and zeros if it is not, because that
-row is the reset. So the final observation of an episode is still processed with the state of its episode.
+The core is between the features and the hidden layers. Each env copy has its own state [..., S]. The row format defines when
+the state is reset. If row t is valid, `obs[t+1]` is processed with the state after `obs[t]`. If row t is not valid, it is
+the reset, and `obs[t+1]` is processed with a state of zeros. So the final observation of an episode still has its episode's
+state.
 
 LSTM (Hochreiter and Schmidhuber 1997) and GRU (Cho et al. 2014), computed as in torch, with torch's order of gates.
 """
@@ -27,7 +28,7 @@ def zero_state(spec: PolicySpec, *lead: int) -> Floats:
 
 
 def core_shapes(spec: PolicySpec, inputs: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    """[out, in] of the two linear maps into the gates: from the inputs, and from the state."""
+    """The shapes [out, in] of the two linear maps to the gates: from the inputs, and from the state."""
     assert spec.core is not None
     gates = GATES[spec.core] * spec.core_size
     return (gates, inputs), (gates, spec.core_size)

@@ -1,4 +1,4 @@
-"""The forward pass in torch of policies that need it (images, custom encoders), with which workers act."""
+"""The forward pass of policies that need torch (images, custom encoders). Workers act with it."""
 
 from __future__ import annotations
 

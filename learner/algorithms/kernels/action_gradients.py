@@ -1,7 +1,7 @@
-"""Log-probabilities and entropies of actions with their gradients derived by hand, in numpy.
+"""Log-probabilities and entropies of actions, and their gradients derived by hand, in numpy.
 
-Rule: they are those of `log_prob_and_entropy` (`protocol.policy.torch_distributions`) and autograd, except for rounding.
-Parameters are [P, B], a column for each of B rows; actions are [B, k]. `forward` keeps what `backward` needs.
+Rule: results equal those of `log_prob_and_entropy` (`protocol.policy.torch_distributions`) and autograd, except for
+rounding. Parameters are [P, B], a column for each of B rows; actions are [B, k]. `forward` keeps what `backward` needs.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class _Categorical:
 
 
 class _MultiCategorical:
-    """A product of independent categorical distributions: ∂ of a sum, part by part."""
+    """A product of independent categorical distributions: log π and H are sums, so each part has its own gradient."""
 
     def __init__(self, sizes: Sequence[int]) -> None:
         self._ends = np.cumsum(sizes)[:-1]

@@ -1,4 +1,4 @@
-"""Action values of a minibatch and their gradient: by autograd, or in numpy where the network is a small MLP on the CPU.
+"""Action values of a minibatch and their gradient: by autograd, or in numpy if the network is a small MLP on the CPU.
 
 Rule: both give the same numbers, except for rounding. Which one is used depends on the policy, the device and the size of
 the minibatch, never on time. Each has its own kind of array: torch tensors, or numpy arrays.
@@ -23,7 +23,7 @@ class ActionValues(Protocol):
     """The action values of one network, for B rows: features [B, D] and images [B, *leaf] uint8 each."""
 
     def to_array(self, array: Array) -> Any:
-        """A numpy array [B] as the kind of array that is used here."""
+        """Convert a numpy array [B] to the kind of array that this class uses."""
         ...
 
     def best_actions(self, x: Array, images: Sequence[Array]) -> Any:
@@ -31,7 +31,7 @@ class ActionValues(Protocol):
         ...
 
     def chosen(self, x: Array, images: Sequence[Array], action: Any) -> Any:
-        """The values [B] of these actions [B]. `backward` starts from those of the last call."""
+        """The values [B] of these actions [B]. `backward` belongs to the last call."""
         ...
 
     def best_values(self, x: Array, images: Sequence[Array]) -> Any:
@@ -39,7 +39,7 @@ class ActionValues(Protocol):
         ...
 
     def backward(self, gradient: Any) -> None:
-        """Write the gradient of every parameter, from the gradient [B] by the last values of `chosen`."""
+        """Write the gradient of every parameter. The argument is the loss's gradient [B] of the last values of `chosen`."""
         ...
 
     def numbers_and_norm(self, *numbers: Any) -> list[float]:

@@ -1,8 +1,8 @@
 """The losses of `learner.algorithms.losses` with their gradients derived by hand: no autograd graph.
 
-A small minibatch spends more time on the graph than on the arithmetic. Pure: each function takes arrays [B] and returns the
-loss, an array of no dimension, and its gradient [B]. Arrays are torch tensors, or numpy arrays where the network is
-evaluated in numpy (`kernels.fused`); the formulas are the same. Tests compare each gradient with autograd's.
+For a small minibatch, autograd's graph takes more time than the arithmetic. Pure: each function takes arrays [B] and returns
+the loss, an array of no dimension, and its gradient [B]. Arrays are torch tensors, or numpy arrays if the network is
+evaluated in numpy (`kernels.fused`). The formulas are the same. Tests compare each gradient with autograd's.
 """
 
 from __future__ import annotations
@@ -68,24 +68,27 @@ def ppo(
 
 
 def clipped_surrogate(ratio: A, advantage: A, clip_range: float) -> tuple[A, A]:
-    """PPO's policy loss and its gradient by log π(a): −ρ A / B where ρ A is the smaller of the two, else 0."""
+    """PPO's policy loss and its gradient with respect to log π(a).
+
+    The gradient is −ρ A / B if ρ A is the smaller of the two terms, else 0.
+    """
     plain, clipped = ratio * advantage, _clip(ratio, 1 - clip_range, 1 + clip_range) * advantage
     return -mean(library(ratio).minimum(plain, clipped)), plain * (plain <= clipped) / -len(ratio)
 
 
 def policy_gradient(log_prob: A, advantage: A) -> tuple[A, A]:
-    """−E[A log π(a)] and its gradient by log π(a)."""
+    """−E[A log π(a)] and its gradient with respect to log π(a)."""
     return (log_prob @ advantage) / -len(advantage), advantage / -len(advantage)
 
 
 def value_loss(value: A, target: A) -> tuple[A, A]:
-    """The mean squared error and its gradient by the value."""
+    """The mean squared error and its gradient with respect to the value."""
     error = value - target
     return (error @ error) / len(error), error * (2 / len(error))
 
 
 def clipped_value_loss(value: A, target: A, old_value: A, clip_range: float) -> tuple[A, A]:
-    """The clipped value loss and its gradient by the value."""
+    """The clipped value loss and its gradient with respect to the value."""
     moved, error = value - old_value, value - target
     xp = library(value)
     clipped_value = xp.where(abs(moved) <= clip_range, value, old_value + _clip(moved, -clip_range, clip_range))
@@ -95,19 +98,19 @@ def clipped_value_loss(value: A, target: A, old_value: A, clip_range: float) -> 
 
 
 def entropy_loss(entropy: A) -> tuple[A, A]:
-    """Minus the mean entropy and its gradient by the entropy."""
+    """Minus the mean entropy and its gradient with respect to the entropy."""
     return -mean(entropy), library(entropy).full_like(entropy, -1 / len(entropy))
 
 
 def huber_loss(error: A, weight: A) -> tuple[Any, A]:
-    """The weighted Huber loss and its gradient by the error."""
+    """The weighted Huber loss and its gradient with respect to the error."""
     clipped = _clip(error, -1, 1)
     weighted = weight * clipped
     return weighted @ (error - 0.5 * clipped) / len(error), weighted / len(error)
 
 
 def squared_loss(error: A, weight: A) -> tuple[Any, A]:
-    """The weighted squared loss and its gradient by the error."""
+    """The weighted squared loss and its gradient with respect to the error."""
     weighted = weight * error
     return weighted @ error / len(error), weighted * (2 / len(error))
 

@@ -1,11 +1,11 @@
-"""MLPs without a graph: several side by side, forward and backward, in arrays that are reused from minibatch to minibatch.
+"""MLPs without autograd: forward and backward pass of several networks at once, in arrays that all minibatches reuse.
 
 Rule: outputs and gradients are those of the formulas below, except for rounding. How rows are divided into chunks depends
 only on their number, so the same minibatch gives the same bits.
 
-Arrays are [S, n, B]: S networks side by side, and one column for each of B rows, so that inner loops are long. Each chunk of
-the rows goes all the way forward, or backward, while it is in the cache. With g = ∂L/∂(pre-activation): ∂L/∂W = g hᵀ,
-∂L/∂b = Σ g, ∂L/∂h = Wᵀ g; φ' is 1 − h² (tanh) or h > 0 (ReLU).
+Arrays are [S, n, B]: S networks, and one column for each of B rows, so that inner loops are long. Each chunk of rows passes
+through all layers forward, or backward, while it is in the cache. With g = ∂L/∂(pre-activation): ∂L/∂W = g hᵀ, ∂L/∂b = Σ g,
+∂L/∂h = Wᵀ g; φ' is 1 − h² (tanh) or h > 0 (ReLU).
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class FusedMLP:
         return [output[0] for output in plan.head_outputs]
 
     def backward(self, gradients: Sequence[Array]) -> None:
-        """Write the gradients of all layers, from the gradients [out, B] by the outputs of the last forward pass."""
+        """Write the gradients of all layers. Arguments: ∂L/∂output [out, B] for each output of the last forward pass."""
         for gradient, place in zip(gradients, self._plan.head_gradients, strict=True):
             place[0] = gradient
         for chunk in self._plan.chunks:
@@ -98,7 +98,7 @@ class _Workspace:
         self._taken = 0
 
     def restart(self) -> None:
-        """Take from the first array again."""
+        """Start with the first array again."""
         self._taken = 0
 
     def take(self, *shape: int) -> Array:
@@ -108,8 +108,9 @@ class _Workspace:
         if number == len(self._arrays):
             self._arrays.append(np.empty(0, self._like.dtype))
         if self._arrays[number].size < size:
-            # torch allocates it, because torch aligns all arrays in the same way: with another alignment its products could
-            # give other bits. The size is a power of two, so that a slightly larger minibatch does not need a new array.
+            # torch allocates the array, because torch aligns all arrays in the same way. With another alignment, torch's
+            # products could give other bits. The size is a power of two, so that a slightly larger minibatch needs no new
+            # array.
             room = 1 << (size - 1).bit_length()
             self._arrays[number] = torch.zeros(room, dtype=torch.from_numpy(self._like).dtype).numpy()
         return self._arrays[number][:size].reshape(shape)
@@ -161,7 +162,7 @@ class _Chunk:
         self.rows = rows
         self._workspace = workspace
         self.x = self._h = workspace.take(1, first.weight.shape[2], rows.stop - rows.start)
-        self._dh: Array | None = None  # the gradient by the outputs of the last hidden layers
+        self._dh: Array | None = None  # ∂L/∂output of the last hidden layers
         self._networks_with_gradient: set[int] = set()  # those whose part of `_dh` a head has written
         self._ones = np.ones(rows.stop - rows.start, first.weight.dtype)
         self.forward: list[Call] = []
@@ -169,7 +170,7 @@ class _Chunk:
         self.back_through_hidden: list[Call] = []
 
     def add_hidden(self, layer: Linear, dy: Array, relu: bool) -> None:
-        """Add a hidden layer. `dy`: the array for the gradient by its output."""
+        """Add a hidden layer. `dy`: the array for ∂L/∂output of this layer."""
         y = self._workspace.outputs(layer, len(self._ones))
         self.forward += [*_linear(layer, self._h, y), _activation(y, relu)]
         self.back_through_hidden[:0] = [_activation_gradient(dy, y, relu), *self._back(layer, self._h, dy, self._dh)]
@@ -207,7 +208,7 @@ def _activation(y: Array, relu: bool) -> Call:
 
 
 def _activation_gradient(dy: Array, y: Array, relu: bool) -> Call:
-    """The call that turns the gradient by the activation's output into that by its input, in place."""
+    """The call that replaces ∂L/∂output of the activation by ∂L/∂input, in place."""
     gradient, output = torch.from_numpy(dy), torch.from_numpy(y)
     if relu:
         return partial(torch.ops.aten.threshold_backward.grad_input, gradient, output, 0, grad_input=gradient)

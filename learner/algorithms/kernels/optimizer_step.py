@@ -1,17 +1,17 @@
 """A step of torch's Adam, AdamW or RMSprop on one flat tensor, without the overhead of `Optimizer.step`.
 
-Rule: the same kernels on the same state, so the same bits as `Optimizer.step`, with one exception: denormal numbers count
-as zero during the step. The state stays the optimizer's own: the optimizer saves and loads it.
+Rule: it uses the same kernels on the same state, so it gives the same bits as `Optimizer.step`, with one exception: denormal
+numbers count as zero during the step. The state belongs to the optimizer, which saves and loads it.
 
-For a small network the overhead of `Optimizer.step` takes longer than the kernel. Besides, making an optimizer and calling
-its first `step` import torch's compiler, only to exclude these methods from compilation. This costs 0.8 s and 70 MB, and a
-learner that compiles nothing does not need it.
+For a small network, the overhead of `Optimizer.step` takes longer than the kernel. In addition, making an optimizer and
+calling its first `step` import torch's compiler, only to exclude these methods from compilation. This takes 0.8 s and 70 MB,
+which a learner that compiles nothing does not need.
 
-Why denormal numbers are flushed: the moments of parameters that get no gradient any more, as behind a dead ReLU, decay to
-denormal numbers within 800 steps and stay there. A step with them takes a CPU twelve times as long.
+Why denormal numbers are set to zero: if parameters get no gradient any more, for example behind a dead ReLU, their moments
+decay to denormal numbers within 800 steps and stay there. Then a step takes a CPU twelve times as long.
 
 This file uses private parts of torch: `torch._fused_adam_`, `torch._fused_adamw_`, `__dynamo_disable`. If this version of
-torch lacks such a function, or its function takes other arguments or does something else, we call `Optimizer.step`.
+torch lacks such a function, or its function takes other arguments or does something else, `Optimizer.step` is called.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ Kernel = Callable[..., Any]
 def avoid_compiler_import() -> None:
     """Let optimizers be made, saved and loaded without importing torch's compiler.
 
-    Some methods of `Optimizer` are wrapped: the wrapper asks the compiler for a version of the method that is excluded from
-    compilation, and keeps it beside the method. We put the method itself there. Where torch does not wrap these methods in
-    this way, nothing is changed.
+    torch wraps some methods of `Optimizer`. The wrapper asks the compiler for a version of the method that is excluded from
+    compilation, and stores this version in an attribute. This function stores the method itself there, so that the wrapper
+    does not ask. If torch does not wrap these methods in this way, nothing changes.
     """
     for method in (Optimizer.add_param_group, Optimizer.state_dict, Optimizer.load_state_dict, Optimizer.zero_grad):
         wrapped = getattr(method, "__wrapped__", None)
@@ -61,7 +61,7 @@ def take_step(optimizer: Optimizer) -> None:
 
 
 def _step_of(optimizer: Optimizer) -> Callable[[Tensor, dict[str, Any], State], None] | None:
-    """The step of this kind of optimizer; None if we do not know it, or if this version of torch lacks its kernel."""
+    """The step of this kind of optimizer. None if the kind is not known here, or this version of torch lacks its kernel."""
     match optimizer:
         case AdamW():  # before Adam: in newer versions of torch AdamW is a subclass of it
             return _adam_step("_fused_adamw_", decayed_parameter=0.85)
@@ -74,16 +74,16 @@ def _step_of(optimizer: Optimizer) -> Callable[[Tensor, dict[str, Any], State], 
 
 
 def _adam_step(name: str, decayed_parameter: float) -> Callable[[Tensor, dict[str, Any], State], None] | None:
-    """The step by a private function of torch, if there is one of this name that does what we expect."""
+    """The step by a private function of torch, if torch has one of this name and it does what this file expects."""
     kernel = getattr(torch, name, None)
     return partial(_adam, kernel) if kernel is not None and _is_adam(kernel, decayed_parameter) else None
 
 
 @cache
 def _is_adam(kernel: Kernel, decayed_parameter: float) -> bool:
-    """Whether a first step of 0.1 from 1, with a gradient of 1 and a weight decay of 0.5, gives this parameter.
+    """Whether a first step of 0.1 from 1, with a gradient of 1 and a weight decay of 0.5, gives the expected parameter.
 
-    Adam adds the decay to the gradient, whose length does not matter in a first step: 1 - 0.1. AdamW shrinks the parameter
+    Adam adds the decay to the gradient, whose size does not matter in a first step: 1 - 0.1. AdamW reduces the parameter
     itself: (1 - 0.1 · 0.5) - 0.1.
     """
     flat = torch.ones(1)
