@@ -1,4 +1,4 @@
-"""What the tests of real processes share: a stage and a network that are gone when the test is over."""
+"""Fixtures for tests with real processes: a stage and a network, which are removed when the test is over."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def network() -> Iterator[Network]:
 @pytest.fixture
 def stage(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Stage]:
     if "network" in request.fixturenames:
-        request.getfixturevalue("network")  # first: it must outlive the processes on it
+        request.getfixturevalue("network")  # first, because the network must outlive the processes on its hosts
     made = Stage(tmp_path)
     try:
         yield made

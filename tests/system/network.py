@@ -1,7 +1,7 @@
-"""Hosts with addresses of their own on this one machine: network namespaces, joined by a switch that is one, too.
+"""Several hosts on this machine, each with its own address: network namespaces, which are connected by a switch.
 
-Rule: nothing outside the namespaces made here is touched, and they are gone when the network is closed. Needs root, `ip`
-and `nft`; `why_not` says what is missing.
+Rule: nothing outside these namespaces is changed, and they are removed when the network is closed. This needs root, `ip` and
+`nft`. `why_not` says what is missing.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _numbers = itertools.count()
 
 
 def why_not() -> str:
-    """Why this machine cannot have such a network; empty if it can."""
+    """The reason why this machine cannot have such a network; empty if it can."""
     if os.geteuid() != 0:
         return "network namespaces take root"
     missing = [name for name in ("ip", "nft") if shutil.which(name) is None]
@@ -31,27 +31,27 @@ class Host:
         self.address = f"10.99.0.{number}"
         self.namespace = _namespace()
         self.before = ("ip", "netns", "exec", self.namespace)
-        """goes before a command that shall run here"""
+        """words to put before a command that must run on this host"""
         self._switch, self._port = switch, f"port{number}"
         _ip("netns", "add", self.namespace)
         peer = ("peer", "name", self._port, "netns", switch)
         _ip("link", "add", "eth0", "netns", self.namespace, "type", "veth", *peer)
         self._here("addr", "add", f"{self.address}/24", "dev", "eth0")
-        self._here("link", "set", "eth0", "address", f"02:00:00:00:00:{number:02x}")  # the same when it comes back
+        self._here("link", "set", "eth0", "address", f"02:00:00:00:00:{number:02x}")  # the same if it comes back
         for device in ("lo", "eth0"):
             self._here("link", "set", device, "up")
         _ip("-n", switch, "link", "set", self._port, "master", "bridge", "up")
 
     def cut(self) -> None:
-        """Between it and all others nothing arrives any more; its own link stays up, so nobody is told."""
+        """Drop all packets between this host and the others. Its link stays up, so neither side is notified."""
         _ip("-n", self._switch, "link", "set", self._port, "nomaster")
 
     def heal(self) -> None:
-        """As before."""
+        """Stop dropping packets."""
         _ip("-n", self._switch, "link", "set", self._port, "master", "bridge")
 
     def lose(self, percent: int) -> None:
-        """Drop so many of the packets that come and of those that go; 0: none."""
+        """Drop this percentage of the packets in each direction; 0: none."""
         rules = "table inet faults\ndelete table inet faults\n"
         if percent:
             drop = f"numgen random mod 100 < {percent} drop;"
@@ -60,13 +60,13 @@ class Host:
         _run(["ip", "netns", "exec", self.namespace, "nft", "-f", "-"], rules)
 
     def slow(self, kilobits_per_s: int) -> None:
-        """Bound the rate at which it sends; 0: no bound."""
+        """Limit the rate at which this host sends; 0: no limit."""
         rate = f"rate {kilobits_per_s}kbit burst 2kb latency 2s".split()
         command = ["replace", "dev", "eth0", "root", "tbf", *rate] if kilobits_per_s else ["del", "dev", "eth0", "root"]
         _run(["tc", "-n", self.namespace, "qdisc", *command])
 
     def vanish(self) -> None:
-        """Gone in an instant, with its connections: nobody is told. End its processes first, after `cut`."""
+        """Remove the host and its connections without notifying anybody. Call `cut` and end its processes first."""
         _ip("-n", self._switch, "link", "delete", self._port)
         _ip("netns", "delete", self.namespace)
 
@@ -75,14 +75,14 @@ class Host:
 
 
 class Network:
-    """A switch and its hosts. A context."""
+    """A switch and its hosts. Use it as a context manager."""
 
     def __init__(self) -> None:
         self._switch = _namespace()
         self._hosts: dict[int, Host] = {}
 
     def host(self, number: int) -> Host:
-        """A new host, 10.99.0.`number`; one that vanished may come back."""
+        """A new host with the address 10.99.0.`number`. A host that vanished may be made again."""
         self._hosts[number] = Host(self._switch, number)
         return self._hosts[number]
 

@@ -1,7 +1,7 @@
-"""Learners and workers as real processes: started, watched, stopped, and none of them left behind.
+"""Starts, observes and stops learners and workers as real processes.
 
-Rule: every wait has a deadline, and says what it waited for and what was said instead; a process that a test started is
-dead when the test is over, whatever the test did to it.
+Rule: every wait has a deadline. If it fails, the error says what it waited for and what the process printed instead. When a
+test is over, all processes that it started are dead, whatever it did to them.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from protocol.keys.key_folder import KeyFolder
 ROOT = Path(__file__).parents[2]
 T = TypeVar("T")
 LOOK_EVERY_S = 0.02
-START_S = 90.0  # torch takes seconds to import, and on a crowded machine many
+START_S = 90.0  # importing torch takes seconds, and longer on a busy machine
 TOY = "workers.envs.toy:Slow-v0"
 WORKER_TIMEOUT_S = 1.5
 SMALL: dict[str, object] = {
@@ -38,7 +38,7 @@ SMALL: dict[str, object] = {
     "batch-size": 64,
     "n-epochs": 1,
     "eval-episodes": 1,
-    "steps": 1_000_000_000,  # the test says when it is over
+    "steps": 1_000_000_000,  # practically no limit: the test ends the run
     "worker-timeout-s": WORKER_TIMEOUT_S,
     "heartbeat-s": 0.3,
     "no-workers-timeout-s": 60,
@@ -51,7 +51,7 @@ def wait_for(
     what: Callable[[], str] | str = "it",
     every_s: float = LOOK_EVERY_S,
 ) -> T:
-    """What `condition` gives, as soon as it is true; it is asked `every_s`. Fails after `within_s`."""
+    """Call `condition` every `every_s` seconds and return its first true result. Fails after `within_s`."""
     deadline = time.monotonic() + within_s
     while not (found := condition()):
         text = what if isinstance(what, str) else what()
@@ -61,21 +61,21 @@ def wait_for(
 
 
 def crowding() -> float:
-    """How many processes want each core, at least 1: how much longer than on an idle machine a thing may take."""
+    """Number of processes for each core, at least 1: the factor by which work may take longer than on an idle machine."""
     return max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
 
 
 def free_port() -> int:
-    """A TCP port of loopback that nobody has."""
+    """A TCP port of loopback that nobody uses."""
     with socket.create_server(("127.0.0.1", 0)) as found:
         return int(found.getsockname()[1])
 
 
 class Running:
-    """A process that was started; all that it says goes to a file."""
+    """A process that was started. Its output goes to a file."""
 
     def __init__(self, command: Sequence[str], said: Path, told: bool = False) -> None:
-        """`told`: it reads stdin; see `tell`."""
+        """`told`: the process reads lines from stdin; see `tell`."""
         self.said_in = said
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
         with said.open("ab") as file:
@@ -90,11 +90,11 @@ class Running:
         self.pid = self.process.pid
 
     def said(self) -> str:
-        """Everything so far."""
+        """Its output so far."""
         return self.said_in.read_text(errors="replace")
 
     def hears(self, pattern: str, within_s: float = 30.0, times: int = 1) -> str:
-        """Wait until it has said this so many times; the last of them."""
+        """Wait until its output has this many matches of the pattern. Returns the last match."""
         found = wait_for(
             lambda: len(said := re.findall(f".*{pattern}.*", self.said())) >= times and said,
             within_s,
@@ -104,13 +104,13 @@ class Running:
         return str(found[-1])
 
     def tell(self, line: str) -> None:
-        """A line for its stdin."""
+        """Write a line to its stdin."""
         assert self.process.stdin is not None
         self.process.stdin.write(f"{line}\n".encode())
         self.process.stdin.flush()
 
     def alive(self) -> bool:
-        """Whether it runs, or is stopped."""
+        """Whether it has not ended. A stopped process has not ended."""
         return self.process.poll() is None
 
     def signal(self, number: int) -> None:
@@ -118,31 +118,31 @@ class Running:
         self.process.send_signal(number)
 
     def kill(self) -> None:
-        """SIGKILL, and wait until it is dead."""
+        """Send SIGKILL and wait until it is dead."""
         self.process.kill()
         self.process.wait(10)
 
     def pause(self) -> None:
-        """SIGSTOP, and wait until it stands."""
+        """Send SIGSTOP and wait until it is stopped."""
         self.signal(signal.SIGSTOP)
         stopped = psutil.STATUS_STOPPED
         wait_for(lambda: psutil.Process(self.pid).status() == stopped, 10, "the process to stop")
 
     def go_on(self) -> None:
-        """SIGCONT."""
+        """Send SIGCONT."""
         self.signal(signal.SIGCONT)
 
     def ends(self, within_s: float = 30.0) -> int:
-        """Wait until it has ended by itself; the exit code."""
+        """Wait until it has ended by itself. Returns the exit code."""
         wait_for(lambda: not self.alive(), within_s, lambda: f"the end of {self.said_in.name}, which says:\n{self.said()}\n")
         return self.process.wait()
 
     def memory_mb(self) -> float:
-        """Resident."""
+        """Resident memory in MB."""
         return float(psutil.Process(self.pid).memory_info().rss) / 1e6
 
     def descriptors(self) -> int:
-        """Open files and sockets."""
+        """Number of open files and sockets."""
         return int(psutil.Process(self.pid).num_fds())
 
 
@@ -155,7 +155,7 @@ class Learner(Running):
 
     @property
     def folder(self) -> Path:
-        """The run folder, once it is there."""
+        """The run folder, which must exist."""
         (found,) = self._runs.iterdir()
         return found
 
@@ -169,18 +169,18 @@ class Learner(Running):
         return read_rows(tables[0]) if tables else []
 
     def updates(self) -> int:
-        """How many there were."""
+        """Number of updates so far."""
         rows = self.rows()
         return int(rows[-1]["time/iterations"]) if rows else 0
 
     def trains(self, more: int = 3, within_s: float = START_S) -> dict[str, Any]:
-        """Wait for so many updates from now on; the newest row."""
+        """Wait for this many more updates. Returns the newest row."""
         since = self.updates()
         self.until(lambda row: row["time/iterations"] >= since + more, within_s, f"{more} updates after the first {since}")
         return self.rows()[-1]
 
     def until(self, reached: Callable[[dict[str, Any]], bool], within_s: float, what: str = "the row") -> float:
-        """Wait for an update whose row is so; how many seconds it took."""
+        """Wait for an update whose row fulfils `reached`. Returns the seconds that this took."""
         began_s = time.monotonic()
 
         def found() -> bool:
@@ -192,22 +192,22 @@ class Learner(Running):
         return time.monotonic() - began_s
 
     def ledger(self) -> dict[str, int]:
-        """As of the newest row."""
+        """The ledger in the newest row."""
         prefix = "ledger/"
         return {name.removeprefix(prefix): count for name, count in self.rows()[-1].items() if name.startswith(prefix)}
 
     def summary(self) -> dict[str, Any]:
-        """summary.json."""
+        """The content of summary.json."""
         found: dict[str, Any] = json.loads((self.folder / "summary.json").read_text())
         return found
 
     def checkpoints(self) -> list[Path]:
-        """Oldest first."""
+        """Paths of the checkpoints, oldest first."""
         return sorted(self._runs.glob("*/checkpoints/*.pt"))
 
 
 class Stage:
-    """All processes of one test."""
+    """Starts the processes of one test, and ends them after it."""
 
     def __init__(self, tmp_path: Path) -> None:
         tmp_path.mkdir(exist_ok=True)
@@ -217,7 +217,7 @@ class Stage:
         self._numbers = itertools.count()
 
     def keys(self) -> tuple[Path, Path]:
-        """A key folder, and the token of a client that it allows."""
+        """Make a key folder. Returns its path, and the path of the token with which workers may join."""
         folder = self.tmp_path / "keys"
         return folder, KeyFolder(folder).new("workers", datetime.now(UTC).replace(microsecond=0))
 
@@ -230,7 +230,7 @@ class Stage:
         before: Sequence[str] = (),
         resume: Path | None = None,
     ) -> Learner:
-        """`python -m learner` at this address. `settings` are flags over SMALL; `before` goes before the command."""
+        """Start `python -m learner` at this address. `settings` override SMALL. `before`: words before the command."""
         arguments = ["--resume", str(resume)]
         if resume is None:
             arguments = [env, "--bind", address, "--run-dir", str(self.runs)]
@@ -243,17 +243,17 @@ class Stage:
         return learner
 
     def worker(self, address: str, name: str, *flags: str, before: Sequence[str] = ()) -> Running:
-        """`python -m workers` for the learner at this address."""
+        """Start `python -m workers` for the learner at this address."""
         return self.start([*before, sys.executable, "-m", "workers", address, "--name", name, *flags], name)
 
     def start(self, command: Sequence[str], name: str, told: bool = False) -> Running:
-        """Any process; it is ended with the test."""
+        """Start any process. It is ended with the test."""
         running = Running(command, self.tmp_path / f"{name}-{next(self._numbers)}.log", told)
         self.started.append(running)
         return running
 
     def close(self) -> None:
-        """End all, also those that are stopped; fail if any of them started a process that is still there."""
+        """End all processes, also stopped ones. Fails if a process that one of them started still runs."""
         families = []
         for running in self.started:
             if running.alive():

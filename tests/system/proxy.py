@@ -1,7 +1,7 @@
-"""A TCP proxy in the way of a connection: it delays, slices, resets, or swallows everything. Also a process of its own.
+"""A TCP proxy, which can delay data, cut it into pieces, reset connections, or forward nothing.
 
-Rule: bytes keep their order and none is changed; only when they arrive, in what pieces, and whether at all, is its own.
-What it is told holds for connections that are open, too.
+Rule: the proxy does not change bytes or their order. It only decides when they arrive, in what pieces, and whether they
+arrive. Commands also apply to connections that are already open. It can also run as a separate process.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from types import TracebackType
 from typing import Any
 
 READ_BYTES = 1 << 16
-QUEUED = 256  # chunks under way in one direction
+QUEUED = 256  # chunks on their way in one direction
 
 
 class Proxy:
-    """Listens on a port of address `at` and passes on to another port there. A context; its thread ends with it."""
+    """Listens on a port of address `at` and forwards to another port there. A context manager, which ends its thread."""
 
     def __init__(self, port: int, *, at: str = "127.0.0.1", listen: int = 0) -> None:
         self.latency_s = 0.0
-        """how much later each chunk arrives"""
+        """seconds by which each chunk is delayed"""
         self.slice_bytes = 0
-        """pieces in which chunks are passed on; 0: as they come"""
+        """size of the pieces in which data is forwarded, in bytes; 0: as it arrives"""
         self.connections = 0
-        """accepted so far"""
+        """number of connections accepted so far"""
         self._port, self._at = port, at
         self._writers: set[asyncio.StreamWriter] = set()
         self._tasks: set[asyncio.Task[None]] = set()
@@ -43,19 +43,19 @@ class Proxy:
 
     @property
     def address(self) -> str:
-        """Where a worker connects."""
+        """The address to which a worker connects."""
         return f"tcp://{self._at}:{self._server.sockets[0].getsockname()[1]}"
 
     def swallow(self) -> None:
-        """Pass nothing on; connections stay open, as when a cable is cut."""
+        """Forward nothing. Connections stay open, as when a cable is cut."""
         self._loop.call_soon_threadsafe(self._flowing.clear)
 
     def flow(self) -> None:
-        """Pass everything on again, what came meanwhile first."""
+        """Forward everything again, beginning with what arrived in the meantime."""
         self._loop.call_soon_threadsafe(self._flowing.set)
 
     def reset(self) -> None:
-        """End every connection with RST."""
+        """Reset every connection (RST)."""
         self._do(self._reset())
 
     def __enter__(self) -> Proxy:
@@ -79,7 +79,7 @@ class Proxy:
         self.connections += 1
         try:
             there, back = await asyncio.open_connection(self._at, self._port)
-        except OSError:  # nobody listens there
+        except OSError:  # nothing listens at the target
             writer.transport.abort()
             return
         self._writers |= {writer, back}
@@ -92,7 +92,7 @@ class Proxy:
         task.add_done_callback(self._tasks.discard)
 
     async def _carry(self, source: asyncio.StreamReader, target: asyncio.StreamWriter) -> None:
-        """One direction: read at once, write when it is due."""
+        """Forward one direction: read at once, write when the delay has passed."""
         chunks: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(QUEUED)
 
         async def read() -> None:
@@ -118,7 +118,7 @@ class Proxy:
         reading = self._loop.create_task(read())
         try:
             await write()
-        except OSError:  # reset by either end
+        except OSError:  # one end reset the connection
             pass
         finally:
             reading.cancel()
@@ -128,7 +128,7 @@ class Proxy:
 
     async def _reset(self) -> None:
         for writer in list(self._writers):
-            with suppress(OSError):  # it has just been closed
+            with suppress(OSError):  # the connection was just closed
                 _with_reset(writer)
             writer.transport.abort()
 
@@ -143,13 +143,13 @@ class Proxy:
 
 
 def _with_reset(writer: asyncio.StreamWriter) -> None:
-    """Closing this connection sends RST, not FIN."""
+    """Make closing this connection send RST instead of FIN."""
     set_option: Callable[..., None] = writer.get_extra_info("socket").setsockopt
     set_option(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
 
 
 def main(port: int, at: str, listen: int) -> None:
-    """Proxy until stdin ends; a line there is `reset`, or `delay SECONDS`."""
+    """Run the proxy until stdin ends. A line of stdin is a command: `reset` or `delay SECONDS`."""
     with Proxy(port, at=at, listen=listen) as proxy:
         for line in sys.stdin:
             match line.split():

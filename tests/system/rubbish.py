@@ -1,6 +1,6 @@
-"""A peer that talks rubbish: bytes that are not ZeroMQ's, and ZeroMQ messages that are not ours. Also a process of its own.
+"""A peer that sends invalid data: random bytes, and ZeroMQ messages with random frames. It can run as a separate process.
 
-Rule: what it says follows from the seed.
+Rule: the seed decides what it sends.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ NAME = b"stranger"
 
 
 def talk_rubbish(host: str, port: int, seed: int, *, connections: int = 100, messages: int = 300) -> bool:
-    """Random bytes over so many connections, so many messages of random frames and one more; whether it was answered."""
+    """Send random bytes over some connections, then messages with random frames. Returns whether the learner answered."""
     noise = random.Random(seed)
     for _ in range(connections):
         with socket.create_connection((host, port), timeout=10) as raw:
@@ -34,7 +34,7 @@ def talk_rubbish(host: str, port: int, seed: int, *, connections: int = 100, mes
         stranger.send_multipart([*encode(hello), b"one frame too many"])
         stranger.send_multipart(encode(Heartbeat(7, 0, 0, (), 0, {}, 0)))
         return bool(stranger.poll(10_000))
-    except zmq.Again:  # it is not let in, and its queue is full
+    except zmq.Again:  # the learner does not let it in, and its queue is full
         return False
     finally:
         context.destroy(linger=0)

@@ -1,6 +1,6 @@
-"""A run that trains, ready for its fault; how long it took until training went on; and its end.
+"""Helpers for a run with a fault: start it, measure the time until training goes on, and end it.
 
-Rule: at its end every ticket and every transition is accounted for, whatever was done to it.
+Rule: at the end of the run every ticket and every transition is accounted for, whatever the fault was.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from tests.system.network import Host, Network
 from tests.system.processes import START_S, TOY, WORKER_TIMEOUT_S, Learner, Running, Stage, crowding, free_port
 
 LANES, ROWS = 4, 16 * 2  # rows of a rollout: T steps of N copies
-IN_ROLLOUT = {"env-kwargs": "seconds 0.005"}  # a rollout takes 0.3 s: a fault falls into the middle of one
-NOTICED_S = WORKER_TIMEOUT_S + 1  # a worker's silence, and its tickets dealt again
+IN_ROLLOUT = {"env-kwargs": "seconds 0.005"}  # a rollout takes 0.3 s, so that a fault happens during one
+NOTICED_S = WORKER_TIMEOUT_S + 1  # a worker is silent, and new tickets are dealt in place of its tickets
 
 
 def play(
     stage: Stage, settings: Mapping[str, object] = {}, *, env: str = TOY, workers: int = 2
 ) -> tuple[Learner, list[Running]]:
-    """A learner and workers on loopback, that train."""
+    """Start a learner and workers on loopback, and wait until they train."""
     address = f"tcp://127.0.0.1:{free_port()}"
     learner = stage.learner(address, {"min-workers": workers, **settings}, env=env)
     started = [stage.worker(address, f"w{number}") for number in range(workers)]
@@ -32,7 +32,10 @@ def play(
 def far_apart(
     stage: Stage, network: Network, settings: Mapping[str, object] = {}
 ) -> tuple[Learner, list[Running], list[Host], tuple[str, ...]]:
-    """A learner and two workers, each on a host of its own (the learner on the first), that train; the flags of a token."""
+    """Start a learner and two workers, each on its own host (the learner on the first), and wait until they train.
+
+    Returns also the hosts, and the flags with the token.
+    """
     hosts = [network.host(number) for number in (1, 2, 3)]
     address = f"tcp://{hosts[0].address}:5555"
     keys, token = stage.keys()
@@ -44,19 +47,19 @@ def far_apart(
 
 
 def within(row: str, seconds: float, bound_s: float) -> None:
-    """Say how long it took until training went on; fail when that was too long (a crowded machine may take longer)."""
+    """Print how long it took until training went on. Fails if it took too long; a busy machine may take longer."""
     sys.stdout.write(f"\n{row}: {seconds:.2f} s (bound {bound_s:.1f} s, crowding {crowding():.1f})\n")
     assert seconds <= bound_s * crowding(), f"{row}: training went on after {seconds:.2f} s, expected {bound_s:.1f} s"
 
 
 def dealt_again(learner: Learner) -> float:
-    """Seconds until an update was made of rollouts whose first tickets were lost."""
+    """Seconds until an update after tickets were lost and new ones were dealt in their place."""
     before = learner.ledger()["lost"]
     return learner.until(lambda row: row["ledger/lost"] > before, START_S, "an update with tickets dealt again")
 
 
 def finish(learner: Learner, workers: Sequence[Running], **shape: int) -> dict[str, int]:
-    """SIGTERM to the learner: it saves, its workers leave, and everything is accounted for. The ledger."""
+    """Send SIGTERM to the learner. It saves, its workers leave, and everything is accounted for. Returns the ledger."""
     learner.signal(signal.SIGTERM)
     assert learner.ends() == 130, learner.said()
     for worker in workers:
@@ -65,7 +68,7 @@ def finish(learner: Learner, workers: Sequence[Running], **shape: int) -> dict[s
 
 
 def accounted(summary: dict[str, Any], lanes: int = LANES, rows: int = ROWS, max_lag: int = 0) -> dict[str, int]:
-    """Every ticket and every transition is accounted for; the ledger. `rows`: steps times copies of a rollout."""
+    """Check that every ticket and every transition is accounted for. Returns the ledger. `rows`: T · N of a rollout."""
     ledger: dict[str, int] = summary["ledger"]
     assert ledger["issued"] == ledger["used"] + ledger["outstanding"] + ledger["stale"] + ledger["lost"]
     named = sum(ledger[f"transitions_{why}"] for why in ("used", "waiting", "stale", "duplicate", "late", "invalid"))

@@ -1,7 +1,7 @@
-"""`python -m tests.system.soak`: eight workers on two hosts learn CartPole, and every two seconds something goes wrong.
+"""`python -m tests.system.soak`: eight workers on two hosts learn CartPole, with a fault every two seconds.
 
-Rule: whatever happens, training ends, the policy is as good as without faults, every ticket and transition is accounted
-for, and nothing is left behind. What goes wrong, and when, follows from the seed. Exit code 1 when it falls short.
+Rule: in spite of the faults, training ends, the policy is as good as without faults, every ticket and transition is
+accounted for, and nothing is left behind. The seed decides the faults and their times. The exit code is 1 if this fails.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from tests.system.runs import accounted
 PORT, PROXY_PORT = 5555, 5556
 WORKERS = 8
 FAULT_EVERY_S, HEALED_WITHIN_S = 2.0, (0.5, 4.0)
-STEPS_FIRST_MINUTE, STEPS_PER_MINUTE = 150_000, 270_000  # what is learned with these faults on two cores, about
+STEPS_FIRST_MINUTE, STEPS_PER_MINUTE = 150_000, 270_000  # env steps that are trained with these faults on two cores, about
 SETTINGS: dict[str, object] = {
     "env-kwargs": "",
     "rollout-steps": 32,
@@ -37,15 +37,15 @@ SETTINGS: dict[str, object] = {
     "eval-episodes": 100,
     "checkpoint-every-s": 2,
 }
-WARM_S = 10.0  # of a learner: until then its memory still grows
-LIFE_S = 30.0  # the shortest that shows a slope
+WARM_S = 10.0  # seconds after a learner's start in which its memory still grows
+LIFE_S = 30.0  # the shortest time that shows a slope
 MOST_MB_PER_MIN = 6.0
 MOST_MORE_DESCRIPTORS = 40
 Undo = Callable[[], None]
 
 
 class Soak:
-    """The scene: a learner on the first host, workers on the other two, one of them behind a proxy."""
+    """A learner on the first host, and workers on the other two, one of which is behind a proxy; and the faults."""
 
     def __init__(self, stage: Stage, network: Network, steps: int, seed: int) -> None:
         self.stage, self.random = stage, random.Random(seed)
@@ -140,7 +140,7 @@ class Soak:
     # ---------------------------------------------------------------- the course of things
 
     def play(self, deadline_s: float) -> None:
-        """Faults until the learner ends."""
+        """Inject faults until the learner ends."""
         draw: dict[Callable[[], Undo | None], int] = {
             self.kill_a_worker: 6,
             self.stop_a_worker: 6,
@@ -151,7 +151,7 @@ class Soak:
             self.talk_rubbish: 2,
             self.kill_the_learner: 1,
         }
-        coming = self.random.sample(list(draw), len(draw))  # each once, then as drawn
+        coming = self.random.sample(list(draw), len(draw))  # each fault once, then at random
         self.learner.is_open()
         wait_for(self.learner.checkpoints, START_S, "the first checkpoint")
         next_s = time.monotonic() + FAULT_EVERY_S
@@ -178,7 +178,7 @@ class Soak:
             self._due.append((time.monotonic() + self.random.uniform(*HEALED_WITHIN_S), undo))
 
     def _look_after(self, now: float) -> None:
-        """Start again the workers that were killed, note those that ended by themselves; measure."""
+        """Restart workers that were killed, record those that ended by themselves, and measure memory and descriptors."""
         self._look_at_updates(now)
         for number, worker in self.workers.items():
             if not worker.alive() and self.learner.alive():
@@ -189,14 +189,14 @@ class Soak:
         for running in (self.learner, *self.workers.values()):
             try:
                 descriptors, memory_mb = running.descriptors(), running.memory_mb()
-            except Exception:  # it has just ended
+            except Exception:  # the process has just ended
                 continue
             self.descriptors.setdefault(running.pid, []).append(descriptors)
             if running is self.learner:
                 self.memory.append((running.pid, now, memory_mb))
 
     def _look_at_updates(self, now: float) -> None:
-        """How long there was none, and what had gone wrong shortly before and meanwhile."""
+        """Record the longest time without an update, and the faults shortly before and during it."""
         rows_bytes = (self.learner.folder / "metrics.jsonl").stat().st_size
         if rows_bytes == self._rows_bytes:
             return
@@ -210,7 +210,7 @@ class Soak:
     # ---------------------------------------------------------------- the account
 
     def slope_mb_per_min(self) -> float:
-        """Of the learner's memory: the mean over its lives, each by its length, without their first seconds."""
+        """Growth of the learner's memory, without the first seconds of each process: a mean, weighted by their length."""
         slopes, weights = [], []
         for pid in {pid for pid, _, _ in self.memory}:
             points = np.array([(s, mb) for found, s, mb in self.memory if found == pid])
@@ -221,12 +221,12 @@ class Soak:
         return float(np.average(slopes, weights=weights)) if slopes else 0.0
 
     def more_descriptors(self) -> int:
-        """By how many the open files and sockets of a process grew, at most, once it was warm."""
+        """The largest growth of the number of open files and sockets of a process after its first seconds."""
         return max((max(seen[20:]) - seen[20] for seen in self.descriptors.values() if len(seen) > 40), default=0)
 
 
 def without_faults(stage: Stage, steps: int, seed: int) -> Learner:
-    """The same run, on loopback, undisturbed."""
+    """The same run on loopback, without faults."""
     settings = {**SETTINGS, "steps": steps, "seed": seed, "min-workers": 2}
     learner = stage.learner("tcp://127.0.0.1:5557", settings, env="CartPole-v1")
     workers = [stage.worker("tcp://127.0.0.1:5557", f"w{number}") for number in range(2)]
@@ -237,7 +237,7 @@ def without_faults(stage: Stage, steps: int, seed: int) -> Learner:
 
 
 def soak(minutes: float, seed: int, folder: Path) -> list[str]:
-    """Print the table; what falls short."""
+    """Run it and print the table. Returns the requirements that were not met."""
     steps = STEPS_FIRST_MINUTE + int((minutes - 1) * STEPS_PER_MINUTE)
     print(f"soak: seed {seed}, {steps:,} env steps, about {minutes:g} minutes", flush=True)
     short: list[str] = []
@@ -257,7 +257,8 @@ def soak(minutes: float, seed: int, folder: Path) -> list[str]:
             if learner.ends() != 0:
                 short.append(f"the learner ended with {learner.process.returncode}: {learner.said()[-3000:]}")
             time.sleep(2.0)
-            deaf = [worker for worker in scene.workers.values() if worker.alive()]  # cut off, or new, when the end was said
+            # These were cut off, or just started, when the learner told the workers to leave.
+            deaf = [worker for worker in scene.workers.values() if worker.alive()]
             for worker in deaf:
                 worker.signal(signal.SIGTERM)
             for number, worker in scene.workers.items():
@@ -306,7 +307,7 @@ def soak(minutes: float, seed: int, folder: Path) -> list[str]:
 
 
 def main() -> int:
-    """The exit code."""
+    """Run the program. Returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m tests.system.soak", description=__doc__.partition("\n")[0])
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--seed", type=int, default=random.SystemRandom().getrandbits(31), help="default: any, printed")

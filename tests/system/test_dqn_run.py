@@ -1,4 +1,4 @@
-"""Whole runs of DQN on this machine: the same bytes and the same replay ratio, however many the workers, and with lag."""
+"""Whole runs of DQN on this machine: the same weights and the same replay ratio for any number of workers, and with lag."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SMALL: dict[str, Any] = {
     "gradient_steps": 16,
     "eval_episodes": 1,
 }
-BATCH = 8 * 16  # rows of an update, with those that are not valid
+BATCH = 8 * 16  # rows of an update, including those that are not valid
 
 
 def run(tmp_path: Path, **settings: Any) -> Path:
@@ -33,7 +33,7 @@ def run(tmp_path: Path, **settings: Any) -> Path:
 
 
 def ratios(folder: Path) -> list[float]:
-    """Env steps per gradient step of each update that made any."""
+    """Env steps per gradient step, for each update that made gradient steps."""
     rows = read_rows(folder / "metrics.jsonl")
     return [ratio for row in rows if (ratio := row.get("replay/env_steps_per_gradient_step")) is not None]
 
@@ -41,7 +41,7 @@ def ratios(folder: Path) -> list[float]:
 @pytest.mark.parametrize(
     "settings", [{}, {"replay": "prioritized", "n_step": 3, "dueling": True, "normalize_observations": True}]
 )
-def test_the_same_curve_and_replay_ratio_whatever_the_number_of_workers(tmp_path: Path, settings: dict[str, Any]) -> None:
+def test_curve_and_replay_ratio_do_not_depend_on_the_number_of_workers(tmp_path: Path, settings: dict[str, Any]) -> None:
     policies, found = {}, {}
     for workers in (1, 2, 4):
         folder = run(tmp_path, workers=workers, **settings)
@@ -56,7 +56,7 @@ def test_the_same_curve_and_replay_ratio_whatever_the_number_of_workers(tmp_path
 
 @pytest.mark.parametrize("workers", [1, 4])
 def test_the_replay_ratio_holds_while_collecting_and_learning_overlap(tmp_path: Path, workers: int) -> None:
-    """With rollouts up to 4 versions old, a lane stands in a batch twice, or not at all; the ratio is the same."""
+    """With rollouts up to 4 versions old, a batch may contain a lane twice or not at all. The ratio stays the same."""
     folder = run(tmp_path, workers=workers, max_lag=4, n_step=3)
     rows = read_rows(folder / "metrics.jsonl")
     made = rows[-1]["train/n_updates"]
@@ -68,13 +68,13 @@ def test_the_replay_ratio_holds_while_collecting_and_learning_overlap(tmp_path: 
     assert sizes == [row["time/total_timesteps"] for row in rows]
 
 
-def test_images_are_learned_on(tmp_path: Path) -> None:
+def test_dqn_learns_from_images(tmp_path: Path) -> None:
     kwargs = {"observation": "nested", "action": "offset"}
     folder = run(tmp_path, env="workers.envs.toy:Spaces-v0", env_kwargs=kwargs, steps=800, gradient_steps=2)
     assert ratios(folder)
 
 
-def test_what_dqn_cannot_learn_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_an_unsupported_action_space_is_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(
         UsageError, match=r"dqn: expected an action space Discrete\(n\), got box\[1\]; take --algo ppo for it"
     ):

@@ -1,7 +1,7 @@
-"""What must happen when: a learner and its workers as real processes over TCP, and one fault each.
+"""A learner and its workers as real processes over TCP, with one fault in each test.
 
-Each test says what was done to whom and what the learner said, prints how long it took until training went on, and at the
-end finds every ticket and every transition accounted for. Faults of the network: `test_network_faults.py`.
+Each test injects a fault, checks the learner's log, and prints how long it took until training went on. At the end every
+ticket and every transition must be accounted for. Network faults are in `test_network_faults.py`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from tests.system.runs import IN_ROLLOUT, LANES, NOTICED_S, accounted, dealt_aga
 # ---------------------------------------------------------------- workers
 
 
-def test_a_worker_killed_in_mid_rollout(stage: Stage) -> None:
+def test_training_goes_on_after_a_worker_is_killed(stage: Stage) -> None:
     learner, (victim, other) = play(stage, IN_ROLLOUT)
     victim.kill()
     within("worker killed -9, elsewhere", dealt_again(learner), NOTICED_S)
@@ -34,8 +34,8 @@ def test_a_worker_killed_in_mid_rollout(stage: Stage) -> None:
     assert ledger["transitions_late"] == ledger["transitions_invalid"] == 0, "half a rollout was seen"
 
 
-def test_a_worker_killed_beside_its_learner(stage: Stage) -> None:
-    """The learner's own child: its death is known at once, and it is started again."""
+def test_a_killed_worker_of_a_local_run_is_restarted(stage: Stage) -> None:
+    """The worker is a child process of the learner, which notices its death at once and restarts it."""
     settings = {"transport": "tcp", "rollout-steps": 16, "batch-size": 64, "n-epochs": 1, "eval-episodes": 1}
     flags = [word for name, value in settings.items() for word in (f"--{name}", str(value))]
     command = [sys.executable, "-m", "millrace", "train", TOY, "--env-kwargs", "seconds", "0.005", *flags]
@@ -51,11 +51,11 @@ def test_a_worker_killed_beside_its_learner(stage: Stage) -> None:
     finish(learner, [])
 
 
-def test_a_worker_stopped_and_continued(stage: Stage) -> None:
-    """It stands in its rollout's one long step; when it wakes, it sends what nobody waits for any more."""
+def test_a_stopped_worker_joins_again_when_it_continues(stage: Stage) -> None:
+    """The worker is stopped in the one long step of its rollout. When it continues, its rollout comes too late."""
     one_step = {"env-kwargs": "seconds 0.4", "rollout-steps": 1, "envs": 2, "lanes": 2, "batch-size": 2}
     learner, (stopped, other) = play(stage, one_step)
-    time.sleep(0.1)  # after an update: both are in their next step
+    time.sleep(0.1)  # after an update, so that both workers are in their next step
     stopped.pause()
     within("worker stopped", dealt_again(learner), NOTICED_S)
     learner.hears(r"worker w0 silent for 2 s; \d of its tickets are dealt again")
@@ -68,7 +68,7 @@ def test_a_worker_stopped_and_continued(stage: Stage) -> None:
     assert ledger["transitions_late"] > 0, "its late rollout was not counted"
 
 
-def test_all_workers_gone(stage: Stage) -> None:
+def test_a_run_without_workers_saves_a_checkpoint_and_fails(stage: Stage) -> None:
     learner, workers = play(stage, {"no-workers-timeout-s": 1, **IN_ROLLOUT})
     for worker in workers:
         worker.kill()
@@ -83,8 +83,8 @@ def test_all_workers_gone(stage: Stage) -> None:
     assert ledger["lost"] > 0
 
 
-def test_sigterm_to_a_worker_and_to_the_learner(stage: Stage) -> None:
-    """The rollout in hand is delivered: nothing is lost but tickets that nobody had begun."""
+def test_a_worker_delivers_its_rollout_after_sigterm(stage: Stage) -> None:
+    """The unfinished rollout is delivered. Only tickets whose rollouts had not begun are lost."""
     learner, (leaver, other) = play(stage, IN_ROLLOUT)
     leaver.signal(signal.SIGTERM)
     began_s = time.monotonic()
@@ -105,7 +105,7 @@ def test_sigterm_to_a_worker_and_to_the_learner(stage: Stage) -> None:
 # ---------------------------------------------------------------- the learner
 
 
-def test_the_learner_killed_and_resumed_on_its_port(stage: Stage) -> None:
+def test_workers_join_a_resumed_learner_on_the_same_port(stage: Stage) -> None:
     address = f"tcp://127.0.0.1:{free_port()}"
     killed = stage.learner(address, {"min-workers": 2, "checkpoint-every-s": 0.3})
     workers = [stage.worker(address, f"w{number}") for number in range(2)]
@@ -123,8 +123,8 @@ def test_the_learner_killed_and_resumed_on_its_port(stage: Stage) -> None:
     finish(learner, workers)
 
 
-def test_a_slow_learner(stage: Stage) -> None:
-    """It stands for longer than worker_timeout_s: tickets run out, no queue grows, and nobody is given up."""
+def test_a_slow_learner_loses_no_worker(stage: Stage) -> None:
+    """The learner is stopped for longer than worker_timeout_s. Tickets run out, no queue grows, and no worker is removed."""
     learner, workers = play(stage)
     before = [worker.memory_mb() for worker in workers]
     learner.pause()
@@ -144,7 +144,7 @@ def test_a_slow_learner(stage: Stage) -> None:
 # ---------------------------------------------------------------- what breaks by itself
 
 
-def test_an_environment_that_raises_over_tcp(stage: Stage) -> None:
+def test_training_goes_on_after_an_environment_raised(stage: Stage) -> None:
     once = stage.tmp_path / "raised"
     settings = {"env-kwargs": f"once {once} after 300"}
     learner, workers = play(stage, settings, env="workers.envs.toy:Raises-v0")
@@ -159,8 +159,8 @@ def test_an_environment_that_raises_over_tcp(stage: Stage) -> None:
     finish(learner, [worker for worker in workers if worker is not broken])
 
 
-def test_an_environment_that_hangs_over_tcp(stage: Stage) -> None:
-    """Nothing is heard of its worker any more, which ends itself and says where it hung."""
+def test_training_goes_on_after_an_environment_hung(stage: Stage) -> None:
+    """The learner hears nothing from the worker any more. The worker ends itself and says where it hung."""
     address = f"tcp://127.0.0.1:{free_port()}"
     began = stage.tmp_path / "hung"
     settings = {"min-workers": 2, "env-kwargs": f"once {began} after 300"}
@@ -178,7 +178,7 @@ def test_an_environment_that_hangs_over_tcp(stage: Stage) -> None:
 
 @contextmanager
 def small_disk(at: Path) -> Iterator[Path]:
-    """A file system of 4 MB."""
+    """Mount a file system of 4 MB."""
     if os.geteuid() != 0:
         pytest.skip("mounting a small file system takes root")
     at.mkdir()
@@ -190,7 +190,7 @@ def small_disk(at: Path) -> Iterator[Path]:
 
 
 def filled(disk: Path) -> Path:
-    """A file that leaves no room."""
+    """Fill the disk with a file."""
     filler = disk / "filler"
     with filler.open("wb", buffering=0) as file:
         try:
@@ -200,8 +200,8 @@ def filled(disk: Path) -> Path:
             return filler
 
 
-def test_a_disk_that_is_full(stage: Stage) -> None:
-    """The old checkpoints stay whole, training goes on, with a warning each time; when there is room, it saves again."""
+def test_training_goes_on_while_the_disk_is_full(stage: Stage) -> None:
+    """The old checkpoints stay whole, and training goes on with a warning each time. When there is space, it saves again."""
     with small_disk(stage.tmp_path / "disk") as disk:
         stage.runs = disk / "runs"
         learner, workers = play(stage, {"checkpoint-every-s": 0.3})

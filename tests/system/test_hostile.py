@@ -1,4 +1,4 @@
-"""A learner in a bad neighbourhood, over tcp: what it learns does not depend on strangers, nor on who died when."""
+"""A learner over TCP with hostile peers: its weights do not depend on their messages, nor on when a worker dies."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from tests.system.runs import accounted
 from workers.collect.env_copies import copy_seeds
 
 MESSAGES, STRANGERS = 100_000, 5
-GROWTH_MB = 20  # in the second half: by then the room for what waits to be read, which stays with the heap, is there
+GROWTH_MB = 20  # growth in the second half: by then the heap has the memory for messages that wait to be read
 
 
 def result(learner: Learner) -> tuple[bytes, dict[str, Any], list[dict[str, Any]]]:
-    """Wait for the end; the policy, the summary and the rows of metrics."""
+    """Wait for the end of the run. Returns the policy, the summary and the rows of metrics."""
     assert learner.ends(START_S) == 0, learner.said()[-5_000:]
     return (learner.folder / "policy.safetensors").read_bytes(), learner.summary(), learner.rows()
 
 
 def answered(stranger: zmq.Socket[bytes]) -> None:
-    """Wait until the learner has read all that this stranger has sent: what is on its way is no growth of the learner."""
+    """Wait until the learner has read everything that this stranger sent, so that no data is on its way."""
     stranger.send_multipart([bytes(frame) for frame in encode(Inquire())])
     deadline_s = time.monotonic() + START_S
     while True:
         assert stranger.poll(max(0, int(1000 * (deadline_s - time.monotonic())))), "a stranger's question was not answered"
-        with suppress(BadMessage):  # what it was told of its rubbish
+        with suppress(BadMessage):  # the learner's answers to its invalid messages
             if isinstance(decode_to_observer(stranger.recv_multipart()), Status):
                 return
 
 
 def pester(learner: Learner, address: str) -> float:
-    """Send hostile messages under names of their own while the learner learns; by how many MB it grew."""
+    """Send hostile messages under several names while the learner learns. Returns its growth in MB."""
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     strangers = []
     for n in range(STRANGERS):
@@ -65,7 +65,7 @@ def pester(learner: Learner, address: str) -> float:
     return sizes[-1] - sizes[len(sizes) // 2]
 
 
-def test_what_is_learned_among_strangers_who_send_rubbish_is_the_same_to_the_bit(tmp_path: Path) -> None:
+def test_invalid_messages_of_strangers_do_not_change_the_weights(tmp_path: Path) -> None:
     settings = {"env-kwargs": "", "rollout-steps": 32, "batch-size": 256, "n-epochs": 4, "steps": 80_000, "seed": 5}
 
     def learn(name: str, loud: bool) -> tuple[bytes, dict[str, Any], float]:
@@ -83,14 +83,14 @@ def test_what_is_learned_among_strangers_who_send_rubbish_is_the_same_to_the_bit
     assert found == expected
     assert grew_mb < GROWTH_MB
     ledger = accounted(summary, rows=32 * 2)
-    assert ledger["messages_bad"] > MESSAGES / 3  # the rest was of a session that is not theirs
+    assert ledger["messages_bad"] > MESSAGES / 3  # the rest used a session of another peer
 
 
-def test_two_runs_in_which_the_same_ticket_kills_its_worker_are_equal_to_the_bit(tmp_path: Path) -> None:
-    """And until that ticket they are equal to the run in which nobody dies: only the lane's new life is another."""
+def test_two_runs_in_which_the_same_ticket_kills_its_worker_give_the_same_weights(tmp_path: Path) -> None:
+    """Until that ticket, they are equal to the run without a death. After it, only the incarnation of the lane differs."""
     steps, seed, deadly_update = 16, 2, 4
     doomed = copy_seeds(seed, lane=1, incarnation=0, copies=2)[1]
-    after = ((deadly_update - 1) * steps + steps // 2) * 5 // 6  # of its steps: every sixth row only resets
+    after = ((deadly_update - 1) * steps + steps // 2) * 5 // 6  # env steps: every sixth row only resets
 
     def learn(name: str, only_seed: int) -> tuple[bytes, dict[str, Any], list[dict[str, Any]]]:
         settings = {

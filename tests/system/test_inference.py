@@ -1,4 +1,4 @@
-"""Runs with `--inference learner`: the same weights as with `--inference workers`, and the same results of faults."""
+"""Runs with `--inference learner`: the same weights and the same handling of faults as with `--inference workers`."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def policy_of(folder: Path) -> bytes:
     ids=["ppo", "gaussian", "lstm", "a2c", "dqn", "reinforce", "impala"],
 )
 def test_the_weights_equal_those_of_inference_workers(tmp_path: Path, env: str, settings: dict[str, Any]) -> None:
-    """Bit for bit: a lane has its own seeds and random numbers, wherever its copies are and wherever the policy acts."""
+    """Bit for bit: seeds and random numbers belong to the lane, wherever its copies are and wherever the policy acts."""
     in_workers = run(tmp_path, env, seed=3, workers=2, eval_episodes=1, **settings)
     in_learner = run(tmp_path, env, seed=3, workers=2, eval_episodes=1, **settings, **IN_LEARNER)
     assert policy_of(in_learner) == policy_of(in_workers)
@@ -67,7 +67,7 @@ def test_the_weights_equal_those_of_inference_workers(tmp_path: Path, env: str, 
 
 def test_the_weights_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
     policies = {}
-    for workers, transport in ((1, "ipc"), (2, "tcp"), (3, "inproc"), (5, "ipc")):  # of five workers one has no lane
+    for workers, transport in ((1, "ipc"), (2, "tcp"), (3, "inproc"), (5, "ipc")):  # with five workers, one has no lane
         settings: dict[str, Any] = {"workers": workers, "transport": transport, "steps": 2_500, **SMALL, **IN_LEARNER}
         policies[workers] = policy_of(run(tmp_path, "CartPole-v1", seed=3, **settings))
     assert len(set(policies.values())) == 1
@@ -75,7 +75,7 @@ def test_the_weights_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> N
     assert policy_of(run(tmp_path, "CartPole-v1", seed=4, **other)) != policies[1], "the seed changes nothing"
 
 
-def test_it_learns(tmp_path: Path) -> None:
+def test_a_run_with_learner_inference_learns(tmp_path: Path) -> None:
     folder = run(tmp_path, "CartPole-v1", steps=60_000, target_mean_return=150.0, eval_episodes=10, **IN_LEARNER)
     assert summary(folder)["stop_reason"] == "mean return 150 of the last episodes reached"
     assert summary(folder)["evaluation"]["return_mean"] > 150
@@ -195,7 +195,7 @@ def test_a_killed_worker_costs_only_the_episodes_of_its_copies(tmp_path: Path, c
     assert restored, "the killed worker was not replaced"
     assert result["stop_reason"] == "all steps done"
     assert "was killed by SIGKILL" in caplog.text
-    assert caplog.text.count("comes back truncated") == 2  # it had two of the four lanes
+    assert caplog.text.count("comes back truncated") == 2  # the killed worker had two of the four lanes
     assert result["ledger"]["lost"] == 0
     assert_balanced(result["ledger"])
 
@@ -214,7 +214,7 @@ def test_one_failure_of_an_environment_is_tolerated(tmp_path: Path) -> None:
     result = summary(folder)
     assert Path(kwargs["once"]).exists()
     assert result["stop_reason"] == "all steps done"
-    assert result["ledger"]["lost"] == 4  # the unfinished rollouts, one of each lane; their tickets are issued again
+    assert result["ledger"]["lost"] == 4  # the tickets of the unfinished rollouts, one of each lane
     assert_balanced(result["ledger"])
 
 
@@ -224,7 +224,7 @@ def test_nan_ends_the_run_with_an_error_that_says_where(tmp_path: Path, env: str
         run(tmp_path, f"{TOY}{env}-v0", max_env_failures=0, **SMALL, **IN_LEARNER)
 
 
-def test_an_environment_that_hangs_is_given_up(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_run_continues_after_an_environment_hung(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     kwargs = {"once": str(tmp_path / "hung"), "after": 30}
     settings: dict[str, Any] = {"steps": 2_000, "step_timeout_s": 1.0, "env_kwargs": kwargs, **SMALL, **IN_LEARNER}
     with caplog.at_level(logging.WARNING):
@@ -233,7 +233,7 @@ def test_an_environment_that_hangs_is_given_up(tmp_path: Path, caplog: pytest.Lo
     assert "a step of its environment took too long (--step-timeout-s)" in caplog.text
 
 
-def test_no_worker_joins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_run_fails_if_no_worker_joins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("workers.supervisor.sys.executable", "/bin/false")
     began_s = time.monotonic()
     with pytest.raises(NoWorkers, match="waited 1 s for 2 workers"):

@@ -91,7 +91,7 @@ def test_a_worker_without_a_token_says_why_it_cannot_join(stage: Stage) -> None:
     worker = stage.worker(address, "w", "--join-timeout-s", "3")
     worker.hears("perhaps it asks for a key: give this worker --token FILE")
     learner.hears("was not let in")
-    assert time.monotonic() - began_s < (5 + 1) * crowding()  # and the time that Python takes to start
+    assert time.monotonic() - began_s < (5 + 1) * crowding()  # includes the time that Python takes to start
     assert worker.ends() == 1
     assert "no learner answered for 3 s: " in worker.said().splitlines()[-1]
 
@@ -108,7 +108,7 @@ def test_an_insecure_learner_warns_and_a_worker_of_it_runs_no_code(stage: Stage)
 
 
 def test_a_run_on_this_machine_over_encrypted_tcp_learns_the_same(tmp_path: Path) -> None:
-    """With keys made for this run alone, in no file, the weights are the same bits as without keys."""
+    """With keys made only for this run and not stored in a file, the weights are the same bits as without keys."""
     policies = []
     runs: dict[str, dict[str, Any]] = {"ipc": {}, "sealed": {"transport": "tcp", "keys": str(tmp_path / "keys")}}
     for name, settings in runs.items():

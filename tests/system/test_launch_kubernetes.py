@@ -43,7 +43,7 @@ def with_variables(container: dict[str, Any], secret: dict[str, bytes]) -> list[
     return ["env", *(f"{name}={value}" for name, value in found.items())]
 
 
-def test_a_run_by_the_commands_of_the_manifest(capsys: pytest.CaptureFixture[str], stage: Stage, tmp_path: Path) -> None:
+def test_the_commands_of_the_manifest_train(capsys: pytest.CaptureFixture[str], stage: Stage, tmp_path: Path) -> None:
     found = manifest(
         capsys, tmp_path, "--workers", "2", "--", "--steps", "4096", "--eval-episodes", "1", "--min-workers", "2"
     )

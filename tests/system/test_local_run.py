@@ -25,7 +25,7 @@ from learner.run_folder.progress import Progress
 from millrace.launch.local_run import train
 from protocol.errors import EnvironmentFailed, NoWorkers, RunError, Stalled, UsageError
 
-SMALL: dict[str, Any] = {"n_epochs": 2, "eval_episodes": 2}  # what is shown here does not hang on learning much
+SMALL: dict[str, Any] = {"n_epochs": 2, "eval_episodes": 2}  # these tests do not need a run that learns much
 
 
 def run(tmp_path: Path, env: str, watch: Any = lambda progress: None, resume: Path | None = None, **settings: Any) -> Path:
@@ -53,8 +53,8 @@ def worker_processes() -> list[psutil.Process]:
     ("env", "settings"),
     [("CartPole-v1", {"steps": 5_300}), ("Pendulum-v1", {"steps": 42_500, "n_epochs": 1, "batch_size": 256})],
 )
-def test_the_same_curve_whatever_the_number_of_workers(tmp_path: Path, env: str, settings: dict[str, Any]) -> None:
-    """20 updates on one seed, in the default lanes: the same bytes for 1, 2 and 4 workers, over inproc, ipc and tcp."""
+def test_the_curve_does_not_depend_on_the_number_of_workers(tmp_path: Path, env: str, settings: dict[str, Any]) -> None:
+    """20 updates with one seed and the default lanes: the same weights for 1, 2 and 4 workers, over inproc, ipc and tcp."""
     policies: dict[tuple[int | str, str], bytes] = {}
     for workers in (1, 2, 4):
         for transport in ("inproc", "ipc", "tcp"):
@@ -70,7 +70,7 @@ def test_the_same_curve_whatever_the_number_of_workers(tmp_path: Path, env: str,
     assert (other / "policy.safetensors").read_bytes() != policies[1, "inproc"], "the seed changes nothing"
 
 
-def test_compressed_rollouts_change_nothing_but_their_bytes(tmp_path: Path) -> None:
+def test_compressing_rollouts_does_not_change_the_run(tmp_path: Path) -> None:
     settings: dict[str, Any] = {"steps": 2_000, "rollout_steps": 64, "seed": 3, "eval_episodes": 1}
     plain, compressed = (run(tmp_path, "CartPole-v1", compress=compress, **settings) for compress in ("none", "zstd"))
     assert (plain / "policy.safetensors").read_bytes() == (compressed / "policy.safetensors").read_bytes()
@@ -84,14 +84,14 @@ def test_a_learner_that_cannot_decompress_does_not_start(tmp_path: Path, monkeyp
     assert not list(tmp_path.glob("runs*"))
 
 
-def test_a_run_whose_weights_travel_rounded_learns(tmp_path: Path) -> None:
-    """It learns what it learns from exact weights, of which it is not: another run."""
+def test_a_run_with_rounded_weights_learns(tmp_path: Path) -> None:
+    """The run reaches a good return. Its weights differ from those of a run with exact weights, as expected."""
     settings: dict[str, Any] = {"steps": 12_000, "seed": 3, "eval_episodes": 5, "learning_rate": 0.003, "rollout_steps": 64}
     env = "workers.envs.toy:Identity-v0"
     folders = {dtype: run(tmp_path, env, weights_dtype=dtype, **settings) for dtype in ("float32", "bfloat16", "float16")}
     for folder in folders.values():
         assert summary(folder)["evaluation"]["return_mean"] == 10
-        assert summary(folder)["return_mean_100"] > 8  # 2.5 at random
+        assert summary(folder)["return_mean_100"] > 8  # a random policy returns 2.5
     assert len({(folder / "policy.safetensors").read_bytes() for folder in folders.values()}) == 3
 
 
@@ -113,7 +113,7 @@ def test_lag_never_exceeds_its_bound(tmp_path: Path, max_lag: int) -> None:
 
 
 @pytest.mark.parametrize("max_lag", [0, 1])
-def test_the_learners_stages_are_all_of_its_time(tmp_path: Path, max_lag: int) -> None:
+def test_the_learners_stages_sum_to_its_time(tmp_path: Path, max_lag: int) -> None:
     folder = run(tmp_path, "CartPole-v1", max_lag=max_lag, steps=12_000, **SMALL)
     first, *_, last = read_rows(folder / "metrics.jsonl")
     names = ("learner_wait", "learner_update", "learner_other")
@@ -121,8 +121,8 @@ def test_the_learners_stages_are_all_of_its_time(tmp_path: Path, max_lag: int) -
     assert told == pytest.approx(last["time/time_elapsed"] - first["time/time_elapsed"], rel=0.03)
 
 
-def test_the_best_policy_by_the_runs_own_evaluations_is_kept_and_tried_again(tmp_path: Path) -> None:
-    """The greedy return of CartPole rises and falls; what is kept is the highest point, not the last."""
+def test_the_best_policy_of_the_evaluations_is_kept_and_evaluated_again(tmp_path: Path) -> None:
+    """The greedy return of CartPole rises and falls. The policy with the highest return is kept, not the last one."""
     settings: dict[str, Any] = {"steps": 12_000, "eval_every": 1_000, "eval_episodes": 20, "learning_rate": 0.01}
     folder = run(tmp_path, "CartPole-v1", seed=3, **settings)
     evaluations = {
@@ -217,14 +217,14 @@ def test_a_run_continues_after_an_environment_raised_once(tmp_path: Path) -> Non
     assert_balanced(found["ledger"])
 
 
-def test_nan_ends_the_run_naming_where(tmp_path: Path) -> None:
+def test_nan_ends_the_run_with_an_error_that_says_where(tmp_path: Path) -> None:
     for env, what in (("NaNObservation", "observation"), ("NaNReward", "reward")):
         with pytest.raises(EnvironmentFailed, match=rf"lane \d.*{what}.*nan at step \d+, copy \d+"):
             run(tmp_path, f"workers.envs.toy:{env}-v0", max_env_failures=0, **SMALL)
 
 
-def test_nobody_comes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Workers that cannot even start: the run ends by its deadline and says what it waited for."""
+def test_a_run_whose_workers_cannot_start_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The workers cannot start. The run ends at its deadline and says what it waited for."""
     monkeypatch.setattr("workers.supervisor.sys.executable", "/bin/false")
     with pytest.raises(NoWorkers, match="waited 1 s for 2 workers"):
         run(tmp_path, "CartPole-v1", no_workers_timeout_s=1.0, **SMALL)
@@ -241,7 +241,7 @@ def test_nobody_comes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("tuple", "unbounded", "inproc"),
     ],
 )
-def test_every_kind_of_space_is_learned_on(tmp_path: Path, observation: str, action: str, transport: str) -> None:
+def test_a_run_learns_with_every_kind_of_space(tmp_path: Path, observation: str, action: str, transport: str) -> None:
     kwargs = {"observation": observation, "action": action}
     settings: dict[str, Any] = {
         "env_kwargs": kwargs,
@@ -270,7 +270,7 @@ def test_an_environment_may_be_a_callable_and_travels_to_local_workers_only(tmp_
         millrace.train(balance, transport="tcp", **settings)
 
 
-def test_learner_and_workers_as_processes_of_their_own(tmp_path: Path) -> None:
+def test_learner_and_workers_train_as_separate_processes(tmp_path: Path) -> None:
     address = f"ipc://{tmp_path}/learner"
     flags = ["CartPole-v1", "--bind", address, "--min-workers", "2", "--steps", "2000", "--eval-episodes", "2"]
     command = [sys.executable, "-m", "learner", *flags, "--run-dir", str(tmp_path / "runs")]
@@ -289,7 +289,7 @@ def test_learner_and_workers_as_processes_of_their_own(tmp_path: Path) -> None:
     assert again.returncode == 0, "a run that is done waits for workers"
 
 
-def test_a_worker_says_that_nobody_answers(tmp_path: Path) -> None:
+def test_a_worker_without_a_learner_says_that_nobody_answers(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "workers", f"ipc://{tmp_path}/nobody", "--join-timeout-s", "0.5"]
     worker = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
     assert worker.returncode == 1

@@ -1,4 +1,4 @@
-"""Many workers, with real sockets, before one learner: nothing is lost."""
+"""One learner with many workers over real sockets: nothing is lost."""
 
 from __future__ import annotations
 

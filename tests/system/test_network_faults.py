@@ -1,6 +1,6 @@
-"""What must happen when the way between learner and workers is bad, cut, or used by strangers.
+"""Runs whose network is bad or cut, or is used by strangers.
 
-Hosts are network namespaces (root, `ip`, `nft`); what needs none of them goes through a proxy on loopback.
+Hosts are network namespaces (root, `ip`, `nft`). Tests that do not need them use a proxy on loopback.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from tests.system.proxy import Proxy
 from tests.system.rubbish import talk_rubbish
 from tests.system.runs import NOTICED_S, dealt_again, far_apart, finish, play, within
 
-AGAIN_S = 5.0  # after a cut: at most 2 s until a connection in vain is given up, 2 s until the next is tried, and a Hello
+AGAIN_S = 5.0  # after a cut: at most 2 s until a connection attempt fails, 2 s until the next attempt, and a Hello
 
 # ---------------------------------------------------------------- cut, and healed
 
 
 @pytest.mark.parametrize("cut_s", [4, pytest.param(30, marks=pytest.mark.soak)])
-def test_a_network_cut_and_healed(stage: Stage, network: Network, cut_s: float) -> None:
+def test_a_worker_joins_again_after_its_network_was_cut(stage: Stage, network: Network, cut_s: float) -> None:
     learner, workers, (_, far, _), _ = far_apart(stage, network)
     far.cut()
     began_s = time.monotonic()
     within("a worker's network cut", dealt_again(learner), NOTICED_S)
     learner.hears("worker w0 silent for 2 s")
-    time.sleep(cut_s - (time.monotonic() - began_s))  # long enough for TCP to wait for long between two tries
+    time.sleep(cut_s - (time.monotonic() - began_s))  # long enough that TCP waits long between two attempts
     far.heal()
     began_s = time.monotonic()
     learner.hears(r"worker w0 \(.*\) joined", times=2)
@@ -39,7 +39,7 @@ def test_a_network_cut_and_healed(stage: Stage, network: Network, cut_s: float) 
 
 
 @pytest.mark.soak
-def test_the_learners_network_cut_and_healed(stage: Stage, network: Network) -> None:
+def test_workers_join_again_after_the_learners_network_was_cut(stage: Stage, network: Network) -> None:
     learner, workers, (here, *_), _ = far_apart(stage, network)
     here.cut()
     learner.hears("worker w[01] silent for 2 s", times=2)
@@ -52,8 +52,8 @@ def test_the_learners_network_cut_and_healed(stage: Stage, network: Network) -> 
     finish(learner, workers)
 
 
-def test_a_host_that_vanished_and_came_back(stage: Stage, network: Network) -> None:
-    """The learner's connection to it is half-open; the worker that comes back has its name, and is not locked out."""
+def test_a_worker_on_a_vanished_host_joins_again_under_its_name(stage: Stage, network: Network) -> None:
+    """The learner's connection to the host is half-open. A new worker of the same name is not locked out."""
     learner, (gone, other), (here, far, _), token = far_apart(stage, network, {"worker-timeout-s": 20})
     far.cut()
     gone.kill()
@@ -69,8 +69,8 @@ def test_a_host_that_vanished_and_came_back(stage: Stage, network: Network) -> N
 
 
 @pytest.mark.soak
-def test_a_host_that_vanished_for_good(stage: Stage, network: Network) -> None:
-    """Nobody says goodbye, and the learner has nothing to say to it: its connection is closed nevertheless."""
+def test_the_connection_to_a_vanished_host_is_closed(stage: Stage, network: Network) -> None:
+    """The worker sends no Goodbye, and the learner sends nothing to it. The learner still closes the connection."""
     learner, (gone, other), (_, far, _), _ = far_apart(stage, network)
     far.cut()
     gone.kill()
@@ -84,8 +84,8 @@ def test_a_host_that_vanished_for_good(stage: Stage, network: Network) -> None:
 
 
 @pytest.mark.soak
-def test_the_learners_host_vanished_and_came_back(stage: Stage, network: Network) -> None:
-    """The workers' connections are half-open: nobody tells them that they are."""
+def test_workers_join_a_learner_whose_host_vanished_and_came_back(stage: Stage, network: Network) -> None:
+    """The workers' connections are half-open, and the workers are not notified."""
     learner, workers, (here, *_), _ = far_apart(stage, network, {"checkpoint-every-s": 0.3})
     wait_for(lambda: len(learner.checkpoints()) >= 2, START_S, "the second checkpoint")
     here.cut()
@@ -108,7 +108,7 @@ def test_the_learners_host_vanished_and_came_back(stage: Stage, network: Network
     ("percent", "bound_s"),
     [(1, 4.0), pytest.param(10, 15.0, marks=pytest.mark.soak), pytest.param(30, 60.0, marks=pytest.mark.soak)],
 )
-def test_lost_packets(stage: Stage, network: Network, percent: int, bound_s: float) -> None:
+def test_training_goes_on_while_packets_are_lost(stage: Stage, network: Network, percent: int, bound_s: float) -> None:
     learner, workers, (_, *far), _ = far_apart(stage, network)
     for host in far:
         host.lose(percent)
@@ -122,8 +122,8 @@ def test_lost_packets(stage: Stage, network: Network, percent: int, bound_s: flo
 
 
 @pytest.mark.soak
-def test_a_thin_line(stage: Stage, network: Network) -> None:
-    """Weights and rollouts take longer than the heartbeats between them."""
+def test_training_goes_on_over_a_slow_line(stage: Stage, network: Network) -> None:
+    """Sending weights or a rollout takes longer than the interval between heartbeats."""
     learner, workers, (_, *far), _ = far_apart(stage, network)
     for host in far:
         host.slow(32)
@@ -138,7 +138,7 @@ def test_a_thin_line(stage: Stage, network: Network) -> None:
     finish(learner, workers)
 
 
-def test_latency_and_small_pieces(stage: Stage) -> None:
+def test_training_goes_on_with_latency_and_small_pieces(stage: Stage) -> None:
     port = free_port()
     learner = stage.learner(f"tcp://127.0.0.1:{port}", {"min-workers": 2})
     with Proxy(port) as far:
@@ -155,8 +155,8 @@ def test_latency_and_small_pieces(stage: Stage) -> None:
         finish(learner, workers)
 
 
-def test_connections_that_are_reset(stage: Stage) -> None:
-    """What was under way is lost; heartbeats repair it; nobody is given up and no ticket is lost."""
+def test_no_worker_is_lost_when_connections_are_reset(stage: Stage) -> None:
+    """Messages on their way are lost, and heartbeats repair this. No worker is removed, and no ticket is lost."""
     port = free_port()
     learner = stage.learner(f"tcp://127.0.0.1:{port}", {"min-workers": 2})
     with Proxy(port) as way:
@@ -175,8 +175,8 @@ def test_connections_that_are_reset(stage: Stage) -> None:
 
 
 @pytest.mark.soak
-def test_a_way_that_swallows_everything(stage: Stage) -> None:
-    """Connections stay open and nothing comes: the worker is given up, and when it comes again it is told to rejoin."""
+def test_a_worker_joins_again_after_its_connection_forwarded_nothing(stage: Stage) -> None:
+    """Connections stay open and nothing arrives. The learner removes the worker, and later tells it to rejoin."""
     port = free_port()
     learner = stage.learner(f"tcp://127.0.0.1:{port}", {"min-workers": 2})
     with Proxy(port) as way:
@@ -196,7 +196,7 @@ def test_a_way_that_swallows_everything(stage: Stage) -> None:
 # ---------------------------------------------------------------- strangers
 
 
-def test_peers_that_talk_rubbish(stage: Stage) -> None:
+def test_training_goes_on_while_peers_send_invalid_data(stage: Stage) -> None:
     learner, workers = play(stage)
     before_mb = learner.memory_mb()
     port = int(learner.hears("waiting for workers").rpartition(":")[2])
@@ -213,7 +213,7 @@ def test_peers_that_talk_rubbish(stage: Stage) -> None:
     finish(learner, workers)
 
 
-def test_a_worker_of_another_protocol_version(stage: Stage) -> None:
+def test_a_worker_of_another_protocol_version_is_refused(stage: Stage) -> None:
     learner, workers = play(stage)
     address = learner.hears("waiting for workers").split()[-1]
     newer = "import sys, workers.session as s, workers.__main__ as m; s.PROTOCOL_VERSION = 999; sys.exit(m.main())"

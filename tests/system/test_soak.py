@@ -1,4 +1,4 @@
-"""A minute of the soak: many faults at once, and all that must hold when they are over."""
+"""One minute of the soak test: many faults at once, and all requirements afterwards."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.system.soak import soak
 
 
 @pytest.mark.timeout(400)
-def test_a_minute_of_faults(tmp_path: Path) -> None:
+def test_a_run_survives_a_minute_of_faults(tmp_path: Path) -> None:
     if why := why_not():
         pytest.skip(why)
     assert soak(1.0, seed=1, folder=tmp_path) == []

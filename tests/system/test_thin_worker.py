@@ -37,7 +37,7 @@ def names(requirements: list[str]) -> set[str]:
 
 @pytest.fixture
 def thin(tmp_path: Path) -> dict[str, str]:
-    """The environment of processes that find nothing but what a worker needs."""
+    """Environment variables for processes that can import only what a worker needs."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = [line for lines in project["optional-dependencies"].values() for line in lines]
     missing = names(project["dependencies"] + extras) - names((ROOT / "docker" / "worker.txt").read_text().splitlines())
@@ -83,7 +83,7 @@ def test_keys_and_help_need_nothing_more(thin: dict[str, str], tmp_path: Path) -
     assert re.search(r"^far .* may connect$", shown, re.MULTILINE)
 
 
-def test_workers_join_and_a_run_is_asked_how_it_is(stage: Stage, thin: dict[str, str]) -> None:
+def test_workers_join_and_status_shows_the_run(stage: Stage, thin: dict[str, str]) -> None:
     keys, token = stage.keys()
     learner = stage.learner("tcp://127.0.0.1:*", {"keys": keys})
     address = learner.hears("millrace worker ", START_S).partition("millrace worker ")[2].split()[0]

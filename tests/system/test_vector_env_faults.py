@@ -49,7 +49,7 @@ def local_workers() -> list[psutil.Process]:
 
 
 def close_and_check(env: ZmqVectorEnv) -> None:
-    """Close it twice, in time; no worker process is left."""
+    """Close the environment twice, in time. No worker process must be left."""
     began = time.monotonic()
     env.close()
     env.close()
@@ -96,7 +96,7 @@ def test_a_loss_is_reported_beside_infos_too_long_for_shared_memory() -> None:
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.DISABLED])
-def test_a_lost_worker_in_the_other_modes(mode: AutoresetMode) -> None:
+def test_a_lost_worker_is_truncated_in_the_other_autoreset_modes(mode: AutoresetMode) -> None:
     env = make(autoreset_mode=mode)
     env.reset(seed=1)
     before = env.step(ZEROS)[0]
@@ -181,7 +181,7 @@ def test_an_environment_that_cannot_be_made_in_a_worker_says_why() -> None:
 
 
 @pytest.mark.parametrize("loss", ["truncate", "raise"])
-def test_an_environment_that_hangs_is_given_up_at_the_deadline(tmp_path: Path, loss: str) -> None:
+def test_a_worker_whose_environment_hangs_is_lost_at_the_deadline(tmp_path: Path, loss: str) -> None:
     once = str(tmp_path / "once")
     env = make("workers.envs.toy:Hangs-v0", after=1, once=once, timeout=1.5, on_worker_loss=loss)
     env.reset(seed=1)
@@ -198,14 +198,14 @@ def test_an_environment_that_hangs_is_given_up_at_the_deadline(tmp_path: Path, l
     close_and_check(env)
 
 
-def test_closing_while_an_environment_hangs() -> None:
+def test_close_returns_while_an_environment_hangs() -> None:
     env = make("workers.envs.toy:Hangs-v0", after=0)
     env.reset(seed=1)
     env.step_async(ZEROS)
     close_and_check(env)
 
 
-def test_a_stopped_worker_is_given_up_at_the_deadline() -> None:
+def test_a_stopped_worker_is_lost_at_the_deadline() -> None:
     env = make(timeout=1.0)
     env.reset(seed=1)
     local_workers()[0].send_signal(signal.SIGSTOP)
@@ -228,7 +228,7 @@ def test_a_reset_is_repeated_when_workers_are_lost() -> None:
     close_and_check(env)
 
 
-def test_nothing_stays_open_after_many_environments() -> None:
+def test_many_environments_leave_nothing_open() -> None:
     def use_one() -> None:
         with make() as env:
             env.reset(seed=1)
@@ -242,7 +242,7 @@ def test_nothing_stays_open_after_many_environments() -> None:
     assert set(os.listdir("/dev/shm")) <= shared_files
 
 
-def test_no_worker_joins() -> None:
+def test_make_vec_fails_if_no_worker_joins() -> None:
     env: ZmqVectorEnv | None = None
     with pytest.raises(NoWorkers, match=r"waited 0.5 s for 2 workers at tcp://127.0.0.1:\d+, 0 joined; start one"):
         env = make(workers=0, lanes=2, bind="tcp://127.0.0.1:*", timeout=0.5)
@@ -285,7 +285,7 @@ def test_no_process_outlives_the_learner(end: str, tmp_path: Path) -> None:
 
 
 def test_workers_elsewhere_join_by_tcp_and_come_back() -> None:
-    """They are started by hand, over tcp; one is killed and another takes its place."""
+    """The test starts the workers, which join over TCP. One is killed, and another takes its place."""
 
     def start(address: str, name: str) -> subprocess.Popen[bytes]:
         root = Path(__file__).parents[2]
@@ -316,7 +316,7 @@ def test_workers_elsewhere_join_by_tcp_and_come_back() -> None:
 
 
 class Elsewhere:
-    """Workers that are started by hand; their stderr goes to a file."""
+    """Workers that the test starts itself. Their stderr goes to a file."""
 
     def __init__(self, folder: Path) -> None:
         self.address = f"tcp://127.0.0.1:{free_port()}"
@@ -371,7 +371,7 @@ def test_with_keys_a_callable_is_sent_and_a_revoked_key_is_a_lost_worker(elsewhe
     assert "revoked" in elsewhere.stderr()
 
 
-def test_a_silent_worker_elsewhere_is_given_up_long_before_the_deadline(elsewhere: Elsewhere) -> None:
+def test_a_silent_worker_elsewhere_is_lost_long_before_the_deadline(elsewhere: Elsewhere) -> None:
     for name in ("a", "b"):
         elsewhere.start(name)
     with make(workers=None, lanes=2, bind=elsewhere.address, timeout=60.0) as env:
@@ -387,8 +387,8 @@ def test_a_silent_worker_elsewhere_is_given_up_long_before_the_deadline(elsewher
         assert env.reset(seed=1)[0].shape == (4, 4)
 
 
-def test_a_slow_step_or_a_slow_caller_is_no_silence(elsewhere: Elsewhere, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both take longer than the time after which a silent worker is given up."""
+def test_a_slow_step_or_a_slow_caller_does_not_lose_a_worker(elsewhere: Elsewhere, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both take longer than the time after which a silent worker counts as lost."""
     monkeypatch.setattr(vector, "WORKER_TIMEOUT_S", 2.0)
     elsewhere.start("a")
     with millrace.make_vec("workers.envs.toy:Slow-v0", 1, bind=elsewhere.address, seconds=3.0, timeout=60.0) as env:
