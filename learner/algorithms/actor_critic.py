@@ -203,8 +203,7 @@ class ActorCritic:
         metrics = self._gradient(rows)
         check_finite(metrics, self.version, "a lower learning_rate, or normalize_observations and normalize_rewards")
         if metrics["grad_norm"] > self.config.max_grad_norm:
-            with torch.no_grad():
-                self.net.flat_grad.mul_(self.config.max_grad_norm / metrics["grad_norm"])
+            self.net.flat_grad.mul_(self.config.max_grad_norm / metrics["grad_norm"])
         if not self.stops(metrics):
             take_step(self.optimizer)
         return metrics
@@ -275,9 +274,14 @@ class ActorCritic:
         raw = features(self.policy, batch.obs)
         x = normalize(raw, *np.split(self._buffers, 2)) if self.policy.normalize_observations else raw
         images = [array for leaf, array in zip(self.policy.observation, batch.obs, strict=True) if leaf.is_image]
-        keep_state = np.concatenate([np.ones((1, raw.shape[1]), bool), batch.valid]).astype(np.float32)
-        recurrent = RecurrentInput(self._to_device(batch.state), self._to_device(keep_state))
-        return Observations(raw, self._flat_tensor(x), tuple(map(self._flat_tensor, images)), recurrent)
+        return Observations(raw, self._flat_tensor(x), tuple(map(self._flat_tensor, images)), self._recurrent_input(batch))
+
+    def _recurrent_input(self, batch: Batch) -> RecurrentInput | None:
+        """The states before all T+1 steps, and where they are reset; None without a core."""
+        if self.policy.core is None:
+            return None
+        keep_state = np.concatenate([np.ones_like(batch.valid[:1]), batch.valid]).astype(np.float32)
+        return RecurrentInput(self._to_device(batch.state), self._to_device(keep_state))
 
     def rewards(self, batch: Batch) -> Floats:
         """Rewards [T, ΣN], scaled if the settings say so. Updates the scale: call it once for each batch."""
@@ -351,9 +355,10 @@ class ActorCritic:
 
     def _epochs(self, rows: Minibatch, mask: Bools) -> Iterator[Iterable[Minibatch]]:
         """The minibatches of each epoch, without end. A single minibatch is made once, with its rows in order."""
-        count = self.minibatch_count(int(np.count_nonzero(mask)))
+        selected = int(np.count_nonzero(mask))
+        count = self.minibatch_count(selected)
         single: tuple[Minibatch, ...] = ()
-        if mask.any() and count == 1 and not self.shuffles_single_minibatch:
+        if selected and count == 1 and not self.shuffles_single_minibatch:
             single = (self.select(rows, mask),)
         while True:
             yield single or self.minibatches(rows, mask, count)

@@ -31,12 +31,13 @@ class Observations(NamedTuple):
     raw_features: Floats  # [T+1, ΣN, D], not normalized
     features: Tensor  # [(T+1) · ΣN, D] float32, normalized
     images: tuple[Tensor, ...]  # [(T+1) · ΣN, *leaf] uint8 each
-    recurrent: RecurrentInput  # for all T+1 steps; its state has size 0 without a core
+    recurrent: RecurrentInput | None  # for all T+1 steps; None without a core
 
     def network_input(self, steps: int, columns: Index, rows: Index) -> NetworkInput:
         """The input for `rows`, which must be the first `steps` steps of `columns` if the policy has a core."""
-        state, keep_state, _ = self.recurrent
-        recurrent = RecurrentInput(state[columns], keep_state[:steps, columns]) if state.shape[1] else None
+        recurrent = self.recurrent
+        if recurrent is not None:
+            recurrent = RecurrentInput(recurrent.initial_state[columns], recurrent.keep_state[:steps, columns])
         return NetworkInput(self.features[rows], tuple(image[rows] for image in self.images), recurrent)
 
 

@@ -10,6 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from learner.members.events import EnvironmentRaised, Event
 from learner.members.member_server import MemberServer, ServerCallbacks
@@ -50,8 +51,7 @@ class HubSettings:
     """Dtype in which parameters are sent."""
 
 
-@dataclass(frozen=True)
-class HubSnapshot:
+class HubSnapshot(NamedTuple):
     """State of the hub at one moment, for metrics, checkpoints and status. Cheap to make."""
 
     progress: Progress
@@ -215,7 +215,7 @@ class Hub:
             ledger=coordinator.ledger.copy(),
             incarnations=coordinator.incarnations(),
             lags=self._lags,
-            lag_counts=self._weight_age.lags.copy(),
+            lag_counts=dict(self._weight_age.lags),
             wait_s=self._wait_s,
             members=tuple(coordinator.members.values()),
             received=(link.received.messages, link.received.bytes),
