@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
@@ -17,8 +17,13 @@ WINDOW_EPISODES = 100
 class EpisodeWindow:
     """The last 100 episodes."""
 
-    def __init__(self, episodes: Iterable[Episode] = ()) -> None:
-        self._episodes: deque[Episode] = deque(episodes, maxlen=WINDOW_EPISODES)
+    def __init__(self, episodes: Sequence[Episode] = ()) -> None:
+        self.return_mean: float | None = None
+        """Mean return, or None before the first episode has ended."""
+        self.length_mean: float | None = None
+        """Mean length in env steps, or None before the first episode has ended."""
+        self._episodes: deque[Episode] = deque(maxlen=WINDOW_EPISODES)
+        self.extend(episodes)
 
     @staticmethod
     def from_state(state: list[Any]) -> EpisodeWindow:
@@ -30,21 +35,15 @@ class EpisodeWindow:
         state: list[Any] = msgspec.to_builtins(list(self._episodes))
         return state
 
-    def extend(self, episodes: Iterable[Episode]) -> None:
+    def extend(self, episodes: Sequence[Episode]) -> None:
         """Add episodes that have just ended, in order."""
+        if not episodes:
+            return  # as after most updates of short rollouts: the means need not be computed again
         self._episodes.extend(episodes)
+        self.return_mean = float(np.mean([episode.reward for episode in self._episodes]))
+        self.length_mean = float(np.mean([episode.length for episode in self._episodes]))
 
     @property
     def full(self) -> bool:
         """True once there are 100."""
         return len(self._episodes) == WINDOW_EPISODES
-
-    @property
-    def return_mean(self) -> float | None:
-        """Mean return, or None before the first episode has ended."""
-        return float(np.mean([episode.reward for episode in self._episodes])) if self._episodes else None
-
-    @property
-    def length_mean(self) -> float | None:
-        """Mean length in env steps, or None before the first episode has ended."""
-        return float(np.mean([episode.length for episode in self._episodes])) if self._episodes else None

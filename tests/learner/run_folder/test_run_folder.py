@@ -241,7 +241,8 @@ def test_the_window_holds_the_last_hundred_episodes() -> None:
     window = EpisodeWindow()
     assert window.return_mean is None
     assert window.length_mean is None
-    window.extend(Episode(float(i), 2 * i, 0.0) for i in range(150))
+    window.extend([Episode(float(i), 2 * i, 0.0) for i in range(150)])
+    window.extend([])
     assert window.return_mean == np.mean(range(50, 150))
     assert window.length_mean == 2 * np.mean(range(50, 150))
     again = EpisodeWindow.from_state(json.loads(json.dumps(window.state())))
