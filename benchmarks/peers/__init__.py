@@ -1,4 +1,4 @@
-"""PPO of other systems as programs of their own, each in an environment of its own, with our names for its settings.
+"""PPO of other systems as separate programs, each in its own environment. They take settings by millrace's names.
 
-Rule: a file here that runs in a peer's environment imports that peer, and of this repository `benchmarks.peers` alone.
+Rule: a file here that runs in a peer's environment imports that peer and `benchmarks.peers`, and nothing else of millrace.
 """

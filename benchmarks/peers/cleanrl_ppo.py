@@ -1,7 +1,7 @@
-"""CleanRL's ppo.py as it is installed, run as a script; what it tells TensorBoard at the end of an update tells us, too.
+"""Runs CleanRL's installed ppo.py as a script. This file replaces its TensorBoard writer, to see the end of each update.
 
-Cannot be said to it: a clip range that falls (stays 0.2), a truncated episode's value (counts as terminated), another
-vector environment than its own (one process).
+Settings that it does not have: a falling clip range (it stays 0.2), the value of a truncated episode (it counts as
+terminated), and another vector environment than its own (one process).
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ import numpy as np
 import torch
 import torch.utils.tensorboard
 
-from benchmarks.peers.told import Told
+from benchmarks.peers.peer_run import PeerRun
 
-LAST = "charts/SPS"  # the last figure of an update
+LAST = "charts/SPS"  # the last figure that it writes for an update
 
 
 def arguments(s: dict[str, Any]) -> list[str]:
-    """Its names for the settings. Half of the squared error is its value loss: hence twice the coefficient."""
+    """The settings by CleanRL's names. Its value loss is half the squared error, so it gets twice the coefficient."""
     flags = {
         "env-id": s["env"], "seed": s["seed"], "num-envs": s["envs"], "num-steps": s["rollout_steps"],
         "num-minibatches": s["envs"] * s["rollout_steps"] // s["batch_size"], "update-epochs": s["n_epochs"],
@@ -35,9 +35,9 @@ def arguments(s: dict[str, Any]) -> list[str]:
 
 
 class Writer:
-    """In place of TensorBoard's."""
+    """Replaces TensorBoard's `SummaryWriter`."""
 
-    told: Told
+    run: PeerRun
 
     def __init__(self, *_: object) -> None:
         pass
@@ -51,25 +51,25 @@ class Writer:
     def add_scalar(self, name: str, _: float, env_steps: int) -> None:
         if name == LAST:
             script = sys._getframe(1)
-            if self.told.update(env_steps, lambda obs: greedy(script, obs)):
+            if self.run.update(env_steps, lambda obs: greedy(script, obs)):
                 sys.exit()
 
 
 def greedy(script: FrameType, obs: Any) -> Any:
-    """By the agent of the script that is running."""
+    """The greedy actions of the agent of the running script."""
     with torch.no_grad():
         return script.f_globals["agent"].actor(torch.from_numpy(obs)).argmax(-1).numpy()
 
 
 def main() -> None:
     torch.set_num_threads(1)
-    Writer.told = Told()
+    Writer.run = PeerRun()
     torch.utils.tensorboard.SummaryWriter = Writer  # type: ignore[misc, assignment]
     np.bool8 = np.bool_  # type: ignore[attr-defined]  # its gym is of 2022
     found = importlib.util.find_spec("cleanrl.ppo")
     assert found is not None
     assert found.origin is not None
-    sys.argv = [found.origin, *arguments(Writer.told.settings)]
+    sys.argv = [found.origin, *arguments(Writer.run.settings)]
     runpy.run_path(found.origin, run_name="__main__")
 
 

@@ -1,8 +1,8 @@
-"""The peers' environments, since their pins conflict: `python -m benchmarks.peers.install [NAME …]`, or all of them.
+"""Installs the peers: `python -m benchmarks.peers.install [NAME …]`; without a name, all of them.
 
-Each is a virtual environment in `benchmarks/peers/envs` with what its peer asks for. PyTorch is there once for all, in
-`envs/torch`: a file `shared_torch.pth` in each environment puts that folder behind its own packages, so that it sees this
-torch (and what torch needs) unless it has its own. About 1 GB for torch, 2 GB for the rest.
+Each peer has its own virtual environment in `benchmarks/peers/envs`, because their pinned versions conflict. They share one
+PyTorch in `envs/torch`. A file `shared_torch.pth` in each environment puts that folder after the environment's own packages,
+so that torch is found there unless the environment has its own. This takes about 1 GB for torch and 2 GB for the rest.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from typing import NamedTuple
 
 ENVS = Path(__file__).parent / "envs"
 TORCH = ENVS / "torch"
-DONE = "installed"  # a file in an environment that is whole
+DONE = "installed"  # this file marks an environment that is complete
 
 
 class Peer(NamedTuple):
-    """How to get one."""
+    """How to install one peer."""
 
     steps: tuple[tuple[str, ...], ...]
-    """what pip is asked for, one after another"""
+    """arguments of pip, for one call after another"""
     environ: tuple[tuple[str, str], ...] = ()
-    """while it is"""
+    """environment variables during the installation"""
     line: str = ""
-    """of Python that runs at every start of the environment's Python while it is"""
+    """a line that the environment's Python runs at every start during the installation"""
 
 
 PEERS = {
-    # Declares Python < 3.11 and pins a torch of 2022; its PPO, one file, runs on this Python with this gymnasium.
+    # CleanRL declares Python < 3.11 and pins a torch of 2022. Its PPO is one file, which runs with newer versions.
     "cleanrl": Peer(
         (
             ("gym==0.23.1", "gymnasium==0.29.1", "numpy<2", "pygame-ce", "setuptools<80", "tensorboard"),
@@ -42,8 +42,8 @@ PEERS = {
         )
     ),
     "sample_factory": Peer((("sample-factory==2.1.1", "gymnasium<1.0", "numpy<2"),)),
-    # A source package whose build needs a C++ compiler. NO_OCEAN: without its own environments, whose parts it would fetch
-    # from elsewhere; its setup.py then lacks a name, which the line of Python supplies while it builds.
+    # A source package whose build needs a C++ compiler. NO_OCEAN leaves out its own environments, whose parts it would
+    # download. Then its setup.py lacks a name, which the line of Python defines during the build.
     "pufferlib": Peer(
         (
             ("numpy<2", "Cython", "setuptools<80", "wheel"),
@@ -59,17 +59,17 @@ PEERS = {
 
 
 def python(name: str) -> Path:
-    """Of this peer's environment."""
+    """The Python interpreter of this peer's environment."""
     return ENVS / name / "bin" / "python"
 
 
 def installed() -> list[str]:
-    """The peers that are there, whole."""
+    """The peers whose installation is complete."""
     return [name for name in PEERS if (ENVS / name / DONE).exists()]
 
 
 def install(name: str) -> None:
-    """Make its environment anew. Raises `CalledProcessError`."""
+    """Make its environment from the beginning. Raises `CalledProcessError`."""
     peer, folder = PEERS[name], ENVS / name
     share_torch()
     shutil.rmtree(folder, ignore_errors=True)
@@ -85,12 +85,12 @@ def install(name: str) -> None:
 
 
 def _path() -> str:
-    """Without folders that hold a CUDA compiler: with one, an extension would be built for a GPU."""
+    """PATH without folders that hold a CUDA compiler. With a compiler, an extension would be built for a GPU."""
     return os.pathsep.join(folder for folder in os.get_exec_path() if not (Path(folder) / "nvcc").exists())
 
 
 def share_torch() -> None:
-    """Of the version that this Python has, once."""
+    """Install torch once for all peers, in the version that this Python has."""
     if (TORCH / DONE).exists():
         return
     version = importlib.metadata.version("torch").partition("+")[0]
@@ -101,8 +101,8 @@ def share_torch() -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="the environments of the peers, each of its own")
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(PEERS)}; without one: all")
+    parser = argparse.ArgumentParser(description="install each peer in its own environment")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"one of {', '.join(PEERS)}; without a name: all")
     names = parser.parse_args().names or list(PEERS)
     if unknown := [name for name in names if name not in PEERS]:
         parser.error(f"expected names of {', '.join(PEERS)}; got {', '.join(unknown)}")

@@ -1,8 +1,9 @@
-"""PufferLib's PPO over its serial vector environment, the fastest of its own on two cores; `--how own` for its own settings.
+"""PufferLib's PPO with its serial vector environment, its fastest on two cores. `--how own` selects its own settings.
 
-Cannot be said to it: minibatches of single rows (they are whole segments), a clip range that falls (stays 0.2), a learning
-rate that falls in a line (falls as a cosine), a network for the value alone within its own policy class: the one below is
-ours. Values move within an update and its advantages with them, as V-trace's. Rewards are clipped to [-1, 1].
+Settings that it does not have: minibatches of single rows (its minibatches are whole segments), a falling clip range (it
+stays 0.2), a learning rate that falls linearly (it falls as a cosine), and a separate network for the value in its own
+policy class (the class below is ours). Values change within an update, and the advantages change with them, as in V-trace.
+Rewards are clipped to [-1, 1].
 """
 
 from __future__ import annotations
@@ -18,14 +19,14 @@ import pufferlib.pytorch
 import pufferlib.vector
 import torch
 
-from benchmarks.peers.told import Told
+from benchmarks.peers.peer_run import PeerRun
 
 OWN_COPIES = 16
-OWN_STEPS = 500_000  # its classic_control.ini's: what its learning rate falls over, and what it may take to solve the task
+OWN_STEPS = 500_000  # from its classic_control.ini: its learning rate falls over these steps, and the run ends after them
 
 
 class Policy(torch.nn.Module):
-    """64-64 tanh for the actor, and for the critic."""
+    """Separate 64-64 tanh networks for the actor and the critic."""
 
     def __init__(self, env: Any) -> None:
         super().__init__()
@@ -47,12 +48,12 @@ class Policy(torch.nn.Module):
 
 
 def make(env: str, **kwargs: Any) -> Any:
-    """One copy."""
+    """Make one env copy."""
     return pufferlib.emulation.GymnasiumPufferEnv(gymnasium.make(env), **kwargs)
 
 
 def config(s: dict[str, Any], own: bool) -> dict[str, Any]:
-    """Its default.ini; with the common settings in it unless its own are asked for."""
+    """Its default.ini. Unless its own settings are requested, the common settings replace those in it."""
     from pufferlib.pufferl import load_config
 
     argv, sys.argv = sys.argv, sys.argv[:1]
@@ -63,14 +64,15 @@ def config(s: dict[str, Any], own: bool) -> dict[str, Any]:
         "data_dir": str(Path.cwd()), "checkpoint_interval": 10**9,
     }  # fmt: skip
     if own:
-        # Its minibatch of 8,192 rows needs 128 copies. The whole batch of 16 is too few gradient steps for 475: a quarter.
+        # Its minibatch of 8,192 rows needs 128 copies. With 16 copies, one step on the whole batch is too little to reach
+        # a return of 475, so a minibatch is a quarter of the batch.
         return found | {"minibatch_size": OWN_COPIES * found["bptt_horizon"] // 4, "total_timesteps": OWN_STEPS}
     return found | {
         "optimizer": "adam", "adam_beta1": 0.9, "adam_beta2": 0.999, "adam_eps": 1e-5,
         "learning_rate": s["learning_rate"], "anneal_lr": s["learning_rate_schedule"] == "linear",
         "gamma": s["gamma"], "gae_lambda": s["gae_lambda"], "update_epochs": s["n_epochs"],
         "bptt_horizon": s["rollout_steps"], "minibatch_size": s["batch_size"], "clip_coef": s["clip_range"],
-        "vf_coef": 2.0 * s["vf_coef"],  # it halves the squared error
+        "vf_coef": 2.0 * s["vf_coef"],  # its value loss is half the squared error
         "vf_clip_coef": 1e9, "max_grad_norm": s["max_grad_norm"], "ent_coef": s["ent_coef"],
         "prio_alpha": 0.0, "prio_beta0": 1.0,
     }  # fmt: skip
@@ -80,10 +82,10 @@ def main() -> None:
     from pufferlib.pufferl import PuffeRL
 
     torch.set_num_threads(1)
-    told = Told()
-    s, own = told.settings, told.how == "own"
+    run = PeerRun()
+    s, own = run.settings, run.how == "own"
     if own:
-        s["steps"] = max(s["steps"], OWN_STEPS) if told.until_solved else s["steps"]
+        s["steps"] = max(s["steps"], OWN_STEPS) if run.until_solved else s["steps"]
     torch.manual_seed(s["seed"])
     copies = OWN_COPIES if own else s["envs"]
     envs = pufferlib.vector.make(
@@ -101,7 +103,7 @@ def main() -> None:
     while not ended:
         trainer.evaluate()
         trainer.train()
-        ended = told.update(trainer.global_step, greedy)
+        ended = run.update(trainer.global_step, greedy)
     trainer.close()
 
 

@@ -1,7 +1,7 @@
-"""RLlib's PPO: two env runners with half of the copies each, a learner in the driver.
+"""RLlib's PPO: two env runners with half of the copies each, and a learner in the driver.
 
-Cannot be said to it: a clip range that falls (stays 0.2), Adam's epsilon of 1e-5. Rows of an episode's end are padded
-in, so a minibatch may hold a few more rows than told.
+Settings that it does not have: a falling clip range (it stays 0.2), and Adam's epsilon of 1e-5. It adds rows at the end of
+episodes, so a minibatch may hold a few more rows than requested.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from ray import init, shutdown
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 
-from benchmarks.peers.told import Told
+from benchmarks.peers.peer_run import PeerRun
 
 RUNNERS = 2
 
 
 def main() -> None:
     torch.set_num_threads(1)
-    told = Told()
-    s = told.settings
+    run = PeerRun()
+    s = run.settings
     logging.getLogger("ray").setLevel(logging.ERROR)
     init(num_cpus=RUNNERS + 1, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
     rate, rows = s["learning_rate"], s["envs"] * s["rollout_steps"]
@@ -66,7 +66,7 @@ def main() -> None:
     try:
         while not ended:
             result = algorithm.train()
-            ended = told.update(int(result["num_env_steps_sampled_lifetime"]), greedy)
+            ended = run.update(int(result["num_env_steps_sampled_lifetime"]), greedy)
     finally:
         algorithm.stop()
         shutdown()

@@ -1,7 +1,8 @@
 """Sample Factory's APPO: `--how serial` in one process, `async` two workers and a learner, `own` its documented settings.
 
-Cannot be said to it: a clip range that falls (stays 0.2, from 1 / 1.2 to 1.2), a truncated episode's true last value. With
-`async` and `own` weights may be some updates old. Its learner is another process then, which is where updates are told.
+Settings that it does not have: a falling clip range (it stays 0.2, from 1 / 1.2 to 1.2), and the true last value of a
+truncated episode. With `async` and `own`, weights may be several updates old. Then its learner is a separate process, which
+reports the updates.
 """
 
 from __future__ import annotations
@@ -19,28 +20,28 @@ from sample_factory.cfg.arguments import parse_full_cfg, parse_sf_args
 from sample_factory.envs.env_utils import register_env
 from sample_factory.train import run_rl
 
-from benchmarks.peers.told import Told
+from benchmarks.peers.peer_run import PeerRun
 
 WORKERS = 2
-ARGV = "BENCHMARKED"  # an environment variable: a child process of its own kind is started with other arguments
+ARGV = "BENCHMARKED"  # an environment variable, because its child processes are started with other arguments
 
 
-class TellingLearner:
-    """What Sample Factory's learner does after an update, besides."""
+class ReportingLearner:
+    """Makes Sample Factory's learner report each update."""
 
-    told: Told | None = None
+    run: PeerRun | None = None
     train = Learner.train
     ended = False
 
     @staticmethod
-    def tell(learner: Any, batch: Any) -> Any:
-        stats = TellingLearner.train(learner, batch)
-        if TellingLearner.told is None:
+    def train_and_report(learner: Any, batch: Any) -> Any:
+        stats = ReportingLearner.train(learner, batch)
+        if ReportingLearner.run is None:
             torch.set_num_threads(1)
-            TellingLearner.told = Told(json.loads(os.environ[ARGV]))
-        if not TellingLearner.ended and TellingLearner.told.update(learner.env_steps, lambda obs: _greedy(learner, obs)):
-            TellingLearner.ended = True
-            learner.env_steps += int(learner.cfg.train_for_env_steps)  # so that the whole of it ends
+            ReportingLearner.run = PeerRun(json.loads(os.environ[ARGV]))
+        if not ReportingLearner.ended and ReportingLearner.run.update(learner.env_steps, lambda obs: _greedy(learner, obs)):
+            ReportingLearner.ended = True
+            learner.env_steps += int(learner.cfg.train_for_env_steps)  # so that all of its processes end
         return stats
 
 
@@ -55,7 +56,7 @@ def _greedy(learner: Any, obs: Any) -> Any:
     return found
 
 
-Learner.train = TellingLearner.tell  # in every process that imports this file
+Learner.train = ReportingLearner.train_and_report  # at import, so that it applies in every process that imports this file
 
 
 def make(name: str, cfg: Any = None, env_config: Any = None, render_mode: Any = None) -> Any:
@@ -64,13 +65,13 @@ def make(name: str, cfg: Any = None, env_config: Any = None, render_mode: Any = 
 
 
 def arguments(s: dict[str, Any], how: str) -> list[str]:
-    """Its names for the settings."""
+    """The settings by Sample Factory's names."""
     common = {
         "env": s["env"], "algo": "APPO", "experiment": "benchmark", "train_dir": Path.cwd(), "seed": s["seed"],
         "train_for_env_steps": s["steps"], "device": "cpu", "use_rnn": False, "num_workers": WORKERS,
         "save_every_sec": 10**6, "save_best_every_sec": 10**6, "with_vtrace": False,
     }  # fmt: skip
-    if how == "own":  # as in its documentation's example for CartPole
+    if how == "own":  # from the example for CartPole in its documentation
         own = {"num_envs_per_worker": 20, "policy_workers_per_policy": 2, "recurrence": 1, "batch_size": 512}
         named = common | own | {"reward_scale": 0.1}
     else:
@@ -94,13 +95,13 @@ def arguments(s: dict[str, Any], how: str) -> list[str]:
 def main() -> int:
     torch.set_num_threads(1)
     os.environ[ARGV] = json.dumps(sys.argv[1:])
-    told = Told()
-    register_env(told.settings["env"], make)
-    argv = arguments(told.settings, told.how)
+    run = PeerRun()
+    register_env(run.settings["env"], make)
+    argv = arguments(run.settings, run.how)
     parser, _ = parse_sf_args(argv=argv)
     cfg = parse_full_cfg(parser, argv)
-    if told.how != "own" and told.settings["learning_rate_schedule"] == "linear":
-        cfg.lr_schedule = "linear_decay"  # it knows this one; its command line does not
+    if run.how != "own" and run.settings["learning_rate_schedule"] == "linear":
+        cfg.lr_schedule = "linear_decay"  # Sample Factory has this setting, but its command line does not
     return int(run_rl(cfg))
 
 

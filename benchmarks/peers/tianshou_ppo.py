@@ -1,6 +1,6 @@
-"""Tianshou's PPO over its DummyVectorEnv, which for CartPole is faster than its subprocesses.
+"""Tianshou's PPO with its DummyVectorEnv, which is faster for CartPole than its subprocesses.
 
-Adam's epsilon is 1e-5 as everywhere. The clip range falls by our hand, the learning rate by its own scheduler's rule.
+Adam's epsilon is 1e-5, as for all peers. This file sets the falling clip range; Tianshou's scheduler sets the learning rate.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from tianshou.utils.net.common import Net
 from tianshou.utils.net.discrete import DiscreteActor, DiscreteCritic
 from tianshou.utils.torch_utils import policy_within_training_step
 
-from benchmarks.peers.told import Told, left
+from benchmarks.peers.peer_run import PeerRun, scheduled
 
 
 def main() -> None:
     torch.set_num_threads(1)
-    told = Told()
-    s = told.settings
+    run = PeerRun()
+    s = run.settings
     np.random.seed(s["seed"])
     torch.manual_seed(s["seed"])
     envs = DummyVectorEnv([lambda: gymnasium.make(s["env"])] * s["envs"])
@@ -74,14 +74,14 @@ def main() -> None:
     env_steps, ended = 0, False
     while not ended:
         for group in algorithm.optim._optim.param_groups:
-            group["lr"] = left(s, "learning_rate", env_steps)
-        algorithm.eps_clip = left(s, "clip_range", env_steps)
+            group["lr"] = scheduled(s, "learning_rate", env_steps)
+        algorithm.eps_clip = scheduled(s, "clip_range", env_steps)
         with policy_within_training_step(policy):
             collector.collect(n_step=rows)
             algorithm.update(collector.buffer, s["batch_size"], s["n_epochs"])
         collector.reset_buffer(keep_statistics=True)
         env_steps += rows
-        ended = told.update(env_steps, greedy)
+        ended = run.update(env_steps, greedy)
 
 
 if __name__ == "__main__":

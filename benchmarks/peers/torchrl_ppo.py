@@ -1,7 +1,7 @@
 """TorchRL's PPO: its collector with two processes of serial copies (`--how sync` or `async`), its GAE and its clipped loss.
 
-`async`, its faster one, hands over whatever process is ready: a batch is then one process's, twice as long, and may be a
-version old.
+`async`, which is faster, returns the data of the first process that is ready. A batch then comes from one process, is twice
+as long, and may be one version old.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from benchmarks.peers.told import Told, left
+from benchmarks.peers.peer_run import PeerRun, scheduled
 
 PROCESSES = 2
 
 
 class Make:
-    """The copies of one process; a class, since it travels to another."""
+    """Makes the copies of one process. It is a class, because it is sent to that process."""
 
     def __init__(self, env: str, copies: int) -> None:
         self.env, self.copies = env, copies
@@ -39,7 +39,7 @@ class Make:
 
 
 def network(inputs: int, outputs: int, last: float) -> Any:
-    """64-64 tanh, orthogonal as everywhere."""
+    """A 64-64 tanh network with orthogonal initialization, as for all peers."""
     net = MLP(in_features=inputs, out_features=outputs, num_cells=[64, 64], activation_class=torch.nn.Tanh)
     layers = [module for module in net.modules() if isinstance(module, torch.nn.Linear)]
     for layer in layers:
@@ -50,8 +50,8 @@ def network(inputs: int, outputs: int, last: float) -> Any:
 
 def main() -> None:
     torch.set_num_threads(1)
-    told = Told()
-    s = told.settings
+    run = PeerRun()
+    s = run.settings
     torch.manual_seed(s["seed"])
     copies, rows = s["envs"] // PROCESSES, s["envs"] * s["rollout_steps"]
     make = Make(s["env"], copies)
@@ -80,12 +80,12 @@ def main() -> None:
     )
     adam = torch.optim.Adam(loss.parameters(), lr=s["learning_rate"], eps=1e-5)
     buffer = ReplayBuffer(storage=LazyTensorStorage(rows), sampler=SamplerWithoutReplacement(), batch_size=s["batch_size"])
-    collector = (MultiAsyncCollector if told.how == "async" else MultiSyncCollector)(
+    collector = (MultiAsyncCollector if run.how == "async" else MultiSyncCollector)(
         [make] * PROCESSES,
         actor,
         frames_per_batch=rows,
         total_frames=-1,
-        **({} if told.how == "async" else {"cat_results": 0}),
+        **({} if run.how == "async" else {"cat_results": 0}),
     )
     collector.set_seed(s["seed"])
 
@@ -99,8 +99,8 @@ def main() -> None:
             with torch.no_grad():
                 gae(batch)
             for group in adam.param_groups:
-                group["lr"] = left(s, "learning_rate", env_steps)
-            loss.clip_epsilon.fill_(left(s, "clip_range", env_steps))
+                group["lr"] = scheduled(s, "learning_rate", env_steps)
+            loss.clip_epsilon.fill_(scheduled(s, "clip_range", env_steps))
             buffer.extend(batch.reshape(-1))
             for _ in range(s["n_epochs"]):
                 for minibatch in buffer:
@@ -113,7 +113,7 @@ def main() -> None:
             buffer.empty()
             collector.update_policy_weights_()
             env_steps += batch.numel()
-            if told.update(env_steps, greedy):
+            if run.update(env_steps, greedy):
                 break
     finally:
         collector.shutdown()

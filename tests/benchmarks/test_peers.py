@@ -1,4 +1,4 @@
-"""The peers of `millrace bench train`: what they are told, what they tell, and who is left out."""
+"""The peers of `millrace bench train`: their settings, their reports, and which of them are left out."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from benchmarks import programs, train
 from benchmarks.peers import install
 from benchmarks.peers.cleanrl_ppo import arguments
-from benchmarks.peers.told import Told, left, mean_return
+from benchmarks.peers.peer_run import PeerRun, mean_return, scheduled
 from benchmarks.programs import CONTENDERS, LARGE, OURS, ZOO
 from benchmarks.train import PEERS_MEASURES, PPO_MEASURES, SECONDS, SMALL_RATE, Measure, against, summary, table
 
@@ -35,26 +35,26 @@ def test_the_worst_policy_falls_at_once_and_a_better_one_later() -> None:
 
 
 def test_it_looks_when_it_is_due_and_ends_when_it_is_solved(capsys: pytest.CaptureFixture[str]) -> None:
-    told = Told([json.dumps(ZOO | RUN), "--target", "100"])
-    assert not told.update(4864, balanced), "looked too early"
-    assert not told.update(5120, worst)
-    assert not told.update(5376, balanced), "looked twice for 5,000 env steps"
-    assert told.update(10_240, balanced)
+    run = PeerRun([json.dumps(ZOO | RUN), "--target", "100"])
+    assert not run.update(4864, balanced), "looked too early"
+    assert not run.update(5120, worst)
+    assert not run.update(5376, balanced), "looked twice for 5,000 env steps"
+    assert run.update(10_240, balanced)
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [line["env_steps"] for line in lines if "env_steps" in line] == [4864, 5120, 5376, 10_240]
     assert [line["solved"] >= 100 for line in lines if "solved" in line] == [True]
 
 
 def test_without_a_target_it_ends_after_its_steps() -> None:
-    told = Told([json.dumps(ZOO | RUN)])
-    assert not told.update(9984, worst)
-    assert told.update(10_240, worst)
+    run = PeerRun([json.dumps(ZOO | RUN)])
+    assert not run.update(9984, worst)
+    assert run.update(10_240, worst)
 
 
 def test_a_schedule_falls_to_zero_or_stays() -> None:
-    assert left(ZOO | RUN, "learning_rate", 2500) == pytest.approx(0.75e-3)
-    assert left(ZOO | RUN, "clip_range", 12_000) == 0.0
-    assert left(LARGE | RUN, "learning_rate", 9000) == 3e-4
+    assert scheduled(ZOO | RUN, "learning_rate", 2500) == pytest.approx(0.75e-3)
+    assert scheduled(ZOO | RUN, "clip_range", 12_000) == 0.0
+    assert scheduled(LARGE | RUN, "learning_rate", 9000) == 3e-4
 
 
 @pytest.mark.parametrize(("settings", "minibatches"), [(ZOO, "1"), (LARGE, "4")])

@@ -1,7 +1,7 @@
-"""What every peer's program shares: the settings it is given, a line for each update, and when the task is solved.
+"""Shared by the programs of all peers: reading settings, reporting each update, and finding out when the task is solved.
 
-Rule: all peers are asked the same question by the same code: greedy episodes, as often as ours are. Seconds spent here
-count as theirs, as they do for ours.
+Rule: the same code evaluates all peers, with greedy episodes, as often as millrace evaluates. The time of these evaluations
+counts for the peers, as it does for millrace.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ Greedy = Callable[[NDArray[np.float32]], NDArray[np.int64]]
 FIRST_SEED = 1000
 
 
-class Told:
-    """A run, as the benchmark hears of it."""
+class PeerRun:
+    """Reports the progress of a run to the benchmark, as lines of output."""
 
     def __init__(self, argv: list[str] | None = None) -> None:
         parser = argparse.ArgumentParser()
         parser.add_argument("settings", type=json.loads)
         parser.add_argument("--target", type=float, help="stop as soon as a greedy evaluation averages at least this")
-        parser.add_argument("--how", default="", help="which way of collecting or which settings, where a peer has several")
+        parser.add_argument("--how", default="", help="the way of collecting or the settings, for a peer that has several")
         arguments = parser.parse_args(argv)
         self.settings: dict[str, Any] = arguments.settings
         self.how: str = arguments.how
@@ -37,7 +37,7 @@ class Told:
         self._due = self.settings["eval_every"]  # env steps
 
     def update(self, env_steps: int, greedy: Greedy) -> bool:
-        """After an update: is it time to end, be it solved or out of steps?"""
+        """Report an update. Returns whether the run must end, because the task is solved or all steps are done."""
         print(json.dumps({"env_steps": env_steps, "at_s": time.monotonic()}), flush=True)
         if self._target is not None and env_steps >= self._due:
             self._due = (env_steps // self.settings["eval_every"] + 1) * self.settings["eval_every"]
@@ -49,7 +49,7 @@ class Told:
 
 
 def mean_return(env_id: str, episodes: int, greedy: Greedy) -> float:
-    """Of so many greedy episodes, played side by side."""
+    """The mean return of this many greedy episodes, which are played side by side."""
     copies: list[gymnasium.Env[Any, Any]] = [gymnasium.make(env_id) for _ in range(episodes)]
     obs = [copy.reset(seed=FIRST_SEED + lane)[0] for lane, copy in enumerate(copies)]
     total, playing = 0.0, list(range(episodes))
@@ -65,7 +65,7 @@ def mean_return(env_id: str, episodes: int, greedy: Greedy) -> float:
     return total / episodes
 
 
-def left(settings: dict[str, Any], name: str, env_steps: int) -> float:
-    """A hyperparameter with a schedule, after so many env steps."""
+def scheduled(settings: dict[str, Any], name: str, env_steps: int) -> float:
+    """The value of a hyperparameter with a schedule after this many env steps."""
     value = float(settings[name])
     return value * max(0.0, 1.0 - env_steps / settings["steps"]) if settings[f"{name}_schedule"] == "linear" else value
