@@ -32,7 +32,7 @@ from protocol.wire.compression import Packing, raw_bytes, unpack_array
 
 Buffer = bytes | memoryview
 
-MAX_FRAMES = 64
+MAX_FRAMES = 256  # a description has two for each array of a space
 MAX_HEAD_BYTES = 1 << 20
 MAX_FRAME_BYTES = 1 << 30
 MAX_ITEMS = 1 << 16  # in a list or map of a worker's message; of the learner's, its head bounds them

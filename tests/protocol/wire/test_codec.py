@@ -332,8 +332,8 @@ def test_the_hand_made_weights_are_good_ones() -> None:
 @pytest.mark.parametrize(
     ("frames", "says"),
     [
-        ([], "expected 1 to 64 frames, got 0"),
-        ([b""] * (MAX_FRAMES + 1), "expected 1 to 64 frames, got 65"),
+        ([], "expected 1 to 256 frames, got 0"),
+        ([b""] * (MAX_FRAMES + 1), "expected 1 to 256 frames, got 257"),
         ([b"\xc0" * (MAX_HEAD_BYTES + 1)], "head expected at most 1048576 bytes"),
         ([b"\x91" * 100_000], "head is not a message of ours"),  # nested a hundred thousand deep
         ([b"\x81\xa1a" * 100_000], "head is not a message of ours"),

@@ -1,0 +1,110 @@
+"""An environment's description: made from an env copy by a worker, and read by the learner, which has no copy of its own.
+
+Rule: what a worker sent is data. Reading it makes spaces and records; it imports nothing and runs no environment code.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
+
+from protocol.arrays import Array
+from protocol.bounds import LARGEST, MAX_NAME, MAX_TEXT, one_line
+from protocol.envs.space_records import describe_space, make_space
+from protocol.errors import BadMessage, UsageError, first_line
+from protocol.space_spec import EnvDescription, check_size
+from protocol.wire import plain_values
+
+MAX_METADATA_BYTES = 1 << 16
+
+
+@dataclass(frozen=True)
+class DescribedEnv:
+    """The properties of an environment that the learner knows."""
+
+    observation_space: gymnasium.Space[Any]
+    action_space: gymnasium.Space[Any]
+    metadata: dict[str, Any] = field(default_factory=dict)
+    """`Env.metadata`, without what is not plain data"""
+    spec: GymnasiumSpec | None = None
+    """gymnasium's own specification; None if there is none, or JSON cannot hold it"""
+    max_episode_steps: int | None = None
+    """time limit of an episode in env steps; None if there is none"""
+    render_mode: str | None = None
+
+
+def describe_env(env: gymnasium.Env[Any, Any]) -> EnvDescription:
+    """The description of an env copy. Raises `UsageError` if its spaces are not supported or too large to send."""
+    description = EnvDescription(
+        observation=describe_space(env.observation_space, "observation space"),
+        action=describe_space(env.action_space, "action space"),
+        metadata=_metadata(env.metadata),
+        spec=_spec_as_text(env.spec),
+        longest_episode=_longest_episode(env.spec),
+        render_mode=one_line(env.render_mode or "", MAX_NAME),
+    )
+    try:
+        check_size(description)
+    except BadMessage as error:
+        raise UsageError(str(error)) from error
+    return description
+
+
+def read_description(description: EnvDescription) -> DescribedEnv:
+    """The properties that a description gives. Raises `BadMessage` if it describes no environment, and no other error.
+
+    It must have passed `protocol.space_spec.check_size`, as what was decoded has.
+    """
+    if description.metadata.nbytes > MAX_METADATA_BYTES or description.metadata.dtype != np.uint8:
+        raise BadMessage(f"metadata: expected at most {MAX_METADATA_BYTES} bytes, got {description.metadata.nbytes}")
+    metadata = plain_values.unpack(description.metadata.tobytes())
+    if type(metadata) is not dict or not all(type(name) is str for name in metadata):
+        raise BadMessage(f"metadata: expected a dict with names as keys, got {type(metadata).__name__}")
+    return DescribedEnv(
+        observation_space=make_space(description.observation),
+        action_space=make_space(description.action),
+        metadata=metadata,
+        spec=_spec_from_text(description.spec),
+        max_episode_steps=description.longest_episode or None,
+        render_mode=description.render_mode or None,
+    )
+
+
+def _metadata(metadata: object) -> Array:
+    """Packed: the entries that are plain data, [bytes] uint8. Those that would make it too long are left out."""
+    kept: dict[str, Any] = {}
+    packed = plain_values.pack(kept)
+    for name, value in metadata.items() if isinstance(metadata, dict) else ():
+        try:
+            longer = plain_values.pack({**kept, name: value})
+        except (TypeError, ValueError):  # ValueError: text with a lone surrogate
+            continue
+        if type(name) is str and len(longer) <= MAX_METADATA_BYTES:
+            kept[name], packed = value, longer
+    return np.frombuffer(packed, np.uint8)
+
+
+def _spec_as_text(spec: GymnasiumSpec | None) -> str:
+    try:
+        text = "" if spec is None else spec.to_json()
+    except Exception:  # an entry point or an argument that JSON cannot hold, or a specification of the user's own
+        return ""
+    return text if len(text) <= MAX_TEXT else ""
+
+
+def _spec_from_text(text: str) -> GymnasiumSpec | None:
+    if not text:
+        return None
+    try:
+        return GymnasiumSpec.from_json(text)
+    except Exception as error:  # any type: the text may be anything
+        raise BadMessage(f"spec: expected gymnasium's as JSON: {one_line(first_line(error), 200)}") from error
+
+
+def _longest_episode(spec: GymnasiumSpec | None) -> int:
+    limit = None if spec is None else spec.max_episode_steps
+    return limit if isinstance(limit, int) and 0 < limit <= LARGEST else 0
