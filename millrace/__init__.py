@@ -140,7 +140,7 @@ def make_vec(
 
 
 def __getattr__(name: str) -> str:
-    """Look up `__version__` when it is first used: that takes longer than the rest of this file."""
+    """Look up `__version__` when it is first used, because that takes longer than the rest of this file."""
     if name != "__version__":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import metadata

@@ -1,7 +1,7 @@
 """Finds out, when `millrace` is imported, whether other code hides its packages `learner`, `workers` or `protocol`.
 
 Python searches the folder of the script (with `python -m`: the current folder) before the installed packages. A user's own
-`learner.py` there would be imported in place of ours, and fail far away.
+`learner.py` there would be imported in place of millrace's, with a confusing error later.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class ImportConflict(ImportError):
 def check_imports() -> None:
     """Check that `learner`, `workers` and `protocol` are ours, without importing them. Raises `ImportConflict`.
 
-    As `python -m millrace` there is no caller that could handle the error: the process ends with one line and exit code 2.
+    With `python -m millrace`, no caller could handle the error, so the process ends with one line and exit code 2.
     """
     for name in PACKAGES:
         found = _location(name)
@@ -37,7 +37,7 @@ def check_imports() -> None:
 
 
 def _location(name: str) -> Path | None:
-    """The file or folder that `import NAME` gives, or has given; None if there is none."""
+    """The file or folder that `import NAME` finds, or has found; None if there is none."""
     module = sys.modules.get(name)
     spec = getattr(module, "__spec__", None) if module is not None else importlib.util.find_spec(name)
     if spec is not None and spec.submodule_search_locations:

@@ -1,7 +1,7 @@
 """Shows the progress of a run: as a live block on a terminal, as a line every few seconds elsewhere, or as JSON.
 
-Rule: it never slows the run (at most five redraws a second), the last progress is always shown, and a reader that has
-gone (`| head`) does not end the run. Warnings of the log are shown above the block.
+Rule: it never slows the run (at most five redraws a second), and the last progress is always shown. If nobody reads the
+output any more (`| head`), the run continues. Warnings of the log are shown above the block.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class ProgressView(Protocol):
         ...
 
     def print_line(self, line: str) -> None:
-        """Print a line that stays."""
+        """Print a line that is not redrawn."""
         ...
 
     def close(self) -> None:
@@ -47,7 +47,7 @@ class ProgressView(Protocol):
 def progress_view(
     log_json: bool = False, clock: Callable[[], float] = time.monotonic
 ) -> Iterator[Callable[[Progress], None]]:
-    """Gives a function to call with each progress. Meanwhile the log of millrace is shown too."""
+    """A context manager that returns a function to call with each progress. Until it ends, millrace's log is shown too."""
     live = sys.stdout.isatty() and not log_json
     view: ProgressView = LiveBlock(Console()) if live else JsonEvents() if log_json else PlainLines()
     limited = RateLimitedView(view, REDRAW_EVERY_S if live else LINE_EVERY_S, clock)
@@ -106,7 +106,7 @@ class PlainLines:
         """Print the line."""
         try:
             print(line, flush=True)
-        except BrokenPipeError:  # the reader has gone; the run continues, and Python must be able to flush at its exit
+        except BrokenPipeError:  # nobody reads the output; the run continues, and Python must be able to flush at its exit
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
     def close(self) -> None:
@@ -121,7 +121,7 @@ class JsonEvents:
         sys.stderr.write(f"{progress_line(progress, time.time())}\n")
 
     def print_line(self, line: str) -> None:
-        """Do nothing: notes are part of the progress, and the log has a handler of its own."""
+        """Do nothing: notes are part of the progress, and the log has its own handler."""
 
     def close(self) -> None:
         """Nothing to do."""

@@ -1,6 +1,6 @@
-"""The rooms and their doors: which file may import which, and what may stand only in its one place.
+"""Rules of the packages and folders: which file may import which, and what may be in one place only.
 
-docs/architecture.md describes the rooms. Every import counts, also one inside a function or under TYPE_CHECKING.
+docs/architecture.md describes them. Every import counts, also one inside a function or under TYPE_CHECKING.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-ROOMS = ("protocol", "workers", "learner", "millrace")
+PACKAGES = ("protocol", "workers", "learner", "millrace")
 FORBIDDEN = {
     "protocol": {"workers", "learner", "millrace"},
     "workers": {"learner", "millrace"},
     "learner": {"workers", "millrace"},
     "millrace": {"benchmarks", "tests"},
 }
-LEARNER = {  # what each room of the learner may import of the learner; train.py, run.py and the like may import all
+LEARNER = {  # what each folder of the learner may import of the learner; train.py, run.py and the like may import all
     "config": {"run_folder"},
     "algorithms": {"config"},
     "members": set[str](),
@@ -127,11 +127,11 @@ def circles(arrows: Mapping[str, set[str]]) -> list[list[str]]:
     return found
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_the_arrows_point_one_way(room: str) -> None:
-    assert sources(room)
-    for source in sources(room):
-        assert not imported(source) & FORBIDDEN[room], source
+@pytest.mark.parametrize("folder", PACKAGES)
+def test_imports_between_packages_go_one_way(folder: str) -> None:
+    assert sources(folder)
+    for source in sources(folder):
+        assert not imported(source) & FORBIDDEN[folder], source
 
 
 def test_the_search_for_circles_finds_one() -> None:
@@ -140,16 +140,16 @@ def test_the_search_for_circles_finds_one() -> None:
 
 
 def test_no_files_import_each_other_in_a_circle() -> None:
-    files = {module(source): source for source in sources(*ROOMS)}
+    files = {module(source): source for source in sources(*PACKAGES)}
     assert not circles({source: files_imported(source, files) for source in files.values()})
 
 
-@pytest.mark.parametrize("room", LEARNER)
-def test_a_room_of_the_learner_imports_only_what_it_may(room: str) -> None:
-    assert sources(f"learner/{room}")
-    for source in sources(f"learner/{room}"):
+@pytest.mark.parametrize("folder", LEARNER)
+def test_a_folder_of_the_learner_imports_only_what_it_may(folder: str) -> None:
+    assert sources(f"learner/{folder}")
+    for source in sources(f"learner/{folder}"):
         places = {name.split(".")[1] for name in modules_imported(source) if name.startswith("learner.")}
-        assert places <= LEARNER[room] | {room}, source
+        assert places <= LEARNER[folder] | {folder}, source
 
 
 def test_the_learner_has_no_room_without_a_rule() -> None:
@@ -157,13 +157,13 @@ def test_the_learner_has_no_room_without_a_rule() -> None:
 
 
 def test_torch_stays_with_the_learner() -> None:
-    for source in sources(*ROOMS):
+    for source in sources(*PACKAGES):
         if not source.startswith(("learner/", TORCH_IN_PROTOCOL)):
             assert "torch" not in imported(source), source
 
 
 def test_torch_s_internals_are_used_in_one_room() -> None:
-    for source in sources(*ROOMS):
+    for source in sources(*PACKAGES):
         if not source.startswith(TORCH_INTERNALS):
             assert not list(torch_internals(source)), source
 
@@ -182,7 +182,7 @@ def torch_internals(source: str) -> Iterator[str]:
 
 
 def test_nothing_is_pickled_but_in_the_one_guarded_place() -> None:
-    for source in sources(*ROOMS):
+    for source in sources(*PACKAGES):
         if source not in MAY_UNPICKLE:
             assert not imported(source) & {"pickle", "cloudpickle", "dill", "shelve", "marshal", "joblib"}, source
         for node in ast.walk(tree(source)):
@@ -195,7 +195,7 @@ def test_nothing_is_pickled_but_in_the_one_guarded_place() -> None:
 
 
 def test_only_the_command_line_prints() -> None:
-    for source in sources(*ROOMS):
+    for source in sources(*PACKAGES):
         if source not in MAY_PRINT:
             assert not [where for where in calls(source, "print") if " of " not in where]
 
@@ -207,20 +207,20 @@ def test_tests_do_not_sleep() -> None:
 
 
 def test_no_folder_is_a_drawer_for_everything() -> None:
-    for source in sources(*ROOMS, "tests"):
+    for source in sources(*PACKAGES, "tests"):
         assert not set(Path(source).parts) & {"utils", "common", "misc", "helpers"}, source
 
 
 def test_no_folder_holds_too_many_files() -> None:
     found: dict[Path, int] = defaultdict(int)
-    for source in sources(*ROOMS):
+    for source in sources(*PACKAGES):
         found[Path(source).parent] += not source.endswith("__init__.py")
     assert not {str(folder): count for folder, count in found.items() if count > MOST_FILES}
 
 
 def test_no_function_takes_too_many_parameters() -> None:
     """A narrow record takes their place."""
-    for source in sources(*ROOMS):
+    for source in sources(*PACKAGES):
         for node in ast.walk(tree(source)):
             if isinstance(node, ast.FunctionDef) and f"{source}:{node.name}" not in MAY_TAKE_MORE:
                 every = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
@@ -229,7 +229,7 @@ def test_no_function_takes_too_many_parameters() -> None:
 
 
 def test_every_file_says_first_what_it_holds() -> None:
-    for source in sources(*ROOMS, "tests"):
+    for source in sources(*PACKAGES, "tests"):
         assert ast.get_docstring(tree(source)) or not (ROOT / source).read_text().strip(), source
 
 

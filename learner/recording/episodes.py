@@ -1,7 +1,7 @@
-"""Rows of rollouts -> whole episodes. Pure: arrays in, arrays out.
+"""Assembles whole episodes from the rows of rollouts. Pure: arrays in, arrays out.
 
-Rule: every valid row is in exactly one whole episode, or waits for its episode to end (`waiting`), or is counted as left
-out (`left_out`). A reset row is in no episode. An episode that spans several rollouts is assembled only if all of them
+Rule: every valid row is in exactly one whole episode, or waits for its episode to end (`waiting`), or is counted as left out
+(`left_out`). A reset row is not part of an episode. An episode that spans several rollouts is assembled only if all of them
 arrived, in order, from the same incarnation of their lane, so no episode has a hole.
 """
 
@@ -27,7 +27,7 @@ class RecordedEpisode:
     terminated: Bools  # [L]
     truncated: Bools  # [L]
     seed: int | None = None
-    """seed of the reset with which it began, if that is known"""
+    """seed of the reset with which the episode began, if it is known"""
 
     @property
     def length(self) -> int:
@@ -57,7 +57,7 @@ class _LaneState:
     incarnation: int
     sequence: int  # of the next rollout
     running: list[list[_Fragment] | None] = field(default_factory=list)
-    """[N] the running episode of each env copy; None, until the next reset, if its beginning is missing"""
+    """[N] the unfinished episode of each env copy. It is None until the next reset if its beginning is missing."""
 
     @property
     def waiting(self) -> int:
@@ -70,7 +70,7 @@ class EpisodeAssembler:
     def __init__(self, to_env_action: Callable[[Array], Array]) -> None:
         """`to_env_action` converts the actions of a rollout [k, *action] to those that the environment took."""
         self.left_out = 0
-        """valid rows of episodes that cannot be whole, because a rollout was dropped or the lane moved"""
+        """number of valid rows in episodes that cannot be whole, because a rollout was dropped or the lane moved"""
         self._to_env_action = to_env_action
         self._lanes: dict[int, _LaneState] = {}
 
@@ -86,7 +86,7 @@ class EpisodeAssembler:
         """
         lane = self._lanes.get(rollout.lane)
         if lane is not None and (incarnation, rollout.sequence) < (lane.incarnation, lane.sequence):
-            self.left_out += rollout.env_steps  # it arrived out of order
+            self.left_out += rollout.env_steps  # the rollout arrived out of order
             return []
         if lane is None or (incarnation, rollout.sequence) != (lane.incarnation, lane.sequence):
             self.left_out += lane.waiting if lane is not None else 0

@@ -1,7 +1,7 @@
 """Writes a Minari dataset. Minari is an optional dependency and is imported only when it is needed.
 
-Rule: the dataset is there whole or not at all; if writing fails, everything that Minari made for it is removed. At most
-about `CHUNK_BYTES` of episodes are held in memory. Images are stored as they are, not as JPEG.
+Rule: the dataset is complete, or there is none: if writing fails, everything that Minari made for it is removed. Episodes
+take at most about `CHUNK_BYTES` of memory. Images are stored unchanged, not as JPEG.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ CHUNK_BYTES = 64 * 2**20
 class MinariDataset:
     """Writes a Minari dataset into the folder that MINARI_DATASETS_PATH names.
 
-    As a context: afterwards the dataset is whole. If the body raises, it is removed.
+    As a context manager: at the end the dataset is complete. If the body raises, the dataset is removed.
     """
 
     def __init__(self, dataset_id: str, env: gymnasium.Env[Any, Any], about: str) -> None:
@@ -138,7 +138,7 @@ def nested(space: gymnasium.Space[Any], leaves: Iterator[Array]) -> Any:
 
 
 def _spec_can_be_stored(env: gymnasium.Env[Any, Any]) -> bool:
-    """Whether the dataset can store how to make its environment. It cannot if that was registered by a class or function."""
+    """Whether the dataset can store how to make its environment. It cannot if a class or function was registered."""
     try:
         return env.spec is not None and bool(env.spec.to_json())
     except (TypeError, ValueError):

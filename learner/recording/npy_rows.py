@@ -1,6 +1,6 @@
-"""A .npy file with a row [observation, action] for each step: float32, flattened (what the teaching notebooks read).
+"""Writes a .npy file with a row [observation, action] for each step: float32, flattened, as the teaching notebooks read it.
 
-Rule: the file is there whole or not at all.
+Rule: the file is complete, or there is none.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ class NpyRows:
     """Context manager: collects rows in a temporary file and writes the .npy file at the end, unless the body raises."""
 
     def __init__(self, target: Path | None) -> None:
-        """`target`: the file to write; None: none, and every method does nothing."""
+        """`target`: the file to write. With None, nothing is written and every method does nothing."""
         self._target = target
         self._shape = (0, 0)
 
     def add(self, episode: RecordedEpisode) -> None:
-        """Add a row for each step. The last observation has none, since no action followed it."""
+        """Add a row for each step. The last observation gets no row, because no action followed it."""
         if self._target is None:
             return
         columns = [*(leaf[:-1] for leaf in episode.obs), episode.action]

@@ -18,7 +18,7 @@ from protocol.specs import PolicySpec
 
 
 class Player:
-    """Plays episode after episode. Each episode begins with a reset seed of its own."""
+    """Plays one episode after another. Each episode has its own reset seed."""
 
     def __init__(
         self, env: gymnasium.Env[Any, Any], policy: Policy, spec: PolicySpec, seed: int, stochastic: bool = False

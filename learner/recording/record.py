@@ -1,9 +1,9 @@
 """`millrace record`: episodes of a run's policy as a Minari dataset, and if wanted as a .npy file of rows.
 
-Rule: a dataset consists of whole episodes with raw rewards, and is there whole or not at all. Episodes are played one
-after another on one env copy, so that short ones are not favored. Each has its own reset seed, which is stored with it. The
-last episode is finished, so a dataset may have more steps than requested. Only if it would double their number, it is cut,
-and its last step is marked truncated.
+Rule: a dataset consists of whole episodes with raw rewards. It is complete, or there is none. Episodes are played one after
+another on one env copy, so that short episodes are not favored. Each has its own reset seed, which is stored with it. The
+last episode is finished, so a dataset may have more steps than requested. If this would double the number of steps, the
+episode is cut, and its last step is marked as truncated.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def record(
 
     `stochastic`: draw actions from the policy; otherwise take the most probable ones. `npy`: also write this file. `best`:
     use the best policy of the run's own evaluations instead of the newest.
-    Raises `UserFacingError`; then it leaves no files.
+    Raises `UserFacingError` if this fails; then no files are left.
     """
     policy, spec, env_spec = load_policy(run, "best" if best else "final")
     if npy is not None and not npy.parent.is_dir():

@@ -1,7 +1,7 @@
 """`millrace evaluate --video`: greedy episodes as mp4 files, by gymnasium's RecordVideo, whose packages are optional.
 
-Rule: a video is in the folder whole or not at all. Its name has the seed and the number of the episode, so the same
-episode overwrites its old video.
+Rule: the folder holds only complete videos. The name of a video has the seed and the number of its episode, so a new video
+of the same episode replaces the old one.
 """
 
 from __future__ import annotations

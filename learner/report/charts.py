@@ -26,7 +26,7 @@ class Series(NamedTuple):
     x: Doubles  # [K]
     y: Doubles  # [K], or [K, 2] of a band
     tooltip: str = ""
-    """text that is shown when the pointer rests on it"""
+    """text that is shown when the pointer is on the series"""
 
 
 def ticks(low: float, high: float, about: int) -> list[float]:

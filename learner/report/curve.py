@@ -39,7 +39,7 @@ class RunFiles(NamedTuple):
     rows: list[dict[str, Any]]
 
     def points(self, key: str) -> list[tuple[float, float]]:
-        """Env steps and value of this metric, where there is one."""
+        """Env steps and value of this metric, for each row that has it."""
         return [(row[ENV_STEPS_KEY], row[key]) for row in self.rows if row.get(key) is not None]
 
     def curve(self) -> Curve | None:

@@ -1,7 +1,7 @@
-"""Learning curves of run folders as a PNG. It has no global state: matplotlib's pyplot is not used.
+"""Draws learning curves of run folders as a PNG. Without global state: matplotlib's pyplot is not used.
 
-There is a panel for each environment and a color for each algorithm. Several runs of the same environment and algorithm are
-drawn as a thin line each, a bold line for the mean, and a band from the worst to the best.
+There is a panel for each environment and a color for each algorithm. For several runs of the same environment and algorithm,
+each run is a thin line, their mean is a bold line, and a band reaches from the worst to the best.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ PROCESSES = {"learner": "The learner", "worker": "All workers together"}
 
 
 def ledgers(report: ReportData) -> str:
-    """The ledger: in which state every ticket and every transition ended, as sums."""
+    """The ledger: the number of tickets and transitions that ended in each state, as sums."""
     tables = _balance(report, "Tickets", "", TICKETS) + _balance(report, "Transitions", "transitions_", TRANSITIONS)
     bad = sum(run.results.ledger.get("messages_bad", 0) for _, run in report.runs)
     about = "What became of every ticket that was dealt, and of every transition that reached the learner."

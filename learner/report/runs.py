@@ -1,7 +1,7 @@
-"""The data of the page: what is read from each run folder, and which runs form a group.
+"""The data of the page: the runs, read from their folders, and the groups of runs.
 
-Rule: a run that has not finished is described as far as its metrics go. Runs form a group if all their settings but the
-seed and the folder are the same.
+Rule: of a run that has not finished, the page shows what its metrics contain. Runs form a group if all their settings except
+the seed and the folder are the same.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class RunResults(NamedTuple):
     """mean return of the last 100 training episodes"""
     evaluation: Evaluation | None
     stop_reason: str
-    """why it stopped, or that it has not"""
+    """why the run stopped, or that it has not stopped"""
     ledger: dict[str, int]
     stages: dict[str, float]
 
@@ -151,7 +151,7 @@ def _name(run: Run, firsts: Sequence[Run]) -> tuple[str, str]:
         return run.algo.upper(), ""
     differing = differing_settings(firsts, MAY_DIFFER_IN_A_GROUP)
     names = [name for name in differing if all(name in first.settings for first in firsts)]
-    names.sort(key=lambda name: name not in run.algorithm_settings)  # those of the algorithm first: they say most
+    names.sort(key=lambda name: name not in run.algorithm_settings)  # settings of the algorithm first, because they say most
     more = [f"{len(names) - MOST_DIFFERENCES} more"] if len(names) > MOST_DIFFERENCES else []
     differences = ", ".join([*(f"{name} {run.settings[name]}" for name in names[:MOST_DIFFERENCES]), *more])
     return f"{run.algo.upper()} {_letters(firsts.index(run))}", differences

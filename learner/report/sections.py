@@ -1,4 +1,4 @@
-"""The sections of the page, as HTML text: results, curves, videos, settings. Pure but for reading the videos.
+"""The sections of the page, as HTML text: results, curves, videos, settings. Pure, except that it reads the videos.
 
 Rule: text from run folders is escaped.
 """
@@ -162,7 +162,7 @@ def videos(report: ReportData) -> str:
 
 
 def settings(report: ReportData) -> str:
-    """Settings: first those that differ, with a column for each group; the others are folded."""
+    """Settings: first those that differ, with a column for each group. The others are in a block that is closed at first."""
     runs = [run for _, run in report.runs]
     differ = differing_settings(runs)
     same = {name: value for name, value in runs[0].settings.items() if name not in differ}

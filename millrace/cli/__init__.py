@@ -1,1 +1,1 @@
-"""The command line `millrace COMMAND`: one module reads the command, others hold what is long."""
+"""The command line `millrace COMMAND`: `main` runs the command, and the other modules hold flags and longer commands."""

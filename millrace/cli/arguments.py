@@ -1,6 +1,6 @@
 """Flags by argparse, for the commands that also work where only a worker's packages are installed: `status` and `keys`.
 
-The other commands take their flags by tyro (`learner.config.flag_parser`). What a user does wrong is one line either way.
+The other commands take their flags by tyro (`learner.config.flag_parser`). In both cases an error of the user is one line.
 """
 
 from __future__ import annotations
@@ -37,5 +37,5 @@ class Arguments(argparse.ArgumentParser):
         return values
 
     def error(self, message: str) -> NoReturn:
-        """Raise `UsageError` where argparse would end the process."""
+        """Raise `UsageError`; argparse itself would end the process."""
         raise UsageError(f"{self._command}: {message}; {self.prog} --help tells more")

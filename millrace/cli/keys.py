@@ -1,6 +1,6 @@
 """`millrace keys`: who may join the learners of this machine. Returns lines; the command line prints them.
 
-Rule: a secret is printed only where it was asked for by name.
+Rule: a secret is printed only if the user asked for it by name.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Subcommand(NamedTuple):
 
 
 def keys(argv: list[str]) -> list[str]:
-    """Run a subcommand; the lines to print. Raises `UsageError`."""
+    """Run a subcommand. Returns the lines to print. Raises `UsageError`."""
     name, *rest = argv or [""]
     if name in ("-h", "--help"):
         return _help()

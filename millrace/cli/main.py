@@ -21,7 +21,7 @@ from protocol.errors import UsageError, UserFacingError, first_line
 ABOUT = "Worker processes step copies of a gymnasium environment; one learner trains a policy in PyTorch."
 HELP_FLAGS = ("-h", "--help")
 NOT_IN_WORKERS = {"matplotlib", "prometheus_client", "rich", "safetensors", "tensorboard", "tomli_w", "torch", "tyro"}
-"""Packages that the learner needs and a worker does not: an installation for workers alone lacks them."""
+"""Packages that the learner needs and a worker does not. An installation only for workers lacks them."""
 
 
 class Command(NamedTuple):
@@ -36,7 +36,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line. Returns the exit code."""
     argv = sys.argv[1:] if argv is None else argv
     if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # last: a module of the user is found here and hides no installed module
+        sys.path.append(os.getcwd())  # last, so that a user's module is found but hides no installed module
     try:
         exit_code = _dispatch(argv)
         sys.stdout.flush()
@@ -50,7 +50,7 @@ def main(argv: list[str] | None = None) -> int:
         run = getattr(interrupt, "run", None)
         _print_error(f"millrace: interrupted{f'; go on with: millrace train --resume {run}' if run else ''}")
         return _failed(argv, 130)
-    except BrokenPipeError:  # the reader of our output (`| head`) has gone: a message would reach nobody
+    except BrokenPipeError:  # nobody reads our output any more (`| head`), so a message is useless
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except ModuleNotFoundError as error:

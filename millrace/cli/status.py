@@ -1,7 +1,7 @@
-"""`millrace status ADDRESS`: ask a learner how its run is, and print the answer. Needs only a worker's packages.
+"""`millrace status ADDRESS`: ask a learner for the state of its run and print it. Needs only a worker's packages.
 
-Rule: whoever may connect may ask, and asking changes nothing; a learner that does not answer within the deadline is an
-error of one line; nothing that a peer has named can control the terminal.
+Rule: everybody who may connect may ask, and asking changes nothing. If a learner does not answer within the deadline, the
+error is one line. Names that a peer has chosen cannot control the terminal.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ DROPS = {
     "transitions_invalid": "invalid transitions (wrong shape, dtype, value or reset row)",
     "messages_bad": "messages that could not be read",
 }
-"""What was dropped, by its name in the ledger."""
+"""Text for each kind of dropped data, by its name in the ledger."""
 LEFT_ALIGNED = ("worker", "host", "lanes")  # columns of words; columns of numbers are right-aligned
 
 
@@ -73,7 +73,7 @@ def status(argv: list[str], out: TextIO) -> None:
 
 
 def observer_name() -> str:
-    """A name that no worker has."""
+    """A routing name that no worker has."""
     return f"status-{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}"
 
 

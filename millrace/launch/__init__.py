@@ -1,1 +1,1 @@
-"""Launchers: each starts a learner and workers somewhere. Learner and workers know nothing of it."""
+"""Launchers: each starts a learner and workers on one machine or on a cluster. Learner and workers do not import them."""

@@ -1,6 +1,6 @@
 """The command line of a launcher: its own flags, and behind `--` the flags of the learner that it starts.
 
-Rule: what a cluster would refuse later is refused here, before anything is written or started.
+Rule: settings that a cluster would refuse later are refused here, before anything is written or started.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ Flags = TypeVar("Flags", bound=LaunchFlags)
 
 METRICS_PORT = 9464
 SET_BY_LAUNCHER = ("bind", "advertise", "run-dir", "resume", "keys", "insecure")
-"""Flags of the learner that a launcher sets, so that the user must not."""
+"""Flags of the learner that a launcher sets. The user must not set them."""
 DNS_LABEL = re.compile(r"[a-z]([-a-z0-9]{0,38}[a-z0-9])?")
 
 
 def read_flags(
     kind: type[Flags], argv: Sequence[str], launcher: str, set_by_launcher: Sequence[str] = SET_BY_LAUNCHER
 ) -> tuple[Flags, list[str]]:
-    """The launcher's flags, and the user's flags for the learner. Raises `UsageError` if either cannot work."""
+    """The launcher's flags, and the user's flags for the learner. Raises `UsageError` if a flag is not valid."""
     words = list(argv)
     separator = words.index("--") if "--" in words else len(words)
     flags, rest = parse_flags(kind, words[:separator], f"launch {launcher}"), words[separator + 1 :]

@@ -68,7 +68,7 @@ def train(
 
         supervisor = Supervisor(lambda name: WorkerThread(link.address, name, context, collector), 1, prefix="inference")
         stack.callback(supervisor.stop)
-        stack.callback(supervisor.ask_to_leave)  # asked a second time, it leaves at once
+        stack.callback(supervisor.ask_to_leave)  # if it is asked a second time, the worker leaves at once
 
         def ended() -> list[tuple[str, str]]:
             lanes.raise_if_no_workers()
@@ -81,9 +81,9 @@ def train(
 
 
 def acting_policy(spec: PolicySpec, device: str, images: ImagesDtype) -> Policy:
-    """The policy that acts: numpy on the CPU where it can, to the same bits as on a worker; else torch on the device.
+    """The policy that acts. If numpy can compute it, it runs in numpy on the CPU and gives the same bits as on a worker.
 
-    Torch acts for all lanes in one pass.
+    Otherwise it runs in torch on the device, for all lanes in one pass.
     """
     if device == "cpu" and not spec.needs_torch:
         return make_policy(spec)
@@ -109,7 +109,7 @@ def _settings(config: Config, factory: Callable[..., object] | None, *, elsewher
 
 
 def _before_waits(env: ZmqVectorEnv, workers: int, timeout_s: float) -> Callable[[Pulse], None]:
-    """A function to call before each wait for `env`: it passes on the pulse; at first it waits until workers have joined."""
+    """A function to call before each wait for `env`. It calls the pulse. The first call waits until workers have joined."""
     waited = False
 
     def before(pulse: Pulse) -> None:

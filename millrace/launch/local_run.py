@@ -23,9 +23,9 @@ from workers.supervisor import Running, Supervisor, WorkerCommand, WorkerProcess
 
 
 def train(config: Config, resume: Path | None, watch: Watch, factory: Callable[..., object] | None = None) -> Path:
-    """Train; the run folder. `factory` returns the environment, if the id does not name one.
+    """Train. Returns the run folder. `factory` returns the environment if the id does not name one.
 
-    Raises `UserFacingError`, or `Interrupted` when the user stopped the run.
+    Raises `UserFacingError`, or `Interrupted` if the user stopped the run.
     """
     if config.inference == "learner":
         from millrace.launch import learner_inference as inference

@@ -1,6 +1,6 @@
-"""Local workers of a learner: an address, keys, their flags, their cores.
+"""Options of local workers: their address, keys, flags and cores.
 
-Rule: a socket file lies in a folder of its own that only this user can enter (0700), and is removed with it.
+Rule: a socket file is in its own folder, which only this user can enter (0700). The folder is removed with it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from protocol.keys.keys import Token
 from workers.supervisor import core_flags
 
 WorkerFlags = Callable[[str], tuple[list[str], Path | None]]
-"""From a worker's name to the flags of its process, and the file for its stderr (None: ours)."""
+"""Takes a worker's name. Returns the flags of its process, and the file for its stderr (None: this process's stderr)."""
 
 
 def private_address(transport: str, stack: ExitStack) -> str:
@@ -41,7 +41,7 @@ def private_address(transport: str, stack: ExitStack) -> str:
 
 
 def temporary_keys(transport: str, keys: str, *, insecure: bool) -> tuple[Keyring | None, Token | None]:
-    """Keys for this run alone if it uses TCP and a key folder was named; else None."""
+    """Keys for this run only, if it uses TCP and a key folder was named; else None."""
     encrypted = transport == "tcp" and chosen_key_folder(keys) is not None and not insecure
     return generate_run_keys("local", datetime.now(UTC)) if encrypted else (None, None)
 
@@ -62,8 +62,8 @@ def worker_cores(config: Config) -> list[int]:
     """The cores that local workers are pinned to, in turn; empty if they are not pinned. Raises `UsageError`.
 
     New weights wake all workers at once, while the learner still runs. Linux then often puts two workers on one core and
-    leaves another core idle, for too short a time to move them. If there are fewer workers than cores, they find a free core
-    themselves; pinned, they could share a core with the workers of another run.
+    leaves another core idle, for too short a time to move them. If there are fewer workers than cores, they are not
+    pinned: Linux finds a free core for each, and pinned workers could share a core with the workers of another run.
     """
     if not hasattr(os, "sched_setaffinity"):
         if config.pin_workers:

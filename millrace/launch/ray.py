@@ -1,7 +1,7 @@
 """`millrace launch ray`: the learner runs in this process, on a node of a Ray cluster; the workers run in Ray actors.
 
-Rule: an actor runs the worker program and nothing else. Ray alone restarts actors and chooses their nodes. When the
-learner has ended, so have the actors.
+Rule: an actor runs the worker program and nothing else. Only Ray restarts actors and chooses their nodes. When the
+learner has ended, the actors have ended, too.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from protocol.keys.key_folder import Keyring, read_token
 
 
 def launch(flags: RayFlags, rest: Sequence[str], watch: Watch) -> Path:
-    """Train; the run folder. `rest` are the user's flags for the learner. Raises `UserFacingError`."""
+    """Train. Returns the run folder. `rest` are the user's flags for the learner. Raises `UserFacingError`."""
     for name in ("processes", "port"):
         if getattr(flags, name) < 1:
             raise UsageError(f"{name}: expected int >= 1, got {getattr(flags, name)}")
@@ -55,7 +55,7 @@ def _token_text(keyring: Keyring | None) -> str:
 
 @contextmanager
 def _ray_cluster(address: str) -> Iterator[str]:
-    """Connect to the cluster. Gives the IP address of this node, as the other nodes know it."""
+    """Connect to the cluster. Returns the IP address by which other nodes reach this node."""
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.WARNING)
     except (ConnectionError, RuntimeError, ValueError) as error:

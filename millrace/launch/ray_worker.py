@@ -14,11 +14,11 @@ class WorkerHost:
     """The Ray actor that runs a worker."""
 
     def run(self, address: str, token: str, processes: int) -> int:
-        """Run the worker program until it leaves; its exit code. `token` may be empty.
+        """Run the worker program until it leaves. Returns its exit code. `token` may be empty.
 
         Raises `RuntimeError` if the program failed, so that Ray runs it again.
         """
-        os.environ[TOKEN_VARIABLE] = token  # the program removes the variable when it has read it
+        os.environ[TOKEN_VARIABLE] = token  # the program removes the variable after reading it
         code = run_worker([address, "--processes", str(processes), "--join-timeout-s", "600"])
         if code not in FINAL_EXIT_CODES:
             raise RuntimeError(f"the worker program ended with exit code {code}")

@@ -15,7 +15,7 @@ from protocol.errors import UsageError
 
 
 def script(flags: SlurmFlags, rest: Sequence[str]) -> str:
-    """The script, for sbatch. `rest` are the user's flags for the learner. Raises `UsageError`."""
+    """The script for sbatch. `rest` are the user's flags for the learner. Raises `UsageError`."""
     folder = flags.folder.expanduser().absolute()
     for text in (str(folder), flags.time, flags.partition):
         if any(character.isspace() or character in "%\"'\\" for character in text):

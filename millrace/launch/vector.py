@@ -33,10 +33,10 @@ from workers.supervisor import Running, Supervisor, WorkerCommand, WorkerProcess
 
 log = logging.getLogger("millrace.learner")
 
-CLOSE_TIMEOUT_S = 5.0  # for workers to leave; afterwards local ones are killed
-JOIN_TIMEOUT_S = 60.0  # for local workers to join
-WORKER_TIMEOUT_S = 5.0  # a worker elsewhere is given up when it is silent for this long while the learner listens
-LEARNER_TIMEOUT_S = 600.0  # a worker elsewhere joins again when it hears nothing from the learner for this long
+CLOSE_TIMEOUT_S = 5.0  # seconds for workers to leave; then local workers are killed
+JOIN_TIMEOUT_S = 60.0  # seconds for local workers to join
+WORKER_TIMEOUT_S = 5.0  # a worker elsewhere is lost if it is silent for this long while the learner listens
+LEARNER_TIMEOUT_S = 600.0  # a worker elsewhere joins again if it hears nothing from the learner for this long
 STEP_TIMEOUT_LEAST_S, STEP_TIMEOUT_MOST_S = 60.0, 1e6
 
 
@@ -80,7 +80,7 @@ class ListeningVectorEnv:
             local_workers=supervisor,
             shared=self.shared,
             worker_timeout_s=WORKER_TIMEOUT_S if settings.listen.bind else math.inf,
-            spin_s=SPIN_S if count < usable_cores() else 0.0,  # only if a core is left for the learner
+            spin_s=SPIN_S if count < usable_cores() else 0.0,  # only if one core is free for the learner
         )
         self.resources.callback(hub.close, CLOSE_TIMEOUT_S)
         if supervisor is None:
@@ -117,7 +117,7 @@ def listen(settings: VectorEnvSettings, resources: ExitStack) -> ListeningVector
     where, transport, count = settings.listen, settings.transport, settings.local_workers
     if where.bind and settings.workers:
         raise UsageError(f"workers: expected 0, got {settings.workers}; with a bind address, start the workers yourself")
-    # Local workers end with this process, which sees at once when one of them ends: neither side needs a timeout.
+    # Local workers end with this process, and this process notices at once if one of them ends. So no timeout is needed.
     description = describe(settings, LEARNER_TIMEOUT_S if where.bind else math.inf)
     address = where.bind or private_address(transport, resources)
     keyring, token = _keys(where, transport)
@@ -129,7 +129,7 @@ def listen(settings: VectorEnvSettings, resources: ExitStack) -> ListeningVector
     resources.callback(link.close, 0.5)
     shared = None
     if settings.shared_memory and SUPPORTED and count and transport != "inproc":
-        to_learner = WakePipe()  # one for all: the worker that finishes a step last writes to it
+        to_learner = WakePipe()  # one for all workers: the last worker to finish a step writes to it
         shared = SharedSteps(SharedMemory(description.step), {f"w{n}": (WakePipe(), to_learner) for n in range(count)})
         resources.callback(shared.close)
     return ListeningVectorEnv(settings, description, link, context, keyring, token, shared, resources)
@@ -144,8 +144,9 @@ def _keys(where: BindSettings, transport: str) -> tuple[Keyring | None, Token | 
 
 
 def _step_timeout_s(timeout_s: float) -> float:
-    """After how long a local worker ends itself because a step hangs; 0 means never.
+    """Seconds after which a local worker ends itself because a step hangs; 0 means never.
 
-    It is longer than `timeout_s`, after which the learner kills the worker: it matters only if the learner no longer waits.
+    This is longer than `timeout_s`, after which the learner kills the worker. So it matters only if the learner does not
+    wait.
     """
     return max(STEP_TIMEOUT_LEAST_S, 2 * timeout_s) if timeout_s < STEP_TIMEOUT_MOST_S else 0.0
