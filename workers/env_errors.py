@@ -20,6 +20,14 @@ class CopyRaised(Exception):
         self.doing = doing
 
 
+class Unusable(CopyRaised):
+    """An env copy returned what no array of the run can hold; `line` says what was expected and what it was."""
+
+    def __init__(self, copy: int | None, line: str, doing: str = "reset") -> None:
+        super().__init__(copy, doing)
+        self.line = line
+
+
 class LaneFailed(RunError):
     """The environment raised, or returned data that no rollout can hold. `detail` is its traceback, if it raised."""
 
@@ -30,7 +38,9 @@ class LaneFailed(RunError):
 
 def lane_failed(lane: int, doing: str, error: CopyRaised) -> LaneFailed:
     """The environment's own exception as an error of its lane: one line, with the traceback as its detail."""
-    cause = error.__cause__ or error
     where = doing if error.copy is None else f"copy {error.copy}, {doing}"
+    if isinstance(error, Unusable):
+        return LaneFailed(lane, f"{where}: {error.line}")
+    cause = error.__cause__ or error
     line = f"{where}: its environment raised {type(cause).__name__}: {first_line(cause, '')}"
     return LaneFailed(lane, line, "".join(format_exception(cause)))

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from time import perf_counter
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import gymnasium
 
@@ -24,14 +24,6 @@ Pulse = Callable[[], None]
 """Called now and then during long work, so that the worker can answer the learner. It may raise to end the work."""
 
 PULSE_S = 0.05  # a loop over slow copies calls `pulse` this often
-
-
-class ObservationSink(Protocol):
-    """Takes the observation of copy n: a list of observations, or an array [N, *leaf]."""
-
-    def __setitem__(self, copy: Any, observation: Any, /) -> None:
-        """Store it."""
-        ...
 
 
 class EnvLoop:
@@ -72,7 +64,7 @@ class EnvLoop:
         self,
         copies: Iterable[int],
         seeds: Sequence[int | None],
-        into: ObservationSink,
+        into: list[Any],
         pulse: Pulse,
         keywords: Mapping[str, Any] | None = None,
     ) -> Infos:
@@ -89,7 +81,7 @@ class EnvLoop:
                 infos.append((n, info))
         return infos
 
-    def step(self, actions: Iterable[Any], into: ObservationSink, pulse: Pulse) -> Infos:
+    def step(self, actions: Iterable[Any], into: list[Any], pulse: Pulse) -> Infos:
         """Step every copy with its action, or reset it. The rest of the result is in `reward`, `terminated`, `truncated`."""
         reward, terminated, truncated = self.reward, self.terminated, self.truncated
         next_step, same_step = self._next_step, self._same_step

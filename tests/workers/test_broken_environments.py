@@ -6,8 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import msgspec
 import numpy as np
 import pytest
+from gymnasium.vector import SyncVectorEnv
 
 from protocol.errors import UsageError
 from protocol.specs import RunSpec
@@ -21,7 +23,7 @@ from tests.support.collectors import (
     sync_vector_env_over,
     with_env,
 )
-from workers.collect.env_copies import LoopedCopies
+from workers.collect.env_copies import LoopedCopies, VectorCopies
 from workers.env_errors import LaneFailed
 from workers.envs.toy import Countdown
 
@@ -116,7 +118,7 @@ def answer(good: int, observation: Any, reward: Any = 1.0, space: Any = None) ->
     return str(caught.value)
 
 
-@pytest.mark.parametrize("good", [0, 1], ids=["reset", "step"])
+@pytest.mark.parametrize("good", [0, 1, 4], ids=["reset", "first step", "later step"])
 @pytest.mark.parametrize(
     ("observation", "got"),
     [
@@ -126,12 +128,15 @@ def answer(good: int, observation: Any, reward: Any = 1.0, space: Any = None) ->
         (np.zeros(1, complex), "complex128[1]"),
         ("up", "<U2[]"),
         (None, "object[]"),
+        ("1", "<U1[]"),
+        (["1"], "<U1[1]"),
+        ([None], "object[1]"),
         ([[1, 2], [3]], "object[]"),
     ],
     ids=str,
 )
 def test_an_observation_that_does_not_fit_is_refused_before_it_is_kept(good: int, observation: Any, got: str) -> None:
-    when = ["first reset", "step 0"][good]
+    when = f"step {good - 1}" if good else "first reset"
     assert answer(good, observation).startswith(
         f"lane 0, copy 0, {when}: observation: expected float32[1] as its space says, got {got}; fix"
     )
@@ -143,12 +148,79 @@ def test_an_observation_that_does_not_fit_is_refused_before_it_is_kept(good: int
         (gymnasium.spaces.Box(0, 255, (2,), np.uint8), np.array([0.5, 0.5])),
         (gymnasium.spaces.Box(0, 255, (2,), np.uint8), np.array([256, 0])),
         (gymnasium.spaces.Box(-9, 9, (2,), np.int16), np.array([70000, 0])),
+        (gymnasium.spaces.Box(0, 9, (2,), np.int64), [0.5, 1]),
+        (gymnasium.spaces.Box(0, 9, (), np.int64), 0.5),
+        (gymnasium.spaces.Box(0, 9, (2,), np.uint8), np.array([-1, 0])),
         (gymnasium.spaces.Discrete(3), 1.0),
+        (gymnasium.spaces.Discrete(3), True + 0.5),
+        (gymnasium.spaces.MultiBinary(2), [0, 300]),
+        (gymnasium.spaces.Box(0, 9, (3,), np.float32), np.zeros(1, np.float32)),
+        (gymnasium.spaces.Box(0, 9, (3, 2), np.float32), np.zeros((1, 2), np.float32)),
+        (gymnasium.spaces.Box(0, 9, (2, 2), np.float32), np.zeros((2, 1), np.float32)),
+        (gymnasium.spaces.Box(0, 9, (), np.float32), np.zeros(1, np.float32)),
+        (gymnasium.spaces.Box(0, 9, (), np.float32), None),
+        (gymnasium.spaces.Dict({"a": gymnasium.spaces.Discrete(3)}), {"a": None}),
     ],
     ids=str,
 )
-def test_an_observation_that_would_lose_its_meaning_is_refused(space: Any, observation: Any) -> None:
-    assert "as its space says" in answer(0, observation, space=space)
+@pytest.mark.parametrize("good", [0, 1, 4], ids=["reset", "first step", "later step"])
+def test_an_observation_that_would_lose_its_meaning_is_refused(good: int, space: Any, observation: Any) -> None:
+    assert "as its space says" in answer(good, observation, space=space)
+
+
+@pytest.mark.parametrize(
+    ("observation", "got"),
+    [
+        ({"b": 1}, "a dict of 'b' (KeyError: 'a')"),
+        (7, "a int (TypeError: 'int' object is not subscriptable)"),
+    ],
+)
+@pytest.mark.parametrize("good", [0, 4], ids=["reset", "later step"])
+def test_an_observation_without_one_of_its_arrays_is_named(good: int, observation: Any, got: str) -> None:
+    said = answer(good, observation, space=gymnasium.spaces.Dict({"a": gymnasium.spaces.Discrete(3)}))
+    when = f"step {good - 1}" if good else "first reset"
+    assert said.startswith(
+        f"lane 0, copy 0, {when}: observation: expected the structure of its space, got {got}; fix the environment"
+    )
+
+
+class Turns(Countdown):
+    """Gives float32[4], and from its fourth step on what it is told."""
+
+    def __init__(self, *later: Any) -> None:
+        super().__init__(50)
+        self.observation_space = gymnasium.spaces.Box(-9, 9, (4,), np.float32)
+        self._later = later
+
+    def _observation(self) -> Any:
+        return self._later[0] if self._later and self._left < 47 else np.zeros(4, np.float32)
+
+
+def test_the_copy_whose_observation_changes_is_named_even_if_another_makes_up_for_it() -> None:
+    short, long = np.zeros(3, np.float32), np.zeros(5, np.float32)
+    for copies, named in [((Turns(), Turns(short), Turns(long)), 1), ((Turns(long), Turns(), Turns(short)), 0)]:
+        run = msgspec.structs.replace(run_around(copies[0], T=6), copies=3)
+        with pytest.raises(LaneFailed, match=rf"lane 0, copy {named}, step 3: observation: expected float32\[4\] as its"):
+            collect(random_collector(run, loop_over([lambda env=env: env for env in copies])), run)  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("space", "given"),
+    [
+        (gymnasium.spaces.Box(-9, 9, (2,), np.float32), [np.array([1, 2]), [1.0, 2], (True, 2), np.array([1.0, 2.0])]),
+        (gymnasium.spaces.Box(0, 9, (2,), np.uint8), [np.array([1, 2]), [1, 2], np.array([1, 2], np.uint64), [True, 2]]),
+        (gymnasium.spaces.Discrete(3), [1, np.int32(1), np.array(1, np.uint8), True]),
+        (gymnasium.spaces.Box(-9, 9, (), np.float64), [1, np.float32(1), np.array(1.0), 1.0]),
+    ],
+    ids=str,
+)
+def test_observations_of_other_types_are_kept_as_long_as_they_mean_the_same(space: Any, given: list[Any]) -> None:
+    for observation in given:
+        env = Answers(1, observation, space=space)
+        env._rows = iter([(observation, 1.0)] * 9)
+        run = run_around(env, T=6)
+        (rollout,) = collect(random_collector(run, loop_over([lambda env=env: env])), run)  # type: ignore[misc]
+        assert (rollout.obs[0] == np.asarray(observation)).all()
 
 
 class Doubles(Countdown):
@@ -173,16 +245,41 @@ def test_a_discrete_observation_outside_its_space_is_named(observation: int) -> 
 @pytest.mark.parametrize(
     ("reward", "said"),
     [
-        (
-            "much",
-            "step 2: its environment returned an unusable value: could not convert string to float: 'much'",
-        ),
-        ([1.0, 2.0], "step 2: its environment returned an unusable value: setting an array element"),
+        ("much", "copy 0, step 2: reward: expected a number, got 'much'"),
+        ([1.0, 2.0], "copy 0, step 2: reward: expected a number, got an array of shape (2,); wrap the environment so"),
+        ([[1.0], [2.0, 3.0]], "copy 0, step 2: reward: expected a number, got [[1.0], [2.0, 3.0]]"),
         (None, "reward: expected finite values, got nan at step 2, copy 0"),
     ],
 )
 def test_a_reward_that_is_no_number_is_refused(reward: Any, said: str) -> None:
     assert answer(3, np.zeros(1, np.float32), reward).startswith(f"lane 0, {said}")
+
+
+@pytest.mark.parametrize("copies", [1, 3])
+@pytest.mark.parametrize("reward", [np.array([2.5]), [2.5], np.array([[2.5]], np.float32), np.float64(2.5), np.array(2.5)])
+def test_a_reward_of_one_element_is_a_number(reward: Any, copies: int) -> None:
+    class Rewards(Countdown):
+        def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+            observation, _, terminated, truncated, info = super().step(action)
+            return observation, reward, np.array([terminated]), truncated, info
+
+    run = msgspec.structs.replace(run_around(Rewards(), T=6), copies=copies)
+    (rollout,) = collect(random_collector(run, loop_over([Rewards] * copies)), run)
+    assert rollout.reward.tolist() == [[2.5] * copies] * 5 + [[0.0] * copies]
+    assert rollout.terminated.sum() == copies
+
+
+def test_a_vector_environment_whose_rewards_are_not_one_for_each_copy_is_named() -> None:
+    class One(SyncVectorEnv):
+        def step(self, actions: Any) -> Any:
+            observation, reward, *rest = super().step(actions)
+            return observation, reward[:1], *rest
+
+    run = run_of(f"{TOY}Countdown-v0", N=2)
+    with pytest.raises(
+        LaneFailed, match=r"lane 0, step 0: reward: expected one for each of 2 copies, got an array of shape"
+    ):
+        collect(random_collector(run, lambda r, lane, pulse: VectorCopies(One([Countdown] * 2))), run)
 
 
 def test_a_nan_is_named_even_if_the_environment_then_chokes_on_it() -> None:

@@ -1,16 +1,21 @@
-"""The stepper of a worker: which attributes of its env copies a learner may use."""
+"""The stepper of a worker: which attributes of its env copies a learner may use, and which results it refuses."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 
 from learner.vector_env.settings import VectorEnvSettings
 from learner.vector_env.spec import describe
-from protocol.messages import Call, Returned
+from protocol.messages import Call, Reset, Returned, Step, Stepped
 from protocol.wire.plain_values import pack, unpack
+from workers.env_errors import LaneFailed
+from workers.envs.toy import Countdown
 from workers.step.stepper import Stepper
 
 
@@ -40,3 +45,56 @@ def test_private_attributes_are_given_to_a_learner_that_may_run_code() -> None:
     answer = call(stepper, "_k", ((), {}))
     assert (answer.error, unpack(answer.results.data)) == ("", [4, 5])
     stepper.close_all()
+
+
+# ------------------------------------------------------------------------------------------------ what copies return
+
+
+class Changes(Countdown):
+    """Its observation is `later` from the fourth step on, and its reward is `reward`."""
+
+    def __init__(self, nested: bool = False, reward: Any = 1.0, later: str = "np.zeros(3)") -> None:
+        super().__init__(50)
+        box = gymnasium.spaces.Box(-9, 9, (2,), np.float32)
+        self.observation_space = gymnasium.spaces.Dict({"a": box}) if nested else box
+        self._nested, self._later, self._reward = nested, later, reward
+
+    def _observation(self) -> Any:
+        value = np.zeros(2, np.float32) if self._left > 46 else eval(self._later)
+        return {"a": value} if self._nested else value
+
+
+def stepped(env: Callable[[], Any], steps: int) -> list[Stepped]:
+    """The answers of two copies in a vector environment to `steps` steps."""
+    stepper = Stepper(describe(VectorEnvSettings(env, 2, lanes=1)).step)
+    answers = [stepper.execute(Reset(1, 1, 0, 0, (0, 1), (0, 1), np.frombuffer(pack(None), np.uint8)), lambda: None)]
+    actions = (np.zeros(2, np.int64),)
+    answers += [stepper.execute(Step(1, t, 0, 0, actions), lambda: None) for t in range(2, 2 + steps)]
+    return [answer for answer in answers if isinstance(answer, Stepped)]
+
+
+@pytest.mark.parametrize("nested", [False, True])
+@pytest.mark.parametrize(
+    ("later", "got"),
+    [
+        ("np.zeros(1, np.float32)", "float32[1]"),
+        ("np.zeros((1, 2), np.float32)", "float32[1, 2]"),
+        ("np.float32(0)", "float32[]"),
+        ("None", "object[]"),
+        ("'1'", "<U1[]"),
+        ("['1', '2']", "<U1[2]"),
+    ],
+)
+def test_an_observation_that_does_not_fit_is_refused_at_every_step(nested: bool, later: str, got: str) -> None:
+    named = "observation a" if nested else "observation"
+    assert len(stepped(partial(Changes, nested), 3)) == 4
+    with pytest.raises(LaneFailed) as caught:
+        stepped(partial(Changes, nested, later=later), 4)
+    expected = f"{named}: expected float32[2] as its space says, got {got}; fix the environment or its observation_space"
+    assert str(caught.value) == f"lane 0, copy 0, step 3: {expected}"
+
+
+def test_rewards_are_numbers_or_arrays_of_one_element() -> None:
+    assert stepped(partial(Changes, reward=np.array([2.5])), 1)[1].reward.tolist() == [2.5, 2.5]
+    with pytest.raises(LaneFailed, match=r"copy 0, step 0: reward: expected a number, got an array of shape \(2,\); wrap"):
+        stepped(partial(Changes, reward=np.zeros(2)), 1)

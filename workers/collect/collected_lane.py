@@ -6,7 +6,7 @@ raises `LaneFailed` for an environment that raises, for observations that do not
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from time import perf_counter
 
 import numpy as np
@@ -17,9 +17,10 @@ from protocol.errors import UsageError
 from protocol.policy.recurrent import zero_state
 from protocol.rollout import Episode, describe_first_non_finite
 from protocol.specs import Leaf, RunSpec
-from workers.collect.env_copies import EnvCopies, Leaves, StepResult, copy_seeds
+from workers.collect.env_copies import EnvCopies, Leaves, copy_seeds
 from workers.env_errors import CopyRaised, LaneFailed, lane_failed
 from workers.env_loop import Pulse
+from workers.env_results import leaf_writers
 
 
 class CollectedLane:
@@ -40,7 +41,7 @@ class CollectedLane:
         self._return = [0.0] * run.copies  # of the running episodes, as are the next two
         self._length = [0] * run.copies
         self._start_s = [0.0] * run.copies  # by perf_counter
-        self._fits = False
+        self._writers = leaf_writers(run.policy.observation, run.copies)
 
     def reset(self, pulse: Pulse) -> None:
         """Start episodes in all copies. Raises `UsageError` when their spaces are not those of the run."""
@@ -51,47 +52,15 @@ class CollectedLane:
                 "the learner has; install the same version of it on both machines"
             )
         try:
-            leaves = self.copies.reset(self._seeds, pulse)
+            self.write_observations(self.obs, self.copies.reset(self._seeds, pulse))
         except CopyRaised as error:
             raise lane_failed(self.number, "first reset", error) from error
-        self._check_fit(leaves, "first reset")
-        for array, leaf in zip(self.obs, leaves, strict=True):
-            array[:] = leaf
         self._start_s = [perf_counter()] * len(self._start_s)
 
-    def step(self, actions: Array, t: int, pulse: Pulse) -> StepResult:
-        """Step `t` of a rollout, with actions [N, *action]."""
-        try:
-            row = self.copies.step(actions, pulse)
-        except CopyRaised as error:
-            raise lane_failed(self.number, f"step {t}", error) from error
-        if not self._fits:
-            self._check_fit(row.leaves, f"step {t}")
-            self._fits = True
-        return row
-
-    def _check_fit(self, leaves: Leaves, when: str) -> None:
-        """Raise if an observation is not of its space's shape, or if a cast to its dtype changes its kind or an integer.
-
-        Checked at the first reset and the first step: an environment that fits then, fits later.
-        """
-        for leaf, values in zip(self._run.policy.observation, leaves, strict=True):
-            wanted = np.dtype(leaf.dtype)
-            for n, value in enumerate(values):
-                try:
-                    array = np.asarray(value)
-                except ValueError:  # rows of different lengths
-                    array = np.asarray(None)
-                if (
-                    array.shape != leaf.shape
-                    or not np.can_cast(array.dtype, wanted, "same_kind")
-                    or (wanted.kind in "iu" and (array.astype(wanted) != array).any())
-                ):
-                    raise LaneFailed(
-                        self.number,
-                        f"copy {n}, {when}: {_name(leaf)}: expected {wanted}{list(leaf.shape)} as its space says, "
-                        f"got {array.dtype}{list(array.shape)}; fix the environment or its observation_space",
-                    )
+    def write_observations(self, rows: Iterable[Array], leaves: Leaves) -> None:
+        """Write observations into `rows`, [N, *leaf] each. Raises `Unusable`, an error of one copy."""
+        for writer, row, values in zip(self._writers, rows, leaves, strict=True):
+            writer.write(row, values)
 
     def check_values(self, obs: Sequence[Array], reward: Array) -> None:
         """Raise, naming step and copy, if obs [rows, N, *leaf] or rewards [rows, N] are not finite or not in their space."""

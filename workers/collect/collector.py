@@ -30,6 +30,7 @@ from workers.collect.envpool_copies import EnvpoolCopies
 from workers.collect.held_rollouts import Assignment
 from workers.env_errors import CopyRaised, LaneFailed, lane_failed
 from workers.env_loop import Pulse
+from workers.env_results import write_numbers
 
 OpenEnvCopies = Callable[[RunSpec, int, Pulse], EnvCopies]
 """Makes the env copies of the lane of this number."""
@@ -192,16 +193,15 @@ class Collector:
             acted = perf_counter()
             self._step_all(numbers, taken, pulse)
             for i, lane, reward, terminated, truncated, obs in views:
-                row = lane.step(taken[i], t, pulse)
                 try:
-                    leaves, reward[t], terminated[t], truncated[t], lost = row
-                    for array, leaf in zip(obs, leaves, strict=True):
-                        array[t + 1] = leaf
-                except (TypeError, ValueError) as error:
-                    raise LaneFailed(
-                        lane.number, f"step {t}: its environment returned an unusable value: {error}"
-                    ) from error
-                if lost is not None:
+                    row = lane.copies.step(taken[i], pulse)
+                    write_numbers("reward", reward[t], row.reward)
+                    write_numbers("terminated", terminated[t], row.terminated)
+                    write_numbers("truncated", truncated[t], row.truncated)
+                    lane.write_observations([array[t + 1] for array in obs], row.leaves)
+                except CopyRaised as error:
+                    raise lane_failed(lane.number, f"step {t}", error) from error
+                if (lost := row.lost) is not None:
                     _truncate_lost(rows, i, lane, t, lost)
             if is_recurrent:
                 rows.state[resets] = 0.0

@@ -20,14 +20,15 @@ from protocol.arrays import Array
 from protocol.envs.spaces import make_flatten
 from protocol.envs.vectorized import check_resets_next_step
 from protocol.errors import UsageError
-from workers.env_errors import CopyRaised
+from workers.env_errors import CopyRaised, Unusable
 from workers.env_loop import EnvLoop, Pulse
+from workers.env_results import missing_leaf, read_leaves
 
 Leaves = Sequence[Any]  # for each leaf of the observation: an array [N, *leaf], or a sequence of N observations
 
 
 class StepResult(NamedTuple):
-    """Result of one step of N copies; each part is anything that numpy can assign to an array [N, …]."""
+    """Result of one step of N copies; `workers/env_results.py` writes each part into an array [N, …]."""
 
     leaves: Leaves
     reward: Any
@@ -89,7 +90,7 @@ class LoopedCopies:
 
     def _leaves(self) -> Leaves:
         if self._nested:
-            return tuple(zip(*map(self._read, self._observations), strict=True))
+            return read_leaves(self._read, self._observations)
         return (self._observations,)
 
     def close(self) -> None:
@@ -120,6 +121,7 @@ class VectorCopies:
         """Raises `UsageError` for another autoreset mode."""
         check_resets_next_step(env)
         self._env = env
+        self._per_copy = (env.num_envs,)
         self.observation_space = env.single_observation_space
         self.action_space = env.single_action_space
         self._read = make_flatten(self.observation_space)
@@ -147,7 +149,16 @@ class VectorCopies:
             observation, reward, terminated, truncated, _ = self._env.step(actions)
         except Exception as error:
             raise CopyRaised(None, "step") from error
-        return StepResult(self._read(observation), reward, terminated, truncated)
+        for name, array in (("reward", reward), ("terminated", terminated), ("truncated", truncated)):
+            if np.shape(array) != self._per_copy:
+                line = (
+                    f"{name}: expected one for each of {self._per_copy[0]} copies, got an array of shape {np.shape(array)}"
+                )
+                raise Unusable(None, line)
+        try:
+            return StepResult(self._read(observation), reward, terminated, truncated)
+        except (LookupError, TypeError) as error:
+            raise missing_leaf(None, observation, error) from error
 
     def close(self) -> None:
         """Close it. What it raises is ignored."""

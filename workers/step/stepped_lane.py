@@ -6,7 +6,7 @@ copies.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any, NamedTuple
@@ -17,8 +17,10 @@ import numpy as np
 from protocol.arrays import Array
 from protocol.envs.spaces import leaves_with_own_dtype, make_flatten, make_unflatten
 from protocol.errors import UsageError
-from protocol.specs import Leaf, StepSpec
-from workers.env_loop import EnvLoop, Infos, ObservationSink, Pulse
+from protocol.specs import StepSpec
+from workers.env_errors import Unusable
+from workers.env_loop import EnvLoop, Infos, Pulse
+from workers.env_results import leaf_writers, read_leaves, write_numbers
 
 
 class Rows(NamedTuple):
@@ -51,27 +53,39 @@ class SteppedLane:
         env = self._loop.envs[0]
         self._nested_actions = _is_nested(env.action_space)
         self._nest = make_unflatten(env.action_space)
-        read = make_flatten(env.observation_space)
-        self._fast_sink: ObservationSink = _LeafSink(read, rows.obs) if _is_nested(env.observation_space) else rows.obs[0]
-        self._sink: ObservationSink = _CheckedLeafSink(read, rows.obs, spec.observation)
+        self._nested_observations = _is_nested(env.observation_space)
+        self._read = make_flatten(env.observation_space)
+        self._observations: list[Any] = [None] * len(self._loop.envs)  # as the copies returned them last
+        self._writers = leaf_writers(spec.observation, len(self._loop.envs))
 
     def reset(self, copies: Sequence[int], seeds: Sequence[int | None], options: Any, pulse: Pulse) -> Infos:
         """Start episodes in these copies, with a seed for each."""
-        infos = self._loop.reset(copies, seeds, self._sink, pulse, {"options": options})
-        self._copy_flags()
+        infos = self._loop.reset(copies, seeds, self._observations, pulse, {"options": options})
+        for n in copies:  # only these: a copy may overwrite the observation that it returned before
+            (values,) = zip(*read_leaves(self._read, [self._observations[n]]), strict=True)
+            for writer, row, value in zip(self._writers, self.rows.obs, values, strict=True):
+                writer.write_one(row, n, value)
+        self._write_numbers()
         return infos
 
     def step(self, actions: Sequence[Array], pulse: Pulse) -> Infos:
         """Step each copy with its row of the actions, which are [N, *leaf] for each leaf."""
         each: Iterable[Any] = map(self._nest, zip(*actions, strict=True)) if self._nested_actions else actions[0]
-        infos = self._loop.step(each, self._sink, pulse)
-        self._sink = self._fast_sink  # an environment whose first step fits its space, fits later
-        self._copy_flags()
+        step = self._loop.steps
+        infos = self._loop.step(each, self._observations, pulse)
+        try:
+            leaves = read_leaves(self._read, self._observations) if self._nested_observations else (self._observations,)
+            for writer, row, values in zip(self._writers, self.rows.obs, leaves, strict=True):
+                writer.write(row, values)
+            self._write_numbers()
+        except Unusable as error:
+            raise Unusable(error.copy, error.line, f"step {step}") from error
         return infos
 
-    def _copy_flags(self) -> None:
-        rows, loop = self.rows, self._loop
-        rows.reward[:], rows.terminated[:], rows.truncated[:] = loop.reward, loop.terminated, loop.truncated
+    def _write_numbers(self) -> None:
+        write_numbers("reward", self.rows.reward, self._loop.reward)
+        write_numbers("terminated", self.rows.terminated, self._loop.terminated)
+        write_numbers("truncated", self.rows.truncated, self._loop.truncated)
 
     def call(self, copies: Sequence[int], name: str, args: Sequence[Any], kwargs: dict[str, Any]) -> list[Any]:
         """The attribute of each of these copies, or its result if it can be called. Its exceptions are not caught."""
@@ -113,32 +127,3 @@ def _make_copy(spec: StepSpec, number: int, copy: int) -> gymnasium.Env[Any, Any
 
 def _is_nested(space: gymnasium.Space[Any]) -> bool:
     return isinstance(space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple)
-
-
-class _LeafSink:
-    """Writes the observation of one copy into arrays [N, *leaf], leaf by leaf."""
-
-    def __init__(self, read: Callable[[Any], Sequence[Any]], arrays: Sequence[Array]) -> None:
-        self._read, self._arrays = read, arrays
-
-    def __setitem__(self, copy: int, observation: Any) -> None:
-        for array, value in zip(self._arrays, self._read(observation), strict=True):
-            array[copy] = value
-
-
-class _CheckedLeafSink(_LeafSink):
-    """The same, and raises `ValueError` if an observation does not have the shape and dtype of its space."""
-
-    def __init__(self, read: Callable[[Any], Sequence[Any]], arrays: Sequence[Array], leaves: Sequence[Leaf]) -> None:
-        super().__init__(read, arrays)
-        self._leaves = leaves
-
-    def __setitem__(self, copy: int, observation: Any) -> None:
-        for leaf, stored, value in zip(self._leaves, self._arrays, self._read(observation), strict=True):
-            array = np.asarray(value)
-            if array.shape != leaf.shape or not np.can_cast(array.dtype, stored.dtype, "same_kind"):
-                raise ValueError(
-                    f"observation {leaf.path}".strip() + f": expected {leaf.dtype}{list(leaf.shape)} as its space says, "
-                    f"got {array.dtype}{list(array.shape)}"
-                )
-        super().__setitem__(copy, observation)

@@ -1,0 +1,136 @@
+"""Writes what N env copies returned into arrays. What an array could only seem to hold is refused (`Unusable`).
+
+numpy's assignment broadcasts an observation of another shape, reads None as NaN and text as a number, and cuts fractions off
+for a space of integers. Here every observation has the shape of its space, and its dtype is cast only within its kind; an
+integer keeps its value. This is checked at every step, in calls that treat all copies at once; the loop over the copies
+runs only to find which of them is wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NoReturn
+
+import numpy as np
+
+from protocol.arrays import Array
+from protocol.bounds import one_line
+from protocol.specs import Leaf
+from workers.env_errors import Unusable
+
+
+class LeafWriter:
+    """Writes one array of the observations of N copies."""
+
+    def __init__(self, leaf: Leaf, copies: int) -> None:
+        self._leaf, self._dtype = leaf, np.dtype(leaf.dtype)
+        self._is_whole = self._dtype.kind in "iu"
+        self._shape = (copies, *leaf.shape)
+        # Observations of one dimension or more are joined along their first one, which is the fastest way.
+        self._lengths = [leaf.shape[0]] * copies if leaf.shape else None
+        self._joined_shape = (copies * leaf.shape[0], *leaf.shape[1:]) if leaf.shape else ()
+        self._casting: Any = "safe" if self._is_whole else "same_kind"
+
+    def write(self, row: Array, values: Any) -> None:
+        """Write into `row`, a contiguous array [N, *leaf]. `values`: an array of this shape, or N observations in order.
+
+        Raises `Unusable`; some copies may be written then.
+        """
+        try:
+            if self._lengths is not None and isinstance(values, list | tuple):
+                if list(map(len, values)) == self._lengths:
+                    np.concatenate(values, out=row.reshape(self._joined_shape), casting=self._casting)
+                    return
+            else:
+                array = np.asarray(values)
+                if array.shape == self._shape and (array.dtype == self._dtype or self._keeps_values(array)):
+                    row[...] = array
+                    return
+        except (TypeError, ValueError):  # the loop below finds what is wrong, if anything is
+            pass
+        if len(values) != len(row):
+            raise Unusable(None, f"{_name(self._leaf)}: expected those of {len(row)} copies, got {len(values)}")
+        for n, value in enumerate(values):
+            self.write_one(row, n, value)
+
+    def write_one(self, row: Array, n: int, value: Any) -> None:
+        """Write the observation of copy `n` into `row` [N, *leaf]. Raises `Unusable`."""
+        try:
+            array = np.asarray(value)
+        except ValueError:  # rows of different lengths
+            array = np.asarray(None)
+        if array.shape != self._leaf.shape or not self._keeps_values(array):
+            self._refuse(n, array)
+        row[n] = array
+
+    def _keeps_values(self, array: Array) -> bool:
+        """Whether a cast to the leaf's dtype keeps the kind, and the value of each integer."""
+        if array.dtype == self._dtype:
+            return True
+        if self._is_whole:
+            return array.dtype.kind in "biu" and bool((array.astype(self._dtype) == array).all())
+        return np.can_cast(array.dtype, self._dtype, "same_kind")
+
+    def _refuse(self, n: int, array: Array) -> NoReturn:
+        expected = f"expected {self._dtype}{list(self._leaf.shape)} as its space says"
+        got = f"got {array.dtype}{list(array.shape)}"
+        if self._is_whole and array.shape == self._leaf.shape and array.dtype.kind in "iu":
+            got += f" with the value {array[array.astype(self._dtype) != array].flat[0]}"
+        raise Unusable(n, f"{_name(self._leaf)}: {expected}, {got}; fix the environment or its observation_space")
+
+
+def read_leaves(read: Callable[[Any], tuple[Any, ...]], observations: Sequence[Any]) -> tuple[Sequence[Any], ...]:
+    """For each leaf of a Dict or Tuple observation, the values of N copies. Raises `Unusable` where a leaf is missing."""
+    try:
+        return tuple(zip(*map(read, observations), strict=True))
+    except (LookupError, TypeError):
+        for n, observation in enumerate(observations):
+            try:
+                read(observation)
+            except (LookupError, TypeError) as error:
+                raise missing_leaf(n, observation, error) from error
+        raise
+
+
+def missing_leaf(n: int | None, observation: Any, error: Exception) -> Unusable:
+    """The error for an observation in which a leaf of its space cannot be found."""
+    keys = f" of {', '.join(map(repr, observation))}" if isinstance(observation, dict) else ""
+    return Unusable(
+        n,
+        f"observation: expected the structure of its space, got a {type(observation).__name__}{keys} "
+        f"({type(error).__name__}: {error}); fix the environment or its observation_space",
+    )
+
+
+def write_numbers(name: str, row: Array, values: Any) -> None:
+    """Write one number of each of N copies into `row` [N]. An array of one element counts as a number, as in gymnasium.
+
+    Raises `Unusable`, which names the copy.
+    """
+    try:
+        row[:] = values
+    except (TypeError, ValueError):
+        for n, value in enumerate(values):
+            row[n] = _number(name, n, value)
+
+
+def _number(name: str, n: int, value: Any) -> Any:
+    try:
+        array = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        array = np.asarray(None)
+    if array.size == 1 and array.dtype.kind in "biuf":
+        return array.item()
+    if array.size == 1:
+        raise Unusable(n, f"{name}: expected a number, got {one_line(repr(value), 80)}")
+    advice = "; wrap the environment so that it returns one number" if name == "reward" else ""
+    raise Unusable(n, f"{name}: expected a number, got an array of shape {array.shape}{advice}")
+
+
+def leaf_writers(leaves: Iterable[Leaf], copies: int) -> list[LeafWriter]:
+    """A writer for each leaf."""
+    return [LeafWriter(leaf, copies) for leaf in leaves]
+
+
+def _name(leaf: Leaf) -> str:
+    return f"observation {leaf.path}".strip()
