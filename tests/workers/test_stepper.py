@@ -56,7 +56,7 @@ class Changes(Countdown):
     def __init__(self, nested: bool = False, reward: Any = 1.0, later: str = "np.zeros(3)") -> None:
         super().__init__(50)
         box = gymnasium.spaces.Box(-9, 9, (2,), np.float32)
-        self.observation_space = gymnasium.spaces.Dict({"a": box}) if nested else box
+        self.observation_space = gymnasium.spaces.Dict({"a": box}) if nested else box  # type: ignore[assignment]
         self._nested, self._later, self._reward = nested, later, reward
 
     def _observation(self) -> Any:
