@@ -220,6 +220,6 @@ def test_a_worker_of_another_protocol_version_is_refused(stage: Stage) -> None:
     stranger = stage.start([sys.executable, "-c", newer, address, "--name", "newer"], "newer")
     assert stranger.ends() == 2
     assert "got 999; install the learner's version of millrace" in stranger.said()
-    learner.hears(f"worker newer was refused: protocol expected {PROTOCOL_VERSION}, got 999")
+    learner.hears(f"worker newer was refused: protocol: expected {PROTOCOL_VERSION}, got 999")
     learner.trains()
     finish(learner, workers)
