@@ -48,6 +48,9 @@ BENCHMARKS = {
         "PPO on CartPole-v1, compared with Stable-Baselines3; --peers: with six more systems",
         brief=("--rounds", "2"),
     ),
+    "slow": Benchmark(
+        "slow", "PPO on an environment whose steps sleep 5 ms, compared with Stable-Baselines3", brief=("--rounds", "1")
+    ),
     "wire": Benchmark("wire", "sending rollouts, compared with raw ZeroMQ"),
     "scale": Benchmark("scale", "one learner with 10, 100 and 1,000 simulated workers"),
     "memory": Benchmark(

@@ -131,16 +131,18 @@ def missing() -> list[str]:
 
 
 def run(
-    contender: str,
+    name: str,
     settings: dict[str, Any],
     target: float | None = None,
     look: Callable[[int], None] = lambda pid: None,
+    contender: Contender | None = None,
 ) -> ProgramResult:
     """Run a program to its end.
 
-    `look` is called with its pid from time to time. With a target it ends once that is reached.
+    `look` is called with its pid from time to time. With a target it ends once that is reached. `contender`: the program, if
+    `CONTENDERS` does not have the name.
     """
-    each = CONTENDERS[contender]
+    each = contender or CONTENDERS[name]
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         command = _ours(each, settings, target, folder) if each.ours else _theirs(each, settings, target)
         threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -169,7 +171,7 @@ def run(
                     os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
         if process.returncode:
-            raise RuntimeError(f"{contender} ended with {process.returncode}: {out.read_text()[-500:]}")
+            raise RuntimeError(f"{name} ended with {process.returncode}: {out.read_text()[-500:]}")
         if each.ours:
             (table,) = Path(folder).rglob("metrics.jsonl")
             config = config_of_run(table.parent)

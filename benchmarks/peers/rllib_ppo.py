@@ -24,15 +24,16 @@ def main() -> None:
     run = PeerRun()
     s = run.settings
     logging.getLogger("ray").setLevel(logging.ERROR)
-    init(num_cpus=RUNNERS + 1, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
+    runners = s.get("processes", RUNNERS)
+    init(num_cpus=runners + 1, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
     rate, rows = s["learning_rate"], s["envs"] * s["rollout_steps"]
     config = (
         PPOConfig()
         .environment(s["env"])
         .framework("torch", torch_skip_nan_gradients=False)
         .env_runners(
-            num_env_runners=RUNNERS,
-            num_envs_per_env_runner=s["envs"] // RUNNERS,
+            num_env_runners=runners,
+            num_envs_per_env_runner=s["envs"] // runners,
             rollout_fragment_length=s["rollout_steps"],
         )
         .learners(num_learners=0)

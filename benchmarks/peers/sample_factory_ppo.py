@@ -66,9 +66,10 @@ def make(name: str, cfg: Any = None, env_config: Any = None, render_mode: Any = 
 
 def arguments(s: dict[str, Any], how: str) -> list[str]:
     """The settings by Sample Factory's names."""
+    workers = s.get("processes", WORKERS)
     common = {
         "env": s["env"], "algo": "APPO", "experiment": "benchmark", "train_dir": Path.cwd(), "seed": s["seed"],
-        "train_for_env_steps": s["steps"], "device": "cpu", "use_rnn": False, "num_workers": WORKERS,
+        "train_for_env_steps": s["steps"], "device": "cpu", "use_rnn": False, "num_workers": workers,
         "save_every_sec": 10**6, "save_best_every_sec": 10**6, "with_vtrace": False,
     }  # fmt: skip
     if how == "own":  # from the example for CartPole in its documentation
@@ -76,10 +77,10 @@ def arguments(s: dict[str, Any], how: str) -> list[str]:
         named = common | own | {"reward_scale": 0.1}
     else:
         serial = how == "serial"
-        rows = s["envs"] * s["rollout_steps"]
+        rows, splits = s["envs"] * s["rollout_steps"], 1 if serial or s["envs"] == workers else 2
         named = common | {
-            "serial_mode": serial, "async_rl": not serial, "num_workers": 1 if serial else WORKERS,
-            "num_envs_per_worker": s["envs"] if serial else s["envs"] // WORKERS, "worker_num_splits": 1 if serial else 2,
+            "serial_mode": serial, "async_rl": not serial, "num_workers": 1 if serial else workers,
+            "num_envs_per_worker": s["envs"] if serial else s["envs"] // workers, "worker_num_splits": splits,
             "rollout": s["rollout_steps"], "recurrence": 1, "batch_size": s["batch_size"],
             "num_batches_per_epoch": rows // s["batch_size"], "num_epochs": s["n_epochs"], "shuffle_minibatches": True,
             "gamma": s["gamma"], "gae_lambda": s["gae_lambda"], "learning_rate": s["learning_rate"],

@@ -53,7 +53,8 @@ def main() -> None:
     run = PeerRun()
     s = run.settings
     torch.manual_seed(s["seed"])
-    copies, rows = s["envs"] // PROCESSES, s["envs"] * s["rollout_steps"]
+    processes = s.get("processes", PROCESSES)
+    copies, rows = s["envs"] // processes, s["envs"] * s["rollout_steps"]
     make = Make(s["env"], copies)
     one = make.one()
     inputs, outputs = one.observation_spec["observation"].shape[-1], one.action_spec.space.n
@@ -81,7 +82,7 @@ def main() -> None:
     adam = torch.optim.Adam(loss.parameters(), lr=s["learning_rate"], eps=1e-5)
     buffer = ReplayBuffer(storage=LazyTensorStorage(rows), sampler=SamplerWithoutReplacement(), batch_size=s["batch_size"])
     collector = (MultiAsyncCollector if run.how == "async" else MultiSyncCollector)(
-        [make] * PROCESSES,
+        [make] * processes,
         actor,
         frames_per_batch=rows,
         total_frames=-1,

@@ -1,0 +1,141 @@
+"""Compares training on a slow environment: `python -m benchmarks.slow`, or `millrace bench slow`.
+
+PPO with 64 steps, minibatches of 256 and 10 epochs, on 16 env copies in 16 processes. The environment sleeps
+(`benchmarks/slow_env.py`), so that the number of cores does not matter and waiting is all that is measured. The ideal is 16
+copies that never wait. Each run is a process tree of its own; all take turns. `--peers` adds the installed systems that can
+run 16 processes. `--picture FILE` draws who waits for whom.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks import programs
+from benchmarks.programs import CONTENDERS, Contender, contenders
+from benchmarks.slow_env import STEPS_PER_S, TIMELINE
+from benchmarks.writing import write
+from learner.report.learning_curves import COLORS, DPI, GREY
+
+COPIES = 16
+IDEAL = COPIES * STEPS_PER_S
+WARM_UP = 3  # updates
+SETTINGS: dict[str, Any] = {
+    "env": "benchmarks.slow_env:Lognormal-v0", "algo": "ppo", "envs": COPIES, "rollout_steps": 64, "batch_size": 256,
+    "n_epochs": 10, "gamma": 0.99, "gae_lambda": 0.95, "ent_coef": 0.0, "vf_coef": 0.5, "max_grad_norm": 0.5,
+    "learning_rate": 3e-4, "learning_rate_schedule": "constant", "clip_range": 0.2, "clip_range_schedule": "constant",
+    "eval_every": 0, "eval_episodes": 1, "processes": COPIES,
+}  # fmt: skip
+UPDATES, UPDATES_OF_PEERS = 24, 8
+SUBPROC = "SB3, SubprocVecEnv"
+OURS = {
+    f"millrace, --max-lag {lag}": Contender(
+        "millrace", flags=(*f"--workers {COPIES} --lanes {COPIES} --max-lag {lag}".split(),)
+    )
+    for lag in (0, 1, 2)
+}
+PEERS = ("TorchRL, 2 workers", "RLlib, 2 runners", "Sample Factory, 2 workers")
+"""Systems that can run 16 processes; their programs take the number from the settings."""
+
+
+def rate(name: str, contender: Contender, seed: int) -> float:
+    """Env steps/s after the warm-up. Raises `RuntimeError`."""
+    updates = UPDATES if contender.ours else UPDATES_OF_PEERS
+    settings = SETTINGS | {"steps": updates * COPIES * SETTINGS["rollout_steps"], "seed": seed}
+    if contender.ours:
+        del settings["processes"]
+    ends = programs.run(name, settings, contender=contender).updates
+    (first, began_s), (last, ended_s) = ends[WARM_UP], ends[-1]
+    return (last - first) / (ended_s - began_s)
+
+
+def timelines(name: str, contender: Contender, seed: int) -> list[np.ndarray[Any, Any]]:
+    """For each env copy, its calls [calls, 3]: start, end, whether it was a reset."""
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ[TIMELINE] = folder
+        try:
+            rate(name, contender, seed)
+        finally:
+            del os.environ[TIMELINE]
+        found = [np.fromfile(path).reshape(-1, 3) for path in Path(folder).iterdir() if path.stat().st_size]
+    return sorted(found, key=len)[-COPIES:]  # an evaluation has copies of its own, with fewer calls
+
+
+def draw(found: dict[str, list[np.ndarray[Any, Any]]], out: Path, seconds: float = 1.5) -> None:
+    """A row for each env copy: steps and resets; white is waiting."""
+    from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    figure = Figure(figsize=(10.0, 1.9 * len(found)), layout=ConstrainedLayoutEngine())
+    panels = figure.subplots(len(found), 1, sharex=True, squeeze=False)[:, 0]
+    for panel, (title, copies) in zip(panels, found.items(), strict=True):
+        last_s = min(calls[-1, 1] for calls in copies)
+        began_s = last_s - seconds - 0.5
+        busy = 0.0
+        for row, calls in enumerate(copies):
+            shown = calls[(calls[:, 1] > began_s) & (calls[:, 0] < began_s + seconds)]
+            spans = np.clip(shown[:, :2], began_s, began_s + seconds) - began_s
+            busy += float((spans[:, 1] - spans[:, 0]).sum())
+            for is_reset, color in ((0, COLORS[0]), (1, "#e0a030")):
+                chosen = spans[shown[:, 2] == is_reset]
+                panel.broken_barh(
+                    [(start, end - start) for start, end in chosen], (row + 0.1, 0.8), color=color, linewidth=0
+                )
+        share = busy / (seconds * len(copies))
+        panel.set_title(f"{title}: {share:.0%} of the time in the environment", fontsize=9, fontweight="bold", loc="left")
+        panel.set_xlim(0, seconds)
+        panel.set_ylim(0, len(copies))
+        panel.set_yticks([])
+        panel.set_ylabel(f"{len(copies)} copies", fontsize=8, color=GREY)
+        panel.tick_params(labelsize=8, colors=GREY, length=2)
+        for side in ("top", "right", "left"):
+            panel.spines[side].set_visible(False)
+    panels[-1].set_xlabel("seconds; blue: a step, orange: a reset, white: the copy waits", fontsize=8, color=GREY)
+    figure.savefig(out, dpi=DPI)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="compare training on a slow environment with Stable-Baselines3")
+    parser.add_argument("--rounds", type=int, default=3, help="number of turns, each with another seed")
+    parser.add_argument("--peers", action="store_true", help="compare with all installed systems that run 16 processes")
+    parser.add_argument("--picture", type=Path, help="draw who waits for whom into this PNG, and measure nothing else")
+    arguments = parser.parse_args()
+    here = contenders(arguments.peers)
+    others = {name: CONTENDERS[name] for name in (SUBPROC, *(PEERS if arguments.peers else ())) if name in here}
+    if arguments.picture is not None:
+        chosen = {name: each for name, each in (others | OURS).items() if name in (SUBPROC, *list(OURS)[:2])}
+        draw({name: timelines(name, each, 1) for name, each in chosen.items()}, arguments.picture)
+        print(arguments.picture)
+        return
+    found: dict[str, list[float]] = {name: [] for name in others | OURS}
+    for turn in range(arguments.rounds):
+        for name, each in (others | OURS).items():
+            try:
+                found[name].append(rate(name, each, turn + 1))
+            except RuntimeError as error:
+                print(f"left out: {error}", file=sys.stderr)
+    medians = {name: statistics.median(rates) for name, rates in found.items() if rates}
+    slowest = medians.get(SUBPROC)
+    table = Table(title=f"slow environment, {COPIES} copies, medians of {arguments.rounds} (least to most)")
+    for column in ("", "env steps/s", "of copies that never wait", f"× {SUBPROC}"):
+        table.add_column(column, justify="left" if not column else "right")
+    for name, median in medians.items():
+        each = f"{median:,.0f} ({min(found[name]):,.0f} to {max(found[name]):,.0f})"
+        table.add_row(name, each, f"{median / IDEAL:.2f}", "–" if slowest is None else f"{median / slowest:.1f}")
+    Console(width=110).print(table)
+    print(f"copies that never wait: {IDEAL:,.0f} env steps/s")
+    title = "env steps/s, 16 copies; a step takes 5 ms, a reset 200 ms"
+    write("slow", {"ideal": IDEAL, "median": medians, "of": found}, [(title, medians | {"never waiting": IDEAL})])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,61 @@
+"""An environment whose steps and resets take time and no CPU, because they sleep: `benchmarks.slow_env:Lognormal-v0`.
+
+A step takes 5 ms in the mean (lognormal, sigma 1), a reset 200 ms, and an episode has 50 to 150 steps. The durations follow
+from the reset seed. A copy that never waits makes 100 steps in 0.7 s.
+
+With the environment variable `SLOW_ENV_TIMELINE` each copy appends every step and reset to a file in that folder: three
+float64 numbers: start and end by the monotonic clock, and 1 for a reset.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import struct
+import time
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.envs.registration import register
+from gymnasium.spaces import Box, Discrete
+
+MEAN_STEP_S, SIGMA, RESET_S = 0.005, 1.0, 0.2
+SHORTEST, LONGEST = 50, 150  # steps of an episode
+TIMELINE = "SLOW_ENV_TIMELINE"
+STEPS_PER_S = 1 / (MEAN_STEP_S + RESET_S / ((SHORTEST + LONGEST) / 2))  # of a copy that never waits
+
+
+class Lognormal(gymnasium.Env[Any, Any]):
+    """An environment that sleeps."""
+
+    def __init__(self) -> None:
+        self.observation_space = Box(-1.0, 1.0, (4,), np.float32)
+        self.action_space = Discrete(2)
+        self._left = 0
+        folder = os.environ.get(TIMELINE)
+        self._timeline = (Path(folder) / f"{os.getpid()}-{id(self):x}").open("ab", 0) if folder else None
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._sleep(RESET_S, 1.0)
+        self._left = int(self.np_random.integers(SHORTEST, LONGEST, endpoint=True))
+        return self._observation(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self._sleep(float(self.np_random.lognormal(math.log(MEAN_STEP_S) - SIGMA**2 / 2, SIGMA)), 0.0)
+        self._left -= 1
+        return self._observation(), 1.0, self._left == 0, False, {}
+
+    def _observation(self) -> Any:
+        return self.np_random.uniform(-1, 1, 4).astype(np.float32)
+
+    def _sleep(self, duration_s: float, is_reset: float) -> None:
+        began_s = time.monotonic()
+        time.sleep(duration_s)
+        if self._timeline is not None:
+            self._timeline.write(struct.pack("3d", began_s, time.monotonic(), is_reset))
+
+
+register("Lognormal-v0", Lognormal)
