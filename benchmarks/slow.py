@@ -129,8 +129,8 @@ def main() -> None:
     for column in ("", "env steps/s", "of copies that never wait", f"× {SUBPROC}"):
         table.add_column(column, justify="left" if not column else "right")
     for name, median in medians.items():
-        each = f"{median:,.0f} ({min(found[name]):,.0f} to {max(found[name]):,.0f})"
-        table.add_row(name, each, f"{median / IDEAL:.2f}", "–" if slowest is None else f"{median / slowest:.1f}")
+        measured = f"{median:,.0f} ({min(found[name]):,.0f} to {max(found[name]):,.0f})"
+        table.add_row(name, measured, f"{median / IDEAL:.2f}", "–" if slowest is None else f"{median / slowest:.1f}")
     Console(width=110).print(table)
     print(f"copies that never wait: {IDEAL:,.0f} env steps/s")
     title = "env steps/s, 16 copies; a step takes 5 ms, a reset 200 ms"

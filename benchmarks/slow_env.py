@@ -58,4 +58,4 @@ class Lognormal(gymnasium.Env[Any, Any]):
             self._timeline.write(struct.pack("3d", began_s, time.monotonic(), is_reset))
 
 
-register("Lognormal-v0", Lognormal)
+register("Lognormal-v0", "benchmarks.slow_env:Lognormal")
