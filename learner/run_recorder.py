@@ -25,7 +25,6 @@ from learner.run_folder.run_folder import RunFolder
 from learner.run_folder.versions import versions
 from learner.run_state import RunState
 from learner.service import RolloutService
-from protocol.bounds import Stages
 from protocol.rollout import Batch
 from protocol.specs import RunSpec
 
@@ -57,7 +56,6 @@ class RunRecorder:
         self._metrics = MetricsLog(folder.path, state.env_steps)
         self._episode_recorder = _episode_recorder(config, folder, spec)
         self._stages_s = {"update": 0.0, "other": 0.0}
-        self._worker_stages_s: dict[int, Stages] = {}  # by session; workers that have left count too
         self._wall_before_s, self._steps_before = state.wall_s, state.env_steps
         self._started_s = self._saved_s = time.monotonic()
         self._episodes_since_save = 0
@@ -187,11 +185,7 @@ class RunRecorder:
     def _stages(self, snapshot: HubSnapshot) -> dict[str, float]:
         """Seconds in each stage: of the learner, and of all workers together, from their last heartbeats."""
         stages = {"learner_wait": snapshot.wait_s} | {f"learner_{name}": s for name, s in self._stages_s.items()}
-        self._worker_stages_s |= snapshot.worker_stages()
-        for worker_stages in self._worker_stages_s.values():
-            for name, seconds in worker_stages.items():
-                stages[f"worker_{name}"] = stages.get(f"worker_{name}", 0.0) + seconds
-        return stages
+        return stages | {f"worker_{name}": s for name, s in snapshot.worker_stages.items()}
 
     def _wall_s(self) -> float:
         return self._wall_before_s + time.monotonic() - self._started_s

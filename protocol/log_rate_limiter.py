@@ -1,9 +1,13 @@
-"""Limits how often a log line is repeated. Pure: `now` is an argument.
+"""Limits what peers can write to the log: how often a line is repeated, and how much each source may log. Pure.
 
-Rule: a peer that causes log lines can neither cause many of them nor make this table grow.
+Rule: a peer that causes log lines can neither cause many of them, nor long ones without end, nor make these tables grow.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+
+from protocol.token_bucket import TokenBucket
 
 
 class LogRateLimiter:
@@ -26,6 +30,41 @@ class LogRateLimiter:
                 return None
         self._last_lines[key] = (now, 0)
         return last[1] if last is not None else 0
+
+
+@dataclass(frozen=True)
+class Allowance:
+    """How much may be logged: at once, and then in each second."""
+
+    lines: int
+    lines_per_s: float
+    bytes: int
+    bytes_per_s: float
+
+
+class LogBudget:
+    """What one source may still log: its lines and its bytes are limited."""
+
+    def __init__(self, allowance: Allowance) -> None:
+        self._lines = TokenBucket(allowance.lines, allowance.lines_per_s)
+        self._bytes = TokenBucket(allowance.bytes, allowance.bytes_per_s)
+        self._suppressed = 0
+
+    def covers(self, size: int, now: float) -> bool:
+        """Whether a line of `size` bytes may be logged now."""
+        covered = [self._lines.holds(1, now), self._bytes.holds(size, now)]
+        return all(covered)
+
+    def spend(self, size: int) -> int:
+        """A line of this size is logged. Returns the number of lines that were suppressed since the last one."""
+        self._lines.spend(1)
+        self._bytes.spend(size)
+        suppressed, self._suppressed = self._suppressed, 0
+        return suppressed
+
+    def suppress(self) -> None:
+        """A line was not logged."""
+        self._suppressed += 1
 
 
 def suppressed_note(suppressed: int) -> str:

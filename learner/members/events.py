@@ -6,7 +6,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from textwrap import indent
 from typing import ClassVar
+
+from protocol.bounds import MAX_LINE, escaped, one_line
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,8 @@ class EnvironmentRaised:
     lane: int | None
     error: str
     traceback: str
+    spare: bool = False
+    """Whether it held no lane and no ticket while every lane had a worker. Such a failure does not count against the run."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +83,23 @@ Event = WorkerJoined | WorkerLeft | WorkerRefused | EnvironmentRaised | RejoinRe
 
 
 def describe(event: Event) -> str:
-    """One line for the log."""
+    """Text for the log: one line, and below it the traceback if there is one, indented, so that none of its lines looks
+    like a line of the log. Whatever a peer has named is shown without control characters.
+    """
+    line = one_line(_line(event), 4 * MAX_LINE)
+    match event:
+        case EnvironmentRaised(traceback=traceback) if traceback:
+            return f"{line}\n{indented(traceback)}"
+        case _:
+            return line
+
+
+def indented(traceback: str) -> str:
+    """A peer's traceback as it is shown: without control characters, each line indented."""
+    return indent(escaped(traceback).strip("\n"), "    ", lambda line: True)
+
+
+def _line(event: Event) -> str:
     match event:
         case WorkerJoined(worker, host, pid):
             return f"worker {worker} ({host}, pid {pid}) joined"
@@ -86,8 +107,8 @@ def describe(event: Event) -> str:
             return f"worker {worker} {why}" + (f"; {tickets} of its tickets are dealt again" if tickets else "")
         case WorkerRefused(worker, why):
             return f"worker {worker} was refused: {why}"
-        case EnvironmentRaised(worker, host, lane, error, traceback):
-            return f"worker {worker} ({host}): lane {lane}: {error}\n{traceback}"
+        case EnvironmentRaised(worker, host, lane, error):
+            return f"worker {worker} ({host}): lane {lane}: {error}"
         case RejoinRequested(worker, _, late):
             counted = f"; {late} transitions that it sent are counted, not used" if late else ""
             return f"worker {worker} was told to join again: its session had ended{counted}"

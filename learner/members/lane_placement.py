@@ -41,6 +41,11 @@ class PlacedLane:
 L = TypeVar("L", bound=PlacedLane)
 
 
+def is_spare(member: Member, lanes: Iterable[PlacedLane]) -> bool:
+    """Whether the worker has nothing to do with the environment: it holds no lane and no ticket, and none waits for it."""
+    return not member.lanes and not member.tickets and all(lane.owner is not None for lane in lanes)
+
+
 class LanePlacement(Generic[L]):
     """Places lanes with workers."""
 
@@ -72,6 +77,10 @@ class LanePlacement(Generic[L]):
         if self._settled:
             return []
         self._settled = True
+        active = list(active)
+        if not self._unplaced and all(len(member.lanes) < 2 for member in active):
+            self._stop_waiting()
+            return []  # nothing can move, however many spares there are
         members = sorted(active, key=lambda member: member.join_number)
         self.assign([self._lanes[number] for number in sorted(self._unplaced)], members)
         return self.even_out(members)
@@ -87,9 +96,7 @@ class LanePlacement(Generic[L]):
 
     def even_out(self, members: Sequence[Member]) -> list[Outgoing]:
         """Move lanes from the workers with the most to those with the fewest. Stops at a lane that must wait to move."""
-        for number in self._waiting_for.lanes if self._waiting_for is not None else ():
-            self._lanes[number].moving = False
-        self._waiting_for = None
+        self._stop_waiting()
         out: list[Outgoing] = []
         while members:
             fullest = max(members, key=lambda member: len(member.lanes))
@@ -105,6 +112,11 @@ class LanePlacement(Generic[L]):
             lane.restart()
             self._give(lane, emptiest)
         return out
+
+    def _stop_waiting(self) -> None:
+        for number in self._waiting_for.lanes if self._waiting_for is not None else ():
+            self._lanes[number].moving = False
+        self._waiting_for = None
 
     def _give(self, lane: L, member: Member) -> None:
         self._unplaced.discard(lane.number)

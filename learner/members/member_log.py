@@ -1,33 +1,84 @@
-"""A rate-limited log of what workers send and of what happens among them."""
+"""A rate-limited log of what workers send and of what happens among them.
+
+Rule: lines and bytes are limited for each worker, and for all workers of one key together; workers without keys share one
+limit. So a peer that joins under ever new names, or with long texts, cannot fill the log. What was left out is counted.
+"""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable
 
-from learner.members.events import Event, RejoinRequested
-from protocol.log_rate_limiter import LogRateLimiter, suppressed_note
+from learner.members.events import Event, RejoinRequested, RolloutDropped
+from protocol.bounds import MAX_TEXT, one_line
+from protocol.log_rate_limiter import Allowance, LogBudget, LogRateLimiter, suppressed_note
 from protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")
 
+MOST_WORKERS = 1_000  # whose budgets are remembered
+OF_A_WORKER = Allowance(lines=30, lines_per_s=0.2, bytes=MAX_TEXT, bytes_per_s=100)
+OF_A_KEY = Allowance(lines=5_000, lines_per_s=5, bytes=6 * MAX_TEXT, bytes_per_s=500)
+LINE_BYTES = 100  # that a line takes beside its text: time, level, line break
+
 
 class MemberLog:
-    """Log lines that workers cause: few for each worker, however much it sends."""
+    """Log lines that workers cause: few for each worker and for each key, however much it sends."""
 
     def __init__(self, link: LearnerLink, clock: Callable[[], float]) -> None:
         self._link, self._clock = link, clock
         self._limit = LogRateLimiter()
+        self._of_key: dict[str, LogBudget] = {}  # as many as there are keys, and one more
+        self._of_worker: dict[str, LogBudget] = {}
 
     def warn_limited(self, peer: bytes, line: str) -> None:
         """Warn about what a peer sent, unless there was a line about it a short while ago."""
         if (kept_back := self._limit.due(self._link.name_for_log(peer), self._clock())) is not None:
-            log.warning("%s%s", line, suppressed_note(kept_back))
+            self._write(logging.WARNING, [self._budget_of_key(peer)], one_line(line), suppressed_note(kept_back))
 
-    def log_event(self, level: int, event: Event, line: str) -> None:
-        """Log an event. Requests to join again are limited: after a restart of the learner they come in floods."""
+    def log_event(self, level: int, event: Event, lines: str, cause: bytes | None) -> None:
+        """Log an event. If its `lines` are too long together, only the first is logged: the others are a traceback.
+
+        `cause` is the peer whose message caused the event; None if no message did. Requests to join again are limited
+        more: after a restart of the learner they come in floods.
+        """
+        if isinstance(event, RolloutDropped):
+            log.log(level, "%s", lines, extra={"event": event})
+            return
         kept_back: int | None = 0
         if isinstance(event, RejoinRequested):
             kept_back = self._limit.due(f"told {event.worker}", self._clock())
-        if kept_back is not None:
-            log.log(level, "%s%s", line, suppressed_note(kept_back), extra={"event": event})
+        if kept_back is None:
+            return
+        budgets = [self._budget_of_worker(event.worker), self._budget_of_key(cause)]
+        self._write(level, budgets, lines, suppressed_note(kept_back), event)
+
+    def _write(self, level: int, budgets: list[LogBudget], lines: str, note: str, event: Event | None = None) -> None:
+        now = self._clock()
+        first, _, more = lines.partition("\n")
+        if more and not all(budget.covers(_size(lines), now) for budget in budgets):
+            lines = f"{first} (its traceback is left out: too much was logged of this worker)"
+            event = None  # it carries the traceback
+        size = _size(lines)
+        if not all(budget.covers(size, now) for budget in budgets):
+            for budget in budgets:
+                budget.suppress()
+            return
+        suppressed = max(budget.spend(size) for budget in budgets)
+        note += f" ({suppressed} more lines about it, or about workers of the same key, were left out)" if suppressed else ""
+        first, _, more = lines.partition("\n")
+        log.log(level, "%s%s%s", first, note, f"\n{more}" if more else "", extra={"event": event} if event else None)
+
+    def _budget_of_key(self, peer: bytes | None) -> LogBudget:
+        return self._of_key.setdefault(self._link.source(peer) if peer else "", LogBudget(OF_A_KEY))
+
+    def _budget_of_worker(self, worker: str) -> LogBudget:
+        budget = self._of_worker.pop(worker, None) or LogBudget(OF_A_WORKER)
+        self._of_worker[worker] = budget  # last in the table: the worker that was silent for longest stands first
+        if len(self._of_worker) > MOST_WORKERS:
+            del self._of_worker[next(iter(self._of_worker))]
+        return budget
+
+
+def _size(text: str) -> int:
+    return len(text.encode(errors="replace")) + LINE_BYTES

@@ -2,11 +2,15 @@
 
 Rule: the inbox is emptied before silent workers are removed, and a learner that was away listens for a while first. So a
 long update, or a stopped process, never costs a healthy worker its membership.
+
+Rule: peers that send without end cost a bounded time. A turn of listening is cut off after a while (ZeroMQ takes messages
+from its connections in turn, so nobody is left out), new sessions are limited for each key, and so are answers to `Inquire`.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -24,16 +28,25 @@ from learner.members.events import (
     WorkerRefused,
     describe,
 )
+from learner.members.join_limiter import JoinLimiter
 from learner.members.key_revocation import KeyRevocation
 from learner.members.member_log import MemberLog
 from learner.members.membership import Membership, Outgoing
+from learner.members.states import SentUnusable
 from protocol.address import name_for_people
+from protocol.bounds import one_line
 from protocol.errors import BadMessage, NoWorkers
-from protocol.messages import Inquire, Status, ToLearner, ToWorker, Weights
+from protocol.messages import Hello, Inquire, Refuse, Status, ToLearner, ToWorker, Weights
 from protocol.wire.codec import Buffer, encode
 from protocol.wire.learner_link import LearnerLink
 
+log = logging.getLogger("millrace.learner")
+
 AWAY_S = 0.5  # a learner that has not listened for longer was busy, or its process was stopped
+TURN_S = 0.2  # of reading messages, at most, before the caller may go on
+SHORT_TURN_S = 0.003  # at least so much, also in a short turn
+FAIR_SHARE = 10_000  # messages after which every connection was read, for ZeroMQ takes them in turn
+STATUS_SHARE = 20  # making answers to Inquire takes at most this part of the time
 
 
 class MemberCoordinator(Protocol):
@@ -106,10 +119,19 @@ class MemberServer:
         self._remove_silent_from_s = self.listened_s
         self._last_turned_away = ""  # what became of the last worker that did not stay
         self._encoded: tuple[ToWorker, Sequence[Buffer]] | None = None
+        self._joins = JoinLimiter()
+        self._read_since_empty = 0  # messages, since the inbox was empty
+        self._status: tuple[float, Sequence[Buffer]] = (-math.inf, ())  # until when it is fresh enough, and its frames
+        self.unexpected_errors = 0
+        """errors of this program that a peer's message led to; each cost that peer its membership, and nothing else"""
 
-    def listen(self, timeout_s: float) -> None:
-        """Wait at most `timeout_s` for messages, answer all that have come, and remove the members that are gone."""
-        self.receive(timeout_s)
+    def listen(self, timeout_s: float, short: bool = False) -> None:
+        """Wait at most `timeout_s` for messages, answer them, and remove the members that are gone.
+
+        `short`: answer for no longer than the caller has worked since the last time; what is left waits.
+        """
+        worked_s = self._clock() - self.listened_s
+        self.receive(timeout_s, min(TURN_S, max(SHORT_TURN_S, worked_s)) if short else TURN_S)
         self._revoke_keys()
         self._remove_ended_processes(self._settings.last_messages_wait_s)
         now = self._clock()
@@ -117,32 +139,33 @@ class MemberServer:
             # Messages of the meantime may still lie in the kernel: if we were stopped, so was ZeroMQ's thread.
             self._remove_silent_from_s = now + self._settings.grace_s
         self.listened_s = now
-        if now >= self._remove_silent_from_s:
+        if now >= self._remove_silent_from_s and (not self._read_since_empty or self._read_since_empty >= FAIR_SHARE):
+            self._read_since_empty = 0
             self.send(self._coordinator.remove_silent(now))
 
-    def receive(self, timeout_s: float) -> None:
-        """Wait at most `timeout_s` for messages and answer all that have come."""
+    def receive(self, timeout_s: float, turn_s: float = TURN_S) -> None:
+        """Wait at most `timeout_s` for messages and answer those that have come, for about `turn_s` at most."""
         if not self._link.poll(timeout_s):
+            self._read_since_empty = 0
             return
+        until_s = self._clock() + turn_s
         for peer, message in self._link.receive():
+            self._read_since_empty += 1
             now = self._clock()
-            if isinstance(message, BadMessage):
-                self.warn_limited(peer, f"message from {name_for_people(peer)!r}: {message}")
-                self.send(self._coordinator.reject_message(peer, str(message), now))
-            elif isinstance(message, Inquire):
-                self._link.send(peer, _status_frames(self._callbacks.status(now)))
-            else:
-                self.send(self._callbacks.message(peer, message, now))
+            self.send(self._answer(peer, message, now), peer)
+            if now > until_s:
+                return
+        self._read_since_empty = 0
 
-    def send(self, messages: Sequence[Outgoing]) -> None:
-        """Send these messages, then log what has happened."""
+    def send(self, messages: Sequence[Outgoing], cause: bytes | None = None) -> None:
+        """Send these messages, then log what has happened. `cause`: the peer whose message made it happen, if one did."""
         for peer, message in messages:
             if self._link.send(
                 peer, self._frames(message)
             ):  # a failed send is ignored: such a worker is soon removed as silent
                 self._callbacks.sent(peer)
         if self._membership.events:
-            self._log_events()
+            self._log_events(cause)
 
     def warn_limited(self, peer: bytes, line: str) -> None:
         """Warn about what a peer sent; few lines for each peer."""
@@ -184,6 +207,40 @@ class MemberServer:
 
     # ---------------------------------------------------------------- inside
 
+    def _answer(self, peer: bytes, message: ToLearner | Inquire | BadMessage, now: float) -> Sequence[Outgoing]:
+        """Answer one message. Whatever goes wrong costs its sender its membership, and never ends the run."""
+        try:
+            match message:
+                case BadMessage():
+                    self.warn_limited(peer, f"message from {name_for_people(peer)!r}: {message}")
+                    return self._coordinator.reject_message(peer, str(message), now)
+                case Inquire():
+                    self._link.send(peer, self._status_frames(now))
+                    return ()
+                case Hello() if not self._joins.admits(self._link.source(peer), now):
+                    return ()  # it says Hello again
+                case _:
+                    return self._callbacks.message(peer, message, now)
+        except Exception as error:
+            return self._refuse_after_error(peer, type(message).__name__, error)
+
+    def _refuse_after_error(self, peer: bytes, kind: str, error: Exception) -> Sequence[Outgoing]:
+        """The last guard: no message should lead here. Refuse its sender; log the first such error with its traceback."""
+        self.unexpected_errors += 1
+        line = f"its {kind} led to an error in the learner: {type(error).__name__}"
+        if self.unexpected_errors == 1:
+            log.error("%r: %s; please report it", name_for_people(peer), line, exc_info=error)
+        member = self._membership.members.get(peer)
+        return [(peer, Refuse(line))] if member is None else self._membership.refuse(member, SentUnusable, line)
+
+    def _status_frames(self, now: float) -> Sequence[Buffer]:
+        """Frames of a status. It is made anew after `STATUS_SHARE` times as long as it took to make."""
+        if now >= self._status[0]:
+            frames = status_frames(self._callbacks.status(now))
+            took_s = self._clock() - now
+            self._status = (now + STATUS_SHARE * took_s, frames)
+        return self._status[1]
+
     def _revoke_keys(self) -> None:
         for peer, why in self._keys.revoked(self._membership.members):
             self.send(self._coordinator.revoke(peer, why))
@@ -203,29 +260,31 @@ class MemberServer:
             self._encoded = (message, encode(message))
         return self._encoded[1]
 
-    def _log_events(self) -> None:
+    def _log_events(self, cause: bytes | None) -> None:
         for event in self._membership.take_events():
             line, expected = describe(event), isinstance(event, WorkerJoined | RejoinRequested | RolloutDropped)
             match event:
                 case WorkerRefused(_, why):
-                    self._last_turned_away = f"was refused: {why}"
+                    self._last_turned_away = f"was refused: {one_line(why)}"
                 case WorkerLeft(_, why, _, on_purpose) if on_purpose:
                     expected = self._membership.draining is not None
                     self._last_turned_away = self._last_turned_away if expected else why
-                case EnvironmentRaised(worker, host, _, error, _) if not self._settings.log_tracebacks:
-                    line, expected = f"worker {worker} ({host}): {error}", True
+                case EnvironmentRaised() if not self._settings.log_tracebacks:
+                    line, expected = line.partition("\n")[0], True
                 case _:
                     pass
-            self._log.log_event(logging.INFO if expected else logging.WARNING, event, line)
+            self._log.log_event(logging.INFO if expected else logging.WARNING, event, line, cause)
             self._callbacks.event(event)
 
 
-def _status_frames(status: Status) -> Sequence[Buffer]:
+def status_frames(status: Status) -> Sequence[Buffer]:
     """Frames of a status. If it is too long for a message, the last workers are left out, and their number is given."""
     while True:
         try:
             return encode(status)
         except ValueError:
+            if not status.workers:
+                raise
             kept = len(status.workers) // 2
             left_out = status.workers_left_out + len(status.workers) - kept
             status = msgspec.structs.replace(status, workers=status.workers[:kept], workers_left_out=left_out)

@@ -1,5 +1,8 @@
 """Membership of workers: joining, sessions, names, refusals, leaving. Pure: messages and `now` in, messages out.
 
+Rule: what is kept of a worker ends with its session, beside totals and a limited number of refusals. The number of
+members is limited.
+
 Rule: one process has one session at a time. A repeated Hello is answered by the same Welcome. A Hello of a new attempt,
 or of another process under the same name, ends the session before it. A process that was refused stays refused. A worker
 that is silent for too long is removed.
@@ -8,7 +11,7 @@ that is silent for too long is removed.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
@@ -17,7 +20,7 @@ import msgspec
 from learner.members.events import Event, RejoinRequested, WorkerJoined, WorkerLeft, WorkerRefused
 from learner.members.states import TABLE, KeyRevoked, MemberState, TimedOut
 from protocol.address import name_for_people, worker_name
-from protocol.bounds import one_line
+from protocol.bounds import Stage, Stages, one_line
 from protocol.messages import (
     PROTOCOL_VERSION,
     Alive,
@@ -37,7 +40,8 @@ from protocol.messages import (
 from protocol.specs import RunSpec, StepSpec
 
 MEASURE_S = 0.5  # at least, between the two heartbeats that a worker's speed is measured by
-REMEMBERED_REFUSALS = 1000  # processes; a peer with many names must not fill the memory
+REMEMBERED = 1_000  # refused processes, and names of silent workers; a peer with many names must not fill the memory
+MAX_MEMBERS = 4_096
 
 Outgoing = tuple[bytes, ToWorker]
 """A message and the routing id of the worker that it is sent to."""
@@ -55,6 +59,8 @@ class Member:
     """Number of this member in the order of joining."""
     heard_s: float
     """Time of the worker's last message."""
+    joined_s: float = 0.0
+    """Time when it joined."""
     state: MemberState = MemberState.ACTIVE
     lanes: set[int] = field(default_factory=set)
     tickets: dict[int, int] = field(default_factory=dict)
@@ -63,6 +69,8 @@ class Member:
     """Number of heartbeat replies that were sent."""
     heartbeat: Heartbeat | None = None
     """Newest heartbeat."""
+    stages_before: Stages = field(default_factory=dict)
+    """Seconds in each stage of the worker's process before this session."""
     steps_per_s: float = 0.0
     measured: tuple[int, float] = (0, 0.0)
     """Env steps in the heartbeat by which the speed was last measured, and the time when it arrived."""
@@ -72,13 +80,23 @@ class Member:
 
         A ticket is lost if it was sent before a reply that the worker has seen, and the worker does not hold it.
         """
+        if self.heartbeat is None and self.hello.attempt > 1:
+            self.stages_before = heartbeat.stages
         self.heartbeat = msgspec.structs.replace(heartbeat, tickets=())  # what is kept of it is small
         steps, since_s = self.measured
         if self.heard_s - since_s >= MEASURE_S:  # new weights trigger an extra heartbeat, too early to measure speed
-            self.steps_per_s = (heartbeat.steps - steps) / (self.heard_s - since_s) if since_s else 0.0
+            self.steps_per_s = max(0, heartbeat.steps - steps) / (self.heard_s - since_s) if since_s else 0.0
             self.measured = heartbeat.steps, self.heard_s
         held, seen = set(heartbeat.tickets), min(heartbeat.replies, self.replies)
         return [ticket for ticket, sent_at in self.tickets.items() if ticket not in held and seen > sent_at]
+
+    def stages(self) -> Stages:
+        """Seconds in each stage during this session, by its newest heartbeat; none is longer than the session."""
+        lasted_s = self.heard_s - self.joined_s
+        return {
+            stage: max(0.0, min(seconds - self.stages_before.get(stage, 0.0), lasted_s))
+            for stage, seconds in (self.heartbeat.stages if self.heartbeat is not None else {}).items()
+        }
 
     def status(self, now: float) -> WorkerStatus:
         """The worker's row of `millrace status`."""
@@ -100,6 +118,8 @@ class Member:
 
 
 M = TypeVar("M", bound=Member)
+K = TypeVar("K")
+V = TypeVar("V")
 
 
 class Membership(Generic[M]):
@@ -117,7 +137,8 @@ class Membership(Generic[M]):
         self._next_session = first_session
         self._joins = 0
         self._none_silent_before_s = -math.inf  # until then no member can have been silent for too long
-        self._removed_for_silence: set[str] = set()  # names, until they join again
+        self._removed_for_silence: dict[str, None] = {}  # names, until they join again; the oldest first
+        self._stages_of_left: Stages = {}  # of the members that have left
         self._refused: dict[bytes, tuple[int, str]] = {}  # the process (by its nonce) that was refused, and why
 
     def active(self) -> list[M]:
@@ -127,6 +148,13 @@ class Membership(Generic[M]):
     def status(self, now: float) -> tuple[WorkerStatus, ...]:
         """A row of `millrace status` for each member, in the order in which they joined."""
         return tuple(member.status(now) for member in sorted(self.members.values(), key=lambda member: member.join_number))
+
+    def stages(self) -> Stages:
+        """Seconds in each stage: of all members, and of those that have left."""
+        total = dict(self._stages_of_left)
+        for member in self.members.values():
+            _add(total, member.stages())
+        return total
 
     def take_events(self) -> list[Event]:
         """Return and clear the events since the last call."""
@@ -165,6 +193,10 @@ class Membership(Generic[M]):
         if self.draining is not None:
             return [(peer, Drain(one_line(self.draining)))], None
         member = self.members.get(peer)
+        if member is None and len(self.members) >= MAX_MEMBERS:
+            why = f"workers: expected at most {MAX_MEMBERS} at one learner"
+            self.events.append(WorkerRefused(hello.worker, why))
+            return [(peer, Refuse(why))], None
         if member is not None:
             same_process = member.hello.process_nonce == hello.process_nonce
             if same_process and hello.attempt == member.hello.attempt:
@@ -176,11 +208,11 @@ class Membership(Generic[M]):
                 why = f"another process, on {hello.host}, joined as {hello.worker}; give each worker a name of its own"
                 self._remember_refusal(member, why)
             self.remove(member, TimedOut, "began again" if same_process else f"replaced by process {hello.pid}")
-        member = self._member_class(peer, hello, self._next_session, self._joins, now)
+        member = self._member_class(peer, hello, self._next_session, self._joins, now, joined_s=now)
         self._next_session += 1
         self._joins += 1
         self.members[peer] = member
-        self._removed_for_silence.discard(hello.worker)
+        self._removed_for_silence.pop(hello.worker, None)
         self.events.append(WorkerJoined(hello.worker, hello.host, hello.pid))
         return [(peer, Welcome(member.session, hello.attempt, self._run))], member
 
@@ -199,7 +231,7 @@ class Membership(Generic[M]):
         if member is not None:
             self.remove(member, TimedOut, why)
         elif worker in self._removed_for_silence:  # now it is known why it was silent
-            self._removed_for_silence.discard(worker)
+            del self._removed_for_silence[worker]
             self.events.append(WorkerLeft(worker, why, 0, False))
         return member is not None
 
@@ -209,7 +241,7 @@ class Membership(Generic[M]):
             return []
         silent = [member for member in self.members.values() if now - member.heard_s > timeout_s]
         for member in silent:
-            self._removed_for_silence.add(member.hello.worker)
+            _remember(self._removed_for_silence, member.hello.worker, None)
             self.remove(member, TimedOut, f"silent for {timeout_s:.0f} s")
         self._none_silent_before_s = min((member.heard_s for member in self.members.values()), default=now) + timeout_s
         return silent
@@ -218,6 +250,7 @@ class Membership(Generic[M]):
         """Remove a member."""
         member.state = TABLE[member.state][event]
         del self.members[member.peer]
+        _add(self._stages_of_left, member.stages())
         self.events.append(WorkerLeft(member.hello.worker, why, len(member.tickets), event is Goodbye))
         self._on_removed(member, why)
 
@@ -236,7 +269,17 @@ class Membership(Generic[M]):
         return [(member.peer, Refuse(one_line(refusal)))]
 
     def _remember_refusal(self, member: M, why: str) -> None:
-        self._refused.pop(member.peer, None)
-        self._refused[member.peer] = (member.hello.process_nonce, why)
-        if len(self._refused) > REMEMBERED_REFUSALS:
-            del self._refused[next(iter(self._refused))]
+        _remember(self._refused, member.peer, (member.hello.process_nonce, one_line(why)))
+
+
+def _remember(table: dict[K, V], key: K, value: V) -> None:
+    """Put it last in a table that is limited: the oldest entry stands first and goes first."""
+    table.pop(key, None)
+    table[key] = value
+    if len(table) > REMEMBERED:
+        del table[next(iter(table))]
+
+
+def _add(total: Stages, stages: Mapping[Stage, float]) -> None:
+    for stage, seconds in stages.items():
+        total[stage] = total.get(stage, 0.0) + seconds

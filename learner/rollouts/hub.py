@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -25,7 +25,7 @@ from learner.rollouts.weight_age import WeightAge
 from learner.run_folder.progress import Progress
 from protocol.address import name_for_people
 from protocol.arrays import Array
-from protocol.bounds import Stages
+from protocol.bounds import MAX_LINE, Stages, one_line
 from protocol.errors import BadRollout, EnvironmentFailed, NoWorkers, Stalled
 from protocol.messages import Rollout, Status, ToLearner
 from protocol.rollout import rollout_bytes, validate
@@ -38,6 +38,7 @@ POLL_S = 0.1
 # Least interval between two pulses. A minibatch may take only a tenth of it, and one pulse takes as long as a minibatch.
 PULSE_S = 0.003
 LOG_WAITING_EVERY_S = 10.0
+MOST_NAMES = 50  # of workers in one line
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,8 @@ class HubSnapshot(NamedTuple):
     wait_s: float
     """Seconds spent waiting for rollouts since this learner started."""
     members: tuple[CollectingMember, ...]
+    worker_stages: Stages
+    """Seconds in each stage, of all workers since this learner started, also of those that have left."""
     received: tuple[int, int]
     """Number of messages and of bytes."""
     sent: tuple[int, int]
@@ -77,13 +80,15 @@ class HubSnapshot(NamedTuple):
     """Number of messages under revoked keys."""
     refused_handshakes: int
 
-    def worker_stages(self) -> dict[int, Stages]:
-        """Seconds in each stage, by session, from the workers' last heartbeats."""
-        return {member.session: member.heartbeat.stages for member in self.members if member.heartbeat is not None}
-
     def worker_states(self) -> Counter[str]:
         """Number of workers that are active, draining, or spare (active without a lane)."""
         return Counter(_state(member) for member in self.members)
+
+
+def _names(workers: Sequence[str]) -> str:
+    """The first of these names, as text."""
+    more = len(workers) - MOST_NAMES
+    return one_line(", ".join(workers[:MOST_NAMES]), 4 * MAX_LINE) + (f" and {more} more" if more > 0 else "")
 
 
 def _state(member: CollectingMember) -> str:
@@ -164,19 +169,19 @@ class Hub:
                 log.warning("%s", self.waiting_for())
 
     def pulse(self) -> None:
-        """Empty the inbox, then remove workers that have been silent for too long, unless that was just done.
+        """Answer the workers, then remove those that have been silent for too long, unless that was just done.
 
-        Called between minibatches. Never waits, never ends the run.
+        Called between minibatches. Never waits, never ends the run. It takes no longer than the work since the last call.
         """
         if self._clock() - self._server.listened_s >= PULSE_S:
-            self._listen(0.0)
+            self._listen(0.0, short=True)
 
     def drain(self, reason: str, timeout_s: float = 5.0) -> None:
         """Ask every worker to leave and wait for their Goodbye, at most `timeout_s`. Late rollouts are counted."""
         self._server.send(self.coordinator.drain(reason))
         self._server.wait_until_all_left(self._clock() + timeout_s, POLL_S)
-        for member in self.coordinator.members.values():
-            log.warning("worker %s did not say goodbye within %.0f s", member.hello.worker, timeout_s)
+        if late := [member.hello.worker for member in self.coordinator.members.values()]:
+            log.warning("did not say goodbye within %.0f s: workers %s", timeout_s, _names(late))
 
     def waiting_for(self) -> str:
         """A description of what the learner waits for, for the terminal."""
@@ -185,7 +190,7 @@ class Hub:
             return f"waiting for a worker to join at {self.link.address}{self._server.missing_reason()}"
         late = sorted({coordinator.members[ticket.peer].hello.worker for ticket in coordinator.tickets.values()})
         have, need = len(coordinator.ready), coordinator.rollouts_per_update
-        return f"waiting for rollouts: have {have} of {need}, outstanding with {', '.join(late) or 'nobody'}"
+        return f"waiting for rollouts: have {have} of {need}, outstanding with {_names(late) or 'nobody'}"
 
     # ---------------------------------------------------------------- what others ask and tell
 
@@ -218,6 +223,7 @@ class Hub:
             lag_counts=dict(self._weight_age.lags),
             wait_s=self._wait_s,
             members=tuple(coordinator.members.values()),
+            worker_stages=coordinator.membership.stages(),
             received=(link.received.messages, link.received.bytes),
             sent=(link.sent.messages, link.sent.bytes),
             refused_messages=link.refused_messages,
@@ -234,8 +240,8 @@ class Hub:
             raise self._failure
         self._check_members()
 
-    def _listen(self, timeout_s: float) -> None:
-        self._server.listen(timeout_s)
+    def _listen(self, timeout_s: float, short: bool = False) -> None:
+        self._server.listen(timeout_s, short)
         self._observer(self)
 
     def _answer(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
@@ -247,20 +253,23 @@ class Hub:
             why = f"worker {name_for_people(peer)}: rollout of ticket {message.ticket}: {error}"
             self._server.warn_limited(peer, why)
             return self.coordinator.reject_rollout(peer, message, why, now)
-        self._weight_age.arrived(name_for_people(peer), message.version, now)
-        return self.coordinator.receive(peer, message, now)
+        ready = len(self.coordinator.ready)
+        out = self.coordinator.receive(peer, message, now)
+        if len(self.coordinator.ready) > ready:  # of a ticket that this worker held
+            self._weight_age.arrived(name_for_people(peer), message.version, now)
+        return out
 
     def _status(self, now: float) -> Status:
         return status(self.coordinator, self._progress, now)
 
     def _on_event(self, event: Event) -> None:
         """Count failures of environments; too many end the run."""
-        if isinstance(event, EnvironmentRaised):
+        if isinstance(event, EnvironmentRaised) and not event.spare:
             self._env_failures += 1
             allowed = self.settings.max_env_failures
             if self._env_failures > allowed:
                 counted = f"failure {self._env_failures}; max_env_failures allows {allowed}"
-                line = f"worker {event.worker} ({event.host}): {event.error}; {counted}"
+                line = one_line(f"worker {event.worker} ({event.host}): {event.error}; {counted}", 4 * MAX_LINE)
                 self._failure = EnvironmentFailed(line, event.traceback)
 
     def _check_members(self) -> None:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import msgspec
 
 from learner.members.events import EnvironmentRaised, Event, RolloutDropped
-from learner.members.lane_placement import LanePlacement
+from learner.members.lane_placement import LanePlacement, is_spare
 from learner.members.membership import Member, Membership, Outgoing
 from learner.members.states import MemberState, SentUnusable
 from learner.rollouts.lanes import AcceptedRollout, LaneQueue, Ticket, TicketedLane
@@ -135,8 +135,8 @@ class TicketCoordinator:
                 self.membership.remove(member, Goodbye, f"left: {reason}")
                 return self._deal()
             case Failure(_, error, traceback, lane):
-                hello = member.hello
-                self.events.append(EnvironmentRaised(hello.worker, hello.host, lane, error, escaped(traceback)))
+                hello, spare = member.hello, is_spare(member, self.lanes)
+                self.events.append(EnvironmentRaised(hello.worker, hello.host, lane, error, escaped(traceback), spare))
                 self.membership.remove(member, Failure, f"broke: {error}")
                 return self._deal()
 

@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from statistics import median
 
 REMEMBERED = 1_000  # the newest versions, and the newest measurements of each worker
+WORKERS = 1_000  # of which measurements are kept; of more, the newest
 
 
 class WeightAge:
@@ -33,7 +34,14 @@ class WeightAge:
         """A rollout of this worker arrived. It was acted under this version."""
         if version > self._newest_used.get(worker, -1) and version in self._published_s:
             self._first_use_s[worker].append(now - self._published_s[version])
-        self._newest_used[worker] = max(version, self._newest_used.get(worker, -1))
+        newest = self._newest_used.pop(worker, -1)
+        self._newest_used[worker] = max(
+            version, newest
+        )  # last in the table: the worker that sent nothing for longest is first
+        if len(self._newest_used) > WORKERS:
+            oldest = next(iter(self._newest_used))
+            del self._newest_used[oldest]
+            self._first_use_s.pop(oldest, None)
 
     def used(self, lags: Iterable[int]) -> None:
         """Rollouts with these lags went into an update."""

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from learner.members.events import EnvironmentRaised
-from learner.members.lane_placement import LanePlacement, PlacedLane
+from learner.members.lane_placement import LanePlacement, PlacedLane, is_spare
 from learner.members.membership import Member, Membership, Outgoing
 from learner.members.states import MemberState, SentUnusable
 from protocol.bounds import escaped, one_line
@@ -23,6 +23,7 @@ from protocol.errors import BadMessage
 from protocol.messages import (
     Alive,
     Answer,
+    Call,
     Described,
     Drain,
     EpisodeRows,
@@ -42,6 +43,7 @@ from protocol.messages import (
     ToLearner,
 )
 from protocol.specs import StepSpec
+from protocol.wire.plain_values import unpack
 
 MakeOrder = Callable[[int, int, LaneIncarnation], Order]
 """Makes an order for a lane from the session, the ticket, and the lane's number and incarnation."""
@@ -106,8 +108,10 @@ class OrderCoordinator:
             case Goodbye(_, reason):
                 self.membership.remove(member, Goodbye, f"left: {reason}")
             case Failure(_, error, traceback, lane):
-                failure = EnvironmentRaised(member.hello.worker, member.hello.host, lane, error, escaped(traceback))
-                self.failures.append(failure)
+                hello, spare = member.hello, is_spare(member, self.lanes)
+                failure = EnvironmentRaised(hello.worker, hello.host, lane, error, escaped(traceback), spare)
+                if not spare:
+                    self.failures.append(failure)
                 self.membership.events.append(failure)
                 self.membership.remove(member, Failure, f"broke: {error}")
             case Rollout() | Described() | Evaluated() | EpisodeRows() | Alive():
@@ -239,7 +243,12 @@ def check(answer: Answer, order: Order, spec: StepSpec) -> None:
     """Check that the answer belongs to this order. Raises `BadMessage`, with a one-line message, if it does not."""
     if (answer.lane, answer.incarnation) != (order.lane, order.incarnation):
         raise BadMessage(f"answer: expected one from lane {order.lane}, got one from lane {answer.lane}")
+    if isinstance(answer, Returned) != isinstance(order, Call):
+        kind = "Returned" if isinstance(order, Call) else "Stepped"
+        raise BadMessage(f"answer to {type(order).__name__}: expected {kind}, got {type(answer).__name__}")
     if isinstance(answer, Returned):
+        if not answer.error and isinstance(order, Call):
+            _check_results(answer, order)
         return
     N = spec.lanes[answer.lane]
     if len(answer.obs) != len(spec.observation):
@@ -254,3 +263,9 @@ def check(answer: Answer, order: Order, spec: StepSpec) -> None:
             raise BadMessage(f"{name}: expected {dtype}{[N, *shape]}, got {array.dtype}{list(array.shape)}")
         if array.dtype.kind == "b" and array.size and array.view(np.uint8).max() > 1:
             raise BadMessage(f"{name}: expected bytes 0 and 1, got {array.view(np.uint8).max()}")
+
+
+def _check_results(answer: Returned, order: Call) -> None:
+    results = unpack(answer.results.data)
+    if not isinstance(results, list) or len(results) != len(order.copies):
+        raise BadMessage(f"results: expected a list of {len(order.copies)}, got {type(results).__name__}")

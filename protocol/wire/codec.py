@@ -151,8 +151,8 @@ def _decode(frames: Sequence[Buffer], kinds: MessageTypes, packed_bytes_limit: i
         )
         named = type(head) is dict and "type" in head  # with only one type, msgspec would accept a map without it
         message = msgspec.convert(head, by_name if named else by_position, dec_hook=hook)
-    except BadMessage:
-        raise
+    except BadMessage as error:
+        raise BadMessage(one_line(str(error), 500)) from error  # it may quote the peer
     except Exception as error:  # msgpack and msgspec raise a dozen types for invalid bytes
         reason = one_line(" ".join(_explain_validation_error(str(error), head, by_position).split()), 200)  # quotes the peer
         raise BadMessage(f"head is not a message of ours: {type(error).__name__}: {reason}") from error

@@ -104,6 +104,10 @@ class LearnerLink:
         """The name for log lines about this peer: that of its key, or without keys the one it gave itself."""
         return name_for_people(peer) if self.keyring is None else self.keyring.allowed.name_of(_key_of(peer))
 
+    def source(self, peer: bytes) -> str:
+        """Who answers for this peer: the name of its key. Empty without keys, for a name proves nothing there."""
+        return "" if self.keyring is None else self.name_for_log(peer)
+
     def _peer(self, routing_id: bytes, key: str) -> bytes:
         """The peer that uses this routing id now."""
         self._last_keys.pop(routing_id, None)  # so that the routing id of the oldest message stands first

@@ -32,5 +32,11 @@ class FakeLink:
         self.sent.append(frames)
         return True
 
+    def name_for_log(self, peer: bytes) -> str:
+        return peer.decode(errors="replace")
+
+    def source(self, peer: bytes) -> str:
+        return ""
+
     def rejection_reason(self, peer: bytes) -> str:
         return ""

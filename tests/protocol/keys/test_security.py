@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import zmq
 
-from learner.members.membership import REMEMBERED_REFUSALS
+from learner.members.membership import REMEMBERED
 from learner.rollouts.hub import Hub, HubSettings
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 from protocol.address import worker_name
@@ -661,14 +661,14 @@ def test_strangers_make_few_lines(net: Net, caplog: pytest.LogCaptureFixture) ->
 def test_who_comes_under_ever_new_names_does_not_fill_the_memory() -> None:
     logging.disable(logging.CRITICAL)
     learner = coordinator()
-    for number in range(3 * REMEMBERED_REFUSALS):
+    for number in range(3 * REMEMBERED):
         peer = b"w%d" % number
         learner.receive(peer, hello(f"w{number}", number), 0.0)
         for _ in range(3):
             learner.reject_message(peer, "rubbish", 0.0)
     logging.disable(logging.NOTSET)
     assert not learner.members
-    assert len(learner.membership._refused) == REMEMBERED_REFUSALS
+    assert len(learner.membership._refused) == REMEMBERED
     assert isinstance(learner.receive(peer, hello(f"w{number}", number), 0.0)[0][1], Refuse), "it came back"
 
 

@@ -1,0 +1,306 @@
+"""Workers that send too much: the log, the memory and the time that they can take are limited."""
+
+from __future__ import annotations
+
+import logging
+from typing import cast
+
+import msgspec
+import numpy as np
+import pytest
+
+from learner.members.events import EnvironmentRaised, WorkerLeft, WorkerRefused, describe
+from learner.members.join_limiter import AT_ONCE, PER_S, JoinLimiter
+from learner.members.member_log import OF_A_KEY, OF_A_WORKER
+from learner.members.member_server import TURN_S
+from learner.members.membership import MAX_MEMBERS, REMEMBERED
+from learner.rollouts.hub import Hub, HubSettings
+from learner.rollouts.ticket_coordinator import TicketCoordinator
+from learner.rollouts.weight_age import WORKERS, WeightAge
+from protocol.errors import BadMessage, EnvironmentFailed
+from protocol.messages import (
+    PROTOCOL_VERSION,
+    Failure,
+    Goodbye,
+    Heartbeat,
+    Hello,
+    Inquire,
+    Refuse,
+    Status,
+    ToLearner,
+    Welcome,
+)
+from protocol.token_bucket import TokenBucket
+from protocol.wire.codec import decode_to_observer, decode_to_worker
+from protocol.wire.learner_link import LearnerLink
+from tests.learner.rollouts.test_ticket_coordinator import Learner
+from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollout, run_spec
+from tests.support.fake_link import FakeLink
+
+
+class Noisy:
+    """A hub that has one lane, an honest worker that owns it, and a link on which anybody may speak."""
+
+    def __init__(self, max_env_failures: int = 0) -> None:
+        self.link = FakeLink()
+        self.coordinator = TicketCoordinator(
+            run_spec(lanes=1), rollouts_per_update=1, max_lag=0, worker_timeout_s=5.0, first_session=1
+        )
+        settings = HubSettings(60.0, 600.0, max_env_failures)
+        self.hub = Hub(cast(LearnerLink, self.link), self.coordinator, settings, clock=lambda: self.link.now)
+        self.joins("honest")
+        self.hub.publish(0, PARAMETERS, BUFFERS)
+
+    def hears(self, peer: str, *messages: ToLearner | Inquire | BadMessage) -> None:
+        self.link.inbox += [(peer.encode(), cast(ToLearner, message)) for message in messages]
+        while self.link.inbox:
+            self.hub.pulse()
+            self.link.now += 0.01
+
+    def joins(self, name: str, nonce: int = 1) -> int:
+        """The session of this worker."""
+        self.hears(name, hello(name, nonce))
+        return self.coordinator.members[name.encode()].session
+
+
+def hello(name: str, nonce: int = 1, host: str = "host", attempt: int = 1) -> Hello:
+    return Hello(PROTOCOL_VERSION, name, host, 1, nonce, "fake", attempt)
+
+
+def logged(caplog: pytest.LogCaptureFixture) -> int:
+    return sum(len(record.getMessage().encode()) for record in caplog.records)
+
+
+# ---------------------------------------------------------------- the log
+
+
+@pytest.mark.parametrize("names", [1, 100_000])
+def test_a_flood_of_sessions_and_reasons_logs_a_limited_number_of_bytes(
+    names: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    noisy = Noisy()
+    for number in range(4_000):
+        name = f"w{number % names}"
+        session = noisy.joins(name, number)
+        noisy.hears(name, Goodbye(session, "x" * 1_000, ()))
+    limit = OF_A_WORKER if names == 1 else OF_A_KEY
+    seconds = 4_000 * 2 * 0.01
+    assert logged(caplog) < limit.bytes + seconds * limit.bytes_per_s
+    assert len(caplog.records) < limit.lines + seconds * limit.lines_per_s + 2  # two of the honest worker
+    noisy.link.now += 10_000
+    noisy.joins("later")
+    assert "more lines about it, or about workers of the same key, were left out)" in caplog.messages[-1] or names == 1
+
+
+def test_a_thousand_honest_workers_are_all_logged(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    noisy = Noisy()
+    for number in range(1_000):
+        session = noisy.joins(f"w{number}")
+        noisy.hears(f"w{number}", Goodbye(session, "told to stop", ()))
+    assert len(caplog.records) == 1 + 2 * 1_000
+
+
+def test_of_a_failure_that_would_fill_the_log_only_the_line_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    noisy = Noisy()
+    for number in range(5):
+        session = noisy.joins("spare", number)
+        noisy.hears("spare", Failure(session, "boom", "y" * 30_000, None))
+    broke = [line for line in caplog.messages if "boom" in line and "lane" in line]
+    assert ["\n    yyy" in line for line in broke] == [True, True, False, False, False]
+    assert "its traceback is left out" in broke[2]
+
+
+def test_no_line_of_a_traceback_looks_like_a_line_of_the_log() -> None:
+    forged = "2026-11-22 05:00:00,000 learner: all is well"
+    text = describe(EnvironmentRaised("w", "h", 0, "boom\x9b31m", f"{forged}\n\x1b[2J\r{forged}\u2028{forged}\x85{forged}"))
+    first, *more = text.splitlines()
+    assert "\x9b" not in first
+    assert more
+    assert all(line.startswith("    ") for line in more)
+    assert "\x1b" not in text
+
+
+def test_a_message_that_cannot_be_read_forges_no_line(caplog: pytest.LogCaptureFixture) -> None:
+    noisy = Noisy()
+    noisy.hears("spare", BadMessage("array expected, got one\n2026 learner: all is \x1b[31mwell"))
+    (line,) = caplog.messages
+    assert len(line.splitlines()) == 1
+    assert "\x1b" not in line
+
+
+# ---------------------------------------------------------------- memory
+
+
+def test_what_is_kept_of_workers_that_left_is_limited() -> None:
+    logging.disable(logging.CRITICAL)
+    noisy = Noisy()
+    stages = noisy.coordinator.membership
+    for number in range(REMEMBERED + 500):
+        name = f"w{number}"
+        session = noisy.joins(name)
+        noisy.hears(name, Heartbeat(session, 0, 0, (), 2**53, {"step": 1e9}, 0), fake_rollout(session, 0, 9, 0, 0))
+    honest = noisy.joins("honest", 2)
+    for _ in range(20):
+        noisy.link.now += 0.4
+        noisy.hears("honest", Heartbeat(honest, 0, 0, (), 0, {}, 0))
+    logging.disable(logging.NOTSET)
+    assert set(noisy.coordinator.members) == {b"honest"}
+    assert len(stages._removed_for_silence) == REMEMBERED
+    assert len(noisy.hub._weight_age._newest_used) == 0, "a rollout counts for the weights' age only if it was accepted"
+    assert stages.stages().keys() == {"step"}
+    assert 0 < stages.stages()["step"] < 0.1 * (REMEMBERED + 500), "no session has taken longer than it lasted"
+
+
+def test_the_stages_of_a_process_that_joins_again_are_counted_once() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(b"a")
+    learner.now = 60.0
+    learner.says(b"a", Heartbeat(learner.session(b"a"), 0, 0, tuple(learner.tickets(b"a")), 1, {"step": 10.0}, 0))
+    learner.says(b"a", hello("a", 4_001, attempt=2))
+    for now, step_s in ((61.0, 10.5), (100.0, 30.5)):
+        learner.now = now
+        learner.says(b"a", Heartbeat(learner.session(b"a"), 0, 0, tuple(learner.tickets(b"a")), 1, {"step": step_s}, 0))
+    assert learner.coordinator.membership.stages() == {"step": 30.0}
+
+
+def test_measurements_of_the_weights_age_are_kept_of_a_limited_number_of_workers() -> None:
+    age = WeightAge()
+    age.published(0, 0.0)
+    for number in range(3 * WORKERS):
+        age.arrived("honest", 0, 1.0)
+        age.arrived(f"w{number}", 0, 2.0)
+    assert len(age.first_use_s()) == WORKERS
+    assert "honest" in age.first_use_s()
+
+
+def test_there_is_a_limit_to_the_number_of_members() -> None:
+    learner = Learner(lanes=1)
+    for number in range(MAX_MEMBERS):
+        learner.joins(b"w%d" % number)
+    ((_, answer),) = learner.joins(b"more")
+    assert answer == Refuse(f"workers: expected at most {MAX_MEMBERS} at one learner")
+    ((_, answer), *_) = learner.joins(b"w7")  # a member asks again
+    assert isinstance(answer, Welcome)
+    assert len(learner.coordinator.members) == MAX_MEMBERS
+
+
+# ---------------------------------------------------------------- time
+
+
+def test_a_bucket_spends_a_burst_and_then_a_steady_rate() -> None:
+    bucket = TokenBucket(3, 0.5)
+    spent = []
+    for second in range(10):
+        if bucket.holds(1, float(second)):
+            bucket.spend(1)
+            spent.append(second)
+    assert spent == [0, 1, 2, 3, 4, 6, 8]
+
+
+def test_hellos_of_one_key_beyond_the_limit_are_not_answered_and_those_of_another_are() -> None:
+    limiter = JoinLimiter()
+    assert all(limiter.admits("loud", 0.0) for _ in range(AT_ONCE))
+    assert not limiter.admits("loud", 0.0)
+    assert limiter.admits("quiet", 0.0)
+    assert [limiter.admits("loud", 1.0) for _ in range(int(PER_S) + 1)] == [True] * int(PER_S) + [False]
+
+
+def test_a_flood_is_read_for_a_limited_time_and_an_honest_worker_is_not_taken_for_silent() -> None:
+    noisy = Noisy()
+    hears = noisy.coordinator.receive
+
+    def slowly(peer: bytes, message: ToLearner, now: float) -> object:
+        noisy.link.now += 0.01
+        return hears(peer, message, now)
+
+    noisy.coordinator.receive = slowly  # type: ignore[method-assign, assignment]
+    flood = [(b"spare", cast(ToLearner, Heartbeat(7, 0, 0, (), 0, {}, 0)))] * 1_000
+    noisy.link.inbox += [*flood, (b"honest", Heartbeat(1, 0, 0, (), 0, {}, 0))]
+    while noisy.link.inbox:
+        began_s, left = noisy.link.now, len(noisy.link.inbox)
+        noisy.hub.pulse()
+        assert noisy.link.now - began_s <= TURN_S + 0.02
+        noisy.link.now += 0.02  # a minibatch: short, so the next pulse may take as long
+        assert left - len(noisy.link.inbox) <= 1 + TURN_S / 0.01
+        assert b"honest" in noisy.coordinator.members, "silence was judged before all was read"
+
+
+def test_questions_take_a_limited_part_of_the_time() -> None:
+    noisy = Noisy()
+    made = []
+    status = noisy.hub._server._callbacks.status
+
+    def slowly(now: float) -> Status:
+        made.append(now)
+        noisy.link.now += 0.1
+        return status(now)
+
+    object.__setattr__(noisy.hub._server._callbacks, "status", slowly)
+    noisy.link.sent.clear()
+    noisy.hears("asks", *[Inquire()] * 50)
+    assert len(noisy.link.sent) == 50
+    assert len(made) == 1
+    noisy.link.now += 2.0
+    noisy.hears("asks", Inquire())
+    assert len(made) == 2
+    assert decode_to_observer(noisy.link.sent[-1]).workers[0].worker == "honest"
+
+
+# ---------------------------------------------------------------- errors
+
+
+def test_an_error_in_the_learner_costs_its_sender_the_membership_and_nothing_else(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    noisy = Noisy()
+    noisy.joins("spare")
+    hears = noisy.coordinator.receive
+
+    def raises(peer: bytes, message: ToLearner, now: float) -> object:
+        if peer == b"spare":
+            raise ZeroDivisionError("not expected")
+        return hears(peer, message, now)
+
+    noisy.coordinator.receive = raises  # type: ignore[method-assign, assignment]
+    for _ in range(3):
+        noisy.hears("spare", Heartbeat(2, 0, 0, (), 0, {}, 0))
+    assert set(noisy.coordinator.members) == {b"honest"}
+    assert decode_to_worker(noisy.link.sent[-1]) == Refuse("its Heartbeat led to an error in the learner: ZeroDivisionError")
+    assert noisy.hub._server.unexpected_errors == 3
+    assert len([record for record in caplog.records if record.exc_info]) == 1
+
+
+def test_a_spare_worker_cannot_end_the_run_with_failures() -> None:
+    noisy = Noisy(max_env_failures=0)
+    for number in range(10):
+        session = noisy.joins("spare", number)
+        noisy.hears("spare", Failure(session, "boom", "", 0))
+    noisy.hub._turn(0.0)
+    noisy.hears("honest", Failure(1, "boom", "", 0))
+    with pytest.raises(EnvironmentFailed, match="boom; failure 1; max_env_failures allows 0"):
+        noisy.hub._turn(0.0)
+
+
+def test_a_worker_that_fails_before_lanes_are_placed_counts() -> None:
+    learner = Learner(lanes=2, publish=False)
+    learner.joins(b"a")
+    learner.says(b"a", Failure(learner.session(b"a"), "no such module", "", None))
+    (raised,) = [event for event in learner.coordinator.events if isinstance(event, EnvironmentRaised)]
+    assert not raised.spare
+
+
+def test_what_members_are_told_fits_into_a_message() -> None:
+    """Names, hosts and reasons of the greatest length, of as many workers as there may be."""
+    noisy = Noisy()
+    for number in range(MAX_MEMBERS - 1):
+        name = f"{number:0200d}"
+        noisy.coordinator.receive(name.encode(), hello(name, number, "h" * 1_000), noisy.link.now)
+    noisy.coordinator.events.clear()
+    noisy.hears("asks", Inquire())
+    status = decode_to_observer(noisy.link.sent[-1])
+    assert len(status.workers) + status.workers_left_out == MAX_MEMBERS
+    assert all(isinstance(event, WorkerLeft | WorkerRefused) for event in noisy.coordinator.events)
+    assert np.isfinite([worker.steps_per_s for worker in status.workers]).all()
+    assert msgspec.json.encode(status)
