@@ -268,4 +268,5 @@ def check(answer: Answer, order: Order, spec: StepSpec) -> None:
 def _check_results(answer: Returned, order: Call) -> None:
     results = unpack(answer.results.data)
     if not isinstance(results, list) or len(results) != len(order.copies):
-        raise BadMessage(f"results: expected a list of {len(order.copies)}, got {type(results).__name__}")
+        got = f"{len(results)} in a list" if isinstance(results, list) else type(results).__name__
+        raise BadMessage(f"results: expected a list of {len(order.copies)}, got {got}")

@@ -99,7 +99,7 @@ def test_a_thousand_honest_workers_are_all_logged(caplog: pytest.LogCaptureFixtu
     for number in range(1_000):
         session = noisy.joins(f"w{number}")
         noisy.hears(f"w{number}", Goodbye(session, "told to stop", ()))
-    assert len(caplog.records) == 1 + 2 * 1_000
+    assert len([line for line in caplog.messages if line.startswith("worker w")]) == 2 * 1_000
 
 
 def test_of_a_failure_that_would_fill_the_log_only_the_line_is_logged(caplog: pytest.LogCaptureFixture) -> None:

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, cast
+
 import msgspec
 import numpy as np
 import pytest
 
 from learner.members.events import WorkerLeft, WorkerRefused
-from learner.vector_env.order_coordinator import OrderCoordinator
+from learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator
 from learner.vector_env.status import status
 from protocol.env_spec import EnvSpec
 from protocol.messages import (
     PROTOCOL_VERSION,
     Answer,
     Call,
+    Failure,
     Goodbye,
     Heartbeat,
     Hello,
@@ -26,6 +30,7 @@ from protocol.messages import (
     Stepped,
 )
 from protocol.specs import Leaf, StepSpec
+from protocol.wire.plain_values import pack
 
 A, B = b"a", b"b"
 TIMEOUT_S = 5.0
@@ -222,3 +227,45 @@ def test_it_says_how_it_is() -> None:
     found = status(made, 13.0)
     assert (found.env, found.env_steps, found.steps_per_s, found.total_steps) == ("Fake-v0", 350, 100.0, 0)
     assert [(one.worker, one.lanes, one.silent_s) for one in found.workers] == [("b", (1,), 1.0), ("a", (0,), 1.0)]
+
+
+def call(session: int, ticket: int, life: LaneIncarnation) -> Order:
+    return Call(session, ticket, life.lane, life.incarnation, (0,), "name", False, NOTHING)
+
+
+def test_an_answer_of_the_other_kind_and_results_that_are_not_one_for_each_copy_are_refused() -> None:
+    results = np.frombuffer(pack([1]), np.uint8)
+    two = np.frombuffer(pack([1, 2]), np.uint8)
+    text = np.frombuffer(pack("x"), np.uint8)
+
+    def told(make: MakeOrder, answer: Callable[[Order], Answer]) -> str:
+        coordinator = order_coordinator(A, B)
+        ((_, sent),) = coordinator.order(0, make)
+        order = cast(Order, sent)
+        out = coordinator.receive(A, answer(order), 0.0)
+        if not out:
+            assert coordinator.answers[0].ticket == order.ticket
+            return ""
+        assert 0 not in coordinator.answers
+        ((_, refusal),) = out
+        assert isinstance(refusal, Refuse)
+        return refusal.reason
+
+    def returned(packed: np.ndarray[Any, Any], error: str = "") -> Callable[[Order], Answer]:
+        return lambda order: Returned(order.session, order.ticket, order.lane, order.incarnation, packed, error, "")
+
+    assert told(step, returned(results)) == "answer to Step: expected Stepped, got Returned"
+    assert told(call, stepped) == "answer to Call: expected Returned, got Stepped"
+    assert told(call, returned(two)) == "results: expected a list of 1, got 2 in a list"
+    assert told(call, returned(text)) == "results: expected a list of 1, got str"
+    assert "not a plain value" in told(call, returned(WORDS))
+    assert (told(call, returned(WORDS, "KeyError: 1")), told(call, returned(results)), told(step, stepped)) == ("", "", "")
+
+
+def test_failures_of_spare_workers_are_not_raised() -> None:
+    coordinator = order_coordinator(A, B)
+    coordinator.receive(b"spare", Hello(PROTOCOL_VERSION, "spare", "host", 1, 1, "fake", 1), 0.0)
+    coordinator.receive(b"spare", Failure(coordinator.members[b"spare"].session, "boom", "", 0), 0.0)
+    assert coordinator.failures == []
+    coordinator.receive(B, Failure(coordinator.members[B].session, "boom", "", 0), 0.0)
+    assert [failure.worker for failure in coordinator.failures] == ["b"]

@@ -358,3 +358,8 @@ def test_with_more_lanes_than_workers_all_lanes_are_placed_at_once() -> None:
     assert env.step(np.zeros(4, np.int64))[1].tolist() == [1.0] * 4
     assert env.workers == 1
     env.close()
+
+
+def test_a_negative_number_of_workers_is_refused_in_one_line() -> None:
+    with pytest.raises(UsageError, match=r"^workers: expected at least 0, got -1$"):
+        millrace.make_vec("CartPole-v1", 2, workers=-1)
