@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from learner.members import membership
+from learner.members import join_limiter, membership
 from learner.members import states as standing
 from learner.rollouts import ticket_coordinator
 from protocol import bounds, env_spec, messages, rollout, space_spec, specs
@@ -127,7 +127,10 @@ LIMITS: Mapping[tuple[ModuleType, str], str] = {
     (session, "HELLO_MOST_S"): "seconds between two Hello messages, at most",
     (held_rollouts, "REMEMBERED_TICKETS"): "finished tickets of a lane that a worker remembers, to know a late repeat",
     (ticket_coordinator, "STRIKES"): "messages or rollouts that cannot be used, after which a worker is refused",
-    (membership, "REMEMBERED_REFUSALS"): "refused processes that the learner remembers, so that they do not come back",
+    (membership, "REMEMBERED"): "refused processes that the learner remembers, so that they do not come back",
+    (membership, "MAX_MEMBERS"): "workers of one learner",
+    (join_limiter, "AT_ONCE"): "times that the workers of one key may say Hello at once; more are not answered",
+    (join_limiter, "PER_S"): "of them in each second, after that",
     (handshake, "HANDSHAKE_MS"): "milliseconds that a handshake may take",
     (sockets, "LINGER_MS"): "milliseconds for which a closing socket still sends queued messages",
 }
