@@ -9,6 +9,8 @@ import msgspec
 from protocol.env_spec import AllowedCode, EnvSpec
 from protocol.wire.compression import why_no_zstd
 
+MIN_IMAGE_SIDE = 5  # pixels: a 3 x 3 convolution, then one with stride 2
+
 
 class Leaf(msgspec.Struct, frozen=True):
     """One array of an observation. A Dict or Tuple observation has several."""
@@ -26,8 +28,18 @@ class Leaf(msgspec.Struct, frozen=True):
 
     @property
     def is_image(self) -> bool:
-        """A three-dimensional array of bytes is an image: it goes through a convolutional network."""
-        return self.kind == "box" and self.dtype == "uint8" and len(self.shape) == 3
+        """A three-dimensional array of bytes is an image: it goes through a convolutional network.
+
+        If one of its sides is smaller than the convolutions need, it is flattened like any other array.
+        """
+        if self.kind != "box" or self.dtype != "uint8" or len(self.shape) != 3:
+            return False
+        return min(self.shape[:2] if self.has_channels_last else self.shape[1:]) >= MIN_IMAGE_SIDE
+
+    @property
+    def has_channels_last(self) -> bool:
+        """Of an image: whether its last dimension holds the channels. It does, unless it is larger than the first."""
+        return self.shape[2] <= self.shape[0]
 
 
 class ActionSpec(msgspec.Struct, frozen=True):

@@ -65,7 +65,7 @@ class ObservationNormalizer:
         self._moments = RunningMoments(self._box_features.shape)
         assert not self._enabled or buffer_size(spec) == 2 * len(self._box_features)
 
-    def update(self, features: Floats, valid: npt.NDArray[np.bool_]) -> None:
+    def update(self, features: Floats | Doubles, valid: npt.NDArray[np.bool_]) -> None:
         """Count features [T, N, D], not yet normalized, of the rows [T, N] that are valid."""
         if self._enabled:
             self._moments.update(features[valid])

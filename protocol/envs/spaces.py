@@ -118,11 +118,15 @@ def make_flatten(space: gymnasium.Space[Any]) -> Callable[[Any], tuple[Any, ...]
 
 
 def make_action_converter(spec: ActionSpec) -> Callable[[Array], Array]:
-    """A function from stored actions [N, *action] to actions of the environment: shifted by `start`, or clipped (Box)."""
+    """A function from stored actions [N, *action] to actions of the environment: shifted by `start`, or clipped (Box).
+
+    A Box action is clipped in the dtype of the space, in which the bounds are exact: the float32 next to a float64 bound may
+    lie outside of it.
+    """
     dtype = np.dtype(spec.dtype)
     if spec.kind == "box":
-        low, high = (np.reshape(np.asarray(bound, np.float32), spec.shape) for bound in (spec.low, spec.high))
-        return lambda action: np.clip(action, low, high).astype(dtype, copy=False)
+        low, high = (np.reshape(np.asarray(bound, dtype), spec.shape) for bound in (spec.low, spec.high))
+        return lambda action: np.clip(action.astype(dtype, copy=False), low, high)
     start = np.reshape(np.asarray(spec.start or 0, dtype), spec.shape if spec.start else ())
     if not start.any():
         return lambda action: action.astype(dtype, copy=False)

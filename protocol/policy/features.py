@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 
-from protocol.arrays import Array, Bools, Floats
+from protocol.arrays import Array, Bools, Doubles, Floats
 from protocol.specs import Leaf, PolicySpec
 
 CLIP = np.float32(10.0)  # normalized observations are clipped to ±10
@@ -25,13 +26,14 @@ def _leaf_features(leaf: Leaf) -> int:
     return sum(leaf.sizes) if leaf.sizes else math.prod(leaf.shape)
 
 
-def features(spec: PolicySpec, leaves: Sequence[Array]) -> Floats:
-    """Features [..., D] float32 of leaves [..., *leaf]. Images are left out.
+def features(spec: PolicySpec, leaves: Sequence[Array]) -> Floats | Doubles:
+    """Features [..., D] of leaves [..., *leaf], not yet normalized. Images are left out.
 
-    Arrays are flattened, discrete values become one-hot vectors, and bytes are divided by 255.
+    Arrays are flattened, discrete values become one-hot vectors, and bytes are divided by 255. The dtype is float32, or
+    float64 if the policy normalizes and an array of the observation is float64: `normalize` makes float32 of them.
     """
     plain = [(leaf, array) for leaf, array in zip(spec.observation, leaves, strict=True) if not leaf.is_image]
-    parts = [_features(leaf, array) for leaf, array in plain]
+    parts = [_features(leaf, array, spec.normalize_observations) for leaf, array in plain]
     if len(parts) == 1:
         return parts[0]
     if not parts:
@@ -40,15 +42,25 @@ def features(spec: PolicySpec, leaves: Sequence[Array]) -> Floats:
     return np.concatenate(parts, -1)
 
 
-def _features(leaf: Leaf, array: Array) -> Floats:
+def _features(leaf: Leaf, array: Array, keeps_float64: bool) -> Array:
     lead = array.shape[: array.ndim - len(leaf.shape)]
     if leaf.sizes:
-        flat = array.reshape(*lead, len(leaf.sizes)) - np.asarray(leaf.start)
-        return np.concatenate([np.eye(n, dtype=np.float32)[flat[..., i]] for i, n in enumerate(leaf.sizes)], -1)
+        offsets, total = _one_hot_offsets(leaf)
+        flat = array.reshape(-1, len(leaf.sizes)) + offsets
+        found = np.zeros((len(flat), total), np.float32)
+        found[np.arange(len(flat))[:, None], flat] = 1
+        return found.reshape(*lead, total)
     flat = array.reshape(*lead, math.prod(leaf.shape))
     if leaf.dtype == "uint8":
         return flat * np.float32(1 / 255)
-    return flat.astype(np.float32, copy=False)
+    return flat if keeps_float64 and leaf.dtype == "float64" else flat.astype(np.float32, copy=False)
+
+
+@lru_cache(maxsize=64)
+def _one_hot_offsets(leaf: Leaf) -> tuple[Array, int]:
+    """What to add to each value to get the number of its feature, and the number of features."""
+    before = np.cumsum((0, *leaf.sizes[:-1]), dtype=np.int64)
+    return before - np.asarray(leaf.start, np.int64), sum(leaf.sizes)
 
 
 def box_feature_mask(spec: PolicySpec) -> Bools:
@@ -57,6 +69,9 @@ def box_feature_mask(spec: PolicySpec) -> Bools:
     return np.concatenate([np.full(_leaf_features(leaf), leaf.kind == "box") for leaf in plain] or [np.zeros(0, bool)])
 
 
-def normalize(x: Floats, mean: Floats, std: Floats) -> Floats:
-    """(x − mean) / std, clipped to ±10."""
-    return np.asarray(np.clip((x - mean) / std, -CLIP, CLIP))
+def normalize(x: Floats | Doubles, mean: Floats, std: Floats) -> Floats:
+    """(x − mean) / std, clipped to ±10, float32. It is computed in the dtype of x.
+
+    So a float64 observation keeps the digits by which it differs from the mean, however large both are.
+    """
+    return np.asarray(np.clip((x - mean) / std, -CLIP, CLIP)).astype(np.float32, copy=False)

@@ -47,13 +47,12 @@ def convolutions(leaf: Leaf) -> tuple[tuple[Conv, ...], tuple[int, int, int], in
     The last dimension holds the channels, unless it is larger than the first. If both sides of the image have at least 36
     pixels, it gets the convolutions of Mnih et al. (2015), otherwise two 3 x 3 convolutions.
     """
-    first, _, last = leaf.shape
-    chw = (last, *leaf.shape[:2]) if last <= first else leaf.shape
+    chw = (leaf.shape[2], *leaf.shape[:2]) if leaf.has_channels_last else leaf.shape
     stack = NATURE if min(chw[1:]) >= 36 else SMALL
     height, width = chw[1:]
     for conv in stack:
         height, width = ((side - conv.kernel) // conv.stride + 1 for side in (height, width))
-    return stack, (chw[0], chw[1], chw[2]), stack[-1].channels * max(height, 0) * max(width, 0)
+    return stack, (chw[0], chw[1], chw[2]), stack[-1].channels * height * width
 
 
 def parameter_layout(spec: PolicySpec) -> tuple[tuple[Field, ...], tuple[Field, ...]]:

@@ -287,6 +287,7 @@ ACTIONS: dict[str, gymnasium.Space[Any]] = {
     "multibinary": spaces.MultiBinary(4),
     "box": spaces.Box(-0.1, 0.1, (2,), np.float32),
     "scalar": spaces.Box(-0.1, 0.1, (), np.float32),
+    "doubles": spaces.Box(-0.1, 0.1, (2,), np.float64),
     "half": spaces.Box(np.array([0, -np.inf]), np.array([np.inf, 0]), dtype=np.float64),
     "unbounded": spaces.Box(-np.inf, np.inf, (2, 2), np.float32),
     "integers": spaces.Box(0, 5, (2,), np.int64),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import gymnasium
 import numpy as np
 import pytest
@@ -92,6 +94,15 @@ def test_actions_are_shifted_to_where_the_space_starts() -> None:
     table = action_spec(ACTIONS["table"])
     assert make_action_converter(table)(np.zeros((1, 2, 2), np.int64)).tolist() == [[[1, 0], [0, -2]]]
     assert make_action_converter(action_spec(ACTIONS["offset"]))(np.array([0, 1, 2])).tolist() == [5, 6, 7]
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_an_action_is_clipped_to_the_exact_bounds_of_its_space(dtype: type[np.floating[Any]]) -> None:
+    low, high = np.array([-0.1, -1 / 3, -1e-9]), np.array([0.1, 1 / 3, 0.7])
+    space = spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype)
+    written = make_action_converter(action_spec(space))(np.array([[-9.0] * 3, [9.0] * 3], np.float32))
+    assert written.dtype == dtype
+    assert (written == [space.low, space.high]).all()
 
 
 def test_only_what_is_outside_is_clipped() -> None:

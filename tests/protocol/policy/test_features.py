@@ -1,0 +1,158 @@
+"""Features: one-hot without a square, small images flattened, float64 observations normalized before they are rounded."""
+
+from __future__ import annotations
+
+import tracemalloc
+from typing import Any
+
+import gymnasium
+import msgspec
+import numpy as np
+import pytest
+
+from learner.algorithms.normalization import ObservationNormalizer
+from learner.algorithms.ppo import PPO
+from learner.config.hyperparameters import PPOConfig
+from protocol.envs.spaces import observation_leaves
+from protocol.policy.features import feature_size, features, normalize
+from protocol.policy.layout import acting_size, convolutions
+from protocol.policy.policy import make_policy
+from protocol.rollout import stack_rollouts
+from protocol.specs import ActionSpec, Leaf, PolicySpec
+from tests.support.collectors import collect, loop_over, random_collector, run_around
+from workers.envs.toy import Countdown
+
+TWO = ActionSpec("discrete", (), "int64", (2,), (0,))
+IMAGE = gymnasium.spaces.Box(0, 255, (12, 12, 3), np.uint8)
+
+
+def policy_of(space: gymnasium.Space[Any], **settings: Any) -> PolicySpec:
+    return PolicySpec(observation_leaves(space), TWO, **settings)
+
+
+# ------------------------------------------------------------------------------------------------ one-hot
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        gymnasium.spaces.Discrete(1),
+        gymnasium.spaces.Discrete(500),
+        gymnasium.spaces.Discrete(7, start=-3),
+        gymnasium.spaces.MultiDiscrete([3, 1, 4], start=[-1, 0, 5]),
+        gymnasium.spaces.MultiDiscrete([[2, 3], [4, 5]]),
+    ],
+    ids=str,
+)
+def test_one_hot_features_are_rows_of_the_identity_side_by_side(space: Any) -> None:
+    spec = policy_of(space)
+    (leaf,) = spec.observation
+    rows = np.stack([space.sample() for _ in range(6 * 5)]).reshape(6, 5, *leaf.shape)
+    counted = (rows - np.reshape(leaf.start, leaf.shape)).reshape(6, 5, -1)
+    identities = [np.eye(n, dtype=np.float32)[counted[..., i]] for i, n in enumerate(leaf.sizes)]
+    assert features(spec, [rows]).tobytes() == np.concatenate(identities, -1).tobytes()
+    assert features(spec, [rows]).dtype == np.float32
+
+
+@pytest.mark.parametrize("space", [gymnasium.spaces.Discrete(100_000), gymnasium.spaces.MultiDiscrete([4] * 25_000)])
+def test_one_hot_features_take_no_more_memory_than_their_result(space: Any) -> None:
+    spec = policy_of(space)
+    rows = space.sample()[None, None] if isinstance(space, gymnasium.spaces.MultiDiscrete) else np.zeros((1, 1), np.int64)
+    features(spec, [rows])
+    tracemalloc.start()
+    found = features(spec, [rows])
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert found.nbytes == 400_000
+    assert peak < 6 * found.nbytes
+
+
+# ------------------------------------------------------------------------------------------------ images
+
+
+@pytest.mark.parametrize(
+    ("shape", "is_image"),
+    [
+        ((5, 5, 3), True), ((3, 5, 5), True), ((5, 40, 1), True), ((36, 36, 4), True), ((35, 90, 4), True),
+        ((4, 5, 3), False), ((5, 4, 3), False), ((3, 4, 9), False), ((2, 9, 4), False), ((1, 1, 1), False),
+        ((4, 84, 84), True), ((84, 84, 100), True), ((84, 3, 100), False),
+    ],
+)  # fmt: skip
+def test_an_image_whose_side_is_too_small_for_the_convolutions_is_flattened(shape: tuple[int, ...], is_image: bool) -> None:
+    leaf = Leaf("", "box", shape, "uint8")
+    assert leaf.is_image is is_image
+    spec = PolicySpec((leaf,), TWO)
+    if is_image:
+        assert convolutions(leaf)[2] > 0
+    else:
+        assert feature_size(spec) == np.prod(shape)
+        assert not spec.needs_torch
+    image = np.full((2, 3, *shape), 255, np.uint8)
+    policy = make_policy(spec)
+    policy.load(np.full(acting_size(spec), 0.01, np.float32), np.zeros(0, np.float32))
+    params = policy([image])
+    assert params.shape == (2, 3, 2)
+    assert (params != 0).all()
+
+
+# ------------------------------------------------------------------------------------------------ float64
+
+
+class Clock(Countdown):
+    """Shows a large time that differs by less than float32 can tell from one step to the next."""
+
+    START = 2.0**20  # float32 has steps of 0.125 here
+    STEP = 0.05
+
+    def __init__(self) -> None:
+        super().__init__(100)
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)  # type: ignore[assignment]
+
+    def _observation(self) -> Any:
+        return np.array([self.START + self.STEP * self._left, self._left])
+
+
+def test_a_float64_observation_keeps_the_digits_by_which_it_differs_from_the_mean() -> None:
+    spec = policy_of(Clock().observation_space, normalize_observations=True)
+    x = np.array([[[Clock.START + 0.05, 1.0], [Clock.START + 0.1, 2.0]]])
+    mean, std = np.array([Clock.START, 1.5], np.float32), np.array([0.05, 0.5], np.float32)
+    found = normalize(features(spec, [x]), mean, std)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, [[[1.0, -1.0], [2.0, 1.0]]], rtol=1e-6)
+
+
+def test_statistics_of_float64_observations_are_those_of_all_their_digits() -> None:
+    spec = policy_of(Clock().observation_space, normalize_observations=True)
+    normalizer = ObservationNormalizer(spec)
+    x = np.stack([Clock.START + 0.05 * np.arange(100), np.arange(100)], -1)[:, None]
+    normalizer.update(features(spec, [x]), np.ones((100, 1), bool))
+    np.testing.assert_allclose(normalizer.buffers()[2:], np.arange(100).std() * np.array([0.05, 1.0]), rtol=1e-5)
+
+
+def test_only_a_policy_that_normalizes_keeps_float64_and_only_until_then() -> None:
+    x = [np.linspace(-1, 1, 6).reshape(1, 3, 2)]
+    spec = policy_of(Clock().observation_space)
+    assert features(spec, x).tobytes() == x[0].astype(np.float32).tobytes()
+    single = PolicySpec((Leaf("", "box", (2,), "float32"),), TWO, normalize_observations=True)
+    assert features(single, [x[0].astype(np.float32)]).dtype == np.float32
+
+
+def test_learner_and_worker_see_the_same_numbers_of_float64_observations() -> None:
+    """After an update has moved the statistics, the probability ratio before the next step is 1."""
+    run = run_around(Clock(), T=128)
+    policy = msgspec.structs.replace(run.policy, normalize_observations=True)
+    run = msgspec.structs.replace(run, policy=policy, copies=4)
+    learner = PPO(PPOConfig(n_epochs=1, batch_size=128), policy, total_steps=10_000, seed=0)
+    collector = random_collector(run, loop_over([Clock] * 4))
+    for k in range(3):
+        collector.load(*learner.weights())
+        batch = stack_rollouts(collect(collector, run, k))
+        seen = learner.observations(batch)
+        worker = normalize(features(policy, batch.obs), *np.split(learner.weights()[1], 2))
+        assert worker.tobytes() == seen.features.numpy().tobytes()
+        assert k == 0 or len(np.unique(worker[..., 0])) > 95  # else the digits were lost on both sides
+        mask = batch.valid
+        np.testing.assert_array_equal(
+            np.exp(learner.log_probs(seen, batch, lambda: None)[mask] - batch.log_prob[mask]).round(6), 1
+        )
+        learner.update(batch, lambda: None)
