@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from protocol.arrays import Doubles, Floats
+from protocol.arrays import Array
 from protocol.policy.networks import RecurrentInput
 
 Index = Tensor | slice
@@ -28,7 +28,7 @@ class NetworkInput(NamedTuple):
 class Observations(NamedTuple):
     """The T+1 observations of ΣN env copies, normalized by the statistics that the workers acted under."""
 
-    raw_features: Floats | Doubles  # [T+1, ΣN, D], not normalized
+    raw_features: Array  # [T+1, ΣN, D] float32 or float64, not normalized
     features: Tensor  # [(T+1) · ΣN, D] float32, normalized
     images: tuple[Tensor, ...]  # [(T+1) · ΣN, *leaf] uint8 each
     recurrent: RecurrentInput | None  # for all T+1 steps; None without a core

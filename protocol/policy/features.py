@@ -26,7 +26,7 @@ def _leaf_features(leaf: Leaf) -> int:
     return sum(leaf.sizes) if leaf.sizes else math.prod(leaf.shape)
 
 
-def features(spec: PolicySpec, leaves: Sequence[Array]) -> Floats | Doubles:
+def features(spec: PolicySpec, leaves: Sequence[Array]) -> Array:
     """Features [..., D] of leaves [..., *leaf], not yet normalized. Images are left out.
 
     Arrays are flattened, discrete values become one-hot vectors, and bytes are divided by 255. The dtype is float32, or
@@ -45,11 +45,10 @@ def features(spec: PolicySpec, leaves: Sequence[Array]) -> Floats | Doubles:
 def _features(leaf: Leaf, array: Array, keeps_float64: bool) -> Array:
     lead = array.shape[: array.ndim - len(leaf.shape)]
     if leaf.sizes:
-        offsets, total = _one_hot_offsets(leaf)
-        flat = array.reshape(-1, len(leaf.sizes)) + offsets
-        found = np.zeros((len(flat), total), np.float32)
-        found[np.arange(len(flat))[:, None], flat] = 1
-        return found.reshape(*lead, total)
+        flat = array.reshape(*lead, len(leaf.sizes))
+        if len(leaf.sizes) > 1:
+            flat = np.repeat(flat, leaf.sizes, -1)
+        return np.equal(flat, _one_hot_values(leaf)).astype(np.float32)
     flat = array.reshape(*lead, math.prod(leaf.shape))
     if leaf.dtype == "uint8":
         return flat * np.float32(1 / 255)
@@ -57,10 +56,9 @@ def _features(leaf: Leaf, array: Array, keeps_float64: bool) -> Array:
 
 
 @lru_cache(maxsize=64)
-def _one_hot_offsets(leaf: Leaf) -> tuple[Array, int]:
-    """What to add to each value to get the number of its feature, and the number of features."""
-    before = np.cumsum((0, *leaf.sizes[:-1]), dtype=np.int64)
-    return before - np.asarray(leaf.start, np.int64), sum(leaf.sizes)
+def _one_hot_values(leaf: Leaf) -> Array:
+    """[features] the value that each feature of this leaf stands for."""
+    return np.concatenate([np.arange(start, start + n) for start, n in zip(leaf.start, leaf.sizes, strict=True)])
 
 
 def box_feature_mask(spec: PolicySpec) -> Bools:

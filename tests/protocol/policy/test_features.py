@@ -40,7 +40,7 @@ def policy_of(space: gymnasium.Space[Any], **settings: Any) -> PolicySpec:
         gymnasium.spaces.Discrete(500),
         gymnasium.spaces.Discrete(7, start=-3),
         gymnasium.spaces.MultiDiscrete([3, 1, 4], start=[-1, 0, 5]),
-        gymnasium.spaces.MultiDiscrete([[2, 3], [4, 5]]),
+        gymnasium.spaces.MultiDiscrete(np.array([[2, 3], [4, 5]])),
     ],
     ids=str,
 )
@@ -106,7 +106,7 @@ class Clock(Countdown):
 
     def __init__(self) -> None:
         super().__init__(100)
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)  # type: ignore[assignment]
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)  # type: ignore[arg-type]
 
     def _observation(self) -> Any:
         return np.array([self.START + self.STEP * self._left, self._left])
