@@ -13,6 +13,7 @@ from protocol.envs.vectorized import check_native
 from protocol.errors import UsageError
 from protocol.policy.encoder import describe_encoder
 from protocol.specs import PolicySpec, RunSpec
+from protocol.wire.codec import check_can_be_sent
 from protocol.wire.compression import why_no_zstd
 
 
@@ -33,7 +34,7 @@ def run_spec(config: Config, env: EnvSpec, spaces: EnvSpaces | None = None) -> R
             check_native(env, spaces.observation, spaces.action)
         case "envpool":
             check_envpool(env, spaces.observation, spaces.action)
-    return RunSpec(
+    run = RunSpec(
         env=env,
         policy=policy,
         rollout_steps=config.algorithm.rollout_steps,
@@ -45,6 +46,8 @@ def run_spec(config: Config, env: EnvSpec, spaces: EnvSpaces | None = None) -> R
         images_dtype=config.images_dtype,
         heartbeat_s=config.heartbeat_s,
     )
+    check_can_be_sent(env.id, run)
+    return run
 
 
 def _policy_spec(config: Config, spaces: EnvSpaces) -> PolicySpec:

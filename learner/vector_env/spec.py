@@ -14,6 +14,7 @@ from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import leaves_with_own_dtype
 from protocol.errors import UsageError
 from protocol.specs import Leaf, StepSpec
+from protocol.wire.codec import check_can_be_sent
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,7 @@ def describe(settings: VectorEnvSettings, learner_timeout_s: float = math.inf) -
             render_mode=settings.render_mode,
             learner_timeout_s=learner_timeout_s,
         )
+        check_can_be_sent(different[0].id, step)
         metadata = {**copy.metadata, "autoreset_mode": AutoresetMode(step.autoreset)}
         spec = copy.spec if len(different) == 1 and different[0].factory is None else None
         return VectorEnvDescription(step, copy.observation_space, copy.action_space, metadata, copy.render_mode, spec)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import operator
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import reduce
 from typing import Any, get_args
@@ -25,9 +25,10 @@ import numpy as np
 
 from protocol.bounds import one_line
 from protocol.env_spec import MAX_CALLABLE_BYTES, PickledCallable
-from protocol.errors import BadMessage
-from protocol.messages import Described, Hello, Inquire, Refuse, Rollout, Status, ToLearner, ToObserver, ToWorker
+from protocol.errors import BadMessage, UsageError
+from protocol.messages import Described, Hello, Inquire, Refuse, Rollout, Status, ToLearner, ToObserver, ToWorker, Welcome
 from protocol.space_spec import check_size
+from protocol.specs import RunSpec, StepSpec
 from protocol.wire.compression import Packing, raw_bytes, unpack_array
 
 Buffer = bytes | memoryview
@@ -81,11 +82,25 @@ def encode(message: ToLearner | Inquire | ToWorker | ToObserver, packing: Packin
         frames.append(frame)
         return [*described, packings] if packings else described
 
-    head = msgpack.packb(msgspec.to_builtins(message, enc_hook=hook, builtin_types=(bytes,)))
+    head = _head(message, hook)
     if len(head) > MAX_HEAD_BYTES:
         raise ValueError(f"{type(message).__name__}: head expected at most {MAX_HEAD_BYTES} bytes, got {len(head)}")
     frames[0] = head
     return frames
+
+
+def _head(message: object, hook: Callable[[object], object]) -> bytes:
+    head: bytes = msgpack.packb(msgspec.to_builtins(message, enc_hook=hook, builtin_types=(bytes,)))
+    return head
+
+
+def check_can_be_sent(env: str, run: RunSpec | StepSpec) -> None:
+    """Raise `UsageError` if this description of a run is too large for a `Welcome`. `env` names the environment."""
+    if (size := len(_head(Welcome(0, 0, run), lambda value: None))) > MAX_HEAD_BYTES:
+        raise UsageError(
+            f"environment {env}: expected spaces whose description takes at most {MAX_HEAD_BYTES:,} bytes, got {size:,}; "
+            "wrap the environment so that its spaces have fewer entries, or so that a MultiDiscrete is a Box of integers"
+        )
 
 
 def decode_to_learner(frames: Sequence[Buffer], packed_bytes_limit: int = 0) -> ToLearner | Inquire:
