@@ -35,7 +35,7 @@ class Shows(Countdown):
 
     def __init__(self, space: gymnasium.Space[Any]) -> None:
         super().__init__()
-        self.observation_space = space  # type: ignore[assignment]
+        self.observation_space = space
 
     def _observation(self) -> Any:
         return self.observation_space.sample()
