@@ -1,0 +1,337 @@
+"""A hostile worker without a lane says everything that a worker can say, at extreme values. Nothing that it says matters.
+
+Rule: the rollouts that are used, and the answers that a vector environment gets, are those of the same run without it; no
+message of it leads to an error of the learner. Pure but for the codec: the link and the clock are not real.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache
+from typing import cast
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from learner.rollouts.hub import Hub, HubSettings
+from learner.rollouts.ticket_coordinator import TicketCoordinator
+from learner.vector_env.step_hub import StepHub
+from millrace.cli.status import as_table
+from protocol.errors import BadMessage
+from protocol.messages import (
+    PROTOCOL_VERSION,
+    Alive,
+    Collect,
+    Failure,
+    Goodbye,
+    Heartbeat,
+    Hello,
+    Inquire,
+    Order,
+    Refuse,
+    Rejoin,
+    Rollout,
+    Step,
+    Stepped,
+    ToLearner,
+    ToWorker,
+    Weights,
+    Welcome,
+)
+from protocol.rollout import rollout_bytes
+from protocol.wire.codec import Buffer, decode_to_learner, decode_to_observer, decode_to_worker, encode
+from protocol.wire.learner_link import LearnerLink
+from tests.learner.vector_env.test_order_coordinator import SPEC, step, stepped
+from tests.support.extreme_messages import MARK, SESSION, extremes, of_session
+from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollout, run_spec
+from tests.support.fake_link import FakeLink
+from tests.support.hostile_messages import hostile, real
+
+HOSTILE = "spare"
+LANES, TURN_S = 2, 0.05
+RUN = run_spec(LANES)
+
+
+@cache
+def sayings() -> list[list[bytes]]:
+    """Everything that the hostile worker says, each in a session that is filled in."""
+    rollout = fake_rollout(SESSION, 0, 1, 0, 0)
+    return [frames for message in real(rollout) for frames in extremes(message)]
+
+
+@pytest.fixture(autouse=True)
+def quiet() -> Iterator[None]:
+    logging.disable(logging.CRITICAL)
+    yield
+    logging.disable(logging.NOTSET)
+
+
+class Conversation(FakeLink):
+    """A link on which honest workers answer at once, and the hostile one says what it likes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.told: list[tuple[bytes, ToWorker]] = []  # to honest workers
+        self.observed: list[str] = []
+        self.sayings: list[tuple[str, list[bytes]]] = []  # of the hostile worker, with the name that it uses
+        self.sessions: dict[str, int] = {}  # of the hostile worker, by name, until it is refused
+        self.nonces = itertools.count(10)
+        self.in_session = 0  # messages that it said in a session of its own
+
+    def poll(self, timeout_s: float) -> bool:
+        return bool(self.sayings) or super().poll(timeout_s)
+
+    def receive(self) -> Iterator[tuple[bytes, ToLearner]]:
+        yield from super().receive()
+        while self.sayings:
+            name, frames = self.sayings.pop(0)
+            if name not in self.sessions:
+                yield name.encode(), Hello(PROTOCOL_VERSION, name, "host", 1, next(self.nonces), "fake", 1)
+            session = self.sessions.get(name, 0)
+            self.in_session += session > 0
+            try:
+                message = decode_to_learner(of_session(frames, session), rollout_bytes(RUN))
+            except BadMessage as error:
+                yield name.encode(), cast(ToLearner, error)
+            else:
+                yield name.encode(), cast(ToLearner, message)
+
+    def send(self, peer: bytes, frames: Sequence[Buffer]) -> bool:
+        name = peer.decode()
+        if not name.startswith(HOSTILE):
+            self.told.append((peer, decode_to_worker(frames)))
+            return True
+        try:
+            match decode_to_worker(frames):
+                case Welcome(session):
+                    self.sessions[name] = session
+                case Refuse() | Rejoin():
+                    self.sessions.pop(name, None)
+                case _:
+                    pass
+        except BadMessage:
+            self.observed.append(as_table(decode_to_observer(frames)))
+        return True
+
+    def says(self, frames: list[bytes], name: str = HOSTILE) -> None:
+        """The hostile worker says this, as bytes, in its session; it joins first if it is no member."""
+        self.sayings.append((name, frames))
+
+
+class Honest:
+    """A worker of a run, without faults."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.session, self.version, self.sent = 0, -1, 0
+        self.permits: list[tuple[int, int]] = []
+
+    def hears(self, message: ToWorker) -> None:
+        match message:
+            case Welcome(session):
+                self.session = session
+            case Weights(version):
+                self.version = version
+            case Collect(_, _, permits):
+                self.permits += [(permit.ticket, permit.lane) for permit in permits]
+            case _:
+                pass
+
+    def says(self) -> Iterator[ToLearner]:
+        if not self.session:
+            yield Hello(PROTOCOL_VERSION, self.name, "host", 1, 1, "fake", 1)
+            return
+        yield Heartbeat(self.session, 0, self.version, tuple(ticket for ticket, _ in self.permits), self.sent, {}, 0)
+        if self.permits:
+            ticket, lane = self.permits.pop(0)
+            yield fake_rollout(self.session, lane, ticket, self.version, self.sent)
+            self.sent += 1
+
+
+Say = Callable[[Conversation, int], None]
+
+
+def used(turns: int, say: Say) -> list[tuple[int, int, int, int, int]]:
+    """Lane, ticket, version, sequence and incarnation of each rollout that an update used, in order."""
+    link = Conversation()
+    coordinator = TicketCoordinator(RUN, rollouts_per_update=LANES, max_lag=1, worker_timeout_s=3.0, first_session=1)
+    settings = HubSettings(60.0, 600.0, max_env_failures=0)
+    hub = Hub(cast(LearnerLink, link), coordinator, settings, clock=lambda: link.now)
+    honest = [Honest(f"w{number}") for number in range(LANES)]
+    found = []
+    for turn in range(turns):
+        if turn == 2:
+            hub.publish(0, PARAMETERS, BUFFERS)
+        if turn > 2:  # every lane has its owner
+            say(link, turn)
+        link.inbox += [(worker.name.encode(), message) for worker in honest for message in worker.says()]
+        while link.inbox or link.sayings:
+            hub._turn(0.0)
+        taken = coordinator.take() if turn > 2 else None
+        if taken is not None:
+            found += [
+                (r.rollout.lane, r.rollout.ticket, r.rollout.version, r.rollout.sequence, r.incarnation) for r in taken
+            ]
+            hub.publish(coordinator.version + 1, PARAMETERS, BUFFERS)
+        for peer, message in link.told:
+            next(worker for worker in honest if worker.name.encode() == peer).hears(message)
+        link.told.clear()
+        link.now += TURN_S
+    assert hub._server.unexpected_errors == 0
+    ledger = coordinator.ledger
+    assert ledger.issued == ledger.used + ledger.outstanding + ledger.stale + ledger.lost
+    assert ledger.lost == 0
+    assert not any(MARK in text for text in link.observed)
+    return found
+
+
+def answers(turns: int, say: Say) -> list[bytes]:
+    """The observations that a vector environment of two lanes got, in order."""
+    link = Conversation()
+    hub = StepHub(cast(LearnerLink, link), SPEC, first_session=1, worker_timeout_s=3.0, clock=lambda: link.now)
+    orders: list[tuple[bytes, Order]] = []
+    found: list[bytes] = []
+    wait = link.poll
+
+    def poll(timeout_s: float) -> bool:
+        for peer, message in link.told:
+            if isinstance(message, Step):
+                orders.append((peer, message))
+        link.told.clear()
+        if not link.inbox and not link.sayings and orders:
+            peer, order = orders.pop(0)
+            obs = np.full((1, 2), 100 * order.lane + len(found), np.float32)
+            link.inbox.append((peer, msgspec.structs.replace(cast(Stepped, stepped(order)), obs=(obs,))))
+        return wait(timeout_s)
+
+    link.poll = poll  # type: ignore[method-assign]
+    for name in ("w0", "w1"):
+        link.inbox.append((name.encode(), Hello(PROTOCOL_VERSION, name, "host", 1, 1, "fake", 1)))
+    hub.wait_for(2, 5.0)
+    for turn in range(turns):
+        for number in (0, 1):
+            session = hub._coordinator.members[b"w%d" % number].session
+            link.inbox.append((b"w%d" % number, Heartbeat(session, 0, 0, tuple(hub._coordinator.orders), 0, {}, 0)))
+        if turn:
+            say(link, turn)
+        hub.send_orders(dict.fromkeys((0, 1), step))
+        got = hub.wait_for_answers(30.0)
+        assert sorted(got) == [0, 1], hub.take_lost()
+        found += [cast(Stepped, got[lane]).obs[0].tobytes() for lane in (0, 1)]
+    assert hub._server.unexpected_errors == 0
+    return found
+
+
+def silent(link: Conversation, turn: int) -> None:
+    """No hostile worker."""
+
+
+def all_of(batch: int) -> Say:
+    """In each turn the next so many sayings."""
+
+    def say(link: Conversation, turn: int) -> None:
+        for frames in sayings()[(turn - 3) * batch : (turn - 2) * batch]:
+            link.says(frames)
+
+    return say
+
+
+def remembering(say: Say, links: list[Conversation]) -> Say:
+    """The same, and the link on which it was said."""
+
+    def remember(link: Conversation, turn: int) -> None:
+        links.append(link)
+        say(link, turn)
+
+    return remember
+
+
+BATCH = 12
+
+
+def test_every_field_at_extreme_values_changes_no_rollout_that_is_used() -> None:
+    turns = 3 + len(sayings()) // BATCH + 1
+    expected = used(turns, silent)
+    assert len(expected) > 500
+    said: list[Conversation] = []
+    assert used(turns, remembering(all_of(BATCH), said)) == expected
+    assert said[0].in_session > 0.9 * len(sayings())
+
+
+def test_every_field_at_extreme_values_changes_no_answer_of_a_vector_environment() -> None:
+    turns = 3 + len(sayings()) // BATCH + 1
+    said: list[Conversation] = []
+    assert answers(turns, remembering(all_of(BATCH), said)) == answers(turns, silent)
+    assert said[0].in_session > 0.9 * len(sayings())
+
+
+FLOODS: list[Callable[[int], list[ToLearner | Inquire]]] = [
+    lambda nonce: [Hello(PROTOCOL_VERSION, HOSTILE, "h" * 1_000, 2**31, nonce, "s", 1)],
+    lambda nonce: [Goodbye(SESSION, "x" * 1_000, (0, 1))],
+    lambda nonce: [Heartbeat(SESSION, 2**53, 2**53, tuple(range(1_000)), 2**53, {"step": 1e9}, 2**53)],
+    lambda nonce: [Failure(SESSION, "boom", "t" * 64_000, nonce % 3)],
+    lambda nonce: [Inquire()],
+    lambda nonce: [Alive((), ())],
+    lambda nonce: [fake_rollout(SESSION, nonce % 2, nonce, nonce % 5, nonce)],
+]
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            st.integers(4, 40),
+            st.one_of(st.integers(0, 4_999), st.sampled_from(range(-len(FLOODS), 0))),
+            st.integers(1, 20),
+            st.booleans(),
+        ),
+        max_size=40,
+    ),
+    st.sampled_from([used, answers]),
+)
+def test_whatever_it_says_when_and_however_often_changes_nothing(
+    script: list[tuple[int, int, int, bool]], play: Callable[[int, Say], object]
+) -> None:
+    """`script`: at which turn it says what, how often, and whether under a new name."""
+
+    def say(link: Conversation, turn: int) -> None:
+        for at, what, times, renamed in script:
+            for time in range(times if at == turn else 0):
+                frames = sayings()[what] if what >= 0 else None
+                flood = FLOODS[what](next(link.nonces)) if frames is None else []
+                said = [frames] if frames is not None else [[bytes(frame) for frame in encode(one)] for one in flood]
+                for one in said:
+                    link.says(one, f"{HOSTILE}{turn}.{time}" if renamed else HOSTILE)
+
+    assert play(44, say) == play(44, silent)
+
+
+def test_fuzzed_bytes_change_nothing() -> None:
+    def say(link: Conversation, turn: int) -> None:
+        for _ in range(10):
+            link.says(next(fuzzed))
+
+    for play in (used, answers):
+        fuzzed = hostile(5, real(fake_rollout(SESSION, 0, 1, 0, 0)))
+        assert play(100, say) == play(100, silent)
+
+
+def test_the_sayings_reach_every_field_and_some_of_every_kind_are_understood() -> None:
+    understood: dict[type, int] = {}
+    refusals = []
+    for frames in sayings():
+        try:
+            message = decode_to_learner(of_session(frames, 5), rollout_bytes(RUN))
+        except BadMessage as error:
+            refusals.append(str(error))
+            continue
+        understood[type(message)] = understood.get(type(message), 0) + 1
+    assert all(text.isprintable() and len(text) <= 500 for text in refusals)
+    assert set(understood) | {Inquire} == {type(message) for message in real(fake_rollout(7, 0, 1, 0, 0))}
+    assert min(understood.values()) > 20
+    assert understood[Rollout] > 300
