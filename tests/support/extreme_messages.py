@@ -197,8 +197,8 @@ def _arrays(message: Any) -> Iterator[Any]:
 def _other_arrays(array: np.ndarray[Any, Any]) -> Iterator[np.ndarray[Any, Any]]:
     for dtype in DTYPES.values():
         yield array.astype(dtype)
-    for dtype, values in ((np.float32, (math.nan, math.inf, 3e38)), (np.int64, (-(2**63), 2**63 - 1)), (np.uint8, (255,))):
-        yield from (np.full(array.shape, one, dtype) for one in values)
+    for name, values in (("<f4", (math.nan, math.inf, 3e38)), ("<i8", (-(2**63), 2**63 - 1)), ("|u1", (255,))):
+        yield from (np.full(array.shape, one, name) for one in values)
     if array.dtype == bool:
         yield np.full(array.shape, 255, np.uint8).view(bool)
         yield ~array

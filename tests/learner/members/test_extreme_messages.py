@@ -10,6 +10,7 @@ import itertools
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
+from itertools import product
 from typing import cast
 
 import msgspec
@@ -222,7 +223,7 @@ def answers(turns: int, say: Say) -> list[bytes]:
         hub.send_orders(dict.fromkeys((0, 1), step))
         got = hub.wait_for_answers(30.0)
         assert sorted(got) == [0, 1], hub.take_lost()
-        found += [cast(Stepped, got[lane]).obs[0].tobytes() for lane in (0, 1)]
+        found += [got[lane].obs[0].tobytes() for lane in (0, 1)]
     assert hub._server.unexpected_errors == 0
     return found
 
@@ -309,6 +310,21 @@ def test_whatever_it_says_when_and_however_often_changes_nothing(
                     link.says(one, f"{HOSTILE}{turn}.{time}" if renamed else HOSTILE)
 
     assert play(44, say) == play(44, silent)
+
+
+def test_rollouts_on_tickets_that_others_hold_change_nothing() -> None:
+    def say(link: Conversation, turn: int) -> None:
+        for ticket, back, version in product(range(2 * turn - 8, 2 * turn + 2), range(3, 6), range(turn - 5, turn - 2)):
+            link.says(
+                [
+                    bytes(frame)
+                    for frame in encode(
+                        fake_rollout(SESSION, ticket % 2, max(0, ticket), max(0, version), max(0, turn - back))
+                    )
+                ]
+            )
+
+    assert used(30, say) == used(30, silent)
 
 
 def test_fuzzed_bytes_change_nothing() -> None:
