@@ -207,7 +207,7 @@ def answers(turns: int, say: Say) -> list[bytes]:
         if not link.inbox and not link.sayings and orders:
             peer, order = orders.pop(0)
             obs = np.full((1, 2), 100 * order.lane + len(found), np.float32)
-            link.inbox.append((peer, msgspec.structs.replace(cast(Stepped, stepped(order)), obs=(obs,))))
+            link.inbox.append((peer, msgspec.structs.replace(stepped(order), obs=(obs,))))
         return wait(timeout_s)
 
     link.poll = poll  # type: ignore[method-assign]
@@ -223,7 +223,7 @@ def answers(turns: int, say: Say) -> list[bytes]:
         hub.send_orders(dict.fromkeys((0, 1), step))
         got = hub.wait_for_answers(30.0)
         assert sorted(got) == [0, 1], hub.take_lost()
-        found += [got[lane].obs[0].tobytes() for lane in (0, 1)]
+        found += [answer.obs[0].tobytes() for _, answer in sorted(got.items()) if isinstance(answer, Stepped)]
     assert hub._server.unexpected_errors == 0
     return found
 
@@ -314,17 +314,11 @@ def test_whatever_it_says_when_and_however_often_changes_nothing(
 
 def test_rollouts_on_tickets_that_others_hold_change_nothing() -> None:
     def say(link: Conversation, turn: int) -> None:
-        for ticket, back, version in product(range(2 * turn - 8, 2 * turn + 2), range(3, 6), range(turn - 5, turn - 2)):
-            link.says(
-                [
-                    bytes(frame)
-                    for frame in encode(
-                        fake_rollout(SESSION, ticket % 2, max(0, ticket), max(0, version), max(0, turn - back))
-                    )
-                ]
-            )
+        for ticket, back, version in product(range(2 * turn - 8, 2 * turn + 2), range(1, 5), range(turn - 5, turn - 2)):
+            taken = fake_rollout(SESSION, ticket % 2, max(0, ticket), max(0, version), max(0, turn - back))
+            link.says([bytes(frame) for frame in encode(taken)])
 
-    assert used(30, say) == used(30, silent)
+    assert used(15, say) == used(15, silent)
 
 
 def test_fuzzed_bytes_change_nothing() -> None:
