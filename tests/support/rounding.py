@@ -1,17 +1,14 @@
 """How far two float32 computations of the same outputs or the same gradient may differ, on any processor.
 
-The tolerances are derived, not tuned. A sum of products whose terms pass through n roundings differs from the exact sum by
-at most g(n) times the sum of the absolute values of its terms, with
-
-    g(n) = exp(4 √n u + n u² / (1 - u)) - 1,    u = 2^-24 in float32
-
-except with a probability of 2 exp(-8) for each n (Higham and Mary 2019, "A new approach to probabilistic rounding error
-analysis", theorem 2.4 with λ = 4). The order of the sum, and so the processor and its kernels, makes no difference.
+The tolerances are derived, not tuned. Each rounding of a sum changes it by at most u s, where u = 2^-24 in float32 and s is
+the sum of the absolute values of its terms. Roundings are taken as independent with mean 0. So n of them change the sum by at
+most λ √n u s, except with a probability of 2 exp(-λ²/2) (Higham and Mary 2019, "A new approach to probabilistic rounding
+error analysis", theorem 2.4; terms in u² are left out). Here λ is 4. The order of the sum, and so the processor and its
+kernels, makes no difference.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -26,11 +23,6 @@ from protocol.specs import PolicySpec
 
 UNIT = 2.0**-24
 ELEMENTWISE = 16  # roundings that an activation, a softmax or a log-probability adds
-
-
-def growth(roundings: int) -> float:
-    """g(n) for float32."""
-    return math.expm1(4 * math.sqrt(roundings) * UNIT + roundings * UNIT**2 / (1 - UNIT))
 
 
 class Forward(NamedTuple):
@@ -70,10 +62,10 @@ def forward_tolerance(layers: Sequence[tuple[Array, Array]], x: Array, relu: boo
     """How far two float32 forward passes of the same MLP may differ, [B, outputs].
 
     `layers`: weight [out, in] and bias [out] of each layer, the last one linear; `x` [B, in]. A unit is a sum of n = in + 1
-    terms. Each of its n roundings is at most u s with s = |h| |W|ᵀ + |b|, and roundings are independent (as in `growth`). So
+    terms. Each of its n roundings is at most u s with s = |h| |W|ᵀ + |b|, and roundings are independent. So
     a layer adds a variance of at most n (u s)², and its weights carry over the variance v of its input: v W²ᵀ. tanh and ReLU
     do not enlarge an error, and add ELEMENTWISE roundings. The difference of two passes has twice the variance. The result
-    is 4 standard deviations (λ in `growth`) of this bound, which is itself several times the true deviation.
+    is 4 standard deviations (λ above) of this bound, which is itself several times the true deviation.
 
     A test in `test_fused` shows that the loss of a single term exceeds it.
     """
@@ -311,6 +303,12 @@ def q_gradient_tolerance(
     return tolerance_of(len(by_top) * variances)
 
 
+def value_tolerance(net: ActorCriticNetwork, x: Array) -> Array:
+    """How far two float32 computations of the values [B] of features [B, D] may differ."""
+    names = [*hidden_names(net.spec, "" if net.spec.shared_net else "critic"), "critic.out"]
+    return forward_tolerance(network_layers(net.parameters, names), x, net.spec.activation == "relu")[:, 0]
+
+
 def by_value_variance(net: ActorCriticNetwork, x: Array, by_value: Array, slope: float) -> Array:
     """The variance of the errors of the gradient by value [B], where it is `slope` times the value less its target."""
     names = [*hidden_names(net.spec, "" if net.spec.shared_net else "critic"), "critic.out"]
@@ -323,48 +321,3 @@ def assert_within(found: Array, expected: Array, tolerance: Array) -> None:
     off = np.abs(np.asarray(found, np.float64) - np.asarray(expected, np.float64))
     assert off.shape == tolerance.shape
     assert (off <= tolerance).all(), f"{off.max():.3g} off, {tolerance.flat[int(np.argmax(off - tolerance))]:.3g} allowed"
-
-
-def sums_of_absolute_values(
-    spec: PolicySpec, flat: Array, x: Array, action: Array, by_outputs: tuple[Array, Array, Array]
-) -> tuple[Array, int]:
-    """What the gradient of each parameter [P] of a tanh actor-critic is a sum of, and how many roundings a term passes.
-
-    `flat` [P], `x` [B, D] and `by_outputs` (gradients by log-probability, entropy and value, [B] each) are float64. A
-    backward pass over absolute values gives the sums. The policy has no shared trunk.
-    """
-    fields = sum(parameter_layout(spec), ())
-    weights, found = named_views(flat, fields), np.zeros(total_size(fields))
-    grads = named_views(found, fields)
-    by_log_prob, by_entropy, by_value = map(np.abs, by_outputs)
-
-    def trunk(names: list[str]) -> list[Array]:
-        """The input of each layer, and the output of the last."""
-        inputs = [x]
-        for name in names:
-            inputs.append(np.tanh(inputs[-1] @ weights[f"{name}.weight"].T + weights[f"{name}.bias"]))
-        return inputs
-
-    def back(names: list[str], inputs: list[Array], by_out: Array) -> None:
-        """Sums of absolute values: `by_out` [B, outputs] of the last of these layers, which is linear."""
-        for i, name in reversed(list(enumerate(names))):
-            grads[f"{name}.weight"][:] = by_out.T @ np.abs(inputs[i])
-            grads[f"{name}.bias"][:] = by_out.sum(0)
-            by_out = by_out @ np.abs(weights[f"{name}.weight"]) * (1 - inputs[i] ** 2)
-
-    acting, judging = hidden_names(spec), hidden_names(spec, "critic")
-    inputs = trunk(acting)
-    out = inputs[-1] @ weights["actor.out.weight"].T + weights["actor.out.bias"]
-    log_std = weights.get("actor.log_std")
-    params = out if log_std is None else np.concatenate([out, np.broadcast_to(log_std, out.shape)], -1)
-    leaf = torch.tensor(params, requires_grad=True)
-    log_prob, entropy = log_prob_and_entropy(spec.action, leaf, torch.tensor(action))
-    slopes = [torch.autograd.grad(each.sum(), leaf, retain_graph=True, allow_unused=True)[0] for each in (log_prob, entropy)]
-    of_log_prob, of_entropy = (np.zeros_like(params) if slope is None else slope.abs().numpy() for slope in slopes)
-    by_params = by_log_prob[:, None] * of_log_prob + by_entropy[:, None] * of_entropy
-    if log_std is not None:
-        grads["actor.log_std"][:] = by_params[:, out.shape[1] :].sum(0)
-    back([*acting, "actor.out"], inputs, by_params[:, : out.shape[1]])
-    back([*judging, "critic.out"], trunk(judging), by_value[:, None])
-    roundings = len(x) + 2 * (x.shape[1] + sum(spec.net)) + ELEMENTWISE * (2 + len(spec.net))
-    return found, roundings

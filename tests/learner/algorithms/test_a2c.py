@@ -17,7 +17,9 @@ from learner.algorithms.returns import EpisodeEnds, gae
 from learner.config.hyperparameters import A2CConfig, PPOConfig, REINFORCEConfig
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
+from tests.learner.algorithms.test_returns import Rows, gae_tolerance
 from tests.support.batches import DISCRETE, GAUSSIAN, batch, no_pulse, normal, shared
+from tests.support.steps import Errors, only_step
 
 FREE: dict[str, Any] = {"max_grad_norm": 1e9, "gamma": 0.9, "ent_coef": 0.01, "normalize_rewards": False}
 
@@ -71,15 +73,7 @@ def test_its_gradient_is_that_of_ppos_first_minibatch(spec: PolicySpec, normaliz
     one, other = a2c(spec, **settings), ppo(spec, **settings)
     assert torch.equal(one.net.flat, other.net.flat)
     rows = batch(one, 0)
-    one.update(rows, no_pulse)
-    other.update(rows, no_pulse)
-    assert one.net.flat_grad.norm() > 0.01
-    torch.testing.assert_close(one.net.flat_grad, other.net.flat_grad, atol=1e-5, rtol=1e-3)
-
-
-def of_the_actor(algorithm: A2C | REINFORCE, rows: Batch) -> torch.Tensor:
-    algorithm.update(rows, no_pulse)
-    return algorithm.net.flat_grad[: algorithm.net.acting_size].clone()
+    only_step(one, rows).assert_is(only_step(other, rows).gradient)
 
 
 def constant_critic(algorithm: A2C | REINFORCE, value: float) -> None:
@@ -92,9 +86,7 @@ def test_with_lambda_1_no_bootstrap_and_values_of_0_its_gradient_is_reinforces()
     one, other = a2c(**FREE, gae_lambda=1.0), reinforce(**FREE, baseline=False, normalize_returns=False)
     constant_critic(one, 0.0)
     rows = whole(batch(one, 0))
-    found = of_the_actor(one, rows)
-    assert found.norm() > 0.01
-    torch.testing.assert_close(found, of_the_actor(other, rows), atol=1e-6, rtol=1e-4)
+    only_step(one, rows).assert_is(only_step(other, rows).gradient, slice(one.net.acting_size))
 
 
 @pytest.mark.parametrize("value", [0.0, 3.0])
@@ -103,16 +95,16 @@ def test_a_constant_baseline_is_the_same_in_both(value: float) -> None:
     for each in (one, other):
         constant_critic(each, value)
     rows = whole(batch(one, 0))
-    for each in (one, other):
-        each.update(rows, no_pulse)
-    torch.testing.assert_close(one.net.flat_grad, other.net.flat_grad, atol=1e-6, rtol=1e-4)
+    only_step(one, rows).assert_is(only_step(other, rows).gradient)
 
 
 def test_a_constant_baseline_changes_nothing_that_is_normalized() -> None:
     one, other = a2c(**FREE, normalize_advantage=True), reinforce(**FREE, baseline=False)
     constant_critic(one, 5.0)
     rows = whole(batch(one, 0))
-    torch.testing.assert_close(of_the_actor(one, rows), of_the_actor(other, rows), atol=1e-5, rtol=1e-3)
+    returns = Rows(rows.reward, np.full((len(rows.reward) + 1, rows.reward.shape[1]), 5.0), *EpisodeEnds.of(rows))
+    errors = Errors(advantage=2 * float(gae_tolerance(returns, FREE["gamma"], 1.0).max()))
+    only_step(one, rows, errors).assert_is(only_step(other, rows).gradient, slice(one.net.acting_size))
 
 
 def test_rewards_are_scaled_when_they_are_to_be() -> None:

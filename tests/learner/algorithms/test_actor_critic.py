@@ -34,7 +34,8 @@ from tests.support.batches import (
     normal,
     shared,
 )
-from tests.support.rounding import actor_critic_tolerance, assert_within, by_value_variance
+from tests.support.rounding import assert_within
+from tests.support.steps import gradient_tolerance, usual_rows
 
 NAMES = ["a2c", "impala", "reinforce"]
 Any3 = A2C | Impala | REINFORCE
@@ -180,33 +181,16 @@ def test_a_loss_that_is_not_finite_is_named_and_stops_before_the_weights(name: s
 @pytest.mark.parametrize("spec", [DISCRETE, GAUSSIAN, shared(DISCRETE), shared(GAUSSIAN)])
 @pytest.mark.parametrize("critic", [True, False])
 def test_a_step_follows_the_gradient_of_the_usual_loss(spec: PolicySpec, critic: bool) -> None:
-    algorithm, generator = (
-        make("a2c", spec, vf_coef=0.7 if critic else 0.0, ent_coef=0.3, max_grad_norm=1e9),
-        torch.Generator().manual_seed(0),
-    )
-    x, advantage, target = (torch.randn(s, generator=generator) for s in [(30, 4), (30,), (30,)])
-    params, value = algorithm.net.forward(x)
-    if spec.action.kind == "discrete":
-        usual: Any = torch.distributions.Categorical(logits=params)
-        action = torch.randint(4, (30,), generator=generator)
-    else:
-        usual = torch.distributions.Independent(torch.distributions.Normal(params[:, :2], params[:, 2:].exp()), 1)
-        action = torch.randn((30, 2), generator=generator)
+    algorithm = make("a2c", spec, vf_coef=0.7 if critic else 0.0, ent_coef=0.3, max_grad_norm=1e9)
+    x, action, advantage, target, usual, value = usual_rows(algorithm)
     policy_loss = -(usual.log_prob(action) * advantage).mean()
     value_loss = (value - target).square().mean() if critic else torch.zeros(())
     (policy_loss + 0.7 * value_loss - 0.3 * usual.entropy().mean()).backward()
     expected = algorithm.net.flat_grad.clone()
-    by_value = (1.4 if critic else 0.0) / 30 * (value - target).detach().numpy()
-    allowed = actor_critic_tolerance(
-        spec,
-        algorithm.net.flat.numpy(),
-        x.numpy(),
-        action.numpy(),
-        [-advantage.numpy() / 30, np.full(30, -0.3 / 30), by_value],
-        by_value_variance=by_value_variance(algorithm.net, x.numpy(), by_value, 1.4 / 30 if critic else 0.0),
-    )
-    measured = algorithm.step(Minibatch(x, (), action, advantage, advantage, target))
-    assert_within(algorithm.net.flat_grad.numpy(), expected.numpy(), allowed.gradient)
+    rows = Minibatch(x, (), action, advantage, advantage, target)
+    allowed = gradient_tolerance(algorithm, rows)
+    measured = algorithm.step(rows)
+    assert_within(algorithm.net.flat_grad.numpy(), expected.numpy(), allowed)
     assert measured["policy_gradient_loss"] == pytest.approx(policy_loss.item(), rel=1e-4)
 
 

@@ -1,4 +1,4 @@
-"""The update without a graph is the update with one: outputs, gradients, losses, a thousand steps; and when it is chosen."""
+"""The update without a graph is the update with one: outputs, gradients, losses, each step; and when it is chosen."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from learner.algorithms.minibatches import Minibatch
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
 from protocol.arrays import Array
-from protocol.policy.layout import hidden_names, parameter_layout, total_size
+from protocol.policy.layout import parameter_layout, total_size
 from protocol.policy.networks import ActorCriticNetwork
 from protocol.policy.torch_distributions import log_prob_and_entropy
 from protocol.specs import ActionSpec, Leaf, PolicySpec
@@ -33,11 +33,9 @@ from tests.support.finite_differences import is_the_slope
 from tests.support.rounding import (
     actor_critic_tolerance,
     assert_within,
-    forward_tolerance,
-    growth,
-    network_layers,
-    sums_of_absolute_values,
+    value_tolerance,
 )
+from tests.support.steps import gradient_tolerance
 
 BOX = (Leaf("", "box", (4,), "float32"),)
 
@@ -87,18 +85,12 @@ def test_so_they_are_at_the_sizes_that_are_used(rows: int, shared_net: bool) -> 
     outputs_and_gradients(PolicySpec(BOX, ACTIONS["discrete"], (64, 64), shared_net=shared_net), rows, 0)
 
 
-def value_tolerance(spec: PolicySpec, net: ActorCriticNetwork, x: Array) -> Array:
-    """How far two ways to compute the values [B] of these features may differ."""
-    names = [*hidden_names(spec, "" if spec.shared_net else "critic"), "critic.out"]
-    return forward_tolerance(network_layers(net.parameters, names), x, spec.activation == "relu")[:, 0]
-
-
 def test_the_tolerance_of_values_is_exceeded_if_a_single_term_is_lost() -> None:
     for net_size in ((), (5,), (64, 64)):
         spec = PolicySpec(BOX, ACTIONS["discrete"], net_size)
         net, fused = make(spec, 0)
         x = np.random.default_rng(0).normal(size=(64, 4)).astype(np.float32)
-        before, tolerance = fused.value(x).copy(), value_tolerance(spec, net, x)
+        before, tolerance = fused.value(x).copy(), value_tolerance(net, x)
         for name in [name for name in net.parameters if name.startswith("critic") and name.endswith("weight")]:
             with torch.no_grad():
                 lost = net.parameters[name][0, -1].clone()
@@ -114,7 +106,7 @@ def outputs_and_gradients(spec: PolicySpec, rows: int, seed: int) -> None:
     params, value = with_graph.forward(torch.tensor(x))
     expected = (*log_prob_and_entropy(spec.action, params, torch.tensor(taken)), value)
     found = fused.forward(x, taken)
-    tolerance = value_tolerance(spec, with_graph, x)
+    tolerance = value_tolerance(with_graph, x)
     assert_within(fused.value(x), found[2], tolerance)
     assert_within(found[2], value.detach().numpy(), tolerance)
     given_back = [generator.normal(size=rows).astype(np.float32) for _ in range(3)]
@@ -203,20 +195,20 @@ def test_in_float32_it_is_as_near_to_float64_as_rounding_allows(action: str, row
     fused.forward(x, taken)
     fused.backward(*given_back)
     flat = with_graph.flat.numpy().astype(np.float64)
-    truth = np.empty_like(flat)
-    exact = FusedActorCritic(spec, flat, truth)
-    exact.forward(x.astype(np.float64), taken)
-    by_outputs = [each.astype(np.float64) for each in given_back]
-    exact.backward(*(each.copy() for each in by_outputs))
-    first, second, third = by_outputs
-    terms, roundings = sums_of_absolute_values(spec, flat, x.astype(np.float64), taken, (first, second, third))
-    allowed = terms * growth(roundings)
-    assert (np.abs(truth) <= terms).all()
-    assert growth(roundings) < 0.1 / rows  # a tenth of what an average row adds would show
+    gradient = np.empty_like(flat)
+    exact = FusedActorCritic(spec, flat, gradient)
+
+    def truth(by_outputs: list[Array]) -> Array:
+        exact.forward(x.astype(np.float64), taken)
+        exact.backward(*(each.astype(np.float64) for each in by_outputs))
+        return gradient.copy()
+
+    expected = truth(given_back)
+    allowed = actor_critic_tolerance(spec, with_graph.flat.numpy(), x, taken, given_back).gradient
     for found in (with_graph.flat_grad.numpy(), autograds):
-        off = np.abs(found - truth)
-        worst = int(np.argmax(off / allowed))
-        assert (off <= allowed).all(), f"parameter {worst}: {off[worst]:.3g} off, {allowed[worst]:.3g} allowed"
+        assert_within(found, expected, allowed)
+    without_a_row = [np.where(np.arange(rows) == 7, 0, each) for each in given_back]
+    assert (np.abs(truth(without_a_row) - expected) > allowed).mean() > 0.9  # the loss of a single row would show
 
 
 SETTINGS: list[tuple[str, dict[str, Any]]] = [
@@ -231,42 +223,38 @@ SETTINGS: list[tuple[str, dict[str, Any]]] = [
 
 @pytest.mark.parametrize("spec", [DISCRETE, normal(GAUSSIAN)], ids=["discrete", "gaussian"])
 @pytest.mark.parametrize(("name", "changes"), SETTINGS)
-def test_an_update_is_the_same_by_kernels_by_hand_derived_gradients_and_by_autograd(
+def test_every_gradient_is_the_same_by_kernels_by_hand_derived_gradients_and_by_autograd(
     name: str, changes: dict[str, Any], spec: PolicySpec, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """In each step of three updates, with the weights and the minibatch of that step: errors do not add up."""
     config = msgspec.convert(changes, HYPERPARAMETERS[name])
     spec = shared(spec) if config.shared_net else spec  # type: ignore[attr-defined]
-    found: list[tuple[Array, dict[str, float]]] = []
     built_in: Any = algorithm_class(name)
     of_its_own_loss: Any = type("OfItsOwnLoss", (built_in,), {"loss": built_in.loss})
-    for algorithm_type, most in ((built_in, 512), (built_in, 0), (of_its_own_loss, 512)):
-        monkeypatch.setattr("learner.algorithms.actor_critic.MAX_ROWS", most)
-        algorithm = algorithm_type(config, spec, total_steps=1_000, seed=0)
-        assert algorithm._hand_derived == (algorithm_type is built_in)
-        for seed in range(3):
-            metrics = algorithm.update(batch(algorithm, seed, fresh=seed == 0), no_pulse)
-        found.append((algorithm.net.flat.numpy().copy(), metrics))
-    for flat, metrics in found[1:]:
-        np.testing.assert_allclose(flat, found[0][0], atol=2e-5)
-        assert metrics == pytest.approx(found[0][1], rel=1e-3, abs=1e-4, nan_ok=True)
+    algorithm, *others = (kind(config, spec, total_steps=1_000, seed=0) for kind in (built_in, built_in, of_its_own_loss))
+    assert [each._hand_derived for each in others] == [True, False]
+    step, steps = algorithm.step, 0
 
+    def checked_step(minibatch: Minibatch) -> dict[str, float]:
+        nonlocal steps
+        steps += 1
+        assert isinstance(minibatch.features, np.ndarray)
+        tolerance = gradient_tolerance(algorithm, minibatch)
+        expected = algorithm._gradient(algorithm.evaluate(minibatch))
+        in_torch = Minibatch(*(torch.from_numpy(part) if len(part) else () for part in minibatch[:6]))  # type: ignore[arg-type]
+        for other in others:
+            other.net.flat.copy_(algorithm.net.flat)
+            other.env_steps = algorithm.env_steps
+            other.set_schedules()
+            metrics = other._gradient(other.evaluate(in_torch))
+            assert_within(other.net.flat_grad.numpy(), algorithm.net.flat_grad.numpy(), tolerance)
+            assert {each: metrics[each] for each in expected} == pytest.approx(expected, rel=1e-3, abs=1e-4)
+        return step(minibatch)  # type: ignore[no-any-return]
 
-def test_a_thousand_steps_stay_together() -> None:
-    """Two copies of the same policy, one with the graph and one without, on the same minibatches."""
-    generator = np.random.default_rng(0)
-    config = PPOConfig(ent_coef=0.01)
-    spec = PolicySpec(BOX, ACTIONS["discrete"])
-    one, other = (PPO(config, spec, total_steps=1, seed=0) for _ in range(2))
-    for _ in range(1_000):
-        x = generator.normal(size=(64, 4)).astype(np.float32)
-        action = (x[:, 0] > 0) + 2 * (x[:, 1] > 0)
-        target, advantage = x.sum(-1), generator.normal(size=64).astype(np.float32)
-        rows = Minibatch(x, (), action, np.full(64, -1.386, np.float32), advantage, target)
-        first = one.step(rows)
-        tensors: list[Any] = [torch.tensor(part) if len(part) else () for part in rows[:6]]
-        second = other.step(Minibatch(*tensors))
-    assert float((one.net.flat - other.net.flat).abs().max()) < 1e-3
-    assert first == pytest.approx(second, rel=1e-2, abs=1e-3)
+    monkeypatch.setattr(algorithm, "step", checked_step)
+    for seed in range(3):
+        algorithm.update(batch(algorithm, seed, fresh=seed == 0), no_pulse)
+    assert steps >= 3
 
 
 @pytest.mark.parametrize(
@@ -290,7 +278,7 @@ def test_sizes_of_minibatches_come_and_go(monkeypatch: pytest.MonkeyPatch) -> No
     spec = PolicySpec(BOX, ACTIONS["discrete"], (5,))
     net, fused = make(spec, 0)
     x = np.random.default_rng(0).normal(size=(99, 4)).astype(np.float32)
-    whole, tolerance = fused.value(x).copy(), value_tolerance(spec, net, x)
+    whole, tolerance = fused.value(x).copy(), value_tolerance(net, x)
     for rows in (*range(1, 99), 40, 2):
         assert_within(fused.value(x[:rows]), whole[:rows], tolerance[:rows])
         assert len(fused._critic_mlp._plans) <= 30

@@ -11,11 +11,15 @@ import torch
 from learner.algorithms.a2c import A2C
 from learner.algorithms.impala import Impala
 from learner.algorithms.minibatches import Minibatch
+from learner.algorithms.returns import EpisodeEnds
 from learner.config.hyperparameters import A2CConfig, ImpalaConfig
+from protocol.rollout import Batch
 from protocol.specs import PolicySpec
 from tests.learner.algorithms.test_returns import Rows
-from tests.learner.algorithms.test_vtrace import OffPolicy, slow_vtrace
+from tests.learner.algorithms.test_vtrace import OffPolicy, on_policy, slow_vtrace, vtrace_tolerances
 from tests.support.batches import DISCRETE, GAUSSIAN, batch, identity_batch, no_pulse, normal, shared
+from tests.support.rounding import ELEMENTWISE, UNIT, log_prob_variance, tolerance_of, value_tolerance
+from tests.support.steps import Errors, only_step, usual_distribution
 
 GAMMA = 0.9
 
@@ -29,14 +33,22 @@ def impala(spec: PolicySpec = DISCRETE, seed: int = 0, **settings: Any) -> Impal
 @pytest.mark.parametrize("lam", [1.0, 0.7])
 def test_on_rows_of_the_newest_weights_its_gradient_is_a2cs(spec: PolicySpec, lam: float) -> None:
     config = A2CConfig(gamma=GAMMA, max_grad_norm=1e9, gae_lambda=lam, ent_coef=0.01, normalize_rewards=True)
-    one = impala(spec, vtrace_lambda=lam, ent_coef=0.01, normalize_rewards=True)
+    one, twin = (impala(spec, vtrace_lambda=lam, ent_coef=0.01, normalize_rewards=True) for _ in range(2))
     other = A2C(config, spec, total_steps=10_000, seed=0)
     rows = batch(one, 0)
-    metrics = one.update(rows, no_pulse)
-    other.update(rows, no_pulse)
-    assert metrics["train/rho"] == pytest.approx(1, abs=1e-5)
-    assert one.net.flat_grad.norm() > 0.01
-    torch.testing.assert_close(one.net.flat_grad, other.net.flat_grad, atol=1e-5, rtol=1e-3)
+    returns = Rows(twin.rewards(rows), twin.values(twin.observations(rows), no_pulse), *EpisodeEnds.of(rows))
+    of_log_prob = log_prob_error(one, rows)
+    of_target, of_advantage = vtrace_tolerances(on_policy(returns), GAMMA, lam, log_ratio_error=of_log_prob)
+    step = only_step(one, rows, Errors(advantage=2 * float(of_advantage.max()), target=2 * float(of_target.max())))
+    step.assert_is(only_step(other, rows).gradient)
+    assert abs(step.metrics["train/rho"] - 1) < of_log_prob + (rows.env_steps + ELEMENTWISE) * UNIT
+
+
+def log_prob_error(algorithm: Impala, rows: Batch) -> float:
+    """How far two float32 log-probabilities of the actions of this batch may differ under the algorithm's weights."""
+    x = algorithm.observations(rows).features[: rows.valid.size].numpy()
+    action = rows.action.reshape(len(x), *rows.action.shape[2:])
+    return float(tolerance_of(log_prob_variance(algorithm.policy, algorithm.net.flat.numpy(), x, action)).max())
 
 
 @pytest.mark.parametrize("spec", [DISCRETE, GAUSSIAN])
@@ -47,26 +59,27 @@ def test_on_rows_of_older_weights_it_follows_the_gradient_of_the_papers_loss(spe
         algorithm.net.parameters["actor.out.weight"].mul_(60)  # far from the older policy
     rows = batch(older, 0)
     valid = torch.from_numpy(rows.valid.flatten())
-    params, value = algorithm.net.forward(torch.from_numpy(rows.obs[0]).flatten(0, 1))
-    action = torch.from_numpy(rows.action).flatten(0, 1)
-    params = params[: len(action)]
-    usual: Any
-    if spec is DISCRETE:
-        usual = torch.distributions.Categorical(logits=params)
-    else:
-        usual = torch.distributions.Independent(torch.distributions.Normal(params[:, :2], params[:, 2:].exp()), 1)
+    x, action = torch.from_numpy(rows.obs[0]).flatten(0, 1), torch.from_numpy(rows.action).flatten(0, 1)
+    params, value = algorithm.net.forward(x)
+    usual = usual_distribution(spec, params[: len(action)])
     log_prob = usual.log_prob(action)
     log_ratio = log_prob.detach().numpy().reshape(rows.valid.shape) - rows.log_prob
     values = value.detach().numpy().reshape(len(rows.valid) + 1, -1)
-    o = OffPolicy(Rows(rows.reward, values, rows.terminated, rows.truncated, rows.valid), log_ratio)
-    target, advantage = (torch.from_numpy(each).flatten().float() for each in slow_vtrace(o, GAMMA, 0.8, 1.2, 0.9))
+    bars = GAMMA, 0.8, 1.2, 0.9
+    o = OffPolicy(Rows(rows.reward, values, *EpisodeEnds.of(rows)), log_ratio)
+    target, advantage = (torch.from_numpy(each).flatten().float() for each in slow_vtrace(o, *bars))
     policy_loss = -(log_prob * advantage)[valid].mean()
     value_loss = (value[: len(target)] - target)[valid].square().mean()
     (policy_loss + 0.7 * value_loss - 0.3 * usual.entropy()[valid].mean()).backward()
-    expected = algorithm.net.flat_grad.clone()
-    metrics = algorithm.update(rows, no_pulse)
-    assert metrics["train/rho"] < 0.9
-    torch.testing.assert_close(algorithm.net.flat_grad, expected, atol=1e-4, rtol=1e-3)
+    expected = algorithm.net.flat_grad.numpy().copy()
+    of_sums = vtrace_tolerances(o, *bars, log_ratio_error=log_prob_error(algorithm, rows))
+    # Targets and advantages are linear in the values, and so are their errors.
+    of_values = np.full_like(values, value_tolerance(algorithm.net, x.numpy()).max())
+    of_means = slow_vtrace(o._replace(rows=o.rows._replace(reward=0 * rows.reward, values=of_values)).sizes, *bars)
+    of_target, of_advantage = (float((one + other).max()) for one, other in zip(of_sums, of_means, strict=True))
+    step = only_step(algorithm, rows, Errors(advantage=of_advantage, target=of_target))
+    step.assert_is(expected)
+    assert step.metrics["train/rho"] < 0.9
 
 
 def watch(algorithm: Impala, monkeypatch: pytest.MonkeyPatch) -> list[Minibatch]:

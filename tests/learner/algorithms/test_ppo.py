@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -31,14 +30,8 @@ from tests.support.batches import (
     normal,
     shared,
 )
-from tests.support.rounding import (
-    ELEMENTWISE,
-    UNIT,
-    actor_critic_tolerance,
-    assert_within,
-    by_value_variance,
-    log_prob_variance,
-)
+from tests.support.rounding import ELEMENTWISE, UNIT, assert_within
+from tests.support.steps import Errors, gradient_tolerance, usual_rows
 
 EVERYTHING = PPOConfig(normalize_rewards=True, learning_rate_schedule="linear", clip_range_schedule="linear", n_epochs=3)
 
@@ -253,38 +246,19 @@ def test_the_gradient_is_shortened_to_max_grad_norm() -> None:
 
 @pytest.mark.parametrize("spec", [DISCRETE, GAUSSIAN])
 def test_a_step_follows_the_gradient_of_the_usual_loss(spec: PolicySpec) -> None:
-    config = PPOConfig(vf_coef=0.7, ent_coef=0.3, max_grad_norm=1e9, clip_range=0.1)
-    algorithm, generator = ppo(config, spec), torch.Generator().manual_seed(0)
-    x, advantage, target = (torch.randn(s, generator=generator) for s in [(30, 4), (30,), (30,)])
-    params, value = algorithm.net.forward(x)
-    if spec is DISCRETE:
-        usual: Any = torch.distributions.Categorical(logits=params)
-        action = torch.randint(4, (30,), generator=generator)
-    else:
-        usual = torch.distributions.Independent(torch.distributions.Normal(params[:, :2], params[:, 2:].exp()), 1)
-        action = torch.randn((30, 2), generator=generator)
+    algorithm = ppo(PPOConfig(vf_coef=0.7, ent_coef=0.3, max_grad_norm=1e9, clip_range=0.1), spec)
+    x, action, advantage, target, usual, value = usual_rows(algorithm)
     log_prob = usual.log_prob(action)
-    old = log_prob.detach() + 0.2 * torch.randn(30, generator=generator)
+    old = log_prob.detach() + 0.2 * torch.randn(30, generator=torch.Generator().manual_seed(1))
     ratio = (log_prob - old).exp()
     a = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
     policy_loss = -torch.min(ratio * a, ratio.clamp(0.9, 1.1) * a).mean()
-    by_log_prob = torch.autograd.grad(policy_loss, log_prob, retain_graph=True)[0].numpy()
     (policy_loss + 0.7 * (value - target).square().mean() - 0.3 * usual.entropy().mean()).backward()
     expected = algorithm.net.flat_grad.clone()
-    by_value = 1.4 / 30 * (value - target).detach().numpy()
-    arrays = algorithm.net.flat.numpy(), x.numpy(), action.numpy()
-    # The relative error of a ratio is the absolute error of its log-probability. The mean and the standard deviation of the
-    # advantages are sums of 30 terms, each at most as large as the largest advantage.
-    relative = log_prob_variance(spec, *arrays) + 2 * (30 + ELEMENTWISE) * UNIT**2 * float(a.abs().max()) ** 2
-    allowed = actor_critic_tolerance(
-        spec,
-        *arrays,
-        [by_log_prob, np.full(30, -0.3 / 30), by_value],
-        (np.abs(by_log_prob) + (by_log_prob != 0) / 30) ** 2 * relative,
-        by_value_variance(algorithm.net, x.numpy(), by_value, 1.4 / 30),
-    )
-    measured = algorithm.step(Minibatch(x, (), action, old, advantage, target))
-    assert_within(algorithm.net.flat_grad.numpy(), expected.numpy(), allowed.gradient)
+    rows = Minibatch(x, (), action, old, advantage, target)
+    allowed = gradient_tolerance(algorithm, rows)
+    measured = algorithm.step(rows)
+    assert_within(algorithm.net.flat_grad.numpy(), expected.numpy(), allowed)
     assert measured["clip_fraction"] > 0
     assert measured["policy_gradient_loss"] == pytest.approx(policy_loss.item(), rel=1e-4)
 
@@ -309,31 +283,18 @@ def test_clipped_values_move_less() -> None:
 @pytest.mark.parametrize("before", [-3.0, 0.0, 0.7, 5.0])
 def test_a_step_with_clipped_values_follows_the_gradient_of_the_usual_loss(before: float) -> None:
     """The value before the update is the target less the advantage, which is standardised only afterwards."""
-    algorithm, generator = (
-        ppo(PPOConfig(vf_coef=1.0, max_grad_norm=1e9, clip_range_vf=0.5)),
-        torch.Generator().manual_seed(0),
-    )
-    x, target = torch.randn(30, 4, generator=generator), torch.randn(30, generator=generator)
+    algorithm = ppo(PPOConfig(vf_coef=1.0, max_grad_norm=1e9, clip_range_vf=0.5))
+    x, action, _, target, _, value = usual_rows(algorithm)
     old = torch.full((30,), before)
-    _, value = algorithm.net.forward(x)
     clipped = old + (value - old).clamp(-0.5, 0.5)
     loss = torch.maximum((value - target).square(), (clipped - target).square()).mean()
-    by_value = torch.autograd.grad(loss, value, retain_graph=True)[0].numpy()
     loss.backward()  # type: ignore[no-untyped-call]
     critic = slice(algorithm.net.acting_size, None)
-    expected = algorithm.net.flat_grad.clone()[critic]
-    action, zeros = torch.zeros(30, dtype=torch.int64), torch.zeros(30)
-    allowed = actor_critic_tolerance(
-        DISCRETE,
-        algorithm.net.flat.numpy(),
-        x.numpy(),
-        action.numpy(),
-        [zeros.numpy(), zeros.numpy(), by_value],
-        by_value_variance=(by_value != 0) * by_value_variance(algorithm.net, x.numpy(), by_value, 2 / 30)
-        + (2 / 30 * ELEMENTWISE * UNIT * abs(before)) ** 2,  # the value before is rounded
-    )
-    algorithm.step(Minibatch(x, (), action, zeros, target - old, target))
-    assert_within(algorithm.net.flat_grad[critic].numpy(), expected.numpy(), allowed.gradient[critic])
+    expected = algorithm.net.flat_grad.clone()
+    rows = Minibatch(x, (), action, torch.zeros(30), target - old, target)
+    allowed = gradient_tolerance(algorithm, rows, Errors(target=ELEMENTWISE * UNIT * abs(before)))  # it is rounded
+    algorithm.step(rows)
+    assert_within(algorithm.net.flat_grad[critic].numpy(), expected[critic].numpy(), allowed[critic])
 
 
 @pytest.mark.parametrize(("spec", "start", "goal"), [(normal(DISCRETE), 0.5, 0.95), (normal(GAUSSIAN), -1.5, -0.35)])

@@ -88,9 +88,11 @@ def slow_gae(r: Rows, gamma: float, gae_lambda: float) -> Array:
     return found
 
 
-def gae_roundings(r: Rows) -> int:
-    """Roundings of a term of `gae`, at most: three in each step (γλ, product, sum), and five of γ and δ."""
-    return 3 * len(r.reward) + 5
+def gae_tolerance(r: Rows, gamma: float, gae_lambda: float) -> Array:
+    """How far `gae` [T, N] may be from the exact sums. A term passes through three roundings in each step (γλ, product, sum)
+    and five of γ and δ.
+    """
+    return sum_tolerance(slow_gae(r.sizes, gamma, gae_lambda), 3 * len(r.reward) + 5)
 
 
 @given(rows(), st.floats(0, 1), st.floats(0, 1))
@@ -98,9 +100,7 @@ def gae_roundings(r: Rows) -> int:
 def test_gae_is_the_papers_sum(r: Rows, gamma: float, gae_lambda: float) -> None:
     found = r.gae(gamma, gae_lambda)
     assert found.dtype == np.float32
-    assert_within(
-        found, slow_gae(r, gamma, gae_lambda), sum_tolerance(slow_gae(r.sizes, gamma, gae_lambda), gae_roundings(r))
-    )
+    assert_within(found, slow_gae(r, gamma, gae_lambda), gae_tolerance(r, gamma, gae_lambda))
 
 
 @given(rows(), st.floats(0, 1))
@@ -121,7 +121,7 @@ def test_lambda_1_is_the_monte_carlo_return_less_the_value(r: Rows, gamma: float
                     break
                 k += 1
             expected[t, n] = g - r.values[t, n] if r.valid[t, n] else 0
-    assert_within(r.gae(gamma, 1.0), expected, sum_tolerance(slow_gae(r.sizes, gamma, 1.0), gae_roundings(r)))
+    assert_within(r.gae(gamma, 1.0), expected, gae_tolerance(r, gamma, 1.0))
 
 
 @given(rows())
