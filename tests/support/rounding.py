@@ -1,8 +1,8 @@
 """How far two float32 computations of the same outputs or the same gradient may differ, on any processor.
 
 The tolerances are derived, not tuned. Each rounding of a sum changes it by at most u s, where u = 2^-24 in float32 and s is
-the sum of the absolute values of its terms. Roundings are taken as independent with mean 0. So n of them change the sum by at
-most λ √n u s, except with a probability of 2 exp(-λ²/2) (Higham and Mary 2019, "A new approach to probabilistic rounding
+the sum of the absolute values of its terms. Roundings are taken as independent with mean 0. So n of them change the sum by
+at most λ √n u s, except with a probability of 2 exp(-λ²/2) (Higham and Mary 2019, "A new approach to probabilistic rounding
 error analysis", theorem 2.4; terms in u² are left out). Here λ is 4. The order of the sum, and so the processor and its
 kernels, makes no difference.
 """
@@ -62,10 +62,10 @@ def forward_tolerance(layers: Sequence[tuple[Array, Array]], x: Array, relu: boo
     """How far two float32 forward passes of the same MLP may differ, [B, outputs].
 
     `layers`: weight [out, in] and bias [out] of each layer, the last one linear; `x` [B, in]. A unit is a sum of n = in + 1
-    terms. Each of its n roundings is at most u s with s = |h| |W|ᵀ + |b|, and roundings are independent. So
-    a layer adds a variance of at most n (u s)², and its weights carry over the variance v of its input: v W²ᵀ. tanh and ReLU
-    do not enlarge an error, and add ELEMENTWISE roundings. The difference of two passes has twice the variance. The result
-    is 4 standard deviations (λ above) of this bound, which is itself several times the true deviation.
+    terms. Each of its n roundings is at most u s with s = |h| |W|ᵀ + |b|, and roundings are independent. So a layer adds a
+    variance of at most n (u s)², and its weights carry over the variance v of its input: v W²ᵀ. tanh and ReLU do not enlarge
+    an error, and add ELEMENTWISE roundings. The difference of two passes has twice the variance. The result is 4 standard
+    deviations (λ above) of this bound, which is itself several times the true deviation.
 
     A test in `test_fused` shows that the loss of a single term exceeds it.
     """

@@ -9,16 +9,18 @@ import pytest
 import torch
 
 from learner.algorithms.a2c import A2C
+from learner.algorithms.actor_critic import ActorCritic, Estimates
 from learner.algorithms.impala import Impala
 from learner.algorithms.minibatches import Minibatch
 from learner.algorithms.returns import EpisodeEnds
 from learner.config.hyperparameters import A2CConfig, ImpalaConfig
+from protocol.arrays import Array
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
 from tests.learner.algorithms.test_returns import Rows
 from tests.learner.algorithms.test_vtrace import OffPolicy, on_policy, slow_vtrace, vtrace_tolerances
 from tests.support.batches import DISCRETE, GAUSSIAN, batch, identity_batch, no_pulse, normal, shared
-from tests.support.rounding import ELEMENTWISE, UNIT, log_prob_variance, tolerance_of, value_tolerance
+from tests.support.rounding import ELEMENTWISE, UNIT, assert_within, log_prob_variance, tolerance_of, value_tolerance
 from tests.support.steps import Errors, only_step, usual_distribution
 
 GAMMA = 0.9
@@ -34,14 +36,28 @@ def impala(spec: PolicySpec = DISCRETE, seed: int = 0, **settings: Any) -> Impal
 def test_on_rows_of_the_newest_weights_its_gradient_is_a2cs(spec: PolicySpec, lam: float) -> None:
     config = A2CConfig(gamma=GAMMA, max_grad_norm=1e9, gae_lambda=lam, ent_coef=0.01, normalize_rewards=True)
     one, twin = (impala(spec, vtrace_lambda=lam, ent_coef=0.01, normalize_rewards=True) for _ in range(2))
-    other = A2C(config, spec, total_steps=10_000, seed=0)
+    other, others_twin = (A2C(config, spec, total_steps=10_000, seed=0) for _ in range(2))
     rows = batch(one, 0)
-    returns = Rows(twin.rewards(rows), twin.values(twin.observations(rows), no_pulse), *EpisodeEnds.of(rows))
+    found, expected = estimated(twin, rows), estimated(others_twin, rows)
+    returns = Rows(A2C(config, spec, total_steps=1, seed=0).rewards(rows), expected.values, *EpisodeEnds.of(rows))
     of_log_prob = log_prob_error(one, rows)
     of_target, of_advantage = vtrace_tolerances(on_policy(returns), GAMMA, lam, log_ratio_error=of_log_prob)
-    step = only_step(one, rows, Errors(advantage=2 * float(of_advantage.max()), target=2 * float(of_target.max())))
+    assert_within(found.target[rows.valid], expected.target[rows.valid], 2 * of_target[rows.valid])  # both are rounded
+    assert_within(found.advantage, expected.advantage, 2 * of_advantage)
+    step = only_step(one, rows, largest_differences(found, expected.advantage, expected.target))
     step.assert_is(only_step(other, rows).gradient)
     assert abs(step.metrics["train/rho"] - 1) < of_log_prob + (rows.env_steps + ELEMENTWISE) * UNIT
+
+
+def estimated(algorithm: ActorCritic, rows: Batch) -> Estimates:
+    """The estimates of the first update."""
+    return algorithm.estimate(rows, algorithm.observations(rows), algorithm.rewards(rows), no_pulse)
+
+
+def largest_differences(found: Estimates, advantage: Array, target: Array) -> Errors:
+    """Of the rows to learn from. A test asserts first that the differences are rounding."""
+    pairs = (found.advantage, advantage), (found.target, target)
+    return Errors(*(float(np.abs(one - other)[found.mask].max()) for one, other in pairs))
 
 
 def log_prob_error(algorithm: Impala, rows: Batch) -> float:
@@ -72,12 +88,16 @@ def test_on_rows_of_older_weights_it_follows_the_gradient_of_the_papers_loss(spe
     value_loss = (value[: len(target)] - target)[valid].square().mean()
     (policy_loss + 0.7 * value_loss - 0.3 * usual.entropy()[valid].mean()).backward()
     expected = algorithm.net.flat_grad.numpy().copy()
-    of_sums = vtrace_tolerances(o, *bars, log_ratio_error=log_prob_error(algorithm, rows))
     # Targets and advantages are linear in the values, and so are their errors.
     of_values = np.full_like(values, value_tolerance(algorithm.net, x.numpy()).max())
     of_means = slow_vtrace(o._replace(rows=o.rows._replace(reward=0 * rows.reward, values=of_values)).sizes, *bars)
-    of_target, of_advantage = (float((one + other).max()) for one, other in zip(of_sums, of_means, strict=True))
-    step = only_step(algorithm, rows, Errors(advantage=of_advantage, target=of_target))
+    of_sums = vtrace_tolerances(o, *bars, log_ratio_error=log_prob_error(algorithm, rows))
+    of_target, of_advantage = (one + other for one, other in zip(of_sums, of_means, strict=True))
+    found = estimated(algorithm, rows)
+    exact = advantage.numpy().reshape(rows.valid.shape), target.numpy().reshape(rows.valid.shape)
+    assert_within(found.advantage, exact[0], of_advantage)
+    assert_within(found.target, exact[1], of_target)
+    step = only_step(algorithm, rows, largest_differences(found, *exact))
     step.assert_is(expected)
     assert step.metrics["train/rho"] < 0.9
 
