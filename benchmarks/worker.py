@@ -19,12 +19,16 @@ from rich.table import Table
 
 from benchmarks.writing import write
 from learner.config.layers import resolve
+from learner.env_spaces import EnvSpaces
 from learner.rollouts.hub import Hub, HubSettings
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 from learner.run_spec import run_spec
 from protocol.env_spec import EnvSpec
+from protocol.envs.description import read_description
 from protocol.policy.layout import buffer_size, parameter_layout, total_size
+from protocol.specs import DescribeSpec
 from protocol.wire.learner_link import LearnerLink
+from workers.describe import describing
 from workers.supervisor import WorkerCommand, WorkerProcess
 
 CASES = {
@@ -35,7 +39,9 @@ CASES = {
 
 def start_one(env: EnvSpec) -> tuple[float, float]:
     """Seconds from exec to the first rollout, and resident megabytes after it."""
-    run = run_spec(resolve(env.id, lanes=1, envs=8, rollout_steps=128), env)
+    with describing(DescribeSpec(env)) as description:
+        spaces = EnvSpaces.of_description(read_description(description))
+    run = run_spec(resolve(env.id, lanes=1, envs=8, rollout_steps=128), env, spaces)
     acting, _ = parameter_layout(run.policy)
     with tempfile.TemporaryDirectory() as folder:
         link = LearnerLink(f"ipc://{folder}/learner")

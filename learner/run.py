@@ -1,7 +1,8 @@
 """Makes a learner of its parts: link, coordinator, hub, service, algorithm, recorder.
 
-This takes two steps. `set_up` does what needs no PyTorch: it reads the environment's spaces and makes the run folder. Then a
-launcher starts its worker processes; they start up while `Run` imports PyTorch. This file does not know who the workers are.
+The order is: bind the link; make or open the run folder; start the workers (a launcher does that); let a worker describe the
+environment, while PyTorch is imported (`known_environment`); make the `Run`; train. This file does not know who the workers
+are, and the learner runs no code of the environment.
 """
 
 from __future__ import annotations
@@ -17,17 +18,22 @@ from pathlib import Path
 import zmq
 
 from learner.config.config import Config
-from learner.env_spaces import EnvSpaces, env_spaces
+from learner.env_spaces import EnvSpaces
+from learner.imports_ahead import ImportsAhead
 from learner.interrupts import Interrupts
+from learner.members.describe import DescribeSettings, described_by_workers
 from learner.members.endpoint import join_lines, keyring_for
 from learner.members.process_callbacks import ProcessCallbacks
+from learner.recording.training_recorder import TrainingRecorder
 from learner.rollouts.hub import Hub, HubObserver, HubSettings
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import Interrupted, RunFolder
 from learner.service import RolloutService
 from protocol.env_spec import EnvSpec
+from protocol.envs.description import DescribedEnv
 from protocol.errors import UsageError
+from protocol.specs import DescribeSpec, RunSpec
 from protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")
@@ -37,29 +43,85 @@ Watch = Callable[[Progress], None]
 
 
 @dataclass(frozen=True)
-class RunSetup:
-    """The parts of a run that exist before the workers start."""
+class KnownEnvironment:
+    """What a run must know of its environment before it begins."""
 
-    config: Config
     env: EnvSpec
     spaces: EnvSpaces
+    described: DescribedEnv | None
+    """As a worker described it; None in a resumed run that has no need of it."""
+
+
+@dataclass(frozen=True)
+class RunSetup:
+    """The parts of a run that exist before the `Run`."""
+
+    config: Config
+    known: KnownEnvironment
     folder: RunFolder
     resumed: bool
 
 
 @contextmanager
-def set_up(config: Config, env: EnvSpec, resume: Path | None) -> Iterator[RunSetup]:
-    """Read the environment's spaces and make the run folder, or open the folder of the run to `resume`.
+def run_folder(config: Config, resume: Path | None) -> Iterator[RunFolder]:
+    """A new run folder, or the folder of the run to `resume`. A new one is removed again if no `Run` can be made of it.
 
-    A new folder is removed again if no `Run` can be made of it. Raises `UsageError`.
+    Raises `UsageError`.
     """
-    spaces = env_spaces(env)
     folder = RunFolder.create(config) if resume is None else RunFolder.open(resume)
     try:
-        yield RunSetup(config, env, spaces, folder, resume is not None)
+        yield folder
     except BaseException:
         folder.remove()
         raise
+
+
+Describe = Callable[[DescribeSpec, Callable[[], None]], DescribedEnv]
+"""Has a worker describe the environment. What the second argument raises ends the wait."""
+
+
+def known_environment(
+    config: Config, env: EnvSpec, resume: Path | None, describe: Describe, *, always: bool = False
+) -> KnownEnvironment:
+    """The environment, as `describe` learns it, or as the policy in the folder of the run to `resume` knows it.
+
+    `always`: have it described also if that policy is there. Meanwhile another thread imports
+    PyTorch. Raises `UsageError` if there is no such environment, or no policy for it, `RunError` if no worker describes it
+    in time, and `KeyboardInterrupt` if the user stops the program.
+    """
+    imports = ImportsAhead(config.algo)
+    with Interrupts() as interrupts:
+
+        def check_interrupt() -> None:
+            if interrupts.received:
+                raise KeyboardInterrupt if resume is None else Interrupted(resume)
+
+        policy = None if resume is None or config.record or always else RunFolder.open(resume).policy_spec()
+        if policy is not None:
+            known = KnownEnvironment(env, EnvSpaces.of_policy(policy), None)
+        else:
+            spec = DescribeSpec(env, config.chosen_vector(), heartbeat_s=config.heartbeat_s)
+            described = describe(spec, check_interrupt)
+            known = KnownEnvironment(env, EnvSpaces.of_description(described), described)
+        imports.wait(check_interrupt)
+    return known
+
+
+def describe_over(link: LearnerLink, config: Config, processes: ProcessCallbacks) -> Describe:
+    """Has one of the workers at the link of the run describe the environment."""
+    settings = describe_settings(config)
+    return lambda spec, check_interrupt: described_by_workers(link, spec, settings, processes, check_interrupt)
+
+
+def describe_settings(config: Config) -> DescribeSettings:
+    """The settings of the conversation in which a worker describes the environment."""
+    return DescribeSettings(
+        worker_timeout_s=config.worker_timeout_s,
+        no_workers_timeout_s=config.no_workers_timeout_s,
+        stall_timeout_s=config.stall_timeout_s,
+        max_env_failures=config.max_env_failures,
+        steps=config.steps,
+    )
 
 
 class Run:
@@ -86,7 +148,7 @@ class Run:
         from learner.torch_setup import threads, torch_device
 
         config, self.folder = setup.config, setup.folder
-        spec = run_spec(config, setup.env, setup.spaces)
+        spec = run_spec(config, setup.known.env, setup.known.spaces)
         torch.set_num_threads(threads(config, spec.policy, processes.expected))
         self.algorithm = algorithm_class(config.algo)(
             config.algorithm, spec.policy, total_steps=config.steps, seed=config.seed, device=torch_device(config)
@@ -110,7 +172,8 @@ class Run:
         self._interrupts = Interrupts()
         hub = Hub(link, coordinator, settings, processes, self._check_interrupt, observer)
         self.service = RolloutService(hub, spec, processes.expected)
-        self.recorder = RunRecorder(config, self.folder, spec, self.algorithm, self.service, state, watch)
+        episodes = _training_recorder(config, self.folder, setup.known, spec)
+        self.recorder = RunRecorder(config, self.folder, spec, self.algorithm, self.service, state, watch, episodes)
         self.folder.keep()
 
     def train(self, workers: int) -> None:
@@ -147,12 +210,21 @@ def serve(config: Config, resume: Path | None, watch: Watch) -> Path:
         link = LearnerLink(config.bind, context, keyring)
         stack.callback(link.close)
         observer = stack.enter_context(prometheus_observer(config))
-        setup = stack.enter_context(set_up(config, EnvSpec.of(config.env, config.env_kwargs), resume))
-        run = Run(setup, link, ProcessCallbacks(), watch, observer)
         for line in join_lines(link.address, config.advertise, keyring):
             log.warning("%s", line)
+        env, processes = EnvSpec.of(config.env, config.env_kwargs), ProcessCallbacks()
+        known = known_environment(config, env, resume, describe_over(link, config, processes))
+        folder = stack.enter_context(run_folder(config, resume))
+        run = Run(RunSetup(config, known, folder, resume is not None), link, processes, watch, observer)
         run.train(config.min_workers or 1)
         return run.folder.path
+
+
+def _training_recorder(config: Config, folder: RunFolder, known: KnownEnvironment, spec: RunSpec) -> TrainingRecorder | None:
+    if not config.record or known.described is None:
+        return None
+    about = f"All whole training episodes of millrace run {folder.path.resolve().name}, as acted."
+    return TrainingRecorder(config.record, known.described, spec.policy, about)
 
 
 def prometheus_observer(config: Config) -> AbstractContextManager[HubObserver]:

@@ -43,8 +43,12 @@ class RunRecorder:
         service: RolloutService,
         state: RunState,
         watch: Callable[[Progress], None],
+        episode_recorder: TrainingRecorder | None,
     ) -> None:
-        """`state`: where the run stands. `watch` is called with the progress after each update."""
+        """`state`: where the run stands. `watch` is called with the progress after each update.
+
+        `episode_recorder` is closed with this recorder.
+        """
         self.version, self.env_steps = state.version, state.env_steps
         self._config, self._folder, self._spec = config, folder, spec
         self._algorithm, self._service, self._watch = algorithm, service, watch
@@ -54,7 +58,7 @@ class RunRecorder:
         self._confirmed: Best | None = None
         self._window = EpisodeWindow.from_state(state.episodes)
         self._metrics = MetricsLog(folder.path, state.env_steps)
-        self._episode_recorder = _episode_recorder(config, folder, spec)
+        self._episode_recorder = episode_recorder
         self._stages_s = {"update": 0.0, "other": 0.0}
         self._wall_before_s, self._steps_before = state.wall_s, state.env_steps
         self._started_s = self._saved_s = time.monotonic()
@@ -189,10 +193,3 @@ class RunRecorder:
 
     def _wall_s(self) -> float:
         return self._wall_before_s + time.monotonic() - self._started_s
-
-
-def _episode_recorder(config: Config, folder: RunFolder, spec: RunSpec) -> TrainingRecorder | None:
-    if not config.record:
-        return None
-    about = f"All whole training episodes of millrace run {folder.path.resolve().name}, as acted."
-    return TrainingRecorder(config.record, spec.env, spec.policy, about)

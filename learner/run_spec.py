@@ -6,10 +6,8 @@ import msgspec
 
 from learner.algorithms import algorithm_class
 from learner.config.config import Config
-from learner.env_spaces import EnvSpaces, env_spaces
+from learner.env_spaces import EnvSpaces
 from protocol.env_spec import EnvSpec
-from protocol.envs.envpool import check_envpool
-from protocol.envs.vectorized import check_native
 from protocol.errors import UsageError
 from protocol.policy.encoder import describe_encoder
 from protocol.specs import PolicySpec, RunSpec
@@ -17,23 +15,16 @@ from protocol.wire.codec import check_can_be_sent
 from protocol.wire.compression import why_no_zstd
 
 
-def run_spec(config: Config, env: EnvSpec, spaces: EnvSpaces | None = None) -> RunSpec:
+def run_spec(config: Config, env: EnvSpec, spaces: EnvSpaces) -> RunSpec:
     """The specification that `Welcome` carries. Raises `UsageError` if algorithm, settings and spaces do not fit together.
 
-    `spaces` are those of `env`; without them one env copy is made to read them.
+    `spaces` are those of `env`.
     """
     if config.compress == "zstd" and (why := why_no_zstd()):
         raise UsageError(why)
-    spaces = spaces or env_spaces(env)
-    vector = "loop" if config.vector == "auto" else config.vector
     policy = _policy_spec(config, spaces)
     if algorithm_class(config.algo).whole_episodes:
         _check_room_for_whole_episodes(config, spaces.max_episode_steps)
-    match vector:
-        case "native":
-            check_native(env, spaces.observation, spaces.action)
-        case "envpool":
-            check_envpool(env, spaces.observation, spaces.action)
     run = RunSpec(
         env=env,
         policy=policy,
@@ -41,7 +32,7 @@ def run_spec(config: Config, env: EnvSpec, spaces: EnvSpaces | None = None) -> R
         copies=config.envs // config.lanes,
         lanes=config.lanes,
         seed=config.seed,
-        vector=vector,
+        vector=config.chosen_vector(),
         compress=config.compress,
         images_dtype=config.images_dtype,
         heartbeat_s=config.heartbeat_s,

@@ -33,6 +33,8 @@ from protocol.space_spec import EnvDescription
 from protocol.specs import DescribeSpec, RunSpec, StepSpec
 
 PROTOCOL_VERSION = 4
+TOLD_TO_STOP = "told to stop"
+"""The reason in the Goodbye of a worker that got a signal. With any other reason it declines what it was asked for."""
 
 
 class Message(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unknown_fields=True):
@@ -423,9 +425,9 @@ Answer = Stepped | Returned
 ToObserver = Status
 
 __all__ = [
-    "PROTOCOL_VERSION", "Alive", "Answer", "Array", "Call", "Collect", "Described", "Doing", "Drain", "EpisodeRows",
-    "Evaluate", "Evaluated", "Failure", "Goodbye", "Heartbeat", "HeartbeatReply", "Hello", "Inquire", "LaneIncarnation",
-    "Message", "Order", "Permit", "Received", "Refuse", "Rejoin", "Release", "Reset", "Returned", "Rollout", "Status",
-    "Step", "Stepped", "ToLearner", "ToObserver", "ToWorker", "Weights", "Welcome", "WorkerActivity", "WorkerExit",
-    "WorkerStatus",
+    "PROTOCOL_VERSION", "TOLD_TO_STOP", "Alive", "Answer", "Array", "Call", "Collect", "Described", "Doing", "Drain",
+    "EpisodeRows", "Evaluate", "Evaluated", "Failure", "Goodbye", "Heartbeat", "HeartbeatReply", "Hello", "Inquire",
+    "LaneIncarnation", "Message", "Order", "Permit", "Received", "Refuse", "Rejoin", "Release", "Reset", "Returned",
+    "Rollout", "Status", "Step", "Stepped", "ToLearner", "ToObserver", "ToWorker", "Weights", "Welcome",
+    "WorkerActivity", "WorkerExit", "WorkerStatus",
 ]  # fmt: skip

@@ -13,9 +13,11 @@ from dataclasses import dataclass, field
 from protocol.bounds import MAX_TICKETS, Stage, last_text, one_line
 from protocol.messages import (
     PROTOCOL_VERSION,
+    TOLD_TO_STOP,
     Answer,
     Call,
     Collect,
+    Described,
     Drain,
     Failure,
     Goodbye,
@@ -36,6 +38,7 @@ from protocol.messages import (
     Weights,
     Welcome,
 )
+from protocol.space_spec import EnvDescription
 from protocol.specs import DescribeSpec, RunSpec, StepSpec
 from workers.collect.held_rollouts import Assignment, HeldRollouts
 from workers.states import TABLE, LearnerSilent, State, StopRequested, WorkerFailed, WorkFinished
@@ -128,6 +131,7 @@ class _SessionState:
 
     rollouts: HeldRollouts = field(default_factory=HeldRollouts)
     orders: HeldOrders = field(default_factory=HeldOrders)
+    described: Described | None = None  # sent with every Heartbeat, because one may be lost
     weights: Weights | None = None
     in_progress: tuple[int, ...] = ()  # tickets
     replies: int = 0  # number of the last HeartbeatReply
@@ -231,7 +235,8 @@ class Session:
             return []
         self._due_s = now + self.run.heartbeat_s
         self._current.acknowledged_version = self._current.version
-        return [Send(self._heartbeat())]
+        described = self._current.described
+        return [Send(self._heartbeat()), *([] if described is None else [Send(described)])]
 
     def update_statistics(self, statistics: Statistics) -> None:
         """The next Heartbeat reports these."""
@@ -243,7 +248,7 @@ class Session:
 
     def stop(self) -> list[Effect]:
         """Leave: after the work in progress, or at once when called twice."""
-        return [] if self.state is State.LEFT else self._drain(StopRequested(), "told to stop")
+        return [] if self.state is State.LEFT else self._drain(StopRequested(), TOLD_TO_STOP)
 
     def fail(self, error: str, traceback: str, lane: int | None) -> list[Effect]:
         """The environment, or this worker, raised: report it to the learner, and leave."""
@@ -259,6 +264,15 @@ class Session:
     def refused(self, reason: str) -> list[Effect]:
         """Leave, because the learner's endpoint rejects this worker for good."""
         return [] if self.state is State.LEFT else self._leave(Refuse(reason), 2, reason)
+
+    # ---------------------------------------------------------------- describing
+
+    def described(self, description: EnvDescription) -> list[Effect]:
+        """The environment of the `DescribeSpec` is described."""
+        if self.state not in (State.READY, State.DRAINING):
+            return []
+        self._current.described = Described(self.session, description)
+        return [Send(self._current.described)]
 
     # ---------------------------------------------------------------- collecting
 

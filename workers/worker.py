@@ -14,13 +14,14 @@ import socket
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from protocol.bounds import Stages
 from protocol.env_spec import AllowedCode
-from protocol.errors import BadMessage, UserFacingError, first_line
+from protocol.errors import BadMessage, UsageError, UserFacingError, first_line
 from protocol.messages import Order, Stepped, Weights
 from protocol.policy.policy import make_policy
 from protocol.specs import DescribeSpec, RunSpec, StepSpec
@@ -29,6 +30,7 @@ from protocol.wire.shared_memory import InheritedDescriptors
 from protocol.wire.weight_dtypes import to_float32
 from protocol.wire.worker_link import WorkerLink
 from workers.collect.collector import Collector
+from workers.describe import describing
 from workers.env_errors import LaneFailed
 from workers.heartbeat_thread import HeartbeatThread
 from workers.session import CloseLanes, Effect, Identity, Leave, Send, Session, StartSession, Statistics, Task
@@ -257,9 +259,28 @@ class Worker:
                         allow_private_names=self._options.code is not AllowedCode.REGISTERED,
                     )
                     self._heartbeats.start()
+                case DescribeSpec():
+                    self._describe(run)
             self._loaded = None
         except (UserFacingError, ImportError, ValueError) as error:
             self._do(self._session.fail(_line(error), traceback.format_exc(), None))
+
+    def _describe(self, spec: DescribeSpec) -> None:
+        """Describe the environment. A second thread sends the heartbeats while its code runs."""
+        heartbeats = HeartbeatThread(lambda: self._do(self._session.heartbeat_if_due(self._clock())))
+        try:
+            with ExitStack() as copy:
+                heartbeats.start()
+                try:
+                    with heartbeats.lock_released():
+                        description = copy.enter_context(describing(spec))
+                finally:
+                    heartbeats.stop()
+                self._do(self._session.described(description))
+        except UsageError as error:
+            self._do(self._session.decline(str(error)))
+        except Exception as error:
+            self._fail(error)
 
     def _close_all(self) -> None:
         if (owner := self._collector or self._stepper) is not None:

@@ -15,7 +15,7 @@ from tyro.conf import Positional
 
 from learner.config.hyperparameters import Hyperparameters, PPOConfig
 from learner.config.run_rules import CheckpointPolicy, EvaluationSettings, StopRule
-from protocol.specs import ImagesDtype
+from protocol.specs import ImagesDtype, Vector
 from protocol.wire.weight_dtypes import WeightsDtype
 
 PRESETS = Path(__file__).with_name("presets.toml")
@@ -157,6 +157,10 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """HOST:PORT at which Prometheus can read the metrics, as 127.0.0.1:9464. With 0.0.0.0:9464 everybody in the network can
     read them. Default: nowhere.
     """
+
+    def chosen_vector(self) -> Vector:
+        """How the env copies of a lane are stepped."""
+        return "loop" if self.vector == "auto" else self.vector
 
     def stop_rule(self) -> StopRule:
         """When training ends."""

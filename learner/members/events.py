@@ -108,7 +108,8 @@ def _line(event: Event) -> str:
         case WorkerRefused(worker, why):
             return f"worker {worker} was refused: {why}"
         case EnvironmentRaised(worker, host, lane, error):
-            return f"worker {worker} ({host}): lane {lane}: {error}"
+            where = "" if lane is None else f"lane {lane}: "
+            return f"worker {worker} ({host}): {where}{error}"
         case RejoinRequested(worker, _, late):
             counted = f"; {late} transitions that it sent are counted, not used" if late else ""
             return f"worker {worker} was told to join again: its session had ended{counted}"

@@ -95,6 +95,8 @@ class ServerSettings:
     """How long to wait for the last messages of a process that has ended."""
     log_tracebacks: bool = True
     """Whether the traceback of an environment is logged; if not, the hub raises it."""
+    log_joins: bool = True
+    """Whether it is logged that a worker joined; if not, it joins the run in a moment."""
 
 
 class MemberServer:
@@ -273,7 +275,8 @@ class MemberServer:
                     line, expected = line.partition("\n")[0], True
                 case _:
                     pass
-            self._log.log_event(logging.INFO if expected else logging.WARNING, event, line, cause)
+            if self._settings.log_joins or not isinstance(event, WorkerJoined):
+                self._log.log_event(logging.INFO if expected else logging.WARNING, event, line, cause)
             self._callbacks.event(event)
 
 

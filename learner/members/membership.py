@@ -37,7 +37,7 @@ from protocol.messages import (
     Welcome,
     WorkerStatus,
 )
-from protocol.specs import RunSpec, StepSpec
+from protocol.specs import DescribeSpec, RunSpec, StepSpec
 
 MEASURE_S = 0.5  # at least, between the two heartbeats that a worker's speed is measured by
 REMEMBERED = 1_000  # refused processes, and names of silent workers; a peer with many names must not fill the memory
@@ -126,7 +126,11 @@ class Membership(Generic[M]):
     """The members, by their routing ids."""
 
     def __init__(
-        self, run: RunSpec | StepSpec, member_class: type[M], on_removed: Callable[[M, str], None], first_session: int
+        self,
+        run: DescribeSpec | RunSpec | StepSpec,
+        member_class: type[M],
+        on_removed: Callable[[M, str], None],
+        first_session: int,
     ) -> None:
         """`on_removed` is called with each member that was removed, and why: it takes back what that member held."""
         self.members: dict[bytes, M] = {}

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
 
 from learner.recording.episodes import EpisodeAssembler
 from learner.recording.minari import MinariDataset
 from learner.rollouts.lanes import AcceptedRollout
-from protocol.env_spec import EnvSpec
+from protocol.envs.description import DescribedEnv
 from protocol.envs.spaces import make_action_converter
 from protocol.specs import PolicySpec
 
@@ -18,20 +21,15 @@ class TrainingRecorder:
     Steps of episodes that cannot be whole are counted instead.
     """
 
-    def __init__(self, dataset_id: str, env_spec: EnvSpec, spec: PolicySpec, about: str) -> None:
-        """`about`: the description of the dataset.
+    def __init__(self, dataset_id: str, env: DescribedEnv, spec: PolicySpec, about: str) -> None:
+        """`env`: the environment as a worker described it. `about`: the description of the dataset.
 
         Raises `UsageError`, with a one-line message, if the dataset cannot be made.
         """
-        self._env = env_spec.make()
         self._assembler = EpisodeAssembler(make_action_converter(spec.action))
         self._id = dataset_id
         self._episodes = 0
-        try:
-            self._dataset = MinariDataset(dataset_id, self._env, about)
-        except BaseException:
-            self._env.close()
-            raise
+        self._dataset = MinariDataset(dataset_id, _EnvironmentOfDataset(env), about)
 
     def add(self, rollouts: Sequence[AcceptedRollout]) -> None:
         """Add the rollouts of an update."""
@@ -42,12 +40,17 @@ class TrainingRecorder:
 
     def close(self) -> str:
         """Finish the dataset. Returns one line that describes it. Without a whole episode, no dataset is written."""
-        try:
-            if self._episodes:
-                self._dataset.close()
-            else:
-                self._dataset.discard()
-        finally:
-            self._env.close()
+        if self._episodes:
+            self._dataset.close()
+        else:
+            self._dataset.discard()
         parts = self._assembler.waiting + self._assembler.left_out
         return f"dataset {self._id}: {self._episodes:,} training episodes; {parts:,} steps of others left out"
+
+
+class _EnvironmentOfDataset(gymnasium.Env[Any, Any]):
+    """What Minari reads of an environment: its spaces and its spec. Nobody steps it."""
+
+    def __init__(self, env: DescribedEnv) -> None:
+        self.observation_space, self.action_space = env.observation_space, env.action_space
+        self.metadata, self.spec = env.metadata, env.spec

@@ -203,6 +203,13 @@ class RunFolder:
         parameters = _flat([arrays[field.name] for field in acting])
         return description, parameters, _flat([arrays[name] for name in description.buffers])
 
+    def policy_spec(self) -> PolicySpec | None:
+        """The policy that policy.json describes. None if that file is missing or cannot be read."""
+        try:
+            return _decode_description((self.path / POLICY_JSON).read_bytes()).policy
+        except (OSError, msgspec.MsgspecError):
+            return None
+
     def write_summary(self, summary: Summary) -> None:
         """Write summary.json."""
         self._write("summary.json", msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n")

@@ -246,7 +246,9 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         return self._results_of_call(name, call_orders(self._layout, copies, name, args, kwargs))
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
-        """An attribute of every copy."""
+        """An attribute of every copy. `spec` is as a worker described it, for an object of its own cannot travel."""
+        if name == "spec" and self.spec is not None:
+            return (self.spec,) * self.num_envs
         return self.call(name)
 
     def set_attr(self, name: str, values: Any) -> None:

@@ -1,4 +1,4 @@
-"""Describe a vector environment: its env copies, its lanes and its spaces. Makes one env copy to learn the spaces."""
+"""A vector environment as data: its env copies and lanes from the settings, its spaces as a worker described them. Pure."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from gymnasium.vector import AutoresetMode
 
 from learner.vector_env.settings import VectorEnvSettings
 from protocol.env_spec import EnvSpec
+from protocol.envs.description import DescribedEnv
 from protocol.envs.spaces import leaves_with_own_dtype
 from protocol.errors import UsageError
-from protocol.specs import Leaf, StepSpec
+from protocol.specs import DescribeSpec, Leaf, StepSpec
 from protocol.wire.codec import check_can_be_sent
 
 
@@ -30,8 +31,45 @@ class VectorEnvDescription:
     """gymnasium's `EnvSpec` if all copies have the same registered id, else None"""
 
 
-def describe(settings: VectorEnvSettings, learner_timeout_s: float = math.inf) -> VectorEnvDescription:
-    """Describe the vector environment that the settings ask for.
+@dataclass(frozen=True)
+class RequestedCopies:
+    """The env copies that the settings ask for, before their spaces are known."""
+
+    envs: tuple[EnvSpec, ...]
+    """the different environments, each listed once"""
+    copies: tuple[int, ...]
+    """index in `envs` for each copy"""
+    lanes: tuple[int, ...]
+    """how many copies each lane has"""
+    autoreset: Literal["NextStep", "SameStep", "Disabled"]
+    render_mode: str | None
+    learner_timeout_s: float
+
+    @property
+    def to_describe(self) -> DescribeSpec:
+        """The environment that a worker describes: that of the first copy. All copies must have the same spaces."""
+        return DescribeSpec(self.envs[0], render_mode=self.render_mode, learner_timeout_s=self.learner_timeout_s)
+
+    def description(self, env: DescribedEnv) -> VectorEnvDescription:
+        """The vector environment of these copies. Raises `UsageError` for spaces that are not supported."""
+        step = StepSpec(
+            envs=self.envs,
+            copies=self.copies,
+            lanes=self.lanes,
+            observation=leaves_with_own_dtype(env.observation_space),
+            action=_action_leaves(env.action_space),
+            autoreset=self.autoreset,
+            render_mode=self.render_mode,
+            learner_timeout_s=self.learner_timeout_s,
+        )
+        check_can_be_sent(self.envs[0].id, step)
+        metadata = {**env.metadata, "autoreset_mode": AutoresetMode(step.autoreset)}
+        spec = env.spec if len(self.envs) == 1 and self.envs[0].factory is None else None
+        return VectorEnvDescription(step, env.observation_space, env.action_space, metadata, env.render_mode, spec)
+
+
+def requested_copies(settings: VectorEnvSettings, learner_timeout_s: float = math.inf) -> RequestedCopies:
+    """The env copies that the settings ask for.
 
     `learner_timeout_s`: a worker that hears nothing from the learner for this long joins again. Raises `UsageError`.
     """
@@ -44,24 +82,14 @@ def describe(settings: VectorEnvSettings, learner_timeout_s: float = math.inf) -
     env_specs = {env: EnvSpec.of(env, settings.kwargs) for env in dict.fromkeys(envs)}
     different = list({(spec.id, spec.factory): spec for spec in env_specs.values()}.values())
     index = {(spec.id, spec.factory): n for n, spec in enumerate(different)}
-    copy = different[0].make(settings.render_mode)
-    try:
-        step = StepSpec(
-            envs=tuple(different),
-            copies=tuple(index[env_specs[env].id, env_specs[env].factory] for env in envs),
-            lanes=tuple(N // lanes + (lane < N % lanes) for lane in range(lanes)),
-            observation=leaves_with_own_dtype(copy.observation_space),
-            action=_action_leaves(copy.action_space),
-            autoreset=_autoreset_mode(settings.autoreset_mode),
-            render_mode=settings.render_mode,
-            learner_timeout_s=learner_timeout_s,
-        )
-        check_can_be_sent(different[0].id, step)
-        metadata = {**copy.metadata, "autoreset_mode": AutoresetMode(step.autoreset)}
-        spec = copy.spec if len(different) == 1 and different[0].factory is None else None
-        return VectorEnvDescription(step, copy.observation_space, copy.action_space, metadata, copy.render_mode, spec)
-    finally:
-        copy.close()
+    return RequestedCopies(
+        envs=tuple(different),
+        copies=tuple(index[env_specs[env].id, env_specs[env].factory] for env in envs),
+        lanes=tuple(N // lanes + (lane < N % lanes) for lane in range(lanes)),
+        autoreset=_autoreset_mode(settings.autoreset_mode),
+        render_mode=settings.render_mode,
+        learner_timeout_s=learner_timeout_s,
+    )
 
 
 def _action_leaves(space: gymnasium.Space[Any]) -> tuple[Leaf, ...]:

@@ -85,12 +85,6 @@ class SharedSteps:
     wake_pipes: Mapping[str, tuple[WakePipe, WakePipe]]
     """Pipe that wakes the worker, and pipe by which it wakes us; by worker name."""
 
-    def close(self) -> None:
-        """Close all file descriptors."""
-        self.memory.close()
-        for pipe in (pipe for pair in self.wake_pipes.values() for pipe in pair):
-            pipe.close()
-
 
 class StepHub:
     """Everything the vector environment knows of workers."""

@@ -18,14 +18,15 @@ import zmq
 from learner.config.config import Config
 from learner.members.endpoint import BindSettings
 from learner.members.process_callbacks import ProcessCallbacks
-from learner.run import Run, Watch, prometheus_observer, set_up
+from learner.run import Run, RunSetup, Watch, describe_settings, known_environment, prometheus_observer, run_folder
 from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.settings import VectorEnvSettings
 from millrace.launch.local_worker_options import private_address, worker_flags
 from millrace.launch.vector import listen
 from protocol.env_spec import EnvSpec
+from protocol.envs.description import DescribedEnv
 from protocol.policy.policy import Policy, make_policy
-from protocol.specs import ImagesDtype, PolicySpec, RunSpec
+from protocol.specs import DescribeSpec, ImagesDtype, PolicySpec, RunSpec
 from protocol.wire.learner_link import LearnerLink
 from workers.collect.collector import Collector
 from workers.collect.split_vector_env import SplitVectorEnv
@@ -54,8 +55,15 @@ def train(
         listening = listen(_settings(config, factory, elsewhere=elsewhere), stack.enter_context(ExitStack()))
         observer = stack.enter_context(prometheus_observer(config))
         env_spec = EnvSpec.of(config.env if factory is None else factory, config.env_kwargs)
-        setup = stack.enter_context(set_up(config, env_spec, resume))
-        env = listening.start(worker_flags(config, setup.folder.path))
+        folder = stack.enter_context(run_folder(config, resume))
+        started = listening.start(worker_flags(config, folder.path))
+
+        def describe(spec: DescribeSpec, check_interrupt: Callable[[], None]) -> DescribedEnv:
+            return started.describe(describe_settings(config), check_interrupt)
+
+        known = known_environment(config, env_spec, resume, describe, always=True)
+        assert known.described is not None
+        env = started.vector_env(known.described)
         stack.callback(env.close)
         workers = config.min_workers or (1 if elsewhere else min(config.workers, config.envs))
         lanes = SplitVectorEnv(env, config.lanes, _before_waits(env, workers, config.no_workers_timeout_s))
@@ -75,7 +83,7 @@ def train(
             return supervisor.poll()
 
         processes = ProcessCallbacks(ended, lambda: env.workers, 0 if elsewhere else config.workers)
-        run = Run(setup, link, processes, watch, observer)
+        run = Run(RunSetup(config, known, folder, resume is not None), link, processes, watch, observer)
         run.train(1)
         return run.folder.path
 

@@ -13,8 +13,8 @@ import zmq
 
 from learner.config.config import Config
 from learner.members.process_callbacks import ProcessCallbacks
-from learner.run import Run, Watch, prometheus_observer, set_up
-from millrace.launch.local_worker_options import private_address, temporary_keys, worker_flags
+from learner.run import Run, RunSetup, Watch, describe_over, known_environment, prometheus_observer, run_folder
+from millrace.launch.local_worker_options import private_address, stopped_on_error, temporary_keys, worker_flags
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
 from protocol.keys.keys import Token
@@ -42,10 +42,13 @@ def train(config: Config, resume: Path | None, watch: Watch, factory: Callable[.
         stack.callback(link.close, 0.5)
         observer = stack.enter_context(prometheus_observer(config))
         env = EnvSpec.of(config.env if factory is None else factory, config.env_kwargs)
-        setup = stack.enter_context(set_up(config, env, resume))
-        supervisor = Supervisor(_starter(config, link.address, token, context, setup.folder.path), config.workers)
+        folder = stack.enter_context(run_folder(config, resume))
+        supervisor = Supervisor(_starter(config, link.address, token, context, folder.path), config.workers)
         stack.callback(supervisor.stop)
-        run = Run(setup, link, ProcessCallbacks(supervisor.poll, expected=config.workers), watch, observer)
+        processes = ProcessCallbacks(supervisor.poll, expected=config.workers)
+        with stopped_on_error(supervisor):
+            known = known_environment(config, env, resume, describe_over(link, config, processes))
+        run = Run(RunSetup(config, known, folder, resume is not None), link, processes, watch, observer)
         run.train(config.min_workers or config.workers)
         return run.folder.path
 

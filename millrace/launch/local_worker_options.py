@@ -9,8 +9,8 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -19,7 +19,9 @@ from learner.members.endpoint import generate_run_keys
 from protocol.errors import UsageError
 from protocol.keys.key_folder import Keyring, chosen_key_folder
 from protocol.keys.keys import Token
-from workers.supervisor import core_flags
+from workers.supervisor import Supervisor, core_flags
+
+LEAVE_AT_ONCE_S = 0.5  # after a start that failed: a worker in the constructor of its environment hears nothing
 
 WorkerFlags = Callable[[str], tuple[list[str], Path | None]]
 """Takes a worker's name. Returns the flags of its process, and the file for its stderr (None: this process's stderr)."""
@@ -38,6 +40,16 @@ def private_address(transport: str, stack: ExitStack) -> str:
             return f"ipc://{folder}/learner"
         case _:
             raise UsageError(f"transport: expected ipc, tcp or inproc, got {transport!r}")
+
+
+@contextmanager
+def stopped_on_error(supervisor: Supervisor) -> Iterator[None]:
+    """Stop the workers soon if the body raises: there is no run yet, and none of their work could be lost."""
+    try:
+        yield
+    except BaseException:
+        supervisor.stop(LEAVE_AT_ONCE_S)
+        raise
 
 
 def temporary_keys(transport: str, keys: str, *, insecure: bool) -> tuple[Keyring | None, Token | None]:

@@ -8,26 +8,29 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
 import zmq
 
+from learner.members.describe import DescribeSettings, described_by_workers
 from learner.members.endpoint import BindSettings, join_lines, keyring_for
+from learner.members.process_callbacks import ProcessCallbacks
 from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.settings import VectorEnvSettings
-from learner.vector_env.spec import VectorEnvDescription, describe
+from learner.vector_env.spec import RequestedCopies, requested_copies
 from learner.vector_env.step_hub import SharedSteps, StepHub
-from millrace.launch.local_worker_options import WorkerFlags, private_address, temporary_keys
+from millrace.launch.local_worker_options import LEAVE_AT_ONCE_S, WorkerFlags, private_address, temporary_keys
 from protocol.address import advertised_address, check_address
 from protocol.cpu_cores import usable_cores
-from protocol.errors import UsageError
+from protocol.envs.description import DescribedEnv
+from protocol.errors import EnvironmentFailed, UsageError
 from protocol.keys.key_folder import Keyring
 from protocol.keys.keys import Token
 from protocol.wire.learner_link import LearnerLink
-from protocol.wire.shared_memory import SUPPORTED, InheritedDescriptors, SharedMemory
+from protocol.wire.shared_memory import SUPPORTED, InheritedDescriptors, SharedMemory, new_memory
 from protocol.wire.wake_up import SPIN_S, WakePipe
 from workers.supervisor import Running, Supervisor, WorkerCommand, WorkerProcess, WorkerThread
 
@@ -43,15 +46,40 @@ STEP_TIMEOUT_LEAST_S, STEP_TIMEOUT_MOST_S = 60.0, 1e6
 def make_vec(settings: VectorEnvSettings) -> ZmqVectorEnv:
     """See `millrace.make_vec`."""
     flags = ["--step-timeout-s", str(_step_timeout_s(settings.timeout_s))]
+    local_workers = settings.local_workers
+    join_timeout_s = JOIN_TIMEOUT_S if local_workers else settings.timeout_s
+    describe = DescribeSettings(
+        worker_timeout_s=math.inf if local_workers else WORKER_TIMEOUT_S,
+        no_workers_timeout_s=join_timeout_s,
+        stall_timeout_s=max(join_timeout_s, settings.timeout_s),
+        max_env_failures=0,
+    )
     resources = ExitStack()
     try:
-        env = listen(settings, resources).start(lambda name: (flags, None))
-        local_workers = settings.local_workers
-        env.wait_for(local_workers or settings.lane_count, JOIN_TIMEOUT_S if local_workers else settings.timeout_s)
+        started = listen(settings, resources).start(lambda name: (flags, None))
+        env = started.vector_env(started.describe(describe))
+        env.wait_for(local_workers or settings.lane_count, join_timeout_s)
         return env
-    except BaseException:
+    except BaseException as error:
         resources.close()
+        if isinstance(error, EnvironmentFailed) and error.detail:
+            error.add_note(error.detail)
         raise
+
+
+@dataclass(frozen=True)
+class InheritedByWorkers:
+    """Shared memory and wake pipes, which local workers inherit before the sizes of the arrays are known."""
+
+    memory_fd: int
+    wake_pipes: Mapping[str, tuple[WakePipe, WakePipe]]
+    """Pipe that wakes the worker, and pipe by which it wakes us; by worker name."""
+
+    def close(self) -> None:
+        """Close all file descriptors. The memory is freed with its last view."""
+        os.close(self.memory_fd)
+        for pipe in (pipe for pair in self.wake_pipes.values() for pipe in pair):
+            pipe.close()
 
 
 @dataclass(frozen=True)
@@ -59,42 +87,26 @@ class ListeningVectorEnv:
     """A vector environment whose address is bound. Its local workers have not been started."""
 
     settings: VectorEnvSettings
-    description: VectorEnvDescription
+    requested: RequestedCopies
     link: LearnerLink
     context: zmq.Context[zmq.Socket[bytes]]
     keyring: Keyring | None
     token: Token | None
     """Token of local workers."""
-    shared: SharedSteps | None
-    """Shared memory and wake pipes, for local workers only."""
+    inherited: InheritedByWorkers | None
+    """For local workers only."""
     resources: ExitStack
 
-    def start(self, flags: WorkerFlags) -> ZmqVectorEnv:
-        """Start the local workers with these flags. Call it once; it does not wait until workers have joined."""
-        settings, count = self.settings, self.settings.local_workers
+    def start(self, flags: WorkerFlags) -> StartedVectorEnv:
+        """Start the local workers with these flags. Call it once."""
+        count = self.settings.local_workers
         supervisor = Supervisor(self._starter(flags), count) if count else None
-        hub = StepHub(
-            self.link,
-            self.description.step,
-            first_session=int.from_bytes(os.urandom(6), "little"),
-            local_workers=supervisor,
-            shared=self.shared,
-            worker_timeout_s=WORKER_TIMEOUT_S if settings.listen.bind else math.inf,
-            spin_s=SPIN_S if count < usable_cores() else 0.0,  # only if one core is free for the learner
-        )
-        self.resources.callback(hub.close, CLOSE_TIMEOUT_S)
-        if supervisor is None:
-            for line in join_lines(self.link.address, settings.listen.advertise, self.keyring):
+        if supervisor is not None:
+            self.resources.callback(supervisor.stop, LEAVE_AT_ONCE_S)  # if there will be no hub to close
+        else:
+            for line in join_lines(self.link.address, self.settings.listen.advertise, self.keyring):
                 log.warning("%s", line)
-        return ZmqVectorEnv(
-            self.description,
-            hub,
-            memory=None if self.shared is None else self.shared.memory,
-            timeout_s=settings.timeout_s,
-            on_worker_loss=settings.on_worker_loss,
-            copy=settings.copy,
-            on_close=self.resources.close,
-        )
+        return StartedVectorEnv(self, supervisor)
 
     def _starter(self, flags: WorkerFlags) -> Callable[[str], Running]:
         """A function that starts the local worker of a name."""
@@ -103,13 +115,56 @@ class ListeningVectorEnv:
 
         def start(name: str) -> WorkerProcess:
             handed = None
-            if self.shared is not None:
-                to_worker, to_learner = self.shared.wake_pipes[name]
-                handed = InheritedDescriptors(self.shared.memory.fd, to_worker.read_fd, to_learner.write_fd)
+            if self.inherited is not None:
+                to_worker, to_learner = self.inherited.wake_pipes[name]
+                handed = InheritedDescriptors(self.inherited.memory_fd, to_worker.read_fd, to_learner.write_fd)
             worker_flags, log_file = flags(name)
             return WorkerProcess(WorkerCommand(self.link.address, name, log_file, self.token, worker_flags, handed))
 
         return start
+
+
+@dataclass(frozen=True)
+class StartedVectorEnv:
+    """A vector environment whose local workers were started. They have not necessarily joined."""
+
+    listening: ListeningVectorEnv
+    supervisor: Supervisor | None
+
+    def describe(self, settings: DescribeSettings, check_interrupt: Callable[[], None] = lambda: None) -> DescribedEnv:
+        """Have a worker describe the environment. Raises `UserFacingError`, and what `check_interrupt` raises."""
+        spec, processes = self.listening.requested.to_describe, ProcessCallbacks()
+        if self.supervisor is not None:
+            processes = ProcessCallbacks(self.supervisor.poll, expected=self.listening.settings.local_workers)
+        return described_by_workers(self.listening.link, spec, settings, processes, check_interrupt)
+
+    def vector_env(self, described: DescribedEnv) -> ZmqVectorEnv:
+        """The vector environment. Call it once; it does not wait until workers have joined."""
+        listening, inherited, settings = self.listening, self.listening.inherited, self.listening.settings
+        description = listening.requested.description(described)
+        shared = None
+        if inherited is not None:
+            memory = SharedMemory(description.step, inherited.memory_fd, resize=True)
+            shared = SharedSteps(memory, inherited.wake_pipes)
+        hub = StepHub(
+            listening.link,
+            description.step,
+            first_session=int.from_bytes(os.urandom(6), "little"),
+            local_workers=self.supervisor,
+            shared=shared,
+            worker_timeout_s=WORKER_TIMEOUT_S if settings.listen.bind else math.inf,
+            spin_s=SPIN_S if settings.local_workers < usable_cores() else 0.0,  # only if one core is free for the learner
+        )
+        listening.resources.callback(hub.close, CLOSE_TIMEOUT_S)
+        return ZmqVectorEnv(
+            description,
+            hub,
+            memory=None if shared is None else shared.memory,
+            timeout_s=settings.timeout_s,
+            on_worker_loss=settings.on_worker_loss,
+            copy=settings.copy,
+            on_close=listening.resources.close,
+        )
 
 
 def listen(settings: VectorEnvSettings, resources: ExitStack) -> ListeningVectorEnv:
@@ -120,21 +175,21 @@ def listen(settings: VectorEnvSettings, resources: ExitStack) -> ListeningVector
     if settings.workers is not None and settings.workers < 0:
         raise UsageError(f"workers: expected at least 0, got {settings.workers}")
     # Local workers end with this process, and this process notices at once if one of them ends. So no timeout is needed.
-    description = describe(settings, LEARNER_TIMEOUT_S if where.bind else math.inf)
+    requested = requested_copies(settings, LEARNER_TIMEOUT_S if where.bind else math.inf)
     address = where.bind or private_address(transport, resources)
     keyring, token = _keys(where, transport)
-    if address.startswith("tcp://") and keyring is None and any(env.factory is not None for env in description.step.envs):
+    if address.startswith("tcp://") and keyring is None and any(env.factory is not None for env in requested.envs):
         raise UsageError("an environment factory is code: it travels over ipc or inproc only, or over tcp with keys")
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     resources.callback(context.term)
     link = LearnerLink(address, context, keyring)
     resources.callback(link.close, 0.5)
-    shared = None
+    inherited = None
     if settings.shared_memory and SUPPORTED and count and transport != "inproc":
         to_learner = WakePipe()  # one for all workers: the last worker to finish a step writes to it
-        shared = SharedSteps(SharedMemory(description.step), {f"w{n}": (WakePipe(), to_learner) for n in range(count)})
-        resources.callback(shared.close)
-    return ListeningVectorEnv(settings, description, link, context, keyring, token, shared, resources)
+        inherited = InheritedByWorkers(new_memory(), {f"w{n}": (WakePipe(), to_learner) for n in range(count)})
+        resources.callback(inherited.close)
+    return ListeningVectorEnv(settings, requested, link, context, keyring, token, inherited, resources)
 
 
 def _keys(where: BindSettings, transport: str) -> tuple[Keyring | None, Token | None]:

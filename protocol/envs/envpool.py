@@ -20,9 +20,8 @@ from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import VectorEnv
 
 from protocol.env_spec import EnvSpec
-from protocol.envs.vectorized import check_spaces, vector_alternative
+from protocol.envs.vectorized import vector_alternative
 from protocol.errors import UsageError
-from protocol.specs import ActionSpec, Leaf
 
 MAX_EPISODE_STEPS = 2**31 - 1  # envpool counts steps in an int32
 _WARNINGS_LOCK = threading.Lock()
@@ -97,9 +96,3 @@ def _task_and_options(env: EnvSpec, known: gymnasium.envs.registration.EnvSpec) 
         return task, options
     of_gymnasium = str(getattr(creator, "__module__", "")).startswith("gymnasium.")
     return known.id if of_gymnasium else "", dict(env.kwargs)
-
-
-def check_envpool(env: EnvSpec, observation: tuple[Leaf, ...], action: ActionSpec) -> None:
-    """Raises `UsageError` unless envpool's environment has these spaces."""
-    pool = envpool_spec(env)
-    check_spaces(env, "envpool's", pool.observation_space, pool.action_space, observation, action)

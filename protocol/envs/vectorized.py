@@ -8,13 +8,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import gymnasium
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from protocol.env_spec import EnvSpec
-from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import UsageError
-from protocol.specs import ActionSpec, Leaf
 
 
 def make_native(env: EnvSpec, copies: int) -> VectorEnv[Any, Any, Any]:
@@ -38,33 +35,6 @@ def check_resets_next_step(env: VectorEnv[Any, Any, Any]) -> None:
             f"vector environment {env}: metadata['autoreset_mode']: expected {AutoresetMode.NEXT_STEP}, got {mode}; "
             "make it with autoreset_mode=AutoresetMode.NEXT_STEP"
         )
-
-
-def check_native(env: EnvSpec, observation: tuple[Leaf, ...], action: ActionSpec) -> None:
-    """Raises `UsageError` unless the vectorized form has these spaces."""
-    made = make_native(env, 1)
-    try:
-        check_spaces(
-            env, "its vectorized form", made.single_observation_space, made.single_action_space, observation, action
-        )
-    finally:
-        made.close()
-
-
-def check_spaces(
-    env: EnvSpec,
-    whose: str,
-    observed: gymnasium.Space[Any],
-    acted: gymnasium.Space[Any],
-    observation: tuple[Leaf, ...],
-    action: ActionSpec,
-) -> None:
-    """Raises `UsageError` unless the spaces of a vectorized form equal those of one env copy."""
-    if (observation_leaves(observed), action_spec(acted)) != (observation, action):
-        line = (
-            f"environment {env.id}: {whose} has other spaces than itself, {observed} and {acted}; {vector_alternative(env)}"
-        )
-        raise UsageError(line)
 
 
 def vector_alternative(env: EnvSpec) -> str:

@@ -46,11 +46,19 @@ class LaneArrays(NamedTuple):
     infos: memoryview  # bytes
 
 
+def new_memory() -> int:
+    """The file descriptor of an empty shared memory. Workers may inherit it before its size is known."""
+    return os.memfd_create("millrace", os.MFD_CLOEXEC)
+
+
 class SharedMemory:
     """The shared memory of one vector environment, as one side sees it."""
 
-    def __init__(self, spec: StepSpec, fd: int | None = None) -> None:
-        """The learner makes it; a worker maps the inherited `fd`. Raises ValueError if its size does not fit the spec."""
+    def __init__(self, spec: StepSpec, fd: int, *, resize: bool = False) -> None:
+        """Map the memory. With `resize` (the learner) it gets the size that the spec needs.
+
+        Raises ValueError if it has another size.
+        """
         N, lanes = len(spec.copies), len(spec.lanes)
         self._offset = 2 * CACHE_LINE_BYTES * lanes
         places = [self._reserve(N, leaf.shape, leaf.dtype) for leaf in (*spec.action, *spec.observation)]
@@ -58,11 +66,11 @@ class SharedMemory:
         observed = sum(np.dtype(leaf.dtype).itemsize * int(np.prod(leaf.shape)) for leaf in spec.observation)
         self.info_bytes = [MIN_INFO_BYTES + 2 * observed * copies for copies in spec.lanes]
         infos = self._offset
-        self.fd = os.memfd_create("millrace", os.MFD_CLOEXEC) if fd is None else fd
+        self.fd = fd
         size = infos + sum(self.info_bytes)
-        if fd is None:
-            os.ftruncate(self.fd, size)
-        elif os.fstat(fd).st_size != size:
+        if resize:
+            os.ftruncate(fd, size)
+        if os.fstat(fd).st_size != size:
             raise ValueError(f"shared memory: expected {size} bytes, got {os.fstat(fd).st_size}")
         memory = mmap.mmap(self.fd, size)
         self._words = memoryview(memory)[: 2 * CACHE_LINE_BYTES * lanes].cast("q")

@@ -15,13 +15,13 @@ from learner.config.layers import resolve
 from learner.rollouts.ledger import Ledger
 from learner.run_folder import checkpoint
 from learner.run_folder.run_folder import RunFolder
-from learner.run_spec import run_spec
 from learner.run_state import RunState, restore
 from protocol.env_spec import EnvSpec
 from protocol.errors import CheckpointError
 from protocol.policy.policy import make_policy
 from protocol.rollout import Batch, Rollout, stack_rollouts
 from protocol.specs import RunSpec
+from tests.support.described import run_spec
 from workers.collect.collector import Collector
 from workers.collect.held_rollouts import Assignment
 

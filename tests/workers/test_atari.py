@@ -11,13 +11,13 @@ import pytest
 
 from learner.config.config import Config
 from learner.config.hyperparameters import PPOConfig
-from learner.run_spec import run_spec
 from protocol.env_spec import EnvSpec
 from protocol.envs.envpool import envpool_spec
 from protocol.envs.vectorized import make_native
 from protocol.errors import UsageError
 from protocol.specs import RunSpec
 from tests.support.collectors import bits, collect, no_pulse, random_collector
+from tests.support.described import run_spec
 from workers.collect.env_copies import EnvCopies, LoopedCopies, VectorCopies, copy_seeds
 from workers.collect.envpool_copies import EnvpoolCopies
 from workers.envs import atari

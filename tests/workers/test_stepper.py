@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from learner.vector_env.settings import VectorEnvSettings
-from learner.vector_env.spec import describe
 from protocol.messages import Call, Reset, Returned, Step, Stepped
 from protocol.wire.plain_values import pack, unpack
+from tests.support.described import step_spec
 from workers.env_errors import LaneFailed
 from workers.envs.toy import Countdown
 from workers.step.stepper import Stepper
@@ -29,7 +29,7 @@ def call(stepper: Stepper, name: str, arguments: Any, *, assign: bool = False) -
 @pytest.mark.parametrize("name", ["_k", "__class__", "_max_episode_steps"])
 @pytest.mark.parametrize("assign", [False, True])
 def test_private_attributes_are_not_given_to_a_learner_that_is_not_trusted(name: str, assign: bool) -> None:
-    step = describe(VectorEnvSettings("workers.envs.toy:Countdown-v0", 2, lanes=1, kwargs={"k": 3})).step
+    step = step_spec(VectorEnvSettings("workers.envs.toy:Countdown-v0", 2, lanes=1, kwargs={"k": 3}))
     stepper = Stepper(step, allow_private_names=False)
     answer = call(stepper, name, [4, 4] if assign else ((), {}), assign=assign)
     assert answer.error.startswith(
@@ -40,7 +40,7 @@ def test_private_attributes_are_not_given_to_a_learner_that_is_not_trusted(name:
 
 
 def test_private_attributes_are_given_to_a_learner_that_may_run_code() -> None:
-    stepper = Stepper(describe(VectorEnvSettings("workers.envs.toy:Countdown-v0", 2, lanes=1, kwargs={"k": 3})).step)
+    stepper = Stepper(step_spec(VectorEnvSettings("workers.envs.toy:Countdown-v0", 2, lanes=1, kwargs={"k": 3})))
     assert call(stepper, "_k", [4, 5], assign=True).error == ""
     answer = call(stepper, "_k", ((), {}))
     assert (answer.error, unpack(answer.results.data)) == ("", [4, 5])
@@ -66,7 +66,7 @@ class Changes(Countdown):
 
 def stepped(env: Callable[[], Any], steps: int) -> list[Stepped]:
     """The answers of two copies in a vector environment to `steps` steps."""
-    stepper = Stepper(describe(VectorEnvSettings(env, 2, lanes=1)).step)
+    stepper = Stepper(step_spec(VectorEnvSettings(env, 2, lanes=1)).step)
     answers = [stepper.execute(Reset(1, 1, 0, 0, (0, 1), (0, 1), np.frombuffer(pack(None), np.uint8)), lambda: None)]
     actions = (np.zeros(2, np.int64),)
     answers += [stepper.execute(Step(1, t, 0, 0, actions), lambda: None) for t in range(2, 2 + steps)]

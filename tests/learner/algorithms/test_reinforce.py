@@ -14,12 +14,12 @@ from learner.algorithms.minibatches import LossInput, Minibatch
 from learner.algorithms.reinforce import REINFORCE
 from learner.config.hyperparameters import REINFORCEConfig
 from learner.config.layers import resolve
-from learner.run_spec import run_spec
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
 from tests.support.batches import DISCRETE, GAUSSIAN, batch, no_pulse
+from tests.support.described import run_spec
 
 GAMMA = 0.9
 

@@ -16,12 +16,12 @@ from hypothesis import strategies as st
 
 from learner.config.config import Config
 from learner.config.layers import resolve
-from learner.run_spec import run_spec
 from protocol.env_spec import EnvSpec
 from protocol.envs.envpool import envpool_spec
 from protocol.errors import UsageError
 from protocol.specs import RunSpec
 from tests.support.collectors import TOY, bits, collect, no_pulse, random_collector, run_of, trained
+from tests.support.described import run_spec
 from workers.collect.env_copies import LoopedCopies, StepResult, copy_seeds
 from workers.collect.envpool_copies import EnvpoolCopies
 from workers.envs.toy import Countdown

@@ -14,12 +14,12 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 from learner.config.config import Config
 from learner.config.layers import resolve
-from learner.run_spec import run_spec
 from protocol.env_spec import EnvSpec
 from protocol.envs.vectorized import make_native
 from protocol.errors import UsageError
 from protocol.specs import RunSpec
 from tests.support.collectors import TOY, bits, collect, no_pulse, random_collector, run_of, trained
+from tests.support.described import run_spec
 from workers.collect.env_copies import LoopedCopies, VectorCopies, copy_seeds
 from workers.envs.toy import Countdown
 

@@ -15,7 +15,6 @@ from learner.config.hyperparameters import HYPERPARAMETERS
 from learner.config.layers import resolve
 from learner.evaluate import load_policy
 from learner.run_folder.run_folder import RunFolder
-from learner.run_spec import run_spec
 from protocol.env_spec import AllowedCode, EnvSpec
 from protocol.errors import UsageError
 from protocol.policy.encoder import describe_encoder, make_encoder
@@ -25,6 +24,7 @@ from protocol.policy.policy import make_policy
 from protocol.policy.torch_policy import TorchPolicy
 from protocol.specs import NamedShape, PolicySpec
 from tests.support.batches import DISCRETE, IMAGE, batch, no_pulse, recurrent
+from tests.support.described import run_spec
 
 HERE = "tests.support.custom_encoders"
 

@@ -8,9 +8,9 @@ from collections.abc import Iterator
 import pytest
 
 from learner.vector_env.settings import VectorEnvSettings
-from learner.vector_env.spec import describe
-from protocol.wire.shared_memory import SUPPORTED, SharedMemory
+from protocol.wire.shared_memory import SharedMemory, new_memory
 from protocol.wire.wake_up import CAN_SPIN, SpinWait, WakePipe, WakeReason
+from tests.support.described import step_spec
 
 pytestmark = pytest.mark.skipif(not SUPPORTED, reason="needs Linux")
 
@@ -44,8 +44,8 @@ def test_waking_never_waits_and_never_fails(pipe: WakePipe) -> None:
 
 
 def test_who_is_done_last_sees_that_nobody_is_under_way() -> None:
-    spec = describe(VectorEnvSettings("CartPole-v1", 6, lanes=3)).step
-    here = SharedMemory(spec)
+    spec = step_spec(VectorEnvSettings("CartPole-v1", 6, lanes=3))
+    here = SharedMemory(spec, new_memory(), resize=True)
     there = SharedMemory(spec, os.dup(here.fd))
     for lane in range(3):
         here.order(lane, 7)

@@ -1,0 +1,38 @@
+"""Imports PyTorch and what else a run needs in a second thread, while workers start and describe the environment."""
+
+from __future__ import annotations
+
+import importlib
+import threading
+from collections.abc import Callable
+
+from learner.algorithms import ALGORITHMS
+
+MODULES = ("torch", "learner.run_spec", "learner.run_recorder", "learner.torch_setup")
+POLL_S = 0.05
+
+
+class ImportsAhead:
+    """The imports of one run, which begin at once."""
+
+    def __init__(self, algo: str) -> None:
+        self._modules = (*MODULES, ALGORITHMS[algo].partition(":")[0])
+        self._error: BaseException | None = None
+        # Not a daemon: a thread that the interpreter ends in the middle of importing PyTorch can crash the process.
+        self._thread = threading.Thread(target=self._import, name="imports")
+        self._thread.start()
+
+    def wait(self, check_interrupt: Callable[[], None]) -> None:
+        """Wait until all is imported. Raises what an import raised, or what `check_interrupt` raises meanwhile."""
+        while self._thread.is_alive():
+            self._thread.join(POLL_S)
+            check_interrupt()
+        if self._error is not None:
+            raise self._error
+
+    def _import(self) -> None:
+        try:
+            for name in self._modules:
+                importlib.import_module(name)
+        except BaseException as error:
+            self._error = error

@@ -1,0 +1,93 @@
+"""Asks workers for the description of the environment, before there is a run. A shell round `DescribeCoordinator`.
+
+Rule: every wait has a deadline and says what it waits for. Afterwards the link is free for the run, and all workers say
+Hello again.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from learner.members.describe_coordinator import DescribeCoordinator
+from learner.members.member_server import MemberServer, ServerCallbacks, ServerSettings
+from learner.members.process_callbacks import ProcessCallbacks
+from protocol.envs.description import DescribedEnv
+from protocol.errors import Stalled
+from protocol.specs import DescribeSpec
+from protocol.wire.learner_link import LearnerLink
+
+log = logging.getLogger("millrace.learner")
+
+POLL_S = 0.05
+LOG_WAITING_EVERY_S = 10.0
+LAST_MESSAGES_WAIT_S = 0.1  # the reason of a worker that declines may arrive after its process has ended
+
+
+@dataclass(frozen=True)
+class DescribeSettings:
+    """The settings of a run that matter before it begins, named as in `Config`."""
+
+    worker_timeout_s: float
+    no_workers_timeout_s: float
+    stall_timeout_s: float
+    max_env_failures: int
+    steps: int = 0
+
+
+def described_by_workers(
+    link: LearnerLink,
+    spec: DescribeSpec,
+    settings: DescribeSettings,
+    processes: ProcessCallbacks,
+    check_interrupt: Callable[[], None] = lambda: None,
+    clock: Callable[[], float] = time.monotonic,
+) -> DescribedEnv:
+    """The environment as the first worker describes it.
+
+    `check_interrupt` is called at least every 0.1 s: what it raises ends the wait. Raises `UsageError` if a worker of this
+    program says that there is no such environment; `EnvironmentFailed` if it fails too often; `NoWorkers` or `Stalled` if
+    a deadline passes.
+    """
+    coordinator = DescribeCoordinator(
+        spec,
+        int.from_bytes(os.urandom(6), "little"),
+        worker_timeout_s=settings.worker_timeout_s,
+        max_env_failures=settings.max_env_failures,
+        started_here=processes.expected > 0,
+    )
+    members = coordinator.membership.members
+    callbacks = ServerCallbacks(coordinator.receive, lambda now: coordinator.status(settings.steps, now), lambda event: None)
+    server_settings = ServerSettings(last_messages_wait_s=LAST_MESSAGES_WAIT_S, log_joins=False)
+    server = MemberServer(link, coordinator, callbacks, processes.ended, server_settings, clock)
+    began_s = member_s = logged_s = clock()
+    try:
+        while coordinator.described is None:
+            server.listen(POLL_S)
+            check_interrupt()
+            if coordinator.failure is not None:
+                raise coordinator.failure
+            now = clock()
+            if members:
+                member_s = now
+            if now - member_s > settings.no_workers_timeout_s:
+                raise server.no_workers(1, settings.no_workers_timeout_s)
+            waiting_for = _waiting_for(link, server, sorted(member.hello.worker for member in members.values()))
+            if now - began_s > settings.stall_timeout_s and members:
+                raise Stalled(f"no description of the environment within {settings.stall_timeout_s:.0f} s; {waiting_for}")
+            if now - logged_s > LOG_WAITING_EVERY_S:
+                logged_s = now
+                log.warning("%s", waiting_for)
+        server.send(coordinator.finish())
+        return coordinator.described
+    finally:
+        server.close()
+
+
+def _waiting_for(link: LearnerLink, server: MemberServer, workers: list[str]) -> str:
+    if not workers:
+        return f"waiting for a worker to join at {link.address}{server.missing_reason()}"
+    return f"waiting for a description of the environment from {', '.join(workers[:8])}"

@@ -1,0 +1,137 @@
+"""The conversation before a run: workers describe the environment. Pure: messages and `now` in, messages out.
+
+Rule: the first description that can be read is that of the run; other workers are compared with it when they open their
+lanes. A worker of this program that declines ends the start with its reason. One from elsewhere is refused, and the learner
+goes on waiting for another. An environment that fails counts; its worker may come back.
+"""
+
+from __future__ import annotations
+
+from learner.members.events import EnvironmentRaised
+from learner.members.membership import Member, Membership, Outgoing
+from learner.members.states import SentUnusable
+from protocol.bounds import escaped, one_line
+from protocol.envs.description import DescribedEnv, read_description
+from protocol.errors import BadMessage, EnvironmentFailed, UsageError, UserFacingError
+from protocol.messages import (
+    TOLD_TO_STOP,
+    Described,
+    Failure,
+    Goodbye,
+    Heartbeat,
+    HeartbeatReply,
+    Hello,
+    Refuse,
+    Rejoin,
+    Status,
+    ToLearner,
+)
+from protocol.specs import DescribeSpec
+
+
+class DescribeCoordinator:
+    """Members that describe the environment, until one has done so."""
+
+    def __init__(
+        self,
+        spec: DescribeSpec,
+        first_session: int,
+        *,
+        worker_timeout_s: float,
+        max_env_failures: int,
+        started_here: bool,
+    ) -> None:
+        """`started_here`: whether the workers are processes that this program started."""
+        self.spec = spec
+        self.described: DescribedEnv | None = None
+        """What the first usable description says."""
+        self.failure: UserFacingError | None = None
+        """Why the start cannot go on."""
+        self.membership: Membership[Member] = Membership(spec, Member, lambda member, why: None, first_session)
+        self._worker_timeout_s, self._max_env_failures = worker_timeout_s, max_env_failures
+        self._started_here = started_here
+        self._env_failures = 0
+
+    def receive(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
+        """Answer a message."""
+        if isinstance(message, Hello):
+            return self.membership.join(peer, message, now)[0]
+        member = self.membership.member_of_session(peer, message, now)
+        if member is None:
+            return self.membership.answer_ended_session(peer, message)
+        match message:
+            case Described(_, description) if self.described is None:
+                try:
+                    self.described = read_description(description)
+                except BadMessage as error:
+                    return self.membership.refuse(member, SentUnusable, f"its description of the environment: {error}")
+            case Heartbeat():
+                member.record_heartbeat(message)
+                member.replies += 1
+                return [(peer, HeartbeatReply(member.session, member.replies, ()))]
+            case Goodbye(_, reason):
+                return self._goodbye(member, reason)
+            case Failure(_, error, traceback, lane):
+                hello = member.hello
+                self.membership.events.append(EnvironmentRaised(hello.worker, hello.host, lane, error, escaped(traceback)))
+                self.membership.remove(member, Failure, f"broke: {error}")
+                self._count_failure(f"worker {hello.worker} ({hello.host}): {error}", escaped(traceback))
+        return []
+
+    def reject_message(self, peer: bytes, why: str, now: float) -> list[Outgoing]:
+        """A message that could not be read, such as a description that exceeds the bounds: its sender is refused."""
+        member = self.membership.members.get(peer)
+        if member is None:
+            return [(peer, Refuse(one_line(f"not understood: {why}")))]
+        return self.membership.refuse(member, SentUnusable, why)
+
+    def revoke(self, peer: bytes, why: str) -> list[Outgoing]:
+        """A member's key was revoked: send it the reason and remove it."""
+        return self.membership.revoke(peer, why)
+
+    def remove_worker(self, worker: str, why: str) -> list[Outgoing]:
+        """A worker's process has ended. If it was to describe the environment, the environment ended it."""
+        if self.membership.remove_worker(worker, why):
+            self._count_failure(f"worker {worker} {why} while it described the environment", "")
+        return []
+
+    def remove_silent(self, now: float) -> list[Outgoing]:
+        """Remove workers that were silent for longer than `worker_timeout_s`."""
+        self.membership.remove_silent(now, self._worker_timeout_s)
+        return []
+
+    def finish(self) -> list[Outgoing]:
+        """The next conversation begins: every member says Hello again."""
+        return [(peer, Rejoin(member.session)) for peer, member in self.membership.members.items()]
+
+    def status(self, total_steps: int, now: float) -> Status:
+        """The answer to `millrace status`. There are no weights yet, and no ledger."""
+        return Status(
+            env=self.spec.env.id,
+            version=-1,
+            env_steps=0,
+            total_steps=total_steps,
+            steps_per_s=0.0,
+            return_mean=None,
+            lag_mean=0.0,
+            lag_max=0,
+            workers=self.membership.status(now),
+            ledger={},
+        )
+
+    def _goodbye(self, member: Member, reason: str) -> list[Outgoing]:
+        if reason == TOLD_TO_STOP or self.described is not None:
+            self.membership.remove(member, Goodbye, f"left: {reason}")
+        elif self._started_here:
+            self.membership.remove(member, Goodbye, f"left: {reason}")
+            self.membership.take_events()  # the reason is the error's text, and need not be logged too
+            self.failure = self.failure or UsageError(reason)
+        else:
+            return self.membership.refuse(member, Goodbye, reason)
+        return []
+
+    def _count_failure(self, line: str, detail: str) -> None:
+        self._env_failures += 1
+        if self._env_failures > self._max_env_failures and self.failure is None and self.described is None:
+            counted = f"failure {self._env_failures}; max_env_failures allows {self._max_env_failures}"
+            self.failure = EnvironmentFailed(f"{line}; {counted}", detail)

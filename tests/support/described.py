@@ -1,0 +1,34 @@
+"""An environment as a worker describes it and a learner reads it, in one process; and the specs that follow from it."""
+
+from __future__ import annotations
+
+from learner.config.config import Config
+from learner.env_spaces import EnvSpaces
+from learner.run_spec import run_spec as spec_of_run
+from learner.vector_env.settings import VectorEnvSettings
+from learner.vector_env.spec import requested_copies
+from protocol.env_spec import EnvSpec
+from protocol.envs.description import DescribedEnv, read_description
+from protocol.messages import Described
+from protocol.specs import DescribeSpec, RunSpec, StepSpec, Vector
+from protocol.wire.codec import decode_to_learner, encode
+from workers.describe import describing
+
+
+def described(env: EnvSpec, vector: Vector = "loop", render_mode: str | None = None) -> DescribedEnv:
+    """The description, sent and received. Raises what a worker would report."""
+    with describing(DescribeSpec(env, vector, render_mode)) as description:
+        message = decode_to_learner([bytes(frame) for frame in encode(Described(1, description))])
+    assert isinstance(message, Described)
+    return read_description(message.description)
+
+
+def run_spec(config: Config, env: EnvSpec) -> RunSpec:
+    """The run of this configuration. Raises `UsageError`."""
+    return spec_of_run(config, env, EnvSpaces.of_description(described(env, config.chosen_vector())))
+
+
+def step_spec(settings: VectorEnvSettings) -> StepSpec:
+    """The vector environment of these settings."""
+    requested = requested_copies(settings)
+    return requested.description(described(requested.envs[0], render_mode=settings.render_mode)).step

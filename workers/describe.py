@@ -1,0 +1,77 @@
+"""Answers a learner that does not know its environment yet: makes one env copy, describes it and closes it.
+
+Rule: the environment's code runs here and not in the learner. The description is sent before the copy is closed, so that a
+copy whose `close` raises or hangs cannot take the description with it.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
+import gymnasium
+
+from protocol.env_spec import EnvSpec
+from protocol.envs.description import describe_env
+from protocol.envs.envpool import envpool_spec
+from protocol.envs.spaces import action_spec, observation_leaves
+from protocol.envs.vectorized import make_native, vector_alternative
+from protocol.errors import EnvironmentFailed, UsageError, first_line
+from protocol.space_spec import EnvDescription
+from protocol.specs import DescribeSpec
+
+
+@contextmanager
+def describing(spec: DescribeSpec) -> Iterator[EnvDescription]:
+    """The description of the environment; its copy is closed afterwards, whatever `close` raises.
+
+    Raises `UsageError`, with advice, if the environment cannot be what the learner asks for: its id is unknown, a package
+    is missing, or its spaces are not supported. Raises `EnvironmentFailed` for any exception of its own code, and for an
+    exit of the process that its code asks for.
+    """
+    with _failures_of(spec.env):
+        env = spec.env.make(spec.render_mode)
+    try:
+        with _failures_of(spec.env):
+            _check_vectorized(spec, env)
+            description = describe_env(env)
+        yield description
+    finally:
+        with suppress(Exception, SystemExit):
+            env.close()
+
+
+@contextmanager
+def _failures_of(env: EnvSpec) -> Iterator[None]:
+    try:
+        yield
+    except UsageError as error:
+        if error.detail:  # its constructor raised
+            raise EnvironmentFailed(str(error), error.detail) from error
+        raise
+    except (Exception, SystemExit) as error:
+        line = f"environment {env.id} cannot be made: {type(error).__name__}: {first_line(error)}"
+        raise EnvironmentFailed(line, traceback.format_exc()) from error
+
+
+def _check_vectorized(spec: DescribeSpec, env: gymnasium.Env[object, object]) -> None:
+    """Raise `UsageError` unless the vectorized form that the learner asks for has the spaces of one env copy."""
+    match spec.vector:
+        case "loop":
+            return
+        case "native":
+            whose, made = "its vectorized form", make_native(spec.env, 1)
+            observed, acted = made.single_observation_space, made.single_action_space
+            with suppress(Exception, SystemExit):
+                made.close()
+        case "envpool":
+            whose, pool = "envpool's", envpool_spec(spec.env)
+            observed, acted = pool.observation_space, pool.action_space
+    expected = observation_leaves(env.observation_space), action_spec(env.action_space)
+    if (observation_leaves(observed), action_spec(acted)) != expected:
+        line = (
+            f"environment {spec.env.id}: {whose} has other spaces than itself, {observed} and {acted}; "
+            f"{vector_alternative(spec.env)}"
+        )
+        raise UsageError(line)
