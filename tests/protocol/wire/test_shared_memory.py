@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from learner.vector_env.settings import VectorEnvSettings
-from protocol.wire.shared_memory import SharedMemory, new_memory
+from protocol.wire.shared_memory import SUPPORTED, SharedMemory, new_memory
 from protocol.wire.wake_up import CAN_SPIN, SpinWait, WakePipe, WakeReason
 from tests.support.described import step_spec
 
