@@ -1,0 +1,249 @@
+"""The conversation in which a worker describes the environment: its pure half, and the shell's deadlines on a fake clock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import cast
+
+import msgspec
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from learner.members.describe import LOG_WAITING_EVERY_S, DescribeSettings, described_by_workers
+from learner.members.describe_coordinator import DescribeCoordinator
+from learner.members.membership import Outgoing
+from learner.members.process_callbacks import ProcessCallbacks
+from protocol.env_spec import EnvSpec
+from protocol.errors import EnvironmentFailed, NoWorkers, Stalled, UsageError
+from protocol.messages import (
+    PROTOCOL_VERSION,
+    TOLD_TO_STOP,
+    Described,
+    Failure,
+    Goodbye,
+    Heartbeat,
+    HeartbeatReply,
+    Hello,
+    Refuse,
+    Rejoin,
+    ToLearner,
+    Welcome,
+)
+from protocol.space_spec import BoxSpace, DiscreteSpace, EnvDescription
+from protocol.specs import DescribeSpec
+from protocol.wire.codec import decode_to_worker
+from protocol.wire.learner_link import LearnerLink
+from protocol.wire.plain_values import pack
+from tests.support.fake_link import FakeLink
+
+SPEC = DescribeSpec(EnvSpec("Fake-v0"))
+A, B = b"w0", b"w1"
+NOTHING = np.frombuffer(pack({}), np.uint8)
+DESCRIPTION = EnvDescription(DiscreteSpace(3, 0, "int64"), DiscreteSpace(2, 0, "int64"), NOTHING, "", 7, "")
+BROKEN = msgspec.structs.replace(DESCRIPTION, observation=BoxSpace((2,), "float32", np.ones(3), np.ones(())))
+SETTINGS = DescribeSettings(worker_timeout_s=5, no_workers_timeout_s=60, stall_timeout_s=100, max_env_failures=1)
+
+
+def coordinator(*, started_here: bool = True) -> DescribeCoordinator:
+    return DescribeCoordinator(SPEC, 10, worker_timeout_s=5, max_env_failures=1, started_here=started_here)
+
+
+def hello(name: bytes, nonce: int = 1, attempt: int = 1) -> Hello:
+    return Hello(PROTOCOL_VERSION, name.decode(), "host", 1, nonce, "fake", attempt)
+
+
+def join(made: DescribeCoordinator, name: bytes, nonce: int = 1) -> int:
+    ((_, welcome),) = made.receive(name, hello(name, nonce), 0.0)
+    assert isinstance(welcome, Welcome)
+    assert welcome.run == SPEC
+    return welcome.session
+
+
+# -------------------------------------------------------------------------------------------------- the pure half
+
+
+def test_the_first_description_is_the_run_s_and_all_members_say_hello_again() -> None:
+    made = coordinator()
+    one, two = join(made, A), join(made, B)
+    assert made.receive(A, Described(one, DESCRIPTION), 1.0) == []
+    other = msgspec.structs.replace(DESCRIPTION, observation=DiscreteSpace(9, 0, "int64"))
+    assert made.receive(B, Described(two, other), 1.0) == []
+    assert made.described is not None
+    assert made.described.observation_space == spaces.Discrete(3)
+    assert made.described.max_episode_steps == 7
+    assert made.finish() == [(A, Rejoin(one)), (B, Rejoin(two))]
+
+
+def test_a_description_of_another_session_is_not_used() -> None:
+    made = coordinator()
+    session = join(made, A)
+    assert made.receive(A, Described(session + 7, DESCRIPTION), 1.0) == [(A, Rejoin(session + 7))]
+    assert made.described is None
+
+
+def test_a_description_that_cannot_be_read_gets_its_sender_refused_and_another_is_used() -> None:
+    made = coordinator(started_here=False)
+    ((peer, refusal),) = made.receive(A, Described(join(made, A), BROKEN), 1.0)
+    assert peer == A
+    assert isinstance(refusal, Refuse)
+    assert "low: expected float32(2,)" in refusal.reason
+    assert made.described is None
+    assert made.receive(A, hello(A), 1.0) == [(A, refusal)]  # the same process does not come back
+    made.receive(B, Described(join(made, B), DESCRIPTION), 2.0)
+    assert made.described is not None
+
+
+def test_a_message_that_exceeds_the_bounds_gets_its_sender_refused() -> None:
+    made = coordinator()
+    join(made, A)
+    ((_, refusal),) = made.reject_message(A, "observation space: expected at most 16777216 elements, got 99999999", 1.0)
+    assert isinstance(refusal, Refuse)
+    assert not made.membership.members
+
+
+def test_a_worker_of_ours_that_declines_ends_the_start_with_its_reason() -> None:
+    made = coordinator()
+    made.receive(A, Goodbye(join(made, A), "environment Fake-v0 is not registered", ()), 1.0)
+    assert isinstance(made.failure, UsageError)
+    assert str(made.failure) == "environment Fake-v0 is not registered"
+    assert not made.membership.take_events()  # the error's line is the only one
+
+
+def test_a_worker_from_elsewhere_that_declines_is_refused_and_the_learner_waits_on() -> None:
+    made = coordinator(started_here=False)
+    made.receive(A, Goodbye(join(made, A), "environment Fake-v0 is not registered", ()), 1.0)
+    assert made.failure is None
+    ((_, refusal),) = made.receive(A, hello(A), 2.0)
+    assert refusal == Refuse("environment Fake-v0 is not registered")
+    made.receive(B, Described(join(made, B), DESCRIPTION), 2.0)
+    assert made.described is not None
+
+
+@pytest.mark.parametrize("started_here", [True, False])
+def test_a_worker_that_was_told_to_stop_says_nothing_of_the_environment(started_here: bool) -> None:
+    made = coordinator(started_here=started_here)
+    made.receive(A, Goodbye(join(made, A), TOLD_TO_STOP, ()), 1.0)
+    assert made.failure is None
+    assert isinstance(made.receive(A, hello(A), 2.0)[0][1], Welcome)
+
+
+def test_failures_are_counted_and_the_worker_may_come_back() -> None:
+    made = coordinator()
+    for nonce in (1, 2):
+        assert made.failure is None
+        made.receive(A, Failure(join(made, A, nonce), "OSError: no display", "where\nit was", None), 1.0)
+    assert isinstance(made.failure, EnvironmentFailed)
+    assert str(made.failure) == "worker w0 (host): OSError: no display; failure 2; max_env_failures allows 1"
+    assert made.failure.detail == "where\nit was"
+
+
+def test_a_process_that_ends_while_it_describes_is_a_failure() -> None:
+    made = coordinator()
+    for nonce in (1, 2):
+        join(made, A, nonce)
+        made.remove_worker("w0", "ended with exit code 0")
+    made.remove_worker("w1", "ended with exit code 3")  # it had not joined
+    assert "w0 ended with exit code 0 while it described the environment; failure 2" in str(made.failure)
+
+
+def test_heartbeats_are_answered_and_silence_is_the_end() -> None:
+    made = coordinator()
+    session = join(made, A)
+    assert made.receive(A, Heartbeat(session, 0, -1, (), 0, {}, 0), 4.0) == [(A, HeartbeatReply(session, 1, ()))]
+    made.remove_silent(8.9)
+    assert made.membership.members
+    made.remove_silent(9.1)
+    assert not made.membership.members
+
+
+def test_the_status_says_who_is_here() -> None:
+    made = coordinator()
+    join(made, A)
+    answer = made.status(500, 1.0)
+    assert (answer.env, answer.version, answer.total_steps) == ("Fake-v0", -1, 500)
+    assert [worker.worker for worker in answer.workers] == ["w0"]
+
+
+# -------------------------------------------------------------------------------------------------- the shell
+
+
+class Ends(Exception):
+    """What a test's interrupt raises."""
+
+
+def shell(
+    link: FakeLink, check: Callable[[], None] = lambda: None, processes: ProcessCallbacks | None = None
+) -> tuple[object, list[Outgoing]]:
+    found = described_by_workers(
+        cast(LearnerLink, link), SPEC, SETTINGS, processes or ProcessCallbacks(expected=1), check, lambda: link.now
+    )
+    return found, [(b"", decode_to_worker([bytes(frame) for frame in frames])) for frames in link.sent]
+
+
+def saying(link: FakeLink, *messages: Callable[[int], ToLearner], name: bytes = A, nonce: int = 1) -> None:
+    """Puts a Hello into the inbox; once it is answered, what the worker says in the session that it was given."""
+
+    def answer(peer: bytes, frames: list[bytes]) -> bool:
+        link.sent.append(frames)
+        message = decode_to_worker([bytes(frame) for frame in frames])
+        if isinstance(message, Welcome):
+            link.inbox += [(peer, make(message.session)) for make in messages]
+        return True
+
+    link.send = answer  # type: ignore[method-assign, assignment]
+    link.inbox.append((name, hello(name, nonce)))
+
+
+def test_the_shell_returns_the_description_and_asks_for_another_hello() -> None:
+    link = FakeLink()
+    saying(link, lambda session: Described(session, DESCRIPTION))
+    found, sent = shell(link)
+    assert found.action_space == spaces.Discrete(2)  # type: ignore[attr-defined]
+    assert isinstance(sent[-1][1], Rejoin)
+
+
+def test_nobody_comes() -> None:
+    link = FakeLink()
+    with pytest.raises(NoWorkers, match="waited 60 s for 1 workers at fake, 0 joined"):
+        shell(link)
+    assert 160.0 <= link.now <= 161.0
+
+
+def test_a_worker_that_never_answers_stalls_the_start(caplog: pytest.LogCaptureFixture) -> None:
+    link = FakeLink()
+    saying(link)
+    beat = ProcessCallbacks(lambda: _heartbeats(link), expected=1)
+    with pytest.raises(Stalled, match=r"no description of the environment within 100 s; waiting for .* from w0"):
+        shell(link, processes=beat)
+    lines = [record.getMessage() for record in caplog.records if "waiting for a description" in record.getMessage()]
+    assert abs(len(lines) - SETTINGS.stall_timeout_s / LOG_WAITING_EVERY_S) <= 1
+
+
+def _heartbeats(link: FakeLink) -> tuple[()]:
+    """The worker's heartbeat, whenever the server looks."""
+    for frames in link.sent:
+        message = decode_to_worker([bytes(frame) for frame in frames])
+        if isinstance(message, Welcome):
+            link.inbox.append((A, Heartbeat(message.session, 0, -1, (), 0, {}, 0)))
+            link.now += 0.5
+    return ()
+
+
+def test_an_interrupt_ends_the_wait_at_once() -> None:
+    link = FakeLink()
+
+    def check() -> None:
+        if link.now > 101.0:
+            raise Ends
+
+    with pytest.raises(Ends):
+        shell(link, check)
+    assert link.now <= 101.2
+
+
+def test_the_error_of_a_worker_of_ours_is_raised() -> None:
+    link = FakeLink()
+    saying(link, lambda session: Goodbye(session, "environment Fake-v0: no such", ()))
+    with pytest.raises(UsageError, match="environment Fake-v0: no such"):
+        shell(link)
