@@ -35,6 +35,13 @@ LEARNER = {  # what each folder of the learner may import of the learner; train.
 }
 MAY_PRINT = {"millrace/cli/main.py", "millrace/terminal.py"}
 MAY_UNPICKLE = {"protocol/env_spec.py"}
+ENVIRONMENT_CODE = {"make", "make_vec", "make_vectorized", "registered", "make_native", "envpool_spec"}
+"""functions that run code of the environment: of gymnasium, of `EnvSpec` and of protocol/envs/"""
+RUNS_ENVIRONMENTS = {  # evaluation and recording; everything else of the learner must not
+    "learner/evaluate.py",
+    "learner/recording/record.py",
+    "learner/recording/video.py",
+}
 TORCH_IN_PROTOCOL = "protocol/policy/"
 TORCH_INTERNALS = "learner/algorithms/kernels/"
 MOST_FILES = 16  # in a folder
@@ -192,6 +199,21 @@ def test_nothing_is_pickled_but_in_the_one_guarded_place() -> None:
                     assert flags.get("weights_only") == "True", f"{source}:{node.lineno}"
                 case ast.keyword(arg="allow_pickle"):
                     assert ast.unparse(node.value) == "False", f"{source}:{node.lineno}"
+
+
+def test_the_learner_runs_no_code_of_the_environment() -> None:
+    """Workers describe the environment (`DescribeSpec`): the learner's machine need not have it."""
+    for source in sources("learner"):
+        if source not in RUNS_ENVIRONMENTS:
+            assert not [where for name in ENVIRONMENT_CODE for where in every_call(source, name)], source
+
+
+def every_call(source: str, name: str) -> Iterator[str]:
+    """Where a function of this name is called, by itself or as an attribute of anything."""
+    for node in ast.walk(tree(source)):
+        match node:
+            case ast.Call(func=ast.Name(id=called) | ast.Attribute(attr=called)) if called == name:
+                yield f"{source}:{node.lineno} {name}"
 
 
 def test_only_the_command_line_prints() -> None:

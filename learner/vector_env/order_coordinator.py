@@ -173,13 +173,13 @@ class OrderCoordinator:
         peer = self.lanes[lane].owner
         return None if peer is None else self.members[peer]
 
-    def order(self, lane: int, make: MakeOrder) -> list[Outgoing]:
+    def order(self, lane: int, make_order: MakeOrder) -> list[Outgoing]:
         """Send an order to a lane that was placed."""
         member, record = self.owner(lane), self.lanes[lane]
         if member is None:
             raise ValueError(f"lane {lane}: expected a worker, got none")
         self._tickets += 1
-        order = make(member.session, self._tickets, LaneIncarnation(lane, record.incarnation))
+        order = make_order(member.session, self._tickets, LaneIncarnation(lane, record.incarnation))
         record.started = True
         self.orders[order.ticket] = order
         member.tickets[order.ticket] = member.replies

@@ -66,7 +66,7 @@ class Changes(Countdown):
 
 def stepped(env: Callable[[], Any], steps: int) -> list[Stepped]:
     """The answers of two copies in a vector environment to `steps` steps."""
-    stepper = Stepper(step_spec(VectorEnvSettings(env, 2, lanes=1)).step)
+    stepper = Stepper(step_spec(VectorEnvSettings(env, 2, lanes=1)))
     answers = [stepper.execute(Reset(1, 1, 0, 0, (0, 1), (0, 1), np.frombuffer(pack(None), np.uint8)), lambda: None)]
     actions = (np.zeros(2, np.int64),)
     answers += [stepper.execute(Step(1, t, 0, 0, actions), lambda: None) for t in range(2, 2 + steps)]
