@@ -11,10 +11,11 @@ from collections.abc import Callable
 
 from learner.algorithms import Algorithm
 from learner.config.run_rules import EvaluationSettings
+from learner.rollouts.evaluation_tickets import EvaluationPlan
 from learner.run_folder.results import Best, Evaluation
 from learner.run_folder.run_folder import RunFolder
+from learner.run_state import RunState
 from learner.service import RolloutService
-from protocol.arrays import Floats
 from protocol.errors import RunError, UsageError
 from protocol.specs import RunSpec
 
@@ -33,41 +34,39 @@ class Evaluations:
         spec: RunSpec,
         algorithm: Algorithm,
         service: RolloutService,
-        best: list[float] | None,
-        env_steps: int,
+        state: RunState,
+        watch: Callable[[], None],
     ) -> None:
-        """`best` and `env_steps` are those of the checkpoint that the run resumes from; None and 0 in a new run."""
+        """`state`: where the run stands. `watch` is called several times a second during an evaluation."""
         self.newest: Evaluation | None = None
         """The newest evaluation since this learner started."""
-        self.best = best
+        self.best = state.best
         """Mean return and env steps of the best evaluation during training."""
         self.note = ""
         """The newest evaluation as one line of text for the user."""
+        self.doing = ""
+        """How far the evaluation in progress is, as text for the user; empty if there is none."""
         self._settings, self._folder, self._spec = settings, folder, spec
-        self._algorithm, self._service = algorithm, service
+        self._algorithm, self._service, self._watch = algorithm, service, watch
         self._version = -1  # of the weights that `newest` evaluated
-        self._next_at = env_steps + settings.every_env_steps
+        due_at = state.env_steps + settings.every_env_steps
+        self.next_at = min(state.next_evaluation or due_at, due_at)
+        """Env steps at which the next evaluation is due."""
 
-    def evaluate_if_due(self, version: int, env_steps: int) -> dict[str, float]:
-        """Evaluate every `every_env_steps` env steps. The metrics of the evaluation; empty if none was due."""
-        if not self._settings.every_env_steps or env_steps < self._next_at:
-            return {}
-        self._next_at += self._settings.every_env_steps
-        found = self.evaluate(version, env_steps)
+    def is_due(self, env_steps: int) -> bool:
+        """Whether an evaluation is due after so many env steps."""
+        return bool(self._settings.every_env_steps) and env_steps >= self.next_at
+
+    def evaluate_newest(self, version: int, env_steps: int) -> dict[str, float]:
+        """Make the evaluation that is due, of the newest policy, which is this version. Returns its metrics."""
+        found = self._evaluate_version(version, env_steps)
         self._keep_if_best(found, env_steps)
+        self.next_at += self._settings.every_env_steps
         return found.metrics()
-
-    def evaluate(self, version: int, env_steps: int) -> Evaluation:
-        """Evaluate the newest policy, which is this version; the same version is not evaluated twice."""
-        if self.newest is None or self._version != version:
-            self.newest = self._evaluate(*self._algorithm.weights(), EVALUATION_SEED)
-            self._version = version
-            self.note = f"{env_steps:,} env steps: greedy {self.newest}"
-        return self.newest
 
     def conclude(self, version: int, env_steps: int) -> Best | None:
         """Evaluate the final policy. If the run kept a best policy, evaluate that one on other episodes and return it."""
-        found = self.evaluate(version, env_steps)
+        found = self._evaluate_version(version, env_steps)
         if self._settings.every_env_steps:
             self._keep_if_best(found, env_steps)
         if self.best is None:
@@ -78,15 +77,35 @@ class Evaluations:
             log.warning("%s", error)
             return None
         chosen_by, at_env_steps = self.best
-        confirmed = self._evaluate(parameters, buffers, CONFIRMATION_SEED)
+        self._service.publish(version + 1, parameters, buffers, deal=False)  # training is over: no update has this number
+        confirmed = self._evaluate("the best policy", CONFIRMATION_SEED)
         return Best(env_steps=int(at_env_steps), chosen_by=chosen_by, evaluation=confirmed)
 
     def of_version(self, version: int) -> Evaluation | None:
         """The evaluation of this version, if there is one."""
         return self.newest if self._version == version else None
 
-    def _evaluate(self, parameters: Floats, buffers: Floats, seed: int) -> Evaluation:
-        return self._service.evaluate(parameters, buffers, self._settings.episodes, seed + self._settings.seed)
+    def _evaluate_version(self, version: int, env_steps: int) -> Evaluation:
+        """Evaluate the newest policy, which is this version; the same version is not evaluated twice."""
+        if self.newest is None or self._version != version:
+            self.newest = self._evaluate("", EVALUATION_SEED)
+            self._version = version
+            self.note = f"{env_steps:,} env steps: greedy {self.newest}"
+        return self.newest
+
+    def _evaluate(self, what: str, seed: int) -> Evaluation:
+        """Evaluate the weights that were published last."""
+        settings = self._settings
+        plan = EvaluationPlan.of(settings.episodes, seed + settings.seed, settings.copies, settings.max_steps)
+
+        def show(played: int) -> None:
+            self.doing = f"evaluating{f' {what}' if what else ''}: {played:,} of {settings.episodes:,} episodes"
+            self._watch()
+
+        try:
+            return self._service.evaluate(plan, show)
+        finally:
+            self.doing = ""
 
     def _keep_if_best(self, found: Evaluation, env_steps: int) -> None:
         """Keep the evaluation if it is the best. A tie keeps the earlier one, which needed fewer steps."""

@@ -171,7 +171,7 @@ class Run:
         )
         self._interrupts = Interrupts()
         hub = Hub(link, coordinator, settings, processes, self._check_interrupt, observer)
-        self.service = RolloutService(hub, spec, processes.expected)
+        self.service = RolloutService(hub, processes.expected)
         episodes = _training_recorder(config, self.folder, setup.known, spec)
         self.recorder = RunRecorder(config, self.folder, spec, self.algorithm, self.service, state, watch, episodes)
         self.folder.keep()

@@ -1,14 +1,16 @@
 """Metrics, checkpoints, evaluations and the decision to stop: everything that a run does between two updates.
 
 Rule: a checkpoint is written between two updates, never during one, and holds everything that the next update depends on.
-If the disk is full, the run logs a warning and goes on.
+It is written before an evaluation, which may take long. If the disk is full, the run logs a warning and goes on. The seconds
+of evaluations are a stage of their own and do not count as training.
 """
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 
 from learner.algorithms import Algorithm
 from learner.config.config import Config
@@ -29,6 +31,8 @@ from protocol.rollout import Batch
 from protocol.specs import RunSpec
 
 log = logging.getLogger("millrace.learner")
+
+SHOW_EVERY_S = 0.2  # progress of an evaluation
 
 
 class RunRecorder:
@@ -54,7 +58,9 @@ class RunRecorder:
         self._algorithm, self._service, self._watch = algorithm, service, watch
         self._stop_rule, self._checkpoints = config.stop_rule(), config.checkpoint_policy()
         settings = config.evaluation_settings()
-        self._evaluations = Evaluations(settings, folder, spec, algorithm, service, state.best, state.env_steps)
+        self._evaluations = Evaluations(settings, folder, spec, algorithm, service, state, self._show_evaluation)
+        self._evaluating_since_s: float | None = None
+        self._shown_s = 0.0
         self._confirmed: Best | None = None
         self._window = EpisodeWindow.from_state(state.episodes)
         self._metrics = MetricsLog(folder.path, state.env_steps)
@@ -83,25 +89,41 @@ class RunRecorder:
         if self._episode_recorder is not None:
             self._episode_recorder.add(rollouts)
 
-    def updated(self, batch: Batch, metrics: Mapping[str, float], update_s: float) -> None:
-        """An update was made and published: count it, evaluate and write what is due."""
-        began_s = time.monotonic()
+    def count(self, batch: Batch) -> None:
+        """An update was made of this batch."""
         self.version += 1
         self.env_steps += batch.env_steps
+        self._window.extend(batch.episodes)
+        self._episodes_since_save += len(batch.episodes)
+
+    def training_goes_on(self) -> bool:
+        """Whether the next rollouts may be collected now: no evaluation is due, and the run does not end."""
+        return not self._evaluations.is_due(self.env_steps) and self.stop_reason() is None
+
+    def updated(self, metrics: Mapping[str, float], update_s: float) -> None:
+        """The update that was counted last was published: evaluate it and write what is due."""
+        began_s, evaluated_s = time.monotonic(), self._stages_s.get("evaluate", 0.0)
         self._workers_alive = self._service.workers_alive()
         self._stages_s["update"] += update_s
-        self._window.extend(batch.episodes)
-        evaluation = self._evaluations.evaluate_if_due(self.version, self.env_steps)
-        progress = self.progress()
-        warn_on_error(lambda: self._metrics.write(progress, {**metrics, **evaluation}))
-        self._service.report(progress)
-        self._watch(progress)
-        self._episodes_since_save += len(batch.episodes)
-        if self._checkpoints.is_due(
+        evaluation: dict[str, float] = {}
+        try:
+            if self._evaluations.is_due(self.env_steps):
+                self.save()
+                evaluation = self._evaluate()
+        finally:
+            self._report({**metrics, **evaluation})
+        if evaluation or self._checkpoints.is_due(
             since_last_s=began_s - self._saved_s, episodes_since_last=self._episodes_since_save, updates=self.version
         ):
             self.save()
-        self._stages_s["other"] += time.monotonic() - began_s
+        evaluated_s = self._stages_s.get("evaluate", 0.0) - evaluated_s
+        self._stages_s["other"] += time.monotonic() - began_s - evaluated_s
+
+    def evaluate_if_due(self) -> None:
+        """Make the evaluation before which the run was interrupted, if there is one. The weights must be published."""
+        if self._evaluations.is_due(self.env_steps):
+            self._report(self._evaluate())
+            self.save()
 
     def save(self) -> None:
         """Write a checkpoint and the policy."""
@@ -113,8 +135,9 @@ class RunRecorder:
         warn_on_error(lambda: self._folder.write_policy(policy, env, *self._algorithm.weights()))
 
     def conclude(self) -> None:
-        """Evaluate the final policy, and the best one."""
-        self._confirmed = self._evaluations.conclude(self.version, self.env_steps)
+        """Evaluate the final policy, which must be published, and the best one."""
+        with self._evaluation_time():
+            self._confirmed = self._evaluations.conclude(self.version, self.env_steps)
 
     def finish(self, reason: str) -> None:
         """Write the summary."""
@@ -149,9 +172,40 @@ class RunRecorder:
             ledger=snapshot.ledger.counts(),
             stages=self._stages(snapshot),
             note=self._evaluations.note,
+            doing=self._evaluations.doing,
         )
 
     # ---------------------------------------------------------------- inside
+
+    def _evaluate(self) -> dict[str, float]:
+        """Evaluate the newest policy. Returns the metrics."""
+        with self._evaluation_time():
+            return self._evaluations.evaluate_newest(self.version, self.env_steps)
+
+    @contextmanager
+    def _evaluation_time(self) -> Iterator[None]:
+        """Count the seconds as those of an evaluation."""
+        self._evaluating_since_s = time.monotonic()
+        try:
+            yield
+        finally:
+            seconds = time.monotonic() - self._evaluating_since_s
+            self._evaluating_since_s = None
+            self._stages_s["evaluate"] = self._stages_s.get("evaluate", 0.0) + seconds
+
+    def _show_evaluation(self) -> None:
+        """Show how far an evaluation is, now and then."""
+        now = time.monotonic()
+        if now - self._shown_s >= SHOW_EVERY_S:
+            self._shown_s = now
+            self._watch(self.progress())
+
+    def _report(self, metrics: Mapping[str, float]) -> None:
+        """Write a row of metrics, and tell how far the run is."""
+        progress = self.progress()
+        warn_on_error(lambda: self._metrics.write(progress, metrics))
+        self._service.report(progress)
+        self._watch(progress)
 
     def _state(self) -> RunState:
         snapshot = self._service.snapshot()
@@ -163,6 +217,7 @@ class RunRecorder:
             incarnations=snapshot.incarnations,
             episodes=self._window.state(),
             best=self._evaluations.best,
+            next_evaluation=self._evaluations.next_at,
         )
 
     def _summary(self, reason: str) -> Summary:
@@ -192,4 +247,7 @@ class RunRecorder:
         return stages | {f"worker_{name}": s for name, s in snapshot.worker_stages.items()}
 
     def _wall_s(self) -> float:
-        return self._wall_before_s + time.monotonic() - self._started_s
+        """Seconds of training: without evaluations."""
+        now = time.monotonic()
+        evaluating_s = 0.0 if self._evaluating_since_s is None else now - self._evaluating_since_s
+        return self._wall_before_s + now - self._started_s - self._stages_s.get("evaluate", 0.0) - evaluating_s

@@ -29,6 +29,8 @@ class RunState(msgspec.Struct, kw_only=True):
     """State of the `EpisodeWindow`."""
     best: list[float] | None = None
     """Mean return and env steps of the best evaluation. Its policy is in the run folder."""
+    next_evaluation: int = 0
+    """Env steps at which the next evaluation is due; 0 if that is not known."""
 
     def checkpoint_content(self, algorithm: Algorithm) -> dict[str, Any]:
         """The content of a checkpoint: plain data and tensors."""

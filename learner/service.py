@@ -6,34 +6,35 @@ This is all that `learner.train` knows of the rest. Who starts worker processes 
 
 from __future__ import annotations
 
-from learner.evaluate import evaluate
+from collections.abc import Callable
+
+from learner.rollouts.evaluation_tickets import EvaluationPlan
 from learner.rollouts.hub import Hub, HubSnapshot
 from learner.rollouts.lanes import AcceptedRollout
 from learner.run_folder.progress import Progress
 from learner.run_folder.results import Evaluation
 from protocol.arrays import Floats
-from protocol.policy.policy import make_policy
-from protocol.specs import RunSpec
 
 
 class RolloutService:
     """Rollouts of one run, from any number of workers."""
 
-    def __init__(self, hub: Hub, spec: RunSpec, workers_expected: int = 0) -> None:
+    def __init__(self, hub: Hub, workers_expected: int = 0) -> None:
         """`workers_expected`: how many workers the user asked for; 0: any number."""
         self.workers_expected = workers_expected
-        self._hub, self._spec = hub, spec
+        self._hub = hub
 
     def wait_for_workers(self, count: int) -> None:
         """Wait until this number of `workers` have joined. Raises `NoWorkers` when they do not come in time."""
         self._hub.wait_for(count)
 
-    def publish(self, version: int, parameters: Floats, buffers: Floats) -> None:
+    def publish(self, version: int, parameters: Floats, buffers: Floats, *, deal: bool = True) -> None:
         """Send new weights to all workers and deal the tickets that they allow. The arrays must not change afterwards.
 
+        `deal` False: deal no ticket before the next `gather`, because these weights are evaluated first.
         Raises `RunError` if a parameter is too large for the dtype in which weights are sent.
         """
-        self._hub.publish(version, parameters, buffers)
+        self._hub.publish(version, parameters, buffers, deal=deal)
 
     def gather(self) -> list[AcceptedRollout]:
         """Wait for the rollouts of the next update. Raises `RunError` when the run cannot go on."""
@@ -43,14 +44,16 @@ class RolloutService:
         """Answer the workers, during a long computation. Never waits, never raises."""
         self._hub.pulse()
 
-    def evaluate(self, parameters: Floats, buffers: Floats, episodes: int, seed: int) -> Evaluation:
-        """Play greedy episodes under these weights, and answer the workers meanwhile.
+    def evaluate(self, plan: EvaluationPlan, watch: Callable[[int], None]) -> Evaluation:
+        """Let the workers play these episodes under the newest weights, which must be published with `deal` False.
 
-        Raises `EnvironmentFailed` if the environment raises.
+        `watch` is called with the number of episodes that were played, several times a second. Raises `RunError` when the run
+        cannot go on.
         """
-        policy = make_policy(self._spec.policy)
-        policy.load(parameters, buffers)
-        return evaluate(self._spec.env, policy, self._spec.policy, episodes, seed, self.pulse)
+        played = self._hub.evaluate(plan, watch)
+        episodes = [one.episode for one in played]
+        cut = sum(one.cut for one in played)
+        return Evaluation.of([episode.reward for episode in episodes], [episode.length for episode in episodes], cut)
 
     def drain(self, reason: str, timeout_s: float = 5.0) -> None:
         """Ask every worker to leave, and wait for that at most `timeout_s`."""

@@ -1,5 +1,7 @@
 """The training loop. Everything else is called from here; `service.gather` is the only place that waits for rollouts.
 
+An evaluation belongs to one version: it comes after that version's checkpoint, and before the next rollouts are collected.
+
 With `max_lag` 0 the learner publishes weights, gathers rollouts and learns, one after the other. With `max_lag` 1 the
 workers already collect the next rollouts while the learner learns. The loop is the same: only the number of tickets differs.
 """
@@ -24,9 +26,9 @@ def train(algorithm: Algorithm, service: RolloutService, recorder: RunRecorder, 
     error is raised.
     """
     recorder.save()
-    if recorder.stop_reason() is None:
-        service.wait_for_workers(workers)
-        service.publish(recorder.version, *algorithm.weights())
+    service.wait_for_workers(workers)
+    service.publish(recorder.version, *algorithm.weights(), deal=recorder.training_goes_on())
+    recorder.evaluate_if_due()
     while (reason := recorder.stop_reason()) is None:
         try:
             arrived = service.gather()
@@ -37,10 +39,11 @@ def train(algorithm: Algorithm, service: RolloutService, recorder: RunRecorder, 
         began_s = time.monotonic()
         batch = stack_rollouts([one.rollout for one in arrived])
         metrics = algorithm.update(batch, service.pulse)
-        service.publish(recorder.version + 1, *algorithm.weights())
-        recorder.updated(batch, metrics, time.monotonic() - began_s)
+        recorder.count(batch)
+        service.publish(recorder.version, *algorithm.weights(), deal=recorder.training_goes_on())
+        recorder.updated(metrics, time.monotonic() - began_s)
     recorder.save()
-    service.drain(reason)
     recorder.conclude()
+    service.drain(reason)
     recorder.finish(reason)
     return reason

@@ -100,6 +100,7 @@ class PlainLines:
     def show(self, progress: Progress) -> None:
         """Print one line."""
         parts = [f"{progress.env_steps:,} of {progress.total_steps:,} env steps", *main_figures(progress).values()]
+        parts += [progress.doing] if progress.doing else []
         self.print_line(" | ".join(parts))
 
     def print_line(self, line: str) -> None:
@@ -188,7 +189,7 @@ def render_block(progress: Progress) -> RenderableType:
 
 def detail_rows(progress: Progress) -> dict[str, str]:
     """The details, as text by name: each stage's share of the time, counts that are not zero, the run folder."""
-    rows = {}
+    rows = {"now": progress.doing} if progress.doing else {}
     for owner in ("learner", "worker"):
         seconds = {name.removeprefix(f"{owner}_"): s for name, s in progress.stages.items() if name.startswith(owner)}
         if total := sum(seconds.values()):

@@ -2,7 +2,7 @@
 
 Rule: a rollout starts only under weights at least as new as its ticket asks for. A message that is lost does no harm,
 because the next Heartbeat lists all tickets that this worker holds, and the learner sends again what is missing. What a
-worker holds is in `collect/held_rollouts.py` and `step/held_orders.py`.
+worker holds is in `collect/held_rollouts.py`, `evaluate/held_evaluations.py` and `step/held_orders.py`.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from protocol.messages import (
     Collect,
     Described,
     Drain,
+    Evaluate,
+    Evaluated,
     Failure,
     Goodbye,
     Heartbeat,
@@ -41,6 +43,7 @@ from protocol.messages import (
 from protocol.space_spec import EnvDescription
 from protocol.specs import DescribeSpec, RunSpec, StepSpec
 from workers.collect.held_rollouts import Assignment, HeldRollouts
+from workers.evaluate.held_evaluations import HeldEvaluations
 from workers.states import TABLE, LearnerSilent, State, StopRequested, WorkerFailed, WorkFinished
 from workers.step.held_orders import HeldOrders
 
@@ -90,6 +93,14 @@ class Task:
 
 
 @dataclass(frozen=True)
+class EvaluationTask:
+    """Episodes to play under these weights."""
+
+    weights: Weights
+    order: Evaluate
+
+
+@dataclass(frozen=True)
 class Identity:
     """The identity of this worker: its name, host and process."""
 
@@ -130,6 +141,7 @@ class _SessionState:
     """All that belongs to one session. A new session starts with a new one."""
 
     rollouts: HeldRollouts = field(default_factory=HeldRollouts)
+    evaluations: HeldEvaluations = field(default_factory=HeldEvaluations)
     orders: HeldOrders = field(default_factory=HeldOrders)
     described: Described | None = None  # sent with every Heartbeat, because one may be lost
     weights: Weights | None = None
@@ -144,7 +156,7 @@ class _SessionState:
 
     def unfinished(self) -> tuple[int, ...]:
         """Tickets that are not yet collected or executed."""
-        return (*self.rollouts.tickets(), *self.orders.tickets())
+        return (*self.rollouts.tickets(), *self.evaluations.tickets(), *self.orders.tickets())
 
     def lanes(self) -> tuple[LaneIncarnation, ...]:
         """The lanes of this worker."""
@@ -199,6 +211,9 @@ class Session:
                 closed = self._received(received)
                 again = [self._current.rollouts.take(permit, version) for permit in permits]
                 return closed + [Send(rollout) for rollout in again if rollout is not None]
+            case Evaluate() if isinstance(self.run, RunSpec):
+                evaluated = self._current.evaluations.take(message)
+                return [] if evaluated is None else [Send(evaluated)]
             case Reset() | Step() | Call() if isinstance(self.run, StepSpec):
                 answer = self._current.orders.take(message)
                 return [] if answer is None else [Send(answer)]
@@ -298,6 +313,29 @@ class Session:
         if self.state is State.DRAINING:
             effects += self._goodbye()
         return effects
+
+    # ---------------------------------------------------------------- evaluating
+
+    def next_evaluation(self) -> EvaluationTask | None:
+        """The oldest order to evaluate the weights held. It is in progress until `evaluated`. None when there is none."""
+        if self.state is not State.READY or self._current.weights is None or self._current.in_progress:
+            return None
+        order = self._current.evaluations.next(self._current.version)
+        if order is None:
+            return None
+        self._current.in_progress = (order.ticket,)
+        return EvaluationTask(self._current.weights, order)
+
+    def evaluated(self, answer: Evaluated | None) -> list[Effect]:
+        """The evaluation in progress has ended with this answer, or with None: it was abandoned."""
+        self._current.in_progress = ()
+        is_wanted = answer is not None and answer.session == self.session and self._current.evaluations.keep(answer)
+        effects: list[Effect] = [Send(answer)] if answer is not None and is_wanted else []
+        return effects + (self._goodbye() if self.state is State.DRAINING else [])
+
+    def evaluation_abandoned(self, session: int) -> bool:
+        """True when an evaluation of this session is no longer wanted. A worker that leaves does not finish it."""
+        return self.state is not State.READY or session != self.session
 
     # ---------------------------------------------------------------- stepping in lock-step
 

@@ -1,8 +1,8 @@
 """Runs a session: connects it with the link, the collector or stepper, and signals. All decisions are the session's.
 
-Rule: the worker reads all messages before a rollout starts, and again between env steps, so it answers while it collects
-and acts under the newest weights that it holds. Every failure of the environment is reported to the learner. In a vector
-environment, where one step may take as long as the caller allows, a second thread sends the heartbeats.
+Rule: the worker reads all messages before a rollout or an evaluation starts, and again between env steps, so it answers
+while it works and acts under the newest weights that it holds. Every failure of the environment is reported to the learner.
+In a vector environment, where one step may take as long as the caller allows, a second thread sends the heartbeats.
 """
 
 from __future__ import annotations
@@ -32,8 +32,20 @@ from protocol.wire.worker_link import WorkerLink
 from workers.collect.collector import Collector
 from workers.describe import describing
 from workers.env_errors import LaneFailed
+from workers.evaluate.evaluator import Evaluator
 from workers.heartbeat_thread import HeartbeatThread
-from workers.session import CloseLanes, Effect, Identity, Leave, Send, Session, StartSession, Statistics, Task
+from workers.session import (
+    CloseLanes,
+    Effect,
+    EvaluationTask,
+    Identity,
+    Leave,
+    Send,
+    Session,
+    StartSession,
+    Statistics,
+    Task,
+)
 from workers.step.stepper import Stepper
 
 log = logging.getLogger("millrace.worker")
@@ -43,12 +55,13 @@ IDLE_S = 0.5  # longest wait while idle, so that a signal or the end of the pare
 AFTER_WAKE_UP_S = 0.02  # longest wait for a message after a wake-up, which is faster than the message
 STATM = Path("/proc/self/statm")  # pages: all, resident, …
 
-MakeCollector = Callable[[RunSpec], Collector]
+MakeCollector = Callable[[RunSpec], tuple[Collector, Evaluator]]
 
 
-def make_local_collector(run: RunSpec) -> Collector:
-    """A collector that has env copies and a policy of its own."""
-    return Collector(run, make_policy(run.policy, run.images_dtype))
+def make_local_collector(run: RunSpec) -> tuple[Collector, Evaluator]:
+    """A collector and an evaluator that have env copies of their own and share a policy."""
+    policy = make_policy(run.policy, run.images_dtype)
+    return Collector(run, policy), Evaluator(run, policy)
 
 
 class _Abandoned(Exception):
@@ -75,7 +88,7 @@ class WorkerOptions:
     shared_memory: InheritedDescriptors | None = None
     """Shared memory and wake pipes, for a vector environment on this machine."""
     make_collector: MakeCollector = make_local_collector
-    """Makes the collector of a run, with the policy that acts."""
+    """Makes the collector and the evaluator of a run, with the policy that acts."""
 
 
 class Worker:
@@ -92,6 +105,7 @@ class Worker:
         self._options = options or WorkerOptions()
         self._handled_stop_requests = 0
         self._collector: Collector | None = None
+        self._evaluator: Evaluator | None = None
         self._stepper: Stepper | None = None
         self._loaded: Weights | None = None
         self._packing = link.packing
@@ -109,17 +123,25 @@ class Worker:
                 if self._left is None:
                     idle_s = min(IDLE_S, max(0.0, self._session.next_due_s() - self._clock()))
                     self._listen(self._serve_shared_memory(idle_s))
-                while self._left is None and (task := self._session.next_task()) is not None:
-                    self._collect(task)
-                    self._listen(0.0)
-                while self._left is None and (order := self._session.next_order()) is not None:
-                    self._execute(order)
+                while self._left is None and self._work():
                     self._listen(0.0)
         finally:
             self._heartbeats.stop()
             self._close_all()
             self._link.close()
         return self._left
+
+    def _work(self) -> bool:
+        """Do the next piece of work; False if there is none."""
+        if (evaluation := self._session.next_evaluation()) is not None:
+            self._evaluate(evaluation)
+        elif (task := self._session.next_task()) is not None:
+            self._collect(task)
+        elif (order := self._session.next_order()) is not None:
+            self._execute(order)
+        else:
+            return False
+        return True
 
     def _listen(self, timeout_s: float) -> None:
         """Handle signals, then all messages that have arrived."""
@@ -148,9 +170,7 @@ class Worker:
             self._pulse(task.session)
 
         try:
-            if self._loaded is not task.weights:
-                collector.load(to_float32(task.weights.parameters), task.weights.buffers)
-                self._loaded = task.weights
+            self._load(collector, task.weights)
             rollouts = collector.collect(task.assignments, task.weights.version, task.session, pulse)
         except _Abandoned:
             rollouts = []
@@ -159,6 +179,34 @@ class Worker:
             return
         self._update_statistics()
         self._do(self._session.finished(rollouts))
+
+    def _load(self, collector: Collector, weights: Weights) -> None:
+        """Let the policy act under these weights."""
+        if self._loaded is not weights:
+            collector.load(to_float32(weights.parameters), weights.buffers)
+            self._loaded = weights
+
+    def _evaluate(self, task: EvaluationTask) -> None:
+        collector, evaluator, order = self._collector, self._evaluator, task.order
+        assert collector is not None
+        assert evaluator is not None
+
+        def pulse() -> None:
+            self._pulse(order.session)
+            if self._session.evaluation_abandoned(order.session):
+                raise _Abandoned
+
+        answer = None
+        try:
+            self._load(collector, task.weights)
+            answer = evaluator.play(order, lambda rows: self._do([Send(rows)]), pulse)
+        except _Abandoned:
+            pass
+        except Exception as error:
+            self._fail(error)
+            return
+        self._update_statistics()
+        self._do(self._session.evaluated(answer))
 
     def _execute(self, order: Order) -> None:
         stepper = self._stepper
@@ -225,7 +273,11 @@ class Worker:
     def _update_statistics(self) -> None:
         if (source := self._collector or self._stepper) is not None:
             stages: Stages = {**source.stages, "wait": self._waited_s}
-            self._session.update_statistics(Statistics(source.steps, stages, self._resident_bytes))
+            steps = source.steps
+            if self._evaluator is not None and self._evaluator.steps:
+                stages["evaluate"] = self._evaluator.seconds
+                steps += self._evaluator.steps
+            self._session.update_statistics(Statistics(steps, stages, self._resident_bytes))
 
     def _do(self, effects: list[Effect]) -> None:
         for effect in effects:
@@ -243,14 +295,14 @@ class Worker:
     def _start_session(self, run: DescribeSpec | RunSpec | StepSpec) -> None:
         """Make a new collector or stepper; nothing of the old one is kept."""
         self._close_all()
-        self._collector = self._stepper = None
+        self._collector = self._evaluator = self._stepper = None
         if why := run.rejection_reason(self._options.code):
             self._do(self._session.decline(why))
             return
         try:
             match run:
                 case RunSpec():
-                    self._collector = self._options.make_collector(run)
+                    self._collector, self._evaluator = self._options.make_collector(run)
                     self._packing = replace(self._link.packing, zstd=run.compress == "zstd")
                 case StepSpec():
                     self._stepper = Stepper(
@@ -285,6 +337,8 @@ class Worker:
     def _close_all(self) -> None:
         if (owner := self._collector or self._stepper) is not None:
             owner.close_all()
+        if self._evaluator is not None:
+            self._evaluator.close()
 
 
 def _resident_bytes() -> int:

@@ -15,6 +15,7 @@ from tyro.conf import Positional
 
 from learner.config.hyperparameters import Hyperparameters, PPOConfig
 from learner.config.run_rules import CheckpointPolicy, EvaluationSettings, StopRule
+from protocol.bounds import MAX_SEEDS
 from protocol.specs import ImagesDtype, Vector
 from protocol.wire.weight_dtypes import WeightsDtype
 
@@ -57,6 +58,14 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """Number of greedy episodes in an evaluation."""
     eval_every: Natural = 0
     """Env steps between evaluations during training. 0: evaluate only at the end."""
+    eval_copies: Annotated[int, Meta(ge=1, le=MAX_SEEDS)] = 4
+    """Number of evaluation episodes that a worker plays side by side, on env copies of their own. Results may depend on it in
+    their last bits, and never on the number of workers.
+    """
+    eval_max_steps: Count = 1_000_000
+    """Most env steps of one evaluation. Each episode gets an equal share: with 100 episodes, one that reaches 10000 steps is
+    cut. It counts with the return it has by then, and the result says how many were cut.
+    """
     target_return: float | None = None
     """Stop as soon as the mean return of an evaluation is at least this. Needs eval_every."""
     target_mean_return: float | None = None
@@ -177,7 +186,13 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     def evaluation_settings(self) -> EvaluationSettings:
         """How often the policy is evaluated, and on which episodes."""
-        return EvaluationSettings(episodes=self.eval_episodes, every_env_steps=self.eval_every, seed=self.seed)
+        return EvaluationSettings(
+            episodes=self.eval_episodes,
+            every_env_steps=self.eval_every,
+            copies=self.eval_copies,
+            max_steps=self.eval_max_steps,
+            seed=self.seed,
+        )
 
     def to_toml(self) -> str:
         """All settings as TOML, in the order of the fields. A setting that is None is written as "none"."""

@@ -59,5 +59,9 @@ class EvaluationSettings(msgspec.Struct, frozen=True, kw_only=True):
     """episodes of one evaluation"""
     every_env_steps: int
     """env steps between evaluations during training; 0: evaluate only at the end"""
+    copies: int
+    """episodes that a worker plays side by side"""
+    max_steps: int
+    """most env steps of one evaluation"""
     seed: int
     """the run's seed: it decides which episodes are played"""

@@ -76,10 +76,7 @@ class Member:
     """Env steps in the heartbeat by which the speed was last measured, and the time when it arrived."""
 
     def record_heartbeat(self, heartbeat: Heartbeat) -> list[int]:
-        """Keep the heartbeat. Returns the tickets that were lost on the way.
-
-        A ticket is lost if it was sent before a reply that the worker has seen, and the worker does not hold it.
-        """
+        """Keep the heartbeat. Returns the tickets that were lost on the way."""
         if self.heartbeat is None and self.hello.attempt > 1:
             self.stages_before = heartbeat.stages
         self.heartbeat = msgspec.structs.replace(heartbeat, tickets=())  # what is kept of it is small
@@ -87,8 +84,15 @@ class Member:
         if self.heard_s - since_s >= MEASURE_S:  # new weights trigger an extra heartbeat, too early to measure speed
             self.steps_per_s = max(0, heartbeat.steps - steps) / (self.heard_s - since_s) if since_s else 0.0
             self.measured = heartbeat.steps, self.heard_s
+        return self.lost_on_the_way(heartbeat, self.tickets)
+
+    def lost_on_the_way(self, heartbeat: Heartbeat, sent: Mapping[int, int]) -> list[int]:
+        """Those of the tickets in `sent` that were lost; for each, it has the value of `replies` when it was last sent.
+
+        A ticket is lost if it was sent before a reply that the worker has seen, and the worker does not hold it.
+        """
         held, seen = set(heartbeat.tickets), min(heartbeat.replies, self.replies)
-        return [ticket for ticket, sent_at in self.tickets.items() if ticket not in held and seen > sent_at]
+        return [ticket for ticket, sent_at in sent.items() if ticket not in held and seen > sent_at]
 
     def stages(self) -> Stages:
         """Seconds in each stage during this session, by its newest heartbeat; none is longer than the session."""

@@ -1,4 +1,4 @@
-"""The hub: link, ticket coordinator and clock together. `gather` is the only place where a training loop waits.
+"""The hub: link, ticket coordinator and clock together. A training loop waits only in `gather` and in `evaluate`.
 
 Rule: every wait has a deadline and says what it waits for.
 """
@@ -17,6 +17,7 @@ from learner.members.member_server import MemberServer, ServerCallbacks
 from learner.members.membership import Outgoing
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.members.states import MemberState
+from learner.rollouts.evaluation_tickets import EvaluationPlan, OnRows, PlayedEpisode
 from learner.rollouts.lanes import AcceptedRollout
 from learner.rollouts.ledger import Ledger
 from learner.rollouts.status import status
@@ -135,14 +136,15 @@ class Hub:
         """Wait until this number of `workers` have joined. Raises `NoWorkers` after `no_workers_timeout_s`."""
         self._server.wait_for(workers, self.settings.no_workers_timeout_s, lambda: self._turn(POLL_S))
 
-    def publish(self, version: int, parameters: Array, buffers: Array) -> None:
+    def publish(self, version: int, parameters: Array, buffers: Array, *, deal: bool = True) -> None:
         """Broadcast new weights and deal the tickets that they allow. The arrays must not change afterwards.
 
+        `deal` False: deal no ticket before the next `gather`, because these weights are evaluated first.
         Raises `RunError` if a parameter is too large for `weights_dtype`.
         """
         sent = to_wire_dtype(parameters, self.settings.weights_dtype)
         self._weight_age.published(version, self._clock())
-        self._server.send(self.coordinator.publish(version, sent, buffers))
+        self._server.send(self.coordinator.publish(version, sent, buffers, deal=deal))
 
     def gather(self) -> list[AcceptedRollout]:
         """The rollouts of the next update. Raises `NoWorkers`, `Stalled` or `EnvironmentFailed`."""
@@ -167,6 +169,35 @@ class Hub:
             if now - logged_s > LOG_WAITING_EVERY_S:
                 logged_s = now
                 log.warning("%s", self.waiting_for())
+
+    def evaluate(
+        self, plan: EvaluationPlan, watch: Callable[[int], None], on_rows: OnRows | None = None
+    ) -> list[PlayedEpisode]:
+        """Let the workers play these episodes under the newest weights. Returns them in the order of their seeds.
+
+        `watch` is called with the number of episodes played, at least every `POLL_S`. Raises as `gather` does.
+        """
+        evaluation, stall_timeout_s = self.coordinator.evaluation, self.settings.stall_timeout_s
+        progress_s = logged_s = self._clock()
+        steps = -1
+        self._server.send(self.coordinator.begin_evaluation(plan, on_rows))
+        try:
+            while not evaluation.done:
+                self._turn(POLL_S)
+                now = self._clock()
+                watch(evaluation.episodes_played)
+                if (so_far := self._worker_steps() + evaluation.episodes_played) != steps:
+                    steps, progress_s = so_far, now
+                if now - progress_s > stall_timeout_s:
+                    waiting = self._waiting_for_episodes()
+                    raise Stalled(f"no env step of an evaluation was made for {stall_timeout_s:.0f} s; {waiting}")
+                if now - logged_s > LOG_WAITING_EVERY_S:
+                    logged_s = now
+                    log.info("%s", self._waiting_for_episodes())
+        finally:
+            played = self.coordinator.end_evaluation()
+        self._weight_age.published(self.coordinator.version, self._clock())  # they are used for rollouts from now on
+        return played
 
     def pulse(self) -> None:
         """Answer the workers, then remove those that have been silent for too long, unless that was just done.
@@ -231,6 +262,18 @@ class Hub:
         )
 
     # ---------------------------------------------------------------- inside
+
+    def _worker_steps(self) -> int:
+        """Env steps of all workers, as of their last heartbeats."""
+        heartbeats = (member.heartbeat for member in self.coordinator.members.values())
+        return sum(heartbeat.steps for heartbeat in heartbeats if heartbeat is not None)
+
+    def _waiting_for_episodes(self) -> str:
+        coordinator = self.coordinator
+        if not coordinator.members:
+            return self.waiting_for()
+        late = ", ".join(coordinator.members[peer].hello.worker for peer in coordinator.evaluation.holders)
+        return f"evaluating: {coordinator.evaluation.episodes_played} episodes played, others are with {late or 'nobody'}"
 
     def _turn(self, timeout_s: float) -> None:
         """One turn of waiting: listen, then check whether the run can go on."""

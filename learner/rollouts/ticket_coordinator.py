@@ -8,6 +8,8 @@ A lane has one owner at a time and moves only between rollouts. Its new owner st
 worker is lost, its lanes go to other workers, and new tickets are dealt in place of its tickets. There is no other failure
 handling. If a Heartbeat shows that a message was lost on the way, the message is sent again. Every ticket and every
 transition is counted in the ledger.
+
+An evaluation belongs to one version: while it is pending, no ticket for a rollout is dealt, and no weights are published.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from learner.members.events import EnvironmentRaised, Event, RolloutDropped
 from learner.members.lane_placement import LanePlacement, is_spare
 from learner.members.membership import Member, Membership, Outgoing
 from learner.members.states import MemberState, SentUnusable
+from learner.rollouts.evaluation_tickets import EvaluationPlan, EvaluationTickets, OnRows, PlayedEpisode
 from learner.rollouts.lanes import AcceptedRollout, LaneQueue, Ticket, TicketedLane
 from learner.rollouts.ledger import Ledger
 from protocol.bounds import escaped, one_line
@@ -97,6 +100,8 @@ class TicketCoordinator:
         self.lanes = [TicketedLane(n, incarnations[n] if incarnations else 0) for n in range(run.lanes)]
         self.tickets: dict[int, Ticket] = {}
         self.ready: list[AcceptedRollout] = []
+        self.evaluation = EvaluationTickets()
+        self._held_back = False  # whether to deal no ticket for a rollout, because an evaluation is about to begin
         self._placement, self._queue = LanePlacement(self.lanes, _by_joining), LaneQueue(self.lanes)
         self._oldest_ready = version  # no rollout that is ready is older
         self._weights: Weights | None = None
@@ -129,7 +134,11 @@ class TicketCoordinator:
                 return self._rollout(member, message)
             case Heartbeat():
                 return self._heartbeat(member, message)
-            case Stepped() | Returned() | Described() | Evaluated() | EpisodeRows() | Alive():
+            case Evaluated():
+                return self._checked(member, self.evaluation.take(member, message), now)
+            case EpisodeRows():
+                return self._checked(member, self.evaluation.take_rows(member, message), now)
+            case Stepped() | Returned() | Described() | Alive():
                 return []  # answers to orders that a run does not give
             case Goodbye(_, reason):
                 self.membership.remove(member, Goodbye, f"left: {reason}")
@@ -181,8 +190,13 @@ class TicketCoordinator:
 
     # ---------------------------------------------------------------- the learner's side
 
-    def publish(self, version: int, parameters: Array, buffers: Array) -> list[Outgoing]:
-        """Set the newest weights. Send them to the workers that can take them now; deal the tickets that they allow."""
+    def publish(self, version: int, parameters: Array, buffers: Array, *, deal: bool = True) -> list[Outgoing]:
+        """Set the newest weights. Send them to the workers that can take them now; deal the tickets that they allow.
+
+        `deal` False: deal none before `deal` is called, because these weights are evaluated first.
+        """
+        assert not self.evaluation.pending, "an evaluation is pending"
+        self._held_back = not deal
         self.version = version
         self._weights = Weights(version, parameters, buffers)
         out = [out for member in self.membership.active() for out in self._send_newest_weights(member)]
@@ -200,8 +214,18 @@ class TicketCoordinator:
         return taken
 
     def deal(self) -> list[Outgoing]:
-        """Deal the tickets that may be dealt, as after stale rollouts were dropped."""
+        """Deal the tickets that may be dealt, as after stale rollouts were dropped, or after an evaluation."""
+        self._held_back = False
         return self._deal()
+
+    def begin_evaluation(self, plan: EvaluationPlan, on_rows: OnRows | None = None) -> list[Outgoing]:
+        """Begin to evaluate the newest weights. `self.evaluation` says when it is done."""
+        self.evaluation.begin(plan, self.version, on_rows)
+        return self._deal()
+
+    def end_evaluation(self) -> list[PlayedEpisode]:
+        """End the evaluation, also one that is not done. Returns its episodes, in the order of their seeds."""
+        return self.evaluation.end()
 
     def drain(self, reason: str) -> list[Outgoing]:
         """Ask every worker to leave; deal no more tickets."""
@@ -225,6 +249,10 @@ class TicketCoordinator:
         member.heard_s = now
         member.strikes += 1
         return self.membership.refuse(member, SentUnusable, why) if member.strikes >= STRIKES else []
+
+    def _checked(self, member: CollectingMember, why: str, now: float) -> list[Outgoing]:
+        """After an answer of an evaluation was taken; `why` it could not be used, if so."""
+        return (self._strike(member, why, now) if why else []) + self._deal()
 
     def _drop_stale(self) -> None:
         stale = [arrived.rollout for arrived in self.ready if self.version - arrived.rollout.version > self.max_lag]
@@ -273,6 +301,7 @@ class TicketCoordinator:
             member.sending = None
         out = self._send_newest_weights(member)
         out += self._collect(member, lost)
+        out += self.evaluation.send_again(member, heartbeat)
         member.replies += 1
         out.append((peer, HeartbeatReply(member.session, member.replies, self._received(member.lanes))))
         return out + self._deal()
@@ -310,6 +339,7 @@ class TicketCoordinator:
         """The worker is gone: its tickets are lost, its lanes have no owner. `_deal` gives both to other workers."""
         for number in list(member.tickets):
             self._lose(member, number)
+        self.evaluation.removed(member.peer)
         self._placement.removed(member)
 
     def _lose(self, member: CollectingMember, number: int) -> None:
@@ -326,6 +356,10 @@ class TicketCoordinator:
         if self._weights is None or self.membership.draining is not None or not self.members:
             return []
         out = self._placement.place(self.members.values())
+        if self.evaluation.pending:
+            return out + self.evaluation.deal(self.membership.active())
+        if self._held_back:
+            return out
         room = self.rollouts_per_update * (self.version + 1 + self.max_lag) - self.ledger.used - self.ledger.outstanding
         dealt: dict[bytes, list[int]] = {}
         while room > 0:

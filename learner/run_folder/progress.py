@@ -25,9 +25,9 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
     """env steps to train for"""
     updates: int = 0
     wall_s: float = 0.0
-    """seconds of training, those before a resume included"""
+    """seconds of training, those before a resume included; evaluations do not count"""
     steps_per_s: float = 0.0
-    """env steps per second since this process started"""
+    """env steps per second of training since this process started"""
     return_mean: float | None = None
     """mean return of the last 100 training episodes, in raw rewards; None before the first has ended"""
     length_mean: float | None = None
@@ -43,6 +43,8 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
     """seconds spent in each stage so far"""
     note: str = ""
     """a message to the user, in one line"""
+    doing: str = ""
+    """what the run does instead of training, as "evaluating: 37 of 100 episodes"; empty while it trains"""
 
     def row(self, train: Mapping[str, float]) -> dict[str, float | None]:
         """One flat row of metrics. `train`: the metrics of the algorithm."""

@@ -76,7 +76,8 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._batch = BatchArrays(step, self._layout, self.single_observation_space, memory)
         self._lost_lanes = LostLanes()
         self._pending: Literal["", "step"] = ""
-        self._stepping: Sequence[int] = ()  # lanes that the pending step was ordered of
+        self._asked: Sequence[int] = ()  # lanes that the last step was asked of
+        self._stepping: Sequence[int] = ()  # lanes that the pending step was ordered of: those that are not lost
         self._ever_reset, self._all_were_reset = np.zeros(N, bool), False
         self._seeds: list[int | None] = [None] * N  # of each copy's last seeded reset
         self._warned_infos: set[str] = set()  # keys of infos that arrived as their repr
@@ -138,12 +139,20 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self.step_async(actions)
         return self.step_wait()
 
+    def step_lanes(self, lanes: Sequence[int], actions: Any) -> StepResult:
+        """Step the copies of these lanes only. Actions and results have a row for every copy, which other copies ignore."""
+        self._order_step(lanes, actions)
+        return self.step_wait()
+
     def step_async(self, actions: Any) -> None:
         """Order every copy to step; `step_wait` returns the results."""
+        self._order_step(self._layout.lanes, actions)
+
+    def _order_step(self, lanes: Sequence[int], actions: Any) -> None:
         self._check_idle("step_async")
         arrays, fit = action_arrays(actions, self._read_actions, self._action_leaves, self.num_envs)
-        if not self._all_were_reset:
-            raise UsageError(f"step before reset of copies {np.flatnonzero(~self._ever_reset).tolist()}: call reset() first")
+        if not self._all_were_reset and (never := [n for n in self._copies_of(lanes) if not self._ever_reset[n]]):
+            raise UsageError(f"step before reset of copies {never}: call reset() first")
         if self._autoreset == "Disabled" and (ended := self._batch.terminated | self._batch.truncated).any():
             raise UsageError(
                 f"copies {np.flatnonzero(ended).tolist()} have ended: autoreset_mode is Disabled, expected "
@@ -153,7 +162,8 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         awaiting_reset, lost = self._lost_lanes.awaiting_reset, self._lost_lanes.unreported
         if awaiting_reset and self.on_worker_loss == "raise":
             raise WorkerLost(f"lanes {sorted(awaiting_reset)} were lost with their worker; call reset() first")
-        self._stepping = [lane for lane in self._layout.lanes if lane not in lost]
+        self._asked = lanes
+        self._stepping = [lane for lane in lanes if lane not in lost]
         self._pending = "step"
         if (
             fit
@@ -187,7 +197,9 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         infos = self._store(answers)
         if hub.stepped:
             infos |= {lane: hub.infos(lane, timeout_s) for lane in sorted(hub.stepped)}
-        if self._lost_lanes.unreported or len(answers) + len(hub.stepped) < len(self._stepping):
+        if any(lane in self._asked for lane in self._lost_lanes.unreported) or len(answers) + len(hub.stepped) < len(
+            self._stepping
+        ):
             return self._step_result_with_losses(infos, {*answers, *hub.stepped})
         batch = self._batch
         return (
@@ -197,6 +209,9 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
             batch.truncated.copy(),
             self._merge_infos(infos),
         )
+
+    def _copies_of(self, lanes: Sequence[int]) -> list[int]:
+        return [n for lane in lanes for n in self._layout.copies(lane)]
 
     def _step_order(self, lane: int, actions: Sequence[Array]) -> MakeOrder:
         rows = self._layout.rows[lane]
@@ -209,7 +224,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         """The result of a step that some lanes did not answer: their copies are truncated at their newest observation."""
         batch, layout = self._batch, self._layout
         self._lost_lanes.add(self._hub.take_lost())
-        lost = self._lost_lanes.report([lane for lane in layout.lanes if lane not in answered])
+        lost = self._lost_lanes.report([lane for lane in self._asked if lane not in answered])
         if self.on_worker_loss == "raise":
             raise worker_lost(lost, layout)
         for lane, why in lost.items():

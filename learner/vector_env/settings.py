@@ -36,6 +36,8 @@ class VectorEnvSettings:
     render_mode: str | None = None
     kwargs: dict[str, Scalar] = field(default_factory=dict)
     """Keyword arguments of the environment."""
+    single_lanes: int = 0
+    """Number of further copies, after the others: each is a lane of its own, which `ZmqVectorEnv.step_lanes` steps."""
 
     @property
     def envs(self) -> list[EnvLike]:
@@ -55,3 +57,9 @@ class VectorEnvSettings:
     def lane_count(self) -> int:
         """Number of lanes: by default one for each local worker."""
         return self.lanes or max(self.local_workers, 1)
+
+    @property
+    def lane_sizes(self) -> tuple[int, ...]:
+        """Number of copies of each lane."""
+        N, lanes = len(self.envs), self.lane_count
+        return (*(N // lanes + (lane < N % lanes) for lane in range(lanes)), *[1] * self.single_lanes)

@@ -84,8 +84,8 @@ def requested_copies(settings: VectorEnvSettings, learner_timeout_s: float = mat
     index = {(spec.id, spec.factory): n for n, spec in enumerate(different)}
     return RequestedCopies(
         envs=tuple(different),
-        copies=tuple(index[env_specs[env].id, env_specs[env].factory] for env in envs),
-        lanes=tuple(N // lanes + (lane < N % lanes) for lane in range(lanes)),
+        copies=tuple(index[env_specs[env].id, env_specs[env].factory] for env in [*envs, *envs[:1] * settings.single_lanes]),
+        lanes=settings.lane_sizes,
         autoreset=_autoreset_mode(settings.autoreset_mode),
         render_mode=settings.render_mode,
         learner_timeout_s=learner_timeout_s,

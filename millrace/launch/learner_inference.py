@@ -31,6 +31,8 @@ from protocol.wire.learner_link import LearnerLink
 from workers.collect.collector import Collector
 from workers.collect.split_vector_env import SplitVectorEnv
 from workers.env_loop import Pulse
+from workers.evaluate.evaluator import Evaluator
+from workers.evaluate.split_evaluation_copies import SplitEvaluationCopies
 from workers.supervisor import Supervisor, WorkerThread
 
 
@@ -66,13 +68,15 @@ def train(
         env = started.vector_env(known.described)
         stack.callback(env.close)
         workers = config.min_workers or (1 if elsewhere else min(config.workers, config.envs))
-        lanes = SplitVectorEnv(env, config.lanes, _before_waits(env, workers, config.no_workers_timeout_s))
+        lanes = SplitVectorEnv(env, config.lanes, _before_waits(env, workers, config.no_workers_timeout_s), env.step_lanes)
+        evaluation_copies = SplitEvaluationCopies(lanes, config.lanes, config.eval_copies)
 
-        def collector(spec: RunSpec) -> Collector:
+        def collector(spec: RunSpec) -> tuple[Collector, Evaluator]:
             from learner.torch_setup import torch_device
 
             policy = acting_policy(spec.policy, torch_device(config), spec.images_dtype)
-            return Collector(spec, policy, lanes.open_lane, lanes.step_all)
+            evaluator = Evaluator(spec, policy, lambda run, count, render_mode, pulse: evaluation_copies)
+            return Collector(spec, policy, lanes.open_lane, lanes.step_all), evaluator
 
         supervisor = Supervisor(lambda name: WorkerThread(link.address, name, context, collector), 1, prefix="inference")
         stack.callback(supervisor.stop)
@@ -113,6 +117,7 @@ def _settings(config: Config, factory: Callable[..., object] | None, *, elsewher
         timeout_s=config.step_timeout_s * (1 if elsewhere else config.envs),
         copy=False,
         kwargs=config.env_kwargs,
+        single_lanes=config.eval_copies,
     )
 
 

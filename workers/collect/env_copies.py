@@ -70,7 +70,7 @@ class LoopedCopies:
     """A loop over N environments."""
 
     def __init__(self, makes: Iterable[Callable[[], gymnasium.Env[Any, Any]]], pulse: Pulse) -> None:
-        self._loop = EnvLoop((partial(_made_without_order_check, make) for make in makes), pulse)
+        self._loop = EnvLoop((partial(made_without_order_check, make) for make in makes), pulse)
         self.observation_space = self._loop.envs[0].observation_space
         self.action_space = self._loop.envs[0].action_space
         self._nested = isinstance(self.observation_space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple)
@@ -98,7 +98,8 @@ class LoopedCopies:
         self._loop.close()
 
 
-def _made_without_order_check(make: Callable[[], gymnasium.Env[Any, Any]]) -> gymnasium.Env[Any, Any]:
+def made_without_order_check(make: Callable[[], gymnasium.Env[Any, Any]]) -> gymnasium.Env[Any, Any]:
+    """Make an environment without `OrderEnforcing`."""
     return _without_order_check(make())
 
 

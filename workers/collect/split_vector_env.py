@@ -26,11 +26,19 @@ class SplitVectorEnv:
     """Lanes of equally many copies each. Lane 0 has the first copies of the vector environment."""
 
     def __init__(
-        self, env: VectorEnv[Any, Any, Any], lanes: int, before_wait: Callable[[Pulse], None] = lambda pulse: None
+        self,
+        env: VectorEnv[Any, Any, Any],
+        lanes: int,
+        before_wait: Callable[[Pulse], None] = lambda pulse: None,
+        step_lanes: Callable[[Sequence[int], Array], Any] | None = None,
     ) -> None:
-        """`before_wait` is called before each wait for the vector environment, with the `pulse` to call during the wait."""
+        """`before_wait` is called before each wait for the vector environment, with the `pulse` to call during the wait.
+
+        `step_lanes` steps some lanes of the vector environment: then it may have more lanes than these, for evaluation.
+        """
         self.env = env
-        self._lanes, self._before_wait = lanes, before_wait
+        self._lanes, self._before_wait, self._step_lanes = lanes, before_wait, step_lanes
+        self._actions: Array | None = None  # [num_envs, *action]
         self._read = make_flatten(env.single_observation_space)
         self._result: StepResult | None = None
         self._no_workers: NoWorkers | None = None
@@ -45,8 +53,20 @@ class SplitVectorEnv:
         if [lanes[i] for i in order] != list(range(self._lanes)):
             raise ValueError(f"lanes: expected all {self._lanes} of the vector environment at once, got {sorted(lanes)}")
         in_order = actions[order].reshape(-1, *actions.shape[2:])  # [L · N, *action]
-        observation, reward, terminated, truncated, infos = self._wait(lambda: self.env.step(in_order), pulse)
-        self._result = StepResult(self._read(observation), reward, terminated, truncated, infos.get("worker_lost"))
+        self._result = self.step_some(range(self._lanes), slice(len(in_order)), in_order, pulse)
+
+    def step_some(self, lanes: Sequence[int], copies: slice, actions: Array, pulse: Pulse) -> StepResult:
+        """Step these lanes, which have these copies, with their actions. The result has a row for every copy there is."""
+        if self._step_lanes is None:
+            result = self._wait(lambda: self.env.step(actions), pulse)
+        else:
+            if self._actions is None:
+                self._actions = np.zeros((self.env.num_envs, *actions.shape[1:]), actions.dtype)
+            padded, step_lanes = self._actions, self._step_lanes
+            padded[copies] = actions
+            result = self._wait(lambda: step_lanes(lanes, padded), pulse)
+        observation, reward, terminated, truncated, infos = result
+        return StepResult(self._read(observation), reward, terminated, truncated, infos.get("worker_lost"))
 
     def result(self, copies: slice) -> StepResult:
         """The part of the last step's result that belongs to these copies."""

@@ -50,4 +50,6 @@ def test_a_checkpoint_is_due_by_time_by_episodes_or_by_updates(
 def test_records_take_their_settings_from_the_configuration() -> None:
     config = Config(keep_checkpoints=7, eval_episodes=5, eval_every=1000, seed=3)
     assert config.checkpoint_policy() == CheckpointPolicy(every_s=60.0, every_episodes=0, every_updates=0, keep=7)
-    assert config.evaluation_settings() == EvaluationSettings(episodes=5, every_env_steps=1000, seed=3)
+    assert config.evaluation_settings() == EvaluationSettings(
+        episodes=5, every_env_steps=1000, copies=4, max_steps=1_000_000, seed=3
+    )

@@ -1,0 +1,197 @@
+"""The tickets of one evaluation: which episodes are still to be played, and who plays them. Pure.
+
+Rule: the seeds are cut into tickets of `copies` seeds, whatever the number of workers, so the result does not depend on that
+number. Every active worker gets tickets, also one without a lane. A ticket whose worker is lost goes to another. The numbers
+of these tickets start at `FIRST_TICKET`, far above those of rollouts, and the ledger does not count them.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from learner.members.membership import Member, Outgoing
+from protocol.messages import EpisodeRows, Evaluate, Evaluated, Heartbeat
+from protocol.rollout import LARGEST_REWARD, Episode
+
+FIRST_TICKET = 1 << 52
+HELD_AT_ONCE = 2  # tickets of one worker: while the learner takes the answer to one, the worker plays the other
+
+OnRows = Callable[[int, EpisodeRows], None]
+"""Called with the number of an episode (the index of its seed in the plan) and some of its rows, in order."""
+
+
+@dataclass(frozen=True)
+class EvaluationPlan:
+    """The episodes of one evaluation."""
+
+    seeds: tuple[int, ...]
+    """reset seed of each episode"""
+    copies: int
+    """seeds of a ticket: as many episodes are played side by side on one worker"""
+    most_steps: int
+    """an episode that reaches this number of env steps is cut"""
+    greedy: bool = True
+    """take the most probable actions; otherwise draw them"""
+    send_rows: bool = False
+    send_frames: bool = False
+
+    @staticmethod
+    def of(episodes: int, seed: int, copies: int, max_steps: int) -> EvaluationPlan:
+        """Greedy episodes with a seed of 31 bits each, because environments pass seeds to C.
+
+        `max_steps`: env steps that the whole evaluation may take. Each episode gets an equal share, at least one step.
+        """
+        return EvaluationPlan(episode_seeds(seed, episodes), copies, max(1, max_steps // episodes))
+
+
+def episode_seeds(seed: int, episodes: int) -> tuple[int, ...]:
+    """The reset seed of each episode."""
+    return tuple(int(state >> 1) for state in np.random.SeedSequence(seed).generate_state(episodes))
+
+
+@dataclass(frozen=True)
+class PlayedEpisode:
+    """An episode that was played to its end, or cut."""
+
+    episode: Episode
+    cut: bool
+
+
+class EvaluationTickets:
+    """The tickets of the evaluation that is pending, if there is one."""
+
+    def __init__(self) -> None:
+        self._plan: EvaluationPlan | None = None
+        self._version = -1
+        self._on_rows: OnRows | None = None
+        self._first = FIRST_TICKET  # number of the first ticket of this evaluation
+        self._seeds: list[tuple[int, ...]] = []  # of each ticket
+        self._undealt: list[int] = []  # heap: indices of tickets that no worker has
+        self._held: dict[bytes, dict[int, int]] = {}  # by worker: index of the ticket -> `replies` when it was last sent
+        self._played: dict[int, Evaluated] = {}  # by index of the ticket
+        self._next_rows: dict[tuple[int, int], int] = {}  # by ticket and episode: the first step that has not come
+
+    @property
+    def pending(self) -> bool:
+        """Whether an evaluation was begun and not ended."""
+        return self._plan is not None
+
+    @property
+    def done(self) -> bool:
+        """Whether all episodes of the pending evaluation were played."""
+        return self._plan is not None and len(self._played) == len(self._seeds)
+
+    @property
+    def episodes_played(self) -> int:
+        """Number of episodes of the pending evaluation that were played."""
+        return sum(len(self._seeds[index]) for index in self._played)
+
+    @property
+    def holders(self) -> list[bytes]:
+        """The workers that hold tickets, by routing id."""
+        return sorted(peer for peer, held in self._held.items() if held)
+
+    def begin(self, plan: EvaluationPlan, version: int, on_rows: OnRows | None = None) -> None:
+        """Begin to evaluate this version. `deal` then gives out the tickets."""
+        assert not self.pending, "an evaluation is pending"
+        self._first += len(self._seeds)
+        self._plan, self._version, self._on_rows = plan, version, on_rows
+        self._seeds = [plan.seeds[i : i + plan.copies] for i in range(0, len(plan.seeds), plan.copies)]
+        self._undealt = list(range(len(self._seeds)))
+        self._held, self._played, self._next_rows = {}, {}, {}
+
+    def end(self) -> list[PlayedEpisode]:
+        """End the evaluation. Returns its episodes in the order of the seeds; of one that is not done, only those played."""
+        self._plan = None
+        answers = [answer for _, answer in sorted(self._played.items())]
+        return [PlayedEpisode(*both) for answer in answers for both in zip(answer.episodes, answer.cut, strict=True)]
+
+    def deal(self, members: Sequence[Member]) -> list[Outgoing]:
+        """Give tickets to these workers: one to each, then a second one while there are plenty."""
+        out: list[Outgoing] = []
+        for most in range(1, HELD_AT_ONCE + 1):
+            for member in members:
+                plenty = most == 1 or len(self._undealt) > len(members)
+                if self._undealt and plenty and len(self._held.get(member.peer, ())) < most:
+                    out.append(self._send(member, heapq.heappop(self._undealt)))
+        return out
+
+    def send_again(self, member: Member, heartbeat: Heartbeat) -> list[Outgoing]:
+        """Orders that were lost on the way to this worker, or whose answers were lost, as its heartbeat shows."""
+        held = {self._first + index: sent_at for index, sent_at in self._held.get(member.peer, {}).items()}
+        return [self._send(member, ticket - self._first) for ticket in member.lost_on_the_way(heartbeat, held)]
+
+    def take(self, member: Member, answer: Evaluated) -> str:
+        """Take an answer. Returns what is wrong with it, or nothing; a wrong answer's ticket goes to another worker."""
+        index = answer.ticket - self._first
+        if not self.pending or index not in self._held.get(member.peer, ()):
+            return ""  # it came twice, or after the end
+        del self._held[member.peer][index]
+        if why := self._wrong(answer, len(self._seeds[index])):
+            self._put_back(index)
+            return f"evaluation of ticket {answer.ticket}: {why}"
+        if self._on_rows is not None and not self._rows_are_whole(index, answer):
+            self._put_back(index)  # a message with rows was lost: the episodes are played again
+            return ""
+        self._played[index] = answer
+        return ""
+
+    def take_rows(self, member: Member, rows: EpisodeRows) -> str:
+        """Take rows. Returns what is wrong with them, or nothing. Rows that came before are ignored."""
+        index = rows.ticket - self._first
+        if not self.pending or index not in self._held.get(member.peer, ()) or self._on_rows is None:
+            return ""
+        if rows.episode >= len(self._seeds[index]):
+            return f"rows of ticket {rows.ticket}: expected an episode below {len(self._seeds[index])}, got {rows.episode}"
+        key = (index, rows.episode)
+        if rows.first_step == self._next_rows.get(key, 0):
+            self._next_rows[key] = rows.first_step + len(rows.reward)
+            assert self._plan is not None
+            self._on_rows(index * self._plan.copies + rows.episode, rows)
+        return ""
+
+    def removed(self, peer: bytes) -> None:
+        """The worker is gone: its tickets go to others."""
+        for index in self._held.pop(peer, {}):
+            self._put_back(index)
+
+    # ---------------------------------------------------------------- inside
+
+    def _put_back(self, index: int) -> None:
+        heapq.heappush(self._undealt, index)
+
+    def _send(self, member: Member, index: int) -> Outgoing:
+        plan = self._plan
+        assert plan is not None
+        self._held.setdefault(member.peer, {})[index] = member.replies
+        order = Evaluate(
+            session=member.session,
+            ticket=self._first + index,
+            version=self._version,
+            seeds=self._seeds[index],
+            greedy=plan.greedy,
+            most_steps=plan.most_steps,
+            send_rows=plan.send_rows,
+            send_frames=plan.send_frames,
+        )
+        return member.peer, order
+
+    def _wrong(self, answer: Evaluated, seeds: int) -> str:
+        assert self._plan is not None
+        most = self._plan.most_steps
+        if len(answer.episodes) != seeds or len(answer.cut) != seeds:
+            return f"expected {seeds} episodes, got {len(answer.episodes)} and {len(answer.cut)} marks of cut ones"
+        for episode in answer.episodes:
+            if episode.length > most:
+                return f"expected episodes of at most {most} steps, got {episode.length}"
+            if not abs(episode.reward) <= episode.length * LARGEST_REWARD:  # false for NaN too
+                return f"expected a return that {episode.length} rewards can give, got {episode.reward}"
+        return ""
+
+    def _rows_are_whole(self, index: int, answer: Evaluated) -> bool:
+        come = [self._next_rows.get((index, n), 0) for n in range(len(answer.episodes))]
+        return come == [episode.length for episode in answer.episodes]

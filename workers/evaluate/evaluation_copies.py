@@ -1,0 +1,114 @@
+"""The env copies on which a worker evaluates. They have no autoreset: a copy is stepped until its episode ends.
+
+Rule: only the copies that are named are stepped, so that an episode that has ended costs nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from time import perf_counter
+from typing import Any, NamedTuple, Protocol
+
+import gymnasium
+
+from protocol.arrays import Array
+from protocol.env_spec import EnvSpec
+from protocol.envs.spaces import make_flatten
+from protocol.errors import UsageError
+from workers.collect.env_copies import made_without_order_check
+from workers.env_errors import CopyRaised
+from workers.env_loop import PULSE_S, EnvLoop, Pulse
+
+
+class CopyStep(NamedTuple):
+    """Result of one step of one copy."""
+
+    leaves: tuple[Any, ...]
+    """the arrays of the observation"""
+    reward: Any
+    terminated: Any
+    truncated: Any
+
+
+class CopiesLost(Exception):
+    """A worker was lost, and with it copies whose episodes had not ended. The episodes must be played again."""
+
+
+class EvaluationCopies(Protocol):
+    """Env copies without autoreset. What the environment raises arrives as `CopyRaised`, what `pulse` raises passes.
+
+    `step` may raise `CopiesLost`.
+    """
+
+    count: int
+    observation_space: gymnasium.Space[Any]
+    action_space: gymnasium.Space[Any]
+
+    def reset(self, seeds: Sequence[int], pulse: Pulse) -> list[tuple[Any, ...]]:
+        """Start episodes in the first copies, with a seed for each. Returns the arrays of each observation."""
+        ...
+
+    def step(self, actions: Array, copies: Sequence[int], pulse: Pulse) -> list[CopyStep]:
+        """Step these copies, with actions [count, *action] of which only theirs are used."""
+        ...
+
+    def render(self, copy: int) -> Any:
+        """What the environment renders."""
+        ...
+
+    def close(self) -> None:
+        """Close the copies. Raises nothing."""
+        ...
+
+
+class LoopedEvaluationCopies:
+    """A loop over environments in this process."""
+
+    def __init__(self, env: EnvSpec, count: int, render_mode: str | None, pulse: Pulse) -> None:
+        """`render_mode`: None, or `rgb_array`. Raises `UsageError` if the environment does not render so."""
+        self.count = count
+        make = partial(made_without_order_check, partial(env.make, render_mode))
+        self._loop = EnvLoop([make] * count, pulse, "Disabled")
+        self._steps = [0] * count
+        first = self._loop.envs[0]
+        self.observation_space, self.action_space = first.observation_space, first.action_space
+        self._read = make_flatten(self.observation_space)
+        modes = first.metadata.get("render_modes", [])
+        if render_mode is not None and (first.render_mode != render_mode or render_mode not in modes):
+            self.close()
+            raise UsageError(f"environment {env.id} cannot be filmed: expected it to render {render_mode}, got {modes}")
+
+    def reset(self, seeds: Sequence[int], pulse: Pulse) -> list[tuple[Any, ...]]:
+        """Start episodes in the first copies, with a seed for each. Returns the arrays of each observation."""
+        observations: list[Any] = [None] * len(seeds)
+        self._loop.reset(range(len(seeds)), seeds, observations, pulse)
+        self._steps[: len(seeds)] = [0] * len(seeds)
+        return [self._read(observation) for observation in observations]
+
+    def step(self, actions: Array, copies: Sequence[int], pulse: Pulse) -> list[CopyStep]:
+        """Step these copies one after another, with actions [count, *action] of which only theirs are used."""
+        results = []
+        pulse_due_s = perf_counter() + PULSE_S
+        for n in copies:
+            try:
+                observation, reward, terminated, truncated, _ = self._loop.envs[n].step(actions[n])
+                results.append(CopyStep(self._read(observation), reward, terminated, truncated))
+            except Exception as error:
+                raise CopyRaised(n, f"step {self._steps[n]}") from error
+            self._steps[n] += 1
+            if perf_counter() > pulse_due_s:
+                pulse()
+                pulse_due_s = perf_counter() + PULSE_S
+        return results
+
+    def render(self, copy: int) -> Any:
+        """What the environment renders."""
+        try:
+            return self._loop.envs[copy].render()
+        except Exception as error:
+            raise CopyRaised(copy, "render") from error
+
+    def close(self) -> None:
+        """Close every copy. What a copy raises is ignored."""
+        self._loop.close()

@@ -1,0 +1,203 @@
+"""Plays the episodes of an Evaluate order. The result depends on the order and the weights, and on nothing else.
+
+Rule: an order has k seeds, so k env copies are stepped together, and the policy always sees a batch [1, k, ...]. A copy
+whose episode has ended stays in the batch and is not stepped. The copies are apart from the lanes of training. They are
+opened once, and reset with a seed before each episode.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from time import perf_counter
+from traceback import format_exception
+from typing import Any
+
+import numpy as np
+
+from protocol.arrays import Array
+from protocol.envs.spaces import action_spec, make_action_converter, observation_leaves
+from protocol.errors import RunError, UsageError, first_line
+from protocol.messages import Evaluate, Evaluated
+from protocol.policy.distributions import distribution
+from protocol.policy.policy import Policy
+from protocol.policy.recurrent import zero_state
+from protocol.rollout import LARGEST_REWARD, Episode
+from protocol.specs import Leaf, RunSpec
+from workers.env_errors import CopyRaised
+from workers.env_loop import Pulse
+from workers.evaluate.episode_rows import RowSender, Send, as_frame
+from workers.evaluate.evaluation_copies import CopiesLost, EvaluationCopies, LoopedEvaluationCopies
+
+OpenEvaluationCopies = Callable[[RunSpec, int, str | None, Pulse], EvaluationCopies]
+"""Makes this number of copies, with this render mode."""
+
+
+class EvaluationFailed(RunError):
+    """The environment raised, or returned something unusable, while the policy was evaluated."""
+
+    def __init__(self, line: str, detail: str = "") -> None:
+        super().__init__(f"while the policy was evaluated: {line}", detail)
+
+
+def open_looped_copies(run: RunSpec, count: int, render_mode: str | None, pulse: Pulse) -> EvaluationCopies:
+    """Copies in this process."""
+    return LoopedEvaluationCopies(run.env, count, render_mode, pulse)
+
+
+class Evaluator:
+    """Plays whole episodes. It opens env copies when they are first needed."""
+
+    def __init__(self, run: RunSpec, policy: Policy, open_copies: OpenEvaluationCopies = open_looped_copies) -> None:
+        """`policy` must hold the weights to evaluate when `play` is called."""
+        self.steps = 0
+        """number of env steps made"""
+        self.seconds = 0.0
+        """seconds spent in `play`"""
+        self._run, self._policy, self._open_copies = run, policy, open_copies
+        self._distribution = distribution(run.policy)
+        self._to_env_action = make_action_converter(run.policy.action)
+        self._copies: dict[str | None, EvaluationCopies] = {}  # by render mode
+
+    def play(self, order: Evaluate, send: Send, pulse: Pulse) -> Evaluated:
+        """Play one episode for each seed. `send` gets the rows, if the order asks for them.
+
+        `pulse` is called at every step and may raise. If it raises, or the environment does (`EvaluationFailed`), all copies
+        are closed.
+        """
+        began_s = perf_counter()
+        try:
+            while True:
+                with suppress(CopiesLost):
+                    return self._play(order, send, pulse)
+        except CopyRaised as error:
+            self.close()
+            cause = error.__cause__ or error
+            where = error.doing if error.copy is None else f"copy {error.copy}, {error.doing}"
+            line = f"{where}: its environment raised {type(cause).__name__}: {first_line(cause, '')}"
+            raise EvaluationFailed(line, "".join(format_exception(cause))) from error
+        except BaseException:
+            self.close()
+            raise
+        finally:
+            self.seconds += perf_counter() - began_s
+
+    def close(self) -> None:
+        """Close all copies."""
+        while self._copies:
+            self._copies.popitem()[1].close()
+
+    def _play(self, order: Evaluate, send: Send, pulse: Pulse) -> Evaluated:
+        k, policy = len(order.seeds), self._run.policy
+        copies = self._opened(k, "rgb_array" if order.send_frames else None, pulse)
+        obs = tuple(np.empty((1, k, *leaf.shape), leaf.dtype) for leaf in policy.observation)
+        actions = np.zeros((copies.count, *policy.action.shape), policy.action.dtype)
+        state, generator = zero_state(policy, 1, k), np.random.default_rng(order.seeds[0])
+        returns, lengths, cut, seconds = [0.0] * k, [0] * k, [False] * k, [0.0] * k
+        senders = [RowSender(order, n, policy, send) for n in range(k)] if order.send_rows or order.send_frames else []
+        began_s = perf_counter()
+        for n, leaves in enumerate(copies.reset(order.seeds, pulse)):
+            self._store(obs, n, leaves, "first reset")
+            if senders:
+                self._observe(senders[n], obs, n, copies)
+        self._check_finite(obs, "first reset")
+        running = list(range(k))
+        while running:
+            pulse()
+            with np.errstate(all="ignore"):
+                params = self._policy(obs, state)
+                if order.greedy:
+                    chosen = self._distribution.mode(params)[0]
+                else:
+                    chosen = self._distribution.sample(params, self._distribution.noise(generator, (1, k)))[0]
+                actions[:k] = self._to_env_action(chosen)
+            ended = False
+            for n, step in zip(running, copies.step(actions, running, pulse), strict=True):
+                reward = _finite_reward(step.reward, n, lengths[n])
+                self._store(obs, n, step.leaves, lengths[n])
+                returns[n] += reward
+                lengths[n] += 1
+                over = bool(step.terminated or step.truncated)
+                cut[n] = not over and lengths[n] >= order.most_steps
+                if senders:
+                    self._observe(senders[n], obs, n, copies)
+                    senders[n].step(chosen[n], reward, bool(step.terminated), bool(step.truncated) or cut[n])
+                if over or cut[n]:
+                    ended, seconds[n] = True, perf_counter() - began_s
+            self._check_finite(obs, lengths[running[0]] - 1)  # all that run have made equally many steps
+            self.steps += len(running)
+            if ended:
+                running = [n for n in running if not seconds[n]]
+        episodes = tuple(Episode(*figures) for figures in zip(returns, lengths, seconds, strict=True))
+        return Evaluated(order.session, order.ticket, episodes, tuple(cut))
+
+    def _opened(self, count: int, render_mode: str | None, pulse: Pulse) -> EvaluationCopies:
+        """At least this number of copies. Raises `UsageError` when their spaces are not those of the run."""
+        copies = self._copies.get(render_mode)
+        if copies is not None and copies.count >= count:
+            return copies
+        if copies is not None:
+            self._copies.pop(render_mode).close()
+        copies = self._copies[render_mode] = self._open_copies(self._run, count, render_mode, pulse)
+        observation, action, policy = copies.observation_space, copies.action_space, self._run.policy
+        if (observation_leaves(observation), action_spec(action)) != (policy.observation, policy.action):
+            raise UsageError(
+                f"environment {self._run.env.id}: its observations {observation} and actions {action} are not those of the "
+                "policy; install the version of it that the policy was trained on"
+            )
+        return copies
+
+    def _store(self, obs: tuple[Array, ...], n: int, leaves: tuple[Any, ...], when: str | int) -> None:
+        """Write the observation of copy n to its place in the batch. Raises if it is not of its space.
+
+        `when` is a text, or the number of the step.
+        """
+        for array, leaf, value in zip(obs, self._run.policy.observation, leaves, strict=True):
+            if type(value) is not np.ndarray or value.dtype != array.dtype or value.shape != leaf.shape:
+                value = _converted(value, leaf, array.dtype, f"copy {n}, {_moment(when)}")
+            array[0, n] = value
+
+    def _check_finite(self, obs: tuple[Array, ...], when: str | int) -> None:
+        """Raise if an observation of the batch is not finite."""
+        for array, leaf in zip(obs, self._run.policy.observation, strict=True):
+            if array.dtype.kind == "f" and not np.isfinite(array).all():
+                n = next(n for n in range(array.shape[1]) if not np.isfinite(array[0, n]).all())
+                where = f"copy {n}, {_moment(when)}: observation {leaf.path}".strip()
+                raise EvaluationFailed(f"{where}: expected finite numbers, got {array[0, n].tolist()}"[:500])
+
+    def _observe(self, sender: RowSender, obs: tuple[Array, ...], n: int, copies: EvaluationCopies) -> None:
+        try:
+            frame = as_frame(copies.render(n)) if sender.wants_frame else None
+        except ValueError as error:
+            raise EvaluationFailed(f"copy {n}, {error}") from error
+        sender.observe([leaf[0, n] for leaf in obs], frame)
+
+
+def _moment(when: str | int) -> str:
+    return when if isinstance(when, str) else f"step {when}"
+
+
+def _converted(value: Any, leaf: Leaf, dtype: np.dtype[Any], where: str) -> Array:
+    """An observation as an array of its space. Raises `EvaluationFailed` if it has another shape or kind."""
+    try:
+        given = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        given = np.asarray(None)
+    if given.shape == leaf.shape and np.can_cast(given.dtype, dtype, "same_kind"):
+        return given
+    what = f"observation {leaf.path}".strip()
+    raise EvaluationFailed(
+        f"{where}: {what}: expected {dtype}{list(leaf.shape)} as its space says, "
+        f"got {given.dtype}{list(given.shape)}; fix the environment or its observation_space"
+    )
+
+
+def _finite_reward(reward: Any, n: int, t: int) -> float:
+    """The reward as a number. Raises `EvaluationFailed` if it is none that a rollout could hold."""
+    try:
+        number = float(reward)
+    except (TypeError, ValueError) as error:
+        raise EvaluationFailed(f"copy {n}, step {t}: reward: expected a number, got {type(reward).__name__}") from error
+    if not abs(number) <= LARGEST_REWARD:
+        raise EvaluationFailed(f"copy {n}, step {t}: reward: expected a finite float32, got {number}")
+    return number
