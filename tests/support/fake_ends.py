@@ -16,12 +16,14 @@ import msgspec
 import numpy as np
 
 from learner.members.membership import Outgoing
+from learner.rollouts.evaluation_tickets import EvaluationPlan
 from learner.rollouts.ledger import Ledger
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 from protocol.env_spec import EnvSpec
-from protocol.messages import Rollout, ToLearner, ToWorker
+from protocol.messages import EpisodeRows, Evaluated, Rollout, ToLearner, ToWorker
+from protocol.rollout import Episode
 from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
-from workers.session import Effect, Identity, Leave, Send, Session, Task
+from workers.session import Effect, EvaluationTask, Identity, Leave, Send, Session, Task
 
 PARAMETERS = np.zeros(1, np.float32)
 BUFFERS = np.zeros(0, np.float32)
@@ -58,6 +60,28 @@ def fake_rollouts(task: Task) -> list[Rollout]:
     return [fake_rollout(task.session, a.lane, a.ticket, task.weights.version, a.sequence) for a in task.assignments]
 
 
+def fake_evaluated(task: EvaluationTask) -> Evaluated:
+    """Result of an evaluator: episodes of two steps whose return names the seed and the version."""
+    order = task.order
+    episodes = tuple(Episode(seed + task.weights.version / 1000, 2, 0.0) for seed in order.seeds)
+    return Evaluated(order.session, order.ticket, episodes, (False,) * len(episodes))
+
+
+def fake_rows(session: int, ticket: int, episode: int, step: int) -> EpisodeRows:
+    """One row of an episode of two steps."""
+    return EpisodeRows(
+        session=session,
+        ticket=ticket,
+        episode=episode,
+        first_step=step,
+        obs=(np.zeros((2, 1), np.float32),),
+        action=np.zeros(1, np.int64),
+        reward=np.zeros(1),
+        terminated=np.array([step == 1]),
+        truncated=np.zeros(1, bool),
+    )
+
+
 @dataclass
 class Faults:
     """What the network and fate do, until `until_s`; after that only `loss` goes on."""
@@ -71,6 +95,7 @@ class Faults:
     late_joiners: int = 0
     leaves: int = 0
     learner_restarts: int = 0
+    evaluations: float = 0.0  # how many of the updates are evaluated
     until_s: float = 30.0
 
 
@@ -80,7 +105,7 @@ class FakeWorker:
 
     name: bytes
     session: Session
-    task: Task | None = None
+    task: Task | EvaluationTask | None = None
     frozen: bool = False
     inbox: list[ToWorker] = field(default_factory=list)
 
@@ -99,6 +124,10 @@ class World:
         self.queue: list[tuple[float, int, Callable[[], None]]] = []
         self.arrival: dict[tuple[bytes, str], float] = {}  # a stream's last delivery: order is kept within it
         self.workers: dict[bytes, FakeWorker] = {}
+        self.evaluations = 0
+        self.plan: EvaluationPlan | None = None  # of the evaluation that is pending
+        self.issued_at_barrier = 0
+        self.rows: list[tuple[int, int]] = []  # episode and step, as they came
         self.used: set[int] = set()
         self.updates = 0
         self.epoch = 0
@@ -193,22 +222,33 @@ class World:
         session = worker.session
         while worker.inbox:
             self.say(worker, session.handle(worker.inbox.pop(0), self.now))
-        if worker.task is not None and session.abandoned(worker.task.session):
-            worker.task = None
-            self.say(worker, session.finished([]))
-        if worker.task is None and (task := session.next_task()) is not None:
+        match worker.task:
+            case Task() if session.abandoned(worker.task.session):
+                worker.task = None
+                self.say(worker, session.finished([]))
+            case EvaluationTask() if session.evaluation_abandoned(worker.task.order.session):
+                worker.task = None
+                self.say(worker, session.evaluated(None))
+        if worker.task is None and (task := session.next_evaluation() or session.next_task()) is not None:
             worker.task = task
             self.at(self.random.uniform(0.01, 0.4), lambda: self._finish(worker, task))
         self.say(worker, session.tick(self.now))
 
-    def _finish(self, worker: FakeWorker, task: Task) -> None:
+    def _finish(self, worker: FakeWorker, task: Task | EvaluationTask) -> None:
         if worker.task is not task or self.workers.get(worker.name) is not worker:
             return
         if worker.frozen:
             self.at(0.5, lambda: self._finish(worker, task))
             return
         worker.task = None
-        self.say(worker, worker.session.finished(fake_rollouts(task)))
+        if isinstance(task, Task):
+            self.say(worker, worker.session.finished(fake_rollouts(task)))
+        else:
+            order = task.order
+            assert task.weights.version == order.version, "evaluated under other weights than those of the order"
+            for n, step in itertools.product(range(len(order.seeds)), range(2)) if order.send_rows else ():
+                self.say(worker, [Send(fake_rows(order.session, order.ticket, n, step))])
+            self.say(worker, worker.session.evaluated(fake_evaluated(task)))
         self._serve(worker)
 
     # ------------------------------------------------------------ learner
@@ -221,6 +261,7 @@ class World:
         self.used = {ticket for ticket in self.used if ticket < ledger.issued}
         self.updates = version
         self.updating = False
+        self.plan = None
         coordinator = TicketCoordinator(
             self.run,
             rollouts_per_update=self.per_update,
@@ -244,7 +285,7 @@ class World:
 
     def _learn(self) -> None:
         """Take a batch if there is one; publish new weights a little later."""
-        if self.updating:
+        if self.updating or self._evaluating():
             return
         taken = self.coordinator.take()
         self.to_workers(self.coordinator.deal())
@@ -266,12 +307,39 @@ class World:
                 return
             self.updates += 1
             self.updating = False
-            self.to_workers(coordinator.publish(self.updates, PARAMETERS, BUFFERS))
+            evaluates = self.random.random() < self.faults.evaluations
+            self.to_workers(coordinator.publish(self.updates, PARAMETERS, BUFFERS, deal=not evaluates))
+            if evaluates:
+                self._begin_evaluation()
             if self.random.random() < 0.3:
                 self.checkpoint = (msgspec.structs.replace(coordinator.ledger), self.updates, coordinator.incarnations())
             self._learn()
 
         self.at(self.random.uniform(0.0, 0.3), publish)
+
+    def _begin_evaluation(self) -> None:
+        draw, coordinator = self.random, self.coordinator
+        seeds = tuple(draw.sample(range(1000), draw.randint(1, 9)))
+        self.plan = EvaluationPlan(seeds, draw.randint(1, 3), most_steps=2, send_rows=draw.random() < 0.5)
+        self.rows, self.issued_at_barrier = [], coordinator.ledger.issued
+        on_rows = self._take_rows if self.plan.send_rows else None
+        self.to_workers(coordinator.begin_evaluation(self.plan, on_rows))
+
+    def _take_rows(self, episode: int, rows: EpisodeRows) -> None:
+        self.rows.append((episode, rows.first_step))
+
+    def _evaluating(self) -> bool:
+        """Whether an evaluation is pending. Ends one that is done, and checks its result."""
+        if self.plan is None or not self.coordinator.evaluation.done:
+            return self.plan is not None
+        plan, self.plan = self.plan, None
+        played = self.coordinator.end_evaluation()
+        expected = [seed + self.coordinator.version / 1000 for seed in plan.seeds]
+        assert [one.episode.reward for one in played] == expected, "the episodes are not those of the seeds"
+        if plan.send_rows:
+            assert sorted(self.rows) == list(itertools.product(range(len(plan.seeds)), range(2)))
+        self.evaluations += 1
+        return False
 
     # ------------------------------------------------------------ fate
 
@@ -331,6 +399,8 @@ class World:
         assert ledger.transitions_waiting == sum(arrived.rollout.env_steps for arrived in coordinator.ready), (
             "transitions do not balance"
         )
+        if self.plan is not None:
+            assert ledger.issued == self.issued_at_barrier, "a ticket for a rollout was dealt during an evaluation"
         bound = self.per_update * (coordinator.version + 1 + self.max_lag)
         assert ledger.used + in_flight <= bound, "more tickets than the bound allows"
         for lane in coordinator.lanes:

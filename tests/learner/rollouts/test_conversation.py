@@ -26,6 +26,7 @@ def case(seed: int) -> World:
         late_joiners=draw.randint(0, 2),
         leaves=draw.randint(0, 1),
         learner_restarts=draw.choice([0, 0, 1, 2]),
+        evaluations=draw.choice([0.0, 0.5]),
         until_s=until_s,
     )
     per_update = lanes if draw.random() < 0.7 else draw.randint(1, lanes)
@@ -50,6 +51,29 @@ def test_without_faults_nothing_is_lost_or_said_twice() -> None:
     counts = world.coordinator.ledger.counts()
     assert counts["lost"] == counts["stale"] == counts["transitions_duplicate"] == counts["transitions_late"] == 0
     assert counts["used"] == 4 * 200
+
+
+def test_every_version_can_be_evaluated_although_workers_die_and_messages_are_lost() -> None:
+    faults = Faults(loss=0.1, repeat=0.2, deaths=6, freezes=4, late_joiners=2, evaluations=1.0, until_s=20.0)
+    world = World(3, faults, workers=3, lanes=2, max_lag=1, per_update=2)
+    world.play(updates=61, limit_s=4000.0)
+    assert world.evaluations >= 60  # that of the last update may be pending
+
+
+def test_a_worker_without_a_lane_evaluates_too() -> None:
+    """One lane and two workers: with the second as a spare, two orders of 0.2 s take no longer than one."""
+    world = World(3, Faults(evaluations=1.0, until_s=0.0), workers=2, lanes=1, max_lag=0, per_update=1)
+    holders = set()
+    check = world.check
+
+    def watch() -> None:
+        check()
+        if world.plan is not None and len(world.plan.seeds) > 2 * world.plan.copies:
+            holders.add(tuple(world.coordinator.evaluation.holders))
+
+    world.check = watch  # type: ignore[method-assign]
+    world.play(updates=20)
+    assert (b"w0", b"w1") in holders
 
 
 def test_lost_messages_cost_no_transition() -> None:
