@@ -47,8 +47,8 @@ class RolloutService:
     def evaluate(self, plan: EvaluationPlan, watch: Callable[[int], None]) -> Evaluation:
         """Let the workers play these episodes under the newest weights, which must be published with `deal` False.
 
-        `watch` is called with the number of episodes that were played, several times a second. Raises `RunError` when the run
-        cannot go on.
+        `watch` is called with the number of episodes that were played, several times a second. Raises `RunError` when the
+        run cannot go on.
         """
         played = self._hub.evaluate(plan, watch)
         episodes = [one.episode for one in played]

@@ -59,8 +59,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     eval_every: Natural = 0
     """Env steps between evaluations during training. 0: evaluate only at the end."""
     eval_copies: Annotated[int, Meta(ge=1, le=MAX_SEEDS)] = 4
-    """Number of evaluation episodes that a worker plays side by side, on env copies of their own. Results may depend on it in
-    their last bits, and never on the number of workers.
+    """Number of evaluation episodes that a worker plays side by side, on env copies of their own. The last bits of results
+    may depend on it. They do not depend on the number of workers.
     """
     eval_max_steps: Count = 1_000_000
     """Most env steps of one evaluation. Each episode gets an equal share: with 100 episodes, one that reaches 10000 steps is

@@ -213,6 +213,7 @@ class Hub:
         self._server.wait_until_all_left(self._clock() + timeout_s, POLL_S)
         if late := [member.hello.worker for member in self.coordinator.members.values()]:
             log.warning("did not say goodbye within %.0f s: workers %s", timeout_s, _names(late))
+        self._observer(self)
 
     def waiting_for(self) -> str:
         """A description of what the learner waits for, for the terminal."""
@@ -272,8 +273,8 @@ class Hub:
         coordinator = self.coordinator
         if not coordinator.members:
             return self.waiting_for()
-        late = ", ".join(coordinator.members[peer].hello.worker for peer in coordinator.evaluation.holders)
-        return f"evaluating: {coordinator.evaluation.episodes_played} episodes played, others are with {late or 'nobody'}"
+        late = _names([coordinator.members[peer].hello.worker for peer in coordinator.evaluation.holders])
+        return f"evaluating: {coordinator.evaluation.episodes_played} episodes played, others are with {late}"
 
     def _turn(self, timeout_s: float) -> None:
         """One turn of waiting: listen, then check whether the run can go on."""

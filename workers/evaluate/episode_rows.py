@@ -51,7 +51,8 @@ class RowSender:
         """Add a row. The observation after it must have been added."""
         self._rows.append((action.copy(), reward, terminated, truncated))
         self._bytes += action.nbytes + 10
-        if terminated or truncated or self._bytes >= CHUNK_BYTES:
+        was_last_frame = bool(self._frames) and self._frames_so_far == MOST_FRAMES
+        if terminated or truncated or was_last_frame or self._bytes >= CHUNK_BYTES:
             self._flush()
 
     def _flush(self) -> None:
@@ -73,8 +74,8 @@ class RowSender:
             )
         )
         self._first_step += len(self._rows)
-        self._obs, self._frames, self._rows = self._obs[-1:], self._frames[-1:], []
-        self._bytes = 0
+        self._obs, self._rows, self._bytes = self._obs[-1:], [], 0
+        self._frames = self._frames[-1:] if self._frames_so_far < MOST_FRAMES else []
 
 
 def as_frame(rendered: Any) -> Array:

@@ -5,6 +5,7 @@ Rule: only the copies that are named are stepped, so that an episode that has en
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from functools import partial
 from time import perf_counter
@@ -69,7 +70,10 @@ class LoopedEvaluationCopies:
         """`render_mode`: None, or `rgb_array`. Raises `UsageError` if the environment does not render so."""
         self.count = count
         make = partial(made_without_order_check, partial(env.make, render_mode))
-        self._loop = EnvLoop([make] * count, pulse, "Disabled")
+        with warnings.catch_warnings():
+            if render_mode is not None:
+                warnings.simplefilter("ignore")  # gymnasium's, about a render mode that is refused below
+            self._loop = EnvLoop([make] * count, pulse, "Disabled")
         self._steps = [0] * count
         first = self._loop.envs[0]
         self.observation_space, self.action_space = first.observation_space, first.action_space
