@@ -27,9 +27,10 @@ from protocol.policy.layout import acting_size
 from protocol.policy.policy import make_policy
 from protocol.rollout import Rollout, rollout_bytes
 from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
-from protocol.wire.codec import MAX_FRAME_BYTES, decode_to_learner, encode
+from protocol.wire.codec import decode_to_learner, encode
 from protocol.wire.compression import Packing
 from protocol.wire.learner_link import LearnerLink
+from protocol.wire.socket_options import MAX_FRAME_BYTES
 from protocol.wire.weight_dtypes import WeightsDtype, to_float32, to_wire_dtype
 from protocol.wire.worker_link import WorkerLink
 from workers.collect.collector import Collector

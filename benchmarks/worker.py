@@ -29,7 +29,7 @@ from protocol.policy.layout import buffer_size, parameter_layout, total_size
 from protocol.specs import DescribeSpec
 from protocol.wire.learner_link import LearnerLink
 from workers.describe import describing
-from workers.supervisor import WorkerCommand, WorkerProcess
+from workers.supervise.worker_process import WorkerCommand, WorkerProcess
 
 CASES = {
     "MLP, CartPole-v1": EnvSpec("CartPole-v1"),

@@ -167,7 +167,11 @@ class Run:
             incarnations=state.incarnations,
         )
         settings = HubSettings(
-            config.no_workers_timeout_s, config.stall_timeout_s, config.max_env_failures, config.weights_dtype
+            config.no_workers_timeout_s,
+            config.stall_timeout_s,
+            config.max_env_failures,
+            config.weights_dtype,
+            config.call_timeouts(),
         )
         self._interrupts = Interrupts()
         hub = Hub(link, coordinator, settings, processes, self._check_interrupt, observer)

@@ -91,6 +91,12 @@ def worker_name(peer: bytes) -> bytes:
     return peer.partition(b"\0")[0]
 
 
+def key_of_peer(peer: bytes) -> bytes:
+    """The key part of a peer of a learner with keys; empty without keys."""
+    _, separator, key = peer.rpartition(b"\0")
+    return key if separator else b""
+
+
 def name_for_people(peer: bytes) -> str:
     """The worker's name as text without control characters, for logs and errors. A stranger's may be any bytes."""
     return one_line(worker_name(peer).decode(errors="replace"), MAX_NAME)

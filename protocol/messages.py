@@ -6,28 +6,28 @@ not used. Every field has a bound (`protocol/bounds.py`), which decoding checks.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 import msgspec
 from msgspec import Meta
 
+from protocol.alive import Alive, Doing, WorkerActivity, WorkerExit
 from protocol.arrays import Array
 from protocol.bounds import (
     MAX_SEEDS,
     MAX_TICKETS,
-    MAX_WORKERS,
     Count,
     Line,
     Name,
     Natural,
     Pid,
-    Seconds,
     Stages,
     Text,
     Tickets,
     Version,
     Whole,
 )
+from protocol.message_base import Message
 from protocol.rollout import Episode, Rollout
 from protocol.space_spec import EnvDescription
 from protocol.specs import DescribeSpec, RunSpec, StepSpec
@@ -35,10 +35,6 @@ from protocol.specs import DescribeSpec, RunSpec, StepSpec
 PROTOCOL_VERSION = 4
 TOLD_TO_STOP = "told to stop"
 """The reason in the Goodbye of a worker that got a signal. With any other reason it declines what it was asked for."""
-
-
-class Message(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unknown_fields=True):
-    """Base of all messages except `Rollout`, which has its own file. Fields travel by position, without their names."""
 
 
 class Hello(Message, frozen=True, array_like=False):  # a map, as in every version, so that any two can part politely
@@ -181,41 +177,6 @@ class Failure(Message, frozen=True):
     error: Line
     traceback: Text
     lane: Natural | None
-
-
-Doing = Literal["starting", "waiting", "describing", "making", "resetting", "stepping", "evaluating", "closing"]
-"""What a worker does, as its supervisor sees it. Environment code runs in all of these except `starting` and `waiting`."""
-
-
-class WorkerActivity(msgspec.Struct, frozen=True, array_like=True):
-    """A running worker, as its supervisor sees it."""
-
-    worker: Name
-    process_nonce: Natural
-    doing: Doing
-    for_s: Seconds
-    """seconds since it started to do this"""
-    env_calls: Natural
-    """calls of the environment (make, reset, step) that have returned since the worker started"""
-
-
-class WorkerExit(msgspec.Struct, frozen=True, array_like=True):
-    """A worker whose process has ended."""
-
-    worker: Name
-    process_nonce: Natural
-    reason: Line
-    """how it ended: an exit code, a signal, or a timeout that its supervisor enforced, by the name of its flag"""
-    failed: bool
-    """whether the environment, or the worker, is to blame: it did not leave on purpose"""
-
-
-class Alive(Message, frozen=True):
-    """A supervisor speaks for its workers. It is believed if it knows a worker's nonce and uses the same key."""
-
-    running: Annotated[tuple[WorkerActivity, ...], Meta(max_length=MAX_WORKERS)]
-    ended: Annotated[tuple[WorkerExit, ...], Meta(max_length=MAX_WORKERS)]
-    """those that ended a short while ago; repeated, because a message may be lost"""
 
 
 class Described(Message, frozen=True):

@@ -20,6 +20,7 @@ from protocol.envs.vectorized import make_native, vector_alternative
 from protocol.errors import EnvironmentFailed, UsageError, first_line
 from protocol.space_spec import EnvDescription
 from protocol.specs import DescribeSpec
+from workers.supervise.activity import CLOSING, DESCRIBING, activity
 
 
 @contextmanager
@@ -30,15 +31,16 @@ def describing(spec: DescribeSpec) -> Iterator[EnvDescription]:
     is missing, or its spaces are not supported. Raises `EnvironmentFailed` for any exception of its own code, and for an
     exit of the process that its code asks for.
     """
-    with _failures_of(spec.env):
+    page = activity()
+    with _failures_of(spec.env), page.during(DESCRIBING):
         env = spec.env.make(spec.render_mode)
     try:
-        with _failures_of(spec.env):
+        with _failures_of(spec.env), page.during(DESCRIBING):
             _check_vectorized(spec, env)
             description = describe_env(env)
         yield description
     finally:
-        with suppress(Exception, SystemExit):
+        with suppress(BaseException), page.during(CLOSING):
             env.close()
 
 
@@ -50,7 +52,7 @@ def _failures_of(env: EnvSpec) -> Iterator[None]:
         if error.detail:  # its constructor raised
             raise EnvironmentFailed(str(error), error.detail) from error
         raise
-    except (Exception, SystemExit) as error:
+    except BaseException as error:
         line = f"environment {env.id} cannot be made: {type(error).__name__}: {first_line(error)}"
         raise EnvironmentFailed(line, traceback.format_exc()) from error
 
@@ -63,7 +65,7 @@ def _check_vectorized(spec: DescribeSpec, env: gymnasium.Env[object, object]) ->
         case "native":
             whose, made = "its vectorized form", make_native(spec.env, 1)
             observed, acted = made.single_observation_space, made.single_action_space
-            with suppress(Exception, SystemExit):
+            with suppress(BaseException):
                 made.close()
         case "envpool":
             whose, pool = "envpool's", envpool_spec(spec.env)

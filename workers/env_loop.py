@@ -16,6 +16,17 @@ import gymnasium
 
 from protocol.errors import UsageError
 from workers.env_errors import CopyRaised
+from workers.supervise.activity import (
+    CLOSING,
+    DOING,
+    ENV_CALLS,
+    MAKING,
+    RESETTING,
+    SINCE_S,
+    STEPPING,
+    WAITING,
+    activity,
+)
 
 Autoreset = Literal["NextStep", "SameStep", "Disabled"]
 Infos = list[tuple[int, dict[str, Any]]]
@@ -39,14 +50,16 @@ class EnvLoop:
     ) -> None:
         """Make the copies, and reset none. `ended`: they count as truncated, so the first step with NextStep resets them."""
         self.envs: list[gymnasium.Env[Any, Any]] = []
+        self._activity = activity()
         for n, make in enumerate(makes):
             pulse()
             try:
-                self.envs.append(make())
+                with self._activity.during(MAKING):
+                    self.envs.append(make())
             except UsageError:
                 self.close()
                 raise
-            except Exception as error:
+            except BaseException as error:  # also SystemExit: the environment must not end the worker in silence
                 self.close()
                 raise CopyRaised(n, "make") from error
         self.steps = 0
@@ -73,8 +86,9 @@ class EnvLoop:
         for n, seed in zip(copies, seeds, strict=True):
             pulse()
             try:
-                into[n], info = self.envs[n].reset(seed=seed, **(keywords or {}))
-            except Exception as error:
+                with self._activity.during(RESETTING):
+                    into[n], info = self.envs[n].reset(seed=seed, **(keywords or {}))
+            except BaseException as error:
                 raise CopyRaised(n, "reset") from error
             self.reward[n], self.terminated[n], self.truncated[n] = 0.0, False, False
             if info:
@@ -86,33 +100,50 @@ class EnvLoop:
         reward, terminated, truncated = self.reward, self.terminated, self.truncated
         next_step, same_step = self._next_step, self._same_step
         infos: Infos = []
-        pulse_due_s = perf_counter() + PULSE_S
+        # What the worker does is written here in full, because this loop must be fast: once per step of the lane, when a
+        # copy is reset, and every `PULSE_S`.
+        numbers, seconds, counted = self._activity.numbers, self._activity.seconds, 0
+        seconds[SINCE_S] = began_s = perf_counter()
+        numbers[DOING] = STEPPING
+        pulse_due_s = began_s + PULSE_S
         for n, (step, action) in enumerate(zip(self._step_functions, actions, strict=True)):
             resets = next_step and (terminated[n] or truncated[n])
             try:
                 if resets:
-                    observation, info = self.envs[n].reset()
+                    with self._activity.during(RESETTING):
+                        observation, info = self.envs[n].reset()
+                    numbers[DOING] = STEPPING
                     reward[n], terminated[n], truncated[n] = 0.0, False, False
                 else:
                     observation, reward[n], terminated[n], truncated[n], info = step(action)
                     if same_step and (terminated[n] or truncated[n]):
                         resets = True
                         last = {"final_obs": observation, "final_info": info}
-                        observation, info = self.envs[n].reset()
+                        with self._activity.during(RESETTING):
+                            observation, info = self.envs[n].reset()
+                        numbers[DOING] = STEPPING
                         info = last | info
                 into[n] = observation
-            except Exception as error:
+            except BaseException as error:
                 raise CopyRaised(n, "reset" if resets else f"step {self.steps}") from error
             if info:
                 infos.append((n, info))
             if perf_counter() > pulse_due_s:
+                numbers[ENV_CALLS] += n + 1 - counted
+                counted = n + 1
+                numbers[DOING] = WAITING
                 pulse()
-                pulse_due_s = perf_counter() + PULSE_S
+                seconds[SINCE_S] = began_s = perf_counter()
+                numbers[DOING] = STEPPING
+                pulse_due_s = began_s + PULSE_S
+        numbers[ENV_CALLS] += len(reward) - counted
+        seconds[SINCE_S] = perf_counter()
+        numbers[DOING] = WAITING
         self.steps += 1
         return infos
 
     def close(self) -> None:
         """Close every copy. What a copy raises is ignored."""
         for env in self.envs:
-            with suppress(Exception):
+            with suppress(BaseException), self._activity.during(CLOSING):
                 env.close()

@@ -1,7 +1,8 @@
 """Ends a process whose environment hangs, even if it hangs in C code and holds the interpreter's lock.
 
 Rule: when nobody calls `feed` for `timeout_s`, the process writes the stack of each of its threads to stderr and exits at
-once with exit code 1; its supervisor then starts another. The timer is a C thread of Python's faulthandler, which does not
+once with exit code 1. Its supervisor ends it before that, unless the supervisor is dead or the worker hangs in our own code.
+The timer is a C thread of Python's faulthandler, which does not
 need the interpreter's lock. Setting it takes about 50 µs, so `feed` does so only now and then.
 """
 
@@ -37,7 +38,12 @@ def where_it_hung(log: str) -> str | None:
     _, found, after = log.rpartition(FAULTHANDLER_HEADER)
     if not found:
         return None
+    return deepest_frame(after) or "an unknown place"
+
+
+def deepest_frame(stacks: str) -> str:
+    """Where the main thread is, from the stacks of all threads that faulthandler wrote; empty if it wrote none."""
     # In each stack the newest call comes first. The last stack is that of the main thread.
-    stacks = re.split(r"^(?:Current )?[Tt]hread .*$", after, flags=re.MULTILINE)
-    frame = re.search(r'File "(.*)", line (\d+) in (\S+)', stacks[-1])
-    return f"{frame[1]}:{frame[2]}, in {frame[3]}" if frame else "an unknown place"
+    each = re.split(r"^(?:Current )?[Tt]hread .*$", stacks, flags=re.MULTILINE)
+    frame = re.search(r'File "(.*)", line (\d+) in (\S+)', each[-1])
+    return f"{frame[1]}:{frame[2]}, in {frame[3]}" if frame else ""

@@ -47,6 +47,7 @@ from workers.session import (
     Task,
 )
 from workers.step.stepper import Stepper
+from workers.supervise.activity import WAITING, activity
 
 log = logging.getLogger("millrace.worker")
 
@@ -75,6 +76,10 @@ def _no_stop_requests() -> int:
 def _no_watchdog(now: float) -> None: ...
 
 
+def _same_exit_code(code: int, reason: str) -> int:
+    return code
+
+
 @dataclass(frozen=True)
 class WorkerOptions:
     """The options of a worker that depend on its process."""
@@ -87,6 +92,8 @@ class WorkerOptions:
     """Called regularly with the time, unless the environment hangs."""
     shared_memory: InheritedDescriptors | None = None
     """Shared memory and wake pipes, for a vector environment on this machine."""
+    exit_code: Callable[[int, str], int] = _same_exit_code
+    """Exit code of the process, from that of the conversation and the reason for leaving."""
     make_collector: MakeCollector = make_local_collector
     """Makes the collector and the evaluator of a run, with the policy that acts."""
 
@@ -289,11 +296,13 @@ class Worker:
                 case CloseLanes(lanes):
                     if (owner := self._collector or self._stepper) is not None:
                         owner.close([lane.lane for lane in lanes])
-                case Leave():
+                case Leave(exit_code, reason):
+                    activity().leave(self._options.exit_code(exit_code, reason))
                     self._left = effect
 
     def _start_session(self, run: DescribeSpec | RunSpec | StepSpec) -> None:
         """Make a new collector or stepper; nothing of the old one is kept."""
+        activity().begin(WAITING)
         self._close_all()
         self._collector = self._evaluator = self._stepper = None
         if why := run.rejection_reason(self._options.code):
@@ -355,14 +364,15 @@ def _line(error: Exception) -> str:
     return f"{type(error).__name__}: {first_line(error, '')}".strip()[:1000]
 
 
-def identity(name: str) -> Identity:
-    """Identity of this process, or of a thread of it."""
+def identity(name: str, process_nonce: int | None = None) -> Identity:
+    """Identity of this process, or of a thread of it. `process_nonce`: its secret number; None: draw one."""
     try:
         software = f"millrace {version('millrace-rl')}"
     except PackageNotFoundError:
         software = "millrace"
     software = f"{software}, python {platform.python_version()}"
-    return Identity(name, socket.gethostname(), os.getpid(), int.from_bytes(os.urandom(6), "little"), software)
+    nonce = int.from_bytes(os.urandom(6), "little") if process_nonce is None else process_nonce
+    return Identity(name, socket.gethostname(), os.getpid(), nonce, software)
 
 
 def parent_is_gone(parent: int) -> bool:

@@ -15,6 +15,7 @@ from tyro.conf import Positional
 
 from learner.config.hyperparameters import Hyperparameters, PPOConfig
 from learner.config.run_rules import CheckpointPolicy, EvaluationSettings, StopRule
+from protocol.alive import CallTimeouts
 from protocol.bounds import MAX_SEEDS
 from protocol.specs import ImagesDtype, Vector
 from protocol.wire.weight_dtypes import WeightsDtype
@@ -24,6 +25,7 @@ Scalar = bool | int | float | str
 Count = Annotated[int, Meta(ge=1)]
 Natural = Annotated[int, Meta(ge=0)]
 Seconds = Annotated[float, Meta(gt=0)]
+SecondsOrNever = Annotated[float, Meta(ge=0)]
 
 
 class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -138,15 +140,23 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     heartbeat_s: Seconds = 1.0
     """Seconds between two heartbeats of a worker."""
     worker_timeout_s: Seconds = 5.0
-    """A worker that has been silent for this many seconds is given up, and other workers take over its lanes."""
+    """A worker that has been silent for this many seconds is given up, and other workers take over its lanes. A worker is
+    not silent while its supervisor says that its environment is busy, however long that takes.
+    """
     no_workers_timeout_s: Seconds = 60.0
     """Write a checkpoint and end the run if there has been no worker for this many seconds."""
-    step_timeout_s: Seconds = 120.0
-    """A local worker process is restarted if one step of an env copy takes longer than this many seconds."""
+    construct_timeout_s: SecondsOrNever = 600.0
+    """A local worker process is restarted if making one env copy takes longer than this many seconds. 0: never."""
+    reset_timeout_s: SecondsOrNever = 600.0
+    """A local worker process is restarted if a reset of an env copy takes longer than this many seconds. 0: never."""
+    step_timeout_s: SecondsOrNever = 600.0
+    """A local worker process is restarted if one step of an env copy takes longer than this many seconds. 0: never."""
     stall_timeout_s: Seconds = 600.0
-    """Write a checkpoint and end the run if no rollout has arrived for this many seconds."""
+    """Write a checkpoint and end the run if no env step, reset or construction has ended for this many seconds, and none
+    is under way within its timeout.
+    """
     max_env_failures: Natural = 3
-    """End the run if the environment has raised more exceptions than this."""
+    """End the run if the environment has raised more exceptions, or ended more worker processes, than this."""
 
     # -------------------------------------------------------------------------------------------------------------- files
 
@@ -166,6 +176,10 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """HOST:PORT at which Prometheus can read the metrics, as 127.0.0.1:9464. With 0.0.0.0:9464 everybody in the network can
     read them. Default: nowhere.
     """
+
+    def call_timeouts(self) -> CallTimeouts:
+        """How long a call of an env copy may take."""
+        return CallTimeouts(self.construct_timeout_s, self.reset_timeout_s, self.step_timeout_s)
 
     def chosen_vector(self) -> Vector:
         """How the env copies of a lane are stepped."""

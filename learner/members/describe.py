@@ -62,7 +62,7 @@ def described_by_workers(
     members = coordinator.membership.members
     callbacks = ServerCallbacks(coordinator.receive, lambda now: coordinator.status(settings.steps, now), lambda event: None)
     server_settings = ServerSettings(last_messages_wait_s=LAST_MESSAGES_WAIT_S, log_joins=False)
-    server = MemberServer(link, coordinator, callbacks, processes.ended, server_settings, clock)
+    server = MemberServer(link, coordinator, callbacks, processes, server_settings, clock)
     began_s = member_s = logged_s = clock()
     try:
         while coordinator.described is None:
@@ -76,7 +76,9 @@ def described_by_workers(
             if now - member_s > settings.no_workers_timeout_s:
                 raise server.no_workers(1, settings.no_workers_timeout_s)
             waiting_for = _waiting_for(link, server, sorted(member.hello.worker for member in members.values()))
-            if now - began_s > settings.stall_timeout_s and members:
+            # In environment code, a worker is ended by the timeouts of the calls, which name themselves.
+            busy_s = max((member.in_env_code_s for member in members.values()), default=began_s)
+            if now - max(began_s, busy_s) > settings.stall_timeout_s and members:
                 raise Stalled(f"no description of the environment within {settings.stall_timeout_s:.0f} s; {waiting_for}")
             if now - logged_s > LOG_WAITING_EVERY_S:
                 logged_s = now

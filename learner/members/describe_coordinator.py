@@ -15,6 +15,7 @@ from protocol.envs.description import DescribedEnv, read_description
 from protocol.errors import BadMessage, EnvironmentFailed, UsageError, UserFacingError
 from protocol.messages import (
     TOLD_TO_STOP,
+    Alive,
     Described,
     Failure,
     Goodbye,
@@ -25,6 +26,7 @@ from protocol.messages import (
     Rejoin,
     Status,
     ToLearner,
+    WorkerExit,
 )
 from protocol.specs import DescribeSpec
 
@@ -56,6 +58,11 @@ class DescribeCoordinator:
         """Answer a message."""
         if isinstance(message, Hello):
             return self.membership.join(peer, message, now)[0]
+        if isinstance(message, Alive):
+            answer, exits = self.membership.hear_supervisor(peer, message, now)
+            for worker_exit in exits:
+                self._count_exit(worker_exit)
+            return answer
         member = self.membership.member_of_session(peer, message, now)
         if member is None:
             return self.membership.answer_ended_session(peer, message)
@@ -89,10 +96,10 @@ class DescribeCoordinator:
         """A member's key was revoked: send it the reason and remove it."""
         return self.membership.revoke(peer, why)
 
-    def remove_worker(self, worker: str, why: str) -> list[Outgoing]:
+    def process_ended(self, worker_exit: WorkerExit) -> list[Outgoing]:
         """A worker's process has ended. If it was to describe the environment, the environment ended it."""
-        if self.membership.remove_worker(worker, why):
-            self._count_failure(f"worker {worker} {why} while it described the environment", "")
+        if self.membership.record_exit(worker_exit):
+            self._count_exit(worker_exit)
         return []
 
     def remove_silent(self, now: float) -> list[Outgoing]:
@@ -129,6 +136,10 @@ class DescribeCoordinator:
         else:
             return self.membership.refuse(member, Goodbye, reason)
         return []
+
+    def _count_exit(self, worker_exit: WorkerExit) -> None:
+        if worker_exit.failed:
+            self._count_failure(f"worker {worker_exit.worker} {worker_exit.reason}", "")
 
     def _count_failure(self, line: str, detail: str) -> None:
         self._env_failures += 1

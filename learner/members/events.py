@@ -57,6 +57,18 @@ class EnvironmentRaised:
 
 
 @dataclass(frozen=True)
+class WorkerProcessFailed:
+    """A worker's process ended in a way that it did not announce: its environment is to blame, as if it had raised."""
+
+    json_name: ClassVar[str] = "died"
+    worker: str
+    host: str
+    reason: str
+    spare: bool = False
+    """as of `EnvironmentRaised`"""
+
+
+@dataclass(frozen=True)
 class RejoinRequested:
     """A worker was told to join again because its session had ended.
 
@@ -79,7 +91,9 @@ class RolloutDropped:
     transitions: int
 
 
-Event = WorkerJoined | WorkerLeft | WorkerRefused | EnvironmentRaised | RejoinRequested | RolloutDropped
+Event = (
+    WorkerJoined | WorkerLeft | WorkerRefused | EnvironmentRaised | WorkerProcessFailed | RejoinRequested | RolloutDropped
+)
 
 
 def describe(event: Event) -> str:
@@ -110,6 +124,9 @@ def _line(event: Event) -> str:
         case EnvironmentRaised(worker, host, lane, error):
             where = "" if lane is None else f"lane {lane}: "
             return f"worker {worker} ({host}): {where}{error}"
+        case WorkerProcessFailed(worker, host, reason, spare):
+            counts = "" if spare else "; this counts as a failure of the environment"
+            return f"worker {worker} ({host}): its process {reason}{counts}"
         case RejoinRequested(worker, _, late):
             counted = f"; {late} transitions that it sent are counted, not used" if late else ""
             return f"worker {worker} was told to join again: its session had ended{counted}"

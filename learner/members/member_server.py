@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -32,16 +32,18 @@ from learner.members.join_limiter import JoinLimiter
 from learner.members.key_revocation import KeyRevocation
 from learner.members.member_log import MemberLog
 from learner.members.membership import Membership, Outgoing
+from learner.members.process_callbacks import ProcessCallbacks
 from learner.members.states import SentUnusable
 from protocol.address import name_for_people
 from protocol.bounds import one_line
 from protocol.errors import BadMessage, NoWorkers
-from protocol.messages import Hello, Inquire, Refuse, Status, ToLearner, ToWorker, Weights
+from protocol.messages import Hello, Inquire, Refuse, Status, ToLearner, ToWorker, Weights, WorkerExit
 from protocol.wire.codec import Buffer, encode
 from protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")
 
+ASK_PROCESSES_S = 0.25  # interval of asking what the workers do that this program started
 AWAY_S = 0.5  # a learner that has not listened for longer was busy, or its process was stopped
 TURN_S = 0.2  # of reading messages, at most, before the caller may go on
 SHORT_TURN_S = 0.003  # at least so much, also in a short turn
@@ -62,7 +64,7 @@ class MemberCoordinator(Protocol):
         """Remove a member whose key was revoked."""
         ...
 
-    def remove_worker(self, worker: str, why: str) -> list[Outgoing]:
+    def process_ended(self, worker_exit: WorkerExit) -> list[Outgoing]:
         """Remove a worker whose process has ended."""
         ...
 
@@ -107,18 +109,19 @@ class MemberServer:
         link: LearnerLink,
         coordinator: MemberCoordinator,
         callbacks: ServerCallbacks,
-        ended: Callable[[], Iterable[tuple[str, str]]],
+        processes: ProcessCallbacks,
         settings: ServerSettings | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`ended` names the workers whose processes have ended since the last call, each with the reason."""
+        """`processes` are the worker processes that this program started."""
         self.listened_s = clock()
         """Time at which the server last listened."""
-        self._link, self._coordinator, self._callbacks, self._ended = link, coordinator, callbacks, ended
+        self._link, self._coordinator, self._callbacks, self._processes = link, coordinator, callbacks, processes
         self._membership = coordinator.membership
         self._settings, self._clock = settings or ServerSettings(), clock
         self._log, self._keys = MemberLog(link, clock), KeyRevocation(link)
         self._remove_silent_from_s = self.listened_s
+        self._ask_processes_s = self.listened_s
         self._last_turned_away = ""  # what became of the last worker that did not stay
         self._encoded: tuple[ToWorker, Sequence[Buffer]] | None = None
         self._joins = JoinLimiter()
@@ -137,6 +140,7 @@ class MemberServer:
         self._revoke_keys()
         self._remove_ended_processes(self._settings.last_messages_wait_s)
         now = self._clock()
+        self._record_activities(now)
         if now - self.listened_s > timeout_s + AWAY_S:
             # Messages of the meantime may still lie in the kernel: if we were stopped, so was ZeroMQ's thread.
             self._remove_silent_from_s = now + self._settings.grace_s
@@ -192,7 +196,7 @@ class MemberServer:
         """Forget the hub. The hub refers to this server, so else both would wait for the garbage collector, and so would
         the file descriptors of what they hold.
         """
-        del self._callbacks, self._ended
+        del self._callbacks, self._processes
 
     def no_workers(self, workers: int, timeout_s: float) -> NoWorkers:
         """The error when fewer than `workers` have joined within `timeout_s`: it says how to start one."""
@@ -249,10 +253,17 @@ class MemberServer:
 
     def _remove_ended_processes(self, last_messages_wait_s: float) -> None:
         """Remove the workers whose processes have ended."""
-        for worker, why in self._ended():
+        for worker_exit in self._processes.ended():
             if last_messages_wait_s:
                 self.receive(last_messages_wait_s)
-            self.send(self._coordinator.remove_worker(worker, why))
+            self.send(self._coordinator.process_ended(worker_exit))
+
+    def _record_activities(self, now: float) -> None:
+        """Record what the workers do that this program started."""
+        if now >= self._ask_processes_s:
+            self._ask_processes_s = now + ASK_PROCESSES_S
+            for activity in self._processes.running():
+                self._membership.record_activity(activity, now)
 
     def _frames(self, message: ToWorker) -> Sequence[Buffer]:
         """Frames of a message. Weights are encoded once, however many workers there are."""

@@ -17,9 +17,17 @@ from typing import Generic, TypeVar
 
 import msgspec
 
-from learner.members.events import Event, RejoinRequested, WorkerJoined, WorkerLeft, WorkerRefused
+from learner.members.events import (
+    Event,
+    RejoinRequested,
+    WorkerJoined,
+    WorkerLeft,
+    WorkerProcessFailed,
+    WorkerRefused,
+)
 from learner.members.states import TABLE, KeyRevoked, MemberState, TimedOut
-from protocol.address import name_for_people, worker_name
+from protocol.address import key_of_peer, name_for_people, worker_name
+from protocol.alive import NO_ENVIRONMENT_CODE
 from protocol.bounds import Stage, Stages, one_line
 from protocol.messages import (
     PROTOCOL_VERSION,
@@ -35,6 +43,8 @@ from protocol.messages import (
     ToLearner,
     ToWorker,
     Welcome,
+    WorkerActivity,
+    WorkerExit,
     WorkerStatus,
 )
 from protocol.specs import DescribeSpec, RunSpec, StepSpec
@@ -42,6 +52,7 @@ from protocol.specs import DescribeSpec, RunSpec, StepSpec
 MEASURE_S = 0.5  # at least, between the two heartbeats that a worker's speed is measured by
 REMEMBERED = 1_000  # refused processes, and names of silent workers; a peer with many names must not fill the memory
 MAX_MEMBERS = 4_096
+SUPERVISOR_WORD_S = 5.0  # what a supervisor said is shown for this long
 
 Outgoing = tuple[bytes, ToWorker]
 """A message and the routing id of the worker that it is sent to."""
@@ -75,6 +86,25 @@ class Member:
     measured: tuple[int, float] = (0, 0.0)
     """Env steps in the heartbeat by which the speed was last measured, and the time when it arrived."""
 
+    activity: WorkerActivity | None = None
+    """What the worker does, as its supervisor said last."""
+    activity_s: float = 0.0
+    """Time when the supervisor said that."""
+    in_env_code_s: float = -math.inf
+    """Time when the supervisor said last that the worker is in environment code: until then the worker was not silent."""
+
+    @property
+    def alive_s(self) -> float:
+        """Time at which the worker was last known to be alive and well."""
+        return max(self.heard_s, self.in_env_code_s)
+
+    def record_activity(self, activity: WorkerActivity, now: float) -> bool:
+        """Keep what the supervisor says. True if calls of the environment have returned since it last did."""
+        before, self.activity, self.activity_s = self.activity, activity, now
+        if activity.doing not in NO_ENVIRONMENT_CODE:
+            self.in_env_code_s = now
+        return activity.env_calls > (0 if before is None else before.env_calls)
+
     def record_heartbeat(self, heartbeat: Heartbeat) -> list[int]:
         """Keep the heartbeat. Returns the tickets that were lost on the way."""
         if self.heartbeat is None and self.hello.attempt > 1:
@@ -105,6 +135,8 @@ class Member:
     def status(self, now: float) -> WorkerStatus:
         """The worker's row of `millrace status`."""
         heartbeat = self.heartbeat
+        said_s = now - self.activity_s
+        activity = self.activity if said_s < SUPERVISOR_WORD_S else None
         return WorkerStatus(
             worker=self.hello.worker,
             host=self.hello.host,
@@ -118,6 +150,8 @@ class Member:
             silent_s=max(0.0, now - self.heard_s),
             resident_bytes=heartbeat.resident_bytes if heartbeat else 0,
             strikes=0,
+            doing=activity.doing if activity else "",
+            doing_s=activity.for_s + max(0.0, said_s) if activity else 0.0,
         )
 
 
@@ -135,17 +169,24 @@ class Membership(Generic[M]):
         member_class: type[M],
         on_removed: Callable[[M, str], None],
         first_session: int,
+        is_spare: Callable[[M], bool] = lambda member: False,
     ) -> None:
-        """`on_removed` is called with each member that was removed, and why: it takes back what that member held."""
+        """`on_removed` is called with each member that was removed, and why: it takes back what that member held.
+
+        `is_spare`: whether a member has nothing to do with the environment, so that its failures do not count.
+        """
         self.members: dict[bytes, M] = {}
         self.events: list[Event] = []
         self.draining: str | None = None
         """why the workers were asked to leave; None while they were not"""
-        self._run, self._member_class, self._on_removed = run, member_class, on_removed
+        self.progress = 0
+        """how often a member has reported more env steps, or more calls of the environment that have returned"""
+        self._run, self._member_class, self._on_removed, self._is_spare = run, member_class, on_removed, is_spare
         self._next_session = first_session
         self._joins = 0
         self._none_silent_before_s = -math.inf  # until then no member can have been silent for too long
-        self._removed_for_silence: dict[str, None] = {}  # names, until they join again; the oldest first
+        self._of_process: dict[tuple[str, int], M] = {}  # by name and process_nonce
+        self._removed_for_silence: dict[str, int] = {}  # name -> process_nonce, until they join again; the oldest first
         self._stages_of_left: Stages = {}  # of the members that have left
         self._refused: dict[bytes, tuple[int, str]] = {}  # the process (by its nonce) that was refused, and why
 
@@ -175,6 +216,8 @@ class Membership(Generic[M]):
         if member is None or isinstance(message, Hello | Alive) or member.session != message.session:
             return None
         member.heard_s = now
+        if isinstance(message, Heartbeat) and message.steps > (member.heartbeat.steps if member.heartbeat else 0):
+            self.progress += 1
         return member
 
     def answer_ended_session(self, peer: bytes, message: ToLearner) -> list[Outgoing]:
@@ -220,6 +263,7 @@ class Membership(Generic[M]):
         self._next_session += 1
         self._joins += 1
         self.members[peer] = member
+        self._of_process[hello.worker, hello.process_nonce] = member
         self._removed_for_silence.pop(hello.worker, None)
         self.events.append(WorkerJoined(hello.worker, hello.host, hello.pid))
         return [(peer, Welcome(member.session, hello.attempt, self._run))], member
@@ -243,15 +287,47 @@ class Membership(Generic[M]):
             self.events.append(WorkerLeft(worker, why, 0, False))
         return member is not None
 
+    def hear_supervisor(self, peer: bytes, alive: Alive, now: float) -> tuple[list[Outgoing], list[WorkerExit]]:
+        """Record what a supervisor says of members that use the same key as it does, and whose nonce it knows.
+
+        Returns the answer, and the exits by which members were removed.
+        """
+        key = key_of_peer(peer)
+        for activity in alive.running:
+            self.record_activity(activity, now, key)
+        removed = [worker_exit for worker_exit in alive.ended if self.record_exit(worker_exit, key)]
+        answer: list[Outgoing] = [] if self.draining is None else [(peer, Drain(one_line(self.draining)))]
+        return answer, removed
+
+    def record_activity(self, activity: WorkerActivity, now: float, key: bytes | None = None) -> None:
+        """Record what a member's process does. `key`: that of the supervisor which says so; None: this program is it."""
+        member = self._of_process.get((activity.worker, activity.process_nonce))
+        if member is not None and (key is None or key == key_of_peer(member.peer)):
+            self.progress += member.record_activity(activity, now)
+
+    def record_exit(self, worker_exit: WorkerExit, key: bytes | None = None) -> bool:
+        """A member's process has ended: remove the member. True if it was one. `key`: as for `record_activity`."""
+        worker, reason = worker_exit.worker, worker_exit.reason
+        member = self._of_process.get((worker, worker_exit.process_nonce))
+        if member is not None and (key is None or key == key_of_peer(member.peer)):
+            if worker_exit.failed:
+                self.events.append(WorkerProcessFailed(worker, member.hello.host, reason, self._is_spare(member)))
+            self.remove(member, TimedOut, reason)
+            return True
+        if self._removed_for_silence.get(worker) == worker_exit.process_nonce:  # now it is known why it was silent
+            del self._removed_for_silence[worker]
+            self.events.append(WorkerLeft(worker, reason, 0, False))
+        return False
+
     def remove_silent(self, now: float, timeout_s: float) -> list[M]:
         """Remove the members that have been silent for too long. Returns them."""
         if now < self._none_silent_before_s:
             return []
-        silent = [member for member in self.members.values() if now - member.heard_s > timeout_s]
+        silent = [member for member in self.members.values() if now - member.alive_s > timeout_s]
         for member in silent:
-            _remember(self._removed_for_silence, member.hello.worker, None)
+            _remember(self._removed_for_silence, member.hello.worker, member.hello.process_nonce)
             self.remove(member, TimedOut, f"silent for {timeout_s:.0f} s")
-        self._none_silent_before_s = min((member.heard_s for member in self.members.values()), default=now) + timeout_s
+        self._none_silent_before_s = min((member.alive_s for member in self.members.values()), default=now) + timeout_s
         return silent
 
     def remove(self, member: M, event: type, why: str) -> None:
@@ -259,6 +335,8 @@ class Membership(Generic[M]):
         member.state = TABLE[member.state][event]
         del self.members[member.peer]
         _add(self._stages_of_left, member.stages())
+        if self._of_process.get(process := (member.hello.worker, member.hello.process_nonce)) is member:
+            del self._of_process[process]
         self.events.append(WorkerLeft(member.hello.worker, why, len(member.tickets), event is Goodbye))
         self._on_removed(member, why)
 

@@ -5,13 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
+from protocol.alive import WorkerActivity, WorkerExit
+
 
 @dataclass(frozen=True)
 class ProcessCallbacks:
     """The worker processes of this program; by default there are none."""
 
-    ended: Callable[[], Iterable[tuple[str, str]]] = lambda: ()
-    """Returns (name, reason) of the workers whose processes have ended since the last call. It may raise."""
+    ended: Callable[[], Iterable[WorkerExit]] = lambda: ()
+    """Returns the workers whose processes have ended since the last call. It may raise."""
+    running: Callable[[], Iterable[WorkerActivity]] = lambda: ()
+    """Returns what the workers do whose processes run. A stopped process is left out."""
     count: Callable[[], int] | None = None
     """Returns the number of processes that step the environment. None: one per member."""
     expected: int = 0

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from learner.members.events import EnvironmentRaised, Event
+from learner.members.events import EnvironmentRaised, Event, WorkerProcessFailed
 from learner.members.member_server import MemberServer, ServerCallbacks
 from learner.members.membership import Outgoing
 from learner.members.process_callbacks import ProcessCallbacks
@@ -25,6 +25,7 @@ from learner.rollouts.ticket_coordinator import CollectingMember, TicketCoordina
 from learner.rollouts.weight_age import WeightAge
 from learner.run_folder.progress import Progress
 from protocol.address import name_for_people
+from protocol.alive import NO_TIMEOUTS, CallTimeouts
 from protocol.arrays import Array
 from protocol.bounds import MAX_LINE, Stages, one_line
 from protocol.errors import BadRollout, EnvironmentFailed, NoWorkers, Stalled
@@ -51,6 +52,8 @@ class HubSettings:
     max_env_failures: int
     weights_dtype: WeightsDtype = "float32"
     """Dtype in which parameters are sent."""
+    call_timeouts: CallTimeouts = NO_TIMEOUTS
+    """How long a call of the environment may take; its supervisor ends a worker that exceeds it."""
 
 
 class HubSnapshot(NamedTuple):
@@ -128,7 +131,7 @@ class Hub:
         self._failure: EnvironmentFailed | None = None
         self._no_members_since_s: float | None = None
         callbacks = ServerCallbacks(self._answer, self._status, self._on_event)
-        self._server = MemberServer(link, coordinator, callbacks, self._processes.ended, clock=clock)
+        self._server = MemberServer(link, coordinator, callbacks, self._processes, clock=clock)
 
     # ---------------------------------------------------------------- what the loop calls
 
@@ -308,13 +311,20 @@ class Hub:
 
     def _on_event(self, event: Event) -> None:
         """Count failures of environments; too many end the run."""
-        if isinstance(event, EnvironmentRaised) and not event.spare:
-            self._env_failures += 1
-            allowed = self.settings.max_env_failures
-            if self._env_failures > allowed:
-                counted = f"failure {self._env_failures}; max_env_failures allows {allowed}"
-                line = one_line(f"worker {event.worker} ({event.host}): {event.error}; {counted}", 4 * MAX_LINE)
-                self._failure = EnvironmentFailed(line, event.traceback)
+        match event:
+            case EnvironmentRaised(worker, host, _, error, traceback, spare) if not spare:
+                self._count_failure(f"worker {worker} ({host}): {error}", traceback)
+            case WorkerProcessFailed(worker, host, reason, spare) if not spare:
+                self._count_failure(f"worker {worker} ({host}): its process {reason}", "")
+            case _:
+                pass
+
+    def _count_failure(self, line: str, traceback: str) -> None:
+        self._env_failures += 1
+        allowed = self.settings.max_env_failures
+        if self._env_failures > allowed:
+            counted = f"failure {self._env_failures}; max_env_failures allows {allowed}"
+            self._failure = EnvironmentFailed(one_line(f"{line}; {counted}", 4 * MAX_LINE), traceback)
 
     def _check_members(self) -> None:
         """Raise `NoWorkers` when there was no member for too long."""

@@ -49,6 +49,7 @@ from protocol.messages import (
     Stepped,
     ToLearner,
     Weights,
+    WorkerExit,
     WorkerStatus,
 )
 from protocol.specs import RunSpec
@@ -96,7 +97,9 @@ class TicketCoordinator:
         self.ledger = ledger or Ledger()
         self.version = version
         self.worker_timeout_s = worker_timeout_s
-        self.membership: Membership[CollectingMember] = Membership(run, CollectingMember, self._removed, first_session)
+        self.membership: Membership[CollectingMember] = Membership(
+            run, CollectingMember, self._removed, first_session, lambda member: is_spare(member, self.lanes)
+        )
         self.lanes = [TicketedLane(n, incarnations[n] if incarnations else 0) for n in range(run.lanes)]
         self.tickets: dict[int, Ticket] = {}
         self.ready: list[AcceptedRollout] = []
@@ -122,6 +125,9 @@ class TicketCoordinator:
         """Answer a message. A rollout must have passed `protocol.rollout.validate`; else call `reject_rollout`."""
         if isinstance(message, Hello):
             return self._join(peer, message, now)
+        if isinstance(message, Alive):
+            answer, removed = self.membership.hear_supervisor(peer, message, now)
+            return [*answer, *(self._deal() if removed else [])]
         if isinstance(message, Rollout):
             self.ledger.transitions_received += message.env_steps
         member = self.membership.member_of_session(peer, message, now)
@@ -138,7 +144,7 @@ class TicketCoordinator:
                 return self._checked(member, self.evaluation.take(member, message), now)
             case EpisodeRows():
                 return self._checked(member, self.evaluation.take_rows(member, message), now)
-            case Stepped() | Returned() | Described() | Alive():
+            case Stepped() | Returned() | Described():
                 return []  # answers to orders that a run does not give
             case Goodbye(_, reason):
                 self.membership.remove(member, Goodbye, f"left: {reason}")
@@ -176,6 +182,10 @@ class TicketCoordinator:
     def remove_worker(self, worker: str, why: str) -> list[Outgoing]:
         """A worker's process is known to be dead: do not wait for its silence."""
         return self._deal() if self.membership.remove_worker(worker, why) else []
+
+    def process_ended(self, worker_exit: WorkerExit) -> list[Outgoing]:
+        """A process of this program has ended."""
+        return self._deal() if self.membership.record_exit(worker_exit) else []
 
     def revoke(self, peer: bytes, why: str) -> list[Outgoing]:
         """A member's key was revoked: send it the reason and remove it at once, even if it holds tickets."""

@@ -41,6 +41,7 @@ from protocol.messages import (
     Rollout,
     Stepped,
     ToLearner,
+    WorkerExit,
 )
 from protocol.specs import StepSpec
 from protocol.wire.plain_values import unpack
@@ -97,6 +98,8 @@ class OrderCoordinator:
         """Answer a message."""
         if isinstance(message, Hello):
             return self.membership.join(peer, message, now)[0]
+        if isinstance(message, Alive):
+            return self.membership.hear_supervisor(peer, message, now)[0]
         member = self.membership.member_of_session(peer, message, now)
         if member is None:
             return self.membership.answer_ended_session(peer, message)
@@ -114,7 +117,7 @@ class OrderCoordinator:
                     self.failures.append(failure)
                 self.membership.events.append(failure)
                 self.membership.remove(member, Failure, f"broke: {error}")
-            case Rollout() | Described() | Evaluated() | EpisodeRows() | Alive():
+            case Rollout() | Described() | Evaluated() | EpisodeRows():
                 why = f"it sent {type(message).__name__}, which a vector environment does not ask for"
                 return self.membership.refuse(member, SentUnusable, why)
         return []
@@ -133,6 +136,11 @@ class OrderCoordinator:
     def remove_worker(self, worker: str, why: str) -> list[Outgoing]:
         """Remove a worker whose process has ended, or for which the learner waits no longer."""
         self.membership.remove_worker(worker, why)
+        return []
+
+    def process_ended(self, worker_exit: WorkerExit) -> list[Outgoing]:
+        """A process of this program has ended."""
+        self.membership.record_exit(worker_exit)
         return []
 
     def remove_silent(self, now: float) -> list[Outgoing]:

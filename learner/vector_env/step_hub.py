@@ -16,11 +16,12 @@ from typing import Protocol
 
 from learner.members.events import Event, WorkerLeft
 from learner.members.member_server import MemberServer, ServerCallbacks, ServerSettings
+from learner.members.process_callbacks import ProcessCallbacks
 from learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator
 from learner.vector_env.status import status
 from protocol.address import worker_name
 from protocol.errors import EnvironmentFailed
-from protocol.messages import Answer
+from protocol.messages import Answer, WorkerActivity, WorkerExit
 from protocol.specs import StepSpec
 from protocol.wire.learner_link import LearnerLink
 from protocol.wire.shared_memory import SharedMemory
@@ -39,8 +40,12 @@ LAST_MESSAGES_WAIT_S = 0.1  # messages that a process sent before it ended may s
 class LocalWorkers(Protocol):
     """The worker processes that this program started."""
 
-    def poll(self) -> Iterable[tuple[str, str]]:
-        """Name and reason of each process that ended since the last call. Restarts the processes whose backoff is over."""
+    def poll(self) -> Iterable[WorkerExit]:
+        """Each process that ended since the last call. Restarts the processes whose backoff is over."""
+        ...
+
+    def activities(self) -> Iterable[WorkerActivity]:
+        """What each running worker does."""
         ...
 
     def kill(self, name: str) -> bool:
@@ -60,8 +65,12 @@ class LocalWorkers(Protocol):
 class NoLocalWorkers:
     """No local processes: all workers are started elsewhere."""
 
-    def poll(self) -> Iterable[tuple[str, str]]:
+    def poll(self) -> Iterable[WorkerExit]:
         """No process has ended."""
+        return ()
+
+    def activities(self) -> Iterable[WorkerActivity]:
+        """Nothing: no worker runs here."""
         return ()
 
     def kill(self, name: str) -> bool:
@@ -124,7 +133,8 @@ class StepHub:
         callbacks = ServerCallbacks(
             self._coordinator.receive, lambda now: status(self._coordinator, now), self._on_event, self._wake_sleeping
         )
-        self._server = MemberServer(link, self._coordinator, callbacks, self._local_workers.poll, settings, clock)
+        processes = ProcessCallbacks(self._local_workers.poll, self._local_workers.activities)
+        self._server = MemberServer(link, self._coordinator, callbacks, processes, settings, clock)
 
     @property
     def address(self) -> str:

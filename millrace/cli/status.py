@@ -21,7 +21,7 @@ from protocol.keys.key_folder import TOKEN_VARIABLE, read_token
 from protocol.messages import Inquire, Status, WorkerStatus
 from protocol.wire.codec import encode
 from protocol.wire.worker_link import WorkerLink
-from workers.security import checked_token
+from workers.connection_rules import checked_token
 
 ASK_AGAIN_S = WATCH_EVERY_S = 1.0
 DROPS = {

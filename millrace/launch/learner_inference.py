@@ -23,6 +23,7 @@ from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.settings import VectorEnvSettings
 from millrace.launch.local_worker_options import private_address, worker_flags
 from millrace.launch.vector import listen
+from protocol.alive import WorkerExit
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.policy.policy import Policy, make_policy
@@ -33,7 +34,10 @@ from workers.collect.split_vector_env import SplitVectorEnv
 from workers.env_loop import Pulse
 from workers.evaluate.evaluator import Evaluator
 from workers.evaluate.split_evaluation_copies import SplitEvaluationCopies
-from workers.supervisor import Supervisor, WorkerThread
+from workers.supervise.worker_thread import WorkerThread
+from workers.supervisor import Supervisor
+
+NEVER_S = 1e9
 
 
 def train(
@@ -58,7 +62,7 @@ def train(
         observer = stack.enter_context(prometheus_observer(config))
         env_spec = EnvSpec.of(config.env if factory is None else factory, config.env_kwargs)
         folder = stack.enter_context(run_folder(config, resume))
-        started = listening.start(worker_flags(config, folder.path))
+        started = listening.start(worker_flags(config, folder.path), config.call_timeouts())
 
         def describe(spec: DescribeSpec, check_interrupt: Callable[[], None]) -> DescribedEnv:
             return started.describe(describe_settings(config), check_interrupt)
@@ -82,11 +86,11 @@ def train(
         stack.callback(supervisor.stop)
         stack.callback(supervisor.ask_to_leave)  # if it is asked a second time, the worker leaves at once
 
-        def ended() -> list[tuple[str, str]]:
+        def ended() -> list[WorkerExit]:
             lanes.raise_if_no_workers()
             return supervisor.poll()
 
-        processes = ProcessCallbacks(ended, lambda: env.workers, 0 if elsewhere else config.workers)
+        processes = ProcessCallbacks(ended, supervisor.activities, lambda: env.workers, 0 if elsewhere else config.workers)
         run = Run(RunSetup(config, known, folder, resume is not None), link, processes, watch, observer)
         run.train(1)
         return run.folder.path
@@ -113,12 +117,18 @@ def _settings(config: Config, factory: Callable[..., object] | None, *, elsewher
         lanes=config.lanes,
         listen=BindSettings(config.bind if elsewhere else "", config.keys, config.insecure, config.advertise),
         transport=config.transport,
-        # A local worker ends itself when the step of one copy hangs. One elsewhere may vanish without a message.
-        timeout_s=config.step_timeout_s * (1 if elsewhere else config.envs),
+        timeout_s=_longest_order_s(config),
         copy=False,
         kwargs=config.env_kwargs,
         single_lanes=config.eval_copies,
     )
+
+
+def _longest_order_s(config: Config) -> float:
+    """How long an order may take: to make and to reset every copy. A worker whose environment hangs is ended before that."""
+    timeouts = config.call_timeouts()
+    each = (timeouts.construct_s, timeouts.reset_s, timeouts.step_s)
+    return sum(each) * config.envs if all(each) else NEVER_S
 
 
 def _before_waits(env: ZmqVectorEnv, workers: int, timeout_s: float) -> Callable[[Pulse], None]:

@@ -19,7 +19,9 @@ from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
 from protocol.keys.keys import Token
 from protocol.wire.learner_link import LearnerLink
-from workers.supervisor import Running, Supervisor, WorkerCommand, WorkerProcess, WorkerThread
+from workers.supervise.worker_process import WorkerCommand, WorkerProcess
+from workers.supervise.worker_thread import WorkerThread
+from workers.supervisor import Running, Supervisor
 
 
 def train(config: Config, resume: Path | None, watch: Watch, factory: Callable[..., object] | None = None) -> Path:
@@ -43,9 +45,10 @@ def train(config: Config, resume: Path | None, watch: Watch, factory: Callable[.
         observer = stack.enter_context(prometheus_observer(config))
         env = EnvSpec.of(config.env if factory is None else factory, config.env_kwargs)
         folder = stack.enter_context(run_folder(config, resume))
-        supervisor = Supervisor(_starter(config, link.address, token, context, folder.path), config.workers)
+        start = _starter(config, link.address, token, context, folder.path)
+        supervisor = Supervisor(start, config.workers, timeouts=config.call_timeouts())
         stack.callback(supervisor.stop)
-        processes = ProcessCallbacks(supervisor.poll, expected=config.workers)
+        processes = ProcessCallbacks(supervisor.poll, supervisor.activities, expected=config.workers)
         with stopped_on_error(supervisor):
             known = known_environment(config, env, resume, describe_over(link, config, processes))
         run = Run(RunSetup(config, known, folder, resume is not None), link, processes, watch, observer)

@@ -19,7 +19,7 @@ from learner.members.endpoint import generate_run_keys
 from protocol.errors import UsageError
 from protocol.keys.key_folder import Keyring, chosen_key_folder
 from protocol.keys.keys import Token
-from workers.supervisor import Supervisor, core_flags
+from workers.supervisor import Supervisor, core_flags, timeout_flags
 
 LEAVE_AT_ONCE_S = 0.5  # after a start that failed: a worker in the constructor of its environment hears nothing
 
@@ -62,10 +62,10 @@ def worker_flags(config: Config, run: Path) -> WorkerFlags:
     """The flags of a run's workers. Their logs are in the run folder."""
     logs = run / "workers"
     logs.mkdir(exist_ok=True)
-    cores = worker_cores(config)
+    cores, timeouts = worker_cores(config), timeout_flags(config.call_timeouts())
 
     def flags(name: str) -> tuple[list[str], Path]:
-        return ["--step-timeout-s", str(config.step_timeout_s), *core_flags(cores, name)], logs / f"{name}.log"
+        return [*timeouts, *core_flags(cores, name)], logs / f"{name}.log"
 
     return flags
 

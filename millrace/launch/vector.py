@@ -24,6 +24,7 @@ from learner.vector_env.spec import RequestedCopies, requested_copies
 from learner.vector_env.step_hub import SharedSteps, StepHub
 from millrace.launch.local_worker_options import LEAVE_AT_ONCE_S, WorkerFlags, private_address, temporary_keys
 from protocol.address import advertised_address, check_address
+from protocol.alive import CallTimeouts
 from protocol.cpu_cores import usable_cores
 from protocol.envs.description import DescribedEnv
 from protocol.errors import EnvironmentFailed, UsageError
@@ -32,7 +33,9 @@ from protocol.keys.keys import Token
 from protocol.wire.learner_link import LearnerLink
 from protocol.wire.shared_memory import SUPPORTED, InheritedDescriptors, SharedMemory, new_memory
 from protocol.wire.wake_up import SPIN_S, WakePipe
-from workers.supervisor import Running, Supervisor, WorkerCommand, WorkerProcess, WorkerThread
+from workers.supervise.worker_process import WorkerCommand, WorkerProcess
+from workers.supervise.worker_thread import WorkerThread
+from workers.supervisor import Running, Supervisor, timeout_flags
 
 log = logging.getLogger("millrace.learner")
 
@@ -45,7 +48,8 @@ STEP_TIMEOUT_LEAST_S, STEP_TIMEOUT_MOST_S = 60.0, 1e6
 
 def make_vec(settings: VectorEnvSettings) -> ZmqVectorEnv:
     """See `millrace.make_vec`."""
-    flags = ["--step-timeout-s", str(_step_timeout_s(settings.timeout_s))]
+    timeouts = _call_timeouts(settings.timeout_s)
+    flags = timeout_flags(timeouts)
     local_workers = settings.local_workers
     join_timeout_s = JOIN_TIMEOUT_S if local_workers else settings.timeout_s
     describe = DescribeSettings(
@@ -56,7 +60,7 @@ def make_vec(settings: VectorEnvSettings) -> ZmqVectorEnv:
     )
     resources = ExitStack()
     try:
-        started = listen(settings, resources).start(lambda name: (flags, None))
+        started = listen(settings, resources).start(lambda name: (flags, None), timeouts)
         env = started.vector_env(started.describe(describe))
         env.wait_for(local_workers or settings.lane_count, join_timeout_s)
         return env
@@ -97,10 +101,10 @@ class ListeningVectorEnv:
     """For local workers only."""
     resources: ExitStack
 
-    def start(self, flags: WorkerFlags) -> StartedVectorEnv:
-        """Start the local workers with these flags. Call it once."""
+    def start(self, flags: WorkerFlags, timeouts: CallTimeouts) -> StartedVectorEnv:
+        """Start the local workers with these flags. `timeouts`: of a call of the environment. Call it once."""
         count = self.settings.local_workers
-        supervisor = Supervisor(self._starter(flags), count) if count else None
+        supervisor = Supervisor(self._starter(flags), count, timeouts=timeouts) if count else None
         if supervisor is not None:
             self.resources.callback(supervisor.stop, LEAVE_AT_ONCE_S)  # if there will be no hub to close
         else:
@@ -135,7 +139,9 @@ class StartedVectorEnv:
         """Have a worker describe the environment. Raises `UserFacingError`, and what `check_interrupt` raises."""
         spec, processes = self.listening.requested.to_describe, ProcessCallbacks()
         if self.supervisor is not None:
-            processes = ProcessCallbacks(self.supervisor.poll, expected=self.listening.settings.local_workers)
+            processes = ProcessCallbacks(
+                self.supervisor.poll, self.supervisor.activities, expected=self.listening.settings.local_workers
+            )
         return described_by_workers(self.listening.link, spec, settings, processes, check_interrupt)
 
     def vector_env(self, described: DescribedEnv) -> ZmqVectorEnv:
@@ -200,10 +206,11 @@ def _keys(where: BindSettings, transport: str) -> tuple[Keyring | None, Token | 
     return keyring_for(where, datetime.now(UTC).replace(microsecond=0)), None
 
 
-def _step_timeout_s(timeout_s: float) -> float:
-    """Seconds after which a local worker ends itself because a step hangs; 0 means never.
+def _call_timeouts(timeout_s: float) -> CallTimeouts:
+    """How long a call of the environment may take before its local worker is ended.
 
     This is longer than `timeout_s`, after which the learner kills the worker. So it matters only if the learner does not
     wait.
     """
-    return max(STEP_TIMEOUT_LEAST_S, 2 * timeout_s) if timeout_s < STEP_TIMEOUT_MOST_S else 0.0
+    seconds = max(STEP_TIMEOUT_LEAST_S, 2 * timeout_s) if timeout_s < STEP_TIMEOUT_MOST_S else 0.0
+    return CallTimeouts(seconds, seconds, seconds)

@@ -30,12 +30,12 @@ from protocol.messages import Described, Hello, Inquire, Refuse, Rollout, Status
 from protocol.space_spec import check_size
 from protocol.specs import RunSpec, StepSpec
 from protocol.wire.compression import Packing, raw_bytes, unpack_array
+from protocol.wire.socket_options import MAX_FRAME_BYTES
 
 Buffer = bytes | memoryview
 
 MAX_FRAMES = 256  # a description has two for each array of a space
 MAX_HEAD_BYTES = 1 << 20
-MAX_FRAME_BYTES = 1 << 30
 MAX_ITEMS = 1 << 16  # in a list or map of a worker's message; of the learner's, its head bounds them
 MAX_DIMENSIONS = 8
 DTYPES = {

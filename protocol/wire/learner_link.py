@@ -24,7 +24,8 @@ from protocol.keys.zap import AuthenticatorThread
 from protocol.log_rate_limiter import LogRateLimiter, suppressed_note
 from protocol.messages import Inquire, Refuse, ToLearner
 from protocol.wire.codec import Buffer, decode_to_learner, encode
-from protocol.wire.sockets import LINGER_MS, Traffic, receive_frames, send_frames, set_options
+from protocol.wire.socket_options import LINGER_MS, set_options
+from protocol.wire.sockets import Traffic, receive_frames, send_frames
 
 log = logging.getLogger("millrace.link")
 

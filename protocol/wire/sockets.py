@@ -1,10 +1,4 @@
-"""What the sockets of both sides share: options, receiving and sending a message, counting traffic.
-
-An experiment taught us each option. MAXMSGSIZE bounds a frame before a byte of it is read. TCP_MAXRT and keepalive close a
-connection whose other end has vanished; the worker makes a new one within seconds. There are no ZMTP heartbeats: while a
-reader is stopped by its high-water mark, they lose and reorder messages. Our own heartbeats detect silence, and tickets keep
-queues short.
-"""
+"""What the sockets of both sides share: receiving and sending a message, counting traffic."""
 
 from __future__ import annotations
 
@@ -13,30 +7,10 @@ from dataclasses import dataclass
 
 import zmq
 
-from protocol.address import needs_ipv6
-from protocol.keys.handshake import HANDSHAKE_MS
-from protocol.wire.codec import MAX_FRAME_BYTES, MAX_FRAMES, Buffer
+from protocol.wire.codec import MAX_FRAMES, Buffer
 
-LINGER_MS = 2000
-UNACKNOWLEDGED_MS = 5000  # TCP doubles its retry interval: after a cut it may need as long again as the cut lasted
-QUEUE = 1000  # messages that wait for a peer that does not read
 COPY_BELOW_BYTES = 65536  # copying a smaller frame is cheaper than tracking it
-CURVE_BYTES = 33  # what encryption adds to a frame
 NOT_WAITING, AND_MORE = int(zmq.NOBLOCK), int(zmq.NOBLOCK | zmq.SNDMORE)
-
-
-def set_options(socket: zmq.Socket[bytes], address: str, curve: bool) -> None:
-    """Set the options that both sides need, before the socket binds or connects."""
-    socket.linger = LINGER_MS
-    socket.maxmsgsize = MAX_FRAME_BYTES + (CURVE_BYTES if curve else 0)
-    socket.handshake_ivl = HANDSHAKE_MS
-    socket.connect_timeout = 2000
-    socket.tcp_maxrt = UNACKNOWLEDGED_MS
-    # Without keepalive, the connection to a host that vanished while idle would stay forever.
-    socket.tcp_keepalive, socket.tcp_keepalive_idle, socket.tcp_keepalive_intvl, socket.tcp_keepalive_cnt = 1, 15, 5, 3
-    socket.ipv6 = needs_ipv6(address)
-    # These limits are never reached: at most one Weights message, a few tickets and their rollouts are on their way.
-    socket.sndhwm = socket.rcvhwm = QUEUE
 
 
 def receive_frames(socket: zmq.Socket[bytes], sender_keys: list[str] | None = None) -> list[Buffer] | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import os
 import struct
@@ -23,13 +22,12 @@ from protocol.log_rate_limiter import LogRateLimiter, suppressed_note
 from protocol.messages import ToObserver, ToWorker
 from protocol.wire.codec import Buffer, decode_to_observer, decode_to_worker
 from protocol.wire.compression import Packing
-from protocol.wire.sockets import LINGER_MS, receive_frames, send_frames, set_options
+from protocol.wire.socket_options import LINGER_MS, RECONNECT_MOST_MS, RECONNECT_MS, routing_id, set_options
+from protocol.wire.sockets import receive_frames, send_frames
 
 Decoded = TypeVar("Decoded")
 
 log = logging.getLogger("millrace.link")
-
-TAG_CHARACTERS = 32
 
 
 class WorkerLink:
@@ -59,9 +57,9 @@ class WorkerLink:
         self.context = context or zmq.Context.instance()
         self._socket = self.context.socket(zmq.DEALER)
         set_options(self._socket, address, token is not None)
-        self._socket.routing_id = _routing_id(name, token)
-        self._socket.reconnect_ivl = 100
-        self._socket.reconnect_ivl_max = 2000
+        self._socket.routing_id = routing_id(name, token)
+        self._socket.reconnect_ivl = RECONNECT_MS
+        self._socket.reconnect_ivl_max = RECONNECT_MOST_MS
         self._monitor: zmq.Socket[bytes] | None = None
         self._poller = zmq.Poller()
         self._poller.register(self._socket, zmq.POLLIN)
@@ -145,11 +143,3 @@ class WorkerLink:
             self._socket.disable_monitor()  # before its reader is closed: libzmq blocks without one
             self._monitor.close(linger=0)
         self._socket.close(linger=int(linger_s * 1000))
-
-
-def _routing_id(name: str, token: Token | None) -> bytes:
-    """The name. With a key, a tag follows that nobody else can compute."""
-    if token is None:
-        return name.encode()
-    tag = hashlib.blake2b(name.encode(), key=token.client.secret, digest_size=TAG_CHARACTERS // 2)
-    return b"%s\0%s" % (name.encode(), tag.hexdigest().encode())

@@ -26,7 +26,7 @@ from learner.rollouts import ticket_coordinator
 from protocol import bounds, env_spec, messages, rollout, space_spec, specs
 from protocol.keys import handshake
 from protocol.messages import PROTOCOL_VERSION, Collect, Hello, Permit, Received, Rollout, ToLearner, ToWorker, Weights
-from protocol.wire import codec, sockets
+from protocol.wire import codec, socket_options
 from protocol.wire import compression as packing
 from workers import session, states
 from workers.collect import held_rollouts
@@ -108,7 +108,7 @@ WORDS: Mapping[str, str] = {
 LIMITS: Mapping[tuple[ModuleType, str], str] = {
     (codec, "MAX_FRAMES"): "frames of a message, the head included",
     (codec, "MAX_HEAD_BYTES"): "bytes of the head",
-    (codec, "MAX_FRAME_BYTES"): "bytes of any one frame: the connection is closed before more is read",
+    (socket_options, "MAX_FRAME_BYTES"): "bytes of any one frame: the connection is closed before more is read",
     (codec, "MAX_ITEMS"): "items of any list or map in the head",
     (codec, "MAX_DIMENSIONS"): "dimensions of an array",
     (bounds, "MAX_NAME"): "characters of a `Name`",
@@ -132,7 +132,7 @@ LIMITS: Mapping[tuple[ModuleType, str], str] = {
     (join_limiter, "AT_ONCE"): "times that the workers of one key may say Hello at once; more are not answered",
     (join_limiter, "PER_S"): "of them in each second, after that",
     (handshake, "HANDSHAKE_MS"): "milliseconds that a handshake may take",
-    (sockets, "LINGER_MS"): "milliseconds for which a closing socket still sends queued messages",
+    (socket_options, "LINGER_MS"): "milliseconds for which a closing socket still sends queued messages",
 }
 
 
@@ -340,8 +340,8 @@ def test_every_record_that_travels_is_described() -> None:
 
 def test_every_limit_is_in_the_document() -> None:
     for module in (
-        bounds, space_spec, env_spec, codec, sockets, packing, session, held_rollouts, ticket_coordinator, messages, rollout,
-        specs,
+        bounds, space_spec, env_spec, codec, socket_options, packing, session, held_rollouts, ticket_coordinator, messages,
+        rollout, specs,
     ):  # fmt: skip
         for name in re.findall(r"^(MAX_\w+)(?:, MAX_\w+)* = ", inspect.getsource(module), re.MULTILINE):
             assert (module, name) in LIMITS, f"say in LIMITS what {name} bounds"

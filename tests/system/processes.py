@@ -146,6 +146,43 @@ class Running:
         return int(psutil.Process(self.pid).num_fds())
 
 
+class Worker(Running):
+    """`python -m workers` with one worker: a supervisor and its child. A fault happens to both, as to a whole host."""
+
+    def processes(self) -> list[psutil.Process]:
+        """The supervisor and its children."""
+        supervisor = psutil.Process(self.pid)
+        return [supervisor, *supervisor.children()]
+
+    def kill(self) -> None:
+        """Send SIGKILL to both and wait until the supervisor is dead."""
+        both = self.processes()
+        for process in both:
+            process.kill()
+        self.process.wait(10)
+
+    def pause(self) -> None:
+        """Send SIGSTOP to both and wait until they have stopped."""
+        both = self.processes()
+        for process in both:
+            process.suspend()
+        stopped = psutil.STATUS_STOPPED
+        wait_for(lambda: all(process.status() == stopped for process in both), 10, "the processes to stop")
+
+    def go_on(self) -> None:
+        """Send SIGCONT to both."""
+        for process in self.processes():
+            process.resume()
+
+    def memory_mb(self) -> float:
+        """Resident memory of both."""
+        return sum(float(process.memory_info().rss) for process in self.processes()) / 1e6
+
+    def descriptors(self) -> int:
+        """Number of open files and sockets of both."""
+        return sum(int(process.num_fds()) for process in self.processes())
+
+
 class Learner(Running):
     """`python -m learner`, and the folder of its run."""
 
@@ -242,9 +279,12 @@ class Stage:
         self.started.append(learner)
         return learner
 
-    def worker(self, address: str, name: str, *flags: str, before: Sequence[str] = ()) -> Running:
+    def worker(self, address: str, name: str, *flags: str, before: Sequence[str] = ()) -> Worker:
         """Start `python -m workers` for the learner at this address."""
-        return self.start([*before, sys.executable, "-m", "workers", address, "--name", name, *flags], name)
+        command = [*before, sys.executable, "-m", "workers", address, "--name", name, *flags]
+        worker = Worker(command, self.tmp_path / f"{name}-{next(self._numbers)}.log")
+        self.started.append(worker)
+        return worker
 
     def start(self, command: Sequence[str], name: str, told: bool = False) -> Running:
         """Start any process. It is ended with the test."""

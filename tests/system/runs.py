@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from tests.system.network import Host, Network
-from tests.system.processes import START_S, TOY, WORKER_TIMEOUT_S, Learner, Running, Stage, crowding, free_port
+from tests.system.processes import START_S, TOY, WORKER_TIMEOUT_S, Learner, Running, Stage, Worker, crowding, free_port
 
 LANES, ROWS = 4, 16 * 2  # rows of a rollout: T steps of N copies
 IN_ROLLOUT = {"env-kwargs": "seconds 0.005"}  # a rollout takes 0.3 s, so that a fault happens during one
@@ -20,7 +20,7 @@ NOTICED_S = WORKER_TIMEOUT_S + 1  # a worker is silent, and new tickets are deal
 
 def play(
     stage: Stage, settings: Mapping[str, object] = {}, *, env: str = TOY, workers: int = 2
-) -> tuple[Learner, list[Running]]:
+) -> tuple[Learner, list[Worker]]:
     """Start a learner and workers on loopback, and wait until they train."""
     address = f"tcp://127.0.0.1:{free_port()}"
     learner = stage.learner(address, {"min-workers": workers, **settings}, env=env)
@@ -31,7 +31,7 @@ def play(
 
 def far_apart(
     stage: Stage, network: Network, settings: Mapping[str, object] = {}
-) -> tuple[Learner, list[Running], list[Host], tuple[str, ...]]:
+) -> tuple[Learner, list[Worker], list[Host], tuple[str, ...]]:
     """Start a learner and two workers, each on its own host (the learner on the first), and wait until they train.
 
     Returns also the hosts, and the flags with the token.

@@ -5,6 +5,7 @@ Hosts are network namespaces (root, `ip`, `nft`). Tests that do not need them us
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 
@@ -217,7 +218,8 @@ def test_a_worker_of_another_protocol_version_is_refused(stage: Stage) -> None:
     learner, workers = play(stage)
     address = learner.hears("waiting for workers").split()[-1]
     newer = "import sys, workers.session as s, workers.__main__ as m; s.PROTOCOL_VERSION = 999; sys.exit(m.main())"
-    stranger = stage.start([sys.executable, "-c", newer, address, "--name", "newer"], "newer")
+    as_worker = ["--name", "newer", "--parent", str(os.getpid())]  # its supervisor would start one of this version
+    stranger = stage.start([sys.executable, "-c", newer, address, *as_worker], "newer")
     assert stranger.ends() == 2
     assert "got 999; install the learner's version of millrace" in stranger.said()
     learner.hears(f"worker newer was refused: protocol: expected {PROTOCOL_VERSION}, got 999")

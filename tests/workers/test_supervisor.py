@@ -2,28 +2,46 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import pytest
 
+from protocol.alive import CallTimeouts, Doing, WorkerActivity, WorkerExit
+from workers.supervise.ending import Ending
 from workers.supervisor import (
     BACKOFF_FIRST_S,
     BACKOFF_MOST_S,
+    ENFORCE_EVERY_S,
     EXIT_NO_LEARNER,
+    HANGS_AFTER_S,
     HEALTHY_S,
     LEAVE_WITHIN_S,
     POLL_S,
     Supervisor,
 )
 
+NONCE = 7
+
 
 @dataclass
 class FakeRunning:
-    end: tuple[int, str] | None = None
+    name: str
+    end: Ending | None = None
     requests: list[str] = field(default_factory=list)
+    process_nonce: int = NONCE
+    doing: Doing = "waiting"
+    since_s: float = 0.0
+    enforced: list[float] = field(default_factory=list)
 
-    def ended(self) -> tuple[int, str] | None:
+    def ended(self) -> Ending | None:
         return self.end
+
+    def activity(self, now: float) -> WorkerActivity | None:
+        return WorkerActivity(self.name, NONCE, self.doing, now - self.since_s, 0) if self.end is None else None
+
+    def enforce(self, timeouts: CallTimeouts, now: float) -> None:
+        self.enforced.append(now)
 
     def stop(self) -> None:
         self.requests.append("stop")
@@ -44,12 +62,12 @@ class Machine:
         self.host = Supervisor(self.start, workers, lambda: self.now)
 
     def start(self, name: str) -> FakeRunning:
-        self.started.append((name, FakeRunning()))
+        self.started.append((name, FakeRunning(name)))
         return self.started[-1][1]
 
-    def die(self, code: int, after_s: float = 0.0) -> list[tuple[str, str]]:
+    def die(self, code: int, after_s: float = 0.0, *, on_purpose: bool = False) -> list[WorkerExit]:
         self.now += after_s
-        self.started[-1][1].end = (code, "why")
+        self.started[-1][1].end = Ending(code, "why", on_purpose, failed=not on_purpose)
         return self.host.poll()
 
     def pause_s(self) -> float:
@@ -66,7 +84,7 @@ def test_a_worker_that_died_is_restarted_under_its_name_with_backoff() -> None:
     machine = Machine()
     pauses = []
     for _ in range(9):
-        assert machine.die(1) == [("w0", "why")]
+        assert machine.die(1) == [WorkerExit("w0", NONCE, "why", True)]
         pauses.append(machine.pause_s())
     assert {name for name, _ in machine.started} == {"w0"}
     expected = [min(BACKOFF_FIRST_S * 2**n, BACKOFF_MOST_S) for n in range(9)]
@@ -85,15 +103,45 @@ def test_the_backoff_of_a_worker_that_was_healthy_is_reset() -> None:
 @pytest.mark.parametrize("code", [0, 2, EXIT_NO_LEARNER])
 def test_a_worker_that_left_on_purpose_or_was_refused_is_not_restarted(code: int) -> None:
     machine = Machine()
-    assert machine.die(code) == [("w0", "why")]
+    assert machine.die(code, on_purpose=True) == [WorkerExit("w0", NONCE, "why", False)]
     machine.now += 10 * BACKOFF_MOST_S
     assert machine.host.poll() == []
     assert len(machine.started) == 1
 
 
+@pytest.mark.parametrize("code", [0, 2, EXIT_NO_LEARNER])
+def test_a_worker_that_ended_with_such_a_code_and_not_on_purpose_is_restarted(code: int) -> None:
+    """The environment called `sys.exit` or `os._exit`."""
+    machine = Machine()
+    assert machine.die(code) == [WorkerExit("w0", NONCE, "why", True)]
+    assert machine.pause_s() == pytest.approx(BACKOFF_FIRST_S, abs=0.11)
+
+
+def test_a_worker_that_failed_on_purpose_is_restarted() -> None:
+    """Its environment raised, which it reported to the learner itself."""
+    machine = Machine()
+    assert machine.die(1, on_purpose=True) == [WorkerExit("w0", NONCE, "why", False)]
+    assert machine.pause_s() == pytest.approx(BACKOFF_FIRST_S, abs=0.11)
+
+
+def test_timeouts_are_enforced_a_few_times_a_second() -> None:
+    """The learner polls thousands of times a second."""
+    machine = Machine()
+    for _ in range(100):
+        machine.now += 0.01
+        machine.host.poll()
+    assert 1.0 / ENFORCE_EVERY_S - 1 <= len(machine.started[0][1].enforced) <= 1.0 / ENFORCE_EVERY_S + 1
+
+
+def test_activities_are_those_of_running_workers() -> None:
+    machine = Machine(workers=2)
+    machine.die(1)
+    assert machine.host.activities() == [WorkerActivity("w0", NONCE, "waiting", 0.0, 0)]
+
+
 def test_each_end_is_reported_once() -> None:
     machine = Machine(workers=2)
-    assert machine.die(1) == [("w1", "why")]
+    assert machine.die(1) == [WorkerExit("w1", NONCE, "why", True)]
     assert machine.host.poll() == []
 
 
@@ -119,7 +167,7 @@ def test_stop_asks_all_waits_for_all_and_restarts_none() -> None:
 def test_a_host_without_workers_returns_the_exit_code_and_reports_each_end(codes: list[int], expected: int) -> None:
     machine = Machine(workers=2)
     for (_, running), code in zip(machine.started, codes, strict=True):
-        running.end = (code, f"ended with {code}")
+        running.end = Ending(code, f"ended with {code}", on_purpose=True)
     reports: list[str] = []
     assert machine.host.run(lambda: 0, reports.append) == expected
     assert reports == [f"w0 ended with {codes[0]}", f"w1 ended with {codes[1]}"]
@@ -130,18 +178,56 @@ def test_every_request_to_stop_is_passed_on_and_a_worker_that_does_not_leave_is_
 ) -> None:
     machine = Machine(workers=1)
     worker = machine.started[0][1]
+    worker.doing = "stepping"
     requests = 0
 
     def sleeps(seconds: float) -> None:
         """Time passes; the worker is asked twice, and ends only when it is killed."""
         nonlocal requests
         machine.now += seconds
+        worker.since_s = machine.now - 0.5  # calls of its environment return
         requests = 2 if machine.now > 5 else 1 if machine.now > 1 else 0
         if "wait" in worker.requests:
-            worker.end = (-9, "was killed")
+            worker.end = Ending(-9, "was killed")
 
     monkeypatch.setattr("workers.supervisor.time.sleep", sleeps)
     assert machine.host.run(lambda: requests, lambda line: None) == 1
     assert worker.requests == ["stop", "stop", "stop", "wait"]
     assert machine.now == pytest.approx(1 + LEAVE_WITHIN_S, abs=5 * POLL_S)
     assert len(machine.started) == 1
+
+
+class Notice:
+    """The learner, as the supervisor hears it."""
+
+    def __init__(self) -> None:
+        self.over = False
+        self.sent: list[tuple[list[WorkerActivity], list[WorkerExit]]] = []
+
+    def send(self, running: Sequence[WorkerActivity], ended: Sequence[WorkerExit], now: float) -> None:
+        self.sent.append((list(running), list(ended)))
+
+    def run_is_over(self) -> bool:
+        return self.over
+
+
+@pytest.mark.parametrize("cause", ["the run is over", "told to leave"])
+def test_a_worker_that_hangs_when_it_should_leave_is_killed_soon(monkeypatch: pytest.MonkeyPatch, cause: str) -> None:
+    """One step of its environment does not return."""
+    machine, notice = Machine(workers=1), Notice()
+    worker = machine.started[0][1]
+    worker.doing = "stepping"
+
+    def sleeps(seconds: float) -> None:
+        machine.now += seconds
+        notice.over = cause == "the run is over" and machine.now > 1
+        if worker.requests[-1:] in (["kill"], ["wait"]):
+            worker.end = Ending(-9, "was killed")
+
+    monkeypatch.setattr("workers.supervisor.time.sleep", sleeps)
+    stop_requests = lambda: int(cause == "told to leave" and machine.now > 1)  # noqa: E731
+    assert machine.host.run(stop_requests, lambda line: None, notice) == 1
+    assert machine.now == pytest.approx(1 + HANGS_AFTER_S, abs=5 * POLL_S)
+    assert len(machine.started) == 1
+    assert notice.sent[0] == ([WorkerActivity("w0", NONCE, "stepping", 0.0, 0)], [])
+    assert notice.sent[-1] == ([], [WorkerExit("w0", NONCE, "was killed", False)])

@@ -31,6 +31,7 @@ from workers.collect.held_rollouts import Assignment
 from workers.env_errors import CopyRaised, LaneFailed, lane_failed
 from workers.env_loop import Pulse
 from workers.env_results import write_numbers
+from workers.supervise.activity import MAKING, activity
 
 OpenEnvCopies = Callable[[RunSpec, int, Pulse], EnvCopies]
 """Makes the env copies of the lane of this number."""
@@ -42,7 +43,9 @@ def open_env_copies(run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
     """The env copies of a lane in this process, of the kind that the run asks for."""
     match run.vector:
         case "native":
-            return VectorCopies(make_native(run.env, run.copies))
+            with activity().during(MAKING):
+                env = make_native(run.env, run.copies)
+            return VectorCopies(env)
         case "envpool":
             return EnvpoolCopies(envpool_spec(run.env), run.copies)
         case "loop":

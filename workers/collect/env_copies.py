@@ -23,6 +23,7 @@ from protocol.errors import UsageError
 from workers.env_errors import CopyRaised, Unusable
 from workers.env_loop import EnvLoop, Pulse
 from workers.env_results import missing_leaf, read_leaves
+from workers.supervise.activity import CLOSING, RESETTING, STEPPING, activity
 
 Leaves = Sequence[Any]  # for each leaf of the observation: an array [N, *leaf], or a sequence of N observations
 
@@ -121,7 +122,7 @@ class VectorCopies:
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
         """Raises `UsageError` for another autoreset mode."""
         check_resets_next_step(env)
-        self._env = env
+        self._env, self._activity = env, activity()
         self._per_copy = (env.num_envs,)
         self.observation_space = env.single_observation_space
         self.action_space = env.single_action_space
@@ -133,8 +134,9 @@ class VectorCopies:
         if len(seeds) != self._env.num_envs:
             raise UsageError(f"vector environment {self._env}: expected {len(seeds)} copies, got {self._env.num_envs}")
         try:
-            return self._read(self._first(seeds))
-        except Exception as error:
+            with activity().during(RESETTING):
+                return self._read(self._first(seeds))
+        except BaseException as error:
             raise CopyRaised(None, "reset") from error
 
     def _first(self, seeds: Sequence[int]) -> Any:
@@ -146,10 +148,13 @@ class VectorCopies:
 
     def step(self, actions: Array, pulse: Pulse) -> StepResult:
         """Step all copies at once."""
+        self._activity.begin(STEPPING)
         try:
             observation, reward, terminated, truncated, _ = self._env.step(actions)
-        except Exception as error:
+        except BaseException as error:
             raise CopyRaised(None, "step") from error
+        finally:
+            self._activity.end(self._env.num_envs)
         for name, array in (("reward", reward), ("terminated", terminated), ("truncated", truncated)):
             if np.shape(array) != self._per_copy:
                 line = (
@@ -163,5 +168,5 @@ class VectorCopies:
 
     def close(self) -> None:
         """Close it. What it raises is ignored."""
-        with suppress(Exception):
+        with suppress(BaseException), self._activity.during(CLOSING):
             self._env.close()

@@ -20,6 +20,7 @@ from protocol.envs.spaces import make_flatten
 from workers.collect.env_copies import Leaves, StepResult
 from workers.env_errors import CopyRaised
 from workers.env_loop import Pulse
+from workers.supervise.activity import CLOSING, RESETTING, STEPPING, activity
 
 
 class EnvpoolCopies:
@@ -28,7 +29,7 @@ class EnvpoolCopies:
     def __init__(self, pool: EnvpoolSpec, copies: int) -> None:
         self.observation_space = pool.observation_space
         self.action_space = pool.action_space
-        self._pool = pool
+        self._pool, self._activity = pool, activity()
         self._env: VectorEnv[Any, Any, Any] | None = None
         self._read = make_flatten(self.observation_space)
         self._truncated = np.zeros(copies, bool)  # [N] truncated here, which envpool does not know
@@ -37,17 +38,21 @@ class EnvpoolCopies:
         """Start episodes in all copies, with a seed for each."""
         pulse()
         try:
-            self._env = self._pool.make(seeds)
-            return self._read(self._env.reset()[0])
-        except Exception as error:
+            with activity().during(RESETTING):
+                self._env = self._pool.make(seeds)
+                return self._read(self._env.reset()[0])
+        except BaseException as error:
             raise CopyRaised(None, "reset") from error
 
     def step(self, actions: Array, pulse: Pulse) -> StepResult:
         """Step all copies at once, and reset those that were truncated here."""
+        self._activity.begin(STEPPING)
         try:
             result, elapsed = self._step_and_reset(actions) if self._truncated.any() else self._step(actions)
-        except Exception as error:
+        except BaseException as error:
             raise CopyRaised(None, "step") from error
+        finally:
+            self._activity.end(len(actions))
         at_limit = elapsed >= self._pool.limit
         self._truncated = at_limit & ~result.terminated & ~result.truncated
         return result._replace(truncated=result.truncated | at_limit)
@@ -75,6 +80,6 @@ class EnvpoolCopies:
     def close(self) -> None:
         """Close the pool and its threads. What it raises is ignored."""
         if self._env is not None:
-            with suppress(Exception):
+            with suppress(BaseException), self._activity.during(CLOSING):
                 self._env.close()
             self._env = None

@@ -20,6 +20,7 @@ from protocol.errors import UsageError
 from workers.collect.env_copies import made_without_order_check
 from workers.env_errors import CopyRaised
 from workers.env_loop import PULSE_S, EnvLoop, Pulse
+from workers.supervise.activity import EVALUATING, activity
 
 
 class CopyStep(NamedTuple):
@@ -68,7 +69,7 @@ class LoopedEvaluationCopies:
 
     def __init__(self, env: EnvSpec, count: int, render_mode: str | None, pulse: Pulse) -> None:
         """`render_mode`: None, or `rgb_array`. Raises `UsageError` if the environment does not render so."""
-        self.count = count
+        self.count, self._activity = count, activity()
         make = partial(made_without_order_check, partial(env.make, render_mode))
         with warnings.catch_warnings():
             if render_mode is not None:
@@ -93,24 +94,29 @@ class LoopedEvaluationCopies:
     def step(self, actions: Array, copies: Sequence[int], pulse: Pulse) -> list[CopyStep]:
         """Step these copies one after another, with actions [count, *action] of which only theirs are used."""
         results = []
+        self._activity.begin(EVALUATING)
         pulse_due_s = perf_counter() + PULSE_S
         for n in copies:
             try:
                 observation, reward, terminated, truncated, _ = self._loop.envs[n].step(actions[n])
                 results.append(CopyStep(self._read(observation), reward, terminated, truncated))
-            except Exception as error:
+            except BaseException as error:
                 raise CopyRaised(n, f"step {self._steps[n]}") from error
             self._steps[n] += 1
             if perf_counter() > pulse_due_s:
+                self._activity.end()
                 pulse()
+                self._activity.begin(EVALUATING)
                 pulse_due_s = perf_counter() + PULSE_S
+        self._activity.end(len(results))
         return results
 
     def render(self, copy: int) -> Any:
         """What the environment renders."""
         try:
-            return self._loop.envs[copy].render()
-        except Exception as error:
+            with self._activity.during(EVALUATING):
+                return self._loop.envs[copy].render()
+        except BaseException as error:
             raise CopyRaised(copy, "render") from error
 
     def close(self) -> None:

@@ -117,7 +117,7 @@ def _make_copy(spec: StepSpec, number: int, copy: int) -> gymnasium.Env[Any, Any
         fits = False
     if fits:
         return env
-    with suppress(Exception):
+    with suppress(BaseException):
         env.close()
     raise UsageError(
         f"copy {copy}: its observations {env.observation_space} and actions {env.action_space} are not those of the "

@@ -25,6 +25,7 @@ from protocol.wire.wake_up import CAN_SPIN, SPIN_S, SpinWait, WakePipe, WakeReas
 from workers.env_errors import CopyRaised, lane_failed
 from workers.env_loop import Infos, Pulse
 from workers.step.stepped_lane import Rows, SteppedLane, new_rows
+from workers.supervise.activity import STEPPING, activity
 
 
 class Stepper:
@@ -199,12 +200,13 @@ def _call(order: Call, lane: SteppedLane, allow_private_names: bool) -> Returned
                 "that it trusts; start the worker with a token, and without --no-code"
             )
         arguments = unpack(order.given.data)
-        if order.assign:
-            lane.assign(order.copies, order.name, arguments)
-        else:
-            results = lane.call(order.copies, order.name, *arguments)
+        with activity().during(STEPPING):
+            if order.assign:
+                lane.assign(order.copies, order.name, arguments)
+            else:
+                results = lane.call(order.copies, order.name, *arguments)
         packed = pack(results)
-    except Exception as raised:
+    except BaseException as raised:
         packed, error, detail = (
             b"",
             one_line(f"{type(raised).__name__}: {first_line(raised)}"),

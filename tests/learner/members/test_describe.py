@@ -19,6 +19,7 @@ from protocol.errors import EnvironmentFailed, NoWorkers, Stalled, UsageError
 from protocol.messages import (
     PROTOCOL_VERSION,
     TOLD_TO_STOP,
+    Alive,
     Described,
     Failure,
     Goodbye,
@@ -29,6 +30,7 @@ from protocol.messages import (
     Rejoin,
     ToLearner,
     Welcome,
+    WorkerExit,
 )
 from protocol.space_spec import BoxSpace, DiscreteSpace, EnvDescription
 from protocol.specs import DescribeSpec
@@ -140,10 +142,16 @@ def test_failures_are_counted_and_the_worker_may_come_back() -> None:
 
 def test_a_process_that_ends_while_it_describes_is_a_failure() -> None:
     made = coordinator()
-    for nonce in (1, 2):
-        join(made, A, nonce)
-        made.remove_worker("w0", "ended with exit code 0")
-    made.remove_worker("w1", "ended with exit code 3")  # it had not joined
+    why = "ended with exit code 0 while it described the environment"
+    join(made, A, 1)
+    made.process_ended(WorkerExit("w0", 1, why, failed=True))  # a process of this program
+    made.process_ended(WorkerExit("w0", 1, why, failed=True))
+    made.process_ended(WorkerExit("w1", 1, "ended with exit code 3", failed=True))  # it had not joined
+    assert made.failure is None
+    join(made, A, 2)
+    made.receive(b"supervisor", Alive((), (WorkerExit("w0", 3, why, failed=True),)), 1.0)  # not the member's nonce
+    assert made.failure is None
+    made.receive(b"supervisor", Alive((), (WorkerExit("w0", 2, why, failed=True),)), 1.0)
     assert "w0 ended with exit code 0 while it described the environment; failure 2" in str(made.failure)
 
 

@@ -7,9 +7,11 @@ from typing import cast
 import pytest
 
 from learner.members.member_server import AWAY_S, MemberServer, ServerCallbacks, ServerSettings
+from learner.members.process_callbacks import ProcessCallbacks
 from learner.vector_env.order_coordinator import OrderCoordinator
 from learner.vector_env.status import status
 from learner.vector_env.step_hub import StepHub
+from protocol.alive import WorkerActivity, WorkerExit
 from protocol.errors import NoWorkers
 from protocol.messages import PROTOCOL_VERSION, Goodbye, Heartbeat, Hello
 from protocol.wire.learner_link import LearnerLink
@@ -24,15 +26,17 @@ class Served:
 
     def __init__(self, settings: ServerSettings | None = None) -> None:
         self.link = FakeLink()
-        self.ended: list[tuple[str, str]] = []
+        self.ended: list[WorkerExit] = []
+        self.running: list[WorkerActivity] = []
         self.coordinator = OrderCoordinator(SPEC, 1, TIMEOUT_S)
         callbacks = ServerCallbacks(self.coordinator.receive, lambda now: status(self.coordinator, now), lambda event: None)
         link = cast(LearnerLink, self.link)
-        self.server = MemberServer(link, self.coordinator, callbacks, self._ended, settings, lambda: self.link.now)
+        processes = ProcessCallbacks(self._ended, lambda: self.running)
+        self.server = MemberServer(link, self.coordinator, callbacks, processes, settings, lambda: self.link.now)
         self.link.inbox.append((b"w0", Hello(PROTOCOL_VERSION, "w0", "host", 1, 1, "fake", 1)))
         self.server.listen(POLL_S)
 
-    def _ended(self) -> list[tuple[str, str]]:
+    def _ended(self) -> list[WorkerExit]:
         ended, self.ended = self.ended, []
         return ended
 
@@ -88,7 +92,7 @@ def test_a_vector_environments_worker_has_its_whole_timeout_to_be_heard() -> Non
 
 def test_the_last_messages_of_a_process_that_has_ended_are_received() -> None:
     served = Served(ServerSettings(last_messages_wait_s=POLL_S))
-    served.ended.append(("w0", "was killed"))
+    served.ended.append(WorkerExit("w0", 1, "was killed", failed=True))
     waiting = served.link.poll
 
     def comes_late(timeout_s: float) -> bool:

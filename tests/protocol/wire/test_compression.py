@@ -23,8 +23,9 @@ from protocol.env_spec import EnvSpec
 from protocol.errors import BadMessage
 from protocol.rollout import Rollout, rollout_bytes
 from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
-from protocol.wire.codec import MAX_FRAME_BYTES, decode_to_learner, decode_to_worker, encode
+from protocol.wire.codec import decode_to_learner, decode_to_worker, encode
 from protocol.wire.compression import Packing, pack_stack, unpack_array, unpack_stack, why_no_zstd
+from protocol.wire.socket_options import MAX_FRAME_BYTES
 from tests.support.collectors import collect, loop_over, random_collector, run_around, run_of
 
 U1 = np.dtype(np.uint8)

@@ -1,0 +1,85 @@
+"""What a supervisor says about its workers. This file imports neither numpy nor gymnasium: a supervisor needs neither."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from protocol.bounds import MAX_WORKERS, Line, Name, Natural, Seconds
+from protocol.message_base import Message
+
+Doing = Literal["starting", "waiting", "describing", "making", "resetting", "stepping", "evaluating", "closing"]
+"""What a worker does, as its supervisor sees it. Environment code runs in all of these except `starting` and `waiting`."""
+NO_ENVIRONMENT_CODE: frozenset[Doing] = frozenset({"starting", "waiting"})
+
+
+class WorkerActivity(msgspec.Struct, frozen=True, array_like=True):
+    """A running worker, as its supervisor sees it."""
+
+    worker: Name
+    process_nonce: Natural
+    doing: Doing
+    for_s: Seconds
+    """seconds since it started to do this"""
+    env_calls: Natural
+    """calls of the environment (make, reset, step) that have returned since the worker started"""
+
+
+class WorkerExit(msgspec.Struct, frozen=True, array_like=True):
+    """A worker whose process has ended."""
+
+    worker: Name
+    process_nonce: Natural
+    reason: Line
+    """how it ended: an exit code, a signal, or a timeout that its supervisor enforced, by the name of its flag"""
+    failed: bool
+    """whether the environment, or the worker, is to blame: it did not leave on purpose"""
+
+
+class Alive(Message, frozen=True):
+    """A supervisor speaks for its workers. It is believed if it knows a worker's nonce and uses the same key.
+
+    Once the run is over, it is answered by `Drain`: the supervisor then ends workers that do not leave by themselves.
+    """
+
+    running: Annotated[tuple[WorkerActivity, ...], Meta(max_length=MAX_WORKERS)]
+    ended: Annotated[tuple[WorkerExit, ...], Meta(max_length=MAX_WORKERS)]
+    """those that ended a short while ago; repeated, because a message may be lost"""
+
+
+@dataclass(frozen=True)
+class CallTimeouts:
+    """How many seconds one call of an env copy may take. 0: any time. The fields are named as the flags are."""
+
+    construct_s: float = 600.0
+    reset_s: float = 600.0
+    step_s: float = 600.0
+
+    def limit_s(self, doing: Doing) -> float:
+        """The limit of what a worker does; infinite if it has none."""
+        match doing:
+            case "describing" | "making":
+                limit = self.construct_s
+            case "resetting":
+                limit = self.reset_s
+            case "stepping" | "evaluating" | "closing":
+                limit = self.step_s
+            case "starting" | "waiting":
+                limit = 0.0
+        return limit or float("inf")
+
+    def reason(self, doing: Doing) -> str:
+        """Why a worker is ended that exceeds its limit. The line names the flag."""
+        call, flag = {
+            "describing": ("the construction of its environment", "construct"),
+            "making": ("the construction of its environment", "construct"),
+            "resetting": ("a reset of its environment", "reset"),
+            "closing": ("close() of its environment", "step"),
+        }.get(doing, ("a step of its environment", "step"))
+        return f"was ended: {call} took longer than {self.limit_s(doing):g} s (--{flag}-timeout-s)"
+
+
+NO_TIMEOUTS = CallTimeouts(0.0, 0.0, 0.0)

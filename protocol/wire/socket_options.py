@@ -1,0 +1,47 @@
+"""Options of the sockets of both sides, and the routing id of a worker. Imports no numpy.
+
+An experiment taught us each option. MAXMSGSIZE bounds a frame before a byte of it is read. TCP_MAXRT and keepalive close a
+connection whose other end has vanished; the worker makes a new one within seconds. There are no ZMTP heartbeats: while a
+reader is stopped by its high-water mark, they lose and reorder messages. Our own heartbeats detect silence, and tickets keep
+queues short.
+"""
+
+from __future__ import annotations
+
+import hashlib
+
+import zmq
+
+from protocol.address import needs_ipv6
+from protocol.keys.handshake import HANDSHAKE_MS
+from protocol.keys.keys import Token
+
+LINGER_MS = 2000
+UNACKNOWLEDGED_MS = 5000  # TCP doubles its retry interval: after a cut it may need as long again as the cut lasted
+QUEUE = 1000  # messages that wait for a peer that does not read
+RECONNECT_MS, RECONNECT_MOST_MS = 100, 2000
+MAX_FRAME_BYTES = 1 << 30
+CURVE_BYTES = 33  # what encryption adds to a frame
+TAG_CHARACTERS = 32
+
+
+def set_options(socket: zmq.Socket[bytes], address: str, curve: bool) -> None:
+    """Set the options that both sides need, before the socket binds or connects."""
+    socket.linger = LINGER_MS
+    socket.maxmsgsize = MAX_FRAME_BYTES + (CURVE_BYTES if curve else 0)
+    socket.handshake_ivl = HANDSHAKE_MS
+    socket.connect_timeout = 2000
+    socket.tcp_maxrt = UNACKNOWLEDGED_MS
+    # Without keepalive, the connection to a host that vanished while idle would stay forever.
+    socket.tcp_keepalive, socket.tcp_keepalive_idle, socket.tcp_keepalive_intvl, socket.tcp_keepalive_cnt = 1, 15, 5, 3
+    socket.ipv6 = needs_ipv6(address)
+    # These limits are never reached: at most one Weights message, a few tickets and their rollouts are on their way.
+    socket.sndhwm = socket.rcvhwm = QUEUE
+
+
+def routing_id(name: str, token: Token | None) -> bytes:
+    """The name. With a key, a tag follows that nobody else can compute."""
+    if token is None:
+        return name.encode()
+    tag = hashlib.blake2b(name.encode(), key=token.client.secret, digest_size=TAG_CHARACTERS // 2)
+    return b"%s\0%s" % (name.encode(), tag.hexdigest().encode())

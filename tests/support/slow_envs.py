@@ -1,0 +1,102 @@
+"""Environments whose calls take seconds, and environments that end or block their process in different ways.
+
+They do so only in a worker process.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+
+import gymnasium
+
+from protocol.arrays import Floats
+from workers.envs.toy import Countdown, Info
+
+IN_WORKER = "--parent" in sys.argv
+
+
+class Slow(Countdown):
+    """Each call takes so many seconds, asleep; with `holds_lock`, in C code that holds the interpreter's lock."""
+
+    def __init__(
+        self, make_s: float = 0.0, reset_s: float = 0.0, step_s: float = 0.0, k: int = 5, holds_lock: bool = False
+    ) -> None:
+        self._holds_lock = holds_lock
+        self._sleep(make_s)
+        super().__init__(k)
+        self._reset_s, self._step_s = reset_s, step_s
+
+    def _sleep(self, seconds: float) -> None:
+        if not IN_WORKER:
+            return
+        if self._holds_lock and seconds:
+            ctypes.PyDLL(None).usleep(ctypes.c_uint(int(seconds * 1e6)))
+        else:
+            time.sleep(seconds)
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Floats, Info]:
+        """Sleep, then start."""
+        self._sleep(self._reset_s)
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> tuple[Floats, float, bool, bool, Info]:
+        """Sleep, then count down."""
+        self._sleep(self._step_s)
+        return super().step(action)
+
+
+class Ends(Countdown):
+    """Ends its process, in the way of `how`, at step `after` of a process, counted over all copies, and at no later one."""
+
+    steps = 0
+
+    def __init__(self, how: str = "exit 0", after: int = 500) -> None:
+        super().__init__()
+        self._how, self._after = how, after
+
+    def step(self, action: Any) -> tuple[Floats, float, bool, bool, Info]:
+        """Count down, or end the process."""
+        Ends.steps += 1
+        if IN_WORKER and Ends.steps == self._after:
+            self._end()
+        return super().step(action)
+
+    def _end(self) -> None:
+        match self._how.split("-"):
+            case "sys.exit", code:
+                sys.exit(int(code))
+            case "os.exit", code:
+                os._exit(int(code))
+            case ["segfault"]:
+                ctypes.string_at(0)
+            case ["kill"]:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+
+class LeavesThings(Countdown):
+    """Starts a child process and a thread that never end, ignores signals, and hangs in `close`."""
+
+    def __init__(self, pid_file: str = "") -> None:
+        super().__init__()
+        if IN_WORKER:
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+            child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(3600)"])
+            with open(pid_file, "a") as file:
+                file.write(f"{child.pid}\n{os.getpid()}\n")
+            threading.Thread(target=time.sleep, args=(3600,), daemon=False).start()
+
+    def close(self) -> None:
+        """Do not return."""
+        if IN_WORKER:
+            time.sleep(3600)
+
+
+for _kind in (Slow, Ends, LeavesThings):
+    gymnasium.register(f"{_kind.__name__}-v0", f"{__name__}:{_kind.__name__}")

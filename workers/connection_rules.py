@@ -1,0 +1,26 @@
+"""To which learner a worker connects, and with which token. Pure, and without imports of numpy or gymnasium.
+
+Rule: over TCP to another machine, a worker connects without a token only with --insecure.
+"""
+
+from __future__ import annotations
+
+from protocol.address import check_address, is_local
+from protocol.errors import UsageError
+from protocol.keys.key_folder import TOKEN_VARIABLE
+from protocol.keys.keys import Token
+
+
+def checked_token(address: str, token: Token | None, *, insecure: bool) -> Token | None:
+    """The token with which to connect, or None to connect without. Raises `UsageError` if neither is allowed."""
+    check_address(address)
+    if not address.startswith("tcp://"):
+        return None  # the permissions of the socket decide who may open it
+    if token is None and not insecure and not is_local(address):
+        raise UsageError(
+            f"address {address} is on another machine: expected --token FILE (or {TOKEN_VARIABLE}), made there by "
+            "`millrace keys new NAME`; --insecure connects without, and trusts whoever answers"
+        )
+    if token is not None and insecure:
+        raise UsageError("a token or --insecure: expected one, got both")
+    return token

@@ -1,0 +1,95 @@
+"""One worker in this process. Its supervisor starts it. Imports torch only for an image policy.
+
+Exit codes: 0 drained, asked to leave, or its supervisor has ended; EXIT_NO_LEARNER if no learner answered; 1 failed; 2
+refused, or bad usage. The code is also written to the page that the supervisor reads: an end without that is a failure.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+from protocol.alive import CallTimeouts
+from protocol.env_spec import AllowedCode
+from protocol.errors import UserFacingError
+from protocol.keys.keys import Token
+from protocol.wire.shared_memory import InheritedDescriptors
+from protocol.wire.worker_link import WorkerLink
+from workers.security import allowed_code
+from workers.session import NO_LEARNER, Session
+from workers.supervise.activity import Activity, activity, share_activity
+from workers.supervise.worker_process import NONCE_VARIABLE
+from workers.supervisor import EXIT_NO_LEARNER
+from workers.watchdog import Watchdog
+from workers.worker import Worker, WorkerOptions, identity, parent_is_gone
+
+LEAVE_AT_ONCE = 2  # requests to leave: the rollout in progress is abandoned
+AFTER_SUPERVISOR_S = 60.0  # how much later than the supervisor the watchdog ends a worker that hangs
+
+
+def work(flags: argparse.Namespace, token: Token | None, timeouts: CallTimeouts, signals: list[int]) -> int:
+    """Run one worker in this process until it leaves. `signals` grows with each request to leave. Returns the exit code."""
+    nonce = int(os.environ.pop(NONCE_VARIABLE, "0")) or None
+    if flags.activity is not None:
+        share_activity(Activity(flags.activity))
+    try:
+        link = WorkerLink(flags.address, flags.name, token=token)
+    except UserFacingError as error:
+        activity().leave(error.exit_code)
+        raise
+    if flags.core is not None:
+        os.sched_setaffinity(0, {flags.core})
+    limits = (timeouts.construct_s, timeouts.reset_s, timeouts.step_s)
+    watchdog = Watchdog(max(limits) + AFTER_SUPERVISOR_S) if all(limits) else None
+    session = Session(identity(flags.name, nonce), time.monotonic(), join_timeout_s=flags.join_timeout_s)
+    options = WorkerOptions(
+        code=AllowedCode.REGISTERED if flags.no_code else allowed_code(flags.address, token),
+        stop_requests=lambda: LEAVE_AT_ONCE if parent_is_gone(flags.parent) else len(signals),
+        feed_watchdog=watchdog.feed if watchdog else lambda now: None,
+        shared_memory=InheritedDescriptors(*map(int, flags.handed.split(","))) if flags.handed else None,
+        exit_code=_exit_code,
+    )
+    left = Worker(link, session, options).run()
+    if watchdog:
+        watchdog.stop()
+    if left.exit_code:
+        sys.stderr.write(f"worker {flags.name}: {_explained(left.reason, link)}\n")
+    if parent_is_gone(flags.parent):
+        _remove_socket_of_killed_parent(flags.address)
+        _kill_own_group()
+    return _exit_code(left.exit_code, left.reason)
+
+
+def _exit_code(code: int, reason: str) -> int:
+    """The exit code of this process: what the supervisor needs to know."""
+    return EXIT_NO_LEARNER if reason.startswith(NO_LEARNER) else code
+
+
+def _kill_own_group() -> None:
+    """End this process with all that its environment has started: the supervisor cannot do it any more."""
+    if os.getpgrp() == os.getpid():
+        sys.stderr.flush()
+        os.killpg(os.getpid(), signal.SIGKILL)
+
+
+def _remove_socket_of_killed_parent(address: str) -> None:
+    """Remove the socket, and the folder that the learner made for it: a killed learner could not."""
+    scheme, _, path = address.partition("://")
+    if scheme == "ipc" and Path(path).parent.name.startswith("millrace-"):
+        Path(path).unlink(missing_ok=True)
+        with suppress(OSError):
+            Path(path).parent.rmdir()
+
+
+def _explained(reason: str, link: WorkerLink) -> str:
+    """The reason for leaving, and if no learner answered, the likely cause."""
+    if not reason.startswith(NO_LEARNER):
+        return reason
+    if link.problem is not None:
+        return f"{reason}: {link.problem.line}"
+    return f"{reason} at {link.address}; is the learner running, and is this its address?"

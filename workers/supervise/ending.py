@@ -1,0 +1,19 @@
+"""How a worker ended. Plain data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a worker ended."""
+
+    code: int
+    """Exit code; below 0 if a signal ended it."""
+    reason: str
+    """One line."""
+    on_purpose: bool = False
+    """The worker has said beforehand that it leaves with this code."""
+    failed: bool = False
+    """Its environment, or the worker, is to blame: it ended neither on purpose nor before it ran environment code."""

@@ -1,0 +1,195 @@
+"""A worker in a process of its own, as its supervisor starts it, watches it and ends it.
+
+Rule: the worker has a process group of its own. When the worker has ended, whatever its environment started in that group is
+killed. If a call of the environment takes too long, the worker writes its stacks and is killed. A worker that leaves on
+purpose says so beforehand: any other end is not on purpose, whatever the exit code.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from protocol.alive import NO_ENVIRONMENT_CODE, CallTimeouts, Doing, WorkerActivity
+from protocol.bounds import one_line
+from protocol.keys.key_folder import TOKEN_VARIABLE
+from protocol.keys.keys import Token
+from workers.supervise.activity import STACK_SIGNAL, ActivityReader
+from workers.supervise.ending import Ending
+from workers.watchdog import deepest_frame, where_it_hung
+
+NONCE_VARIABLE = "MILLRACE_WORKER_NONCE"
+WRITE_STACKS_S = 0.3  # from the signal until the worker is killed
+CLOSE_WITHIN_S = 5.0  # a worker that leaves must have closed its environments and ended within this time
+POLL_S = 0.02
+SINGLE_THREADED = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+WHILE: dict[Doing, str] = {
+    "starting": " while it started",
+    "waiting": "",
+    "describing": " while it described the environment",
+    "making": " while it made its environment",
+    "resetting": " in a reset of its environment",
+    "stepping": " in a step of its environment",
+    "evaluating": " in an evaluation",
+    "closing": " while it closed its environment",
+}
+
+
+@dataclass(frozen=True)
+class WorkerCommand:
+    """How to start a worker process."""
+
+    address: str
+    name: str
+    log: Path | None = None
+    """File for the worker's stderr. None: the supervisor's own stderr."""
+    token: Token | None = None
+    flags: Sequence[str] = ()
+    """Further flags of `python -m workers`."""
+    shared_memory: tuple[int, int, int] | None = None
+    """`InheritedDescriptors` that the worker gets, to step a vector environment through shared memory."""
+
+
+class WorkerProcess:
+    """A worker in a process of its own."""
+
+    def __init__(self, start: WorkerCommand) -> None:
+        self.name, self._log = start.name, start.log
+        self.process_nonce = int.from_bytes(os.urandom(6), "little")
+        self._page = ActivityReader()
+        self._because = ""  # why the supervisor ends it
+        self._kill_at_s = float("inf")
+        self._end: Ending | None = None
+        command = [sys.executable, "-P", "-m", "workers", start.address, "--name", start.name]
+        command += ["--parent", str(os.getpid()), "--activity", str(self._page.fd), *start.flags]
+        if start.shared_memory is not None:
+            command += ["--handed", ",".join(map(str, start.shared_memory))]
+        # The child must find the modules that its parent found: a user's environment may lie beside the user's script.
+        path = os.pathsep.join(entry or os.getcwd() for entry in [*sys.path, str(Path(__file__).parents[2])])
+        secret = {NONCE_VARIABLE: str(self.process_nonce)}
+        if start.token is not None:
+            secret[TOKEN_VARIABLE] = start.token.to_text()
+        with (start.log or Path(os.devnull)).open("ab") as stderr:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=stderr if start.log else None,
+                stderr=stderr if start.log else None,
+                start_new_session=True,  # only the supervisor gets the Ctrl-C of the terminal
+                env={**os.environ, **SINGLE_THREADED, **secret, "PYTHONPATH": path},
+                pass_fds=(self._page.fd, *(start.shared_memory or ())),
+            )
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
+    def ended(self) -> Ending | None:
+        """How it ended, or None while it runs."""
+        if self._end is None and self._has_ended():
+            self._kill_group()  # before the process is reaped: until then nobody else can have its id
+            self._end = self._ending(self._process.wait())
+            self._page.close()
+        return self._end
+
+    def activity(self, now: float) -> WorkerActivity | None:
+        """What it does. None if it has ended, or if it is stopped: then nobody speaks for it."""
+        if self.ended() is not None or _is_stopped(self.pid):
+            return None
+        page = self._page.read(now)
+        return WorkerActivity(self.name, self.process_nonce, page.doing, page.for_s, page.env_calls)
+
+    def enforce(self, timeouts: CallTimeouts, now: float) -> None:
+        """End it if a call of its environment takes too long, or if it does not end although it leaves."""
+        if self.ended() is not None:
+            return
+        if now >= self._kill_at_s:
+            self.kill()
+        elif not self._because:
+            page = self._page.read(now)
+            if page.exit_code is not None:
+                if page.leaves_for_s > CLOSE_WITHIN_S:
+                    self.kill()
+            elif page.for_s > timeouts.limit_s(page.doing):
+                self._because, self._kill_at_s = timeouts.reason(page.doing), now + WRITE_STACKS_S
+                if STACK_SIGNAL is not None:
+                    self._process.send_signal(STACK_SIGNAL)
+
+    def stop(self) -> None:
+        """SIGTERM: it finishes the rollout in progress, and leaves."""
+        if self.ended() is None:
+            self._process.terminate()
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait until it has ended; kill it if it is still running after that."""
+        deadline_s = time.monotonic() + timeout_s
+        while self.ended() is None and time.monotonic() < deadline_s:
+            time.sleep(POLL_S)
+        self.kill()
+        while self.ended() is None:
+            time.sleep(POLL_S)
+
+    def kill(self) -> None:
+        """SIGKILL to its process group, for a worker that hangs."""
+        if self.ended() is None:
+            self._kill_group()
+
+    # ---------------------------------------------------------------- inside
+
+    def _has_ended(self) -> bool:
+        """Whether it has ended. It is not reaped, where the system can tell without."""
+        if hasattr(os, "waitid"):
+            return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
+        return self._process.poll() is not None
+
+    def _kill_group(self) -> None:
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(self.pid, signal.SIGKILL)
+
+    def _ending(self, code: int) -> Ending:
+        """How it ended. `code` is negative if a signal ended it."""
+        page = self._page.read(time.monotonic())
+        output = self._log.read_text(errors="replace") if self._log is not None else ""
+        if self._because:
+            stacks = self._page.stacks()
+            self._write(stacks)
+            where = deepest_frame(stacks)
+            return Ending(code, one_line(self._because + (f", at {where}" if where else "")), failed=True)
+        if page.exit_code is not None:
+            last = output.strip().splitlines()[-1:] if page.exit_code else []
+            line = f"ended with exit code {page.exit_code}{f' ({last[0]})' if last else ''}"
+            return Ending(page.exit_code, one_line(line), on_purpose=True)
+        failed = page.env_calls > 0 or page.doing not in NO_ENVIRONMENT_CODE
+        if code < 0:
+            return Ending(code, f"was killed by {signal.Signals(-code).name}{WHILE[page.doing]}", failed=failed)
+        if (hung := where_it_hung(output)) is not None:
+            return Ending(code, one_line(f"was ended: it made no progress, at {hung}"), failed=failed)
+        last = output.strip().splitlines()[-1:] if code else []
+        line = f"ended with exit code {code}{WHILE[page.doing]}{f' ({last[0]})' if last else ''}"
+        return Ending(code, one_line(line), failed=failed)
+
+    def _write(self, stacks: str) -> None:
+        """Write to where the worker's stderr goes."""
+        text = f"worker {self.name} {self._because}\n{stacks}"
+        with suppress(OSError):
+            if self._log is None:
+                sys.stderr.write(text)
+            else:
+                with self._log.open("a") as log:
+                    log.write(text)
+
+
+def _is_stopped(pid: int) -> bool:
+    """Whether the process is stopped by a signal or a debugger. False on a system without /proc."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()[0] in "Tt"
+    except (OSError, IndexError):
+        return False

@@ -1,0 +1,76 @@
+"""A worker in a thread of this process, over inproc: for debugging, tests, and inference on the learner's side."""
+
+from __future__ import annotations
+
+import threading
+import time
+from contextlib import suppress
+from typing import Any
+
+import zmq
+
+from protocol.alive import CallTimeouts, WorkerActivity
+from protocol.bounds import one_line
+from protocol.env_spec import AllowedCode
+from protocol.wire.worker_link import WorkerLink
+from workers.session import Leave, Session
+from workers.supervise.activity import Activity, ActivityReader, share_activity
+from workers.supervise.ending import Ending
+from workers.worker import MakeCollector, Worker, WorkerOptions, identity, make_local_collector
+
+
+class WorkerThread:
+    """A worker in a thread of this process. A thread cannot be killed."""
+
+    def __init__(
+        self, address: str, name: str, context: zmq.Context[Any], make_collector: MakeCollector = make_local_collector
+    ) -> None:
+        self.name, self._identity = name, identity(name)
+        self.process_nonce = self._identity.process_nonce
+        self._page = Activity()
+        self._reader = ActivityReader(self._page)
+        self._stop_requests = 0
+        self._left: Leave | None = None
+        self._make_collector = make_collector
+        self._thread = threading.Thread(target=self._run, args=(address, context), name=name, daemon=True)
+        self._thread.start()
+
+    def _run(self, address: str, context: zmq.Context[Any]) -> None:
+        share_activity(self._page)
+        session = Session(self._identity, time.monotonic())
+        link = WorkerLink(address, self.name, context)
+        options = WorkerOptions(
+            code=AllowedCode.CALLABLES, stop_requests=lambda: self._stop_requests, make_collector=self._make_collector
+        )
+        with suppress(zmq.ContextTerminated):  # the run has ended, and a thread could not be killed
+            self._left = Worker(link, session, options).run()
+
+    def ended(self) -> Ending | None:
+        """How it ended, or None while it runs."""
+        if self._thread.is_alive():
+            return None
+        if self._left is None:
+            return Ending(1, "its thread raised", failed=True)
+        return Ending(self._left.exit_code, one_line(self._left.reason), on_purpose=True)
+
+    def activity(self, now: float) -> WorkerActivity | None:
+        """What it does; None if it has ended."""
+        if not self._thread.is_alive():
+            return None
+        page = self._reader.read(now)
+        return WorkerActivity(self.name, self.process_nonce, page.doing, page.for_s, page.env_calls)
+
+    def enforce(self, timeouts: CallTimeouts, now: float) -> None:
+        """Nothing: a thread cannot be ended from outside."""
+
+    def stop(self) -> None:
+        """Ask it to leave."""
+        self._stop_requests += 1
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait until it has ended. A thread cannot be killed."""
+        self._thread.join(timeout_s)
+
+    def kill(self) -> None:
+        """Ask it to leave at once."""
+        self._stop_requests += 2
