@@ -19,7 +19,7 @@ import pytest
 from tests.system.processes import ROOT, START_S, Learner, Running, Stage, free_port, wait_for
 from tests.system.runs import within
 
-ENVS = "tests.support.slow_envs"
+ENVS = "tests.system.slow_envs"
 SMALL: dict[str, object] = {
     "rollout-steps": 2,
     "envs": 2,
