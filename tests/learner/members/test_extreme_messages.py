@@ -54,6 +54,7 @@ from tests.support.fake_link import FakeLink
 from tests.support.hostile_messages import hostile, real
 
 HOSTILE = "spare"
+SECRET_NONCE = 0x5EC2E7_5EC2E7  # of honest workers: nobody but a worker's supervisor and the learner knows it
 LANES, TURN_S = 2, 0.05
 RUN = run_spec(LANES)
 
@@ -145,7 +146,7 @@ class Honest:
 
     def says(self) -> Iterator[ToLearner]:
         if not self.session:
-            yield Hello(PROTOCOL_VERSION, self.name, "host", 1, 1, "fake", 1)
+            yield Hello(PROTOCOL_VERSION, self.name, "host", 1, SECRET_NONCE, "fake", 1)
             return
         yield Heartbeat(self.session, 0, self.version, tuple(ticket for ticket, _ in self.permits), self.sent, {}, 0)
         if self.permits:
