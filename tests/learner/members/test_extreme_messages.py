@@ -213,7 +213,7 @@ def answers(turns: int, say: Say) -> list[bytes]:
 
     link.poll = poll  # type: ignore[method-assign]
     for name in ("w0", "w1"):
-        link.inbox.append((name.encode(), Hello(PROTOCOL_VERSION, name, "host", 1, 1, "fake", 1)))
+        link.inbox.append((name.encode(), Hello(PROTOCOL_VERSION, name, "host", 1, SECRET_NONCE, "fake", 1)))
     hub.wait_for(2, 5.0)
     for turn in range(turns):
         for number in (0, 1):
