@@ -35,7 +35,7 @@ SESSION = 2**40 + 7
 
 def of_session(frames: list[bytes], session: int) -> list[bytes]:
     """The same frames, said in this session."""
-    return [frames[0].replace(_session(SESSION), _session(session)), *frames[1:]] if frames else []
+    return [frames[0].replace(_session(SESSION), _session(session)), *frames[1:]]
 
 
 def _session(number: int) -> bytes:
@@ -52,7 +52,8 @@ def extremes(message: Any) -> Iterator[list[bytes]]:
         for other in (b"", frame[:-1], frame + b"\x00", b"\xff" * len(frame), frame * 2):
             yield [*frames[:number], other, *frames[number + 1 :]]
     yield [*frames, b"more"]
-    yield frames[:-1]
+    if len(frames) > 1:
+        yield frames[:-1]
     yield frames * 70
     for changed_array in _arrays(message):
         yield [bytes(frame) for frame in encode(changed_array)]
