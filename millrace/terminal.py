@@ -1,7 +1,8 @@
 """Shows the progress of a run: as a live block on a terminal, as a line every few seconds elsewhere, or as JSON.
 
 Rule: it never slows the run (at most five redraws a second), and the last progress is always shown. If nobody reads the
-output any more (`| head`), the run continues. Warnings of the log are shown above the block.
+output any more (`| head`), the run continues. Warnings of the log are shown above the block. No text is read as markup or
+controls the terminal.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from rich.text import Text
 
 from learner.run_folder.json_log import JsonLines, progress_line
 from learner.run_folder.progress import Progress
+from protocol.bounds import escaped
 
 REDRAW_EVERY_S = 0.2
 LINE_EVERY_S = 5.0
@@ -106,7 +108,7 @@ class PlainLines:
     def print_line(self, line: str) -> None:
         """Print the line."""
         try:
-            print(line, flush=True)
+            print(escaped(line), flush=True)
         except BrokenPipeError:  # nobody reads the output; the run continues, and Python must be able to flush at its exit
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
@@ -148,7 +150,7 @@ class LiveBlock:
 
     def print_line(self, line: str) -> None:
         """Print the line above the block."""
-        self._console.print(line, markup=False, highlight=False)
+        self._console.print(escaped(line), markup=False, highlight=False)
 
     def close(self) -> None:
         """Leave the block as it is and show the cursor again."""
@@ -183,7 +185,7 @@ def render_block(progress: Progress) -> RenderableType:
     rows.add_column(style="dim", no_wrap=True)
     rows.add_column(overflow="fold")
     for name, text in detail_rows(progress).items():
-        rows.add_row(name, text)
+        rows.add_row(name, Text(escaped(text)))
     return Group(bar, head, rows)
 
 

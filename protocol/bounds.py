@@ -7,6 +7,7 @@ the memory nor a log, nor write control characters to a terminal. A sender makes
 from __future__ import annotations
 
 import re
+from textwrap import indent
 from typing import Annotated, Literal
 
 from msgspec import Meta
@@ -51,6 +52,11 @@ def one_line(text: str, most: int = MAX_LINE) -> str:
 def escaped(text: str) -> str:
     """A text of several lines without control characters, safe to show."""
     return _CONTROL_EXCEPT_NEWLINE.sub(_escape, text)
+
+
+def indented(text: str) -> str:
+    """A text of several lines, safe to show, each line indented. So none of them looks like a line of a log."""
+    return indent(escaped(text).strip("\n"), "    ", lambda line: True)
 
 
 def last_text(text: str) -> str:

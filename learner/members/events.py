@@ -6,10 +6,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from textwrap import indent
 from typing import ClassVar
 
-from protocol.bounds import MAX_LINE, escaped, one_line
+from protocol.bounds import MAX_LINE, indented, one_line
 
 
 @dataclass(frozen=True)
@@ -106,11 +105,6 @@ def describe(event: Event) -> str:
             return f"{line}\n{indented(traceback)}"
         case _:
             return line
-
-
-def indented(traceback: str) -> str:
-    """A peer's traceback as it is shown: without control characters, each line indented."""
-    return indent(escaped(traceback).strip("\n"), "    ", lambda line: True)
 
 
 def _line(event: Event) -> str:

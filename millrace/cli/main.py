@@ -16,6 +16,7 @@ from typing import NamedTuple
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # before numpy; --torch-threads sets the learner's
 
+from protocol.bounds import indented
 from protocol.errors import UsageError, UserFacingError, first_line
 
 ABOUT = "Worker processes step copies of a gymnasium environment; one learner trains a policy in PyTorch."
@@ -44,7 +45,7 @@ def main(argv: list[str] | None = None) -> int:
     except UserFacingError as error:
         _print_error(f"millrace: {error}")
         if error.detail:
-            _print_error(error.detail.rstrip())
+            _print_error(indented(error.detail))
         return _failed(argv, error.exit_code)
     except KeyboardInterrupt as interrupt:
         run = getattr(interrupt, "run", None)

@@ -122,3 +122,26 @@ def test_a_reader_that_has_gone_does_not_end_the_run(tmp_path: Path, monkeypatch
         for _ in range(3):
             PlainLines().show(PROGRESS)
         monkeypatch.undo()
+
+
+HOSTILE = Progress(
+    run="runs/[/red]\x1b[7777m", stages={"worker_[/red]": 1.0, "worker_[bold]step": 2.0}, note="[/x]\x1b[7777m"
+)
+
+
+def test_no_text_is_read_as_markup_or_controls_the_terminal() -> None:
+    """A stage named [/red] ended the learner: rich raised MarkupError."""
+    file = io.StringIO()
+    view = LiveBlock(Console(file=file, force_terminal=True, width=100))
+    view.show(HOSTILE)
+    view.print_line("warning: [/red] \x1b[7777m\ud800")
+    view.close()
+    shown = file.getvalue()
+    assert "[/red] 33% · [bold]step 67%" in shown
+    assert "warning: [/red] \\x1b[7777m\\ud800" in shown
+    assert "\x1b[7777m" not in shown
+
+
+def test_a_plain_line_holds_no_control_characters(capsys: pytest.CaptureFixture[str]) -> None:
+    PlainLines().print_line("\x1b[7777m\ud800")
+    assert capsys.readouterr().out == "\\x1b[7777m\\ud800\n"
