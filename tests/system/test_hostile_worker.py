@@ -57,6 +57,7 @@ from tests.system.runs import accounted
 LANES = 2
 SETTINGS: dict[str, object] = {"envs": LANES, "lanes": LANES, "min-workers": LANES, "seed": 3, "batch-size": 16}
 MEMORY_MB, LOG_BYTES = 20, 1_000_000
+END_S = 400.0  # of a run with a hostile worker, on a crowded machine
 EVENTS = ("joined", "left", "turned", "broke", "told", "stale", "progress", "said")  # of `--log-json`
 FORGED = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
 
@@ -208,9 +209,9 @@ def learn(folder: Path, settings: Mapping[str, object], attack: Callable[[Hostil
             return bool(learner.rows()[-1]["time/total_timesteps"] > 0.8 * steps)
 
         assert learner.rows()[-1]["time/total_timesteps"] < 0.8 * steps, "the run was over before the hostile worker was"
-        wait_for(far, START_S, "the end of training", every_s=0.1)
+        wait_for(far, END_S, "the end of training", every_s=0.1)
         seen.memory_mb = median(sizes[-5:])
-        assert learner.ends(START_S) == 0, learner.said()[-5_000:]
+        assert learner.ends(END_S) == 0, learner.said()[-5_000:]
         seen.policy = (learner.folder / "policy.safetensors").read_bytes()
         if isinstance(learner, OnTerminal):
             seen.said = learner.all_said()
@@ -288,7 +289,7 @@ def test_a_hostile_worker_that_says_everything_changes_no_bit_of_the_weights(tmp
         for flood in FLOODS:
             hostile.floods(flood, 3.0, names=100)
 
-    settings = {"steps": 60_000, "env-kwargs": "seconds 0.002"} | ({"log-json": ""} if shown == "json" else {})
+    settings = {"steps": 40_000, "env-kwargs": "seconds 0.002"} | ({"log-json": ""} if shown == "json" else {})
     loud = compare(tmp_path, settings, attack, live=shown == "terminal")
     for line in loud.log.splitlines():
         if shown == "json":

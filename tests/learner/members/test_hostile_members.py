@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from typing import cast
 
+import msgpack
 import msgspec
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from learner.members.membership import MAX_MEMBERS, REMEMBERED
 from learner.rollouts.hub import Hub, HubSettings
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 from learner.rollouts.weight_age import WORKERS, WeightAge
-from protocol.errors import BadMessage, EnvironmentFailed
+from protocol.errors import BadMessage, BadRollout, EnvironmentFailed
 from protocol.messages import (
     PROTOCOL_VERSION,
     Failure,
@@ -30,8 +31,9 @@ from protocol.messages import (
     ToLearner,
     Welcome,
 )
+from protocol.rollout import Episode, validate
 from protocol.token_bucket import TokenBucket
-from protocol.wire.codec import decode_to_observer, decode_to_worker
+from protocol.wire.codec import decode_to_learner, decode_to_observer, decode_to_worker, encode
 from protocol.wire.learner_link import LearnerLink
 from tests.learner.rollouts.test_ticket_coordinator import Learner
 from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollout, run_spec
@@ -304,3 +306,71 @@ def test_what_members_are_told_fits_into_a_message() -> None:
     assert all(isinstance(event, WorkerLeft | WorkerRefused) for event in noisy.coordinator.events)
     assert np.isfinite([worker.steps_per_s for worker in status.workers]).all()
     assert msgspec.json.encode(status)
+
+
+# ---------------------------------------------------------------- what once ended a learner, or filled its log or memory
+
+
+def as_bytes(noisy: Noisy, name: str, message: ToLearner | Inquire) -> None:
+    """Say this on the wire: senders of these messages do not check their bounds."""
+    try:
+        noisy.hears(name, decode_to_learner([bytes(frame) for frame in encode(message)]))
+    except BadMessage as error:
+        noisy.hears(name, error)
+
+
+LONG = 1_048_400  # the head of a message may just be so long
+
+
+def test_two_workers_with_a_host_of_a_megabyte_do_not_make_the_status_too_long() -> None:
+    noisy = Noisy()
+    for name in ("a", "b"):
+        as_bytes(noisy, name, hello(name, host="h" * LONG))
+    as_bytes(noisy, "asks", Inquire())
+    assert [worker.worker for worker in decode_to_observer(noisy.link.sent[-1]).workers] == ["honest"]
+
+
+def test_a_refusal_does_not_quote_a_host_of_a_megabyte() -> None:
+    noisy = Noisy()
+    for nonce, host in ((1, "h"), (2, "h" * LONG), (2, "h" * 1_000), (1, "h")):
+        as_bytes(noisy, "a", hello("a", nonce, host))
+    refusal = decode_to_worker(noisy.link.sent[-1])
+    assert isinstance(refusal, Refuse)
+    assert "another process, on hhh" in refusal.reason
+    assert len(refusal.reason) <= 1_000
+
+
+def test_invented_stage_names_are_not_kept() -> None:
+    noisy = Noisy()
+    for nonce in range(5):
+        session = noisy.joins("a", nonce)
+        as_bytes(noisy, "a", Heartbeat(session, 0, 0, (), 0, {f"stage {n}": 1.0 for n in range(45_000)}, 0))  # type: ignore[misc]
+        as_bytes(noisy, "a", Heartbeat(session, 0, 0, (), 0, {"[/red]": 1.0}, 0))  # type: ignore[dict-item]
+    assert noisy.coordinator.membership.stages() == {}
+    assert noisy.coordinator.ledger.messages_bad == 10
+
+
+def test_goodbyes_with_a_reason_of_a_megabyte_are_not_logged(caplog: pytest.LogCaptureFixture) -> None:
+    noisy = Noisy()
+    for nonce in range(100):
+        as_bytes(noisy, "a", Goodbye(noisy.joins("a", nonce), "x" * 1_000_000, ()))
+    assert logged(caplog) < 10_000
+
+
+@pytest.mark.parametrize("forged", ["h\n2026 learner: forged", "h\x1b[31m", "h\x9b31m", "h\u2028", "h\ud800"])
+def test_control_characters_in_a_host_reach_no_log(forged: str, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    noisy = Noisy()
+    head = msgpack.packb(msgspec.to_builtins(hello("a", host=forged)), unicode_errors="surrogatepass")
+    with pytest.raises(BadMessage):
+        decode_to_learner([head])
+    noisy.hears("a", hello("a", host=forged))  # even if it were decoded
+    assert all(message.isprintable() for message in caplog.messages)
+    assert any("worker a (h" in message for message in caplog.messages)
+
+
+def test_a_return_that_no_episode_can_have_is_refused() -> None:
+    rollout = msgspec.structs.replace(fake_rollout(1, 0, 0, 0, 0), terminated=np.ones((1, 1), bool))
+    validate(msgspec.structs.replace(rollout, episodes=(Episode(1e30, 1, 0.1),)), run_spec(lanes=1))
+    with pytest.raises(BadRollout, match="episode: expected a finite return of 1 to 1 float32 rewards"):
+        validate(msgspec.structs.replace(rollout, episodes=(Episode(1e308, 1, 0.1),)), run_spec(lanes=1))
