@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+import msgspec
 import zmq
 
 from learner.config.config import Config
@@ -89,6 +90,9 @@ def known_environment(
     PyTorch. Raises `UsageError` if there is no such environment, or no policy for it, `RunError` if no worker describes it
     in time, and `KeyboardInterrupt` if the user stops the program.
     """
+    # PyTorch's threads sleep while they wait for one another; this must be set before it is imported. By default they spin,
+    # and hold the core that the slowest needs: beside other busy processes an update takes up to ten times as long.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     imports = ImportsAhead(config.algo)
     with Interrupts() as interrupts:
 
@@ -149,14 +153,17 @@ class Run:
 
         config, self.folder = setup.config, setup.folder
         spec = run_spec(config, setup.known.env, setup.known.spaces)
-        torch.set_num_threads(threads(config, spec.policy, processes.expected))
+        if config.torch_threads is None:
+            # Another number changes the last bits, so the run keeps it, wherever it is resumed or repeated.
+            config = msgspec.structs.replace(config, torch_threads=threads(spec.policy, config.max_lag, processes.expected))
+        torch.set_num_threads(config.torch_threads or 1)
         self.algorithm = algorithm_class(config.algo)(
             config.algorithm, spec.policy, total_steps=config.steps, seed=config.seed, device=torch_device(config)
         )
         state = RunState()
         if setup.resumed:
             state = restore(self.folder, self.algorithm)
-            self.folder.write_config(config)
+        self.folder.write_config(config)
         coordinator = TicketCoordinator(
             spec,
             rollouts_per_update=config.lanes,

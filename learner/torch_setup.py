@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 
-from learner.algorithms.kernels.fused import can_fuse
 from learner.config.config import Config
 from protocol.cpu_cores import usable_cores
 from protocol.errors import UsageError
+from protocol.policy.layout import parameter_layout
 from protocol.specs import PolicySpec
+
+MANY_WEIGHTS = 1 << 18  # 512 x 512
 
 
 def torch_device(config: Config) -> str:
@@ -18,14 +22,14 @@ def torch_device(config: Config) -> str:
     return ("cuda" if torch.cuda.is_available() else "cpu") if config.device == "auto" else config.device
 
 
-def threads(config: Config, policy: PolicySpec, workers: int) -> int:
-    """Number of threads. `workers` is the number of worker processes on this machine.
+def threads(policy: PolicySpec, max_lag: int, workers: int) -> int:
+    """Number of threads, where the settings name none. `workers` is the number of worker processes on this machine.
 
-    A small MLP learns without autograd and gains nothing from a second thread. Other networks use the cores that no worker
-    needs while the learner learns.
+    Operations of small and recurrent networks are so short that a second thread gains nothing, and loses much while another
+    process keeps a core busy: the threads wait for one another at the end of each operation. Images, encoders and layers
+    with `MANY_WEIGHTS` use the cores that no worker needs while the learner learns.
     """
-    if config.torch_threads is not None:
-        return config.torch_threads
-    if can_fuse(policy):
+    largest = max(math.prod(field.shape) for fields in parameter_layout(policy) for field in fields)
+    if not policy.needs_torch and largest < MANY_WEIGHTS:
         return 1
-    return max(1, usable_cores() - (workers if config.max_lag else 0))
+    return max(1, usable_cores() - (workers if max_lag else 0))

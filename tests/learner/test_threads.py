@@ -7,7 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
+import millrace
+from learner import torch_setup
 from learner.config.layers import resolve
 from learner.torch_setup import threads
 from millrace.launch.local_worker_options import worker_cores
@@ -75,26 +78,51 @@ def test_a_container_has_its_share_of_the_cores(
 
 ACTION = ActionSpec("discrete", (), "int64", (2,), (0,))
 SMALL = PolicySpec((Leaf("", "box", (4,), "float32"),), ACTION)
+WIDE = PolicySpec((Leaf("", "box", (4,), "float32"),), ACTION, net=(256, 256))
 LARGE = PolicySpec((Leaf("", "box", (4,), "float32"),), ACTION, net=(512, 512))
+RECURRENT = PolicySpec((Leaf("", "box", (4,), "float32"),), ACTION, core="lstm")
+FEATURES = PolicySpec((Leaf("", "discrete", (), "int64", (500,), (0,)),), ACTION)
 IMAGES = PolicySpec((Leaf("", "box", (84, 84, 4), "uint8"),), ACTION)
 
 
 @pytest.mark.parametrize(
-    ("policy", "settings", "workers", "count"),
+    ("policy", "max_lag", "workers", "count"),
     [
-        (SMALL, {}, 2, 1),
-        (LARGE, {}, 2, 8),  # workers wait while it learns
-        (IMAGES, {}, 2, 8),
-        (IMAGES, {"max_lag": 1}, 2, 6),
-        (IMAGES, {"max_lag": 1}, 0, 8),  # they are elsewhere
-        (IMAGES, {"max_lag": 1}, 20, 1),
-        (IMAGES, {"torch_threads": 3}, 2, 3),
-        (SMALL, {"torch_threads": 3}, 2, 3),
+        (SMALL, 0, 2, 1),
+        (RECURRENT, 0, 2, 1),
+        (FEATURES, 0, 2, 1),
+        (WIDE, 0, 2, 1),
+        (LARGE, 0, 2, 8),  # workers wait while it learns
+        (IMAGES, 0, 2, 8),
+        (IMAGES, 1, 2, 6),
+        (IMAGES, 1, 0, 8),  # they are elsewhere
+        (IMAGES, 1, 20, 1),
     ],
 )
 def test_the_learner_takes_the_cores_that_workers_leave(
-    monkeypatch: pytest.MonkeyPatch, policy: PolicySpec, settings: dict[str, Any], workers: int, count: int
+    monkeypatch: pytest.MonkeyPatch, policy: PolicySpec, max_lag: int, workers: int, count: int
 ) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(8)))
     monkeypatch.setattr(counting, "CPU_MAX", Path("nowhere"))
-    assert threads(resolve("CartPole-v1", **settings), policy, workers) == count
+    assert threads(policy, max_lag, workers) == count
+
+
+def test_a_run_keeps_the_number_of_threads_that_it_began_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever resumes or repeats it with its config.toml on a machine of another size gets the same bits."""
+    settings: dict[str, Any] = {
+        "rollout_steps": 8,
+        "envs": 4,
+        "eval_episodes": 1,
+        "transport": "inproc",
+        "net": (512, 512),
+    }
+    used: list[int] = []
+    monkeypatch.setattr(torch, "set_num_threads", used.append)
+    monkeypatch.setattr(torch_setup, "usable_cores", lambda: 3)
+    folder = millrace.train("CartPole-v1", run_dir=str(tmp_path), steps=64, **settings)
+    assert "torch_threads = 3" in (folder / "config.toml").read_text()
+    monkeypatch.setattr(torch_setup, "usable_cores", lambda: 7)
+    millrace.train(resume=folder, steps=128)
+    again = millrace.train(config=folder / "config.toml", run_dir=str(tmp_path / "again"))
+    assert used == [3, 3, 3]
+    assert "torch_threads = 3" in (again / "config.toml").read_text()
