@@ -20,6 +20,7 @@ from learner.members.states import MemberState
 from learner.rollouts.evaluation_tickets import EvaluationPlan, OnRows, PlayedEpisode
 from learner.rollouts.lanes import AcceptedRollout
 from learner.rollouts.ledger import Ledger
+from learner.rollouts.stall_watch import StallWatch
 from learner.rollouts.status import status
 from learner.rollouts.ticket_coordinator import CollectingMember, TicketCoordinator
 from learner.rollouts.weight_age import WeightAge
@@ -130,6 +131,7 @@ class Hub:
         self._env_failures = 0
         self._failure: EnvironmentFailed | None = None
         self._no_members_since_s: float | None = None
+        self._stall_watch = StallWatch(coordinator, settings.stall_timeout_s, settings.call_timeouts)
         callbacks = ServerCallbacks(self._answer, self._status, self._on_event)
         self._server = MemberServer(link, coordinator, callbacks, self._processes, clock=clock)
 
@@ -151,11 +153,10 @@ class Hub:
 
     def gather(self) -> list[AcceptedRollout]:
         """The rollouts of the next update. Raises `NoWorkers`, `Stalled` or `EnvironmentFailed`."""
-        started_s = logged_s = progress_s = self._clock()
-        stall_timeout_s = self.settings.stall_timeout_s
+        started_s = logged_s = self._clock()
+        self._stall_watch.begin(started_s)
         self._turn(0.0)
         while True:
-            ready = len(self.coordinator.ready)
             taken = self.coordinator.take()
             self._server.send(self.coordinator.deal())
             if taken is not None:
@@ -165,9 +166,8 @@ class Hub:
                 return taken
             self._turn(POLL_S)
             now = self._clock()
-            if len(self.coordinator.ready) > ready:
-                progress_s = now
-            if now - progress_s > stall_timeout_s:
+            if not self._goes_on(now, len(self.coordinator.ready)):
+                stall_timeout_s = self.settings.stall_timeout_s
                 raise Stalled(f"no rollout came for {stall_timeout_s:.0f} s; {self.waiting_for()}")
             if now - logged_s > LOG_WAITING_EVERY_S:
                 logged_s = now
@@ -180,19 +180,17 @@ class Hub:
 
         `watch` is called with the number of episodes played, at least every `POLL_S`. Raises as `gather` does.
         """
-        evaluation, stall_timeout_s = self.coordinator.evaluation, self.settings.stall_timeout_s
-        progress_s = logged_s = self._clock()
-        steps = -1
+        evaluation = self.coordinator.evaluation
+        logged_s = self._clock()
+        self._stall_watch.begin(logged_s)
         self._server.send(self.coordinator.begin_evaluation(plan, on_rows))
         try:
             while not evaluation.done:
                 self._turn(POLL_S)
                 now = self._clock()
                 watch(evaluation.episodes_played)
-                if (so_far := self._worker_steps() + evaluation.episodes_played) != steps:
-                    steps, progress_s = so_far, now
-                if now - progress_s > stall_timeout_s:
-                    waiting = self._waiting_for_episodes()
+                if not self._goes_on(now, self._worker_steps() + evaluation.episodes_played):
+                    stall_timeout_s, waiting = self.settings.stall_timeout_s, self._waiting_for_episodes()
                     raise Stalled(f"no env step of an evaluation was made for {stall_timeout_s:.0f} s; {waiting}")
                 if now - logged_s > LOG_WAITING_EVERY_S:
                     logged_s = now
@@ -266,6 +264,15 @@ class Hub:
         )
 
     # ---------------------------------------------------------------- inside
+
+    def _goes_on(self, now: float, progress: int) -> bool:
+        """Refuse workers that only hold tickets. False if the run stands still."""
+        standstill = self._stall_watch.check(now, progress)
+        if standstill is None:
+            return True
+        for member in standstill.refuse:
+            self._server.send(self.coordinator.refuse(member, standstill.why))
+        return bool(standstill.refuse)
 
     def _worker_steps(self) -> int:
         """Env steps of all workers, as of their last heartbeats."""

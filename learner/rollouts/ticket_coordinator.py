@@ -183,6 +183,10 @@ class TicketCoordinator:
         """A worker's process is known to be dead: do not wait for its silence."""
         return self._deal() if self.membership.remove_worker(worker, why) else []
 
+    def refuse(self, member: CollectingMember, why: str) -> list[Outgoing]:
+        """Refuse a worker that holds tickets and does nothing with them: they are dealt again."""
+        return self.membership.refuse(member, SentUnusable, why) + self._deal()
+
     def process_ended(self, worker_exit: WorkerExit) -> list[Outgoing]:
         """A process of this program has ended."""
         return self._deal() if self.membership.record_exit(worker_exit) else []

@@ -23,6 +23,16 @@ from protocol.wire.codec import encode
 from protocol.wire.worker_link import WorkerLink
 from workers.connection_rules import checked_token
 
+LONG_S = 1.0
+DOING = {
+    "describing": "in construction",
+    "making": "in construction",
+    "resetting": "in reset",
+    "stepping": "in step",
+    "evaluating": "in evaluation",
+    "closing": "in close",
+}
+"""What a worker does, in the words of the table. A worker without a supervisor does not say it."""
 ASK_AGAIN_S = WATCH_EVERY_S = 1.0
 DROPS = {
     "lost": "tickets of workers that were lost",
@@ -33,7 +43,7 @@ DROPS = {
     "messages_bad": "messages that could not be read",
 }
 """Text for each kind of dropped data, by its name in the ledger."""
-LEFT_ALIGNED = ("worker", "host", "lanes")  # columns of words; columns of numbers are right-aligned
+LEFT_ALIGNED = ("worker", "host", "lanes", "doing")  # columns of words; columns of numbers are right-aligned
 
 
 def status(argv: list[str], out: TextIO) -> None:
@@ -141,8 +151,15 @@ def _cells(worker: WorkerStatus, version: int) -> dict[str, str]:
         "steps/s": f"{worker.steps_per_s:,.0f}",
         "weights": "none" if worker.version < 0 else "newest" if behind <= 0 else f"{behind} behind",
         "silent": f"{worker.silent_s:.1f} s",
+        "doing": _doing(worker),
         "memory": f"{worker.resident_bytes / 2**20:,.0f} MB" if worker.resident_bytes else "-",
     }
+
+
+def _doing(worker: WorkerStatus) -> str:
+    """What it does, and for how long if that is long."""
+    words = DOING.get(worker.doing, _printable(worker.doing) or "-")
+    return f"{words} for {worker.doing_s:.0f} s" if worker.doing_s >= LONG_S else words
 
 
 def _table(rows: list[dict[str, str]]) -> list[str]:

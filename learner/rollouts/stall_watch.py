@@ -1,0 +1,85 @@
+"""Judges whether a run stands still, and through which workers. Pure.
+
+Rule: env steps, constructions and resets are progress, as are rollouts. While a call of the environment is under way within
+its timeout, the run does not stand still: the call ends, or its worker is ended. If nothing happens for `stall_timeout_s`,
+the workers that hold tickets are refused, and others get the tickets. The run ends only if no worker would remain. A worker
+that holds its tickets for longer than all calls of the environment may take together is refused, whatever it claims.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from learner.members.membership import Member
+from learner.rollouts.ticket_coordinator import CollectingMember, TicketCoordinator
+from protocol.alive import CallTimeouts
+
+ENDED_WITHIN_S = 5.0  # after its timeout, until the learner hears that a worker was ended
+CHECK_BUDGETS_EVERY_S = 1.0
+
+
+@dataclass(frozen=True)
+class Standstill:
+    """A verdict: these members are to be refused; if there are none, the run ends."""
+
+    refuse: tuple[CollectingMember, ...]
+    why: str
+
+
+class StallWatch:
+    """Watches one run."""
+
+    def __init__(self, coordinator: TicketCoordinator, stall_timeout_s: float, timeouts: CallTimeouts) -> None:
+        self._coordinator, self._stall_timeout_s, self._timeouts = coordinator, stall_timeout_s, timeouts
+        self._mark: object = None
+        self._progress_s = 0.0
+        self._dealt_s: dict[int, float] = {}  # ticket -> when it was first seen here
+        self._budgets_due_s = -math.inf
+
+    def begin(self, now: float) -> None:
+        """The learner begins to wait."""
+        self._progress_s = now
+
+    def check(self, now: float, progress: object) -> Standstill | None:
+        """`progress`: anything that changes when what the learner waits for makes progress. None: the run goes on."""
+        mark = (self._coordinator.membership.progress, progress)
+        if mark != self._mark:
+            self._mark, self._progress_s = mark, now
+        if now >= self._budgets_due_s:
+            self._budgets_due_s = now + CHECK_BUDGETS_EVERY_S
+            if over := self._over_budget(now):
+                return Standstill(over, "it holds tickets for longer than its rollouts can take")
+        members = self._coordinator.members.values()
+        if now - self._progress_s <= self._stall_timeout_s or any(self._in_call(member, now) for member in members):
+            return None
+        self._progress_s = now
+        evaluating = self._coordinator.evaluation.holders
+        idle = tuple(member for member in members if member.tickets or member.peer in evaluating)
+        if len(idle) == len(members):
+            idle = ()
+        return Standstill(idle, f"it holds tickets and has made no progress for {self._stall_timeout_s:.0f} s")
+
+    def _in_call(self, member: Member, now: float) -> bool:
+        """Whether its supervisor says that it is in a call of the environment, which has not exceeded its timeout."""
+        said = member.activity
+        if said is None or now - member.in_env_code_s > self._coordinator.worker_timeout_s:
+            return False
+        return said.for_s + now - member.activity_s <= self._timeouts.limit_s(said.doing) + ENDED_WITHIN_S
+
+    def _over_budget(self, now: float) -> tuple[CollectingMember, ...]:
+        """The members whose oldest ticket is older than all their tickets may take together."""
+        tickets = self._coordinator.tickets
+        self._dealt_s = {number: self._dealt_s.get(number, now) for number in tickets}
+        each_s = self._longest_rollout_s()
+        return tuple(
+            member
+            for member in self._coordinator.members.values()
+            if member.tickets
+            and now - min(self._dealt_s[ticket] for ticket in member.tickets) > each_s * len(member.tickets)
+        )
+
+    def _longest_rollout_s(self) -> float:
+        run, limit_s = self._coordinator.run, self._timeouts.limit_s
+        opening_s = limit_s("making") + limit_s("resetting")
+        return run.copies * (opening_s + run.rollout_steps * max(limit_s("stepping"), limit_s("resetting")))

@@ -1,0 +1,239 @@
+"""What a supervisor says of its workers: when it is believed, and what follows. And when a run stands still. Pure."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from learner.members.events import WorkerLeft, WorkerProcessFailed
+from learner.rollouts.stall_watch import ENDED_WITHIN_S, StallWatch
+from protocol.alive import Alive, CallTimeouts, Doing, WorkerActivity, WorkerExit
+from protocol.messages import Drain, Heartbeat, Hello
+from tests.learner.rollouts.test_ticket_coordinator import TIMEOUT_S, Learner, permits
+
+A, B, SUPERVISOR = b"a", b"b", b"supervisor-of-a"
+NONCE = 1000 * len("host") + 1  # as `Learner.joins` makes it
+OVER_S = TIMEOUT_S + 0.1
+
+
+def activity(doing: Doing = "stepping", for_s: float = 0.0, calls: int = 0, nonce: int = NONCE) -> WorkerActivity:
+    return WorkerActivity("a", nonce, doing, for_s, calls)
+
+
+def speaks(learner: Learner, said: WorkerActivity, peer: bytes = SUPERVISOR) -> None:
+    learner.says(peer, Alive((said,), ()))
+
+
+def is_member_after(learner: Learner, seconds: float) -> bool:
+    learner.now += seconds
+    learner.coordinator.remove_silent(learner.now)
+    return A in learner.coordinator.members
+
+
+@pytest.mark.parametrize("doing", ["describing", "making", "resetting", "stepping", "evaluating", "closing"])
+def test_a_worker_in_environment_code_is_not_silent(doing: Doing) -> None:
+    learner = Learner()
+    learner.joins(A)
+    for _ in range(5):
+        learner.now += TIMEOUT_S - 0.5
+        speaks(learner, activity(doing))
+        assert is_member_after(learner, 0.4)
+
+
+@pytest.mark.parametrize("doing", ["starting", "waiting"])
+def test_a_worker_in_our_own_code_must_speak_for_itself(doing: Doing) -> None:
+    learner = Learner()
+    learner.joins(A)
+    learner.now += TIMEOUT_S - 0.5
+    speaks(learner, activity(doing))
+    assert not is_member_after(learner, 0.6)
+
+
+def test_a_worker_whose_long_step_has_just_ended_has_its_timeout_to_speak() -> None:
+    learner = Learner()
+    learner.joins(A)
+    learner.now += 3 * TIMEOUT_S
+    speaks(learner, activity("stepping", 3 * TIMEOUT_S))
+    learner.now += 0.5
+    speaks(learner, activity("waiting"))
+    assert is_member_after(learner, TIMEOUT_S - 0.6)
+    assert not is_member_after(learner, 0.2)
+
+
+def test_a_supervisor_that_falls_silent_speaks_for_nobody() -> None:
+    learner = Learner()
+    learner.joins(A)
+    speaks(learner, activity())
+    assert is_member_after(learner, TIMEOUT_S - 0.1)
+    assert not is_member_after(learner, 0.2)
+
+
+@pytest.mark.parametrize("said", [activity(nonce=NONCE + 1), WorkerActivity("b", NONCE, "stepping", 0.0, 0)])
+def test_who_does_not_know_the_nonce_is_not_believed(said: WorkerActivity) -> None:
+    learner = Learner()
+    learner.joins(A)
+    learner.now += TIMEOUT_S - 0.5
+    speaks(learner, said)
+    assert not is_member_after(learner, 0.6)
+
+
+@pytest.mark.parametrize(("key", "believed"), [(b"aa", True), (b"bb", False), (b"", False)])
+def test_who_uses_another_key_is_not_believed(key: bytes, believed: bool) -> None:
+    """With keys, a peer is its routing id and its key."""
+    learner = Learner()
+    peer = b"a\0tag\0aa"
+    learner.says(peer, Hello(4, "a", "host", 1, NONCE, "fake", 1))
+    speaker = b"supervisor\0tag\0" + key if key else SUPERVISOR
+    learner.now += TIMEOUT_S - 0.5
+    speaks(learner, activity(), speaker)
+    learner.says(speaker, Alive((), (WorkerExit("a", NONCE + 1, "was killed", True),)))
+    learner.now += 0.6
+    learner.coordinator.remove_silent(learner.now)
+    assert (peer in learner.coordinator.members) == believed
+    if believed:
+        learner.says(b"x\0tag\0bb", Alive((), (WorkerExit("a", NONCE, "was killed", True),)))
+        assert peer in learner.coordinator.members, "another key ended a worker"
+
+
+def test_an_exit_is_counted_once_and_its_tickets_are_dealt_again() -> None:
+    learner = Learner(lanes=2)
+    learner.joins(A)
+    learner.joins(B, host="other")
+    held = len(learner.tickets(A))
+    learner.coordinator.membership.take_events()
+    said = Alive((), (WorkerExit("a", NONCE, "ended with exit code 0 in a step of its environment", True),))
+    outs = learner.says(SUPERVISOR, said)
+    assert len(permits(outs, B)) == held > 0
+    assert learner.says(SUPERVISOR, said) == []
+    why = "ended with exit code 0 in a step of its environment"
+    assert learner.coordinator.membership.take_events() == [
+        WorkerProcessFailed("a", "host", why),
+        WorkerLeft("a", why, held, False),
+    ]
+
+
+def test_an_exit_on_purpose_and_that_of_a_spare_count_as_no_failure() -> None:
+    learner = Learner(lanes=1)
+    learner.joins(A)
+    learner.joins(B, host="other")
+    learner.coordinator.membership.take_events()
+    learner.says(SUPERVISOR, Alive((), (WorkerExit("b", 1000 * len("other") + 1, "was killed", True),)))
+    (failed, _) = learner.coordinator.membership.take_events()
+    assert isinstance(failed, WorkerProcessFailed)
+    assert failed.spare
+    learner.says(SUPERVISOR, Alive((), (WorkerExit("a", NONCE, "ended with exit code 1", False),)))
+    assert learner.coordinator.membership.take_events() == [WorkerLeft("a", "ended with exit code 1", 1, False)]
+
+
+def test_a_supervisor_learns_that_the_run_is_over() -> None:
+    learner = Learner()
+    learner.joins(A)
+    assert learner.says(SUPERVISOR, Alive((activity(),), ())) == []
+    learner.coordinator.drain("all steps done")
+    assert learner.says(SUPERVISOR, Alive((activity(),), ())) == [(SUPERVISOR, Drain("all steps done"))]
+
+
+def test_status_says_what_a_worker_does_until_its_supervisor_is_silent() -> None:
+    learner = Learner()
+    learner.joins(A)
+    speaks(learner, activity("resetting", 40.0))
+    (row,) = learner.coordinator.membership.status(learner.now + 1.5)
+    assert (row.doing, row.doing_s) == ("resetting", 41.5)
+    (row,) = learner.coordinator.membership.status(learner.now + 60.0)
+    assert (row.doing, row.doing_s) == ("", 0.0)
+
+
+# ---------------------------------------------------------------- standing still
+
+STALL_S, STEP_S = 100.0, 30.0
+TIMEOUTS = CallTimeouts(STEP_S, STEP_S, STEP_S)
+
+
+def watch(learner: Learner, timeouts: CallTimeouts = TIMEOUTS) -> StallWatch:
+    made = StallWatch(learner.coordinator, STALL_S, timeouts)
+    made.begin(learner.now)
+    assert made.check(learner.now, 0) is None
+    return made
+
+
+def beats(learner: Learner, peer: bytes, steps: int) -> None:
+    held = tuple(learner.tickets(peer))
+    learner.says(peer, Heartbeat(learner.session(peer), 0, 0, held, steps, {}, 0))
+
+
+def test_a_run_in_which_nothing_happens_stands_still() -> None:
+    learner = Learner()
+    learner.joins(A)
+    made = watch(learner)
+    assert made.check(learner.now + STALL_S, 0) is None
+    verdict = made.check(learner.now + STALL_S + 1, 0)
+    assert verdict is not None
+    assert verdict.refuse == ()
+
+
+def test_env_steps_calls_and_rollouts_are_progress() -> None:
+    learner = Learner()
+    learner.joins(A)
+    made, arrived = watch(learner, CallTimeouts(0.0, 0.0, 0.0)), 0
+    for number, kind in enumerate(["steps", "calls", "rollouts"] * 2, 1):
+        learner.now += STALL_S - 1
+        if kind == "steps":
+            beats(learner, A, number)
+        elif kind == "calls":
+            speaks(learner, activity("waiting", calls=number))
+        else:
+            arrived += 1
+        assert made.check(learner.now, arrived) is None
+
+
+def test_a_call_within_its_timeout_is_no_standstill_and_one_beyond_it_is() -> None:
+    learner = Learner()
+    learner.joins(A)
+    made = watch(learner)
+    learner.now += STALL_S + 1
+    speaks(learner, activity("stepping", STEP_S + ENDED_WITHIN_S - 1))
+    assert made.check(learner.now, 0) is None
+    speaks(learner, activity("stepping", STEP_S + ENDED_WITHIN_S + 1))
+    assert made.check(learner.now, 0) is not None
+
+
+def test_a_worker_that_hoards_its_tickets_is_refused_and_another_gets_them() -> None:
+    learner = Learner(lanes=2)
+    learner.joins(A)
+    learner.joins(B, host="other")
+    made = watch(learner, CallTimeouts(0.0, 0.0, 0.0))
+    hoarded = len(learner.tickets(A))
+    for _ in range(2):
+        learner.now += STALL_S / 2 + 1
+        beats(learner, A, 0)
+    verdict = made.check(learner.now, 0)
+    assert verdict is not None
+    (member,) = verdict.refuse
+    assert member.peer == A
+    outs = learner.balanced(learner.coordinator.refuse(member, verdict.why))
+    assert len(permits(outs, B)) == hoarded == 2
+    assert made.check(learner.now + STALL_S / 2, 0) is None, "the other worker has no time to begin"
+
+
+def test_a_worker_that_claims_progress_is_refused_when_its_budget_is_spent() -> None:
+    learner = Learner()
+    learner.joins(A)
+    made = watch(learner)
+    run = learner.coordinator.run
+    each_s = run.copies * (2 * STEP_S + run.rollout_steps * STEP_S)
+    budget_s, steps = each_s * len(learner.tickets(A)), 0
+    while (verdict := made.check(learner.now, 0)) is None:
+        learner.now += STALL_S / 2
+        steps += 1
+        beats(learner, A, steps)
+        assert learner.now < budget_s + STALL_S
+    assert learner.now > budget_s
+    assert [member.peer for member in verdict.refuse] == [A]
+
+
+def test_without_timeouts_there_is_no_budget() -> None:
+    learner = Learner()
+    learner.joins(A)
+    made = watch(learner, CallTimeouts(0.0, 0.0, 0.0))
+    assert made._longest_rollout_s() == math.inf
