@@ -27,9 +27,12 @@ def threads(policy: PolicySpec, max_lag: int, workers: int) -> int:
 
     Operations of small and recurrent networks are so short that a second thread gains nothing, and loses much while another
     process keeps a core busy: the threads wait for one another at the end of each operation. Images, encoders and layers
-    with `MANY_WEIGHTS` use the cores that no worker needs while the learner learns.
+    with `MANY_WEIGHTS` use all cores. If workers collect meanwhile, they use the cores that are left, but only if those are
+    more than half: where updates take longer than collecting, workers wait for most of the time, and their cores with them.
     """
     largest = max(math.prod(field.shape) for fields in parameter_layout(policy) for field in fields)
     if not policy.needs_torch and largest < MANY_WEIGHTS:
         return 1
-    return max(1, usable_cores() - (workers if max_lag else 0))
+    cores = usable_cores()
+    left = cores - workers if max_lag else cores
+    return left if 2 * left > cores else cores

@@ -97,8 +97,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """
     torch_threads: Count | None = None
     """Number of PyTorch threads in the learner. none: chosen when the run starts, and kept in its config.toml: 1;
-    or with images, an encoder or a layer of 512 x 512 weights all cores, minus one per local worker if max_lag is above 0.
-    Another number changes the last bits of results.
+    or with images, an encoder or a layer of 512 x 512 weights all cores. If max_lag is above 0, one core is left to each
+    local worker, unless half of the cores or less would remain. Another number changes the last bits of results.
     """
     pin_workers: bool | None = None
     """Keep each local worker process on one core (train only). none: do so if max_lag is 0 and the number of workers is a

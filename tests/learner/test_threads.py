@@ -96,7 +96,15 @@ IMAGES = PolicySpec((Leaf("", "box", (84, 84, 4), "uint8"),), ACTION)
         (IMAGES, 0, 2, 8),
         (IMAGES, 1, 2, 6),
         (IMAGES, 1, 0, 8),  # they are elsewhere
-        (IMAGES, 1, 20, 1),
+        (IMAGES, 1, 3, 5),
+        (
+            IMAGES,
+            1,
+            4,
+            8,
+        ),  # workers wait most of the time: the learner on half of the cores would be slower than without lag
+        (IMAGES, 1, 8, 8),
+        (IMAGES, 1, 20, 8),
     ],
 )
 def test_the_learner_takes_the_cores_that_workers_leave(
