@@ -77,10 +77,9 @@ class LanePlacement(Generic[L]):
         if self._settled:
             return []
         self._settled = True
-        active = list(active)
-        if not self._unplaced and all(len(member.lanes) < 2 for member in active):
+        if not self._unplaced and len({lane.owner for lane in self._lanes}) == len(self._lanes):
             self._stop_waiting()
-            return []  # nothing can move, however many spares there are
+            return []  # every lane has a worker of its own: nothing moves, however many spares there are
         members = sorted(active, key=lambda member: member.join_number)
         self.assign([self._lanes[number] for number in sorted(self._unplaced)], members)
         return self.even_out(members)
