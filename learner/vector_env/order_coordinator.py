@@ -275,6 +275,7 @@ def check(answer: Answer, order: Order, spec: StepSpec) -> None:
 
 def _check_results(answer: Returned, order: Call) -> None:
     results = unpack(answer.results.data)
-    if not isinstance(results, list) or len(results) != len(order.copies):
+    expected = 0 if order.assign else len(order.copies)
+    if not isinstance(results, list) or len(results) != expected:
         got = f"{len(results)} in a list" if isinstance(results, list) else type(results).__name__
-        raise BadMessage(f"results: expected a list of {len(order.copies)}, got {got}")
+        raise BadMessage(f"results: expected a list of {expected}, got {got}")

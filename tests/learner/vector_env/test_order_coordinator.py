@@ -233,6 +233,10 @@ def call(session: int, ticket: int, life: LaneIncarnation) -> Order:
     return Call(session, ticket, life.lane, life.incarnation, (0,), "name", False, NOTHING)
 
 
+def assign(session: int, ticket: int, life: LaneIncarnation) -> Order:
+    return Call(session, ticket, life.lane, life.incarnation, (0,), "name", True, NOTHING)
+
+
 def test_an_answer_of_the_other_kind_and_results_that_are_not_one_for_each_copy_are_refused() -> None:
     results = np.frombuffer(pack([1]), np.uint8)
     two = np.frombuffer(pack([1, 2]), np.uint8)
@@ -256,6 +260,8 @@ def test_an_answer_of_the_other_kind_and_results_that_are_not_one_for_each_copy_
 
     assert told(step, returned(results)) == "answer to Step: expected Stepped, got Returned"
     assert told(call, stepped) == "answer to Call: expected Returned, got Stepped"
+    assert told(assign, returned(np.frombuffer(pack([]), np.uint8))) == ""
+    assert told(assign, returned(results)) == "results: expected a list of 0, got 1 in a list"
     assert told(call, returned(two)) == "results: expected a list of 1, got 2 in a list"
     assert told(call, returned(text)) == "results: expected a list of 1, got str"
     assert "not a plain value" in told(call, returned(WORDS))
