@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from learner.rollouts.evaluation_tickets import EvaluationPlan
+from learner.rollouts.evaluation_tickets import EvaluationPlan, evaluation_of
 from learner.rollouts.hub import Hub, HubSnapshot
 from learner.rollouts.lanes import AcceptedRollout
 from learner.run_folder.progress import Progress
@@ -50,10 +50,7 @@ class RolloutService:
         `watch` is called with the number of episodes that were played, several times a second. Raises `RunError` when the
         run cannot go on.
         """
-        played = self._hub.evaluate(plan, watch)
-        episodes = [one.episode for one in played]
-        cut = sum(one.cut for one in played)
-        return Evaluation.of([episode.reward for episode in episodes], [episode.length for episode in episodes], cut)
+        return evaluation_of(self._hub.evaluate(plan, watch))
 
     def drain(self, reason: str, timeout_s: float = 5.0) -> None:
         """Ask every worker to leave, and wait for that at most `timeout_s`."""

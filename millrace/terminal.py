@@ -68,6 +68,27 @@ def progress_view(
         logger.setLevel(level)
 
 
+@contextmanager
+def count_line(doing: str, clock: Callable[[], float] = time.monotonic) -> Iterator[Callable[[str], None]]:
+    """Gives a function that shows a text on stderr, after `doing`: in place on a terminal, else as a line now and then."""
+    live = sys.stderr.isatty()
+    every_s = REDRAW_EVERY_S if live else LINE_EVERY_S
+    shown_s = clock() if not live else -every_s
+
+    def show(text: str) -> None:
+        nonlocal shown_s
+        if clock() - shown_s >= every_s:
+            shown_s = clock()
+            sys.stderr.write(f"\r\x1b[K{doing}: {text}" if live else f"{doing}: {text}\n")
+            sys.stderr.flush()
+
+    try:
+        yield show
+    finally:
+        if live:
+            sys.stderr.write("\r\x1b[K")
+
+
 class RateLimitedView:
     """Shows the first progress, then at most one in `every_s`, and the last one. A new note is printed at once."""
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from learner.members.membership import Member, Outgoing
+from learner.run_folder.results import Evaluation
 from protocol.messages import EpisodeRows, Evaluate, Evaluated, Heartbeat
 from protocol.rollout import LARGEST_REWARD, Episode
 
@@ -59,6 +60,13 @@ class PlayedEpisode:
 
     episode: Episode
     cut: bool
+
+
+def evaluation_of(played: Sequence[PlayedEpisode]) -> Evaluation:
+    """The evaluation that these episodes make."""
+    episodes = [one.episode for one in played]
+    cut = sum(one.cut for one in played)
+    return Evaluation.of([episode.reward for episode in episodes], [episode.length for episode in episodes], cut)
 
 
 class EvaluationTickets:

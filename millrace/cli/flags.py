@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 from tyro.conf import Positional
@@ -20,6 +21,16 @@ class EvaluateFlags(msgspec.Struct, frozen=True, kw_only=True):
     """seed of the episodes"""
     best: bool = False
     """use the policy with the best evaluation during the run (--eval-every), instead of the newest"""
+    workers: int = 2
+    """number of worker processes that play the episodes; the result does not depend on it"""
+    copies: int = 4
+    """number of episodes that a worker plays side by side"""
+    max_steps: int = 1_000_000
+    """most env steps of all episodes together; each episode gets an equal share, and is cut when it reaches it"""
+    transport: Literal["inproc", "ipc", "tcp"] = "ipc"
+    """how local workers are connected: as threads of this process, by local sockets, or by TCP"""
+    bind: str = ""
+    """address at which workers join that are started elsewhere, as tcp://0.0.0.0:5555; then none are started here"""
     video: bool = False
     """film the episodes: an mp4 of each in the folder videos of the run (pip install 'millrace-rl[video]')"""
     debug: bool = False

@@ -11,12 +11,12 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # before numpy; --torch-threads sets the learner's
 
-from protocol.bounds import indented
+from protocol.bounds import MAX_SEEDS, indented
 from protocol.errors import UsageError, UserFacingError, first_line
 
 ABOUT = "Worker processes step copies of a gymnasium environment; one learner trains a policy in PyTorch."
@@ -151,21 +151,40 @@ def _worker(argv: list[str]) -> int:
 
 def _evaluate(argv: list[str]) -> int:
     from learner.config.flag_parser import parse_flags
-    from learner.evaluate import evaluate, load_policy
     from millrace.cli.flags import EvaluateFlags
 
     flags = parse_flags(EvaluateFlags, argv, "evaluate")
     episodes = flags.episodes if flags.episodes is not None else 3 if flags.video else 100
-    _at_least("episodes", episodes, 1)
-    _at_least("seed", flags.seed, 0)
-    policy, spec, env = load_policy(flags.run, "best" if flags.best else "final")
-    if not flags.video:
-        print(evaluate(env, policy, spec, episodes, flags.seed))
-        return 0
-    from learner.recording.video import record_videos
+    for name, value, least in (
+        ("episodes", episodes, 1),
+        ("seed", flags.seed, 0),
+        ("workers", flags.workers, 1),
+        ("copies", flags.copies, 1),
+        ("max_steps", flags.max_steps, 1),
+    ):
+        _at_least(name, value, least)
+    if flags.copies > MAX_SEEDS:
+        raise UsageError(f"copies: expected int <= {MAX_SEEDS}, got {flags.copies}")
+    from learner.policy_player import saved_policy, useful_workers
+    from learner.rollouts.evaluation_tickets import EvaluationPlan, evaluation_of
+    from millrace.launch.policy_workers import PlayingWorkers, policy_player
+    from millrace.terminal import count_line
 
-    evaluation, videos = record_videos(flags.run, env, policy, spec, episodes, flags.seed)
-    print("\n".join(map(str, [evaluation, *videos])))
+    which: Literal["best", "final"] = "best" if flags.best else "final"
+    if flags.video:
+        from learner.evaluate import load_policy
+        from learner.recording.video import record_videos
+
+        policy, spec, env = load_policy(flags.run, which)
+        evaluation, videos = record_videos(flags.run, env, policy, spec, episodes, flags.seed)
+        print("\n".join(map(str, [evaluation, *videos])))
+        return 0
+    saved = saved_policy(flags.run, which)
+    plan = EvaluationPlan.of(episodes, flags.seed, flags.copies, flags.max_steps)
+    workers = PlayingWorkers(useful_workers(flags.workers, episodes, flags.copies), flags.transport, flags.bind)
+    with count_line("evaluating") as watch, policy_player(saved, workers, watch) as player:
+        played = player.play(plan)
+    print(evaluation_of(played))
     return 0
 
 

@@ -1,0 +1,109 @@
+"""A learner that trains nothing: it has workers play episodes of the policy of a run folder.
+
+Rule: the policy is published as version 0, once. The learner's process runs no environment code.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from learner.members.describe import DescribeSettings, described_by_workers
+from learner.members.process_callbacks import ProcessCallbacks
+from learner.rollouts.evaluation_tickets import EvaluationPlan, OnRows, PlayedEpisode
+from learner.rollouts.hub import Hub, HubSettings
+from learner.rollouts.ticket_coordinator import TicketCoordinator
+from learner.run_folder.run_folder import RunFolder, Which
+from protocol.arrays import Floats
+from protocol.env_spec import EnvSpec
+from protocol.envs.description import DescribedEnv
+from protocol.specs import DescribeSpec, PolicySpec, RunSpec
+from protocol.wire.learner_link import LearnerLink
+
+WORKER_TIMEOUT_S, NO_WORKERS_TIMEOUT_S, STALL_TIMEOUT_S = 5.0, 60.0, 600.0
+
+
+class SavedPolicy(NamedTuple):
+    """A policy of a run folder, and the environment for which it was trained."""
+
+    spec: PolicySpec
+    env: EnvSpec
+    parameters: Floats
+    buffers: Floats
+
+
+def saved_policy(run: Path, which: Which = "final") -> SavedPolicy:
+    """Read a policy of a run folder. Raises `UsageError`, with a one-line message, if it cannot be read."""
+    card, parameters, buffers = RunFolder.open(run).read_policy(which)
+    return SavedPolicy(card.policy, EnvSpec(card.env, card.env_kwargs), parameters, buffers)
+
+
+class PolicyPlayer:
+    """Plays episodes of a saved policy with the workers that join at a link."""
+
+    def __init__(
+        self,
+        policy: SavedPolicy,
+        link: LearnerLink,
+        processes: ProcessCallbacks,
+        check_interrupt: Callable[[], None],
+        watch: Callable[[str], None],
+    ) -> None:
+        """`check_interrupt` is called while it waits: what it raises ends the wait.
+
+        `watch` is called several times a second with how far it is, as text.
+        """
+        self.policy = policy
+        self._link, self._processes = link, processes
+        self._check_interrupt, self._watch = check_interrupt, watch
+        self._hub: Hub | None = None
+
+    @property
+    def workers(self) -> int:
+        """Number of workers that have joined since the first `play`."""
+        return 0 if self._hub is None else len(self._hub.coordinator.members)
+
+    def describe(self, render_mode: str | None = None) -> DescribedEnv:
+        """Have a worker describe the environment. Call it before the first `play`. Raises `UserFacingError`."""
+        settings = DescribeSettings(WORKER_TIMEOUT_S, NO_WORKERS_TIMEOUT_S, STALL_TIMEOUT_S, max_env_failures=0)
+        spec = DescribeSpec(self.policy.env, render_mode=render_mode)
+        return described_by_workers(self._link, spec, settings, self._processes, self._check_interrupt)
+
+    def play(self, plan: EvaluationPlan, on_rows: OnRows | None = None, before: int = 0) -> list[PlayedEpisode]:
+        """Play these episodes. Returns them in the order of the seeds. Raises `RunError` if that is not possible.
+
+        `before`: the number of episodes that were played in earlier calls, for the text that `watch` gets.
+        """
+        if self._hub is None:
+            self._hub = self._published()
+        total = before + len(plan.seeds)
+        return self._hub.evaluate(plan, lambda played: self._watch(f"{before + played:,} of {total:,} episodes"), on_rows)
+
+    def leave(self, reason: str) -> None:
+        """Ask the workers to leave."""
+        if self._hub is not None:
+            self._hub.drain(reason, timeout_s=2.0)
+
+    def _published(self) -> Hub:
+        policy = self.policy
+        run = RunSpec(policy.env, policy.spec, rollout_steps=1, copies=1, lanes=1, seed=0)
+        coordinator = TicketCoordinator(
+            run,
+            rollouts_per_update=1,
+            max_lag=0,
+            worker_timeout_s=WORKER_TIMEOUT_S,
+            first_session=int.from_bytes(os.urandom(6), "little"),
+        )
+        settings = HubSettings(NO_WORKERS_TIMEOUT_S, STALL_TIMEOUT_S, max_env_failures=0)
+        hub = Hub(self._link, coordinator, settings, self._processes, self._check_interrupt)
+        hub.wait_for(1)
+        hub.publish(0, policy.parameters, policy.buffers, deal=False)
+        return hub
+
+
+def useful_workers(workers: int, episodes: int, copies: int) -> int:
+    """At most this number of workers: no more than there are tickets."""
+    return min(workers, math.ceil(episodes / copies))
