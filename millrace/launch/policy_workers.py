@@ -22,7 +22,9 @@ from learner.members.process_callbacks import ProcessCallbacks
 from learner.policy_player import PolicyPlayer, SavedPolicy
 from millrace.launch.local_worker_options import private_address
 from protocol.wire.learner_link import LearnerLink
-from workers.supervisor import Running, Supervisor, WorkerCommand, WorkerProcess, WorkerThread
+from workers.supervise.worker_process import WorkerCommand, WorkerProcess
+from workers.supervise.worker_thread import WorkerThread
+from workers.supervisor import Running, Supervisor
 
 log = logging.getLogger("millrace.learner")
 
