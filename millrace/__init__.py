@@ -96,7 +96,8 @@ def make_vec(
         keys: the folder of the keys. An address that other machines can reach needs keys; they are made if there are none.
         insecure: use no keys.
         advertise: the host name by which other machines reach this one.
-        transport: how messages travel to local workers. With `inproc` the worker is a thread of this process.
+        transport: how messages travel to local workers. With `inproc` the worker is a thread of this process,
+            which then runs the environment. Otherwise only workers do.
         shared_memory: local workers get actions and return results through shared memory. It is faster; results are equal.
         autoreset_mode: as in gymnasium: "NextStep", "SameStep" or "Disabled".
         on_worker_loss: "truncate" returns the env copies of a lost worker as truncated, with `worker_lost` in their infos,
