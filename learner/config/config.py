@@ -110,8 +110,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     # ------------------------------------------------------------------------------------------------------------ network
 
     transport: Literal["inproc", "ipc", "tcp"] = "ipc"
-    """How local workers are connected (train only). inproc: as threads of this process, which then runs the environment. ipc:
-    local sockets. tcp: TCP on 127.0.0.1.
+    """How local workers are connected (train only). inproc: as threads of this process, which then runs the environment.
+    ipc: local sockets. tcp: TCP on 127.0.0.1.
     """
     bind: str = "tcp://127.0.0.1:5555"
     """Address at which the learner listens for workers (learner only). With tcp://0.0.0.0:5555 other machines can join; this
