@@ -1,13 +1,17 @@
 """Start-up time and memory of a worker process: `python -m benchmarks.worker`.
 
 Measures the seconds from exec to the first rollout, and resident memory, of a real `python -m workers` over ipc with a hub
-alone. There are two policies: an MLP, which acts in numpy without torch, and an image policy, which needs torch.
+alone. There are two policies: an MLP, which acts in numpy without torch, and an image policy, which needs torch. A last row
+is a supervisor with the MLP's worker: the seconds to the first rollout through it, and its own memory, in which pages that
+it shares with other processes count in part (PSS).
 """
 
 from __future__ import annotations
 
 import argparse
 import statistics
+import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -37,8 +41,11 @@ CASES = {
 }
 
 
-def start_one(env: EnvSpec) -> tuple[float, float]:
-    """Seconds from exec to the first rollout, and resident megabytes after it."""
+SUPERVISOR = "supervisor of the MLP's worker"
+
+
+def start_one(env: EnvSpec, *, supervised: bool = False) -> tuple[float, float]:
+    """Seconds from exec to the first rollout, and megabytes after it: of the worker, resident; of a supervisor, PSS."""
     with describing(DescribeSpec(env)) as description:
         spaces = EnvSpaces.of_description(read_description(description))
     run = run_spec(resolve(env.id, lanes=1, envs=8, rollout_steps=128), env, spaces)
@@ -49,14 +56,19 @@ def start_one(env: EnvSpec) -> tuple[float, float]:
         hub = Hub(link, coordinator, HubSettings(no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=0))
         hub.publish(0, np.zeros(total_size(acting), np.float32), np.zeros(buffer_size(run.policy), np.float32))
         began_s = time.perf_counter()
-        worker = WorkerProcess(WorkerCommand(link.address, "w0", Path(folder) / "log"))
+        command = [sys.executable, "-m", "workers", link.address]
+        started = (
+            subprocess.Popen(command, stderr=subprocess.DEVNULL)
+            if supervised
+            else WorkerProcess(WorkerCommand(link.address, "w0", Path(folder) / "log"))
+        )
         hub.gather()
         took_s = time.perf_counter() - began_s
-        resident = psutil.Process(worker.pid).memory_info().rss / 2**20
+        memory = psutil.Process(started.pid).memory_full_info()
         hub.drain("measured")
-        worker.wait(10)
+        started.wait(30)
         link.close(0)
-    return took_s, resident
+    return took_s, (memory.pss if supervised else memory.rss) / 2**20
 
 
 def main() -> None:
@@ -64,8 +76,12 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=7)
     rounds = parser.parse_args().rounds
     turns = [{name: start_one(env) for name, env in CASES.items()} for _ in range(rounds)]
+    for turn in turns:
+        turn[SUPERVISOR] = start_one(CASES["MLP, CartPole-v1"], supervised=True)
     table = Table("policy", "to first rollout, s", "resident, MB", title=f"A worker process, medians of {rounds}")
-    found = {name: [statistics.median(column) for column in zip(*(t[name] for t in turns), strict=True)] for name in CASES}
+    found = {
+        name: [statistics.median(column) for column in zip(*(t[name] for t in turns), strict=True)] for name in turns[0]
+    }
     for name, (seconds, megabytes) in found.items():
         table.add_row(name, f"{seconds:.2f}", f"{megabytes:.0f}")
     Console().print(table)

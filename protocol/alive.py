@@ -13,6 +13,7 @@ from protocol.message_base import Message
 
 Doing = Literal["starting", "waiting", "describing", "making", "resetting", "stepping", "evaluating", "closing"]
 """What a worker does, as its supervisor sees it. Environment code runs in all of these except `starting` and `waiting`."""
+CLOSE_S = 10.0  # for one env copy; what hangs in `close` has done its work
 NO_ENVIRONMENT_CODE: frozenset[Doing] = frozenset({"starting", "waiting"})
 
 
@@ -65,19 +66,22 @@ class CallTimeouts:
                 limit = self.construct_s
             case "resetting":
                 limit = self.reset_s
-            case "stepping" | "evaluating" | "closing":
+            case "stepping" | "evaluating":
                 limit = self.step_s
+            case "closing":
+                limit = CLOSE_S
             case "starting" | "waiting":
                 limit = 0.0
         return limit or float("inf")
 
     def reason(self, doing: Doing) -> str:
         """Why a worker is ended that exceeds its limit. The line names the flag."""
+        if doing == "closing":
+            return f"was ended: close() of its environment took longer than {CLOSE_S:g} s"
         call, flag = {
             "describing": ("the construction of its environment", "construct"),
             "making": ("the construction of its environment", "construct"),
             "resetting": ("a reset of its environment", "reset"),
-            "closing": ("close() of its environment", "step"),
         }.get(doing, ("a step of its environment", "step"))
         return f"was ended: {call} took longer than {self.limit_s(doing):g} s (--{flag}-timeout-s)"
 

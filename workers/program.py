@@ -10,6 +10,7 @@ import argparse
 import os
 import signal
 import sys
+import threading
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -29,6 +30,7 @@ from workers.watchdog import Watchdog
 from workers.worker import Worker, WorkerOptions, identity, no_limit, parent_is_gone
 
 LEAVE_AT_ONCE = 2  # requests to leave: the rollout in progress is abandoned
+LOOK_FOR_PARENT_S, LEAVE_WITHIN_S = 0.5, 2.0  # after the supervisor's death
 AFTER_SUPERVISOR_S = 60.0  # how much later than the supervisor the watchdog ends a worker that hangs
 
 
@@ -46,6 +48,7 @@ def work(flags: argparse.Namespace, token: Token | None, timeouts: CallTimeouts,
         os.sched_setaffinity(0, {flags.core})
     limits = (timeouts.construct_s, timeouts.reset_s, timeouts.step_s)
     watchdog = Watchdog(max(limits) + AFTER_SUPERVISOR_S) if all(limits) else None
+    threading.Thread(target=_end_after_supervisor, args=(flags.parent, flags.address), daemon=True).start()
     session = Session(identity(flags.name, nonce), time.monotonic(), join_timeout_s=flags.join_timeout_s)
     options = WorkerOptions(
         code=AllowedCode.REGISTERED if flags.no_code else allowed_code(flags.address, token),
@@ -69,6 +72,15 @@ def work(flags: argparse.Namespace, token: Token | None, timeouts: CallTimeouts,
 def _exit_code(code: int, reason: str) -> int:
     """The exit code of this process: what the supervisor needs to know."""
     return EXIT_NO_LEARNER if reason.startswith(NO_LEARNER) else code
+
+
+def _end_after_supervisor(parent: int, address: str) -> None:
+    """End this process if the supervisor is dead and the environment does not return, so that the worker cannot leave."""
+    while not parent_is_gone(parent):
+        time.sleep(LOOK_FOR_PARENT_S)
+    time.sleep(LEAVE_WITHIN_S)
+    _remove_socket_of_killed_parent(address)
+    _kill_own_group()
 
 
 def _kill_own_group() -> None:

@@ -165,7 +165,7 @@ spec:
       terminationGracePeriodSeconds: 30  # for the current rollout
 {_pod()}
       containers:
-        - name: worker  # no probe: a worker ends by itself when a step hangs or no learner answers
+        - name: worker  # no probe: its supervisor ends a worker whose step hangs; it ends itself when no learner answers
           image: {json.dumps(flags.worker_image)}
           imagePullPolicy: IfNotPresent
           args: {_args(args)}

@@ -154,7 +154,7 @@ def test_training_goes_on_after_an_environment_raised(stage: Stage) -> None:
     learner.trains(2)
     within("env.step raised", time.monotonic() - began_s, 2.0)
     assert learner.ledger()["lost"] > 0
-    learner.hears(r"worker w\d \(.*\) joined", times=3)  # its supervisor has started another
+    learner.hears(r"worker w\d \(.*\) joined", START_S, times=3)  # its supervisor has started another
     finish(learner, workers)
 
 
@@ -171,6 +171,7 @@ def test_training_goes_on_after_an_environment_hung(stage: Stage) -> None:
     assert "silent" not in learner.said()
     assert any("toy.py" in worker.said() for worker in workers), "it does not say where it hung"
     learner.trains()
+    learner.hears(r"worker w\d \(.*\) joined", START_S, times=3)  # its supervisor has started another
     finish(learner, workers)
 
 

@@ -1,8 +1,9 @@
 """Tells the learner, on a connection of the supervisor's own, which workers are alive, what they do, and how others ended.
 
 Rule: it says so about every second, and more often while a call of an environment takes long. An ended worker is named for a
-while, because a message may be lost; not at once, so that its own last messages come first. Nothing is sent before a worker
-has joined: a wrong address or key is the worker's to report. This file imports neither numpy nor gymnasium.
+while, because a message may be lost: a failed one at once, one that left on purpose a moment later, so that its own last
+messages come first. Nothing is sent before a worker has joined: a wrong address or key is the worker's to report. This file
+imports neither numpy nor gymnasium.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ class AliveSender:
         self._socket: zmq.Socket[bytes] | None = None
         self._due_s = 0.0
         self._ended: list[tuple[float, WorkerExit]] = []
+        self._reported: set[int] = set()  # nonces of the ended workers that the last message named
         self._over = False
         self._encoder = msgspec.msgpack.Encoder()
 
@@ -47,10 +49,12 @@ class AliveSender:
         slow = any(each.for_s > SLOW_S and each.doing != "waiting" for each in joined)
         if slow:
             self._due_s = min(self._due_s, now + EVERY_S_WHILE_SLOW)
-        if now < self._due_s or not (joined or self._ended):
+        reported = tuple(each for at, each in self._ended if each.failed or now - at >= ENDED_AFTER_S)
+        news = not self._reported.issuperset(each.process_nonce for each in reported)
+        if (now < self._due_s and not news) or not (joined or reported):
             return
+        self._reported = {each.process_nonce for each in reported}
         self._due_s = now + (EVERY_S_WHILE_SLOW if slow else EVERY_S)
-        reported = tuple(each for at, each in self._ended if now - at >= ENDED_AFTER_S)
         for first in range(0, max(len(joined), 1), MAX_WORKERS):
             self._say(Alive(tuple(joined[first : first + MAX_WORKERS]), reported[:MAX_WORKERS]))
 

@@ -162,12 +162,13 @@ class WorkerProcess:
             stacks = self._page.stacks()
             self._write(stacks)
             where = deepest_frame(stacks)
-            return Ending(code, one_line(self._because + (f", at {where}" if where else "")), failed=True)
+            return Ending(code, one_line(self._because + (f", at {where}" if where else "")), failed=page.doing != "closing")
         if page.exit_code is not None:
             last = output.strip().splitlines()[-1:] if page.exit_code else []
             line = f"ended with exit code {page.exit_code}{f' ({last[0]})' if last else ''}"
             return Ending(page.exit_code, one_line(line), on_purpose=True)
-        failed = page.env_calls > 0 or page.doing not in NO_ENVIRONMENT_CODE
+        # In `close`, an environment has done its work: that its process ends there does not count against the run.
+        failed = page.doing != "closing" and (page.env_calls > 0 or page.doing not in NO_ENVIRONMENT_CODE)
         if code < 0:
             return Ending(code, f"was killed by {signal.Signals(-code).name}{WHILE[page.doing]}", failed=failed)
         if (hung := where_it_hung(output)) is not None:

@@ -1,0 +1,108 @@
+"""The page that a worker shares with its supervisor."""
+
+from __future__ import annotations
+
+import math
+from time import perf_counter
+
+import gymnasium
+import pytest
+
+from protocol.alive import CallTimeouts
+from workers.env_errors import CopyRaised
+from workers.env_loop import EnvLoop
+from workers.envs.toy import Countdown
+from workers.supervise.activity import DOING, ENV_CALLS, SINCE_S, Activity, ActivityReader, activity, share_activity
+
+
+class Watched(Countdown):
+    """Notes what the page says while each of its methods runs."""
+
+    seen: list[str]
+
+    def _note(self) -> None:
+        Watched.seen.append(ActivityReader(activity()).read(perf_counter()).doing)
+
+    def __init__(self) -> None:
+        self._note()
+        super().__init__(k=2)
+
+    def reset(self, **keywords: object) -> tuple[object, dict[str, object]]:  # type: ignore[override]
+        self._note()
+        return super().reset()
+
+    def step(self, action: object) -> tuple[object, float, bool, bool, dict[str, object]]:  # type: ignore[override]
+        self._note()
+        return super().step(action)
+
+    def close(self) -> None:
+        self._note()
+
+
+def test_the_page_says_what_a_loop_does_at_each_moment() -> None:
+    Watched.seen = []
+    page = Activity()
+    share_activity(page)
+    reader = ActivityReader(page)
+    loop = EnvLoop([Watched] * 2, lambda: Watched.seen.append(reader.read(perf_counter()).doing))
+    assert Watched.seen == ["starting", "making", "waiting", "making"]
+    Watched.seen = []
+    loop.reset(range(2), [1, 2], [None, None], lambda: None)
+    for _ in range(3):  # the third resets
+        loop.step([0, 0], [None, None], lambda: None)
+    assert Watched.seen == ["resetting"] * 2 + ["stepping"] * 4 + ["resetting"] * 2
+    assert reader.read(perf_counter()).doing == "waiting"
+    assert reader.read(perf_counter()).env_calls >= 2 + 2 + 6
+    Watched.seen = []
+    loop.close()
+    assert Watched.seen == ["closing"] * 2
+
+
+class Exits(Countdown):
+    """Calls `sys.exit` in `step`."""
+
+    def step(self, action: object) -> tuple[object, float, bool, bool, dict[str, object]]:  # type: ignore[override]
+        raise SystemExit(0)
+
+
+@pytest.mark.parametrize("kind", [SystemExit, KeyboardInterrupt])
+def test_an_exit_in_environment_code_is_caught(kind: type[BaseException]) -> None:
+    def make() -> gymnasium.Env[object, object]:
+        raise kind(0)
+
+    with pytest.raises(CopyRaised):
+        EnvLoop([make], lambda: None)
+    loop = EnvLoop([Exits], lambda: None)
+    loop.reset([0], [1], [None], lambda: None)
+    with pytest.raises(CopyRaised):
+        loop.step([0], [None], lambda: None)
+
+
+def test_whatever_environment_code_writes_to_the_page_fits_the_message() -> None:
+    page = Activity()
+    reader = ActivityReader(page)
+    for code in (-1, 99, -(2**63)):
+        page.numbers[DOING] = page.numbers[ENV_CALLS] = code
+        page.seconds[SINCE_S] = math.nan
+        read = reader.read(1.0)
+        assert (read.doing, read.for_s) == ("waiting", 0.0)
+        assert 0 <= read.env_calls <= 2**53
+
+
+def test_only_a_worker_that_says_so_leaves_on_purpose() -> None:
+    page = Activity()
+    reader = ActivityReader(page)
+    assert reader.read(1.0).exit_code is None
+    page.leave(0)
+    assert reader.read(1.0).exit_code == 0
+
+
+def test_each_call_has_its_own_timeout_and_zero_is_never() -> None:
+    timeouts = CallTimeouts(1.0, 2.0, 0.0)
+    assert [timeouts.limit_s(doing) for doing in ("making", "resetting", "stepping", "waiting")] == [
+        1,
+        2,
+        math.inf,
+        math.inf,
+    ]
+    assert "a reset of its environment took longer than 2 s (--reset-timeout-s)" in timeouts.reason("resetting")
