@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from learner.algorithms import algorithm_class
 from learner.config.hyperparameters import HYPERPARAMETERS
@@ -25,6 +26,7 @@ from protocol.policy.torch_policy import TorchPolicy
 from protocol.specs import NamedShape, PolicySpec
 from tests.support.batches import DISCRETE, IMAGE, batch, no_pulse, recurrent
 from tests.support.described import run_spec
+from tests.support.sampled_rounding import in_float64, sampled
 
 HERE = "tests.support.custom_encoders"
 
@@ -77,13 +79,16 @@ def test_acting_with_it_is_learning_with_it(spec: PolicySpec) -> None:
     assert isinstance(policy, TorchPolicy)
     policy.load(net.flat.numpy()[: net.acting_size], np.zeros(int(spec.head == "q"), np.float32))
     obs = np.random.default_rng(0).normal(size=(2, 3, 4)).astype(np.float32)
+    state = torch.zeros(6, spec.state_size)
+
+    def params(net: ActorCriticNetwork | QNetwork, x: Tensor, state: Tensor) -> Tensor:
+        return net.act(x, (), state)[0] if isinstance(net, ActorCriticNetwork) else net.params(x)
+
+    x = torch.tensor(obs).flatten(0, 1)
+    exact = in_float64(net)
+    (expected,) = sampled(lambda: [params(exact, x.double(), state.double())])
     with torch.no_grad():
-        x = torch.tensor(obs).flatten(0, 1)
-        if isinstance(net, ActorCriticNetwork):
-            params, _ = net.act(x, (), torch.zeros(6, spec.state_size))
-        else:
-            params = net.params(x)
-    np.testing.assert_allclose(policy([obs])[..., :4].reshape(6, 4), params.numpy(), atol=1e-6)
+        expected.assert_is(params(net, x, state).numpy(), policy([obs])[..., :4].reshape(6, 4))
 
 
 def test_one_that_is_different_here_is_refused() -> None:
@@ -136,8 +141,9 @@ def test_a_setting_names_it_and_a_run_folder_keeps_it(tmp_path: Path) -> None:
     policy, found, _ = load_policy(folder.path)
     assert found == spec
     obs = np.ones((1, 1, 4), np.float32)
-    with torch.no_grad():
-        np.testing.assert_allclose(policy([obs])[0, :, :2], net.params(torch.tensor(obs[0])).numpy(), atol=1e-6)
+    exact = in_float64(net)
+    (expected,) = sampled(lambda: [exact.params(torch.tensor(obs[0]).double())])
+    expected.assert_is(policy([obs])[0, :, :2])
 
 
 def test_a_worker_that_cannot_be_sure_of_the_learner_imports_no_encoder() -> None:

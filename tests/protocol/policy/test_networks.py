@@ -24,6 +24,7 @@ from protocol.policy.torch_distributions import log_prob_and_entropy
 from protocol.policy.torch_policy import TorchPolicy
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 from tests.support.rounding import assert_within, log_prob_tolerance, params_variance, tolerance_of
+from tests.support.sampled_rounding import in_float64, sampled
 
 BOX = Leaf("x", "box", (2, 3), "float32")
 OBSERVATIONS = {
@@ -158,14 +159,19 @@ def test_forward_and_gradients_are_those_of_the_textbook(observation: tuple[Leaf
     obs = leaves(observation, (6,), generator)
     x = torch.tensor(features(spec, obs))
     images = [torch.tensor(array) for leaf, array in zip(observation, obs, strict=True) if leaf.is_image]
-    gradients = []
-    for params, value in (net.forward(x, images), plain(net, x, images)):
-        net.flat_grad.zero_()
-        (params.sin().sum() + value.square().sum()).backward()  # type: ignore[no-untyped-call]
-        gradients.append((params.detach(), value.detach(), net.flat_grad.clone()))
-    for ours, textbook in zip(*gradients, strict=True):
-        torch.testing.assert_close(ours, textbook, atol=1e-4, rtol=1e-4)
-    assert all((p.grad != 0).any() for p in net.parameters.values() if p.grad is not None)
+    exact = in_float64(net)
+
+    def textbook() -> list[Tensor]:
+        params, value = plain(exact, x.double(), images)
+        loss = params.sin().sum() + value.square().sum()
+        return [params, value, *torch.autograd.grad(loss, list(exact.parameters.values()))]
+
+    params, value = net.forward(x, images)
+    (params.sin().sum() + value.square().sum()).backward()  # type: ignore[no-untyped-call]
+    gradients = [p.grad for p in net.parameters.values() if p.grad is not None]
+    for ours, expected in zip([params, value, *gradients], sampled(textbook), strict=True):
+        expected.assert_is(ours.detach().numpy())
+    assert all((gradient != 0).any() for gradient in gradients)
 
 
 @pytest.mark.parametrize("relu", [False, True])
@@ -261,7 +267,9 @@ def test_torch_policy_gives_each_lane_the_bits_it_gets_alone(observation: tuple[
         np.testing.assert_array_equal(together[lane], it.policy([array[lane : lane + 1] for array in obs])[0])
     x = torch.tensor(normalize(features(it.spec, obs), *np.split(it.buffers, 2)).reshape(15, -1))
     images = [torch.tensor(a.reshape(15, *leaf.shape)) for leaf, a in zip(observation, obs, strict=True) if leaf.is_image]
-    np.testing.assert_allclose(together.reshape(15, 8), it.net.params(x, images).detach(), atol=1e-5, rtol=1e-5)
+    exact = in_float64(it.net)
+    (expected,) = sampled(lambda: [exact.params(x.double(), images)])
+    expected.assert_is(it.net.params(x, images).detach().numpy(), together.reshape(15, 8))
 
 
 @pytest.mark.parametrize("observation", IMAGES.values())
