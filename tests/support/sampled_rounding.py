@@ -27,9 +27,9 @@ from tests.support.rounding import ELEMENTWISE, UNIT, assert_within, tolerance_o
 
 SAMPLES = 16
 
-EXACT = frozenset(
-    ["_to_copy", "_unsafe_view", "cat", "clone", "new_ones", "ones_like", "relu", "relu_"]
-    + ["select_backward", "threshold_backward", "unsafe_split"]
+EXACT = (
+    *("_to_copy", "_unsafe_view", "cat", "clone", "new_ones", "ones_like", "relu", "relu_"),
+    *("select_backward", "threshold_backward", "unsafe_split"),
 )
 # How large the terms are whose roundings make up the error of one element, by the arguments and the result.
 ELEMENTWISE_SIZES: dict[str, Callable[[Sequence[Any], Tensor], Tensor]] = {
@@ -97,7 +97,7 @@ def _magnitude(value: Any) -> Any:
     return abs(value) if isinstance(value, float) else value
 
 
-class _Noise(TorchDispatchMode):
+class _Noise(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """Adds noise to the result of each operation on float64 numbers, and refuses operations that it does not know."""
 
     @classmethod
@@ -105,7 +105,7 @@ class _Noise(TorchDispatchMode):
         return False  # else torch imports its compiler, which takes seconds, to exclude this class from compilation
 
     def __init__(self, generator: np.random.Generator) -> None:
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]
         self._generator = generator
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
