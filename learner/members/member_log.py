@@ -18,7 +18,7 @@ log = logging.getLogger("millrace.learner")
 
 MOST_WORKERS = 1_000  # whose budgets are remembered
 OF_A_WORKER = Allowance(lines=30, lines_per_s=0.2, bytes=MAX_TEXT, bytes_per_s=100)
-OF_A_KEY = Allowance(lines=5_000, lines_per_s=5, bytes=6 * MAX_TEXT, bytes_per_s=500)
+OF_A_KEY = Allowance(lines=5_000, lines_per_s=1, bytes=6 * MAX_TEXT, bytes_per_s=100)
 LINE_BYTES = 100  # that a line takes beside its text: time, level, line break
 
 
