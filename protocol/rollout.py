@@ -116,7 +116,7 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
             )
         if array.dtype.kind == "b" and array.size and array.view(np.uint8).max() > 1:
             raise BadRollout(f"{name}: expected bytes 0 and 1, got {array.view(np.uint8).max()}")
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
+        if array.dtype.kind == "f" and np.count_nonzero(np.isfinite(array)) != array.size:
             raise BadRollout(f"{name}: {describe_first_non_finite(array)}")
     if not 0 <= rollout.lane < run.lanes:
         raise BadRollout(f"lane: expected 0 to {run.lanes - 1}, got {rollout.lane}")
@@ -126,12 +126,13 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
             if (counts < 0).any() or (counts >= np.reshape(leaf.sizes, leaf.shape)).any():
                 raise BadRollout(f"{_named(leaf)}: expected values of its space, got {array.min()} to {array.max()}")
     choices = np.reshape(action.sizes, action.shape) if action.sizes else 2
-    if action.kind != "box" and ((rollout.action < 0).any() or (rollout.action >= choices).any()):
+    # `count_nonzero` takes a third of the time of `any`
+    if action.kind != "box" and np.count_nonzero((rollout.action < 0) | (rollout.action >= choices)):
         raise BadRollout(
             f"action: expected 0 to {max(action.sizes, default=2) - 1}, got {rollout.action.min()} to {rollout.action.max()}"
         )
     ended = rollout.terminated | rollout.truncated
-    if (rollout.valid[1:] == ended[:-1]).any():
+    if np.count_nonzero(rollout.valid[1:] == ended[:-1]):
         t, n = np.argwhere(rollout.valid[1:] == ended[:-1])[0]
         raise BadRollout(f"valid: expected {not ended[t, n]} at step {t + 1}, copy {n}, got {bool(rollout.valid[t + 1, n])}")
     if len(rollout.episodes) != int(np.count_nonzero(ended & rollout.valid)):
