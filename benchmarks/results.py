@@ -17,9 +17,11 @@ import msgspec
 
 from learner.config.config import Config
 from learner.config.layers import config_of_run, resolve
-from learner.evaluate import evaluate, load_policy
+from learner.policy_player import saved_policy
+from learner.rollouts.evaluation_tickets import EvaluationPlan, evaluation_of
 from learner.run_folder.results import Evaluation, Summary
 from learner.run_folder.run_folder import RunFolder, Which
+from millrace.launch.policy_workers import PlayingWorkers, policy_player
 
 OUT = Path(__file__).parents[1] / "docs" / "results.md"
 EPISODES = 100
@@ -62,15 +64,16 @@ def read(path: Path) -> Run | None:
     config, summary = config_of_run(path), folder.summary()
     if summary is None:
         return None
-    best = _played(path, summary.best.evaluation if summary.best else None, "best")
-    return Run(config, summary, best, _played(path, summary.evaluation, "final"))
+    best = _played(path, config, summary.best.evaluation if summary.best else None, "best")
+    return Run(config, summary, best, _played(path, config, summary.evaluation, "final"))
 
 
-def _played(path: Path, found: Evaluation | None, which: Which) -> float | None:
+def _played(path: Path, config: Config, found: Evaluation | None, which: Which) -> float | None:
     """The mean return over `EPISODES` episodes. They are played here if the run's own evaluation had another number."""
     if found is not None and found.episodes != EPISODES:
-        policy, spec, env = load_policy(path, which)
-        found = evaluate(env, policy, spec, EPISODES, OTHER_EPISODES)
+        plan = EvaluationPlan.of(EPISODES, OTHER_EPISODES, config.eval_copies, config.eval_max_steps)
+        with policy_player(saved_policy(path, which), PlayingWorkers(config.workers), lambda text: None) as player:
+            found = evaluation_of(player.play(plan))
     return None if found is None else found.return_mean
 
 

@@ -20,6 +20,7 @@ from learner.run_folder.run_folder import RunFolder, Which
 from protocol.arrays import Floats
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
+from protocol.policy.policy import Policy, make_policy
 from protocol.specs import DescribeSpec, PolicySpec, RunSpec
 from protocol.wire.learner_link import LearnerLink
 
@@ -39,6 +40,14 @@ def saved_policy(run: Path, which: Which = "final") -> SavedPolicy:
     """Read a policy of a run folder. Raises `UsageError`, with a one-line message, if it cannot be read."""
     card, parameters, buffers = RunFolder.open(run).read_policy(which)
     return SavedPolicy(card.policy, EnvSpec(card.env, card.env_kwargs), parameters, buffers)
+
+
+def load_policy(run: Path, which: Which = "final") -> tuple[Policy, PolicySpec, EnvSpec]:
+    """A policy of a run folder that can act, its spec, and the environment for which it was trained. Raises `UsageError`."""
+    saved = saved_policy(run, which)
+    policy = make_policy(saved.spec)
+    policy.load(saved.parameters, saved.buffers)
+    return policy, saved.spec, saved.env
 
 
 class PolicyPlayer:

@@ -30,18 +30,13 @@ LEARNER = {  # what each folder of the learner may import of the learner; train.
     "rollouts": {"members", "run_folder"},
     "vector_env": {"members"},
     "run_folder": set[str](),
-    "recording": {"run_folder", "rollouts", "evaluate"},
+    "recording": {"run_folder", "rollouts", "policy_player"},
     "report": {"run_folder"},
 }
 MAY_PRINT = {"millrace/cli/main.py", "millrace/terminal.py"}
 MAY_UNPICKLE = {"protocol/env_spec.py"}
 ENVIRONMENT_CODE = {"make", "make_vec", "make_vectorized", "registered", "make_native", "envpool_spec"}
 """functions that run code of the environment: of gymnasium, of `EnvSpec` and of protocol/envs/"""
-RUNS_ENVIRONMENTS = {  # evaluation and recording; everything else of the learner must not
-    "learner/evaluate.py",
-    "learner/recording/record.py",
-    "learner/recording/video.py",
-}
 TORCH_IN_PROTOCOL = "protocol/policy/"
 TORCH_INTERNALS = "learner/algorithms/kernels/"
 MOST_FILES = 16  # in a folder
@@ -202,10 +197,9 @@ def test_nothing_is_pickled_but_in_the_one_guarded_place() -> None:
 
 
 def test_the_learner_runs_no_code_of_the_environment() -> None:
-    """Workers describe the environment (`DescribeSpec`): the learner's machine need not have it."""
+    """Workers describe it (`DescribeSpec`), evaluate and record: the learner's machine need not have it."""
     for source in sources("learner"):
-        if source not in RUNS_ENVIRONMENTS:
-            assert not [where for name in ENVIRONMENT_CODE for where in every_call(source, name)], source
+        assert not [where for name in ENVIRONMENT_CODE for where in every_call(source, name)], source
 
 
 def every_call(source: str, name: str) -> Iterator[str]:
@@ -269,7 +263,7 @@ def test_every_public_name_of_millrace_is_documented() -> None:
         "millrace.cli.main",
         "learner.config.command_line",
         "learner.report.learning_curves",
-        "learner.evaluate",
+        "learner.policy_player",
         "learner.algorithms",
     ],
 )

@@ -13,10 +13,11 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from learner.evaluate import load_policy
+from learner.policy_player import PolicyPlayer
 from learner.recording.minari import MinariDataset
 from learner.recording.npy_rows import NpyRows
-from learner.recording.player import Player
+from learner.recording.played_episodes import PlayedEpisodes
+from learner.recording.training_recorder import EnvironmentOfDataset
 from protocol.errors import UsageError
 
 
@@ -38,6 +39,7 @@ class RecordedDataset(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def record(
+    player: PolicyPlayer,
     run: Path,
     dataset_id: str,
     steps: int,
@@ -45,34 +47,26 @@ def record(
     *,
     stochastic: bool = False,
     npy: Path | None = None,
-    best: bool = False,
 ) -> RecordedDataset:
-    """Play the policy of a run folder and write a dataset of at least `steps` env steps.
+    """Have the workers of `player` play the policy of this run folder, and write a dataset of at least `steps` env steps.
 
-    `stochastic`: draw actions from the policy; otherwise take the most probable ones. `npy`: also write this file. `best`:
-    use the best policy of the run's own evaluations instead of the newest.
-    Raises `UserFacingError` if this fails; then no files are left.
+    `stochastic`: draw actions from the policy; otherwise take the most probable ones. `npy`: also write this file.
+    Raises `UserFacingError`; then it leaves no files.
     """
-    policy, spec, env_spec = load_policy(run, "best" if best else "final")
     if npy is not None and not npy.parent.is_dir():
         raise UsageError(f"{npy} cannot be written: no such folder {npy.parent}")
-    env = env_spec.make()
+    env = EnvironmentOfDataset(player.describe())
     how = "drawn from" if stochastic else "the most probable of"
     about = f"Actions {how} the policy of millrace run {run.resolve().name}; seed {seed}."
     returns: list[float] = []
     taken = cut = 0
-    try:
-        player = Player(env, policy, spec, seed, stochastic)
-        with NpyRows(npy) as rows, MinariDataset(dataset_id, env, about) as dataset:
-            while taken < steps:
-                episode = player.episode(longest=2 * steps - taken)
-                dataset.add(episode)
-                rows.add(episode)
-                returns.append(episode.episode_return)
-                taken += episode.length
-                cut += player.was_cut
-    finally:
-        env.close()
+    with NpyRows(npy) as rows, MinariDataset(dataset_id, env, about) as dataset:
+        for episode, was_cut in PlayedEpisodes(player, seed, stochastic=stochastic).until(steps):
+            dataset.add(episode)
+            rows.add(episode)
+            returns.append(episode.episode_return)
+            taken += episode.length
+            cut += was_cut
     return RecordedDataset(
         dataset_id=dataset_id,
         episodes=len(returns),

@@ -29,7 +29,7 @@ class TrainingRecorder:
         self._assembler = EpisodeAssembler(make_action_converter(spec.action))
         self._id = dataset_id
         self._episodes = 0
-        self._dataset = MinariDataset(dataset_id, _EnvironmentOfDataset(env), about)
+        self._dataset = MinariDataset(dataset_id, EnvironmentOfDataset(env), about)
 
     def add(self, rollouts: Sequence[AcceptedRollout]) -> None:
         """Add the rollouts of an update."""
@@ -48,9 +48,10 @@ class TrainingRecorder:
         return f"dataset {self._id}: {self._episodes:,} training episodes; {parts:,} steps of others left out"
 
 
-class _EnvironmentOfDataset(gymnasium.Env[Any, Any]):
+class EnvironmentOfDataset(gymnasium.Env[Any, Any]):
     """What Minari reads of an environment: its spaces and its spec. Nobody steps it."""
 
     def __init__(self, env: DescribedEnv) -> None:
+        """`env`: the environment as a worker described it."""
         self.observation_space, self.action_space = env.observation_space, env.action_space
         self.metadata, self.spec = env.metadata, env.spec

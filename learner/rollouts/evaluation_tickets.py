@@ -14,9 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from learner.members.membership import Member, Outgoing
+from learner.rollouts.row_checks import reason_to_reject
 from learner.run_folder.results import Evaluation
 from protocol.messages import EpisodeRows, Evaluate, Evaluated, Heartbeat
 from protocol.rollout import LARGEST_REWARD, Episode
+from protocol.specs import PolicySpec
 
 FIRST_TICKET = 1 << 52
 HELD_AT_ONCE = 2  # tickets of one worker: while the learner takes the answer to one, the worker plays the other
@@ -72,7 +74,9 @@ def evaluation_of(played: Sequence[PlayedEpisode]) -> Evaluation:
 class EvaluationTickets:
     """The tickets of the evaluation that is pending, if there is one."""
 
-    def __init__(self) -> None:
+    def __init__(self, policy: PolicySpec) -> None:
+        """`policy`: that of the run, which says what rows look like."""
+        self._policy = policy
         self._plan: EvaluationPlan | None = None
         self._version = -1
         self._on_rows: OnRows | None = None
@@ -155,10 +159,12 @@ class EvaluationTickets:
             return ""
         if rows.episode >= len(self._seeds[index]):
             return f"rows of ticket {rows.ticket}: expected an episode below {len(self._seeds[index])}, got {rows.episode}"
+        assert self._plan is not None
+        if why := reason_to_reject(rows, self._policy, self._plan.most_steps):
+            return f"rows of ticket {rows.ticket}: {why}"
         key = (index, rows.episode)
         if rows.first_step == self._next_rows.get(key, 0):
             self._next_rows[key] = rows.first_step + len(rows.reward)
-            assert self._plan is not None
             self._on_rows(index * self._plan.copies + rows.episode, rows)
         return ""
 

@@ -103,7 +103,7 @@ class TicketCoordinator:
         self.lanes = [TicketedLane(n, incarnations[n] if incarnations else 0) for n in range(run.lanes)]
         self.tickets: dict[int, Ticket] = {}
         self.ready: list[AcceptedRollout] = []
-        self.evaluation = EvaluationTickets()
+        self.evaluation = EvaluationTickets(run.policy)
         self._held_back = False  # whether to deal no ticket for a rollout, because an evaluation is about to begin
         self._placement, self._queue = LanePlacement(self.lanes, _by_joining), LaneQueue(self.lanes)
         self._oldest_ready = version  # no rollout that is ready is older

@@ -65,6 +65,12 @@ class RecordFlags(msgspec.Struct, frozen=True, kw_only=True):
     """sample actions from the policy, as in training, instead of taking the most probable ones"""
     seed: int = 2_000_000
     """seed of the episodes and of the sampled actions"""
+    workers: int = 2
+    """number of worker processes that play the episodes; the dataset does not depend on it"""
+    transport: Literal["inproc", "ipc", "tcp"] = "ipc"
+    """how local workers are connected: as threads of this process, by local sockets, or by TCP"""
+    bind: str = ""
+    """address at which workers join that are started elsewhere, as tcp://0.0.0.0:5555; then none are started here"""
     debug: bool = False
     """show the traceback of an error"""
 

@@ -11,7 +11,7 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # before numpy; --torch-threads sets the learner's
@@ -170,33 +170,41 @@ def _evaluate(argv: list[str]) -> int:
     from millrace.launch.policy_workers import PlayingWorkers, policy_player
     from millrace.terminal import count_line
 
-    which: Literal["best", "final"] = "best" if flags.best else "final"
     if flags.video:
-        from learner.evaluate import load_policy
-        from learner.recording.video import record_videos
+        from learner.recording.video import prepare_rendering, record_videos
 
-        policy, spec, env = load_policy(flags.run, which)
-        evaluation, videos = record_videos(flags.run, env, policy, spec, episodes, flags.seed)
-        print("\n".join(map(str, [evaluation, *videos])))
-        return 0
-    saved = saved_policy(flags.run, which)
-    plan = EvaluationPlan.of(episodes, flags.seed, flags.copies, flags.max_steps)
-    workers = PlayingWorkers(useful_workers(flags.workers, episodes, flags.copies), flags.transport, flags.bind)
+        prepare_rendering()
+    saved = saved_policy(flags.run, "best" if flags.best else "final")
+    copies = 1 if flags.video else flags.copies
+    workers = PlayingWorkers(useful_workers(flags.workers, episodes, copies), flags.transport, flags.bind)
     with count_line("evaluating") as watch, policy_player(saved, workers, watch) as player:
-        played = player.play(plan)
-    print(evaluation_of(played))
+        if flags.video:
+            evaluation, videos = record_videos(player, flags.run, episodes, flags.seed)
+        else:
+            videos = []
+            evaluation = evaluation_of(player.play(EvaluationPlan.of(episodes, flags.seed, copies, flags.max_steps)))
+    print("\n".join(map(str, [evaluation, *videos])))
     return 0
 
 
 def _record(argv: list[str]) -> int:
     from learner.config.flag_parser import parse_flags
-    from learner.recording.record import record
     from millrace.cli.flags import RecordFlags
 
     flags = parse_flags(RecordFlags, argv, "record")
     _at_least("steps", flags.steps, 1)
     _at_least("seed", flags.seed, 0)
-    print(record(flags.run, flags.out, flags.steps, flags.seed, stochastic=flags.stochastic, npy=flags.npy, best=flags.best))
+    _at_least("workers", flags.workers, 1)
+    from learner.policy_player import saved_policy
+    from learner.recording.record import record
+    from millrace.launch.policy_workers import PlayingWorkers, policy_player
+    from millrace.terminal import count_line
+
+    saved = saved_policy(flags.run, "best" if flags.best else "final")
+    workers = PlayingWorkers(flags.workers, flags.transport, flags.bind)
+    with count_line("recording") as watch, policy_player(saved, workers, watch) as player:
+        dataset = record(player, flags.run, flags.out, flags.steps, flags.seed, stochastic=flags.stochastic, npy=flags.npy)
+    print(dataset)
     if flags.npy is not None:
         print(f"rows of observation and action: {flags.npy}")
     return 0

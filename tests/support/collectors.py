@@ -12,17 +12,20 @@ import numpy as np
 from gymnasium.vector import SyncVectorEnv
 
 from learner.config.layers import resolve
+from learner.rollouts.evaluation_tickets import episode_seeds
 from millrace.launch.local_run import train
 from protocol.arrays import Array
 from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
+from protocol.messages import Evaluate
 from protocol.policy.layout import acting_size, buffer_size
 from protocol.policy.policy import Policy, make_policy
-from protocol.rollout import Rollout, validate
+from protocol.rollout import Episode, Rollout, validate
 from protocol.specs import PolicySpec, RunSpec
 from workers.collect.collector import Collector, OpenEnvCopies, open_env_copies
 from workers.collect.env_copies import LoopedCopies, VectorCopies
 from workers.collect.held_rollouts import Assignment
+from workers.evaluate.evaluator import Evaluator
 
 TOY = "workers.envs.toy:"
 VERSION, SESSION = 7, 3
@@ -79,6 +82,15 @@ def loop_over(makes: Sequence[Callable[[], gymnasium.Env[Any, Any]]]) -> OpenEnv
 def sync_vector_env_over(makes: Sequence[Callable[[], gymnasium.Env[Any, Any]]]) -> OpenEnvCopies:
     """A SyncVectorEnv over these copies, one of each."""
     return lambda run, lane, pulse: VectorCopies(SyncVectorEnv(makes))
+
+
+def evaluated(run: RunSpec, policy: Policy, episodes: int, seed: int) -> list[Episode]:
+    """Greedy episodes that an evaluator plays, 20 side by side."""
+    evaluator, seeds = Evaluator(run, policy), episode_seeds(seed, episodes)
+    orders = [Evaluate(1, 1, 0, seeds[i : i + 20], True, 10_000, False, False) for i in range(0, episodes, 20)]
+    played = [episode for order in orders for episode in evaluator.play(order, lambda rows: None, no_pulse).episodes]
+    evaluator.close()
+    return played
 
 
 def collect(

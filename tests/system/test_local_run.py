@@ -19,7 +19,7 @@ import pytest
 
 import millrace
 from learner.config.layers import config_from_toml, resolve
-from learner.evaluate import load_policy
+from learner.policy_player import load_policy
 from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.progress import Progress
 from millrace.launch.local_run import train

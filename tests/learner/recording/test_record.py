@@ -14,16 +14,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from learner.config.layers import resolve
-from learner.evaluate import load_policy
+from learner.policy_player import load_policy, saved_policy
 from learner.recording import minari as dataset_module
 from learner.recording.episodes import EpisodeAssembler, RecordedEpisode
-from learner.recording.player import Player
-from learner.recording.record import record
+from learner.recording.played_episodes import recording_seeds
+from learner.recording.record import RecordedDataset
+from learner.recording.record import record as record_with
 from learner.run_folder.run_folder import RunFolder
+from millrace.launch.policy_workers import PlayingWorkers, policy_player
 from protocol.env_spec import EnvSpec
-from protocol.envs.spaces import action_spec, observation_leaves
+from protocol.envs.spaces import action_spec, make_action_converter, make_flatten, observation_leaves
 from protocol.errors import EnvironmentFailed, RunError, UsageError, UserFacingError
+from protocol.policy.distributions import distribution
 from protocol.policy.layout import acting_size, buffer_size
+from protocol.policy.recurrent import zero_state
 from protocol.rollout import Rollout
 from protocol.specs import PolicySpec
 
@@ -235,11 +239,43 @@ def read(dataset_id: str) -> Any:
     return minari.load_dataset(dataset_id)
 
 
+def record(
+    run: Path,
+    dataset_id: str,
+    steps: int,
+    seed: int,
+    stochastic: bool = False,
+    npy: Path | None = None,
+    workers: int = 1,
+) -> RecordedDataset:
+    with policy_player(saved_policy(run), PlayingWorkers(workers, "inproc"), lambda text: None) as player:
+        return record_with(player, run, dataset_id, steps, seed, stochastic=stochastic, npy=npy)
+
+
 def played(run: Path, seed: int, stochastic: bool, episodes: int) -> list[RecordedEpisode]:
+    """The episodes as a plain loop plays them."""
     policy, spec, env_spec = load_policy(run)
-    env = env_spec.make()
-    player = Player(env, policy, spec, seed, stochastic)
-    return [player.episode(1000) for _ in range(episodes)]
+    env, chosen, write = env_spec.make(), distribution(spec), make_action_converter(spec.action)
+    read = make_flatten(env.observation_space)
+    found = []
+    for _, reset_seed in zip(range(episodes), recording_seeds(seed), strict=False):
+        generator = np.random.default_rng(reset_seed)
+        obs: list[Any] = [env.reset(seed=reset_seed)[0]]
+        rows: list[Any] = []
+        while not rows or not (rows[-1][2] or rows[-1][3]):
+            leaves = [
+                np.asarray(leaf, own.dtype)[None, None] for leaf, own in zip(read(obs[-1]), spec.observation, strict=True)
+            ]
+            params = policy(leaves, zero_state(spec, 1, 1))
+            action = chosen.sample(params, chosen.noise(generator, (1, 1))) if stochastic else chosen.mode(params)
+            taken = write(action[0])[0]
+            observation, reward, terminated, truncated, _ = env.step(taken)
+            obs.append(observation)
+            rows.append((taken, reward, terminated, truncated))
+        actions, rewards, terminations, truncations = (np.array(column) for column in zip(*rows, strict=True))
+        leaves = [np.stack(leaf) for leaf in zip(*map(read, obs), strict=True)]
+        found.append(RecordedEpisode(tuple(leaves), actions, rewards, terminations, truncations, reset_seed))
+    return found
 
 
 @pytest.mark.parametrize("chunk_bytes", [1, 2**30])
@@ -315,6 +351,15 @@ def test_the_same_seed_plays_the_same_and_drawn_actions_are_not_the_most_probabl
     assert not np.array_equal(first[0].action, drawn[0].action)
 
 
+def test_the_dataset_does_not_depend_on_the_number_of_workers(tmp_path: Path, root: Path) -> None:
+    run = a_run(tmp_path, EnvSpec("CartPole-v1"))
+    found = [record(run, f"tests/by-{n}-v0", 400, seed=1, stochastic=True, workers=n) for n in (1, 3)]
+    assert found[0].episodes == found[1].episodes > 5
+    for one, other in zip(read("tests/by-1-v0"), read("tests/by-3-v0"), strict=True):
+        assert np.array_equal(one.observations, other.observations)
+        assert np.array_equal(one.actions, other.actions)
+
+
 def test_the_notebooks_array_has_a_row_for_each_step(tmp_path: Path, root: Path) -> None:
     run = a_run(tmp_path, EnvSpec("millrace-tests/Box-v0"))
     record(run, "tests/box-v0", 10, seed=2, npy=tmp_path / "rows.npy")
@@ -360,9 +405,7 @@ def test_nothing_is_left_of_a_dataset_whose_environment_raises(
 ) -> None:
     monkeypatch.setattr(dataset_module, "CHUNK_BYTES", 1)  # some episodes are written by then
     run = a_run(tmp_path, EnvSpec("millrace-tests/Box-v0", {"fails_at": 20}))
-    error = fails(
-        run, "new/deep/box-v0", EnvironmentFailed, "Box-v0 raised while it was played: RuntimeError: the spring broke"
-    )
+    error = fails(run, "new/deep/box-v0", EnvironmentFailed, "its environment raised RuntimeError: the spring broke")
     assert "in step" in error.detail
     assert everything(root) == set()
 

@@ -9,7 +9,7 @@ import pytest
 
 from learner.config.command_line import read_config
 from learner.config.layers import config_of_run, resolve
-from learner.evaluate import load_policy
+from learner.policy_player import load_policy
 from learner.report.learning_curves import plot
 from learner.report.page import write_page
 from learner.run_folder.metrics_log import MetricsLog

@@ -14,7 +14,7 @@ from torch import Tensor
 from learner.algorithms import algorithm_class
 from learner.config.hyperparameters import HYPERPARAMETERS
 from learner.config.layers import resolve
-from learner.evaluate import load_policy
+from learner.policy_player import load_policy
 from learner.run_folder.run_folder import RunFolder
 from protocol.env_spec import AllowedCode, EnvSpec
 from protocol.errors import UsageError

@@ -15,11 +15,10 @@ from learner.algorithms.actor_critic import Estimates
 from learner.algorithms.minibatches import Minibatch
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
-from learner.evaluate import evaluate
-from learner.recording.player import Player
 from protocol.arrays import Array
 from protocol.env_spec import EnvSpec
 from protocol.errors import BadRollout
+from protocol.messages import Evaluate
 from protocol.policy.distributions import distribution
 from protocol.policy.layout import buffer_size
 from protocol.policy.networks import ActorCriticNetwork, RecurrentInput
@@ -30,12 +29,13 @@ from protocol.policy.torch_policy import TorchPolicy
 from protocol.rollout import Rollout, stack_rollouts, validate
 from protocol.specs import PolicySpec, RunSpec
 from tests.support.batches import DISCRETE, GAUSSIAN, IMAGE, batch, no_pulse, normal, recurrent, shared
-from tests.support.collectors import TOY, collect, random_collector, random_policy, run_of
+from tests.support.collectors import TOY, collect, evaluated, random_collector, random_policy, run_of
 from tests.support.rounding import ELEMENTWISE, UNIT, assert_within, core_tolerance, log_prob_tolerance
 from tests.support.sampled_rounding import in_float64, sampled
 from workers.collect.collector import Collector
 from workers.collect.held_rollouts import Assignment
 from workers.envs.toy import Scripted
+from workers.evaluate.evaluator import Evaluator
 
 Core = Literal["lstm", "gru"]
 CORES: tuple[Core, Core] = ("lstm", "gru")
@@ -285,7 +285,7 @@ def learned(name: str, core: Core | None, updates: int) -> float:
     collector.close_all()
     policy = make_policy(spec)
     policy.load(*algorithm.weights())
-    greedy = evaluate(EnvSpec(f"{TOY}Recall-v0"), policy, spec, 60, seed=3).return_mean
+    greedy = float(np.mean([episode.reward for episode in evaluated(run, policy, 60, seed=3)]))
     return min(greedy, float(np.mean([episode.reward for rollout in rollouts for episode in rollout.episodes])))
 
 
@@ -322,11 +322,8 @@ class Watching:
 
 
 def test_an_evaluation_begins_each_episode_without_memory() -> None:
-    spec = run_of(f"{TOY}Scripted-v0", core="gru").policy
-    assert evaluate(EnvSpec.of(Ragged), Watching(), spec, 50, seed=0).episodes == 50
-
-
-def test_a_recording_begins_each_episode_without_memory() -> None:
-    spec = run_of(f"{TOY}Scripted-v0", core="gru").policy
-    player = Player(Ragged(), Watching(), spec, seed=0)
-    assert len({player.episode(longest=100).length for _ in range(9)}) > 2
+    run = run_of(f"{TOY}Scripted-v0", core="gru")
+    evaluator = Evaluator(msgspec.structs.replace(run, env=EnvSpec.of(Ragged)), Watching())
+    orders = [Evaluate(1, seed, 0, (seed,), True, 100, False, False) for seed in range(50)]
+    lengths = [evaluator.play(order, lambda rows: None, no_pulse).episodes[0].length for order in orders]
+    assert len(set(lengths)) > 2

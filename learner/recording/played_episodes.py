@@ -1,0 +1,119 @@
+"""Plays episodes with workers and keeps their rows. Each episode is a ticket of its own, and depends on its seed alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from learner.policy_player import PolicyPlayer
+from learner.recording.episodes import RecordedEpisode
+from learner.rollouts.evaluation_tickets import EvaluationPlan
+from protocol.arrays import Array
+from protocol.envs.spaces import make_action_converter
+from protocol.messages import EpisodeRows
+
+FIRST_EPISODES = 2  # played before their size is known
+CHUNK_BYTES = 256 * 2**20  # about the memory that the episodes of one plan may take
+MOST_EPISODES = 256  # of one plan
+
+
+def recording_seeds(seed: int) -> Iterator[int]:
+    """The reset seeds of a recording's episodes, one after another."""
+    generator = np.random.default_rng([seed, 0])
+    while True:
+        yield int(generator.integers(2**31))
+
+
+class Played(NamedTuple):
+    """An episode that workers played."""
+
+    episode: RecordedEpisode
+    cut: bool
+    """whether it was stopped because it was too long"""
+    frames: list[Array]
+    """[H, W, 3] uint8 for each of the first observations, if they were asked for"""
+
+
+class PlayedEpisodes:
+    """Episodes of a policy, in the order of their seeds."""
+
+    def __init__(self, player: PolicyPlayer, seed: int, *, stochastic: bool = False) -> None:
+        """`stochastic`: draw actions from the policy; otherwise take the most probable ones."""
+        self._player, self._seeds, self._stochastic = player, recording_seeds(seed), stochastic
+        self._to_env_action = make_action_converter(player.policy.spec.action)
+        self._episodes = self._steps = self._bytes = 0  # played so far
+
+    def until(self, steps: int) -> Iterator[tuple[RecordedEpisode, bool]]:
+        """Episodes until they have this number of steps, and whether each was cut.
+
+        The last one is finished. Only if it would double the number of steps it is cut, and its last step marked truncated.
+        """
+        taken = 0
+        while taken < steps:
+            for episode, was_cut, _ in self.play(self._wanted(steps - taken), longest=2 * steps - taken):
+                longest = 2 * steps - taken
+                is_longer = episode.length > longest
+                yield (_cut(episode, longest) if is_longer else episode), was_cut or is_longer
+                taken += min(episode.length, longest)
+                if taken >= steps:
+                    break
+
+    def play(self, count: int, longest: int, *, frames: bool = False) -> list[Played]:
+        """The next episodes, of at most `longest` steps each, with `frames` if wanted."""
+        seeds = [next(self._seeds) for _ in range(count)]
+        rows: list[list[EpisodeRows]] = [[] for _ in seeds]
+        plan = EvaluationPlan(
+            tuple(seeds),
+            copies=1,
+            most_steps=longest,
+            greedy=not self._stochastic,
+            send_rows=True,
+            send_frames=frames,
+        )
+        results = self._player.play(plan, lambda number, some: rows[number].append(some), before=self._episodes)
+        played = [
+            Played(self._whole(some, seed), result.cut, _frames(some))
+            for some, seed, result in zip(rows, seeds, results, strict=True)
+        ]
+        self._episodes += count
+        self._steps += sum(one.episode.length for one in played)
+        self._bytes += sum(leaf.nbytes for one in played for leaf in one.episode.obs)
+        return played
+
+    def _wanted(self, steps: int) -> int:
+        """Number of episodes to play next, if so many steps are missing."""
+        if not self._episodes:
+            return FIRST_EPISODES
+        by_steps = -(-steps * self._episodes // self._steps)
+        by_memory = CHUNK_BYTES * self._episodes // max(1, self._bytes)
+        return max(1, min(by_steps, by_memory, MOST_EPISODES))
+
+    def _whole(self, rows: Sequence[EpisodeRows], seed: int) -> RecordedEpisode:
+        leaves = [[some.obs[i][bool(n) :] for n, some in enumerate(rows)] for i in range(len(rows[0].obs))]
+        return RecordedEpisode(
+            obs=tuple(np.concatenate(parts) for parts in leaves),
+            action=np.asarray(self._to_env_action(np.concatenate([some.action for some in rows]))),
+            reward=np.concatenate([some.reward for some in rows]),
+            terminated=np.concatenate([some.terminated for some in rows]),
+            truncated=np.concatenate([some.truncated for some in rows]),
+            seed=seed,
+        )
+
+
+def _frames(rows: Sequence[EpisodeRows]) -> list[Array]:
+    return [frame for n, some in enumerate(rows) if some.frames is not None for frame in some.frames[bool(n) :]]
+
+
+def _cut(episode: RecordedEpisode, length: int) -> RecordedEpisode:
+    truncated = episode.truncated[:length].copy()
+    truncated[-1] = True
+    return RecordedEpisode(
+        obs=tuple(leaf[: length + 1] for leaf in episode.obs),
+        action=episode.action[:length],
+        reward=episode.reward[:length],
+        terminated=episode.terminated[:length],
+        truncated=truncated,
+        seed=episode.seed,
+    )
