@@ -52,4 +52,9 @@ def main(argv: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    exit_code = main(sys.argv[1:])
+    if "learner.imports_ahead" in sys.modules:
+        from learner.imports_ahead import exit_if_importing
+
+        exit_if_importing(exit_code)
+    sys.exit(exit_code)

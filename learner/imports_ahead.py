@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import logging
+import os
+import sys
 import threading
 from collections.abc import Callable
 
@@ -10,6 +13,7 @@ from learner.algorithms import ALGORITHMS
 
 MODULES = ("torch", "learner.run_spec", "learner.run_recorder", "learner.torch_setup")
 POLL_S = 0.05
+THREAD = "imports"
 
 
 class ImportsAhead:
@@ -19,7 +23,7 @@ class ImportsAhead:
         self._modules = (*MODULES, ALGORITHMS[algo].partition(":")[0])
         self._error: BaseException | None = None
         # Not a daemon: a thread that the interpreter ends in the middle of importing PyTorch can crash the process.
-        self._thread = threading.Thread(target=self._import, name="imports")
+        self._thread = threading.Thread(target=self._import, name=THREAD)
         self._thread.start()
 
     def wait(self, check_interrupt: Callable[[], None]) -> None:
@@ -36,3 +40,15 @@ class ImportsAhead:
                 importlib.import_module(name)
         except BaseException as error:
             self._error = error
+
+
+def exit_if_importing(exit_code: int) -> None:
+    """End this process at once if an import is still under way: the interpreter would wait for it, for seconds.
+
+    Call it last: nothing is cleaned up after it.
+    """
+    if any(thread.name == THREAD for thread in threading.enumerate()):
+        logging.shutdown()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(exit_code)
