@@ -27,7 +27,7 @@ from workers.supervise.activity import Activity, activity, share_activity
 from workers.supervise.worker_process import NONCE_VARIABLE
 from workers.supervisor import EXIT_NO_LEARNER
 from workers.watchdog import Watchdog
-from workers.worker import Worker, WorkerOptions, identity, no_limit, parent_is_gone
+from workers.worker import Worker, WorkerOptions, identity, parent_is_gone
 
 LEAVE_AT_ONCE = 2  # requests to leave: the rollout in progress is abandoned
 LOOK_FOR_PARENT_S, LEAVE_WITHIN_S = 0.5, 2.0  # after the supervisor's death
@@ -54,7 +54,6 @@ def work(flags: argparse.Namespace, token: Token | None, timeouts: CallTimeouts,
         code=AllowedCode.REGISTERED if flags.no_code else allowed_code(flags.address, token),
         stop_requests=lambda: LEAVE_AT_ONCE if parent_is_gone(flags.parent) else len(signals),
         feed_watchdog=watchdog.feed if watchdog else lambda now: None,
-        limited=watchdog.limited if watchdog else no_limit,
         shared_memory=InheritedDescriptors(*map(int, flags.handed.split(","))) if flags.handed else None,
         exit_code=_exit_code,
     )

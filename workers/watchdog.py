@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import faulthandler
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 FAULTHANDLER_HEADER = "Timeout ("  # first words of its output
 
@@ -28,15 +26,6 @@ class Watchdog:
         """Restart the timer: an env step has ended, messages were read, or there was nothing to do."""
         if now >= self._due_s:
             self._due_s = now + self._interval_s
-            faulthandler.dump_traceback_later(self._timeout_s + self._interval_s, exit=True)
-
-    @contextmanager
-    def limited(self, timeout_s: float) -> Iterator[None]:
-        """Run the body with this timeout instead."""
-        faulthandler.dump_traceback_later(timeout_s, exit=True)
-        try:
-            yield
-        finally:
             faulthandler.dump_traceback_later(self._timeout_s + self._interval_s, exit=True)
 
     def stop(self) -> None:

@@ -14,7 +14,7 @@ import socket
 import time
 import traceback
 from collections.abc import Callable
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -54,7 +54,6 @@ log = logging.getLogger("millrace.worker")
 PULSE_S = 0.05  # time between two looks for messages while environments are stepped
 IDLE_S = 0.5  # longest wait while idle, so that a signal or the end of the parent process is noticed
 AFTER_WAKE_UP_S = 0.02  # longest wait for a message after a wake-up, which is faster than the message
-CLOSE_TIMEOUT_S = 5.0  # for the described copy to close; then another process takes this worker's place
 STATM = Path("/proc/self/statm")  # pages: all, resident, …
 
 MakeCollector = Callable[[RunSpec], tuple[Collector, Evaluator]]
@@ -81,11 +80,6 @@ def _same_exit_code(code: int, reason: str) -> int:
     return code
 
 
-def no_limit(timeout_s: float) -> AbstractContextManager[None]:
-    """The body may take as long as it likes."""
-    return nullcontext()
-
-
 @dataclass(frozen=True)
 class WorkerOptions:
     """The options of a worker that depend on its process."""
@@ -96,8 +90,6 @@ class WorkerOptions:
     """Returns the number of requests to leave."""
     feed_watchdog: Callable[[float], None] = _no_watchdog
     """Called regularly with the time, unless the environment hangs."""
-    limited: Callable[[float], AbstractContextManager[None]] = no_limit
-    """Ends this process if the body takes longer than so many seconds."""
     shared_memory: InheritedDescriptors | None = None
     """Shared memory and wake pipes, for a vector environment on this machine."""
     exit_code: Callable[[int, str], int] = _same_exit_code
@@ -346,8 +338,6 @@ class Worker:
                 finally:
                     heartbeats.stop()
                 self._do(self._session.described(description))
-                with self._options.limited(CLOSE_TIMEOUT_S):
-                    copy.close()
         except UsageError as error:
             self._do(self._session.decline(str(error)))
         except Exception as error:

@@ -170,7 +170,8 @@ def test_a_copy_whose_close_fails_does_not_hurt_the_run(stage: Stage, simulator:
     learner = stage.learner(address, {"env-kwargs": f"fault {fault}"}, env="mysim:Sim-v0")
     host = stage.worker(address, "host", "--processes", "2", before=with_path(simulator))
     learner.trains(3)
-    assert ("in close" in host.said()) == (fault == "close_hangs")  # the process that hung was ended, and says where
+    ended = "close() of its environment took longer than" in host.said()  # the process that hung, and it is restarted
+    assert ended == (fault == "close_hangs")
 
 
 @pytest.mark.parametrize(
