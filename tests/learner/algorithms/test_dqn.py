@@ -25,7 +25,15 @@ from protocol.policy.numpy_policy import NumpyPolicy
 from protocol.policy.policy import make_policy
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf
-from tests.support.rounding import ELEMENTWISE, UNIT, assert_within, forward_pass, network_layers, q_gradient_tolerance
+from tests.support.rounding import (
+    ELEMENTWISE,
+    UNIT,
+    assert_within,
+    forward_pass,
+    network_layers,
+    q_gradient_tolerance,
+    tolerance_of,
+)
 
 BOX = Leaf("", "box", (4,), "float32")
 CHOICE = ActionSpec("discrete", (), "int64", (4,), (0,))
@@ -194,27 +202,43 @@ def test_the_gradient_of_a_loss_is_autograds(name: str) -> None:
     torch.testing.assert_close(gradient, error.grad)
 
 
-def gradient_tolerance(made: DQN, drawn: Sample, error: Array) -> Array:
-    """How far two float32 gradients of the Huber loss may differ. It clips the gradient of an error [64] above 1.
+def error_variance(made: DQN, drawn: Sample) -> Array:
+    """The variance of the rounding errors of float32 errors [B]: of values less their targets.
 
-    A value Q is V + A − mean A, whose variances are added up; the target has as many roundings as the value.
+    A value Q is V + A − mean A, whose variances are added up; the target has as many roundings as the value. With double,
+    rounding may decide which action is the best one; then the target may be off by the range of the values.
     """
-    spec, rows = made.policy, len(error)
-    variance = np.zeros(rows)
+    spec = made.policy
+    variance = np.zeros(len(drawn.reward))
     tops = ("q.out", "q.value") if spec.dueling else ("q.out",)
     for network, leaves in ((made.net, drawn.leaves), (made.target, drawn.next_leaves)):
         for top in tops:
             layers = network_layers(network.parameters, [*hidden_names(spec), top])
-            found = forward_pass(layers, leaves[0], spec.activation == "relu")
+            found = forward_pass(layers, made._inputs(leaves)[0], spec.activation == "relu")
             # the largest value of a row, and its mean, is as far off as the worst of them at most
             own = found.out_variance.max(1) + (ELEMENTWISE * UNIT * np.abs(found.out).max(1)) ** 2
             variance += own * (4 if spec.dueling and top == "q.out" else 1)
-    by_value, by_value_variance = np.zeros((2, rows, spec.action.sizes[0]))
+    if made.config.double:
+        x, trunk, relu = made._inputs(drawn.next_leaves)[0], hidden_names(spec), spec.activation == "relu"
+        ours, others = (
+            forward_pass(network_layers(network.parameters, [*trunk, "q.out"]), x, relu)
+            for network in (made.net, made.target)
+        )
+        gap = np.subtract(*np.sort(ours.out, 1)[:, [-1, -2]].T)
+        variance += (gap <= 2 * tolerance_of(ours.out_variance.max(1))) * np.ptp(others.out, 1) ** 2
+    return variance * len(tops)
+
+
+def gradient_tolerance(made: DQN, drawn: Sample, error: Array) -> Array:
+    """How far two float32 gradients of the loss may differ. The Huber loss clips the gradient of an error [B] above 1."""
+    huber, rows = made.config.loss == "huber", len(error)
+    by_value, by_value_variance = np.zeros((2, rows, made.policy.action.sizes[0]))
     chosen = np.arange(rows), drawn.action
-    weight = drawn.weight / rows
-    by_value[chosen] = weight * np.clip(error, -1, 1)
-    by_value_variance[chosen] = weight**2 * len(tops) * variance
-    return q_gradient_tolerance(spec, made.net.flat.numpy(), drawn.leaves[0], by_value, by_value_variance)
+    slope = drawn.weight / rows * (1 if huber else 2)
+    by_value[chosen] = slope * (np.clip(error, -1, 1) if huber else error)
+    by_value_variance[chosen] = slope**2 * error_variance(made, drawn)
+    x = made._inputs(drawn.leaves)[0]
+    return q_gradient_tolerance(made.policy, made.net.flat.numpy(), x, by_value, by_value_variance)
 
 
 @pytest.mark.parametrize("dueling", [False, True])
