@@ -203,7 +203,8 @@ class MemberServer:
         address = self._link.address
         start = f"python -m workers {address}{'' if self._link.keyring is None else ' --token FILE'}"
         joined = f"{len(self._membership.members)} joined{self.missing_reason()}"
-        return NoWorkers(f"waited {timeout_s:g} s for {workers} workers at {address}, {joined}; start one: {start}")
+        awaited = "1 worker" if workers == 1 else f"{workers} workers"
+        return NoWorkers(f"waited {timeout_s:g} s for {awaited} at {address}, {joined}; start one: {start}")
 
     def missing_reason(self) -> str:
         """The known reasons why workers may be missing, in parentheses; empty if there are none."""

@@ -278,7 +278,7 @@ def test_the_workers_own_traceback_stands_beneath(capsys: Captured, monkeypatch:
     failing(monkeypatch, EnvironmentFailed("lane 2 raised too often", "Traceback of worker w1:\n  step\nKeyError: 3\n"))
     assert main(["train", "CartPole-v1"]) == 1
     lines = capsys.readouterr().err.splitlines()
-    assert lines == ["millrace: lane 2 raised too often", "Traceback of worker w1:", "  step", "KeyError: 3"]
+    assert lines == ["millrace: lane 2 raised too often", "    Traceback of worker w1:", "      step", "    KeyError: 3"]
 
 
 def test_an_error_in_millrace_hides_its_traceback_until_asked(capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:

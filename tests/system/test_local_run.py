@@ -226,7 +226,7 @@ def test_nan_ends_the_run_with_an_error_that_says_where(tmp_path: Path) -> None:
 def test_a_run_whose_workers_cannot_start_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The workers cannot start. The run ends at its deadline and says what it waited for."""
     monkeypatch.setattr("workers.supervise.worker_process.sys.executable", "/bin/false")
-    with pytest.raises(NoWorkers, match="waited 1 s for 2 workers"):
+    with pytest.raises(NoWorkers, match="waited 1 s for 1 worker"):
         run(tmp_path, "CartPole-v1", no_workers_timeout_s=1.0, **SMALL)
 
 

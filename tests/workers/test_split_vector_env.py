@@ -75,7 +75,7 @@ def test_lanes_are_collected_in_any_order_but_only_all_together() -> None:
 
 class WithoutWorkers(SyncVectorEnv[Any, Any]):
     def step(self, actions: Any) -> Any:
-        raise NoWorkers("waited 1 s for 1 workers")
+        raise NoWorkers("waited 1 s for 1 worker")
 
 
 def test_that_no_worker_is_left_is_raised_once_to_whoever_asks() -> None:
@@ -85,7 +85,7 @@ def test_that_no_worker_is_left_is_raised_once_to_whoever_asks() -> None:
     split = SplitVectorEnv(env, LANES)
     with pytest.raises(NoWorkers):
         collect(Collector(run, random_policy(run.policy), split.open_lane, split.step_all), run, lanes=range(LANES))
-    with pytest.raises(NoWorkers, match=r"^waited 1 s for 1 workers$"):
+    with pytest.raises(NoWorkers, match=r"^waited 1 s for 1 worker$"):
         split.raise_if_no_workers()
     split.raise_if_no_workers()
     env.close()

@@ -213,7 +213,7 @@ def test_the_shell_returns_the_description_and_asks_for_another_hello() -> None:
 
 def test_nobody_comes() -> None:
     link = FakeLink()
-    with pytest.raises(NoWorkers, match="waited 60 s for 1 workers at fake, 0 joined"):
+    with pytest.raises(NoWorkers, match="waited 60 s for 1 worker at fake, 0 joined"):
         shell(link)
     assert 160.0 <= link.now <= 161.0
 
