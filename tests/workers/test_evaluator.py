@@ -259,7 +259,7 @@ class Blind(Painted):
     metadata: dict[str, Any] = {"render_modes": []}
 
 
-gymnasium.register("millrace-tests/Blind-v0", entry_point=lambda **kwargs: Blind(**kwargs))
+gymnasium.register("millrace-tests/Unseen-v0", entry_point=lambda **kwargs: Blind(**kwargs))
 
 
 def painted(**kwargs: Any) -> RunSpec:
@@ -283,8 +283,8 @@ def test_a_frame_is_sent_of_every_observation_up_to_a_limit(monkeypatch: pytest.
 
 
 def test_an_environment_that_cannot_be_filmed_is_refused() -> None:
-    run = msgspec.structs.replace(echo_run(), env=EnvSpec("millrace-tests/Blind-v0"))
-    with pytest.raises(UsageError, match=r"Blind-v0 cannot be filmed: expected it to render rgb_array, got \[\]"):
+    run = msgspec.structs.replace(echo_run(), env=EnvSpec("millrace-tests/Unseen-v0"))
+    with pytest.raises(UsageError, match=r"Unseen-v0 cannot be filmed: expected it to render rgb_array, got \[\]"):
         Evaluator(run, Repeats()).play(order(1, frames=True), lambda rows: None, no_pulse)
     with pytest.raises(EvaluationFailed, match=r"copy 0, render: expected an array \[H, W, 3\] of uint8, got float64"):
         Evaluator(painted(blank=True), Repeats()).play(order(1, frames=True), lambda rows: None, no_pulse)
