@@ -106,6 +106,7 @@ class Supervisor:
         self._start, self._clock, self._timeouts = start, clock, timeouts
         self._stopping = False
         self._enforce_due_s = 0.0
+        self._left_on_purpose: set[int] = set()  # nonces of workers that ended so: they have said why themselves
         self._slots = [_WorkerSlot(name, start(name), clock()) for name in (f"{prefix}{number}" for number in range(count))]
 
     def poll(self) -> list[WorkerExit]:
@@ -119,6 +120,8 @@ class Supervisor:
                 slot.running.enforce(self._timeouts, now)
             if slot.running is not None and (end := slot.running.ended()) is not None:
                 ended.append(WorkerExit(slot.running.name, slot.running.process_nonce, end.reason, end.failed))
+                if end.on_purpose:
+                    self._left_on_purpose.add(slot.running.process_nonce)
                 self._record_end(slot, end, now)
             if slot.restart_s is not None and now >= slot.restart_s and not self._stopping:
                 slot.restart_s = None
@@ -185,7 +188,8 @@ class Supervisor:
         while True:
             ended = self.poll()
             for each in ended:
-                report(f"{each.worker} {each.reason}")
+                if len(self._slots) > 1 or each.process_nonce not in self._left_on_purpose:
+                    report(f"{each.worker} {each.reason}")
             if notice is not None:
                 notice.send(self.activities(), ended, self._clock())
             if not self.count:
