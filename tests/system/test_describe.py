@@ -170,8 +170,10 @@ def test_a_copy_whose_close_fails_does_not_hurt_the_run(stage: Stage, simulator:
     learner = stage.learner(address, {"env-kwargs": f"fault {fault}"}, env="mysim:Sim-v0")
     host = stage.worker(address, "host", "--processes", "2", before=with_path(simulator))
     learner.trains(3)
-    ended = "close() of its environment took longer than" in host.said()  # the process that hung, and it is restarted
-    assert ended == (fault == "close_hangs")
+    if fault == "close_hangs":
+        host.hears(r"close\(\) of its environment took longer than", 30.0)  # the process that hung; it is restarted
+    else:
+        assert "close() of its environment" not in host.said()
 
 
 @pytest.mark.parametrize(
