@@ -77,6 +77,22 @@ def run_folder(config: Config, resume: Path | None) -> Iterator[RunFolder]:
         raise
 
 
+def is_finished(config: Config, resume: Path) -> bool:
+    """Whether the run to `resume` has nothing left to do: it ended for a reason that holds with this configuration too.
+
+    Then no worker is needed. Raises `UsageError` if there is no such run.
+    """
+    summary = RunFolder.open(resume).summary()
+    if summary is None or summary.evaluation is None:
+        return False
+    reason = config.stop_rule().reason_to_stop(
+        env_steps_after_next_update=summary.env_steps + config.algorithm.rollout_steps * config.envs,
+        evaluation_return=summary.evaluation.return_mean,
+        training_return=summary.return_mean_100,
+    )
+    return reason == summary.stop_reason
+
+
 Describe = Callable[[DescribeSpec, Callable[[], None]], DescribedEnv]
 """Has a worker describe the environment. What the second argument raises ends the wait."""
 
@@ -214,6 +230,8 @@ def serve(config: Config, resume: Path | None, watch: Watch) -> Path:
     """Train with workers that are started elsewhere and join at `config.bind`. Returns the run folder."""
     if config.inference == "learner":
         raise UsageError("--inference learner does not work with python -m learner; use millrace learner")
+    if resume is not None and is_finished(config, resume):
+        return resume
     keyring = keyring_for(config, datetime.now(UTC).replace(microsecond=0))
     with ExitStack() as stack:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()

@@ -118,12 +118,14 @@ def _learner(argv: list[str]) -> int:
     from learner.config.command_line import read_config
 
     config, resume = read_config("learner", argv)
-    from learner.run import serve
+    from learner.run import is_finished, serve
     from millrace.launch import learner_inference as inference
     from millrace.terminal import progress_view
 
     with progress_view("--log-json" in argv) as watch:
-        if config.inference == "learner":
+        if resume is not None and is_finished(config, resume):
+            run = resume
+        elif config.inference == "learner":
             run = inference.train(config, resume, watch, elsewhere=True)
         else:
             run = serve(config, resume, watch)

@@ -13,7 +13,9 @@ from learner.config.config import Config
 from learner.config.hyperparameters import PPOConfig
 from learner.config.layers import resolve
 from learner.rollouts.ledger import Ledger
+from learner.run import is_finished
 from learner.run_folder import checkpoint
+from learner.run_folder.results import Evaluation, Summary
 from learner.run_folder.run_folder import RunFolder
 from learner.run_state import RunState, restore
 from protocol.env_spec import EnvSpec
@@ -97,3 +99,24 @@ def test_a_checkpoint_of_another_network_is_refused_in_one_line(tmp_path: Path) 
     with pytest.raises(CheckpointError, match="expected the state of this configuration") as failure:
         restore(folder, other)
     assert "\n" not in str(failure.value)
+
+
+def test_a_run_is_finished_while_its_reason_to_stop_holds(tmp_path: Path) -> None:
+    config = resolve("CartPole-v1", steps=1000, target_return=400.0, run_dir=str(tmp_path))
+    per_update = config.algorithm.rollout_steps * config.envs
+    folder = RunFolder.create(config)
+    assert not is_finished(config, folder.path), "it has no summary"
+
+    def summary(**changes: Any) -> Summary:
+        fields: dict[str, Any] = {"env": "CartPole-v1", "algo": "ppo", "seed": 1, "updates": 3, "wall_s": 1.0}
+        fields |= {"env_steps": 900, "env_steps_per_s": 1.0, "stop_reason": "all steps done", "return_mean_100": None}
+        evaluation = Evaluation(episodes=1, return_mean=100.0, return_std=0.0, length_mean=100.0)
+        return Summary(**{**fields, "evaluation": evaluation, **changes})
+
+    folder.write_summary(summary())
+    assert is_finished(config, folder.path)
+    for more in ({"steps": 900 + per_update}, {"target_return": 100.0}):
+        assert not is_finished(resolve(resume=folder.path, **more), folder.path), f"{more}: another reason, or none"
+    for unfinished in ({"evaluation": None}, {"stop_reason": "interrupted"}, {"env_steps": 1000 - per_update}):
+        folder.write_summary(summary(**unfinished))
+        assert not is_finished(config, folder.path), unfinished

@@ -95,7 +95,18 @@ def test_workers_join_and_status_shows_the_run(stage: Stage, thin: dict[str, str
     assert len(json.loads(millrace(thin, *status, "--json"))["workers"]) == 2
     head, _, columns, *rows = millrace(thin, *status).splitlines()
     assert "env steps" in head
-    assert columns.split() == ["worker", "host", "pid", "lanes", "tickets", "steps/s", "weights", "silent", "memory"]
+    assert columns.split() == [
+        "worker",
+        "host",
+        "pid",
+        "lanes",
+        "tickets",
+        "steps/s",
+        "weights",
+        "silent",
+        "doing",
+        "memory",
+    ]
     assert len([row for row in rows if row and not row.startswith("dropped")]) == 2
     learner.process.terminate()
     assert learner.ends() == 130, learner.said()

@@ -25,7 +25,7 @@ from learner.vector_env.settings import EnvLike
 from millrace.launch import vector
 from protocol.errors import EnvironmentFailed, NoWorkers, UserFacingError, WorkerLost
 from protocol.keys.key_folder import KeyFolder
-from tests.system.processes import START_S, free_port
+from tests.system.processes import START_S, Worker, free_port
 
 SHARED_MEMORY = {"shared": True, "messages": False}
 ZEROS = np.zeros(4, np.int64)
@@ -174,10 +174,10 @@ def test_an_environment_that_cannot_be_made_in_a_worker_says_why() -> None:
             raise OSError("no licence on this machine")
         return gymnasium.make("CartPole-v1")
 
-    env = make(only_here)
-    with pytest.raises(EnvironmentFailed, match="no licence on this machine"):
-        env.reset(seed=1)
-    close_and_check(env)
+    with pytest.raises(EnvironmentFailed, match="no licence on this machine") as raised:
+        make(only_here)
+    assert "in only_here" in raised.value.detail
+    assert local_workers() == []
 
 
 @pytest.mark.parametrize("loss", ["truncate", "raise"])
@@ -244,7 +244,7 @@ def test_many_environments_leave_nothing_open() -> None:
 
 def test_make_vec_fails_if_no_worker_joins() -> None:
     env: ZmqVectorEnv | None = None
-    with pytest.raises(NoWorkers, match=r"waited 0.5 s for 2 workers at tcp://127.0.0.1:\d+, 0 joined; start one"):
+    with pytest.raises(NoWorkers, match=r"waited 0.5 s for 1 worker at tcp://127.0.0.1:\d+, 0 joined; start one"):
         env = make(workers=0, lanes=2, bind="tcp://127.0.0.1:*", timeout=0.5)
     assert env is None
 
@@ -284,52 +284,39 @@ def test_no_process_outlives_the_learner(end: str, tmp_path: Path) -> None:
     assert set(os.listdir("/dev/shm")) <= before
 
 
-def test_workers_elsewhere_join_by_tcp_and_come_back() -> None:
+def test_workers_elsewhere_join_by_tcp_and_come_back(elsewhere: Elsewhere) -> None:
     """The test starts the workers, which join over TCP. One is killed, and another takes its place."""
-
-    def start(address: str, name: str) -> subprocess.Popen[bytes]:
-        root = Path(__file__).parents[2]
-        return subprocess.Popen([sys.executable, "-m", "workers", address, "--name", name], cwd=root)
-
-    address = f"tcp://127.0.0.1:{free_port()}"
-    started = [start(address, "a"), start(address, "b")]
-    try:
-        env = make(workers=0, lanes=2, bind=address, timeout=START_S)
+    elsewhere.start("a")
+    elsewhere.start("b")
+    with make(workers=0, lanes=2, bind=elsewhere.address, timeout=START_S) as env:
         env.timeout_s = 3.0
         env.reset(seed=1)
         assert env.step(ZEROS)[1].tolist() == [1.0] * 4
-        started.append(start(address, "c"))
-        started[0].kill()
+        elsewhere.start("c")
+        elsewhere.started[0].kill()
         rows = [env.step(ZEROS) for _ in range(3)]
         assert [row[3].any() for row in rows] == [True, False, False]
         assert rows[-1][1].tolist() == [1.0] * 4
-        env.close()
-        assert [process.wait(10) for process in started] == [-9, 0, 0]
-    finally:
-        for process in started:
-            with suppress(UserFacingError):
-                process.kill()
-                process.wait()
+    assert [worker.process.wait(10) for worker in elsewhere.started] == [-9, 0, 0]
 
 
 # ---------------------------------------------------------------- workers elsewhere: keys, code and hangs
 
 
 class Elsewhere:
-    """Workers that the test starts itself. Their stderr goes to a file."""
+    """Workers that the test starts itself, each with its supervisor. Their output goes to a file."""
 
     def __init__(self, folder: Path) -> None:
         self.address = f"tcp://127.0.0.1:{free_port()}"
-        self.started: list[subprocess.Popen[bytes]] = []
-        self._stderr = folder / "stderr"
+        self.started: list[Worker] = []
+        self._said = folder / "said"
 
     def start(self, name: str, *flags: str) -> None:
         command = [sys.executable, "-m", "workers", self.address, "--name", name, *flags]
-        with self._stderr.open("ab") as stderr:
-            self.started.append(subprocess.Popen(command, cwd=Path(__file__).parents[2], stderr=stderr))
+        self.started.append(Worker(command, self._said))
 
-    def stderr(self) -> str:
-        return self._stderr.read_text()
+    def said(self) -> str:
+        return self._said.read_text()
 
 
 @pytest.fixture
@@ -339,11 +326,12 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Elsew
         monkeypatch.delenv(variable, raising=False)
     elsewhere = Elsewhere(tmp_path)
     yield elsewhere
-    for process in elsewhere.started:
-        process.send_signal(signal.SIGCONT)  # a failed test may have left it stopped
-        process.terminate()
-    for process in elsewhere.started:
-        process.wait(10)
+    for worker in elsewhere.started:
+        if worker.alive():
+            worker.go_on()  # a failed test may have left it stopped
+            worker.process.terminate()
+    for worker in elsewhere.started:
+        worker.process.wait(10)
 
 
 def test_with_keys_a_callable_is_sent_and_a_revoked_key_is_a_lost_worker(elsewhere: Elsewhere, tmp_path: Path) -> None:
@@ -367,8 +355,8 @@ def test_with_keys_a_callable_is_sent_and_a_revoked_key_is_a_lost_worker(elsewhe
         assert time.monotonic() - began < 15.0, "long before the deadline"
         assert row[4]["worker_lost"].tolist() == [False, False, True, True]
         assert not env.step(ZEROS)[3].any()
-    assert [process.wait(10) for process in elsewhere.started] == [0, 2]
-    assert "revoked" in elsewhere.stderr()
+    assert [worker.process.wait(10) for worker in elsewhere.started] == [0, 2]
+    assert "revoked" in elsewhere.said()
 
 
 def test_a_silent_worker_elsewhere_is_lost_long_before_the_deadline(elsewhere: Elsewhere) -> None:
@@ -377,13 +365,13 @@ def test_a_silent_worker_elsewhere_is_lost_long_before_the_deadline(elsewhere: E
     with make(workers=None, lanes=2, bind=elsewhere.address, timeout=60.0) as env:
         env.reset(seed=1)
         assert env.step(ZEROS)[1].tolist() == [1.0] * 4
-        elsewhere.started[1].send_signal(signal.SIGSTOP)
+        elsewhere.started[1].pause()
         began = time.monotonic()
         row = env.step(ZEROS)
         assert 4.0 < time.monotonic() - began < 15.0
         assert row[4]["worker_lost"].tolist() == [False, False, True, True]
         assert not env.step(ZEROS)[3].any()
-        elsewhere.started[1].send_signal(signal.SIGCONT)
+        elsewhere.started[1].go_on()
         assert env.reset(seed=1)[0].shape == (4, 4)
 
 
@@ -417,7 +405,7 @@ def test_a_worker_that_runs_no_code_refuses_and_says_why(elsewhere: Elsewhere) -
         UserFacingError, match=r"workers\.envs\.toy:Countdown-v0 imports a module, which this worker does not do"
     ):
         make("workers.envs.toy:Countdown-v0", workers=None, bind=elsewhere.address, timeout=5.0).reset()
-    assert elsewhere.started[0].wait(10) == 2
+    assert elsewhere.started[0].process.wait(10) == 2
 
 
 def test_a_worker_whose_step_hangs_ends_itself_and_another_gets_its_lane(elsewhere: Elsewhere, tmp_path: Path) -> None:
@@ -431,4 +419,4 @@ def test_a_worker_whose_step_hangs_ends_itself_and_another_gets_its_lane(elsewhe
         assert truncated.sum() == 2
         assert time.monotonic() - began < 30.0, "long before the deadline"
         assert env.step(ZEROS)[1][~truncated].tolist() == [1.0, 1.0]
-    assert "a step of its environment took longer than 3 s (--step-timeout-s)" in elsewhere.stderr()
+    assert "a step of its environment took longer than 3 s (--step-timeout-s)" in elsewhere.said()
