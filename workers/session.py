@@ -267,9 +267,10 @@ class Session:
 
     def fail(self, error: str, traceback: str, lane: int | None) -> list[Effect]:
         """The environment, or this worker, raised: report it to the learner, and leave."""
+        error = one_line(error)
         effects: list[Effect] = []
         if self.state in (State.READY, State.DRAINING):
-            effects.append(Send(Failure(self.session, one_line(error), last_text(traceback), lane)))
+            effects.append(Send(Failure(self.session, error, last_text(traceback), lane)))
         return [] if self.state is State.LEFT else effects + self._leave(WorkerFailed(), 1, error)
 
     def decline(self, reason: str) -> list[Effect]:
@@ -293,7 +294,7 @@ class Session:
 
     def next_task(self) -> Task | None:
         """The oldest ticket of every lane that can start, to be collected together. None when there is none."""
-        if self.state is not State.READY or self._current.weights is None or self._current.in_progress:
+        if not self._is_idle() or self._current.weights is None:
             return None
         assignments = self._current.rollouts.startable(self._current.version)
         if not assignments:
@@ -303,22 +304,16 @@ class Session:
 
     def finished(self, rollouts: Sequence[Rollout]) -> list[Effect]:
         """The task in progress has ended with these rollouts."""
-        self._current.in_progress = ()
-        effects: list[Effect] = []
-        for rollout in rollouts:
-            if rollout.session != self.session or not self._current.rollouts.keep(rollout):
-                continue  # the session ended, or the lane was released, while it was collected
-            self._current.acknowledged_version = max(self._current.acknowledged_version, rollout.version)
-            effects.append(Send(rollout))
-        if self.state is State.DRAINING:
-            effects += self._goodbye()
-        return effects
+        # The session may have ended, or the lane may have been released, while it was collected.
+        kept = [each for each in rollouts if each.session == self.session and self._current.rollouts.keep(each)]
+        self._current.acknowledged_version = max([self._current.acknowledged_version, *(each.version for each in kept)])
+        return self._work_ended(kept)
 
     # ---------------------------------------------------------------- evaluating
 
     def next_evaluation(self) -> EvaluationTask | None:
         """The oldest order to evaluate the weights held. It is in progress until `evaluated`. None when there is none."""
-        if self.state is not State.READY or self._current.weights is None or self._current.in_progress:
+        if not self._is_idle() or self._current.weights is None:
             return None
         order = self._current.evaluations.next(self._current.version)
         if order is None:
@@ -328,10 +323,9 @@ class Session:
 
     def evaluated(self, answer: Evaluated | None) -> list[Effect]:
         """The evaluation in progress has ended with this answer, or with None: it was abandoned."""
-        self._current.in_progress = ()
-        is_wanted = answer is not None and answer.session == self.session and self._current.evaluations.keep(answer)
-        effects: list[Effect] = [Send(answer)] if answer is not None and is_wanted else []
-        return effects + (self._goodbye() if self.state is State.DRAINING else [])
+        if answer is None or answer.session != self.session or not self._current.evaluations.keep(answer):
+            return self._work_ended([])
+        return self._work_ended([answer])
 
     def evaluation_abandoned(self, session: int) -> bool:
         """True when an evaluation of this session is no longer wanted. A worker that leaves does not finish it."""
@@ -341,7 +335,7 @@ class Session:
 
     def next_order(self) -> Order | None:
         """The oldest order that is not yet executed. It is in progress until `answered`."""
-        if self.state is not State.READY or self._current.in_progress:
+        if not self._is_idle():
             return None
         order = self._current.orders.next()
         self._current.in_progress = () if order is None else (order.ticket,)
@@ -349,10 +343,8 @@ class Session:
 
     def answered(self, answer: Answer) -> list[Effect]:
         """The order in progress was executed with this answer."""
-        self._current.in_progress = ()
         is_wanted = answer.session == self.session and self._current.orders.keep(answer)
-        effects: list[Effect] = [Send(answer)] if is_wanted else []
-        return effects + (self._goodbye() if self.state is State.DRAINING else [])
+        return self._work_ended([answer] if is_wanted else [])
 
     def abandoned(self, session: int) -> bool:
         """True when the work of this session is no longer wanted."""
@@ -389,6 +381,16 @@ class Session:
         lanes = self._current.lanes()
         self._join(now)
         return [CloseLanes(lanes), *self.tick(now)]
+
+    def _is_idle(self) -> bool:
+        """Whether this worker may start a piece of work."""
+        return self.state is State.READY and not self._current.in_progress
+
+    def _work_ended(self, messages: Sequence[ToLearner]) -> list[Effect]:
+        """The work in progress has ended: send its messages, and leave if this worker drains."""
+        self._current.in_progress = ()
+        effects: list[Effect] = [Send(message) for message in messages]
+        return effects + (self._goodbye() if self.state is State.DRAINING else [])
 
     def _received(self, received: Sequence[Received]) -> list[Effect]:
         """Drop the rollouts that the learner has received, and the lanes that it does not list: their Release was lost."""

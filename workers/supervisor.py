@@ -106,11 +106,13 @@ class Supervisor:
         self._start, self._clock, self._timeouts = start, clock, timeouts
         self._stopping = False
         self._enforce_due_s = 0.0
-        self._left_on_purpose: set[int] = set()  # nonces of workers that ended so: they have said why themselves
         self._slots = [_WorkerSlot(name, start(name), clock()) for name in (f"{prefix}{number}" for number in range(count))]
 
     def poll(self) -> list[WorkerExit]:
         """The workers that have ended since the last call. Ends those that hang, and starts those whose restart is due."""
+        return [each for each, _ in self._ended()]
+
+    def _ended(self) -> list[tuple[WorkerExit, Ending]]:
         ended, now = [], self._clock()
         enforce = now >= self._enforce_due_s
         if enforce:
@@ -119,9 +121,7 @@ class Supervisor:
             if slot.running is not None and enforce:
                 slot.running.enforce(self._timeouts, now)
             if slot.running is not None and (end := slot.running.ended()) is not None:
-                ended.append(WorkerExit(slot.running.name, slot.running.process_nonce, end.reason, end.failed))
-                if end.on_purpose:
-                    self._left_on_purpose.add(slot.running.process_nonce)
+                ended.append((WorkerExit(slot.running.name, slot.running.process_nonce, end.reason, end.failed), end))
                 self._record_end(slot, end, now)
             if slot.restart_s is not None and now >= slot.restart_s and not self._stopping:
                 slot.restart_s = None
@@ -186,12 +186,12 @@ class Supervisor:
         """
         handled, leave_by_s, kill_hanging_from_s = 0, float("inf"), float("inf")
         while True:
-            ended = self.poll()
-            for each in ended:
-                if len(self._slots) > 1 or each.process_nonce not in self._left_on_purpose:
+            ended = self._ended()
+            for each, end in ended:
+                if len(self._slots) > 1 or not end.on_purpose:  # a single worker has said itself why it leaves
                     report(f"{each.worker} {each.reason}")
             if notice is not None:
-                notice.send(self.activities(), ended, self._clock())
+                notice.send(self.activities(), [each for each, _ in ended], self._clock())
             if not self.count:
                 return self.exit_code
             now = self._clock()

@@ -360,8 +360,8 @@ def _resident_bytes() -> int:
 
 def _line(error: Exception) -> str:
     if isinstance(error, UserFacingError):
-        return first_line(error, type(error).__name__)[:1000]
-    return f"{type(error).__name__}: {first_line(error, '')}".strip()[:1000]
+        return first_line(error, type(error).__name__)
+    return f"{type(error).__name__}: {first_line(error, '')}".strip()
 
 
 def identity(name: str, process_nonce: int | None = None) -> Identity:
