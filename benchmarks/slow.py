@@ -2,17 +2,21 @@
 
 PPO with 64 steps, minibatches of 256 and 10 epochs, on 16 env copies in 16 processes. The environment sleeps
 (`benchmarks/slow_env.py`), so that the number of cores does not matter and waiting is all that is measured. The ideal is 16
-copies that never wait. Each run is a process tree of its own; all take turns. `--peers` adds the installed systems that can
-run 16 processes. `--picture FILE` draws who waits for whom.
+copies that never wait: 16 processes that step and do nothing else. They reach less than the durations say, because a machine
+wakes a process a little late. Each run is a process tree of its own; all take turns. `--peers` adds the installed systems
+that can run 16 processes. `--picture FILE` draws who waits for whom.
 """
 
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import os
 import statistics
 import sys
 import tempfile
+import time
+from multiprocessing.synchronize import Barrier
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +26,13 @@ from rich.table import Table
 
 from benchmarks import programs
 from benchmarks.programs import CONTENDERS, Contender, contenders
-from benchmarks.slow_env import STEPS_PER_S, TIMELINE
+from benchmarks.slow_env import STEPS_PER_S, TIMELINE, Lognormal
 from benchmarks.writing import write
 from learner.report.learning_curves import COLORS, DPI, GREY
 
 COPIES = 16
-IDEAL = COPIES * STEPS_PER_S
+IDEAL = COPIES * STEPS_PER_S  # if a machine woke every process in time
+NEVER_WAIT, NEVER_WAIT_S = "copies that never wait", 12.0
 WARM_UP = 3  # updates
 SETTINGS: dict[str, Any] = {
     "env": "benchmarks.slow_env:Lognormal-v0", "algo": "ppo", "envs": COPIES, "rollout_steps": 64, "batch_size": 256,
@@ -56,6 +61,33 @@ def rate(name: str, contender: Contender, seed: int) -> float:
     ends = programs.run(name, settings, contender=contender).updates
     (first, began_s), (last, ended_s) = ends[WARM_UP], ends[-1]
     return (last - first) / (ended_s - began_s)
+
+
+def rate_without_waiting(seed: int) -> float:
+    """Env steps/s of copies in processes that only step and reset."""
+    context = multiprocessing.get_context("spawn")
+    begin, counts = context.Barrier(COPIES), context.Queue()
+    loops = [context.Process(target=_step_only, args=(COPIES * seed + n, begin, counts), daemon=True) for n in range(COPIES)]
+    for loop in loops:
+        loop.start()
+    steps: int = sum(counts.get(timeout=60 + NEVER_WAIT_S) for _ in loops)
+    for loop in loops:
+        loop.join()
+    return steps / NEVER_WAIT_S
+
+
+def _step_only(seed: int, begin: Barrier, counts: multiprocessing.Queue[int]) -> None:
+    env = Lognormal()
+    env.reset(seed=seed)
+    steps = 0
+    begin.wait(60)
+    end_s = time.monotonic() + NEVER_WAIT_S
+    while time.monotonic() < end_s:
+        over = env.step(0)[2]
+        steps += 1
+        if over:
+            env.reset()
+    counts.put(steps)
 
 
 def timelines(name: str, contender: Contender, seed: int) -> list[np.ndarray[Any, Any]]:
@@ -116,25 +148,26 @@ def main() -> None:
         draw({name: timelines(name, each, 1) for name, each in chosen.items()}, arguments.picture)
         print(arguments.picture)
         return
-    found: dict[str, list[float]] = {name: [] for name in others | OURS}
+    found: dict[str, list[float]] = {name: [] for name in (*others, *OURS, NEVER_WAIT)}
     for turn in range(arguments.rounds):
+        found[NEVER_WAIT].append(rate_without_waiting(turn + 1))
         for name, each in (others | OURS).items():
             try:
                 found[name].append(rate(name, each, turn + 1))
             except RuntimeError as error:
                 print(f"left out: {error}", file=sys.stderr)
     medians = {name: statistics.median(rates) for name, rates in found.items() if rates}
-    slowest = medians.get(SUBPROC)
+    slowest, never_waiting = medians.get(SUBPROC), medians[NEVER_WAIT]
     table = Table(title=f"slow environment, {COPIES} copies, medians of {arguments.rounds} (least to most)")
     for column in ("", "env steps/s", "of copies that never wait", f"× {SUBPROC}"):
         table.add_column(column, justify="left" if not column else "right")
     for name, median in medians.items():
         measured = f"{median:,.0f} ({min(found[name]):,.0f} to {max(found[name]):,.0f})"
-        table.add_row(name, measured, f"{median / IDEAL:.2f}", "–" if slowest is None else f"{median / slowest:.1f}")
+        table.add_row(name, measured, f"{median / never_waiting:.2f}", "–" if slowest is None else f"{median / slowest:.1f}")
     Console(width=110).print(table)
-    print(f"copies that never wait: {IDEAL:,.0f} env steps/s")
+    print(f"copies that never wait, if the machine woke them in time: {IDEAL:,.0f} env steps/s")
     title = "env steps/s, 16 copies; a step takes 5 ms, a reset 200 ms"
-    write("slow", {"ideal": IDEAL, "median": medians, "of": found}, [(title, medians | {"never waiting": IDEAL})])
+    write("slow", {"ideal": IDEAL, "median": medians, "of": found}, [(title, medians)])
 
 
 if __name__ == "__main__":

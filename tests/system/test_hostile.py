@@ -19,7 +19,7 @@ from tests.system.processes import START_S, Learner, Stage, free_port
 from tests.system.runs import accounted
 from workers.collect.env_copies import copy_seeds
 
-MESSAGES, STRANGERS = 100_000, 5
+STRANGERS = 5
 GROWTH_MB = 20  # growth in the second half: by then the heap has the memory for messages that wait to be read
 
 
@@ -40,7 +40,7 @@ def answered(stranger: zmq.Socket[bytes]) -> None:
                 return
 
 
-def pester(learner: Learner, address: str) -> float:
+def pester(learner: Learner, address: str, messages: int) -> float:
     """Send hostile messages under several names while the learner learns. Returns its growth in MB."""
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     strangers = []
@@ -52,7 +52,7 @@ def pester(learner: Learner, address: str) -> float:
         strangers.append(stranger)
     sizes = []
     try:
-        for number, frames in enumerate(islice(hostile(3, real(fake_rollout(7, 0, 1, 0, 0))), MESSAGES)):
+        for number, frames in enumerate(islice(hostile(3, real(fake_rollout(7, 0, 1, 0, 0))), messages)):
             strangers[number % STRANGERS].send_multipart(frames)
             if number % 1_000 == 999:
                 for stranger in strangers:
@@ -65,8 +65,11 @@ def pester(learner: Learner, address: str) -> float:
     return sizes[-1] - sizes[len(sizes) // 2]
 
 
-def test_invalid_messages_of_strangers_do_not_change_the_weights(tmp_path: Path) -> None:
-    settings = {"env-kwargs": "", "rollout-steps": 32, "batch-size": 256, "n-epochs": 4, "steps": 80_000, "seed": 5}
+@pytest.mark.parametrize("messages", [20_000, pytest.param(100_000, marks=pytest.mark.soak)])
+def test_invalid_messages_of_strangers_do_not_change_the_weights(tmp_path: Path, messages: int) -> None:
+    """The run is long enough that the learner learns while the messages arrive."""
+    settings: dict[str, object] = {"env-kwargs": "", "rollout-steps": 32, "batch-size": 256, "n-epochs": 4, "seed": 5}
+    settings["steps"] = messages * 4 // 5
 
     def learn(name: str, loud: bool) -> tuple[bytes, dict[str, Any], float]:
         with closing(Stage(tmp_path / name)) as stage:
@@ -74,7 +77,7 @@ def test_invalid_messages_of_strangers_do_not_change_the_weights(tmp_path: Path)
             learner = stage.learner(address, settings, env="CartPole-v1")
             stage.worker(address, "w0")
             learner.trains(1)
-            grew_mb = pester(learner, address) if loud else 0.0
+            grew_mb = pester(learner, address, messages) if loud else 0.0
             policy, summary, _ = result(learner)
             return policy, summary, grew_mb
 
@@ -83,7 +86,7 @@ def test_invalid_messages_of_strangers_do_not_change_the_weights(tmp_path: Path)
     assert found == expected
     assert grew_mb < GROWTH_MB
     ledger = accounted(summary, rows=32 * 2)
-    assert ledger["messages_bad"] > MESSAGES / 3  # the rest used a session of another peer
+    assert ledger["messages_bad"] > messages / 3  # the rest used a session of another peer
 
 
 def test_two_runs_in_which_the_same_ticket_kills_its_worker_give_the_same_weights(tmp_path: Path) -> None:

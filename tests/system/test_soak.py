@@ -10,6 +10,7 @@ from tests.system.network import why_not
 from tests.system.soak import soak
 
 
+@pytest.mark.soak
 @pytest.mark.timeout(400)
 def test_a_run_survives_a_minute_of_faults(tmp_path: Path) -> None:
     if why := why_not():
