@@ -26,6 +26,7 @@ from learner.members.describe import DescribeSettings, described_by_workers
 from learner.members.endpoint import join_lines, keyring_for
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.recording.training_recorder import TrainingRecorder
+from learner.resumption import check_settings, check_spaces
 from learner.rollouts.hub import Hub, HubObserver, HubSettings
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 from learner.run_folder.progress import Progress
@@ -67,8 +68,10 @@ class RunSetup:
 def run_folder(config: Config, resume: Path | None) -> Iterator[RunFolder]:
     """A new run folder, or the folder of the run to `resume`. A new one is removed again if no `Run` can be made of it.
 
-    Raises `UsageError`.
+    Raises `UsageError`, also if the run cannot be resumed with these settings.
     """
+    for line in [] if resume is None else check_settings(config, resume):
+        log.warning("%s", line)
     folder = RunFolder.create(config) if resume is None else RunFolder.open(resume)
     try:
         yield folder
@@ -80,8 +83,9 @@ def run_folder(config: Config, resume: Path | None) -> Iterator[RunFolder]:
 def is_finished(config: Config, resume: Path) -> bool:
     """Whether the run to `resume` has nothing left to do: it ended for a reason that holds with this configuration too.
 
-    Then no worker is needed. Raises `UsageError` if there is no such run.
+    Then no worker is needed. Raises `UsageError` if there is no such run, or if it cannot be resumed with these settings.
     """
+    check_settings(config, resume)
     summary = RunFolder.open(resume).summary()
     if summary is None or summary.evaluation is None:
         return False
@@ -102,9 +106,9 @@ def known_environment(
 ) -> KnownEnvironment:
     """The environment, as `describe` learns it, or as the policy in the folder of the run to `resume` knows it.
 
-    `always`: have it described also if that policy is there. Meanwhile another thread imports
-    PyTorch. Raises `UsageError` if there is no such environment, or no policy for it, `RunError` if no worker describes it
-    in time, and `KeyboardInterrupt` if the user stops the program.
+    `always`: have it described also if that policy is there. Meanwhile another thread imports PyTorch. Raises `UsageError`
+    if there is no such environment, no policy for it, or if it is not the one that policy was made for; `RunError` if no
+    worker describes it in time; and `KeyboardInterrupt` if the user stops the program.
     """
     # PyTorch's threads sleep while they wait for one another; this must be set before it is imported. By default they spin,
     # and hold the core that the slowest needs: beside other busy processes an update takes up to ten times as long.
@@ -116,13 +120,15 @@ def known_environment(
             if interrupts.received:
                 raise KeyboardInterrupt if resume is None else Interrupted(resume)
 
-        policy = None if resume is None or config.record or always else RunFolder.open(resume).policy_spec()
-        if policy is not None:
+        policy = None if resume is None else RunFolder.open(resume).policy_spec()
+        if policy is not None and not (config.record or always):
             known = KnownEnvironment(env, EnvSpaces.of_policy(policy), None)
         else:
             spec = DescribeSpec(env, config.chosen_vector(), heartbeat_s=config.heartbeat_s)
             described = describe(spec, check_interrupt)
             known = KnownEnvironment(env, EnvSpaces.of_description(described), described)
+            if resume is not None and policy is not None:
+                check_spaces(resume, EnvSpaces.of_policy(policy), known.spaces)
         imports.wait(check_interrupt)
     return known
 
@@ -179,7 +185,6 @@ class Run:
         state = RunState()
         if setup.resumed:
             state = restore(self.folder, self.algorithm)
-        self.folder.write_config(config)
         coordinator = TicketCoordinator(
             spec,
             rollouts_per_update=config.lanes,
@@ -200,6 +205,7 @@ class Run:
         hub = Hub(link, coordinator, settings, processes, self._check_interrupt, observer)
         self.service = RolloutService(hub, processes.expected)
         episodes = _training_recorder(config, self.folder, setup.known, spec)
+        self.folder.write_config(config)  # nothing of a resumed run is written before everything fits
         self.recorder = RunRecorder(config, self.folder, spec, self.algorithm, self.service, state, watch, episodes)
         self.folder.keep()
 

@@ -14,6 +14,7 @@ from msgspec import Meta
 from tyro.conf import Positional
 
 from learner.config.hyperparameters import Hyperparameters, PPOConfig
+from learner.config.on_resume import Adaptable, Fixed, Free
 from learner.config.run_rules import CheckpointPolicy, EvaluationSettings, StopRule
 from protocol.alive import CallTimeouts
 from protocol.bounds import MAX_SEEDS
@@ -33,147 +34,147 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     # ------------------------------------------------------------------------------------------------------------ basics
 
-    env: Positional[str] = ""
+    env: Fixed[Positional[str]] = ""
     """Environment id for gymnasium.make, as CartPole-v1, ALE/Pong-v5 or my_package.envs:MyEnv-v0."""
-    env_kwargs: dict[str, Scalar] = {}
+    env_kwargs: Fixed[dict[str, Scalar]] = {}
     """Keyword arguments for gymnasium.make: NAME VALUE NAME VALUE ..."""
-    algo: str = "ppo"
+    algo: Fixed[str] = "ppo"
     """Learning algorithm. `--algo NAME --help` shows its settings."""
-    algorithm: Hyperparameters = PPOConfig()
+    algorithm: Fixed[Hyperparameters] = PPOConfig()
     """Settings of the algorithm."""
-    steps: Count = 100_000
+    steps: Free[Count] = 100_000
     """Env steps to train for, summed over all env copies. Training ends before an update that would exceed them."""
-    seed: Natural = 1
+    seed: Fixed[Natural] = 1
     """Seed of all random numbers of the run."""
-    workers: Count = 2
+    workers: Free[Count] = 2
     """Number of worker processes on this machine (train only)."""
-    envs: Count = 8
+    envs: Adaptable[Count] = 8
     """Number of env copies, summed over all workers. Must be a multiple of lanes."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
+    device: Free[Literal["auto", "cpu", "cuda"]] = "auto"
     """Device of the learner. auto: cuda if PyTorch finds a GPU, else cpu."""
-    run_dir: str = "runs"
+    run_dir: Free[str] = "runs"
     """Folder in which the run folder is made."""
 
     # -------------------------------------------------------------------------------------------- evaluation and targets
 
-    eval_episodes: Count = 100
+    eval_episodes: Free[Count] = 100
     """Number of greedy episodes in an evaluation."""
-    eval_every: Natural = 0
+    eval_every: Free[Natural] = 0
     """Env steps between evaluations during training. 0: evaluate only at the end."""
-    eval_copies: Annotated[int, Meta(ge=1, le=MAX_SEEDS)] = 4
+    eval_copies: Free[Annotated[int, Meta(ge=1, le=MAX_SEEDS)]] = 4
     """Number of evaluation episodes that a worker plays side by side, on env copies of their own. The last bits of results
     may depend on it. They do not depend on the number of workers.
     """
-    eval_max_steps: Count = 1_000_000
+    eval_max_steps: Free[Count] = 1_000_000
     """Most env steps of one evaluation. Each episode gets an equal share: with 100 episodes, one that reaches 10000 steps is
     cut. It counts with the return it has by then, and the result says how many were cut.
     """
-    target_return: float | None = None
+    target_return: Free[float | None] = None
     """Stop as soon as the mean return of an evaluation is at least this. Needs eval_every."""
-    target_mean_return: float | None = None
+    target_mean_return: Free[float | None] = None
     """Stop as soon as the mean return of the last 100 training episodes is at least this."""
 
     # ------------------------------------------------------------------------------------------------------------ workers
 
-    lanes: Count = 4
+    lanes: Adaptable[Count] = 4
     """Number of groups of env copies. The copies of a lane are stepped together, on one worker at a time. Lanes are
     distributed over the workers. Results depend on lanes and envs, not on the number of workers.
     """
-    max_lag: Natural = 0
+    max_lag: Free[Natural] = 0
     """Largest lag of a rollout: how many versions its weights may be older than the learner's. 0: workers and learner take
     turns, and results are reproducible. Above 0: both run at the same time; impala and dqn are made for that.
     """
-    vector: Literal["auto", "loop", "native", "envpool"] = "auto"
+    vector: Free[Literal["auto", "loop", "native", "envpool"]] = "auto"
     """How the env copies of a lane are stepped. loop: one after another. native: by the environment's own vector version.
     envpool: by envpool (pip install 'millrace-rl[envpool]'). auto: loop. The others use other random numbers.
     """
-    inference: Literal["workers", "learner"] = "workers"
+    inference: Free[Literal["workers", "learner"]] = "workers"
     """Where the policy acts. workers: in each worker. learner: in one place beside the learner, for all env copies at once;
     workers then only step the environments.
     """
-    images_dtype: ImagesDtype = "float32"
+    images_dtype: Free[ImagesDtype] = "float32"
     """Precision in which the acting policy processes images. bfloat16 halves the work on CPUs with AMX and is slower
     elsewhere. The learner always computes in float32.
     """
-    torch_threads: Count | None = None
+    torch_threads: Free[Count | None] = None
     """Number of PyTorch threads in the learner. none: chosen when the run starts, and kept in its config.toml: 1;
     or with images, an encoder or a layer of 512 x 512 weights all cores. If max_lag is above 0, one core is left to each
     local worker, unless half of the cores or less would remain. Another number changes the last bits of results.
     """
-    pin_workers: bool | None = None
+    pin_workers: Free[bool | None] = None
     """Keep each local worker process on one core (train only). none: do so if max_lag is 0 and the number of workers is a
     multiple of the number of cores.
     """
-    min_workers: Natural = 0
+    min_workers: Free[Natural] = 0
     """Start training when this many workers have joined. 0: wait for all local workers (train), for one worker (learner)."""
 
     # ------------------------------------------------------------------------------------------------------------ network
 
-    transport: Literal["inproc", "ipc", "tcp"] = "ipc"
+    transport: Free[Literal["inproc", "ipc", "tcp"]] = "ipc"
     """How local workers are connected (train only). inproc: as threads of this process, which then runs the environment.
     ipc: local sockets. tcp: TCP on 127.0.0.1.
     """
-    bind: str = "tcp://127.0.0.1:5555"
+    bind: Free[str] = "tcp://127.0.0.1:5555"
     """Address at which the learner listens for workers (learner only). With tcp://0.0.0.0:5555 other machines can join; this
     needs keys.
     """
-    advertise: str = ""
+    advertise: Free[str] = ""
     """Host name or IP address at which workers on other machines reach this one (learner only). Default: the name of this
     machine.
     """
-    keys: str = ""
+    keys: Free[str] = ""
     """Key folder. Default: MILLRACE_KEYS, else ~/.config/millrace/keys. If a folder is named here or in MILLRACE_KEYS, TCP
     connections on this machine need keys too.
     """
-    insecure: bool = False
+    insecure: Free[bool] = False
     """Accept workers of other machines without keys. Whoever reaches the port can then read, disturb and stop the run."""
-    compress: Literal["none", "zstd"] = "none"
+    compress: Free[Literal["none", "zstd"]] = "none"
     """Compression of rollouts. zstd reduces the size of images, which pays on almost any network
     (pip install 'millrace-rl[compress]' for the learner and every worker).
     """
-    weights_dtype: WeightsDtype = "float32"
+    weights_dtype: Free[WeightsDtype] = "float32"
     """Precision of the weights that are sent to workers. bfloat16 and float16 halve the bytes. Workers act with the rounded
     weights; the learner's stay float32.
     """
 
     # ---------------------------------------------------------------------------------------------- timeouts and failures
 
-    heartbeat_s: Seconds = 1.0
+    heartbeat_s: Free[Seconds] = 1.0
     """Seconds between two heartbeats of a worker."""
-    worker_timeout_s: Seconds = 5.0
+    worker_timeout_s: Free[Seconds] = 5.0
     """A worker that has been silent for this many seconds is given up, and other workers take over its lanes. A worker is
     not silent while its supervisor says that its environment is busy, however long that takes.
     """
-    no_workers_timeout_s: Seconds = 60.0
+    no_workers_timeout_s: Free[Seconds] = 60.0
     """Write a checkpoint and end the run if there has been no worker for this many seconds."""
-    construct_timeout_s: SecondsOrNever = 600.0
+    construct_timeout_s: Free[SecondsOrNever] = 600.0
     """A local worker process is restarted if making one env copy takes longer than this many seconds. 0: never."""
-    reset_timeout_s: SecondsOrNever = 600.0
+    reset_timeout_s: Free[SecondsOrNever] = 600.0
     """A local worker process is restarted if a reset of an env copy takes longer than this many seconds. 0: never."""
-    step_timeout_s: SecondsOrNever = 600.0
+    step_timeout_s: Free[SecondsOrNever] = 600.0
     """A local worker process is restarted if one step of an env copy takes longer than this many seconds. 0: never."""
-    stall_timeout_s: Seconds = 600.0
+    stall_timeout_s: Free[Seconds] = 600.0
     """Write a checkpoint and end the run if no env step, reset or construction has ended for this many seconds, and none
     is under way within its timeout.
     """
-    max_env_failures: Natural = 3
+    max_env_failures: Free[Natural] = 3
     """End the run if the environment has raised more exceptions, or ended more worker processes, than this."""
 
     # -------------------------------------------------------------------------------------------------------------- files
 
-    checkpoint_every_s: Seconds = 60.0
+    checkpoint_every_s: Free[Seconds] = 60.0
     """Seconds between checkpoints."""
-    checkpoint_every_episodes: Natural = 0
+    checkpoint_every_episodes: Free[Natural] = 0
     """Also write a checkpoint after this many training episodes. 0: do not."""
-    checkpoint_every_updates: Natural = 0
+    checkpoint_every_updates: Free[Natural] = 0
     """Also write a checkpoint after this many updates. 0: do not."""
-    keep_checkpoints: Count = 3
+    keep_checkpoints: Free[Count] = 3
     """Number of checkpoints to keep, the newest ones."""
-    record: str = ""
+    record: Free[str] = ""
     """Write all whole training episodes into the Minari dataset of this id, as cartpole/ppo-v0
     (pip install 'millrace-rl[record]').
     """
-    metrics_bind: str = ""
+    metrics_bind: Free[str] = ""
     """HOST:PORT at which Prometheus can read the metrics, as 127.0.0.1:9464. With 0.0.0.0:9464 everybody in the network can
     read them. Default: nowhere.
     """

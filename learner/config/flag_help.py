@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal, NoReturn, get_args, get_origin, get_
 import msgspec
 from tyro.conf import arg
 
-from learner.config.flag_parser import parse_flags
+from learner.config.flag_parser import parse_flags, plain_type
 from learner.config.hyperparameters import HYPERPARAMETERS
 
 BASIC = (
@@ -116,12 +116,10 @@ def _fields(record: msgspec.Struct, names: Sequence[str]) -> list[tuple[str, Any
 
 def _metavar(name: str, hint: Any) -> str | None:
     """Placeholder for the values of a flag in the help text. None: tyro's default."""
-    options = get_args(hint)
+    options = get_args(plain_type(hint))
     if name in METAVARS or NoneType not in options:
         return METAVARS.get(name)
-    kind = next(option for option in options if option is not NoneType)
-    if get_origin(kind) is Annotated:
-        kind = get_args(kind)[0]
+    kind = plain_type(next(option for option in options if option is not NoneType))
     if get_origin(kind) is Literal:
         return f"{{{','.join(map(str, get_args(kind)))},none}}"
     return f"{{{TYPE_NAMES[kind]},none}}" if kind is bool else f"{TYPE_NAMES[kind]}|none"

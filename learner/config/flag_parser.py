@@ -7,7 +7,7 @@ import io
 import re
 from collections.abc import Callable, Iterator
 from itertools import dropwhile, takewhile
-from typing import TypeVar
+from typing import Annotated, Any, TypeVar, get_args, get_origin
 
 import msgspec
 import tyro
@@ -79,8 +79,13 @@ def _flag_names(kind: type[msgspec.Struct], default: msgspec.Struct | None) -> I
         else:
             name = field.name.replace("_", "-")
             yield name
-            if field.type is bool:
+            if plain_type(field.type) is bool:
                 yield f"no-{name}"
+
+
+def plain_type(hint: Any) -> Any:
+    """The type of a field without what `Annotated` says about it."""
+    return get_args(hint)[0] if get_origin(hint) is Annotated else hint
 
 
 def _message_in_box(box: str) -> str:

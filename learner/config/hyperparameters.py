@@ -9,6 +9,8 @@ from typing import Annotated, Literal
 
 import msgspec
 
+from learner.config.on_resume import Fixed, Free
+
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 Fraction = Annotated[float, msgspec.Meta(ge=0, le=1)]
@@ -20,194 +22,194 @@ Optimizer = Literal["rmsprop", "adam"]
 class Hyperparameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings that every algorithm has."""
 
-    rollout_steps: Count = 128
+    rollout_steps: Free[Count] = 128
     """T, the steps of each env copy in a rollout."""
-    net: tuple[Count, ...] = (64, 64)
+    net: Fixed[tuple[Count, ...]] = (64, 64)
     """Sizes of the hidden layers: of the actor and of the critic each, or of the Q-network."""
-    activation: Literal["tanh", "relu"] = "tanh"
+    activation: Fixed[Literal["tanh", "relu"]] = "tanh"
     """Activation function of the hidden layers."""
-    encoder: str | None = None
+    encoder: Fixed[str | None] = None
     """A torch module of your own in front of the hidden layers, as my_package.networks:factory.
     See protocol/policy/encoder.py.
     """
-    normalize_observations: bool = False
+    normalize_observations: Fixed[bool] = False
     """Normalize observations, except images: subtract the running mean, divide by the running standard deviation, clip to
     ±10.
     """
-    gamma: Fraction = 0.99
+    gamma: Fixed[Fraction] = 0.99
     """Discount factor."""
 
 
 class ActorCriticHyperparameters(Hyperparameters, frozen=True):
     """Settings of every algorithm with an actor and a critic."""
 
-    shared_net: bool = False
+    shared_net: Fixed[bool] = False
     """Let actor and critic share their hidden layers."""
-    learning_rate: Positive = 3e-4
+    learning_rate: Free[Positive] = 3e-4
     """Learning rate of the optimizer."""
-    learning_rate_schedule: Schedule = "constant"
+    learning_rate_schedule: Free[Schedule] = "constant"
     """linear: the learning rate falls to zero over the run."""
-    ent_coef: NotNegative = 0.0
+    ent_coef: Free[NotNegative] = 0.0
     """Weight of the entropy bonus in the loss."""
-    vf_coef: NotNegative = 0.5
+    vf_coef: Free[NotNegative] = 0.5
     """Weight of the value loss in the loss."""
-    max_grad_norm: Positive = 0.5
+    max_grad_norm: Free[Positive] = 0.5
     """Clip the norm of the gradient to this."""
-    log_std_init: float = 0.0
+    log_std_init: Fixed[float] = 0.0
     """Initial logarithm of the standard deviation of continuous (Box) actions."""
-    normalize_rewards: bool = False
+    normalize_rewards: Fixed[bool] = False
     """Divide rewards by the running standard deviation of the discounted return."""
 
 
 class RecurrentHyperparameters(ActorCriticHyperparameters, frozen=True):
     """Settings of every algorithm that can train a recurrent policy."""
 
-    core: Literal["lstm", "gru"] | None = None
+    core: Fixed[Literal["lstm", "gru"] | None] = None
     """Recurrent layer in front of the hidden layers. Minibatches then consist of whole sequences: all T steps of some env
     copies.
     """
-    core_size: Count = 64
+    core_size: Fixed[Count] = 64
     """Number of units of the recurrent layer."""
 
 
 class PPOConfig(RecurrentHyperparameters, frozen=True):
     """Proximal policy optimization (Schulman et al. 2017)."""
 
-    batch_size: Count = 64
+    batch_size: Free[Count] = 64
     """Largest number of rows (steps of one env copy) in a minibatch."""
-    n_epochs: Count = 10
+    n_epochs: Free[Count] = 10
     """Number of epochs: how often an update uses each row."""
-    gae_lambda: Fraction = 0.95
+    gae_lambda: Free[Fraction] = 0.95
     """λ of generalized advantage estimation. 1: Monte Carlo return. 0: one-step TD error."""
-    clip_range: Positive = 0.2
+    clip_range: Free[Positive] = 0.2
     """ε of the clipped objective: the ratio of new to old action probability is clipped to 1 ± ε."""
-    clip_range_schedule: Schedule = "constant"
+    clip_range_schedule: Free[Schedule] = "constant"
     """linear: clip_range falls to zero over the run."""
-    clip_range_vf: Positive | None = None
+    clip_range_vf: Free[Positive | None] = None
     """Clip the change of a value in an update to this, in units of (normalized) reward. none: no clipping."""
-    normalize_advantage: bool = True
+    normalize_advantage: Free[bool] = True
     """Normalize the advantages of each minibatch to mean 0 and standard deviation 1."""
-    target_kl: Positive | None = None
+    target_kl: Free[Positive | None] = None
     """End an update when the KL divergence from the old policy exceeds 1.5 times this. none: never."""
 
 
 class A2CConfig(RecurrentHyperparameters, frozen=True):
     """Advantage actor-critic: one gradient step on each batch (Mnih et al. 2016)."""
 
-    rollout_steps: Count = 8
+    rollout_steps: Free[Count] = 8
     """T, the steps of each env copy in a rollout."""
-    learning_rate: Positive = 7e-4
+    learning_rate: Free[Positive] = 7e-4
     """Learning rate of the optimizer."""
-    optimizer: Optimizer = "rmsprop"
+    optimizer: Fixed[Optimizer] = "rmsprop"
     """Optimizer: rmsprop (α = 0.99) or adam, each with ε = 1e-5."""
-    gae_lambda: Fraction = 1.0
+    gae_lambda: Free[Fraction] = 1.0
     """λ of generalized advantage estimation. 1: Monte Carlo return. 0: one-step TD error."""
-    normalize_advantage: bool = False
+    normalize_advantage: Free[bool] = False
     """Normalize the advantages of each batch to mean 0 and standard deviation 1."""
 
 
 class ImpalaConfig(RecurrentHyperparameters, frozen=True):
     """Actor-critic with V-trace, which corrects for rollouts of older weights, max_lag above 0 (Espeholt et al. 2018)."""
 
-    rollout_steps: Count = 32
+    rollout_steps: Free[Count] = 32
     """T, the steps of each env copy in a rollout."""
-    learning_rate: Positive = 7e-4
+    learning_rate: Free[Positive] = 7e-4
     """Learning rate of the optimizer."""
-    optimizer: Optimizer = "rmsprop"
+    optimizer: Fixed[Optimizer] = "rmsprop"
     """Optimizer: rmsprop (α = 0.99) or adam, each with ε = 1e-5."""
-    n_epochs: Count = 1
+    n_epochs: Free[Count] = 1
     """Number of epochs: how often an update uses each row. V-trace is computed anew in each epoch."""
-    minibatches: Count = 1
+    minibatches: Free[Count] = 1
     """Number of minibatches (gradient steps) in an epoch."""
-    vtrace_lambda: Fraction = 1.0
+    vtrace_lambda: Free[Fraction] = 1.0
     """λ of V-trace. 1: as in the paper. 0: one step."""
-    rho_bar: Positive = 1.0
+    rho_bar: Free[Positive] = 1.0
     """ρ̄ of V-trace: importance weights of TD errors are clipped to this. The larger it is, the closer the
     learned values are to those of the newest policy (without clipping: exactly those).
     """
-    c_bar: Positive = 1.0
+    c_bar: Free[Positive] = 1.0
     """c̄ of V-trace: importance weights of traces are clipped to this. It decides how far back a TD error has effect."""
 
 
 class REINFORCEConfig(ActorCriticHyperparameters, frozen=True):
     """Monte Carlo policy gradient on whole episodes (Williams 1992)."""
 
-    rollout_steps: Count = 1001
+    rollout_steps: Fixed[Count] = 1001
     """T, the steps of each env copy in a rollout. Must be longer than any episode."""
-    learning_rate: Positive = 2e-3
+    learning_rate: Free[Positive] = 2e-3
     """Learning rate of the optimizer."""
-    normalize_rewards: bool = True
+    normalize_rewards: Fixed[bool] = True
     """Divide rewards by the running standard deviation of the discounted return. Otherwise the loss of the baseline
     dominates the gradient.
     """
-    optimizer: Optimizer = "adam"
+    optimizer: Fixed[Optimizer] = "adam"
     """Optimizer: rmsprop (α = 0.99) or adam, each with ε = 1e-5."""
-    baseline: bool = True
+    baseline: Free[bool] = True
     """Subtract the value that the critic predicts from the return."""
-    normalize_returns: bool = True
+    normalize_returns: Free[bool] = True
     """Normalize the returns of each batch (less the baseline) to mean 0 and standard deviation 1."""
 
 
 class DQNConfig(Hyperparameters, frozen=True):
     """Deep Q-learning (Mnih et al. 2015), with the usual extensions."""
 
-    rollout_steps: Count = 32
+    rollout_steps: Free[Count] = 32
     """T, the steps of each env copy in a rollout."""
-    activation: Literal["tanh", "relu"] = "relu"
+    activation: Fixed[Literal["tanh", "relu"]] = "relu"
     """Activation function of the hidden layers."""
-    learning_rate: Positive = 3e-4
+    learning_rate: Free[Positive] = 3e-4
     """Learning rate of the optimizer."""
-    learning_rate_schedule: Schedule = "constant"
+    learning_rate_schedule: Free[Schedule] = "constant"
     """linear: the learning rate falls to zero over the run."""
-    optimizer: Literal["adam", "adamw"] = "adam"
+    optimizer: Fixed[Literal["adam", "adamw"]] = "adam"
     """Optimizer. adamw: Adam with a decoupled weight decay of 0.01."""
-    amsgrad: bool = False
+    amsgrad: Fixed[bool] = False
     """Use the AMSGrad variant of the optimizer."""
-    batch_size: Count = 64
+    batch_size: Free[Count] = 64
     """Number of transitions in a gradient step."""
-    gradient_steps: Count = 64
+    gradient_steps: Free[Count] = 64
     """Number of gradient steps in an update. There is one update for every envs x rollout_steps env steps, so this sets the
     replay ratio.
     """
-    learning_starts: Annotated[int, msgspec.Meta(ge=0)] = 1000
+    learning_starts: Free[Annotated[int, msgspec.Meta(ge=0)]] = 1000
     """Number of env steps before the first gradient step."""
-    replay_size: Count = 100_000
+    replay_size: Fixed[Count] = 100_000
     """Capacity of the replay buffer in transitions; the newest are kept. The final observation of a truncated episode takes
     the place of one.
     """
-    replay: Literal["uniform", "prioritized"] = "uniform"
+    replay: Fixed[Literal["uniform", "prioritized"]] = "uniform"
     """How transitions are drawn from the replay buffer. prioritized: by their last TD error."""
-    priority_alpha: Fraction = 0.6
+    priority_alpha: Fixed[Fraction] = 0.6
     """α of prioritized replay. 0: uniform. 1: in proportion to the TD error."""
-    priority_beta: Fraction = 0.4
+    priority_beta: Free[Fraction] = 0.4
     """Initial β of prioritized replay: how far importance weights correct the bias. It grows to 1 (fully) over the run."""
-    n_step: Count = 1
+    n_step: Free[Count] = 1
     """Number of rewards in a target before it bootstraps."""
-    double: bool = True
+    double: Free[bool] = True
     """Double Q-learning: the network chooses the next action, and the target network values it."""
-    dueling: bool = False
+    dueling: Fixed[bool] = False
     """Dueling network: an action value is the state's value plus the action's advantage over the mean."""
-    target: Literal["polyak", "hard"] = "hard"
+    target: Free[Literal["polyak", "hard"]] = "hard"
     """How the target network is updated. polyak: a little in each gradient step. hard: a copy every target_every steps."""
-    tau: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.005
+    tau: Free[Annotated[float, msgspec.Meta(gt=0, le=1)]] = 0.005
     """τ of the polyak update: the fraction by which the target network moves in each gradient step."""
-    target_every: Count = 250
+    target_every: Free[Count] = 250
     """Number of gradient steps between two hard updates of the target network."""
-    epsilon_start: Fraction = 1.0
+    epsilon_start: Free[Fraction] = 1.0
     """Initial probability ε of a random action."""
-    epsilon_end: Fraction = 0.05
+    epsilon_end: Free[Fraction] = 0.05
     """Final probability ε of a random action."""
-    epsilon_schedule: Literal["linear", "exponential"] = "linear"
+    epsilon_schedule: Free[Literal["linear", "exponential"]] = "linear"
     """How ε falls from its initial to its final value."""
-    epsilon_steps: Count = 10_000
+    epsilon_steps: Free[Count] = 10_000
     """Number of env steps, summed over all env copies, over which ε falls. exponential: until its distance to the final
     value is 1/e of the initial distance.
     """
-    loss: Literal["huber", "squared"] = "huber"
+    loss: Free[Literal["huber", "squared"]] = "huber"
     """Loss of the TD error. huber: squared up to 1 and linear beyond."""
-    max_grad_norm: Positive | None = None
+    max_grad_norm: Free[Positive | None] = None
     """Clip the norm of the gradient to this. none: no clipping."""
-    max_grad_value: Positive | None = None
+    max_grad_value: Free[Positive | None] = None
     """Clip each entry of the gradient to ± this, before its norm is clipped. none: no clipping."""
 
 

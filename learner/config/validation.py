@@ -8,7 +8,7 @@ from typing import Any, get_args, get_type_hints
 import msgspec
 
 from learner.config.config import Config
-from learner.config.hyperparameters import HYPERPARAMETERS
+from learner.config.hyperparameters import HYPERPARAMETERS, DQNConfig
 from protocol.address import advertised_address, check_address
 from protocol.errors import UsageError
 
@@ -40,6 +40,9 @@ def validate(config: Config, where: str = "") -> Config:
         raise UsageError(
             f"{at}{config.envs} envs cannot be shared evenly among {config.lanes} lanes; take {near}, or {divisor} lanes"
         )
+    match config.algorithm:
+        case DQNConfig(replay_size=size, rollout_steps=steps) if size < (most := (steps + 1) * config.envs // config.lanes):
+            raise UsageError(f"{at}replay_size {size}: a rollout takes up to {most}; take --replay-size {most} or more")
     if config.inference == "learner":
         _check_learner_inference(config, at)
     check_address(config.bind)

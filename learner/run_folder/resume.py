@@ -15,12 +15,14 @@ AUTO = Path("auto")
 def newest_run(config: RunSettings) -> Path | None:
     """The newest run folder with a checkpoint in `run_dir`, for this environment, algorithm and seed; or None.
 
-    The name of a run folder ends with the start time, so the newest is the last by name.
+    The name of a run folder ends with the start time, and a number if several began in that second.
     """
-    pattern = re.compile(re.escape(f"{as_folder_name(config.env)}-{config.algo}-s{config.seed}-") + r"\d{8}-\d{6}")
+    name = re.escape(f"{as_folder_name(config.env)}-{config.algo}-s{config.seed}-")
+    pattern = re.compile(name + r"(\d{8}-\d{6})(?:-(\d{1,9}))?")
     root = Path(config.run_dir)
-    matching = [path for path in root.iterdir() if pattern.fullmatch(path.name)] if root.is_dir() else []
-    return max((path for path in matching if _can_be_resumed(path, config)), key=lambda path: path.name, default=None)
+    named = [(found, path) for path in (root.iterdir() if root.is_dir() else ()) if (found := pattern.fullmatch(path.name))]
+    matching = [(found[1], int(found[2] or 1), path) for found, path in named if _can_be_resumed(path, config)]
+    return max(matching)[2] if matching else None
 
 
 def _can_be_resumed(path: Path, config: RunSettings) -> bool:

@@ -1,6 +1,6 @@
 """The folder of a run: which files it has, and how they are written and read.
 
-    runs/<env>-<algo>-s<seed>-<time>/
+    runs/<env>-<algo>-s<seed>-<time>/       with a number after the time if several began in one second
       config.toml           all settings of the run
       run.json              the format of the folder (run_format.py)
       metrics.jsonl         a row per update (metrics_log.py)
@@ -20,6 +20,8 @@ from __future__ import annotations
 import re
 import shutil
 import time
+from contextlib import suppress
+from itertools import count
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -106,20 +108,22 @@ class RunFolder:
 
     @staticmethod
     def create(config: RunSettings, started_s: float | None = None) -> RunFolder:
-        """Make a new folder with its config.toml.
+        """Make a new folder with its config.toml. A run of the same name and second gets a number after the time: -2, -3, ….
 
-        `started_s` is wall-clock time. Raises `UsageError` if the folder exists.
+        `started_s` is wall-clock time. Raises `UsageError` if no folder can be made.
         """
         stamp = time.strftime("%Y%m%d-%H%M%S", time.localtime(started_s))
-        path = Path(config.run_dir) / f"{as_folder_name(config.env)}-{config.algo}-s{config.seed}-{stamp}"
+        path = first = Path(config.run_dir) / f"{as_folder_name(config.env)}-{config.algo}-s{config.seed}-{stamp}"
         made = [folder for folder in (path, *path.parents) if not folder.exists()]
-        try:
-            path.mkdir(parents=True)
-        except FileExistsError as error:
-            raise UsageError(f"run folder {path} exists; wait a second, or choose another --run-dir or --seed") from error
-        except OSError as error:
-            raise UsageError(f"run folder {path} cannot be made: {error.strerror}; choose another --run-dir") from error
-        folder = RunFolder(path, made[-1])
+        for number in count(2):
+            try:
+                path.mkdir(parents=True)
+                break
+            except FileExistsError:
+                path = first.with_name(f"{first.name}-{number}")
+            except OSError as error:
+                raise UsageError(f"run folder {path} cannot be made: {error.strerror}; choose another --run-dir") from error
+        folder = RunFolder(path, made[-1] if made else path)
         folder.write_config(config)
         return folder
 
@@ -137,9 +141,18 @@ class RunFolder:
         return RunFolder(path)
 
     def remove(self) -> None:
-        """Remove the folder, and the parent folders made for it. Does nothing if it was there before, or after `keep`."""
-        if self._made is not None:
-            shutil.rmtree(self._made, ignore_errors=True)
+        """Remove the folder, and the parent folders made for it that nothing else is in.
+
+        Does nothing if the folder was there before, or after `keep`.
+        """
+        if self._made is None:
+            return
+        shutil.rmtree(self.path, ignore_errors=True)
+        for parent in self.path.parents:
+            if not parent.is_relative_to(self._made):
+                break
+            with suppress(OSError):  # another run is in it, or has removed it
+                parent.rmdir()
 
     def keep(self) -> None:
         """The run has begun: `remove` does nothing from now on."""

@@ -175,12 +175,18 @@ def test_an_environment_that_is_not_for_the_algorithm_leaves_no_folder_and_no_wo
     assert not (tmp_path / "mine").exists()  # the workers were started before this was known: see conftest.py
 
 
-def test_a_run_folder_that_exists_is_left_alone(tmp_path: Path, capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("learner.run_folder.run_folder.time.strftime", lambda *_: "now")
-    (tmp_path / "CartPole-v1-ppo-s1-now").mkdir()
-    line = refusal(capsys, "train", "CartPole-v1", "--run-dir", str(tmp_path))
-    assert re.search(r"run folder \S+/CartPole-v1-ppo-s1-now exists; .*--run-dir", line)
-    assert not list((tmp_path / "CartPole-v1-ppo-s1-now").iterdir())
+def test_a_resume_with_other_fixed_settings_is_one_line_and_changes_nothing(tmp_path: Path, capsys: Captured) -> None:
+    run = RunFolder.create(resolve("CartPole-v1", run_dir=str(tmp_path))).path
+    before = {file.name: file.read_bytes() for file in run.iterdir()}
+    for flags, says in (
+        (["--algo", "a2c"], "algo: expected ppo as in its config.toml, got a2c"),
+        (["--activation", "relu"], "activation: expected tanh as in its config.toml, got relu"),
+        (["--seed", "5"], "seed: expected 1 as in its config.toml, got 5"),
+    ):
+        for command in ("train", "learner"):
+            line = refusal(capsys, command, "--resume", str(run), *flags)
+            assert f"run {run}: {says}; a run keeps this setting: resume it without, or start a new run" in line
+    assert {file.name: file.read_bytes() for file in run.iterdir()} == before
 
 
 def test_a_broken_checkpoint_is_not_resumed(tmp_path: Path, capsys: Captured) -> None:

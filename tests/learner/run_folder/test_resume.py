@@ -40,6 +40,15 @@ def test_the_newest_with_a_checkpoint_is_taken(tmp_path: Path) -> None:
     assert newest_run(config) == newer
 
 
+def test_of_several_of_one_second_the_last_is_taken(tmp_path: Path) -> None:
+    config = resolve("CartPole-v1", run_dir=str(tmp_path))
+    runs = [a_run(config, HOURS) for _ in range(11)]
+    assert runs[-1].name.endswith("-11")
+    assert newest_run(config) == runs[-1]
+    later = a_run(config, 2 * HOURS)
+    assert newest_run(config) == later
+
+
 @pytest.mark.parametrize("other", [{"seed": 2}, {"algo": "a2c"}, {"env": "Pendulum-v1"}, {"env": "CartPole:v1"}])
 def test_a_run_of_another_environment_algorithm_or_seed_is_let_be(tmp_path: Path, other: dict[str, object]) -> None:
     mine = resolve("CartPole-v1", run_dir=str(tmp_path))

@@ -4,6 +4,7 @@ import errno
 import itertools
 import json
 import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -55,9 +56,32 @@ def test_a_run_has_a_folder_of_its_own(tmp_path: Path) -> None:
     assert folder.path.name.startswith("CartPole-v1-ppo-s3-202311")
     assert config_of_run(folder.path) == config(tmp_path)
     (folder.path / "mine.txt").write_text("mine")
-    with pytest.raises(UsageError, match=r"run folder .*CartPole-v1-ppo-s3-\S+ exists; .*--run-dir"):
-        RunFolder.create(config(tmp_path), STARTED_S)
+    later = [RunFolder.create(config(tmp_path), STARTED_S) for _ in range(2)]
+    assert [run.path.name for run in later] == [f"{folder.path.name}-2", f"{folder.path.name}-3"]
     assert (folder.path / "mine.txt").read_text() == "mine"
+
+
+def test_runs_that_start_in_the_same_second_have_folders_of_their_own(tmp_path: Path) -> None:
+    with ThreadPoolExecutor(8) as threads:
+        made = list(threads.map(lambda _: RunFolder.create(config(tmp_path / "runs"), STARTED_S).path, range(32)))
+    assert len(set(made)) == 32
+    assert all(config_of_run(path) == config(tmp_path / "runs") for path in made)
+
+
+def test_a_run_that_does_not_begin_removes_only_its_own_folder(tmp_path: Path) -> None:
+    """Both were made in a folder that was not there before."""
+    first, second = (RunFolder.create(config(tmp_path / "a" / "runs"), STARTED_S) for _ in range(2))
+    first.remove()
+    assert second.path.is_dir()
+    assert not first.path.exists()
+    alone = RunFolder.create(config(tmp_path / "b" / "runs"), STARTED_S)
+    alone.remove()
+    assert not (tmp_path / "b").exists()
+    assert tmp_path.is_dir()
+    begun = RunFolder.create(config(tmp_path / "c"), STARTED_S)
+    begun.keep()
+    begun.remove()
+    assert begun.path.is_dir()
 
 
 @pytest.mark.parametrize(

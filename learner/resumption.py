@@ -1,0 +1,68 @@
+"""What is checked before a run is resumed: that the settings and the environment are still those of its weights and state.
+
+Rule: all of this is checked before anything is written into the run folder, so a refused resume changes nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from learner.config.config import Config
+from learner.config.hyperparameters import DQNConfig
+from learner.config.layers import config_of_run
+from learner.config.on_resume import Change, OnResume, changes, refusal
+from learner.env_spaces import EnvSpaces
+from learner.run_folder.run_folder import RunFolder
+from protocol.bounds import one_line
+from protocol.errors import UsageError
+
+
+def check_settings(config: Config, run: Path) -> list[str]:
+    """Check that the run in this folder can be resumed with these settings. Returns lines about what will be different.
+
+    Raises `UsageError` that names the fixed settings that differ, or if this is no run folder.
+    """
+    RunFolder.open(run)
+    before = config_of_run(run)
+    changed = [*changes(before, config)]
+    if before.algo == config.algo:  # else the settings of the two algorithms cannot be compared
+        changed += changes(before.algorithm, config.algorithm)
+    if why := refusal(changed):
+        raise UsageError(f"run {run}: {why}; a run keeps this setting: resume it without, or start a new run")
+    return [f"run {run}: {line}" for line in _differences(before, config, changed)]
+
+
+def check_spaces(run: Path, made_for: EnvSpaces, now: EnvSpaces) -> None:
+    """Check that the environment has the spaces that the policy was made for. Raises `UsageError` that names the other."""
+    for what, expected, got in (
+        ("observations", made_for.observation, now.observation),
+        ("actions", (made_for.action,), (now.action,)),
+    ):
+        if expected == got:
+            continue
+        pairs = [
+            (one_line(str(one)), one_line(str(other))) for one, other in zip(expected, got, strict=False) if one != other
+        ]
+        one, other = pairs[0] if pairs else (f"{len(expected)} arrays", f"{len(got)} arrays")
+        raise UsageError(
+            f"run {run}: the environment's {what} have changed: expected {one}, got {other}; "
+            "install the version of the environment that the run was started with, or start a new run"
+        )
+
+
+def _differences(before: Config, config: Config, changed: Sequence[Change]) -> list[str]:
+    lines = [
+        f"{name}: {given} now, {had} before; every lane starts on new env copies"
+        for name, on_resume, had, given in changed
+        if on_resume is OnResume.ADAPTABLE
+    ]
+    match before.algorithm, config.algorithm:
+        case DQNConfig() as had, DQNConfig() as has if has.gradient_steps == had.gradient_steps:
+            was, now = (one.envs * one.algorithm.rollout_steps for one in (before, config))
+            if was != now:
+                lines.append(
+                    f"an update of {has.gradient_steps} gradient steps now follows {now} env steps, {was} before; "
+                    f"--gradient-steps {max(1, round(has.gradient_steps * now / was))} keeps the replay ratio"
+                )
+    return lines
