@@ -150,7 +150,8 @@ def test_another_replay_ratio_is_said(tmp_path: Path) -> None:
     assert line.endswith(
         "an update of 64 gradient steps now follows 512 env steps, 256 before; --gradient-steps 128 keeps the replay ratio"
     )
-    for same in ({"lanes": 2}, {"envs": 16, "rollout_steps": 16}, {"envs": 16, "gradient_steps": 128}):
+    same_ratio: list[dict[str, Any]] = [{"lanes": 2}, {"envs": 16, "rollout_steps": 16}, {"envs": 16, "gradient_steps": 128}]
+    for same in same_ratio:
         assert not [one for one in check_settings(resolve(resume=run, **same), run) if "replay ratio" in one], same
 
 
