@@ -5,7 +5,7 @@ BIN := .venv/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: train test lint type unit docs bench bench-peers test-learning test-cluster soak clean
+.PHONY: train test lint type unit docs bench bench-peers test-learning test-cluster test-model soak clean
 
 train: .venv/installed  ## train CartPole-v1 on two worker processes until a greedy evaluation averages 475
 	$(BIN)/millrace train CartPole-v1 --workers 2 --target-return 475 --eval-episodes 20 --eval-every 5000
@@ -24,6 +24,9 @@ unit: .venv/installed-dev
 
 test-learning: .venv/installed-dev  ## published scores, three seeds each; ten minutes
 	$(BIN)/python -m pytest -m learning --timeout 3600 tests/learning
+
+test-model: .venv/installed-dev  ## every interleaving of messages, faults and time in small runs; half an hour on two cores
+	$(BIN)/python -m pytest -m model -s tests/model
 
 test-cluster: .venv/installed-dev  ## Docker, Prometheus, Slurm and Ray, for real. Needs root, Debian's packages, the extra `ray`; says which
 	$(BIN)/python -m pytest -m cluster -rs -o log_cli=true -o log_cli_level=INFO tests/cluster

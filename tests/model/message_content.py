@@ -1,0 +1,151 @@
+"""Messages as plain tuples, which a state of the model can hold, and back.
+
+Rule: only what the two halves read is kept. A rollout is one valid transition.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+from protocol.messages import (
+    PROTOCOL_VERSION,
+    Collect,
+    Heartbeat,
+    HeartbeatReply,
+    Hello,
+    LaneIncarnation,
+    Permit,
+    Received,
+    Refuse,
+    Rejoin,
+    Release,
+    Rollout,
+    ToLearner,
+    ToWorker,
+    Weights,
+    Welcome,
+)
+from protocol.specs import RunSpec
+from tests.model.names import Kind, Name, name
+from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollout
+
+Content = tuple[Any, ...]
+
+
+def worker_of(peer: bytes) -> int:
+    return int(peer[1:])
+
+
+def peer_of(worker: int) -> bytes:
+    return b"w%d" % worker
+
+
+def session(number: int) -> Name:
+    return name(Kind.SESSION, number)
+
+
+def ticket(number: int) -> Name:
+    return name(Kind.TICKET, number)
+
+
+def incarnation(lane: int, number: int) -> Name:
+    return name(Kind.INCARNATION, number, lane)
+
+
+@cache
+def rollout(session: int, lane: int, ticket: int, version: int, sequence: int) -> Rollout:
+    return fake_rollout(session, lane, ticket, version, sequence)
+
+
+@cache
+def weights(version: int) -> Weights:
+    return Weights(version, PARAMETERS, BUFFERS)
+
+
+def hello(worker: int, nonce: int, attempt: int) -> Hello:
+    return Hello(
+        protocol=PROTOCOL_VERSION,
+        worker=f"w{worker}",
+        host="host",
+        pid=1,
+        process_nonce=nonce,
+        software="model",
+        attempt=attempt,
+    )
+
+
+def content_of(message: ToLearner | ToWorker, worker: int) -> Content:
+    """`worker`: the number of the worker that sends or receives it."""
+    match message:
+        case Hello():
+            attempt = name(Kind.ATTEMPT, message.attempt, worker)
+            return "Hello", name(Kind.NONCE, message.process_nonce, worker), attempt
+        case Heartbeat(number, replies, version, tickets):
+            held = tuple(ticket(each) for each in sorted(tickets))
+            return "Heartbeat", session(number), name(Kind.REPLIES, replies, number), version, held
+        case Rollout():
+            return "Rollout", *rollout_content(message)
+        case Welcome(number, attempt):
+            return "Welcome", session(number), name(Kind.ATTEMPT, attempt, worker)
+        case Refuse():
+            return ("Refuse",)
+        case Rejoin(number):
+            return "Rejoin", session(number)
+        case Weights(version):
+            return "Weights", version
+        case Collect(number, version, permits, received):
+            permitted = tuple((ticket(p.ticket), p.lane, incarnation(p.lane, p.incarnation)) for p in permits)
+            return "Collect", session(number), version, permitted, _received(received)
+        case Release(number, lanes):
+            return "Release", session(number), tuple((each.lane, incarnation(each.lane, each.incarnation)) for each in lanes)
+        case HeartbeatReply(number, replies, received):
+            return "HeartbeatReply", session(number), name(Kind.REPLIES, replies, number), _received(received)
+        case _:
+            raise AssertionError(f"the model has no {type(message).__name__}")
+
+
+def message_of(content: Content, worker: int, run: RunSpec) -> Any:
+    """The message of this content, from or to this worker."""
+    match content:
+        case "Hello", nonce, attempt:
+            return hello(worker, nonce.value, attempt.value)
+        case "Heartbeat", number, replies, version, tickets:
+            held = tuple(each.value for each in tickets)
+            return Heartbeat(number.value, replies.value, version, held, 0, {}, 0)
+        case "Rollout", *fields:
+            return rollout_of(tuple(fields))
+        case "Welcome", number, attempt:
+            return Welcome(number.value, attempt.value, run)
+        case ("Refuse",):
+            return Refuse("refused")
+        case "Rejoin", number:
+            return Rejoin(number.value)
+        case "Weights", version:
+            return weights(version)
+        case "Collect", number, version, permits, received:
+            allowed = tuple(Permit(each.value, lane, inc.value) for each, lane, inc in permits)
+            return Collect(number.value, version, allowed, _received_of(received))
+        case "Release", number, lanes:
+            return Release(number.value, tuple(LaneIncarnation(lane, inc.value) for lane, inc in lanes))
+        case "HeartbeatReply", number, replies, received:
+            return HeartbeatReply(number.value, replies.value, _received_of(received))
+    raise AssertionError(content)
+
+
+def rollout_content(message: Rollout) -> Content:
+    return session(message.session), message.lane, ticket(message.ticket), message.version, message.sequence
+
+
+def rollout_of(content: Content) -> Rollout:
+    number, lane, of_ticket, version, sequence = content
+    return rollout(number.value, lane, of_ticket.value, version, sequence)
+
+
+def _received(received: tuple[Received, ...]) -> Content:
+    lanes = sorted(received, key=lambda each: each.lane)
+    return tuple((r.lane, incarnation(r.lane, r.incarnation), r.next_sequence, tuple(sorted(r.out_of_order))) for r in lanes)
+
+
+def _received_of(content: Content) -> tuple[Received, ...]:
+    return tuple(Received(lane, number.value, following, out) for lane, number, following, out in content)

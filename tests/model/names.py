@@ -1,0 +1,113 @@
+"""Numbers that only identify something, and their renaming in states of the model.
+
+Rule: the program compares tickets, sessions, incarnations and the like, or takes the next one. Their size means nothing. So
+the model numbers them anew, in the same order, from 0: two states that differ in nothing else are one. `OLD` names are of
+things that only a memory of the past lists; they go when nothing else names the same thing.
+(After a learner restart the numbers of tickets and incarnations start again below old ones. Then renaming may change which
+of the later numbers repeats an old one.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from enum import IntEnum
+from typing import Any
+
+BITS = 20
+MASK = (1 << BITS) - 1
+
+
+class Kind(IntEnum):
+    """What a name names. Kinds with a scope come after the kind of their scope."""
+
+    WORKER = 1
+    """number of a worker"""
+    SESSION = 2
+    TICKET = 3
+    INCARNATION = 4
+    """scope: the lane"""
+    REPLIES = 5
+    """number of heartbeat replies; scope: the session"""
+    ATTEMPT = 6
+    """scope: the worker"""
+    NONCE = 7
+    """process of a worker; scope: the worker"""
+    OLD_SESSION = 8
+    OLD_TICKET = 9
+
+
+SCOPED = {Kind.REPLIES: Kind.SESSION, Kind.ATTEMPT: Kind.WORKER, Kind.NONCE: Kind.WORKER}
+OLD = {Kind.OLD_SESSION: Kind.SESSION, Kind.OLD_TICKET: Kind.TICKET}
+
+
+class Name(int):
+    """Kind, scope and value in one integer, so that names sort by kind and scope."""
+
+    @property
+    def kind(self) -> Kind:
+        return Kind(self >> 2 * BITS)
+
+    @property
+    def scope(self) -> int:
+        return self >> BITS & MASK
+
+    @property
+    def value(self) -> int:
+        return self & MASK
+
+    def __repr__(self) -> str:
+        scope = f"{self.scope}:" if self.kind in SCOPED or self.kind is Kind.INCARNATION else ""
+        return f"{self.kind.name.lower()} {scope}{self.value}"
+
+
+def name(kind: Kind, value: int, scope: int = 0) -> Name:
+    assert 0 <= value <= MASK, f"{kind.name} {value}: too large for the model"
+    return Name(kind << 2 * BITS | scope << BITS | value)
+
+
+def names_in(content: Any, found: set[Name]) -> set[Name]:
+    """All names in nested tuples."""
+    if isinstance(content, Name):
+        found.add(content)
+    elif isinstance(content, tuple):
+        for each in content:
+            names_in(each, found)
+    return found
+
+
+def renamed(content: Any, new: dict[Name, Name | None]) -> Any:
+    """Nested tuples under new names. An entry of a tuple whose new name is None is dropped."""
+    if isinstance(content, Name):
+        return new.get(content, content)
+    if isinstance(content, tuple):
+        return tuple(renamed(each, new) for each in content if not (isinstance(each, Name) and new.get(each, each) is None))
+    return content
+
+
+def renaming(names: Iterable[int], workers: dict[int, int]) -> dict[Name, Name | None]:
+    """New names, in the same order, from 0, for those that change. `workers`: the new number of each worker."""
+    new: dict[int, int] = {}
+    changed: dict[Name, Name | None] = {}
+    group, following = -1, 0
+    for old in sorted(names):
+        if old >> BITS != group:
+            group, following = old >> BITS, 0
+            kind, scope = Kind(group >> BITS), group & MASK
+            if kind in SCOPED:
+                scope = workers[scope] if SCOPED[kind] is Kind.WORKER else new[SCOPED[kind] << 2 * BITS | scope] & MASK
+            base = kind << 2 * BITS | scope << BITS
+        if kind is Kind.WORKER:
+            to = base | workers[old & MASK]
+        elif kind in OLD:
+            same = new.get(OLD[kind] << 2 * BITS | old & MASK)
+            if same is None:
+                changed[Name(old)] = None
+                continue
+            to = base | same & MASK
+        else:
+            to = base | following
+            following += 1
+        new[old] = to
+        if to != old:
+            changed[Name(old)] = Name(to)
+    return changed

@@ -1,0 +1,45 @@
+"""The size of one exploration, and the times of the model.
+
+Rule: one tick of time is one second, and times are small, so that few ticks matter: a Heartbeat every tick; after more than
+two ticks of silence either half gives the other up. A worker looks for its learner for ever.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+from protocol.specs import RunSpec
+from tests.support.fake_ends import run_spec
+
+TICK_S = 1.0
+TIMEOUT_S = 2.0
+FOR_EVER_S = math.inf
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is explored completely."""
+
+    workers: int
+    lanes: int
+    updates: int
+    """number of updates after which a run has reached its target"""
+    faults: int
+    """number of faults, of any kinds, at any moments"""
+    max_lag: int = 0
+    per_update: int | None = None
+    """rollouts of an update; None: one of each lane"""
+
+    @property
+    def rollouts_per_update(self) -> int:
+        return self.lanes if self.per_update is None else self.per_update
+
+    @cached_property
+    def run(self) -> RunSpec:
+        return run_spec(self.lanes, heartbeat_s=TICK_S, learner_timeout_s=TIMEOUT_S)
+
+    def __str__(self) -> str:
+        size = f"{self.workers} workers, {self.lanes} lanes, {self.updates} updates, {self.faults} faults"
+        return f"{size}, max_lag {self.max_lag}, {self.rollouts_per_update} rollouts per update"

@@ -1,0 +1,174 @@
+"""A worker of the model: a real `Session`, the rollouts in progress, and what happened to the process.
+
+Rule: a session is taken apart into plain tuples and put together again, as the learner is. After each event the worker does
+what its program does: give up work that nobody wants, start the next work, send what is due. To finish work is an event.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from protocol.messages import ToLearner, ToWorker
+from tests.model.message_content import Content, incarnation, rollout_content, rollout_of, session, ticket, weights
+from tests.model.names import Kind, name
+from tests.model.settings import FOR_EVER_S, TIMEOUT_S, Settings
+from tests.support.fake_ends import fake_rollouts
+from workers.collect.held_rollouts import REMEMBERED_TICKETS, Assignment, HeldRollouts, _HeldLane
+from workers.session import Effect, Identity, Leave, Send, Session, Task, _SessionState
+from workers.states import State
+
+SAVED: dict[type, set[str]] = {
+    Session: {"identity", "state", "run", "session", "_attempt", "_last_heard_s", "_due_s", "_current"},
+    _SessionState: {"rollouts", "weights", "in_progress", "replies", "acknowledged_version"},
+    HeldRollouts: {"_lanes"},
+    _HeldLane: {"incarnation", "sequence", "tickets", "kept", "finished"},
+}
+NOT_SAVED: dict[type, set[str]] = {
+    Session: {"_statistics", "_join_timeout_s", "_rejoin_timeout_s", "_joining_s", "_backoff_s", "_reason"},
+    _SessionState: {"evaluations", "orders", "described"},
+    HeldRollouts: set(),
+    _HeldLane: set(),
+}
+PAUSE_S = 0.5  # between two Hellos: one in every tick
+
+
+@dataclass
+class Worker:
+    """One state of a worker, which an event changes."""
+
+    settings: Settings
+    number: int
+    nonce: int
+    """of its process; a later process has a larger one"""
+    session: Session | None = None
+    """None: its process has ended"""
+    task: Task | None = None
+    frozen: bool = False
+    shut_out: bool = False
+    """whether its key was revoked: the learner hears nothing of it"""
+    cut_off: bool = False
+    """whether its link, or its process, is gone for ever"""
+
+    # ---------------------------------------------------------------- events
+
+    def start(self, now: float) -> list[ToLearner]:
+        """A new process starts under the same name."""
+        self.nonce += 1
+        self.shut_out = False
+        who = Identity(f"w{self.number}", "host", 1, self.nonce, "model")
+        self.session = Session(who, now, join_timeout_s=FOR_EVER_S, rejoin_timeout_s=FOR_EVER_S)
+        return self._turn([], now)
+
+    def end(self) -> None:
+        """The process is killed, or leaves."""
+        self.session = self.task = None
+        self.frozen = False
+
+    def handle(self, message: ToWorker, now: float) -> list[ToLearner]:
+        assert self.session is not None
+        return self._turn(self.session.handle(message, now), now)
+
+    def finish(self, now: float) -> list[ToLearner]:
+        assert self.session is not None
+        assert self.task is not None
+        rollouts, self.task = fake_rollouts(self.task), None
+        return self._turn(self.session.finished(rollouts), now)
+
+    def turn(self, now: float) -> list[ToLearner]:
+        """Time has passed."""
+        return [] if self.session is None or self.frozen else self._turn([], now)
+
+    def refused(self, now: float) -> list[ToLearner]:
+        """The learner's endpoint rejects its key."""
+        assert self.session is not None
+        return self._turn(self.session.refused("its key was revoked"), now)
+
+    # ---------------------------------------------------------------- inside
+
+    def _turn(self, effects: list[Effect], now: float) -> list[ToLearner]:
+        current = self.session
+        assert current is not None
+        if self.task is not None and current.abandoned(self.task.session):
+            self.task = None
+            effects = effects + current.finished([])
+        if self.task is None:
+            self.task = current.next_task()
+        effects = effects + current.tick(now)
+        most = self.settings.rollouts_per_update * (1 + self.settings.max_lag)
+        assert current.held_count() <= most, f"a worker holds {current.held_count()} rollouts, of at most {most}"
+        sent: list[ToLearner] = []
+        for effect in effects:
+            if isinstance(effect, Send):
+                sent.append(effect.message)
+            if isinstance(effect, Leave):
+                self.end()
+        return sent
+
+
+# -------------------------------------------------------------------- to tuples and back
+
+
+def saved(worker: Worker, now: float) -> Content:
+    nonce = name(Kind.NONCE, worker.nonce, worker.number)
+    flags = worker.frozen, worker.shut_out, worker.cut_off
+    current = worker.session
+    if current is None:
+        return nonce, flags, None, None
+    held = current._current
+    fields = (
+        current.state,
+        current.run is None,
+        session(current.session),
+        name(Kind.ATTEMPT, current._attempt, worker.number),
+        max(current._last_heard_s - now, -TIMEOUT_S - 1.0),
+        max(current._due_s - now, 0.0),
+        tuple(_lane(number, lane) for number, lane in held.rollouts._lanes.items()),
+        held.version,
+        tuple(ticket(number) for number in held.in_progress),
+        name(Kind.REPLIES, held.replies, current.session),
+        held.acknowledged_version,
+    )
+    task = worker.task
+    work = None if task is None else (session(task.session), task.weights.version, tuple(_work(a) for a in task.assignments))
+    return nonce, flags, fields, work
+
+
+def _lane(number: int, lane: _HeldLane) -> Content:
+    tickets = tuple((ticket(each), version) for each, version in lane.tickets.items())
+    kept = tuple(rollout_content(rollout) for rollout in lane.kept.values())
+    finished = tuple(name(Kind.OLD_TICKET, each) for each in lane.finished)
+    assert len(finished) <= REMEMBERED_TICKETS, "a worker remembers too many tickets"
+    return number, incarnation(number, lane.incarnation), lane.sequence, tickets, kept, finished
+
+
+def _work(assignment: Assignment) -> Content:
+    number = incarnation(assignment.lane, assignment.incarnation)
+    return ticket(assignment.ticket), assignment.lane, number, assignment.sequence
+
+
+def loaded(content: Content, number: int, settings: Settings) -> Worker:
+    """A worker at the time 0 with this content."""
+    nonce, (frozen, shut_out, cut_off), fields, work = content
+    worker = Worker(settings, number, nonce.value, None, None, frozen, shut_out, cut_off)
+    if fields is None:
+        return worker
+    state, is_new, of_session, attempt, heard, due, lanes, version, in_progress, replies, acknowledged = fields
+    who = Identity(f"w{number}", "host", 1, nonce.value, "model")
+    current = Session(who, 0.0, join_timeout_s=FOR_EVER_S, rejoin_timeout_s=FOR_EVER_S)
+    current.state, current.run = State(state), None if is_new else settings.run
+    current.session, current._attempt = of_session.value, attempt.value
+    current._last_heard_s, current._due_s, current._backoff_s = heard, due, PAUSE_S
+    held = current._current
+    held.weights = None if version < 0 else weights(version)
+    held.in_progress = tuple(each.value for each in in_progress)
+    held.replies, held.acknowledged_version = replies.value, acknowledged
+    for lane, of_incarnation, sequence, tickets, kept, finished in lanes:
+        here = held.rollouts._lanes[lane] = _HeldLane(of_incarnation.value, sequence)
+        here.tickets = {each.value: lowest for each, lowest in tickets}
+        here.kept = {fields[2].value: rollout_of(fields) for fields in kept}
+        here.finished.extend(each.value for each in finished)
+    worker.session = current
+    if work is not None:
+        assignments = tuple(Assignment(each.value, lane, inc.value, sequence) for each, lane, inc, sequence in work[2])
+        worker.task = Task(work[0].value, weights(work[1]), assignments)
+    return worker
