@@ -15,7 +15,7 @@ from learner.config.command_line import read_config
 from learner.run_folder.json_log import JsonLines
 from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import Interrupted
-from protocol.bounds import indented
+from protocol.bounds import escaped, indented
 from protocol.errors import UserFacingError
 
 log = logging.getLogger("millrace.learner")
@@ -43,7 +43,7 @@ def main(argv: list[str]) -> int:
 
         log.info("run folder: %s", serve(config, resume, watch))
     except UserFacingError as error:
-        sys.stderr.write("\n".join(filter(None, [f"learner: {error}", indented(error.detail)])) + "\n")
+        sys.stderr.write("\n".join(filter(None, [escaped(f"learner: {error}"), indented(error.detail)])) + "\n")
         return error.exit_code
     except Interrupted as interrupt:
         sys.stderr.write(f"learner: interrupted; go on with: python -m learner --resume {interrupt.run}\n")

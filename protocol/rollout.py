@@ -21,7 +21,7 @@ import numpy.typing as npt
 from protocol.arrays import Array, Bools, Floats
 from protocol.bounds import Count, Natural, Real, Seconds
 from protocol.errors import BadRollout
-from protocol.specs import Leaf, RunSpec
+from protocol.specs import ActionSpec, Leaf, RunSpec
 
 LARGEST_REWARD = float(np.finfo(np.float32).max)
 
@@ -121,16 +121,10 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
     if not 0 <= rollout.lane < run.lanes:
         raise BadRollout(f"lane: expected 0 to {run.lanes - 1}, got {rollout.lane}")
     for leaf, array in zip(run.policy.observation, rollout.obs, strict=True):
-        if leaf.sizes:
-            counts = array - np.reshape(leaf.start, leaf.shape)
-            if (counts < 0).any() or (counts >= np.reshape(leaf.sizes, leaf.shape)).any():
-                raise BadRollout(f"{_named(leaf)}: expected values of its space, got {array.min()} to {array.max()}")
-    choices = np.reshape(action.sizes, action.shape) if action.sizes else 2
-    # `count_nonzero` takes a third of the time of `any`
-    if action.kind != "box" and np.count_nonzero((rollout.action < 0) | (rollout.action >= choices)):
-        raise BadRollout(
-            f"action: expected 0 to {max(action.sizes, default=2) - 1}, got {rollout.action.min()} to {rollout.action.max()}"
-        )
+        if why := outside_of_space(array, leaf):
+            raise BadRollout(f"{_named(leaf)}: {why}")
+    if why := outside_of_choices(rollout.action, action):
+        raise BadRollout(f"action: {why}")
     ended = rollout.terminated | rollout.truncated
     if np.count_nonzero(rollout.valid[1:] == ended[:-1]):
         t, n = np.argwhere(rollout.valid[1:] == ended[:-1])[0]
@@ -146,6 +140,24 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
             )
         if len(episode.facts) != len(run.facts):
             raise BadRollout(f"episode: expected {len(run.facts)} facts, got {len(episode.facts)}")
+
+
+def outside_of_space(array: Array, leaf: Leaf) -> str:
+    """What is wrong with values [..., *leaf] of an observation; empty if its space has them, as far as it counts them."""
+    if leaf.sizes:
+        counts = array - np.reshape(leaf.start, leaf.shape)
+        if (counts < 0).any() or (counts >= np.reshape(leaf.sizes, leaf.shape)).any():
+            return f"expected values of its space, got {array.min()} to {array.max()}"
+    return ""
+
+
+def outside_of_choices(array: Array, action: ActionSpec) -> str:
+    """What is wrong with stored actions [..., *action]; empty if they are choices of its space, or numbers of a box."""
+    choices = np.reshape(action.sizes, action.shape) if action.sizes else 2
+    # `count_nonzero` takes a third of the time of `any`
+    if action.kind != "box" and np.count_nonzero((array < 0) | (array >= choices)):
+        return f"expected 0 to {max(action.sizes, default=2) - 1}, got {array.min()} to {array.max()}"
+    return ""
 
 
 def _named(leaf: Leaf) -> str:

@@ -20,6 +20,7 @@ from protocol.errors import EnvironmentFailed, RunError, UsageError
 
 AT_ONCE = 2  # episodes whose frames are in memory
 LONGEST_EPISODE = 20_000  # env steps; the worker sends frames of the first 1,500
+FRAMES_PER_S, MOST_FRAMES_PER_S = 30, 1_000  # if the environment names no rate; what it names is what a worker says
 FOLDER = "videos"
 
 
@@ -42,9 +43,11 @@ def record_videos(player: PolicyPlayer, run: Path, episodes: int, seed: int) -> 
     env_id = player.policy.env.id
     env = player.describe("rgb_array")
     modes = env.metadata.get("render_modes", [])
-    if env.render_mode != "rgb_array" or "rgb_array" not in modes:
+    if env.render_mode != "rgb_array" or not isinstance(modes, list | tuple) or "rgb_array" not in modes:
         raise UsageError(f"environment {env_id} cannot be filmed: expected it to render rgb_array, got {modes}")
-    frames_per_s = env.metadata.get("render_fps", 30)
+    frames_per_s = env.metadata.get("render_fps")
+    if not (isinstance(frames_per_s, int | float) and 0 < frames_per_s <= MOST_FRAMES_PER_S):
+        frames_per_s = FRAMES_PER_S
     folder = run / FOLDER
     episodes_played = PlayedEpisodes(player, seed)
     played: list[Played] = []

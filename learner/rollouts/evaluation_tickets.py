@@ -3,12 +3,15 @@
 Rule: the seeds are cut into tickets of `copies` seeds, whatever the number of workers, so the result does not depend on that
 number. Every active worker gets tickets, also one without a lane. A ticket whose worker is lost goes to another. The numbers
 of these tickets start at `FIRST_TICKET`, far above those of rollouts, and the ledger does not count them.
+
+Rule: rows count only together with the answer of the worker that sent them. What a worker sent before it was lost, or before
+an answer that could not be used, is dropped, and its ticket is played again from the start.
 """
 
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +27,10 @@ FIRST_TICKET = 1 << 52
 HELD_AT_ONCE = 2  # tickets of one worker: while the learner takes the answer to one, the worker plays the other
 
 OnRows = Callable[[int, EpisodeRows], None]
-"""Called with the number of an episode (the index of its seed in the plan) and some of its rows, in order."""
+"""Called with the number of an episode (the index of its seed in the plan) and some of its rows, in order.
+
+All rows of a ticket come at once, when its answer has come.
+"""
 
 
 @dataclass(frozen=True)
@@ -85,7 +91,7 @@ class EvaluationTickets:
         self._undealt: list[int] = []  # heap: indices of tickets that no worker has
         self._held: dict[bytes, dict[int, int]] = {}  # by worker: index of the ticket -> `replies` when it was last sent
         self._played: dict[int, Evaluated] = {}  # by index of the ticket
-        self._next_rows: dict[tuple[int, int], int] = {}  # by ticket and episode: the first step that has not come
+        self._rows: dict[int, dict[int, list[EpisodeRows]]] = {}  # by index of a held ticket, and by episode
 
     @property
     def pending(self) -> bool:
@@ -103,6 +109,16 @@ class EvaluationTickets:
         return sum(len(self._seeds[index]) for index in self._played)
 
     @property
+    def plan(self) -> EvaluationPlan | None:
+        """The pending evaluation, if there is one."""
+        return self._plan
+
+    @property
+    def held(self) -> Iterator[tuple[bytes, int]]:
+        """The tickets of the pending evaluation that workers hold: routing id and number."""
+        return ((peer, self._first + index) for peer, held in self._held.items() for index in held if self.pending)
+
+    @property
     def holders(self) -> list[bytes]:
         """The workers that hold tickets, by routing id."""
         return sorted(peer for peer, held in self._held.items() if held)
@@ -114,11 +130,12 @@ class EvaluationTickets:
         self._plan, self._version, self._on_rows = plan, version, on_rows
         self._seeds = [plan.seeds[i : i + plan.copies] for i in range(0, len(plan.seeds), plan.copies)]
         self._undealt = list(range(len(self._seeds)))
-        self._held, self._played, self._next_rows = {}, {}, {}
+        self._held, self._played, self._rows = {}, {}, {}
 
     def end(self) -> list[PlayedEpisode]:
         """End the evaluation. Returns its episodes in the order of the seeds; of one that is not done, only those played."""
         self._plan = None
+        self._rows = {}
         answers = [answer for _, answer in sorted(self._played.items())]
         return [PlayedEpisode(*both) for answer in answers for both in zip(answer.episodes, answer.cut, strict=True)]
 
@@ -146,26 +163,32 @@ class EvaluationTickets:
         if why := self._wrong(answer, len(self._seeds[index])):
             self._put_back(index)
             return f"evaluation of ticket {answer.ticket}: {why}"
-        if self._on_rows is not None and not self._rows_are_whole(index, answer):
-            self._put_back(index)  # a message with rows was lost: the episodes are played again
-            return ""
+        rows = self._rows.pop(index, {})
+        if self._on_rows is not None:
+            if [_end(rows.get(n, ())) for n in range(len(answer.episodes))] != [one.length for one in answer.episodes]:
+                self._put_back(index)  # a message with rows was lost: the episodes are played again
+                return ""
+            assert self._plan is not None
+            for episode, messages in sorted(rows.items()):
+                for message in messages:
+                    self._on_rows(index * self._plan.copies + episode, message)
         self._played[index] = answer
         return ""
 
     def take_rows(self, member: Member, rows: EpisodeRows) -> str:
-        """Take rows. Returns what is wrong with them, or nothing. Rows that came before are ignored."""
+        """Keep rows until their answer comes. Returns what is wrong with them, or nothing. Those that came are ignored."""
         index = rows.ticket - self._first
         if not self.pending or index not in self._held.get(member.peer, ()) or self._on_rows is None:
             return ""
         if rows.episode >= len(self._seeds[index]):
             return f"rows of ticket {rows.ticket}: expected an episode below {len(self._seeds[index])}, got {rows.episode}"
         assert self._plan is not None
-        if why := reason_to_reject(rows, self._policy, self._plan.most_steps):
+        come = self._rows.setdefault(index, {}).setdefault(rows.episode, [])
+        if rows.first_step != _end(come):
+            return ""
+        if why := reason_to_reject(rows, come[:1], self._policy, self._plan.most_steps, self._plan.send_frames):
             return f"rows of ticket {rows.ticket}: {why}"
-        key = (index, rows.episode)
-        if rows.first_step == self._next_rows.get(key, 0):
-            self._next_rows[key] = rows.first_step + len(rows.reward)
-            self._on_rows(index * self._plan.copies + rows.episode, rows)
+        come.append(rows)
         return ""
 
     def removed(self, peer: bytes) -> None:
@@ -176,6 +199,7 @@ class EvaluationTickets:
     # ---------------------------------------------------------------- inside
 
     def _put_back(self, index: int) -> None:
+        self._rows.pop(index, None)
         heapq.heappush(self._undealt, index)
 
     def _send(self, member: Member, index: int) -> Outgoing:
@@ -206,6 +230,7 @@ class EvaluationTickets:
                 return f"expected a return that {episode.length} rewards can give, got {episode.reward}"
         return ""
 
-    def _rows_are_whole(self, index: int, answer: Evaluated) -> bool:
-        come = [self._next_rows.get((index, n), 0) for n in range(len(answer.episodes))]
-        return come == [episode.length for episode in answer.episodes]
+
+def _end(rows: Sequence[EpisodeRows]) -> int:
+    """The first step of an episode that these rows do not hold."""
+    return rows[-1].first_step + len(rows[-1].reward) if rows else 0

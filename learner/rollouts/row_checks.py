@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from protocol.arrays import Array
+from protocol.bounds import MOST_FRAMES
 from protocol.messages import EpisodeRows
+from protocol.rollout import outside_of_choices, outside_of_space
 from protocol.specs import PolicySpec
 
 
-def reason_to_reject(rows: EpisodeRows, policy: PolicySpec, most_steps: int) -> str:
-    """What is wrong with these rows; empty if they can be used."""
+def reason_to_reject(
+    rows: EpisodeRows, first: Sequence[EpisodeRows], policy: PolicySpec, most_steps: int, with_frames: bool
+) -> str:
+    """What is wrong with these rows; empty if they can be used. `first`: the first rows of their episode, if any came."""
     L = len(rows.reward) if rows.reward.ndim == 1 else 0
     if not 1 <= L <= most_steps - rows.first_step:
         return f"expected 1 to {most_steps - rows.first_step} rows, got reward {list(rows.reward.shape)}"
@@ -28,9 +34,30 @@ def reason_to_reject(rows: EpisodeRows, policy: PolicySpec, most_steps: int) -> 
     for name, array, shape, dtype in expected:
         if array.shape != shape or array.dtype != np.dtype(dtype):
             return f"{name}: expected {dtype}{list(shape)}, got {array.dtype}{list(array.shape)}"
+        if array.dtype.kind == "b" and array.view(np.uint8).max() > 1:
+            return f"{name}: expected bytes 0 and 1, got {array.view(np.uint8).max()}"
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            return f"{name}: expected finite values"
+    for array, leaf in zip(rows.obs, policy.observation, strict=True):
+        if why := outside_of_space(array, leaf):
+            return f"observation {leaf.path}: {why}"
+    if why := outside_of_choices(rows.action, action):
+        return f"action: {why}"
     if not np.isfinite(rows.reward).all() or (rows.terminated | rows.truncated)[:-1].any():
         return "expected finite rewards, and an end only in the last row"
-    frames = rows.frames
-    if frames is not None and (frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[::3] != (L + 1, 3)):
+    return _wrong_frames(rows.frames, rows.first_step + L + 1, L, [one.frames for one in first], with_frames)
+
+
+def _wrong_frames(frames: Array | None, end: int, L: int, first: Sequence[Array | None], wanted: bool) -> str:
+    """What is wrong with the frames of rows; `end`: the number of observations of the episode up to their last."""
+    if frames is None:
+        return "frames: expected those of the first observations" if wanted and not first else ""
+    if not wanted or end > MOST_FRAMES:
+        return f"frames: expected {f'those of the first {MOST_FRAMES} observations' if wanted else 'none'}"
+    size = list(frames.shape[1:3])
+    if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[::3] != (L + 1, 3) or not all(size):
         return f"frames: expected uint8[{L + 1}, H, W, 3], got {frames.dtype}{list(frames.shape)}"
+    for before in first:
+        if before is None or before.shape[1:3] != frames.shape[1:3]:
+            return f"frames: expected the size of the first ones, got {size}"
     return ""

@@ -3,7 +3,8 @@
 Rule: env steps, constructions and resets are progress, as are rollouts. While a call of the environment is under way within
 its timeout, the run does not stand still: the call ends, or its worker is ended. If nothing happens for `stall_timeout_s`,
 the workers that hold tickets are refused, and others get the tickets. The run ends only if no worker would remain. A worker
-that holds its tickets for longer than all calls of the environment may take together is refused, whatever it claims.
+that holds its tickets, of rollouts or of an evaluation, for longer than all calls of the environment may take together is
+refused, whatever it claims.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ class StallWatch:
         self._coordinator, self._stall_timeout_s, self._timeouts = coordinator, stall_timeout_s, timeouts
         self._mark: object = None
         self._progress_s = 0.0
-        self._dealt_s: dict[int, float] = {}  # ticket -> when it was first seen here
+        self._dealt_s: dict[tuple[bytes, int], float] = {}  # worker and ticket -> when they were first seen here
         self._budgets_due_s = -math.inf
 
     def begin(self, now: float) -> None:
@@ -49,7 +50,7 @@ class StallWatch:
         if now >= self._budgets_due_s:
             self._budgets_due_s = now + CHECK_BUDGETS_EVERY_S
             if over := self._over_budget(now):
-                return Standstill(over, "it holds tickets for longer than its rollouts can take")
+                return Standstill(over, "it holds tickets for longer than they can take")
         members = self._coordinator.members.values()
         if now - self._progress_s <= self._stall_timeout_s or any(self._in_call(member, now) for member in members):
             return None
@@ -69,17 +70,21 @@ class StallWatch:
 
     def _over_budget(self, now: float) -> tuple[CollectingMember, ...]:
         """The members whose oldest ticket is older than all their tickets may take together."""
-        tickets = self._coordinator.tickets
-        self._dealt_s = {number: self._dealt_s.get(number, now) for number in tickets}
-        each_s = self._longest_rollout_s()
-        return tuple(
-            member
-            for member in self._coordinator.members.values()
-            if member.tickets
-            and now - min(self._dealt_s[ticket] for ticket in member.tickets) > each_s * len(member.tickets)
-        )
+        coordinator = self._coordinator
+        evaluation, run = coordinator.evaluation, coordinator.run
+        rollout_s = self._longest_s(run.copies, run.rollout_steps)
+        episodes_s = self._longest_s(plan.copies, plan.most_steps) if (plan := evaluation.plan) is not None else 0.0
+        held = {(ticket.peer, number): rollout_s for number, ticket in coordinator.tickets.items()}
+        held |= dict.fromkeys(evaluation.held, episodes_s)
+        self._dealt_s = {both: self._dealt_s.get(both, now) for both in held}
+        oldest_s: dict[bytes, float] = {}
+        allowed_s: dict[bytes, float] = {}
+        for (peer, number), limit_s in held.items():
+            oldest_s[peer] = min(oldest_s.get(peer, now), self._dealt_s[peer, number])
+            allowed_s[peer] = allowed_s.get(peer, 0.0) + limit_s
+        return tuple(coordinator.members[peer] for peer in oldest_s if now - oldest_s[peer] > allowed_s[peer])
 
-    def _longest_rollout_s(self) -> float:
-        run, limit_s = self._coordinator.run, self._timeouts.limit_s
+    def _longest_s(self, copies: int, steps: int) -> float:
+        limit_s = self._timeouts.limit_s
         opening_s = limit_s("making") + limit_s("resetting")
-        return run.copies * (opening_s + run.rollout_steps * max(limit_s("stepping"), limit_s("resetting")))
+        return copies * (opening_s + steps * max(limit_s("stepping"), limit_s("resetting")))

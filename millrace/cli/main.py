@@ -16,7 +16,7 @@ from typing import NamedTuple
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # before numpy; --torch-threads sets the learner's
 
-from protocol.bounds import MAX_SEEDS, indented
+from protocol.bounds import MAX_SEEDS, escaped, indented
 from protocol.errors import UsageError, UserFacingError, first_line
 
 ABOUT = "Worker processes step copies of a gymnasium environment; one learner trains a policy in PyTorch."
@@ -376,7 +376,7 @@ LAUNCHERS = {
 
 
 def _print_error(line: str) -> None:
-    print(line, file=sys.stderr)
+    print(escaped(line), file=sys.stderr)  # it may quote what a worker said
 
 
 def _internal_error(argv: list[str], error: Exception) -> int:

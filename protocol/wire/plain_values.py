@@ -8,6 +8,7 @@ arrives as a `ReprString`, which cannot be confused with a string.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -35,9 +36,14 @@ def pack(value: object, use_repr: bool = False) -> bytes:
 
 
 def unpack(data: bytes | memoryview) -> Any:
-    """The value of these bytes. Raises `BadMessage` for invalid bytes, and no other error."""
+    """The value of these bytes. Raises `BadMessage` for invalid bytes, and no other error.
+
+    What it returns can be walked recursively: it has at most `MAX_DEPTH` levels.
+    """
     try:
-        return _unpack(data, 0)
+        value = _unpack(data, 0)
+        _check_depth(value, 0)
+        return value
     except BadMessage:
         raise
     except Exception as error:  # msgpack and numpy raise a dozen types for invalid bytes
@@ -98,6 +104,22 @@ def _unpack(data: bytes | memoryview, depth: int) -> Any:
     return msgpack.unpackb(data, ext_hook=extension, strict_map_key=True)
 
 
+def _check_depth(value: object, depth: int) -> None:
+    if depth > MAX_DEPTH:
+        raise BadMessage(f"plain value: expected at most {MAX_DEPTH} levels, got more")
+    match value:
+        case dict():
+            for inner in (*value.keys(), *value.values()):
+                _check_depth(inner, depth + 1)
+        case list() | tuple():
+            for inner in value:
+                _check_depth(inner, depth + 1)
+        case np.ndarray() if value.dtype.kind == "O":
+            _check_depth(value.ravel().tolist(), depth)
+        case _:
+            pass
+
+
 def _from_extension(code: int, data: bytes, inner: Callable[[bytes], Any]) -> Any:
     match code:
         case 1:
@@ -110,10 +132,14 @@ def _from_extension(code: int, data: bytes, inner: Callable[[bytes], Any]) -> An
             kind = _dtype(dtype)
             if len(raw) != math.prod(shape) * kind.itemsize:
                 raise BadMessage(f"array {dtype}{shape}: expected {math.prod(shape) * kind.itemsize} bytes, got {len(raw)}")
+            if not kind.itemsize:  # numpy would allocate a byte for each element
+                raise BadMessage(f"array {dtype}{shape}: expected elements of a byte or more")
+            _check_characters(raw, kind)
             return np.frombuffer(raw, kind).reshape(shape).copy() if raw else np.zeros(shape, kind)
         case 4:
             dtype, raw = inner(data)
             kind = _dtype(dtype)
+            _check_characters(raw, kind)
             return np.frombuffer(raw, kind)[0] if kind.itemsize else kind.type()
         case 5:
             shape, values = inner(data)
@@ -135,6 +161,12 @@ def _dtype(name: object) -> np.dtype[Any]:
     if kind.kind not in DTYPE_KINDS:
         raise BadMessage(f"array dtype: expected one of plain data, got {str(name)[:20]!r}")
     return kind
+
+
+def _check_characters(raw: bytes, kind: np.dtype[Any]) -> None:
+    """Numpy takes any four bytes for a character, and fails only when the text is used."""
+    if kind.kind == "U" and raw and (last := int(np.frombuffer(raw, f"{kind.str[0]}u4").max())) > sys.maxunicode:
+        raise BadMessage(f"text of {kind.str}: expected characters up to {sys.maxunicode}, got {last}")
 
 
 def repr_paths(value: object, where: str = "") -> list[str]:

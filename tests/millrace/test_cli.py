@@ -417,6 +417,17 @@ def test_what_cannot_be_filmed_is_said(tmp_path: Path, capsys: Captured, monkeyp
     assert line == "videos need moviepy, which is an extra; pip install 'millrace-rl[video]'"
 
 
+def test_what_a_worker_says_cannot_control_the_terminal(capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
+    def train(*_: Any) -> Path:
+        raise EnvironmentFailed("got \x1b[31mred\u202e", "its\x1b[2Jtraceback")
+
+    monkeypatch.setattr("millrace.launch.local_run.train", train)
+    assert main(["train", "CartPole-v1"]) == 1
+    said = capsys.readouterr().err
+    assert "got \\x1b[31mred\\u202e" in said
+    assert "\x1b" not in said
+
+
 def no_pygame(*_: Any) -> None:
     raise gymnasium.error.DependencyNotInstalled("pygame is not installed")
 

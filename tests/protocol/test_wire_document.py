@@ -117,6 +117,7 @@ LIMITS: Mapping[tuple[ModuleType, str], str] = {
     (bounds, "MAX_TICKETS"): "tickets in one message",
     (bounds, "MAX_WORKERS"): "workers that one supervisor speaks for",
     (bounds, "MAX_SEEDS"): "episodes of one Evaluate",
+    (bounds, "MOST_FRAMES"): "observations of an episode that come with a frame: the first ones",
     (space_spec, "MAX_LEAVES"): "arrays of an observation or an action",
     (space_spec, "MAX_DEPTH"): "levels of Dict and Tuple spaces",
     (space_spec, "MAX_ELEMENTS"): "elements of all arrays of a space together",
@@ -343,7 +344,7 @@ def test_every_limit_is_in_the_document() -> None:
         bounds, space_spec, env_spec, codec, socket_options, packing, session, held_rollouts, ticket_coordinator, messages,
         rollout, specs,
     ):  # fmt: skip
-        for name in re.findall(r"^(MAX_\w+)(?:, MAX_\w+)* = ", inspect.getsource(module), re.MULTILINE):
+        for name in re.findall(r"^((?:MAX|MOST)_\w+)(?:, MAX_\w+)* = ", inspect.getsource(module), re.MULTILINE):
             assert (module, name) in LIMITS, f"say in LIMITS what {name} bounds"
 
 

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from protocol.arrays import Array
+from protocol.bounds import MOST_FRAMES
 from protocol.messages import EpisodeRows, Evaluate
 from protocol.specs import PolicySpec
 
 CHUNK_BYTES = 8 * 2**20
-MOST_FRAMES = 1_500  # that are sent of one episode: a minute of video at 25 frames a second
 
 Send = Callable[[EpisodeRows], None]
 

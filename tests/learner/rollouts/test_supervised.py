@@ -7,10 +7,12 @@ import math
 import pytest
 
 from learner.members.events import WorkerLeft, WorkerProcessFailed
+from learner.rollouts.evaluation_tickets import EvaluationPlan
 from learner.rollouts.stall_watch import ENDED_WITHIN_S, StallWatch
 from protocol.alive import Alive, CallTimeouts, Doing, WorkerActivity, WorkerExit
 from protocol.messages import Drain, Heartbeat, Hello
 from tests.learner.rollouts.test_ticket_coordinator import TIMEOUT_S, Learner, permits
+from tests.support.fake_ends import BUFFERS, PARAMETERS
 
 A, B, SUPERVISOR = b"a", b"b", b"supervisor-of-a"
 NONCE = 1000 * len("host") + 1  # as `Learner.joins` makes it
@@ -236,4 +238,27 @@ def test_without_timeouts_there_is_no_budget() -> None:
     learner = Learner()
     learner.joins(A)
     made = watch(learner, CallTimeouts(0.0, 0.0, 0.0))
-    assert made._longest_rollout_s() == math.inf
+    assert made._longest_s(copies=1, steps=1) == math.inf
+
+
+def test_a_worker_that_sits_on_an_evaluation_is_refused_when_its_budget_is_spent() -> None:
+    learner = Learner()
+    learner.joins(A)
+    learner.deliver_all()
+    assert learner.coordinator.take() is not None
+    learner.balanced(learner.coordinator.publish(1, PARAMETERS, BUFFERS, deal=False))
+    learner.joins(B, host="other")
+    plan = EvaluationPlan(seeds=(1, 2, 3, 4), copies=2, most_steps=10)
+    learner.balanced(learner.coordinator.begin_evaluation(plan))
+    made, steps = watch(learner), 0
+    budget_s = plan.copies * (2 * STEP_S + plan.most_steps * STEP_S)
+    while (verdict := made.check(learner.now, steps)) is None:
+        learner.now += STALL_S / 4
+        steps += 1
+        beats(learner, A, steps)
+        beats(learner, B, steps)
+        assert learner.now < budget_s + STALL_S
+    assert learner.now > budget_s
+    assert {member.peer for member in verdict.refuse} == {A, B}
+    learner.coordinator.end_evaluation()
+    assert made.check(learner.now + 2, steps + 1) is None, "an evaluation that has ended holds nobody to account"

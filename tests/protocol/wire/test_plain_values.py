@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
 from hypothesis import given
@@ -84,3 +85,32 @@ def test_spoiled_bytes_raise_one_error(value: Any, at: int, byte: int) -> None:
     data[at % len(data)] = byte
     with suppress(BadMessage):
         unpack(bytes(data))
+
+
+def packed_array(dtype: str, shape: list[int], raw: bytes) -> bytes:
+    packed: bytes = msgpack.packb(msgpack.ExtType(3, msgpack.packb([dtype, shape, raw])))
+    return packed
+
+
+@pytest.mark.parametrize("dtype", ["S0", "U0"])
+def test_an_array_cannot_be_larger_than_its_bytes(dtype: str) -> None:
+    with pytest.raises(BadMessage, match="expected elements of a byte or more"):
+        unpack(packed_array(dtype, [10**12], b""))
+
+
+@pytest.mark.parametrize("inside", [b"\x91", b"\x81\xa1a"], ids=["lists", "dicts"])
+def test_what_arrives_can_be_walked_recursively(inside: bytes) -> None:
+    repr_paths(unpack(inside * MAX_DEPTH + b"\xc0"))
+    with pytest.raises(BadMessage, match=f"at most {MAX_DEPTH} levels"):
+        unpack(inside * (MAX_DEPTH + 1) + b"\xc0")
+
+
+@pytest.mark.parametrize("order", "<>")
+def test_text_has_only_characters_that_there_are(order: str) -> None:
+    for last, fine in ((0x10FFFF, True), (0x110000, False)):
+        raw = np.array([last], f"{order}u4").tobytes()
+        if fine:
+            assert unpack(packed_array(f"{order}U1", [1], raw)).tolist() == [chr(last)]
+        else:
+            with pytest.raises(BadMessage, match="expected characters"):
+                unpack(packed_array(f"{order}U1", [1], raw))

@@ -1,0 +1,123 @@
+"""Rows of played episodes count only with their answer: what a worker sent before it left spoils nothing. Pure."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from learner.rollouts.evaluation_tickets import EvaluationPlan
+from protocol.arrays import Array
+from protocol.bounds import MOST_FRAMES
+from protocol.messages import EpisodeRows, Evaluate, Evaluated, Goodbye
+from protocol.rollout import Episode
+from tests.learner.rollouts.test_ticket_coordinator import Learner, of
+from tests.support.fake_ends import fake_rows
+
+A, B = b"a", b"b"
+MOST_STEPS = 2_000
+
+
+class Played:
+    """One episode of an evaluation that wants rows, and two workers that may play it."""
+
+    def __init__(self, *, send_frames: bool = False) -> None:
+        self.learner = Learner(publish=False)
+        self.learner.publish(0)
+        for peer in (A, B):
+            self.learner.joins(peer, host=peer.decode())
+        self.taken: list[tuple[int, int]] = []
+        plan = EvaluationPlan((7,), 1, MOST_STEPS, send_rows=True, send_frames=send_frames)
+        self.order = self.order_in(self.learner.coordinator.begin_evaluation(plan, self.take), A)
+
+    def order_in(self, outs: list[tuple[bytes, object]], peer: bytes) -> Evaluate:
+        (order,) = of(outs, Evaluate, peer)
+        return order
+
+    def take(self, episode: int, rows: EpisodeRows) -> None:
+        self.taken.append((episode, rows.first_step))
+
+    def rows(self, step: int, **changes: object) -> EpisodeRows:
+        row = fake_rows(self.order.session, self.order.ticket, 0, step)
+        fields = {name: getattr(row, name) for name in row.__struct_fields__}
+        return EpisodeRows(**{**fields, "terminated": np.zeros(1, bool), **changes})
+
+    def answer(self, length: int) -> Evaluated:
+        return Evaluated(self.order.session, self.order.ticket, (Episode(0.0, length, 0.0),), (False,))
+
+    def strikes(self, peer: bytes = A) -> int:
+        return self.learner.coordinator.members[peer].strikes
+
+
+def test_rows_of_a_worker_that_left_do_not_count() -> None:
+    played = Played()
+    for step in range(5):  # more rows than the episode has
+        played.learner.says(A, played.rows(step))
+    outs = played.learner.says(A, Goodbye(played.order.session, "told to stop", ()))
+    played.order = played.order_in(outs, B)
+    assert played.taken == []
+    for step in range(2):
+        played.learner.says(B, played.rows(step))
+    played.learner.says(B, played.answer(2))
+    assert played.learner.coordinator.evaluation.done
+    assert played.taken == [(0, 0), (0, 1)]
+
+
+def test_rows_before_an_answer_that_they_do_not_fit_are_played_again() -> None:
+    played = Played()
+    for step in range(5):
+        played.learner.says(A, played.rows(step))
+    played.order = played.order_in(played.learner.says(A, played.answer(2)), A)
+    assert played.taken == []
+    for step in (0, 0, 1, 1):  # a message may come twice
+        played.learner.says(A, played.rows(step))
+    played.learner.says(A, played.answer(2))
+    assert played.learner.coordinator.evaluation.done
+    assert played.taken == [(0, 0), (0, 1)]
+
+
+def frames(height: int = 2, width: int = 2, count: int = 2) -> Array:
+    return np.zeros((count, height, width, 3), np.uint8)
+
+
+def test_frames_that_were_not_asked_for_are_a_strike() -> None:
+    played = Played()
+    played.learner.says(A, played.rows(0, frames=frames()))
+    assert played.strikes() == 1
+
+
+@pytest.mark.parametrize("bad", [None, frames(0), frames(2, 0), frames(count=1), np.zeros((2, 2), np.uint8)])
+def test_the_first_rows_carry_frames_if_frames_were_asked_for(bad: Array | None) -> None:
+    played = Played(send_frames=True)
+    played.learner.says(A, played.rows(0, frames=bad))
+    assert played.strikes() == 1
+
+
+def test_frames_have_one_size_and_end_at_a_limit() -> None:
+    played = Played(send_frames=True)
+    for step in range(MOST_FRAMES - 1):
+        played.learner.says(A, played.rows(step, frames=frames()))
+        if step == 3:
+            played.learner.says(A, played.rows(4, frames=frames(3)))
+            assert played.strikes() == 1
+    assert played.strikes() == 1
+    played.learner.says(A, played.rows(MOST_FRAMES - 1, frames=frames()))
+    assert played.strikes() == 2
+    played.learner.says(A, played.rows(MOST_FRAMES - 1))
+    played.learner.says(A, played.answer(MOST_FRAMES))
+    assert played.learner.coordinator.evaluation.done
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"obs": (np.full((2, 1), np.nan, np.float32),)},
+        {"action": np.array([2])},
+        {"action": np.array([-1])},
+        {"terminated": np.array([255], np.uint8).view(bool)},
+    ],
+    ids=["observation", "choice", "negative choice", "flag"],
+)
+def test_rows_hold_only_values_that_a_dataset_may_hold(changes: dict[str, object]) -> None:
+    played = Played()
+    played.learner.says(A, played.rows(0, **changes))
+    assert played.strikes() == 1
