@@ -10,9 +10,11 @@ from learner.env_spaces import EnvSpaces
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
 from protocol.policy.encoder import describe_encoder
+from protocol.policy.layout import acting_size
 from protocol.specs import PolicySpec, RunSpec
 from protocol.wire.codec import check_can_be_sent
 from protocol.wire.compression import why_no_zstd
+from protocol.wire.socket_options import MAX_FRAME_BYTES
 
 
 def run_spec(config: Config, env: EnvSpec, spaces: EnvSpaces) -> RunSpec:
@@ -37,8 +39,19 @@ def run_spec(config: Config, env: EnvSpec, spaces: EnvSpaces) -> RunSpec:
         images_dtype=config.images_dtype,
         heartbeat_s=config.heartbeat_s,
     )
+    _check_weights_can_be_sent(env.id, policy, config)
     check_can_be_sent(env.id, run)
     return run
+
+
+def _check_weights_can_be_sent(env: str, policy: PolicySpec, config: Config) -> None:
+    """Also a space of few arrays may make a policy too large to allocate: a `Discrete` of 2**53 values."""
+    size = acting_size(policy) * (4 if config.weights_dtype == "float32" else 2)
+    if size > MAX_FRAME_BYTES:
+        raise UsageError(
+            f"environment {env}: expected a policy whose weights take at most {MAX_FRAME_BYTES:,} bytes, got {size:,}; wrap "
+            "the environment so that its spaces are smaller, or choose a smaller net"
+        )
 
 
 def _policy_spec(config: Config, spaces: EnvSpaces) -> PolicySpec:

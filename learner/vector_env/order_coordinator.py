@@ -17,7 +17,7 @@ import numpy as np
 from learner.members.events import EnvironmentRaised
 from learner.members.lane_placement import LanePlacement, PlacedLane, is_spare
 from learner.members.membership import Member, Membership, Outgoing
-from learner.members.states import MemberState, SentUnusable
+from learner.members.states import MemberState, SentUnusable, TimedOut
 from protocol.bounds import escaped, one_line
 from protocol.errors import BadMessage
 from protocol.messages import (
@@ -133,9 +133,9 @@ class OrderCoordinator:
         """A member's key was revoked: send it the reason and remove it at once, even if it holds orders."""
         return self.membership.revoke(peer, why)
 
-    def remove_worker(self, worker: str, why: str) -> list[Outgoing]:
-        """Remove a worker whose process has ended, or for which the learner waits no longer."""
-        self.membership.remove_worker(worker, why)
+    def give_up(self, member: Member, why: str) -> list[Outgoing]:
+        """Remove this worker, for which the learner waits no longer, and no other of its name: keys may share names."""
+        self.membership.remove(member, TimedOut, why)
         return []
 
     def process_ended(self, worker_exit: WorkerExit) -> list[Outgoing]:

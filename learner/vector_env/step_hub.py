@@ -324,9 +324,7 @@ class StepHub:
         member = self._coordinator.owner(lane)
         if member is not None:
             killed = self._local_workers.kill(member.hello.worker)
-            self._server.send(
-                self._coordinator.remove_worker(member.hello.worker, f"{why}, and was killed" if killed else why)
-            )
+            self._server.send(self._coordinator.give_up(member, f"{why}, and was killed" if killed else why))
 
     def _raise_failure(self) -> None:
         failure, self._coordinator.failures = self._coordinator.failures[0], []

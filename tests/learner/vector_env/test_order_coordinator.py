@@ -148,7 +148,7 @@ def test_infos_of_anothers_lane_or_an_earlier_life_are_not_used() -> None:
     made.receive(A, msgspec.structs.replace(theirs, session=in_memory(made, 0, 7).session), 0.0)
     made.receive(B, msgspec.structs.replace(theirs, incarnation=9), 0.0)
     assert (made.infos, made.answers) == ({}, {})
-    made.remove_worker("b", "was killed")
+    made.give_up(made.members[B], "was killed")
     assert made.shared_orders == {0: 7}, "whoever is gone will not say its infos"
 
 
@@ -174,7 +174,7 @@ def test_whoever_is_silent_while_it_is_listened_to_is_given_up() -> None:
     made.remove_silent(TIMEOUT_S + 1)
     assert list(made.members) == [A]
     assert made.lost == {1: "worker b (host) silent for 5 s"}
-    made.remove_worker("b", "was killed by SIGKILL")
+    made.membership.remove_worker("b", "was killed by SIGKILL")
     assert made.membership.take_events()[-1] == WorkerLeft("b", "was killed by SIGKILL", 0, False)
 
 
@@ -275,3 +275,16 @@ def test_failures_of_spare_workers_are_not_raised() -> None:
     assert coordinator.failures == []
     coordinator.receive(B, Failure(coordinator.members[B].session, "boom", "", 0), 0.0)
     assert [failure.worker for failure in coordinator.failures] == ["b"]
+
+
+def test_whoever_is_waited_for_no_longer_takes_no_other_worker_of_its_name_along() -> None:
+    """Each key has names of its own: the peers differ, the names do not."""
+    made = OrderCoordinator(SPEC, 100, TIMEOUT_S)
+    peers = [b"a\0tag\0" + key * 64 for key in (b"1", b"2")]
+    for lane, peer in enumerate(peers):
+        made.receive(peer, Hello(PROTOCOL_VERSION, "a", "host", 1, lane + 1, "fake", 1), 0.0)
+        assert made.place(lane, patient=False)
+    slow = made.owner(1)
+    assert slow is not None
+    made.give_up(slow, "did not answer in time")
+    assert list(made.members) == [peer for peer in peers if peer != slow.peer]
