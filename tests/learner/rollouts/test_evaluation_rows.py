@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
+from learner.members.membership import Outgoing
 from learner.rollouts.evaluation_tickets import EvaluationPlan
 from protocol.arrays import Array
 from protocol.bounds import MOST_FRAMES
@@ -29,7 +32,7 @@ class Played:
         plan = EvaluationPlan((7,), 1, MOST_STEPS, send_rows=True, send_frames=send_frames)
         self.order = self.order_in(self.learner.coordinator.begin_evaluation(plan, self.take), A)
 
-    def order_in(self, outs: list[tuple[bytes, object]], peer: bytes) -> Evaluate:
+    def order_in(self, outs: Sequence[Outgoing], peer: bytes) -> Evaluate:
         (order,) = of(outs, Evaluate, peer)
         return order
 
