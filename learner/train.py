@@ -37,7 +37,7 @@ def train(algorithm: Algorithm, service: RolloutService, recorder: RunRecorder, 
             raise
         recorder.gathered(arrived)
         began_s = time.monotonic()
-        batch = stack_rollouts([one.rollout for one in arrived])
+        batch = stack_rollouts([one.rollout for one in arrived], [one.fresh for one in arrived])
         metrics = algorithm.update(batch, service.pulse)
         recorder.count(batch)
         service.publish(recorder.version, *algorithm.weights(), deal=recorder.training_goes_on())

@@ -189,7 +189,8 @@ class Batch(msgspec.Struct, frozen=True):
     lane: npt.NDArray[np.int64]
     """[ΣN] the lane of each column"""
     fresh: Bools
-    """[ΣN] True where the column's lane has just been started, so that no state carries over from an earlier rollout"""
+    """[ΣN] True where no state carries over from an earlier rollout: the column's lane has just been started, or a rollout
+    between the two was not used"""
     copies: int
     """N: each lane has this many adjacent columns, or a multiple if the batch has several of its rollouts"""
     episodes: tuple[Episode, ...]
@@ -200,9 +201,15 @@ class Batch(msgspec.Struct, frozen=True):
         return int(np.count_nonzero(self.valid))
 
 
-def stack_rollouts(rollouts: Sequence[Rollout]) -> Batch:
-    """Copy rollouts into one writable batch [T, ΣN], in lane order; those of one lane stay in the order they came in."""
-    rows = sorted(rollouts, key=lambda rollout: rollout.lane)
+def stack_rollouts(rollouts: Sequence[Rollout], fresh: Sequence[bool] | None = None) -> Batch:
+    """Copy rollouts into one writable batch [T, ΣN], in lane order; those of one lane stay in the order they came in.
+
+    `fresh`: for each rollout, whether nothing carries over from an earlier one; None: that is so for the first of a lane.
+    """
+    if fresh is None:
+        fresh = [rollout.sequence == 0 for rollout in rollouts]
+    order = sorted(range(len(rollouts)), key=lambda index: rollouts[index].lane)
+    rows = [rollouts[index] for index in order]
 
     def side_by_side(arrays: Sequence[Array]) -> Array:
         return np.concatenate(arrays, axis=1)
@@ -218,7 +225,7 @@ def stack_rollouts(rollouts: Sequence[Rollout]) -> Batch:
         valid=side_by_side([row.valid for row in rows]),
         state=np.concatenate([row.state for row in rows]),
         lane=np.repeat([row.lane for row in rows], copies),
-        fresh=np.repeat([row.sequence == 0 for row in rows], copies),
+        fresh=np.repeat([fresh[index] for index in order], copies),
         copies=copies,
         episodes=tuple(episode for row in rows for episode in row.episodes),
     )

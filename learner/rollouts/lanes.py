@@ -28,6 +28,8 @@ class TicketedLane(PlacedLane):
     """Every rollout of this incarnation with a smaller sequence number has arrived."""
     out_of_order: set[int] = field(default_factory=set)
     """Sequence numbers that have arrived out of order."""
+    newest_used: tuple[int, int] | None = None
+    """Incarnation and sequence number of the rollout that an update used last; None: none since the learner began."""
 
     @property
     def busy(self) -> int:
@@ -45,6 +47,12 @@ class TicketedLane(PlacedLane):
         """Whether an outstanding rollout can have this sequence number."""
         end = self.next_sequence + len(self.out_of_order) + len(self.outstanding)
         return self.next_sequence <= sequence < end and sequence not in self.out_of_order
+
+    def use(self, incarnation: int, sequence: int) -> bool:
+        """An update uses this rollout. Returns whether it continues the one that was used before it."""
+        continues = self.newest_used == (incarnation, sequence - 1)
+        self.newest_used = (incarnation, sequence)
+        return continues
 
     def arrived(self, sequence: int) -> None:
         """The rollout with this sequence number has arrived."""
@@ -73,6 +81,9 @@ class AcceptedRollout:
     rollout: Rollout
     incarnation: int
     """Incarnation of the lane when its ticket was dealt. Each incarnation has new env copies."""
+    fresh: bool = True
+    """Whether nothing carries over to it from an earlier rollout: it does not continue the one of its lane that was used
+    last, because the lane was started anew, the learner was, or a rollout between the two was dropped or comes later."""
 
 
 class LaneQueue:

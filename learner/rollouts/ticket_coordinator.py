@@ -4,9 +4,10 @@ Rule: a ticket is the permission for one rollout on one lane, and is dealt to th
 
     used + outstanding < rollouts_per_update * (version + 1 + max_lag)
 
-A lane has one owner at a time and moves only between rollouts. Its new owner starts it afresh: its incarnation rises. When a
-worker is lost, its lanes go to other workers, and new tickets are dealt in place of its tickets. There is no other failure
-handling. If a Heartbeat shows that a message was lost on the way, the message is sent again. Every ticket and every
+`used` and `version` are counted from the first version that this learner publishes, because a resumed run may have other
+lanes. A lane has one owner at a time and moves only between rollouts. Its new owner starts it afresh: its incarnation rises.
+When a worker is lost, its lanes go to other workers, and new tickets are dealt in place of its tickets. There is no other
+failure handling. If a Heartbeat shows that a message was lost on the way, the message is sent again. Every ticket and every
 transition is counted in the ledger.
 
 An evaluation belongs to one version: while it is pending, no ticket for a rollout is dealt, and no weights are published.
@@ -15,7 +16,7 @@ An evaluation belongs to one version: while it is pending, no ticket for a rollo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import msgspec
 
@@ -90,7 +91,10 @@ class TicketCoordinator:
         version: int = -1,
         incarnations: Sequence[int] = (),
     ) -> None:
-        """`version` is -1 until `publish`. `ledger` and `incarnations` (of each lane, the first) come from a checkpoint."""
+        """`version` is -1 until `publish`. `ledger` and `incarnations` come from a checkpoint.
+
+        `incarnations`: the first of each lane; there may be more or fewer of them than lanes.
+        """
         self.run = run
         self.rollouts_per_update = rollouts_per_update
         self.max_lag = max_lag
@@ -100,7 +104,8 @@ class TicketCoordinator:
         self.membership: Membership[CollectingMember] = Membership(
             run, CollectingMember, self._removed, first_session, lambda member: is_spare(member, self.lanes)
         )
-        self.lanes = [TicketedLane(n, incarnations[n] if incarnations else 0) for n in range(run.lanes)]
+        self.lanes = [TicketedLane(n, incarnations[n] if n < len(incarnations) else 0) for n in range(run.lanes)]
+        self._absent = list(incarnations[run.lanes :])  # incarnations of lanes that the run had, and may have again
         self.tickets: dict[int, Ticket] = {}
         self.ready: list[AcceptedRollout] = []
         self.evaluation = EvaluationTickets(run.policy)
@@ -108,6 +113,7 @@ class TicketCoordinator:
         self._placement, self._queue = LanePlacement(self.lanes, _by_joining), LaneQueue(self.lanes)
         self._oldest_ready = version  # no rollout that is ready is older
         self._weights: Weights | None = None
+        self._first_version, self._used_before = 0, 0  # the first version published, and the tickets used before it
 
     @property
     def members(self) -> dict[bytes, CollectingMember]:
@@ -211,6 +217,8 @@ class TicketCoordinator:
         """
         assert not self.evaluation.pending, "an evaluation is pending"
         self._held_back = not deal
+        if self._weights is None:
+            self._first_version, self._used_before = version, self.ledger.used
         self.version = version
         self._weights = Weights(version, parameters, buffers)
         out = [out for member in self.membership.active() for out in self._send_newest_weights(member)]
@@ -225,7 +233,7 @@ class TicketCoordinator:
         taken, self.ready = self.ready[: self.rollouts_per_update], self.ready[self.rollouts_per_update :]
         self.ledger.used += len(taken)
         self.ledger.transitions_used += sum(arrived.rollout.env_steps for arrived in taken)
-        return taken
+        return [self._marked(arrived) for arrived in taken]
 
     def deal(self) -> list[Outgoing]:
         """Deal the tickets that may be dealt, as after stale rollouts were dropped, or after an evaluation."""
@@ -247,9 +255,14 @@ class TicketCoordinator:
 
     def incarnations(self) -> list[int]:
         """The next incarnation of each lane, for a checkpoint. One that was dealt a ticket is not used again."""
-        return [lane.incarnation + lane.started for lane in self.lanes]
+        return [*(lane.incarnation + lane.started for lane in self.lanes), *self._absent]
 
     # ---------------------------------------------------------------- inside
+
+    def _marked(self, arrived: AcceptedRollout) -> AcceptedRollout:
+        """The rollout, which an update uses next, marked as fresh or not."""
+        lane = self.lanes[arrived.rollout.lane]
+        return replace(arrived, fresh=not lane.use(arrived.incarnation, arrived.rollout.sequence))
 
     def _join(self, peer: bytes, hello: Hello, now: float) -> list[Outgoing]:
         welcome, member = self.membership.join(peer, hello, now)
@@ -374,7 +387,8 @@ class TicketCoordinator:
             return out + self.evaluation.deal(self.membership.active())
         if self._held_back:
             return out
-        room = self.rollouts_per_update * (self.version + 1 + self.max_lag) - self.ledger.used - self.ledger.outstanding
+        allowed = self.rollouts_per_update * (self.version - self._first_version + 1 + self.max_lag)
+        room = allowed - (self.ledger.used - self._used_before) - self.ledger.outstanding
         dealt: dict[bytes, list[int]] = {}
         while room > 0:
             lane = self._queue.first()

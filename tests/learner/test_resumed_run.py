@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -12,18 +14,21 @@ from learner.algorithms.ppo import PPO
 from learner.config.config import Config
 from learner.config.hyperparameters import PPOConfig
 from learner.config.layers import resolve
+from learner.rollouts.lanes import AcceptedRollout
 from learner.rollouts.ledger import Ledger
 from learner.run import is_finished
 from learner.run_folder import checkpoint
 from learner.run_folder.results import Evaluation, Summary
 from learner.run_folder.run_folder import RunFolder
 from learner.run_state import RunState, restore
+from learner.train import train
 from protocol.env_spec import EnvSpec
 from protocol.errors import CheckpointError
 from protocol.policy.policy import make_policy
 from protocol.rollout import Batch, Rollout, stack_rollouts
 from protocol.specs import RunSpec
 from tests.support.described import run_spec
+from tests.support.fake_ends import fake_rollout
 from workers.collect.collector import Collector
 from workers.collect.held_rollouts import Assignment
 
@@ -75,6 +80,24 @@ def test_the_next_update_is_the_same_as_without_a_stop(tmp_path: Path, env: str)
     not_resumed = algorithm()
     not_resumed.update(third, lambda: None)
     assert not np.array_equal(not_resumed.weights()[0], straight.weights()[0]), "the checkpoint changes nothing"
+
+
+def test_an_update_gets_what_the_coordinator_says_of_each_rollout() -> None:
+    """A rollout of a lane that is not its first and continues nothing, as after a stale one, is fresh in the batch."""
+    sequences_and_fresh = {2: (0, True), 0: (5, True), 1: (5, False)}  # of each lane, as they arrive
+    arrived = [
+        AcceptedRollout(fake_rollout(1, lane, lane, 0, sequence), 0, fresh)
+        for lane, (sequence, fresh) in sequences_and_fresh.items()
+    ]
+    batches: list[Batch] = []
+    algorithm = SimpleNamespace(weights=lambda: (), update=lambda batch, pulse: batches.append(batch))
+    service = MagicMock(gather=lambda: arrived)
+    recorder = MagicMock(stop_reason=MagicMock(side_effect=[None, "done"]))
+    train(algorithm, service, recorder, 1)  # type: ignore[arg-type]
+    (batch,) = batches
+    assert batch.lane.tolist() == [0, 1, 2]
+    assert batch.fresh.tolist() == [True, False, True]
+    assert stack_rollouts([one.rollout for one in arrived]).fresh.tolist() == [False, False, True]
 
 
 def test_tickets_of_the_learner_that_died_are_lost_and_the_ledger_balances(tmp_path: Path) -> None:

@@ -953,6 +953,62 @@ def test_a_resumed_learner_counts_tickets_on() -> None:
     assert [permit.ticket for permit in permits(outs)] == [10, 11]
 
 
+@pytest.mark.parametrize("max_lag", [0, 1, 3])
+@pytest.mark.parametrize(("before", "lanes"), [(2, 3), (3, 2), (4, 1), (1, 4)])
+def test_a_resumed_run_with_other_lanes_deals_tickets_from_there(before: int, lanes: int, max_lag: int) -> None:
+    """100 updates were made of `before` rollouts each. Now each takes one rollout of each of the present lanes."""
+    ledger = Ledger(issued=100 * before, used=100 * before)
+    learner = Learner(lanes=lanes, max_lag=max_lag, ledger=ledger, publish=False)
+    learner.publish(100)
+    learner.joins(A)
+    for update in range(1, 6):
+        assert len(learner.tickets()) == lanes * (1 + max_lag), f"update {update}"
+        for number in learner.tickets()[:lanes]:
+            learner.delivers(number)
+        assert sorted(rollout.lane for rollout in learner.take()) == list(range(lanes))
+        learner.publish(100 + update)
+    assert learner.coordinator.ledger.used == 100 * before + 5 * lanes
+
+
+def test_a_lane_that_is_given_up_and_comes_back_does_not_live_again() -> None:
+    two = Learner(lanes=2, incarnations=[3, 4, 5, 6])
+    two.joins(A)
+    assert two.coordinator.incarnations() == [4, 5, 5, 6]
+    assert Learner(lanes=3, incarnations=[4, 5, 5, 6]).coordinator.incarnations() == [4, 5, 5, 6]
+    assert Learner(lanes=3, incarnations=[7]).coordinator.incarnations() == [7, 0, 0]
+
+
+def test_a_rollout_is_fresh_unless_it_continues_the_one_that_was_used_before() -> None:
+    learner = Learner(lanes=1, max_lag=3, per_update=1)
+    learner.joins(A)
+    coordinator = learner.coordinator
+
+    def used(number: int) -> list[tuple[int, bool]]:
+        learner.delivers(number)
+        taken = coordinator.take() or []
+        return [(arrived.rollout.sequence, arrived.fresh) for arrived in taken]
+
+    first, second, third, fourth = learner.tickets()
+    assert used(first) == [(0, True)]
+    assert used(second) == [(1, False)]
+    assert used(fourth) == [(3, True)]  # it came before the third
+    assert used(third) == [(2, True)]
+
+
+def test_a_rollout_after_one_that_was_dropped_as_stale_is_fresh() -> None:
+    learner = Learner(lanes=1, max_lag=1, per_update=1)
+    learner.joins(A)
+    coordinator = learner.coordinator
+    learner.update()  # with the first of two rollouts
+    (third,) = learner.tickets()
+    learner.publish(3)  # the second is too old now
+    assert coordinator.take() is None
+    assert coordinator.ledger.stale == 1
+    learner.says(A, learner.rollout_of(third, version=3))
+    (arrived,) = coordinator.take() or []
+    assert (arrived.rollout.sequence, arrived.fresh) == (2, True), "it is not the first of its lane, and continues nothing"
+
+
 # -------------------------------------------------------------------- the table
 
 
