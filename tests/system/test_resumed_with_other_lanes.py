@@ -51,7 +51,7 @@ def goes_on_with(tmp_path: Path, algorithm: str, shapes: list[tuple[int, int]]) 
     """Train for five updates with 4 lanes and 8 envs, then for five more with each of these shapes."""
     settings = ALGORITHMS[algorithm]
     T = settings["rollout_steps"]
-    given = {"transport": "inproc", "workers": 1, "eval_episodes": 1, "run_dir": str(tmp_path), "net": (8,)}
+    given: dict[str, Any] = {"transport": "inproc", "workers": 1, "eval_episodes": 1, "run_dir": str(tmp_path), "net": (8,)}
     run = train(resolve("CartPole-v1", preset="none", steps=5 * T * 8, **given, **settings), None, silent)
     max_lag = settings.get("max_lag", 0)
     used = 4 * summary(run)["updates"]
@@ -96,10 +96,18 @@ def test_every_algorithm_goes_on_with_another_shape_and_then_with_its_own(
 
 
 def test_what_is_refused_leaves_the_folder_as_it_was_and_a_plain_resume_goes_on(tmp_path: Path) -> None:
-    given = {"transport": "inproc", "workers": 1, "eval_episodes": 1, "run_dir": str(tmp_path), "net": (8,), "n_epochs": 1}
+    given: dict[str, Any] = {
+        "transport": "inproc",
+        "workers": 1,
+        "eval_episodes": 1,
+        "run_dir": str(tmp_path),
+        "net": (8,),
+        "n_epochs": 1,
+    }
     run = train(resolve("CartPole-v1", preset="none", steps=1_024, rollout_steps=64, **given), None, silent)
     before = content(run)
-    for changed in ({"algo": "a2c"}, {"activation": "relu"}, {"seed": 2}, {"net": (9,)}, {"core": "gru"}):
+    others: list[dict[str, Any]] = [{"algo": "a2c"}, {"activation": "relu"}, {"seed": 2}, {"net": (9,)}, {"core": "gru"}]
+    for changed in others:
         with pytest.raises(UsageError, match="a run keeps this setting"):
             train(resolve(resume=run, steps=4_096, **changed), run, silent)
     assert content(run) == before
