@@ -42,7 +42,8 @@ SAVED: dict[type, set[str]] = {
 }
 """What of each object is saved."""
 NOT_SAVED: dict[type, set[str]] = {
-    TicketCoordinator: {"run", "rollouts_per_update", "max_lag", "worker_timeout_s", "evaluation"},
+    TicketCoordinator: {"run", "rollouts_per_update", "max_lag", "worker_timeout_s", "evaluation", "_absent"}
+    | {"_first_version", "_used_before"},  # no run of the model changes its lanes, so counting from 0 gives the same
     Membership: {"events", "draining", "progress", "_run", "_member_class", "_on_removed", "_is_spare"}
     | {"_removed_for_silence", "_stages_of_left"},
     CollectingMember: {
@@ -56,7 +57,7 @@ NOT_SAVED: dict[type, set[str]] = {
         "activity_s",
     }
     | {"in_env_code_s"},
-    TicketedLane: set(),
+    TicketedLane: {"newest_used"},  # it marks rollouts as fresh for the algorithm; no message depends on it
     Ticket: set(),
     LanePlacement: {"_tie_break"},
     LaneQueue: set(),
