@@ -79,6 +79,9 @@ def rollout_bytes(run: RunSpec) -> int:
     T, N = run.rollout_steps, run.copies
     leaves = [(T + 1, leaf.shape, leaf.dtype) for leaf in run.policy.observation]
     steps = [*leaves, (T, run.policy.action.shape, run.policy.action.stored_dtype), (1, (run.policy.state_size,), "float32")]
+    if run.masked:
+        steps.append((T + 1, (sum(run.policy.action.sizes),), "bool"))
+    steps += [(T, extra.shape, extra.dtype) for extra in run.extras]
     flags = T * N * (2 * np.dtype(np.float32).itemsize + 3)  # log_prob, reward; terminated, truncated, valid
     return flags + sum(rows * N * math.prod(shape) * np.dtype(dtype).itemsize for rows, shape, dtype in steps)
 

@@ -224,6 +224,8 @@ class EvaluationTickets:
         if len(answer.episodes) != seeds or len(answer.cut) != seeds:
             return f"expected {seeds} episodes, got {len(answer.episodes)} and {len(answer.cut)} marks of cut ones"
         for episode in answer.episodes:
+            if episode.facts:
+                return f"expected episodes without facts, got {len(episode.facts)}"
             if episode.length > most:
                 return f"expected episodes of at most {most} steps, got {episode.length}"
             if not abs(episode.reward) <= episode.length * LARGEST_REWARD:  # false for NaN too

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -76,6 +77,13 @@ def test_rows_before_an_answer_that_they_do_not_fit_are_played_again() -> None:
     played.learner.says(A, played.answer(2))
     assert played.learner.coordinator.evaluation.done
     assert played.taken == [(0, 0), (0, 1)]
+
+
+def test_an_answer_holds_nothing_but_what_was_asked_for() -> None:
+    played = Played()
+    episode = Episode(0.0, 1, 0.0, (1.0,) * 60_000)
+    played.learner.says(A, msgspec.structs.replace(played.answer(1), episodes=(episode,)))
+    assert played.strikes() == 1
 
 
 def frames(height: int = 2, width: int = 2, count: int = 2) -> Array:

@@ -22,7 +22,7 @@ from protocol.arrays import Bytes
 from protocol.env_spec import EnvSpec
 from protocol.errors import BadMessage
 from protocol.rollout import Rollout, rollout_bytes
-from protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
+from protocol.specs import ActionSpec, ExtraArray, Leaf, PolicySpec, RunSpec
 from protocol.wire.codec import decode_to_learner, decode_to_worker, encode
 from protocol.wire.compression import Packing, pack_stack, unpack_array, unpack_stack, why_no_zstd
 from protocol.wire.socket_options import MAX_FRAME_BYTES
@@ -189,6 +189,10 @@ def test_the_room_of_a_run_is_what_its_rollouts_come_to() -> None:
         (rollout,) = collect(random_collector(run), run)
         assert rollout_bytes(run) == sum(map(len, encode(rollout)[1:]))
     assert sum(map(len, encode(a_rollout())[1:])) == ROOM
+    (choices,) = STACKS.policy.action.sizes
+    whole = msgspec.structs.replace(a_rollout(), mask=np.ones((17, 2, choices), bool), extras=(np.zeros((16, 2, 3)),))
+    run = msgspec.structs.replace(STACKS, masked=True, extras=(ExtraArray("wind", (3,), "float64"),))
+    assert rollout_bytes(run) == sum(map(len, encode(whole)[1:]))
 
 
 def test_a_packed_rollout_comes_back_as_it_went() -> None:
