@@ -31,10 +31,11 @@ from learner.rollouts.hub import Hub, HubObserver, HubSettings
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import Interrupted, RunFolder
+from learner.run_folder.run_lock import RunLock
 from learner.service import RolloutService
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
-from protocol.errors import UsageError
+from protocol.errors import RunTakenOver, UsageError
 from protocol.specs import DescribeSpec, RunSpec
 from protocol.wire.learner_link import LearnerLink
 
@@ -66,15 +67,17 @@ class RunSetup:
 
 @contextmanager
 def run_folder(config: Config, resume: Path | None) -> Iterator[RunFolder]:
-    """A new run folder, or the folder of the run to `resume`. A new one is removed again if no `Run` can be made of it.
+    """A new run folder, or the folder of the run to `resume`, locked. A new one is removed if no `Run` can be made of it.
 
-    Raises `UsageError`, also if the run cannot be resumed with these settings.
+    Raises `UsageError`, also if the run cannot be resumed with these settings, or if another process trains it.
     """
-    for line in [] if resume is None else check_settings(config, resume):
-        log.warning("%s", line)
+    lines = [] if resume is None else check_settings(config, resume)
     folder = RunFolder.create(config) if resume is None else RunFolder.open(resume)
     try:
-        yield folder
+        with RunLock(folder.path) as folder.lock:
+            for line in lines:
+                log.warning("%s", line)
+            yield folder
     except BaseException:
         folder.remove()
         raise
@@ -219,6 +222,9 @@ class Run:
         try:
             with self._interrupts:
                 train(self.algorithm, self.service, self.recorder, workers)
+        except RunTakenOver as error:
+            self.service.drain(str(error), timeout_s=2.0)
+            raise
         except BaseException as error:
             reason = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error)
             self.service.drain(reason, timeout_s=2.0)
@@ -230,6 +236,8 @@ class Run:
     def _check_interrupt(self) -> None:
         if self._interrupts.received:
             raise Interrupted(self.folder.path)
+        if self.folder.lock is not None:
+            self.folder.lock.check()
 
 
 def serve(config: Config, resume: Path | None, watch: Watch) -> Path:
@@ -240,6 +248,8 @@ def serve(config: Config, resume: Path | None, watch: Watch) -> Path:
         return resume
     keyring = keyring_for(config, datetime.now(UTC).replace(microsecond=0))
     with ExitStack() as stack:
+        # The run is locked before the port is bound: of two learners of one run, the second is told so.
+        folder = None if resume is None else stack.enter_context(run_folder(config, resume))
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         stack.callback(context.term)
         link = LearnerLink(config.bind, context, keyring)
@@ -249,7 +259,7 @@ def serve(config: Config, resume: Path | None, watch: Watch) -> Path:
             log.warning("%s", line)
         env, processes = EnvSpec.of(config.env, config.env_kwargs), ProcessCallbacks()
         known = known_environment(config, env, resume, describe_over(link, config, processes))
-        folder = stack.enter_context(run_folder(config, resume))
+        folder = folder or stack.enter_context(run_folder(config, None))
         run = Run(RunSetup(config, known, folder, resume is not None), link, processes, watch, observer)
         run.train(config.min_workers or 1)
         return run.folder.path

@@ -126,7 +126,9 @@ class RunRecorder:
             self.save()
 
     def save(self) -> None:
-        """Write a checkpoint and the policy."""
+        """Write a checkpoint and the policy. Raises `RunTakenOver` if another process trains this run now."""
+        if self._folder.lock is not None:
+            self._folder.lock.confirm()
         state = self._state().checkpoint_content(self._algorithm)
         self._saved_s = time.monotonic()
         self._episodes_since_save = 0

@@ -4,6 +4,7 @@
     ├── UserFacingError         raised: this side cannot go on; the command line prints its one line, exits with `exit_code`
     │   ├── UsageError            2   bad flag, unknown environment, unsupported space, folder that exists, …
     │   ├── Refused               2   the learner refused this worker
+    │   ├── RunTakenOver          1   another process trains this run now; this one must write nothing more
     │   └── RunError              1   the run cannot go on
     │       ├── CheckpointError   1   a checkpoint is missing, broken or of another format
     │       ├── NoWorkers         1   no worker is left, or none ever joined
@@ -48,6 +49,10 @@ class Refused(UserFacingError):
     """The learner refused this worker."""
 
     exit_code = 2
+
+
+class RunTakenOver(UserFacingError):
+    """Another process trains this run now, because this one seemed dead. Nothing more may be written."""
 
 
 class RunError(UserFacingError):

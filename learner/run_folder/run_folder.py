@@ -11,6 +11,7 @@
       policy.json           the meaning of these arrays: with it, another program can act
       summary.json          the results of the run (results.py)
       workers/              the logs of local worker processes
+      run.lock              who trains the run now (run_lock.py)
 
 Rule: a file is there whole or not at all. The same policy gives the same bytes. Nothing is pickled.
 """
@@ -31,6 +32,7 @@ import numpy as np
 from learner.run_folder.atomic_write import write_atomically
 from learner.run_folder.results import Summary
 from learner.run_folder.run_format import RUN_FILE, check_format, write_format
+from learner.run_folder.run_lock import RunLock
 from protocol.arrays import Floats
 from protocol.env_spec import EnvSpec, Scalar
 from protocol.errors import RunError, UsageError
@@ -105,6 +107,8 @@ class RunFolder:
     def __init__(self, path: Path, made: Path | None = None) -> None:
         """`made`: if the folder is new, the topmost folder that was made for it."""
         self.path, self._made = path, made
+        self.lock: RunLock | None = None
+        """Held while this process trains the run."""
 
     @staticmethod
     def create(config: RunSettings, started_s: float | None = None) -> RunFolder:

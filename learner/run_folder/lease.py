@@ -1,0 +1,62 @@
+"""The content of a run's lock file, and how an observer judges from it whether the owner lives. Pure.
+
+Rule: a living owner rewrites the file every few seconds with a higher count. An observer compares no clocks: it judges by
+its own how long the content stays the same.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import msgspec
+
+WIDTH = 512  # bytes: every rewrite has the same length, so that one of them replaces the whole
+
+
+class Owner(msgspec.Struct, frozen=True, kw_only=True):
+    """The content of the lock file."""
+
+    host: str
+    pid: int
+    boot: str
+    """Which running kernel the process is on: processes with the same one are on one machine."""
+    token: str
+    """Random: two locks never have the same."""
+    count: int = 0
+    """How often the owner has rewritten the file."""
+
+    def __str__(self) -> str:
+        return f"process {self.pid} on {self.host}"
+
+    def encoded(self) -> bytes:
+        """The content of the lock file."""
+        return msgspec.json.encode(self).ljust(WIDTH - 1) + b"\n"
+
+
+def decoded(content: bytes) -> Owner | None:
+    """The owner that this content names. None if it names none: it was cut, or is being written."""
+    try:
+        return msgspec.json.decode(content.strip(), type=Owner)
+    except msgspec.MsgspecError:
+        return None
+
+
+class Verdict(Enum):
+    """What an observer knows about the owner."""
+
+    UNKNOWN = "the content has not changed yet"
+    ALIVE = "the content has changed"
+    DEAD = "the content has stayed the same for too long"
+
+
+class LeaseWatch:
+    """One observer of one lock file."""
+
+    def __init__(self, content: bytes, now: float, dead_after_s: float) -> None:
+        self._content, self._since_s, self._dead_after_s = content, now, dead_after_s
+
+    def judge(self, content: bytes, now: float) -> Verdict:
+        """What the content read now says. `now`: seconds by the observer's monotonic clock."""
+        if content != self._content:
+            return Verdict.ALIVE
+        return Verdict.DEAD if now - self._since_s >= self._dead_after_s else Verdict.UNKNOWN

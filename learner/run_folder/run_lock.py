@@ -1,0 +1,243 @@
+"""The lock of a run folder: one process trains a run at a time.
+
+Rule: the file `run.lock` names the owner. On one machine the system's lock on it (flock) decides; the kernel releases it
+when the process dies, however it dies. Machines that share the folder may not see each other's system locks. So the owner
+also rewrites the file every few seconds (`lease.py`); an owner on another machine that does not is dead. The lock of a dead
+owner is taken over. Commands that only read a run folder do not ask for it.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+import os
+import secrets
+import socket
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple, Self
+
+from msgspec.structs import replace
+
+from learner.run_folder.lease import LeaseWatch, Owner, Verdict, decoded
+from protocol.errors import RunError, RunTakenOver, UsageError
+
+log = logging.getLogger("millrace.learner")
+
+LOCK_FILE = "run.lock"
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+
+
+class Pace(NamedTuple):
+    """How often an owner rewrites its lock, and how an observer waits for that. In seconds."""
+
+    rewrite_every: float = 3.0
+    dead_after: float = 30.0
+    look_every: float = 0.5
+    confirm_after: float = 1.0
+    """After a lock was taken over from another machine: when to see whether a third one took it at the same time."""
+
+
+PACE = Pace()
+JOIN_S = 5.0  # a file system that does not answer must not keep the process
+
+
+class RunLock:
+    """The lock of one run folder, held while it is entered."""
+
+    def __init__(
+        self,
+        folder: Path,
+        pace: Pace = PACE,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._folder, self._path = folder, folder / LOCK_FILE
+        self._pace, self._clock, self._sleep = pace, clock, sleep
+        self._owner = Owner(host=socket.gethostname(), pid=os.getpid(), boot=_boot(), token=secrets.token_hex(8))
+        self._file = -1
+        self._other: Owner | None = None
+        self._stop = threading.Event()
+        self._writing = threading.Lock()  # of this object: the thread and `confirm` both read and rewrite the file
+        self._thread = threading.Thread(target=self._rewrite_often, name="run-lock", daemon=True)
+
+    def __enter__(self) -> Self:
+        """Take the lock.
+
+        Raises `UsageError`, which names the owner, if another process has it, and `RunError` if it cannot be written.
+        """
+        try:
+            self._take()
+        except OSError as error:
+            raise RunError(f"{self._path} not written: {error.strerror}") from error
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """Release the lock and remove its file, unless another process has taken it over."""
+        self._stop.set()
+        self._thread.join(timeout=JOIN_S)
+        with suppress(OSError):
+            if self._is_ours():
+                self._path.unlink()
+        self._close()
+
+    def check(self) -> None:
+        """Raise `RunTakenOver` if another process is known to have taken the run over. Costs nothing."""
+        if self._other is not None:
+            raise RunTakenOver(
+                f"run {self._folder}: {self._other} has taken it over, because this process seemed dead for "
+                f"{self._pace.dead_after:.0f} s; it goes on there, and nothing more is written here"
+            )
+
+    def confirm(self) -> None:
+        """Read the lock file, before something is written. Raises `RunTakenOver`."""
+        self._rewrite()
+        self.check()
+
+    # ---------------------------------------------------------------- taking it
+
+    def _take(self) -> None:
+        while True:
+            try:
+                self._file, made = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644), True
+            except FileExistsError:
+                try:
+                    self._file, made = os.open(self._path, os.O_RDWR), False
+                except FileNotFoundError:
+                    continue  # it was released between the two
+            try:
+                if self._take_open_file(made=made):
+                    return
+            except BaseException as error:
+                if made and isinstance(error, OSError):  # as on a full disk
+                    self._path.unlink(missing_ok=True)
+                self._close()
+                raise
+            self._close()
+
+    def _take_open_file(self, *, made: bool) -> bool:
+        """Take the lock of the open file. False if the file was released meanwhile. Raises `UsageError`."""
+        alone = self._lock_by_system()
+        if not self._is_open_file():
+            return False
+        if made:
+            self._write()
+            return True
+        owner = decoded(self._read_open_file())
+        elsewhere = owner is None or owner.boot != self._owner.boot or not alone
+        if elsewhere:
+            self._wait_until_dead(owner)
+            if not self._is_open_file():
+                return False
+        self._write()
+        if elsewhere:
+            self._sleep(self._pace.confirm_after)
+            if not self._is_ours():
+                raise self._refusal(decoded(self._read_open_file()))
+        log.warning("run %s: %s held its lock and is gone; this process takes over", self._folder, owner or "a process")
+        return True
+
+    def _lock_by_system(self) -> bool:
+        """Take the system's lock. False if the file system has none. Raises `UsageError` if another process has it."""
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise self._refusal(decoded(self._read_open_file())) from None
+        except OSError:
+            return False
+        return True
+
+    def _wait_until_dead(self, owner: Owner | None) -> None:
+        """Return once the content has stayed the same for long enough, or is gone. Raises `UsageError` if it changes."""
+        pace = self._pace
+        log.warning(
+            "run %s: its lock names %s; waiting up to %.0f s to see whether it lives",
+            self._folder,
+            owner or "no process",
+            pace.dead_after,
+        )
+        watch = LeaseWatch(self._read_open_file(), self._clock(), pace.dead_after)
+        while True:
+            self._sleep(pace.look_every)
+            try:
+                content = self._path.read_bytes()  # by its name: a file system may keep the content of an open file
+            except FileNotFoundError:
+                return  # its owner has released it
+            match watch.judge(content, self._clock()):
+                case Verdict.ALIVE:
+                    raise self._refusal(decoded(content) or owner)
+                case Verdict.DEAD:
+                    return
+
+    def _refusal(self, owner: Owner | None) -> UsageError:
+        who = str(owner) if owner is not None else "another process"
+        here = owner is not None and owner.boot == self._owner.boot
+        how = f"kill {owner.pid}" if here and owner is not None else "end that process"
+        return UsageError(f"run {self._folder}: {who} is training it; wait until it ends, or end it ({how}), then resume")
+
+    # ---------------------------------------------------------------- holding it
+
+    def _rewrite_often(self) -> None:
+        while not self._stop.wait(self._pace.rewrite_every):
+            self._rewrite()
+
+    def _rewrite(self) -> None:
+        with self._writing, suppress(OSError):  # a file system that does not answer now may do so the next time
+            if self._other is not None:
+                return
+            try:
+                found = decoded(self._path.read_bytes())
+            except FileNotFoundError:
+                self._make_again()
+                return
+            if found is not None and found.token != self._owner.token:
+                self._other = found
+                return
+            self._owner = replace(self._owner, count=self._owner.count + 1)
+            self._write()
+
+    def _make_again(self) -> None:
+        """Someone removed the file, perhaps with the whole folder: make it again if the folder is there."""
+        if not self._folder.is_dir():
+            return
+        file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
+        self._close()
+        self._file = file
+        with suppress(OSError, UsageError):
+            self._lock_by_system()
+        self._write()
+
+    def _write(self) -> None:
+        os.pwrite(self._file, self._owner.encoded(), 0)
+        os.fdatasync(self._file)  # so that other machines see it
+
+    def _read_open_file(self) -> bytes:
+        return os.pread(self._file, 1 << 16, 0)
+
+    def _is_ours(self) -> bool:
+        found = decoded(self._path.read_bytes())
+        return found is not None and found.token == self._owner.token
+
+    def _is_open_file(self) -> bool:
+        """Whether the open file is the one of this name: its owner may have removed it."""
+        with suppress(FileNotFoundError):
+            return os.path.samestat(os.fstat(self._file), os.stat(self._path))
+        return False
+
+    def _close(self) -> None:
+        if self._file >= 0:
+            os.close(self._file)
+            self._file = -1
+
+
+def _boot() -> str:
+    """Which running kernel this is; the host's name where that cannot be read."""
+    try:
+        return BOOT_ID.read_text().strip()
+    except OSError:
+        return f"host {socket.gethostname()}"

@@ -1,0 +1,214 @@
+"""The lock of a run folder: one owner at a time, on one machine by the system, across machines by a file that changes."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from learner.run_folder.lease import LeaseWatch, Owner, Verdict, decoded
+from learner.run_folder.run_lock import LOCK_FILE, Pace, RunLock
+from protocol.errors import RunError, RunTakenOver, UsageError
+
+ELSEWHERE = Owner(host="far", pid=77, boot="another kernel", token="theirs")
+NEVER = Pace(rewrite_every=1e6, dead_after=30.0, look_every=1.0, confirm_after=1.0)
+OWNS = """
+import sys
+from pathlib import Path
+from learner.run_folder.run_lock import RunLock
+with RunLock(Path(sys.argv[1])):
+    print("taken", flush=True)
+    sys.stdin.read()
+"""
+
+
+class Time:
+    """A clock that `sleep` moves; what is to happen meanwhile happens then."""
+
+    def __init__(self, meanwhile: Callable[[float], object] = lambda now: None) -> None:
+        self.now = 1000.0
+        self._meanwhile = meanwhile
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+        self._meanwhile(self.now)
+
+    def clock(self) -> float:
+        return self.now
+
+
+def lock(folder: Path, time: Time | None = None, pace: Pace = NEVER) -> RunLock:
+    time = time or Time()
+    return RunLock(folder, pace, time.clock, time.sleep)
+
+
+def owner_of(folder: Path) -> Owner:
+    found = decoded((folder / LOCK_FILE).read_bytes())
+    assert found is not None
+    return found
+
+
+def held_elsewhere(folder: Path, count: int = 0) -> None:
+    (folder / LOCK_FILE).write_bytes(Owner(host="far", pid=77, boot="another kernel", token="theirs", count=count).encoded())
+
+
+# ------------------------------------------------------------------------------------------- the judgement
+
+
+def test_an_observer_judges_by_its_own_clock() -> None:
+    for began in (0.0, 1e9):
+        watch = LeaseWatch(b"1", began, 30.0)
+        assert watch.judge(b"1", began + 29.9) is Verdict.UNKNOWN
+        assert watch.judge(b"1", began + 30.0) is Verdict.DEAD
+        assert watch.judge(b"2", began + 31.0) is Verdict.ALIVE
+        assert watch.judge(b"", began + 1.0) is Verdict.ALIVE
+
+
+def test_every_rewrite_replaces_the_whole() -> None:
+    lengths = {len(Owner(host="h" * n, pid=n, boot="b" * 36, token="t" * 16, count=10**n).encoded()) for n in range(1, 15)}
+    assert len(lengths) == 1
+    assert decoded(ELSEWHERE.encoded()) == ELSEWHERE
+    for damaged in (b"", b"{}", ELSEWHERE.encoded()[:40], b"\xff" * 512):
+        assert decoded(damaged) is None
+
+
+# ------------------------------------------------------------------------------------------- one machine
+
+
+def test_a_second_one_is_refused_and_named_and_a_released_lock_leaves_nothing(tmp_path: Path) -> None:
+    with lock(tmp_path):
+        before = (tmp_path / LOCK_FILE).read_bytes()
+        with pytest.raises(UsageError, match=rf"^run {tmp_path}: process {os.getpid()} on \S+ is training it; .*kill"):
+            lock(tmp_path).__enter__()
+        assert (tmp_path / LOCK_FILE).read_bytes() == before
+    assert not (tmp_path / LOCK_FILE).exists()
+    with lock(tmp_path):
+        assert owner_of(tmp_path).pid == os.getpid()
+    assert "run-lock" not in [thread.name for thread in threading.enumerate()]
+
+
+def test_the_lock_of_a_process_that_was_killed_is_taken_over_and_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", OWNS, str(tmp_path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        cwd=Path(__file__).parents[3],
+    ) as other:
+        try:
+            assert other.stdout is not None
+            assert other.stdout.readline() == b"taken\n"
+            with pytest.raises(UsageError, match=rf"process {other.pid} on \S+ is training it"):
+                lock(tmp_path).__enter__()
+        finally:
+            other.send_signal(signal.SIGKILL)
+    time = Time()
+    with lock(tmp_path, time):
+        assert owner_of(tmp_path).pid == os.getpid()
+    assert time.now == 1000.0, "the kernel knows that it is dead: nothing to wait for"
+    assert f"process {other.pid} on" in caplog.text
+    assert "held its lock and is gone; this process takes over" in caplog.text
+
+
+def test_a_folder_that_cannot_be_written_is_said(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"run.lock not written: No such file or directory"):
+        lock(tmp_path / "nowhere").__enter__()
+
+
+# ------------------------------------------------------------------------------------------- several machines
+
+
+def test_an_owner_elsewhere_that_lives_is_not_disturbed(tmp_path: Path) -> None:
+    held_elsewhere(tmp_path)
+    time = Time(lambda now: held_elsewhere(tmp_path, count=int(now // 3)))
+    with pytest.raises(UsageError, match=rf"^run {tmp_path}: process 77 on far is training it; .*end that process"):
+        lock(tmp_path, time).__enter__()
+    assert time.now <= 1003.0
+    assert owner_of(tmp_path).token == "theirs"
+
+
+def test_an_owner_elsewhere_that_is_dead_is_replaced_after_the_whole_time(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    held_elsewhere(tmp_path)
+    time = Time()
+    with lock(tmp_path, time):
+        assert time.now >= 1000.0 + NEVER.dead_after
+        assert owner_of(tmp_path).pid == os.getpid()
+    assert "its lock names process 77 on far; waiting up to 30 s" in caplog.text
+    assert "process 77 on far held its lock and is gone" in caplog.text
+
+
+def test_a_lock_that_is_released_while_one_waits_is_taken(tmp_path: Path) -> None:
+    held_elsewhere(tmp_path)
+    time = Time(lambda now: (tmp_path / LOCK_FILE).unlink(missing_ok=True) if now < 1002 else None)
+    with lock(tmp_path, time):
+        assert time.now < 1003.0
+        assert owner_of(tmp_path).pid == os.getpid()
+
+
+def test_of_two_that_take_over_at_the_same_time_one_is_refused(tmp_path: Path) -> None:
+    held_elsewhere(tmp_path)
+    third = Owner(host="third", pid=5, boot="a third kernel", token="third")
+    time = Time(lambda now: (tmp_path / LOCK_FILE).write_bytes(third.encoded()) if now > 1030 else None)
+    with pytest.raises(UsageError, match="process 5 on third is training it"):
+        lock(tmp_path, time).__enter__()
+    assert owner_of(tmp_path) == third
+
+
+def test_a_file_system_without_locks_is_judged_like_another_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def flock(file: int, operation: int) -> None:
+        raise OSError(errno.ENOTSUP, "not supported")
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    first = lock(tmp_path)
+    with first:
+        time = Time(lambda now: first.confirm())
+        with pytest.raises(UsageError, match=f"process {os.getpid()} on"):
+            lock(tmp_path, time).__enter__()
+        first.check()
+    assert not (tmp_path / LOCK_FILE).exists()
+
+
+def test_who_was_replaced_notices_and_writes_nothing_more(tmp_path: Path) -> None:
+    mine = lock(tmp_path)
+    with mine:
+        mine.confirm()
+        assert owner_of(tmp_path).count == 1
+        held_elsewhere(tmp_path)
+        theirs = (tmp_path / LOCK_FILE).read_bytes()
+        mine.check()  # not known yet
+        for _ in range(2):
+            with pytest.raises(RunTakenOver, match=rf"^run {tmp_path}: process 77 on far has taken it over, .* 30 s"):
+                mine.confirm()
+        with pytest.raises(RunTakenOver):
+            mine.check()
+    assert (tmp_path / LOCK_FILE).read_bytes() == theirs
+
+
+def test_the_file_is_rewritten_again_and_again_and_made_again(tmp_path: Path) -> None:
+    rewritten = threading.Event()
+
+    class Noticed(RunLock):
+        def _write(self) -> None:
+            super()._write()
+            if self._owner.count >= 3:
+                rewritten.set()
+
+    with Noticed(tmp_path, Pace(rewrite_every=0.001)) as held:
+        assert rewritten.wait(10)
+        (tmp_path / LOCK_FILE).unlink()
+        held.confirm()
+        assert owner_of(tmp_path).pid == os.getpid()
+        with pytest.raises(UsageError, match="is training it"):
+            lock(tmp_path).__enter__()
+    assert not (tmp_path / LOCK_FILE).exists()
