@@ -9,6 +9,7 @@ runs only to find which of them is wrong.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any, NoReturn
 
 import numpy as np
@@ -17,6 +18,9 @@ from protocol.arrays import Array
 from protocol.bounds import one_line
 from protocol.specs import Leaf
 from workers.env_errors import Unusable
+
+Numbers = tuple[Any, Any, Any]
+"""Reward, terminated and truncated of N copies: each an array or a sequence."""
 
 
 class LeafWriter:
@@ -29,7 +33,8 @@ class LeafWriter:
         # Observations of one dimension or more are joined along their first one, which is the fastest way.
         self._lengths = [leaf.shape[0]] * copies if leaf.shape else None
         self._joined_shape = (copies * leaf.shape[0], *leaf.shape[1:]) if leaf.shape else ()
-        self._casting: Any = "safe" if self._is_whole else "same_kind"
+        # "same_kind" is the default, and naming it would cost a tenth of the time.
+        self._join: Callable[..., Any] = partial(np.concatenate, casting="safe") if self._is_whole else np.concatenate
 
     def write(self, row: Array, values: Any) -> None:
         """Write into `row`, a contiguous array [N, *leaf]. `values`: an array of this shape, or N observations in order.
@@ -37,9 +42,9 @@ class LeafWriter:
         Raises `Unusable`; some copies may be written then.
         """
         try:
-            if self._lengths is not None and isinstance(values, list | tuple):
+            if self._lengths is not None and isinstance(values, (list, tuple)):
                 if list(map(len, values)) == self._lengths:
-                    np.concatenate(values, out=row.reshape(self._joined_shape), casting=self._casting)
+                    self._join(values, out=row.reshape(self._joined_shape))
                     return
             else:
                 array = np.asarray(values)
@@ -102,16 +107,17 @@ def missing_leaf(n: int | None, observation: Any, error: Exception) -> Unusable:
     )
 
 
-def write_numbers(name: str, row: Array, values: Any) -> None:
-    """Write one number of each of N copies into `row` [N]. An array of one element counts as a number, as in gymnasium.
+def write_numbers(rows: Numbers, values: Numbers) -> None:
+    """Write reward, terminated and truncated of N copies into `rows`, [N] each.
 
-    Raises `Unusable`, which names the copy.
+    An array of one element counts as a number, as in gymnasium. Raises `Unusable`, which names the copy.
     """
     try:
-        row[:] = values
+        rows[0][:], rows[1][:], rows[2][:] = values
     except (TypeError, ValueError):
-        for n, value in enumerate(values):
-            row[n] = _number(name, n, value)
+        for name, row, of_copies in zip(("reward", "terminated", "truncated"), rows, values, strict=True):
+            for n, value in enumerate(of_copies):
+                row[n] = _number(name, n, value)
 
 
 def _number(name: str, n: int, value: Any) -> Any:

@@ -52,15 +52,16 @@ class CollectedLane:
                 "the learner has; install the same version of it on both machines"
             )
         try:
-            self.write_observations(self.obs, self.copies.reset(self._seeds, pulse))
+            leaves = self.copies.reset(self._seeds, pulse)
+            self.write_observations([array[None] for array in self.obs], 0, leaves)
         except CopyRaised as error:
             raise lane_failed(self.number, "first reset", error) from error
         self._start_s = [perf_counter()] * len(self._start_s)
 
-    def write_observations(self, rows: Iterable[Array], leaves: Leaves) -> None:
-        """Write observations into `rows`, [N, *leaf] each. Raises `Unusable`, an error of one copy."""
-        for writer, row, values in zip(self._writers, rows, leaves, strict=True):
-            writer.write(row, values)
+    def write_observations(self, arrays: Iterable[Array], t: int, leaves: Leaves) -> None:
+        """Write observations into row `t` of `arrays`, [rows, N, *leaf] each. Raises `Unusable`, an error of one copy."""
+        for writer, array, values in zip(self._writers, arrays, leaves, strict=True):
+            writer.write(array[t], values)
 
     def check_values(self, obs: Sequence[Array], reward: Array) -> None:
         """Raise, naming step and copy, if obs [rows, N, *leaf] or rewards [rows, N] are not finite or not in their space."""

@@ -198,10 +198,8 @@ class Collector:
             for i, lane, reward, terminated, truncated, obs in views:
                 try:
                     row = lane.copies.step(taken[i], pulse)
-                    write_numbers("reward", reward[t], row.reward)
-                    write_numbers("terminated", terminated[t], row.terminated)
-                    write_numbers("truncated", truncated[t], row.truncated)
-                    lane.write_observations([array[t + 1] for array in obs], row.leaves)
+                    write_numbers((reward[t], terminated[t], truncated[t]), (row.reward, row.terminated, row.truncated))
+                    lane.write_observations(obs, t + 1, row.leaves)
                 except CopyRaised as error:
                     raise lane_failed(lane.number, f"step {t}", error) from error
                 if (lost := row.lost) is not None:

@@ -83,9 +83,8 @@ class SteppedLane:
         return infos
 
     def _write_numbers(self) -> None:
-        write_numbers("reward", self.rows.reward, self._loop.reward)
-        write_numbers("terminated", self.rows.terminated, self._loop.terminated)
-        write_numbers("truncated", self.rows.truncated, self._loop.truncated)
+        rows, loop = self.rows, self._loop
+        write_numbers((rows.reward, rows.terminated, rows.truncated), (loop.reward, loop.terminated, loop.truncated))
 
     def call(self, copies: Sequence[int], name: str, args: Sequence[Any], kwargs: dict[str, Any]) -> list[Any]:
         """The attribute of each of these copies, or its result if it can be called. Its exceptions are not caught."""
