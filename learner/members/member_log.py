@@ -29,7 +29,7 @@ class MemberLog:
         self._link, self._clock = link, clock
         self._limit = LogRateLimiter()
         self._of_key: dict[str, LogBudget] = {}  # as many as there are keys, and one more
-        self._of_worker: dict[str, LogBudget] = {}
+        self._of_worker: dict[tuple[str, str], LogBudget] = {}  # by key and name: workers of two keys may share a name
 
     def warn_limited(self, peer: bytes, line: str) -> None:
         """Warn about what a peer sent, unless there was a line about it a short while ago."""
@@ -45,12 +45,13 @@ class MemberLog:
         if isinstance(event, RolloutDropped):
             log.log(level, "%s", lines, extra={"event": event})
             return
+        source = self._source(cause)
         kept_back: int | None = 0
         if isinstance(event, RejoinRequested):
-            kept_back = self._limit.due(f"told {event.worker}", self._clock())
+            kept_back = self._limit.due(f"told {event.worker} {source}", self._clock())
         if kept_back is None:
             return
-        budgets = [self._budget_of_worker(event.worker), self._budget_of_key(cause)]
+        budgets = [self._budget_of_worker(source, event.worker), self._budget_of_key(cause)]
         self._write(level, budgets, lines, suppressed_note(kept_back), event)
 
     def _write(self, level: int, budgets: list[LogBudget], lines: str, note: str, event: Event | None = None) -> None:
@@ -70,11 +71,14 @@ class MemberLog:
         log.log(level, "%s%s%s", first, note, f"\n{more}" if more else "", extra={"event": event} if event else None)
 
     def _budget_of_key(self, peer: bytes | None) -> LogBudget:
-        return self._of_key.setdefault(self._link.source(peer) if peer else "", LogBudget(OF_A_KEY))
+        return self._of_key.setdefault(self._source(peer), LogBudget(OF_A_KEY))
 
-    def _budget_of_worker(self, worker: str) -> LogBudget:
-        budget = self._of_worker.pop(worker, None) or LogBudget(OF_A_WORKER)
-        self._of_worker[worker] = budget  # last in the table: the worker that was silent for longest stands first
+    def _source(self, peer: bytes | None) -> str:
+        return self._link.source(peer) if peer else ""
+
+    def _budget_of_worker(self, source: str, worker: str) -> LogBudget:
+        budget = self._of_worker.pop((source, worker), None) or LogBudget(OF_A_WORKER)
+        self._of_worker[source, worker] = budget  # last in the table: the worker that was silent for longest stands first
         if len(self._of_worker) > MOST_WORKERS:
             del self._of_worker[next(iter(self._of_worker))]
         return budget

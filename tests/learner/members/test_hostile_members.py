@@ -12,7 +12,7 @@ import pytest
 
 from learner.members.events import EnvironmentRaised, WorkerLeft, WorkerRefused, describe
 from learner.members.join_limiter import AT_ONCE, PER_S, JoinLimiter
-from learner.members.member_log import OF_A_KEY, OF_A_WORKER
+from learner.members.member_log import OF_A_KEY, OF_A_WORKER, MemberLog
 from learner.members.member_server import TURN_S
 from learner.members.membership import MAX_MEMBERS, REMEMBERED
 from learner.rollouts.hub import Hub, HubSettings
@@ -93,6 +93,19 @@ def test_a_flood_of_sessions_and_reasons_logs_a_limited_number_of_bytes(
     noisy.link.now += 10_000
     noisy.joins("later")
     assert "more lines about it, or about workers of the same key, were left out)" in caplog.messages[-1] or names == 1
+
+
+def test_a_worker_cannot_use_up_the_log_of_another_keys_worker_of_its_name(caplog: pytest.LogCaptureFixture) -> None:
+    link = FakeLink()
+    link.source = lambda peer: peer.decode()  # type: ignore[method-assign]
+    member_log = MemberLog(cast(LearnerLink, link), lambda: 0.0)
+    left = WorkerLeft("w0", "left: bye", 0, False)
+    for _ in range(10 * OF_A_WORKER.lines):
+        member_log.log_event(logging.WARNING, left, describe(left), b"hostile")
+    before = len(caplog.records)
+    assert before <= OF_A_WORKER.lines
+    member_log.log_event(logging.WARNING, left, describe(left), b"honest")
+    assert len(caplog.records) == before + 1
 
 
 def test_a_thousand_honest_workers_are_all_logged(caplog: pytest.LogCaptureFixture) -> None:
