@@ -8,6 +8,7 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # before numpy; --torch-threads sets the learner's
 
 import logging
+import shlex
 import sys
 import time
 
@@ -15,6 +16,7 @@ from learner.config.command_line import read_config
 from learner.run_folder.json_log import JsonLines
 from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import Interrupted
+from learner.standard_streams import open_closed, unfailing
 from protocol.bounds import escaped, indented
 from protocol.errors import UserFacingError
 
@@ -25,6 +27,12 @@ LINE_EVERY_S = 10.0
 
 def main(argv: list[str]) -> int:
     """Serve until the run is over. Returns the exit code."""
+    open_closed()
+    with unfailing("stderr"):
+        return _serve(argv)
+
+
+def _serve(argv: list[str]) -> int:
     handler = logging.StreamHandler()
     plain = logging.Formatter("%(asctime)s learner: %(message)s")
     handler.setFormatter(JsonLines() if "--log-json" in argv else plain)
@@ -43,10 +51,11 @@ def main(argv: list[str]) -> int:
 
         log.info("run folder: %s", serve(config, resume, watch))
     except UserFacingError as error:
-        sys.stderr.write("\n".join(filter(None, [escaped(f"learner: {error}"), indented(error.detail)])) + "\n")
+        line = "; ".join([f"learner: {error}", *getattr(error, "__notes__", ())])
+        sys.stderr.write("\n".join(filter(None, [escaped(line), indented(error.detail)])) + "\n")
         return error.exit_code
     except Interrupted as interrupt:
-        sys.stderr.write(f"learner: interrupted; go on with: python -m learner --resume {interrupt.run}\n")
+        sys.stderr.write(f"learner: interrupted; go on with: python -m learner --resume {shlex.quote(str(interrupt.run))}\n")
         return 130
     return 0
 

@@ -1,4 +1,7 @@
-"""SIGINT and SIGTERM of a learner: the first one ends the run after the current update, the second one ends it at once."""
+"""SIGINT, SIGTERM and SIGHUP of a learner: the first ends the run after the current update, the second ends it at once.
+
+SIGHUP says that the terminal is gone. A learner that was told to ignore it (`nohup`) goes on ignoring it.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +19,9 @@ class Interrupts:
 
     def __enter__(self) -> Self:
         try:
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._handlers_before[number] = signal.signal(number, self._note)
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+                    self._handlers_before[number] = signal.signal(number, self._note)
         except ValueError:  # not in the main thread, which handles signals itself
             self._handlers_before.clear()
         return self

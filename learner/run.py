@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -33,9 +33,10 @@ from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import Interrupted, RunFolder
 from learner.run_folder.run_lock import RunLock
 from learner.service import RolloutService
+from protocol.bounds import one_line
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
-from protocol.errors import RunTakenOver, UsageError
+from protocol.errors import MillraceError, RunTakenOver, UsageError, first_line
 from protocol.specs import DescribeSpec, RunSpec
 from protocol.wire.learner_link import LearnerLink
 
@@ -226,9 +227,12 @@ class Run:
             self.service.drain(str(error), timeout_s=2.0)
             raise
         except BaseException as error:
-            reason = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error)
+            if line := self.recorder.saved():
+                error.add_note(line)
+            reason = "interrupted" if isinstance(error, KeyboardInterrupt) else _why(error)
             self.service.drain(reason, timeout_s=2.0)
-            self.recorder.finish(reason)
+            with suppress(Exception):  # `watch` may raise again, and the error of the run is what counts
+                self.recorder.finish(reason)
             raise
         finally:
             self.recorder.close()
@@ -263,6 +267,12 @@ def serve(config: Config, resume: Path | None, watch: Watch) -> Path:
         run = Run(RunSetup(config, known, folder, resume is not None), link, processes, watch, observer)
         run.train(config.min_workers or 1)
         return run.folder.path
+
+
+def _why(error: BaseException) -> str:
+    """One line that says why the run ended. The error may come from a user's code, and say anything."""
+    text = first_line(error, type(error).__name__)
+    return one_line(text if isinstance(error, MillraceError) else f"{type(error).__name__}: {text}")
 
 
 def _training_recorder(config: Config, folder: RunFolder, known: KnownEnvironment, spec: RunSpec) -> TrainingRecorder | None:

@@ -8,9 +8,11 @@ of evaluations are a stage of their own and do not count as training.
 from __future__ import annotations
 
 import logging
+import shlex
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 from learner.algorithms import Algorithm
 from learner.config.config import Config
@@ -27,12 +29,15 @@ from learner.run_folder.run_folder import RunFolder
 from learner.run_folder.versions import versions
 from learner.run_state import RunState
 from learner.service import RolloutService
+from protocol.bounds import one_line
+from protocol.errors import RunError
 from protocol.rollout import Batch
 from protocol.specs import RunSpec
 
 log = logging.getLogger("millrace.learner")
 
 SHOW_EVERY_S = 0.2  # progress of an evaluation
+SAY_AGAIN_S = 60.0  # that rows of metrics are not written
 
 
 class RunRecorder:
@@ -69,6 +74,11 @@ class RunRecorder:
         self._wall_before_s, self._steps_before = state.wall_s, state.env_steps
         self._started_s = self._saved_s = time.monotonic()
         self._episodes_since_save = 0
+        self._saved: tuple[int, int, list[float] | None] | None = None  # what `_position` was in the newest checkpoint
+        self._saved_env_steps: int | None = None
+        self._finished = False
+        self._said_s = -SAY_AGAIN_S
+        self._trouble = ""  # with the folder, as it was said last
         self._workers_alive = 0
         service.report(self.progress())
 
@@ -132,9 +142,26 @@ class RunRecorder:
         state = self._state().checkpoint_content(self._algorithm)
         self._saved_s = time.monotonic()
         self._episodes_since_save = 0
-        warn_on_error(lambda: checkpoint.save(self._folder.path, state, self.env_steps, self._checkpoints.keep))
+        if not self._make_folder_again():
+            return
+        warn_on_error(lambda: self._save_checkpoint(state))
         policy, env = self._spec.policy, self._spec.env
         warn_on_error(lambda: self._folder.write_policy(policy, env, *self._algorithm.weights()))
+
+    def save_unless_saved(self) -> None:
+        """Write a checkpoint and the policy, unless the newest checkpoint already has this state."""
+        if self._saved != self._position():
+            self.save()
+
+    def saved(self) -> str:
+        """One line that says what can be resumed, and where; empty if nothing was learned yet."""
+        if not self.version:
+            return ""
+        where = shlex.quote(str(self._folder.path))
+        if self._saved_env_steps is None:
+            return f"no checkpoint could be written to {where}"
+        newest = f"{self._saved_env_steps:,} env steps are saved"
+        return f"{newest}; go on with: --resume {where}"
 
     def conclude(self) -> None:
         """Evaluate the final policy, which must be published, and the best one."""
@@ -142,9 +169,11 @@ class RunRecorder:
             self._confirmed = self._evaluations.conclude(self.version, self.env_steps)
 
     def finish(self, reason: str) -> None:
-        """Write the summary."""
-        warn_on_error(lambda: self._folder.write_summary(self._summary(reason)))
-        self._watch(self.progress())
+        """Write the summary, and show the last progress. Does nothing if that was done."""
+        if not self._finished:
+            self._finished = True
+            warn_on_error(lambda: self._folder.write_summary(self._summary(reason)))
+            self._watch(self.progress())
 
     def close(self) -> None:
         """Close the metrics, and the dataset if episodes were recorded. Also for a run that was cut short."""
@@ -159,7 +188,7 @@ class RunRecorder:
         here_s = wall_s - self._wall_before_s
         lags = snapshot.lags or [0]
         return Progress(
-            run=str(self._folder.path),
+            run=one_line(str(self._folder.path)),
             env_steps=self.env_steps,
             total_steps=self._config.steps,
             updates=self.version,
@@ -178,6 +207,40 @@ class RunRecorder:
         )
 
     # ---------------------------------------------------------------- inside
+
+    def _make_folder_again(self) -> bool:
+        """Make the run folder again if it was deleted. False if that is not possible; the run goes on without it."""
+        made = True
+        try:
+            line = self._folder.make_again(self._config)
+        except RunError as error:
+            line, made = str(error), False
+        if line:
+            self._saved = self._saved_env_steps = None
+            if made or line != self._trouble:
+                log.warning("%s", line)
+        self._trouble = line
+        return made
+
+    def _write_row(self, progress: Progress, metrics: Mapping[str, float]) -> None:
+        """Write a row of metrics. A disk that does not take rows is said once a minute, not for each row."""
+        if self._metrics.deleted:
+            self._make_folder_again()
+        try:
+            self._metrics.write(progress, metrics)
+        except RunError as error:
+            now = time.monotonic()
+            if now - self._said_s >= SAY_AGAIN_S:
+                self._said_s = now
+                log.warning("%s; the run goes on, and says so at most once a minute", error)
+
+    def _save_checkpoint(self, state: dict[str, Any]) -> None:
+        checkpoint.save(self._folder.path, state, self.env_steps, self._checkpoints.keep)
+        self._saved, self._saved_env_steps = self._position(), self.env_steps
+
+    def _position(self) -> tuple[int, int, list[float] | None]:
+        """What of the state changes when the run goes on: the version, the next evaluation, the best policy."""
+        return self.version, self._evaluations.next_at, self._evaluations.best
 
     def _evaluate(self) -> dict[str, float]:
         """Evaluate the newest policy. Returns the metrics."""
@@ -205,7 +268,7 @@ class RunRecorder:
     def _report(self, metrics: Mapping[str, float]) -> None:
         """Write a row of metrics, and tell how far the run is."""
         progress = self.progress()
-        warn_on_error(lambda: self._metrics.write(progress, metrics))
+        self._write_row(progress, metrics)
         self._service.report(progress)
         self._watch(progress)
 

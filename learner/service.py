@@ -40,6 +40,10 @@ class RolloutService:
         """Wait for the rollouts of the next update. Raises `RunError` when the run cannot go on."""
         return self._hub.gather()
 
+    def not_used(self, rollouts: list[AcceptedRollout]) -> None:
+        """The update of the rollouts that `gather` returned last failed: they are counted as lost."""
+        self._hub.not_used(rollouts)
+
     def pulse(self) -> None:
         """Answer the workers, during a long computation. Never waits, never raises."""
         self._hub.pulse()

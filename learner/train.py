@@ -4,14 +4,21 @@ An evaluation belongs to one version: it comes after that version's checkpoint, 
 
 With `max_lag` 0 the learner publishes weights, gathers rollouts and learns, one after the other. With `max_lag` 1 the
 workers already collect the next rollouts while the learner learns. The loop is the same: only the number of tickets differs.
+
+Rule: whatever ends the run, the state after the last whole update is saved first. An update that raises, or that makes
+weights which are not finite, is taken back.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
 
 from learner.algorithms import Algorithm
-from learner.run_folder.run_folder import Interrupted
+from learner.rollouts.lanes import AcceptedRollout
 from learner.run_recorder import RunRecorder
 from learner.service import RolloutService
 from protocol.errors import RunError
@@ -22,28 +29,44 @@ def train(algorithm: Algorithm, service: RolloutService, recorder: RunRecorder, 
     """Train until `recorder` gives a reason to stop. Returns that reason.
 
     `workers`: number of workers to wait for before the first rollout. If the run cannot go on (no worker is left, the
-    environment raised too often, the user interrupted the run), the state after the last whole update is saved. Then the
-    error is raised.
+    environment raised too often, the user interrupted the run, a loss is not finite, the user's code raised), the state
+    after the last whole update is saved. Then the error is raised.
     """
     recorder.save()
-    service.wait_for_workers(workers)
-    service.publish(recorder.version, *algorithm.weights(), deal=recorder.training_goes_on())
-    recorder.evaluate_if_due()
-    while (reason := recorder.stop_reason()) is None:
-        try:
-            arrived = service.gather()
-        except (RunError, Interrupted):
-            recorder.save()
-            raise
-        recorder.gathered(arrived)
-        began_s = time.monotonic()
-        batch = stack_rollouts([one.rollout for one in arrived], [one.fresh for one in arrived])
-        metrics = algorithm.update(batch, service.pulse)
-        recorder.count(batch)
+    try:
+        service.wait_for_workers(workers)
         service.publish(recorder.version, *algorithm.weights(), deal=recorder.training_goes_on())
-        recorder.updated(metrics, time.monotonic() - began_s)
-    recorder.save()
-    recorder.conclude()
+        recorder.evaluate_if_due()
+        while (reason := recorder.stop_reason()) is None:
+            arrived = service.gather()
+            recorder.gathered(arrived)
+            began_s = time.monotonic()
+            with _whole_update(algorithm, service, arrived):
+                batch = stack_rollouts([one.rollout for one in arrived], [one.fresh for one in arrived])
+                metrics = algorithm.update(batch, service.pulse)
+                weights = algorithm.weights()
+                if not all(np.isfinite(array).all() for array in weights):
+                    raise RunError(f"learner: update {recorder.version}: the weights are not finite after it")
+            recorder.count(batch)
+            service.publish(recorder.version, *weights, deal=recorder.training_goes_on())
+            recorder.updated(metrics, time.monotonic() - began_s)
+        recorder.save()
+        recorder.conclude()
+    except BaseException:
+        recorder.save_unless_saved()
+        raise
     service.drain(reason)
     recorder.finish(reason)
     return reason
+
+
+@contextmanager
+def _whole_update(algorithm: Algorithm, service: RolloutService, arrived: list[AcceptedRollout]) -> Iterator[None]:
+    """An update of the rollouts that have arrived. If the body raises, it is taken back."""
+    algorithm.remember()
+    try:
+        yield
+    except BaseException:
+        algorithm.roll_back()
+        service.not_used(arrived)
+        raise

@@ -1,14 +1,13 @@
 """Shows the progress of a run: as a live block on a terminal, as a line every few seconds elsewhere, or as JSON.
 
-Rule: it never slows the run (at most five redraws a second), and the last progress is always shown. If nobody reads the
-output any more (`| head`), the run continues. Warnings of the log are shown above the block. No text is read as markup or
-controls the terminal.
+Rule: it never slows the run (at most five redraws a second), and the last progress is always shown. Warnings of the log are
+shown above the block. No text is read as markup or controls the terminal. That a stream which is full or closed does not end
+the run is not its business, but that of `learner.standard_streams`.
 """
 
 from __future__ import annotations
 
 import logging
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -128,10 +127,7 @@ class PlainLines:
 
     def print_line(self, line: str) -> None:
         """Print the line."""
-        try:
-            print(escaped(line), flush=True)
-        except BrokenPipeError:  # nobody reads the output; the run continues, and Python must be able to flush at its exit
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        print(escaped(line), flush=True)
 
     def close(self) -> None:
         """Nothing to do."""

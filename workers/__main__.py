@@ -134,10 +134,14 @@ def _supervise(flags: argparse.Namespace, token: Token | None, timeouts: CallTim
 
 
 def _count_signals() -> list[int]:
-    """SIGTERM and SIGINT ask to leave: the first after the rollout in progress, the second at once."""
+    """SIGTERM, SIGINT and SIGHUP ask to leave: the first after the rollout in progress, the second at once.
+
+    A SIGHUP that is ignored (`nohup`) stays ignored.
+    """
     received: list[int] = []
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda signum, frame: received.append(signum))
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, lambda signum, frame: received.append(signum))
     return received
 
 

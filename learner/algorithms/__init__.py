@@ -46,6 +46,14 @@ class Algorithm(Protocol):
         """
         ...
 
+    def remember(self) -> None:
+        """Remember this state, for `roll_back`. Called before each update, so it must be quick."""
+        ...
+
+    def roll_back(self) -> None:
+        """Return to the state that was remembered last, from any state in between: an update was not made whole."""
+        ...
+
     def weights(self) -> tuple[Floats, Floats]:
         """Copies of the acting parameters [P] and of the policy's buffers, both float32, for a `Weights` message."""
         ...

@@ -1,6 +1,7 @@
 """The base of PPO, A2C, IMPALA and REINFORCE: everything about an update except advantages, value targets and the loss.
 
-Rows that are not valid never enter a minibatch. An update raises before a number that is not finite reaches the weights.
+Rows that are not valid never enter a minibatch. An update raises before a number that is not finite reaches the weights, or
+when a step makes one; `roll_back` then takes back what it did.
 With one torch thread on a CPU the same batches give the same bits, also after `load_state_dict`. No sockets, no files, no
 clock.
 """
@@ -21,10 +22,10 @@ from learner.algorithms import losses
 from learner.algorithms.kernels import loss_gradients
 from learner.algorithms.kernels.fused import MAX_ROWS, FusedActorCritic, can_fuse
 from learner.algorithms.kernels.loss_gradients import Numbers, OutputGradients
-from learner.algorithms.kernels.optimizer_step import avoid_compiler_import, take_step
+from learner.algorithms.kernels.optimizer_step import avoid_compiler_import, state_of, take_step
 from learner.algorithms.minibatches import Index, LossInput, Minibatch, NetworkInput, Observations, rows_of_columns
 from learner.algorithms.normalization import ObservationNormalizer, RewardScaler
-from learner.algorithms.updates import check_finite, scheduled
+from learner.algorithms.updates import check_finite, check_finite_weights, scheduled
 from learner.config.hyperparameters import ActorCriticHyperparameters, RecurrentHyperparameters
 from protocol.arrays import Array, Bools, Floats
 from protocol.policy.features import features, normalize
@@ -36,6 +37,7 @@ from protocol.specs import ActionSpec, Leaf, PolicySpec
 Pulse = Callable[[], None]
 Metrics = dict[str, float]
 
+ADVICE = "a lower learning_rate, or normalize_observations and normalize_rewards"
 CHUNK_ROWS = 1024  # observations that are evaluated together where no gradient is needed: this bounds memory
 
 
@@ -112,6 +114,7 @@ class ActorCritic:
         self._normalizer = ObservationNormalizer(policy)
         self._reward_scaler = RewardScaler(config.gamma)
         self._buffers = self._normalizer.buffers()  # float32 means and standard deviations, as published
+        self._remembered: dict[str, Any] = {}
 
     # ---------------------------------------------------------------- what an algorithm defines
 
@@ -183,6 +186,7 @@ class ActorCritic:
             epochs.append(self._epoch(next(minibatches_of_epochs), pulse))
             if epochs[-1] and self.stops(epochs[-1][-1]):
                 break
+        check_finite_weights(self.net.flat, self.version, ADVICE)
         self.count_update(batch, observations, len(epochs))
         return self.metrics(epochs, estimates)
 
@@ -201,7 +205,7 @@ class ActorCritic:
         """One gradient step on a minibatch of valid rows, unless `stops` forbids it. Returns what was measured before it."""
         rows = self.evaluate(minibatch)
         metrics = self._gradient(rows)
-        check_finite(metrics, self.version, "a lower learning_rate, or normalize_observations and normalize_rewards")
+        check_finite(metrics, self.version, ADVICE)
         if metrics["grad_norm"] > self.config.max_grad_norm:
             self.net.flat_grad.mul_(self.config.max_grad_norm / metrics["grad_norm"])
         if not self.stops(metrics):
@@ -410,7 +414,7 @@ class ActorCritic:
         """A copy of everything that the next update depends on: tensors and plain data (`torch.load(weights_only=True)`)."""
         return {
             "parameters": self.net.flat.clone(),
-            "optimizer": copy.deepcopy(self.optimizer.state_dict()),
+            "optimizer": state_of(self.optimizer),
             "generator": self.generator.get_state(),
             "observations": self._normalizer.state_dict(),
             "rewards": self._reward_scaler.state_dict(),
@@ -427,6 +431,14 @@ class ActorCritic:
         self._reward_scaler.load_state_dict(state["rewards"])
         self._buffers = self._normalizer.buffers()
         self.env_steps, self.version = state["env_steps"], state["version"]
+
+    def remember(self) -> None:
+        """Remember this state, for `roll_back`."""
+        self._remembered = self.state_dict()
+
+    def roll_back(self) -> None:
+        """Return to the state that was remembered last."""
+        self.load_state_dict(self._remembered)
 
 
 def make_optimizer(kind: Literal["adam", "rmsprop"], net: ActorCriticNetwork, learning_rate: float) -> torch.optim.Optimizer:

@@ -19,10 +19,10 @@ import torch
 
 from learner.algorithms.kernels import loss_gradients
 from learner.algorithms.kernels.action_values import action_values
-from learner.algorithms.kernels.optimizer_step import avoid_compiler_import, take_step
+from learner.algorithms.kernels.optimizer_step import avoid_compiler_import, state_of, take_step
 from learner.algorithms.normalization import ObservationNormalizer
 from learner.algorithms.replay import ReplayBuffer, Sample
-from learner.algorithms.updates import check_finite, scheduled
+from learner.algorithms.updates import check_finite, check_finite_weights, scheduled
 from learner.config.hyperparameters import DQNConfig
 from protocol.arrays import Array, Floats
 from protocol.errors import UsageError
@@ -40,6 +40,7 @@ class StepMetrics(NamedTuple):
     grad_norm: float  # before clipping
 
 
+ADVICE = "a lower learning_rate, or normalize_observations"
 LOSSES = {"huber": loss_gradients.huber_loss, "squared": loss_gradients.squared_loss}
 
 
@@ -94,6 +95,7 @@ class DQN:
         # The buffers of a Q policy also hold ε, which is not the normalizer's: so it gets the policy with the other head.
         self._normalizer = ObservationNormalizer(msgspec.structs.replace(policy, head="actor_critic"))
         self._statistics = self._normalizer.buffers()
+        self._remembered: dict[str, Any] = {}
 
     def update(self, batch: Batch, pulse: Callable[[], None]) -> dict[str, float]:
         """Add a batch to the replay buffer and learn from it, calling `pulse` between gradient steps. Returns metrics.
@@ -117,6 +119,7 @@ class DQN:
             for _ in range(config.gradient_steps):
                 measured.append(self.step(self.replay.sample(config.batch_size, beta)))
                 pulse()
+        check_finite_weights(self.net.flat, self.version, ADVICE)
         metrics = {
             "rollout/exploration_rate": exploration_rate(config, self.env_steps),
             "train/learning_rate": learning_rate,
@@ -139,7 +142,7 @@ class DQN:
         loss, by_chosen = LOSSES[self.config.loss](error, values.to_array(sample.weight))
         values.backward(by_chosen)
         measured = StepMetrics(*values.numbers_and_norm(loss, chosen.sum() / len(chosen)))
-        check_finite(measured._asdict(), self.version, "a lower learning_rate, or normalize_observations")
+        check_finite(measured._asdict(), self.version, ADVICE)
         self._clip_gradient(measured.grad_norm)
         take_step(self._optimizer)
         self.gradient_steps += 1
@@ -189,12 +192,17 @@ class DQN:
 
     def state_dict(self) -> dict[str, Any]:
         """A copy of everything that the next update depends on: tensors and plain data (`torch.load(weights_only=True)`)."""
+        return self._small_state() | {
+            "replay": self.replay.state_dict(),
+        }
+
+    def _small_state(self) -> dict[str, Any]:
+        """The state without the replay buffer."""
         return {
             "parameters": self.net.flat.clone(),
             "target": self.target.flat.clone(),
-            "optimizer": copy.deepcopy(self._optimizer.state_dict()),
+            "optimizer": state_of(self._optimizer),
             "observations": self._normalizer.state_dict(),
-            "replay": self.replay.state_dict(),
             "env_steps": self.env_steps,
             "version": self.version,
             "gradient_steps": self.gradient_steps,
@@ -202,11 +210,24 @@ class DQN:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`: the next update is the one that would have followed it, bit for bit."""
+        self._load_small_state(state)
+        self.replay.load_state_dict(state["replay"])
+
+    def remember(self) -> None:
+        """Remember this state, for `roll_back`. Of the replay buffer, only what changes from now on is copied."""
+        self._remembered = self._small_state()
+        self.replay.remember()
+
+    def roll_back(self) -> None:
+        """Return to the state that was remembered last."""
+        self._load_small_state(self._remembered)
+        self.replay.roll_back()
+
+    def _load_small_state(self, state: dict[str, Any]) -> None:
         self.net.flat.copy_(state["parameters"])
         self.target.flat.copy_(state["target"])
         self._optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
         self._normalizer.load_state_dict(state["observations"])
         self._statistics = self._normalizer.buffers()
-        self.replay.load_state_dict(state["replay"])
         self.env_steps, self.version = state["env_steps"], state["version"]
         self.gradient_steps = state["gradient_steps"]

@@ -65,6 +65,25 @@ def check_fits_memory(observation: Sequence[Leaf], size: int, prioritized: bool)
     )
 
 
+class Overwritten(NamedTuple):
+    """What some slots held before they were written."""
+
+    slots: Ints  # [K]
+    rows: Array  # [K] of ROW
+    weights: Doubles | None  # [K] of the sum tree
+    leaves: tuple[Array, ...]  # [K, *leaf] each; none where only rows or priorities are written
+
+
+class Remembered(NamedTuple):
+    """The state of a replay buffer that `roll_back` returns to, without the slots."""
+
+    written: int
+    rows: int
+    highest: float
+    newest: dict[int, Ints]
+    generator: Any
+
+
 class ReplayBuffer:
     """The newest transitions of all lanes, drawn uniformly or by priority."""
 
@@ -95,6 +114,8 @@ class ReplayBuffer:
         self._highest = 1.0  # greatest priority so far: new transitions get it
         self._written = 0  # slots ever written; the next one is this, modulo the size
         self._rows = 0
+        self._remembered: Remembered | None = None
+        self._overwritten: list[Overwritten] = []  # since `remember`, oldest first
         self._newest: dict[int, Ints] = {}  # lane -> [copies] value of `_written` when the last observation was written
 
     def __len__(self) -> int:
@@ -125,6 +146,8 @@ class ReplayBuffer:
         written[0][continues] = newest[continues]
         self._written += int(np.count_nonzero(needed))
         slot = written % self.size
+        self._keep(slot[needed], self._obs)
+        self._keep(slot[0][continues], ())
         self._clear(slot[needed])
         for kept, leaf in zip(self._obs, obs, strict=True):
             kept[slot[needed]] = leaf[needed]
@@ -208,7 +231,36 @@ class ReplayBuffer:
             return
         priority = np.abs(error).astype(np.float64) + PRIORITY_OFFSET
         self._highest = max(self._highest, float(priority.max()))
+        self._keep(slots, ())
         self._tree.set(slots, priority**self._alpha)
+
+    # ---------------------------------------------------------------- taking back
+
+    def remember(self) -> None:
+        """Remember this state, for `roll_back`: from now on, what a slot held is kept before it is written."""
+        self._overwritten.clear()
+        self._remembered = Remembered(
+            self._written, self._rows, self._highest, dict(self._newest), self._generator.bit_generator.state
+        )
+
+    def roll_back(self) -> None:
+        """Return to the state that was remembered last."""
+        assert self._remembered is not None, "nothing was remembered"
+        self._written, self._rows, self._highest, newest, generator = self._remembered
+        self._newest, self._generator.bit_generator.state = dict(newest), generator
+        for old in reversed(self._overwritten):
+            self._row[old.slots] = old.rows
+            for leaf, before in zip(self._obs, old.leaves, strict=False):
+                leaf[old.slots] = before
+            if self._tree is not None and old.weights is not None:
+                self._tree.set(old.slots, old.weights)
+        self._overwritten.clear()
+
+    def _keep(self, slots: Ints, leaves: tuple[Array, ...]) -> None:
+        """Keep what these slots hold, if `remember` was called: they are written next."""
+        if self._remembered is not None and len(slots):
+            weights = None if self._tree is None else self._tree.weights[slots]
+            self._overwritten.append(Overwritten(slots, self._row[slots], weights, tuple(leaf[slots] for leaf in leaves)))
 
     # ---------------------------------------------------------------- saving
 

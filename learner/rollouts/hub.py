@@ -173,6 +173,11 @@ class Hub:
                 logged_s = now
                 log.warning("%s", self.waiting_for())
 
+    def not_used(self, taken: list[AcceptedRollout]) -> None:
+        """The update of the rollouts that `gather` returned last failed: they are counted as lost."""
+        self.coordinator.not_used(taken)
+        self._weight_age.not_used(self._lags)
+
     def evaluate(
         self, plan: EvaluationPlan, watch: Callable[[int], None], on_rows: OnRows | None = None
     ) -> list[PlayedEpisode]:

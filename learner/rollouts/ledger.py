@@ -20,7 +20,7 @@ class Ledger(msgspec.Struct, kw_only=True):
     stale: int = 0
     """tickets whose rollout was acted under weights older than max_lag allows: it was dropped, and a new ticket dealt"""
     lost: int = 0
-    """tickets whose worker was lost, left or sent an unusable rollout: a new ticket was dealt"""
+    """tickets whose worker was lost, left or sent an unusable rollout (a new ticket was dealt), or whose update failed"""
 
     transitions_received: int = 0
     transitions_used: int = 0
@@ -28,7 +28,7 @@ class Ledger(msgspec.Struct, kw_only=True):
     transitions_duplicate: int = 0
     """transitions of rollouts that arrived a second time"""
     transitions_late: int = 0
-    """transitions of rollouts of a session that had ended"""
+    """transitions of rollouts of a session that had ended, or of an update that failed"""
     transitions_invalid: int = 0
     """transitions of rollouts that broke the row format or did not fit the run"""
 

@@ -235,6 +235,14 @@ class TicketCoordinator:
         self.ledger.transitions_used += sum(arrived.rollout.env_steps for arrived in taken)
         return [self._marked(arrived) for arrived in taken]
 
+    def not_used(self, taken: list[AcceptedRollout]) -> None:
+        """Count rollouts that `take` returned as lost: no update was made of them."""
+        self.ledger.used -= len(taken)
+        self.ledger.lost += len(taken)
+        env_steps = sum(arrived.rollout.env_steps for arrived in taken)
+        self.ledger.transitions_used -= env_steps
+        self.ledger.transitions_late += env_steps
+
     def deal(self) -> list[Outgoing]:
         """Deal the tickets that may be dealt, as after stale rollouts were dropped, or after an evaluation."""
         self._held_back = False

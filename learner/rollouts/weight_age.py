@@ -47,6 +47,11 @@ class WeightAge:
         """Rollouts with these lags went into an update."""
         self.lags.update(lags)
 
+    def not_used(self, lags: Iterable[int]) -> None:
+        """Rollouts with these lags were to go into an update, which failed."""
+        self.lags.subtract(lags)
+        self.lags = +self.lags
+
     def histogram(self) -> dict[str, int]:
         """Number of rollouts that were used, by lag, from the smallest; a JSON object has strings for keys."""
         return {str(lag): self.lags[lag] for lag in sorted(self.lags)}

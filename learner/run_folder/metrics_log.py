@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import io
+import logging
 import math
 import os
 import socket
@@ -23,6 +24,8 @@ from learner.run_folder.atomic_write import write_atomically
 from learner.run_folder.progress import ENV_STEPS_KEY, Progress, Row
 from protocol.errors import RunError
 
+log = logging.getLogger("millrace.learner")
+
 METRICS_FILE = "metrics.jsonl"
 EVENTS_EVERY_S = 0.2  # a fast run makes a hundred updates in that time, and an event takes as long as a small minibatch
 
@@ -34,17 +37,27 @@ class MetricsLog:
     """
 
     def __init__(self, folder: Path, from_env_steps: int = 0, clock: Callable[[], float] = time.monotonic) -> None:
-        """`from_env_steps`: env steps of the checkpoint that the run goes on from; later rows are removed."""
+        """`from_env_steps`: env steps of the checkpoint that the run goes on from; later rows are removed.
+
+        Raises `RunError`, with a one-line message, if the files cannot be written.
+        """
         table = folder / METRICS_FILE
-        if table.exists():
-            kept = [row for row in read_rows(table) if (row.get(ENV_STEPS_KEY) or 0) <= from_env_steps]
-            write_atomically(table, lambda file: file.writelines(_json_line(row) for row in kept))
         events = folder / "tensorboard" / f"events.out.tfevents.{time.time_ns()}.{socket.gethostname()}.{os.getpid()}"
-        events.parent.mkdir(exist_ok=True)
-        self._table, self._events = _RecordFile(table), _RecordFile(events)
+        try:
+            if table.exists():
+                kept = [row for row in read_rows(table) if row[ENV_STEPS_KEY] <= from_env_steps]
+                write_atomically(table, lambda file: file.writelines(_json_line(row) for row in kept))
+            self._table, self._events = _RecordFile(table), _RecordFile(events)
+        except OSError as error:
+            raise RunError(f"{error.filename or table} cannot be written: {error.strerror}") from error
         self._events.append(_first_event(from_env_steps))
         self._clock, self._last_event_s = clock, -math.inf
         self._unwritten: tuple[Row, int] | None = None  # the newest row and its env steps, if TensorBoard has not got it
+
+    @property
+    def deleted(self) -> bool:
+        """Whether metrics.jsonl was deleted since its last row. `write` makes it again."""
+        return self._table.deleted
 
     def write(self, progress: Progress, train: Mapping[str, float]) -> None:
         """Add a row. `train`: the metrics of the algorithm, and of an evaluation if there was one.
@@ -72,15 +85,26 @@ class MetricsLog:
 
 
 class _RecordFile:
-    """A file to which whole records are appended. A record that a full disk cut off is removed."""
+    """A file to which whole records are appended. A record that a full disk cut off is removed.
+
+    If the file was deleted, it is made again, with its folder.
+    """
 
     def __init__(self, path: Path) -> None:
+        """Raises OSError."""
         self._path = path
-        self._file = path.open("ab", buffering=0)
-        self._bytes = path.stat().st_size
+        self._open()
+
+    @property
+    def deleted(self) -> bool:
+        return os.fstat(self._number).st_nlink == 0
 
     def append(self, record: bytes) -> None:
         try:
+            if self.deleted:
+                deleted = self._file
+                self._open()
+                deleted.close()
             if self._file.write(record) != len(record):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
@@ -92,11 +116,34 @@ class _RecordFile:
     def close(self) -> None:
         self._file.close()
 
+    def _open(self) -> None:
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = self._path.open("ab", buffering=0)
+        self._number = self._file.fileno()
+        self._bytes = self._path.stat().st_size
+
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """The rows of a metrics.jsonl. A last line that was cut off is ignored."""
-    lines = path.read_bytes().splitlines(keepends=True)
-    return [msgspec.json.decode(line, type=dict[str, Any]) for line in lines if line.endswith(b"\n")]
+    """The rows of a metrics.jsonl, each with its env steps. A last line that was cut off is ignored.
+
+    Other rows that cannot be read are left out, and the log says how many. Raises OSError.
+    """
+    *lines, _ = path.read_bytes().split(b"\n")
+    rows = [row for line in lines if (row := _row(line)) is not None]
+    if len(rows) < len(lines):
+        log.warning("%s: %d of %d rows cannot be read; they are left out", path, len(lines) - len(rows), len(lines))
+    return rows
+
+
+def _row(line: bytes) -> dict[str, Any] | None:
+    """A row: finite numbers, or null, by name; None if it cannot be read."""
+    try:
+        row = msgspec.json.decode(line, type=dict[str, int | float | None])
+        if row[ENV_STEPS_KEY] is None or not all(number is None or math.isfinite(number) for number in row.values()):
+            return None
+    except (msgspec.MsgspecError, UnicodeError, KeyError, OverflowError):
+        return None
+    return row
 
 
 def _json_line(row: Row) -> bytes:

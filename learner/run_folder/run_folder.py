@@ -18,6 +18,7 @@ Rule: a file is there whole or not at all. The same policy gives the same bytes.
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import time
@@ -118,6 +119,10 @@ class RunFolder:
         """
         stamp = time.strftime("%Y%m%d-%H%M%S", time.localtime(started_s))
         path = first = Path(config.run_dir) / f"{as_folder_name(config.env)}-{config.algo}-s{config.seed}-{stamp}"
+        try:
+            os.fsencode(path).decode()
+        except UnicodeError as error:
+            raise UsageError(f"run-dir {config.run_dir!r}: expected a name in UTF-8; choose another --run-dir") from error
         made = [folder for folder in (path, *path.parents) if not folder.exists()]
         for number in count(2):
             try:
@@ -162,13 +167,33 @@ class RunFolder:
         """The run has begun: `remove` does nothing from now on."""
         self._made = None
 
+    def make_again(self, config: RunSettings) -> str:
+        """If the folder or its config.toml was deleted, make it again. Returns one line that says so, or nothing.
+
+        Raises `RunError` if it cannot be made.
+        """
+        if (self.path / "config.toml").is_file():
+            return ""
+        line = f"{self.path / 'config.toml'} was deleted; it is written again"
+        if not self.path.is_dir():
+            line = f"run folder {self.path} was deleted; it is made again, without what was in it"
+            try:
+                self.path.mkdir(parents=True)
+            except OSError as error:
+                raise RunError(f"run folder {self.path} was deleted, and cannot be made again: {error.strerror}") from error
+        self.write_config(config)
+        return line
+
     def write_config(self, config: RunSettings) -> None:
         """Write config.toml and run.json: at the start, and again when a run is resumed, perhaps with other settings."""
         try:
             write_format(self.path)
         except OSError as error:
             raise RunError(f"{self.path / RUN_FILE} not written: {error.strerror}") from error
-        self._write("config.toml", f"# Repeat this run: millrace train --config THIS_FILE\n{config.to_toml()}".encode())
+        self._write(
+            "config.toml",
+            f"# Repeat this run: millrace train --config THIS_FILE\n{config.to_toml()}".encode("utf-8", "surrogateescape"),
+        )
 
     def write_policy(
         self, spec: PolicySpec, env: EnvSpec, parameters: Floats, buffers: Floats, which: Which = "final"

@@ -1,23 +1,29 @@
 """The command line: finds the command, runs it, and turns an error into one line and an exit code.
 
 Rule: bad usage is one line on stderr and exit code 2. A run that failed is one line (and the worker's traceback below it,
-if there is one) and exit code 1. Ctrl-C is exit code 130. A traceback of millrace itself is shown with --debug only. Each
+if there is one) and exit code 1. Ctrl-C is exit code 130. A traceback of millrace itself is shown with --debug only. What
+standard error does not take is dropped, and so is what standard output does not take of a run: neither ends a run. Each
 command imports what it needs when it runs, so that `--help` answers at once.
 """
 
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # before numpy; --torch-threads sets the learner's
 
+from learner.standard_streams import open_closed, unfailing
 from protocol.bounds import MAX_SEEDS, escaped, indented
 from protocol.errors import UsageError, UserFacingError, first_line
+
+if TYPE_CHECKING:
+    from learner.run import Watch
 
 ABOUT = "Worker processes step copies of a gymnasium environment; one learner trains a policy in PyTorch."
 HELP_FLAGS = ("-h", "--help")
@@ -38,22 +44,35 @@ def main(argv: list[str] | None = None) -> int:
     argv = sys.argv[1:] if argv is None else argv
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # last, so that a user's module is found but hides no installed module
+    open_closed()
+    with unfailing("stderr"):
+        return _exit_code(argv)
+
+
+def _exit_code(argv: list[str]) -> int:
+    """Run the command line and print its error, if there is one."""
     try:
         exit_code = _dispatch(argv)
         sys.stdout.flush()
         return exit_code
     except UserFacingError as error:
-        _print_error(f"millrace: {error}")
+        _print_error("; ".join([f"millrace: {error}", *_notes(error)]))
         if error.detail:
             _print_error(indented(error.detail))
         return _failed(argv, error.exit_code)
     except KeyboardInterrupt as interrupt:
         run = getattr(interrupt, "run", None)
-        _print_error(f"millrace: interrupted{f'; go on with: millrace train --resume {run}' if run else ''}")
+        more = [f"go on with: millrace train --resume {shlex.quote(str(run))}"] if run else _notes(interrupt)
+        _print_error("; ".join(["millrace: interrupted", *more]))
         return _failed(argv, 130)
     except BrokenPipeError:  # nobody reads our output any more (`| head`), so a message is useless
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         return 1
+    except OSError as error:
+        if _drop_output():
+            _print_error(f"millrace: standard output: {error.strerror}")
+            return _failed(argv, 1)
+        return _internal_error(argv, error)
     except ModuleNotFoundError as error:
         if error.name not in NOT_IN_WORKERS:
             return _internal_error(argv, error)
@@ -64,6 +83,21 @@ def main(argv: list[str] | None = None) -> int:
         return _failed(argv, 2)
     except Exception as error:
         return _internal_error(argv, error)
+
+
+def _drop_output() -> bool:
+    """If standard output does not take what was printed, drop it, so that Python can end. Returns whether it was so."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return True
+    return False
+
+
+def _notes(error: BaseException) -> list[str]:
+    """What was added to the error on its way here: how to go on with the run."""
+    return list(getattr(error, "__notes__", ()))
 
 
 def _dispatch(argv: list[str]) -> int:
@@ -107,11 +141,8 @@ def _train(argv: list[str]) -> int:
 
     config, resume = read_config("train", argv)
     from millrace.launch import local_run
-    from millrace.terminal import progress_view
 
-    with progress_view("--log-json" in argv) as watch:
-        run = local_run.train(config, resume, watch)
-    return _print_result(run)
+    return _run(argv, lambda watch: local_run.train(config, resume, watch))
 
 
 def _learner(argv: list[str]) -> int:
@@ -120,16 +151,25 @@ def _learner(argv: list[str]) -> int:
     config, resume = read_config("learner", argv)
     from learner.run import is_finished, serve
     from millrace.launch import learner_inference as inference
+
+    def train(watch: Watch) -> Path:
+        if resume is not None and is_finished(config, resume):
+            return resume
+        if config.inference == "learner":
+            return inference.train(config, resume, watch, elsewhere=True)
+        return serve(config, resume, watch)
+
+    return _run(argv, train)
+
+
+def _run(argv: list[str], train: Callable[[Watch], Path]) -> int:
+    """Train, show the progress meanwhile, and print how the run ended. Output that cannot be written is dropped."""
     from millrace.terminal import progress_view
 
-    with progress_view("--log-json" in argv) as watch:
-        if resume is not None and is_finished(config, resume):
-            run = resume
-        elif config.inference == "learner":
-            run = inference.train(config, resume, watch, elsewhere=True)
-        else:
-            run = serve(config, resume, watch)
-    return _print_result(run)
+    with unfailing("stdout"):
+        with progress_view("--log-json" in argv) as watch:
+            run = train(watch)
+        return _print_result(run)
 
 
 def _print_result(run: Path) -> int:
@@ -313,11 +353,7 @@ def _launch_ray(argv: list[str]) -> int:
         if error.name != "ray":
             raise
         raise UsageError("launch ray: Ray is not installed; pip install 'millrace-rl[ray]'") from None
-    from millrace.terminal import progress_view
-
-    with progress_view("--log-json" in argv) as watch:
-        run = launch(flags, learner, watch)
-    return _print_result(run)
+    return _run(argv, lambda watch: launch(flags, learner, watch))
 
 
 def _bench(argv: list[str]) -> int:
@@ -380,8 +416,8 @@ def _print_error(line: str) -> None:
 
 
 def _internal_error(argv: list[str], error: Exception) -> int:
-    hint = "" if "--debug" in argv else "; --debug shows the traceback"
-    _print_error(f"millrace: internal error: {type(error).__name__}: {first_line(error)}{hint}")
+    hints = [*_notes(error), *([] if "--debug" in argv else ["--debug shows the traceback"])]
+    _print_error("; ".join([f"millrace: internal error: {type(error).__name__}: {first_line(error)}", *hints]))
     return _failed(argv, 1)
 
 

@@ -9,6 +9,7 @@ import pytest
 from rich.console import Console
 
 from learner.run_folder.progress import Progress
+from learner.standard_streams import never_fails
 from millrace.terminal import LiveBlock, PlainLines, RateLimitedView, detail_rows, progress_view, render_block
 
 PROGRESS = Progress(
@@ -118,7 +119,7 @@ def test_a_reader_that_has_gone_does_not_end_the_run(tmp_path: Path, monkeypatch
     reading, writing = os.pipe()
     os.close(reading)
     with os.fdopen(writing, "w") as pipe:
-        monkeypatch.setattr("sys.stdout", pipe)
+        monkeypatch.setattr("sys.stdout", never_fails(pipe))
         for _ in range(3):
             PlainLines().show(PROGRESS)
         monkeypatch.undo()

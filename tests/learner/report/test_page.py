@@ -276,12 +276,21 @@ def test_what_cannot_be_reported_is_one_line(tmp_path: Path) -> None:
         write_page([run], tmp_path / "no" / "report.html")
     with pytest.raises(UsageError, match=r"is a folder; expected the file to write"):
         write_page([run], tmp_path)
-    (run / "metrics.jsonl").write_text("not json\n")
-    with pytest.raises(UsageError, match="it is damaged, there is nothing to report on"):
-        page([run])
     (run / "config.toml").write_text("env = ")
     with pytest.raises(UsageError, match="it is damaged, there is nothing to report on"):
         page([run])
+
+
+def test_rows_that_cannot_be_read_are_left_out_and_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    run = a_run(tmp_path)
+    whole = page([run])
+    metrics = run / "metrics.jsonl"
+    metrics.write_bytes(b'not json\n{"time/total_timesteps": "x"}\n[]\n' + metrics.read_bytes() + b"\xff\n")
+    assert page([run]) == whole
+    lines = len(metrics.read_bytes().splitlines())
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{metrics}: 4 of {lines} rows cannot be read; they are left out"
+    ]
 
 
 @pytest.mark.parametrize(

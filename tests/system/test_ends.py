@@ -1,0 +1,247 @@
+"""However a run ends, a checkpoint of the last whole update exists, and one line says where. Runs in this process."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import shlex
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from learner.algorithms.ppo import PPO
+from learner.config.layers import resolve
+from learner.run_folder import checkpoint
+from learner.run_folder.metrics_log import read_rows
+from learner.run_folder.progress import Progress
+from millrace.launch.local_run import train
+from protocol.errors import RunError, UsageError
+from tests.system.runs import accounted
+
+SMALL: dict[str, Any] = {
+    "transport": "inproc", "workers": 1, "lanes": 2, "envs": 2, "rollout_steps": 16, "n_epochs": 2, "batch_size": 16,
+    "net": (8,), "steps": 400, "eval_episodes": 2, "checkpoint_every_s": 1000.0,
+}  # fmt: skip
+Watch = Callable[[Progress], None]
+
+
+class UsersError(Exception):
+    """What the user's code raises."""
+
+
+def run(tmp_path: Path, watch: Watch = lambda progress: None, resume: Path | None = None, **settings: Any) -> Path:
+    return train(
+        resolve("workers.envs.toy:Identity-v0", run_dir=str(tmp_path / "runs"), **{**SMALL, **settings}), resume, watch
+    )
+
+
+def folder_of(tmp_path: Path) -> Path:
+    (folder,) = (tmp_path / "runs").iterdir()
+    return folder
+
+
+def summary(folder: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((folder / "summary.json").read_text())
+    return found
+
+
+def raises_at(update: int, error: BaseException) -> Watch:
+    def watch(progress: Progress) -> None:
+        if progress.updates == update:
+            raise error
+
+    return watch
+
+
+def saved(folder: Path) -> int:
+    """The number of updates in the newest checkpoint."""
+    found: int = checkpoint.newest(folder)[0].state["past"]["version"]
+    return found
+
+
+def how_to_go_on(folder: Path) -> list[str]:
+    return [
+        f"{checkpoint.newest(folder)[0].env_steps:,} env steps are saved; go on with: --resume {shlex.quote(str(folder))}"
+    ]
+
+
+def parameters(folder: Path) -> torch.Tensor:
+    found: torch.Tensor = checkpoint.newest(folder)[0].state["algorithm"]["parameters"]
+    return found
+
+
+@pytest.mark.parametrize("max_lag", [0, 1])
+@pytest.mark.parametrize(
+    "error", [UsersError("no\nmore"), KeyboardInterrupt(), SystemExit(3)], ids=lambda e: type(e).__name__
+)
+def test_a_watch_that_raises(tmp_path: Path, error: BaseException, max_lag: int) -> None:
+    with pytest.raises(type(error)) as caught:
+        run(tmp_path, raises_at(5, error), max_lag=max_lag)
+    folder = folder_of(tmp_path)
+    assert caught.value is error
+    assert error.__notes__ == how_to_go_on(folder)
+    assert saved(folder) == 5
+    told = summary(folder)
+    assert told["stop_reason"] in ("UsersError: no", "interrupted", "SystemExit: 3")
+    accounted(told, lanes=2, rows=16, max_lag=max_lag)
+    del error.__notes__
+
+
+def test_a_watch_that_raises_in_an_evaluation(tmp_path: Path) -> None:
+    def watch(progress: Progress) -> None:
+        if progress.doing:
+            raise UsersError
+
+    with pytest.raises(UsersError):
+        run(tmp_path, watch, eval_every=100, eval_episodes=200)
+    found = checkpoint.newest(folder_of(tmp_path))[0]
+    assert saved(folder_of(tmp_path)) == 4
+    assert found.state["past"]["next_evaluation"] == 100 <= found.env_steps, "it must be made again"
+
+
+def test_a_watch_that_raises_at_the_very_end(tmp_path: Path) -> None:
+    def watch(progress: Progress) -> None:
+        finished = (folder_of(tmp_path) / "summary.json").exists()
+        if finished and not progress.doing:
+            raise UsersError
+
+    with pytest.raises(UsersError):
+        run(tmp_path, watch)
+    assert summary(folder_of(tmp_path))["stop_reason"] == "all steps done"
+
+
+def breaks(monkeypatch: pytest.MonkeyPatch, update: int, minibatch: int, how: Callable[[dict[str, float]], None]) -> None:
+    """Have `how` act on the metrics of this minibatch of this update, before its step."""
+    gradient, done = PPO._gradient, [0]
+
+    def broken(self: PPO, rows: Any) -> dict[str, float]:
+        metrics = gradient(self, rows)
+        if self.version == update:
+            done[0] += 1
+            if done[0] == minibatch:
+                how(metrics)
+        return metrics
+
+    monkeypatch.setattr(PPO, "_gradient", broken)
+
+
+@pytest.mark.parametrize("how", ["loss", "user code", "Ctrl-C"])
+def test_an_update_that_fails_in_the_middle_is_taken_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
+    with pytest.raises(UsersError):
+        run(tmp_path / "whole", raises_at(3, UsersError()), seed=4)
+
+    def act(metrics: dict[str, float]) -> None:
+        match how:
+            case "loss":
+                metrics["value_loss"] = float("nan")
+            case "user code":
+                raise UsersError("in the loss")
+            case _:
+                raise KeyboardInterrupt
+
+    breaks(monkeypatch, 3, 3, act)
+    expected = {"loss": RunError, "user code": UsersError, "Ctrl-C": KeyboardInterrupt}[how]
+    with pytest.raises(expected) as caught:
+        run(tmp_path / "broken", seed=4)
+    monkeypatch.undo()
+    whole, broken = folder_of(tmp_path / "whole"), folder_of(tmp_path / "broken")
+    assert saved(broken) == saved(whole) == 3
+    assert torch.equal(parameters(whole), parameters(broken)), "a half update was saved"
+    assert (whole / "policy.safetensors").read_bytes() == (broken / "policy.safetensors").read_bytes()
+    assert caught.value.__notes__ == how_to_go_on(broken)
+    accounted(summary(broken), lanes=2, rows=16)
+    assert summary(broken)["ledger"]["lost"] == 2, "the rollouts of the update that failed"
+    resumed = run(tmp_path / "broken", resume=broken)
+    accounted(summary(resumed), lanes=2, rows=16)
+    assert summary(resumed)["stop_reason"] == "all steps done"
+
+
+def test_weights_that_are_not_finite_are_never_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    update = PPO.update
+
+    def broken(self: PPO, batch: Any, pulse: Any) -> dict[str, float]:
+        metrics = update(self, batch, pulse)
+        if self.version == 3:
+            self.net.flat[0] = float("inf")
+        return metrics
+
+    monkeypatch.setattr(PPO, "update", broken)
+    with pytest.raises(RunError, match="update 2: the weights are not finite"):
+        run(tmp_path)
+    assert saved(folder_of(tmp_path)) == 2
+    assert torch.isfinite(parameters(folder_of(tmp_path))).all()
+
+
+def test_a_run_folder_that_is_deleted_is_made_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.WARNING, "millrace")
+
+    def watch(progress: Progress) -> None:
+        if progress.updates == 3 and not progress.doing:
+            shutil.rmtree(progress.run)
+
+    folder = run(tmp_path, watch, checkpoint_every_updates=2)
+    said = [record.getMessage() for record in caplog.records if "run folder" in record.getMessage()]
+    assert said == [f"run folder {folder} was deleted; it is made again, without what was in it"]
+    assert summary(folder)["stop_reason"] == "all steps done"
+    rows = read_rows(folder / "metrics.jsonl")
+    assert [row["time/iterations"] for row in rows] == list(range(4, saved(folder) + 1)), "rows after it are missing"
+    before = saved(folder)
+    assert run(tmp_path, resume=folder, steps=600) == folder
+    assert saved(folder) > before
+
+
+@pytest.mark.parametrize("what", ["checkpoints", "metrics.jsonl", "tensorboard", "policy.safetensors", "all"])
+def test_a_part_of_the_folder_that_is_deleted_or_cannot_be_written(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, what: str
+) -> None:
+    """What is deleted stands in the way as something else: a file where a folder was, or a folder where a file was."""
+    caplog.set_level(logging.WARNING, "millrace")
+
+    def watch(progress: Progress) -> None:
+        if progress.updates == 3 and not progress.doing and not (tmp_path / "done").exists():
+            (tmp_path / "done").touch()
+            folder = Path(progress.run)
+            if what == "all":
+                shutil.rmtree(folder)
+                folder.write_text("not a folder")
+            elif (folder / what).is_dir():
+                shutil.rmtree(folder / what)
+                (folder / what).write_text("not a folder")
+            else:
+                (folder / what).unlink()
+                (folder / what).mkdir()
+
+    folder = run(tmp_path, watch, checkpoint_every_updates=2)
+    said = [record.getMessage() for record in caplog.records]
+    assert all("\n" not in line for line in said)
+    assert len(said) < 12, f"said too often: {said}"
+    if what == "all":
+        assert any(str(folder) in line for line in said)
+    else:
+        assert summary(folder)["stop_reason"] == "all steps done"
+    if what in ("checkpoints", "policy.safetensors"):
+        assert any(what in line and "not written" in line for line in said)
+
+
+NAMES = ["[red]x[/red]", "with space", "öäü ✓ 学", "%s{0}", "a'b\"c", "-dash", "[0-9]*?"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_run_folders_of_any_name(tmp_path: Path, name: str) -> None:
+    with pytest.raises(UsersError):
+        run(tmp_path / name, raises_at(2, UsersError()))
+    folder = folder_of(tmp_path / name)
+    assert saved(folder) == 2
+    assert run(tmp_path / name, resume=folder) == folder
+    assert summary(folder)["stop_reason"] == "all steps done"
+
+
+def test_a_name_that_is_not_utf8_is_refused_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="expected a name in UTF-8; choose another --run-dir"):
+        run(tmp_path / os.fsdecode(b"\xff"))
+    assert not (tmp_path / os.fsdecode(b"\xff")).exists()
