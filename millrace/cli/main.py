@@ -8,6 +8,7 @@ command imports what it needs when it runs, so that `--help` answers at once.
 
 from __future__ import annotations
 
+import errno
 import os
 import shlex
 import sys
@@ -66,13 +67,13 @@ def _exit_code(argv: list[str]) -> int:
         _print_error("; ".join(["millrace: interrupted", *more]))
         return _failed(argv, 130)
     except BrokenPipeError:  # nobody reads our output any more (`| head`), so a message is useless
-        _drop_output()
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
-        if _drop_output():
-            _print_error(f"millrace: standard output: {error.strerror}")
-            return _failed(argv, 1)
-        return _internal_error(argv, error)
+        if error.filename is not None or error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
+            return _internal_error(argv, error)
+        _print_error(f"millrace: standard output: {error.strerror}")  # an error of a file has the file's name
+        return _failed(argv, 1)
     except ModuleNotFoundError as error:
         if error.name not in NOT_IN_WORKERS:
             return _internal_error(argv, error)
@@ -83,16 +84,6 @@ def _exit_code(argv: list[str]) -> int:
         return _failed(argv, 2)
     except Exception as error:
         return _internal_error(argv, error)
-
-
-def _drop_output() -> bool:
-    """If standard output does not take what was printed, drop it, so that Python can end. Returns whether it was so."""
-    try:
-        sys.stdout.flush()
-    except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return True
-    return False
 
 
 def _notes(error: BaseException) -> list[str]:
