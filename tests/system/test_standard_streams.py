@@ -48,7 +48,7 @@ def updates(tmp_path: Path) -> int:
 def is_whole(tmp_path: Path) -> bool:
     """Whether the newest checkpoint is of the last update."""
     last = read_rows(folder(tmp_path) / "metrics.jsonl")[-1]
-    return checkpoint.newest(folder(tmp_path))[0].env_steps == last["time/total_timesteps"]
+    return bool(checkpoint.newest(folder(tmp_path))[0].env_steps == last["time/total_timesteps"])
 
 
 def done(tmp_path: Path, command: Sequence[str], **streams: Any) -> subprocess.CompletedProcess[bytes]:
@@ -123,7 +123,7 @@ def test_a_terminal_that_goes_away(tmp_path: Path, ignores: bool) -> None:
         os.execv(sys.executable, train(tmp_path, "--steps", "2500" if ignores else "1000000"))
     try:
         os.set_blocking(terminal, False)
-        wait_for(lambda: (_read(terminal), updates(tmp_path) > 3)[1])
+        wait_for(lambda: _reads(terminal) and updates(tmp_path) > 3)
     finally:
         os.close(terminal)
     codes: list[int] = []
@@ -138,10 +138,11 @@ def test_a_terminal_that_goes_away(tmp_path: Path, ignores: bool) -> None:
     assert is_whole(tmp_path)
 
 
-def _read(terminal: int) -> None:
-    """Read what it shows, so that it never waits."""
+def _reads(terminal: int) -> bool:
+    """Read what it shows, so that the learner never waits. True."""
     with suppress(OSError):  # there is nothing to read yet
         os.read(terminal, 65536)
+    return True
 
 
 @pytest.mark.skipif(not FULL.exists(), reason="this system has no /dev/full")
