@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+import gymnasium
+import numpy as np
 import pytest
 
 from learner.config.layers import resolve
@@ -111,5 +113,43 @@ def test_what_is_refused_leaves_the_folder_as_it_was_and_a_plain_resume_goes_on(
         with pytest.raises(UsageError, match="a run keeps this setting"):
             train(resolve(resume=run, steps=4_096, **changed), run, silent)
     assert content(run) == before
+    train(resolve(resume=run, steps=2_048), run, silent)
+    assert summary(run)["env_steps"] > 1_024
+
+
+class Changing(gymnasium.Env[Any, Any]):
+    """An environment whose observations grow by one number with its next version."""
+
+    size: ClassVar[int] = 3
+
+    def __init__(self) -> None:
+        self.observation_space = gymnasium.spaces.Box(-1, 1, (self.size,))
+        self.action_space = gymnasium.spaces.Discrete(2)
+        self._steps = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._steps = 0
+        return np.zeros(self.size, np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self._steps += 1
+        return np.zeros(self.size, np.float32), 1.0, self._steps == 5, False, {}
+
+
+def test_an_environment_whose_spaces_have_changed_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(gymnasium.registry, "Changing-v0", gymnasium.envs.registration.EnvSpec("Changing-v0", Changing))
+    given: dict[str, Any] = {"transport": "inproc", "workers": 1, "eval_episodes": 1, "run_dir": str(tmp_path), "net": (8,)}
+    run = train(resolve("Changing-v0", steps=1_024, rollout_steps=32, n_epochs=1, **given), None, silent)
+    before = content(run)
+    monkeypatch.setattr(Changing, "size", 4)
+    says = (
+        rf"^run {run}: the environment's observations have changed: expected .*\(3,\).*, got .*\(4,\).*; install the version"
+    )
+    with pytest.raises(UsageError, match=says) as why:
+        train(resolve(resume=run, steps=2_048), run, silent)
+    assert "\n" not in str(why.value)
+    assert content(run) == before
+    monkeypatch.setattr(Changing, "size", 3)
     train(resolve(resume=run, steps=2_048), run, silent)
     assert summary(run)["env_steps"] > 1_024

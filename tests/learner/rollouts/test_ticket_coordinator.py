@@ -12,6 +12,7 @@ import pytest
 from learner.members.events import EnvironmentRaised, WorkerJoined, WorkerLeft, WorkerRefused
 from learner.members.membership import Outgoing
 from learner.members.states import TABLE, MemberState, SentUnusable, TimedOut
+from learner.rollouts.lanes import TicketedLane
 from learner.rollouts.ledger import Ledger
 from learner.rollouts.ticket_coordinator import STRIKES, TicketCoordinator
 from protocol.messages import (
@@ -993,6 +994,12 @@ def test_a_rollout_is_fresh_unless_it_continues_the_one_that_was_used_before() -
     assert used(second) == [(1, False)]
     assert used(fourth) == [(3, True)]  # it came before the third
     assert used(third) == [(2, True)]
+
+
+def test_a_rollout_continues_only_one_of_its_own_incarnation() -> None:
+    """The first of the new incarnation was dropped as stale."""
+    lane = TicketedLane(0)
+    assert [lane.use(0, 0), lane.use(0, 1), lane.use(1, 2), lane.use(1, 3)] == [False, True, False, True]
 
 
 def test_a_rollout_after_one_that_was_dropped_as_stale_is_fresh() -> None:
