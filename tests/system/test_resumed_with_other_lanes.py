@@ -138,18 +138,17 @@ class Changing(gymnasium.Env[Any, Any]):
 
 
 def test_an_environment_whose_spaces_have_changed_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(gymnasium.registry, "Changing-v0", gymnasium.envs.registration.EnvSpec("Changing-v0", Changing))
     given: dict[str, Any] = {"transport": "inproc", "workers": 1, "eval_episodes": 1, "run_dir": str(tmp_path), "net": (8,)}
-    run = train(resolve("Changing-v0", steps=1_024, rollout_steps=32, n_epochs=1, **given), None, silent)
+    run = train(resolve("Changing", steps=1_024, rollout_steps=32, n_epochs=1, **given), None, silent, Changing)
     before = content(run)
     monkeypatch.setattr(Changing, "size", 4)
     says = (
         rf"^run {run}: the environment's observations have changed: expected .*\(3,\).*, got .*\(4,\).*; install the version"
     )
     with pytest.raises(UsageError, match=says) as why:
-        train(resolve(resume=run, steps=2_048), run, silent)
+        train(resolve(resume=run, steps=2_048), run, silent, Changing)
     assert "\n" not in str(why.value)
     assert content(run) == before
     monkeypatch.setattr(Changing, "size", 3)
-    train(resolve(resume=run, steps=2_048), run, silent)
+    train(resolve(resume=run, steps=2_048), run, silent, Changing)
     assert summary(run)["env_steps"] > 1_024

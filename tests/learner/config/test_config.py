@@ -206,10 +206,10 @@ def test_no_setting_of_an_algorithm_hides_one_of_the_run() -> None:
 
 def test_a_replay_buffer_that_holds_no_rollout_is_refused() -> None:
     """Before a run begins, and before one is resumed with larger lanes."""
-    fits = {"algo": "dqn", "rollout_steps": 15, "lanes": 2}
+    fits: dict[str, Any] = {"algo": "dqn", "rollout_steps": 15, "lanes": 2}
     line = refusal(**fits, envs=14, replay_size=100)
     assert line == "replay_size 100: a rollout takes up to 112; take --replay-size 112 or more"
-    assert resolve("CartPole-v1", **fits, envs=14, replay_size=112).envs == 14  # type: ignore[arg-type]
+    assert resolve("CartPole-v1", **fits, envs=14, replay_size=112).envs == 14
 
 
 def test_rollouts_that_do_not_travel_are_not_compressed() -> None:
