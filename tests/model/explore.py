@@ -153,7 +153,10 @@ def _step(world: World, state: State, key: int) -> tuple[str, State]:
     """The action that leads to the state of this key, as a sentence, and the state, under the names of this one."""
     for action in _every_action(world, state):
         for cost in (0, 1):
-            after = world.after(state, action, cost)
+            try:
+                after = world.after(state, action, cost)
+            except Violation:
+                continue
             if world.key(world.canonical(after)) in (key, key ^ 1):
                 return _sentence(world, state, action), after
     raise AssertionError("no action leads to the next state")
@@ -171,6 +174,9 @@ def _sentence(world: World, state: State, action: Action) -> str:
         case "down" | "drop down" | "repeat down" as what, worker:
             fate = {"down": "arrives", "drop down": "is lost", "repeat down": "arrives, and will arrive again"}[what]
             return f"{message('down')} to worker {worker} {fate}."
+        case "late up" | "late down" as what, worker, part:
+            kind, *fields = world.parts[part].content
+            return f"{kind}{tuple(fields)} {'of' if what == 'late up' else 'to'} worker {worker} arrives again."
         case "start", worker:
             return f"A process of worker {worker} starts."
         case "finish", worker:

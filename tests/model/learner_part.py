@@ -73,7 +73,7 @@ class Learner:
         self.updating = False
         """whether rollouts were taken, and the weights made of them are not published"""
         self.checkpoints: list[Content] = []
-        """of each version so far: ticket to issue next, tickets used, incarnations"""
+        """of each version so far: ticket to issue next, tickets used, incarnations, newest incarnations accepted"""
         self.used: set[int] = set()
         """tickets whose rollouts were used"""
         self.accepted: list[tuple[int, int | None, set[int]]] = [(-1, None, set())] * settings.lanes
@@ -109,7 +109,7 @@ class Learner:
 
     def restarted(self, version: int) -> tuple[Learner, list[Outgoing]]:
         """A new learner, from the checkpoint of this version."""
-        issued, used, incarnations = self.checkpoints[version]
+        issued, used, incarnations, accepted = self.checkpoints[version]
         settings = self.settings
         coordinator = TicketCoordinator(
             settings.run,
@@ -123,6 +123,7 @@ class Learner:
         learner = Learner(settings, coordinator)
         learner.checkpoints = self.checkpoints[:version]
         learner.used = {number for number in self.used if number < issued.value}
+        learner.accepted = [(-1 if number is None else number.value, None, set()) for number in accepted]
         out = coordinator.publish(version, PARAMETERS, BUFFERS)
         return learner, out + learner._checkpoint()
 
@@ -134,7 +135,8 @@ class Learner:
     def _checkpoint(self) -> list[Outgoing]:
         coordinator = self.coordinator
         incarnations = tuple(incarnation(lane, number) for lane, number in enumerate(coordinator.incarnations()))
-        self.checkpoints.append((ticket(coordinator.ledger.issued), coordinator.ledger.used, incarnations))
+        accepted = tuple(_accepted(lane, number) for lane, (number, _, _) in enumerate(self.accepted))
+        self.checkpoints.append((ticket(coordinator.ledger.issued), coordinator.ledger.used, incarnations, accepted))
         return []
 
     def _accept(self, arrived: AcceptedRollout) -> None:
@@ -238,13 +240,17 @@ def saved(learner: Learner, now: float) -> Content:
         tuple(name(Kind.OLD_TICKET, number) for number in sorted(learner.used)),
         tuple(
             (
-                incarnation(lane, number) if number >= 0 else None,
+                _accepted(lane, number),
                 () if collected_in is None else (name(Kind.OLD_SESSION, collected_in),),
                 tuple(sorted(sequences)),
             )
             for lane, (number, collected_in, sequences) in enumerate(learner.accepted)
         ),
     )
+
+
+def _accepted(lane: int, number: int) -> Name | None:
+    return None if number < 0 else incarnation(lane, number)
 
 
 def _worker(number: int) -> Name:
@@ -357,5 +363,6 @@ def first_learner(settings: Settings) -> tuple[Learner, list[Outgoing]]:
             first_session=0,
         ),
     )
-    before.checkpoints = [(ticket(0), 0, tuple(incarnation(lane, 0) for lane in range(settings.lanes)))]
+    none = tuple(incarnation(lane, 0) for lane in range(settings.lanes))
+    before.checkpoints = [(ticket(0), 0, none, (None,) * settings.lanes)]
     return before.restarted(0)

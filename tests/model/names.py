@@ -27,9 +27,9 @@ class Kind(IntEnum):
     INCARNATION = 4
     """scope: the lane"""
     REPLIES = 5
-    """number of heartbeat replies; scope: the session"""
+    """number of heartbeat replies; 0 stays 0, because each session begins with it; scope: the session"""
     ATTEMPT = 6
-    """scope: the worker"""
+    """keeps its value, because each process begins at 1; scope: the worker"""
     NONCE = 7
     """process of a worker; scope: the worker"""
     OLD_SESSION = 8
@@ -91,13 +91,16 @@ def renaming(names: Iterable[int], workers: dict[int, int]) -> dict[Name, Name |
     group, following = -1, 0
     for old in sorted(names):
         if old >> BITS != group:
-            group, following = old >> BITS, 0
+            group = old >> BITS
+            following = int(old >> 2 * BITS == Kind.REPLIES and old & MASK > 0)
             kind, scope = Kind(group >> BITS), group & MASK
             if kind in SCOPED:
                 scope = workers[scope] if SCOPED[kind] is Kind.WORKER else new[SCOPED[kind] << 2 * BITS | scope] & MASK
             base = kind << 2 * BITS | scope << BITS
         if kind is Kind.WORKER:
             to = base | workers[old & MASK]
+        elif kind is Kind.ATTEMPT:
+            to = base | old & MASK
         elif kind in OLD:
             same = new.get(OLD[kind] << 2 * BITS | old & MASK)
             if same is None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from tests.model.message_content import Content
 from tests.model.settings import Settings
@@ -16,7 +16,7 @@ from tests.model.world import Action, Seat, State, Violation, World
 
 LONGEST = 400  # actions of a fair run to the target
 Turn = Callable[[Iterator[Action]], Action]
-Digests = tuple[int, tuple[tuple[int, tuple[int, ...], tuple[int, ...]], ...], int]
+Digests = tuple[int, tuple[tuple[Any, ...], ...], int]
 
 
 class Broken(Exception):
@@ -71,8 +71,8 @@ class Share:
                 self.world.part(content)
             for (learner, seats, faults), before in states:
                 here = [
-                    Seat(numbers[worker], tuple([numbers[m] for m in up]), tuple([numbers[m] for m in down]))
-                    for worker, up, down in seats
+                    Seat(numbers[worker], *[tuple([numbers[each] for each in messages]) for messages in channels])
+                    for worker, *channels in seats
                 ]
                 state = State(numbers[learner], tuple(here), faults)
                 key = self.world.key(state)

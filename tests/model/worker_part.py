@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from protocol.messages import ToLearner, ToWorker
 from tests.model.message_content import Content, incarnation, rollout_content, rollout_of, session, ticket, weights
-from tests.model.names import Kind, name
+from tests.model.names import MASK, Kind, name
 from tests.model.settings import FOR_EVER_S, TIMEOUT_S, Settings
 from tests.support.fake_ends import fake_rollouts
 from workers.collect.held_rollouts import REMEMBERED_TICKETS, Assignment, HeldRollouts, _HeldLane
@@ -117,15 +117,14 @@ def saved(worker: Worker, now: float) -> Content:
     held = current._current
     fields = (
         current.state,
-        current.run is None,
-        session(current.session),
-        name(Kind.ATTEMPT, current._attempt, worker.number),
+        None if current.run is None else session(current.session),
+        name(Kind.ATTEMPT, 1 if worker.cut_off else current._attempt, worker.number),
         max(current._last_heard_s - now, -TIMEOUT_S - 1.0),
         max(current._due_s - now, 0.0),
         tuple(_lane(number, lane) for number, lane in held.rollouts._lanes.items()),
         held.version,
         tuple(ticket(number) for number in held.in_progress),
-        name(Kind.REPLIES, held.replies, current.session),
+        None if current.run is None else name(Kind.REPLIES, held.replies, current.session),
         held.acknowledged_version,
     )
     task = worker.task
@@ -152,16 +151,18 @@ def loaded(content: Content, number: int, settings: Settings) -> Worker:
     worker = Worker(settings, number, nonce.value, None, None, frozen, shut_out, cut_off)
     if fields is None:
         return worker
-    state, is_new, of_session, attempt, heard, due, lanes, version, in_progress, replies, acknowledged = fields
+    state, of_session, attempt, heard, due, lanes, version, in_progress, replies, acknowledged = fields
     who = Identity(f"w{number}", "host", 1, nonce.value, "model")
     current = Session(who, 0.0, join_timeout_s=FOR_EVER_S, rejoin_timeout_s=FOR_EVER_S)
-    current.state, current.run = State(state), None if is_new else settings.run
-    current.session, current._attempt = of_session.value, attempt.value
+    current.session = MASK  # before its first session: not that of any message
+    current.state, current._attempt = State(state), attempt.value
     current._last_heard_s, current._due_s, current._backoff_s = heard, due, PAUSE_S
     held = current._current
     held.weights = None if version < 0 else weights(version)
     held.in_progress = tuple(each.value for each in in_progress)
-    held.replies, held.acknowledged_version = replies.value, acknowledged
+    held.acknowledged_version = acknowledged
+    if of_session is not None:
+        current.run, current.session, held.replies = settings.run, of_session.value, replies.value
     for lane, of_incarnation, sequence, tickets, kept, finished in lanes:
         here = held.rollouts._lanes[lane] = _HeldLane(of_incarnation.value, sequence)
         here.tickets = {each.value: lowest for each, lowest in tickets}

@@ -1,14 +1,15 @@
 """The model: the learner, the workers and the messages between them, and what can happen next.
 
 Rule: a state is a few numbers of parts: the learner, each worker, each message. What an event makes of a part is computed
-once, by the program's own code, and remembered; so a state costs a few look-ups. A connection keeps the order of messages.
+once, by the program's own code, and remembered; so a state costs a few look-ups. A connection keeps the order of messages;
+only a copy of a message that has arrived can arrive again at any time. (A fault repeats a message.)
 Time passes only when nothing else can happen without a fault; if it passes earlier, what is under way is delayed by a fault.
 States that differ only in the numbers of the workers, or in names, are one state.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from hashlib import blake2b
 from typing import Any, NamedTuple
 
@@ -19,6 +20,7 @@ from tests.model.message_content import Content, content_of, message_of, worker_
 from tests.model.names import Kind, Name, name, names_in, renamed, renaming
 from tests.model.settings import TICK_S, Settings
 from tests.model.worker_part import Worker
+from workers.states import State as SessionState
 
 Action = tuple[Any, ...]
 """What happens, and to which worker or version."""
@@ -30,6 +32,9 @@ class Seat(NamedTuple):
     worker: int
     up: tuple[int, ...]
     down: tuple[int, ...]
+    late_up: tuple[int, ...] = ()
+    """copies of messages that have arrived; they can arrive at any time"""
+    late_down: tuple[int, ...] = ()
 
 
 class State(NamedTuple):
@@ -59,6 +64,8 @@ class Facts(NamedTuple):
     shut_out: bool = False
     cut_off: bool = False
     working: bool = False
+    rejoins: bool = False
+    """whether the worker looks for its learner again"""
 
 
 class Violation(Exception):
@@ -98,8 +105,8 @@ class World:
         """The same state in any process, with a digest for each part."""
         parts = self.parts
         seats = [
-            (parts[worker].digest, tuple([parts[m].digest for m in up]), tuple([parts[m].digest for m in down]))
-            for worker, up, down in state.seats
+            (parts[worker].digest, *[tuple([parts[each].digest for each in messages]) for messages in channels])
+            for worker, *channels in state.seats
         ]
         return parts[state.learner].digest, tuple(seats), state.faults
 
@@ -113,7 +120,7 @@ class World:
         """All actions that need no fault. The order is that of a fair run without faults."""
         learner = self.facts[state.learner]
         under_way = learner.updating
-        for number, (worker, up, down) in enumerate(state.seats):
+        for number, (worker, up, down, late_up, late_down) in enumerate(state.seats):
             facts = self.facts[worker]
             awake = facts.alive and not facts.frozen
             if not facts.alive and not facts.cut_off:
@@ -131,6 +138,10 @@ class World:
             if awake and facts.working:
                 under_way = True
                 yield "finish", number
+            for each in late_up:
+                yield "late up", number, each
+            for each in late_down if awake else ():
+                yield "late down", number, each
         if learner.updating:
             yield ("publish",)
         if not under_way:
@@ -142,7 +153,7 @@ class World:
             return
         learner = self.facts[state.learner]
         under_way = learner.updating
-        for number, (worker, up, down) in enumerate(state.seats):
+        for number, (worker, up, down, _, _) in enumerate(state.seats):
             facts = self.facts[worker]
             awake = facts.alive and not facts.frozen
             under_way = under_way or bool(up or (awake and (down or facts.working)))
@@ -167,9 +178,18 @@ class World:
 
     def successors(self, state: State) -> Iterator[tuple[Action, State]]:
         """All that can follow, in canonical form. Raises `Violation`."""
+        no_fault_yet = state.faults == self.settings.faults
         for actions, cost in ((self.actions(state), 0), (self.faults(state), 1)):
             for action in actions:
-                yield action, self.canonical(self.after(state, action, cost))
+                after = self.after(state, action, cost)
+                if no_fault_yet and not cost and self._gave_up(state, after):
+                    raise Violation(action, AssertionError("a worker was given up, or gave up, although nothing went wrong"))
+                yield action, self.canonical(after)
+
+    def _gave_up(self, before: State, after: State) -> bool:
+        """Whether the learner has fewer members, or a worker says Hello anew."""
+        lost = len(self.facts[after.learner].members) < len(self.facts[before.learner].members)
+        return lost or any(self.facts[seat.worker].rejoins for seat in after.seats)
 
     def after(self, state: State, action: Action, cost: int = 0) -> State:
         """The state after this action. Raises `Violation`."""
@@ -183,14 +203,25 @@ class World:
         match action:
             case "down" | "drop down" | "repeat down" as what, number:
                 seat = state.seats[number]
-                first, rest = seat.down[0], seat.down[1:]
-                state = self._with(state, number, seat._replace(down=seat.down if what == "repeat down" else rest))
+                first, late = seat.down[0], seat.late_down
+                late = self._sorted((*late, first)) if what == "repeat down" else late
+                state = self._with(state, number, seat._replace(down=seat.down[1:], late_down=late))
                 return state if what == "drop down" else self._worker(state, number, ("handle", first))
             case "up" | "drop up" | "repeat up" as what, number:
                 seat = state.seats[number]
-                first, rest = seat.up[0], seat.up[1:]
-                state = self._with(state, number, seat._replace(up=seat.up if what == "repeat up" else rest))
+                first, late = seat.up[0], seat.late_up
+                late = self._sorted((*late, first)) if what == "repeat up" else late
+                state = self._with(state, number, seat._replace(up=seat.up[1:], late_up=late))
                 return state if what == "drop up" else self._learner(state, ("receive", number, first))
+            case "late down", number, message:
+                seat = state.seats[number]
+                rest = _without(seat.late_down, message)
+                state = self._with(state, number, seat._replace(late_down=rest))
+                return self._worker(state, number, ("handle", message))
+            case "late up", number, message:
+                seat = state.seats[number]
+                state = self._with(state, number, seat._replace(late_up=_without(seat.late_up, message)))
+                return self._learner(state, ("receive", number, message))
             case "start" | "finish" | "thaw" | "freeze" | "told" as what, number:
                 return self._worker(state, number, (what,))
             case "kill", number:
@@ -199,7 +230,7 @@ class World:
                 nonce = self.parts[state.seats[number].worker].content[0].value
                 return self._learner(self._worker(state, number, ("end",)), ("ended", number, nonce))
             case "revoke", number:
-                state = self._with(state, number, state.seats[number]._replace(up=()))
+                state = self._with(state, number, state.seats[number]._replace(up=(), late_up=()))
                 return self._learner(self._worker(state, number, ("shut out",)), ("revoke", number))
             case ("publish",):
                 return self._learner(state, ("publish",))
@@ -209,7 +240,7 @@ class World:
                     state = self._worker(state, number, ("time",))
                 return state
             case "restart", version:
-                seats = tuple(seat._replace(up=(), down=()) for seat in state.seats)
+                seats = tuple(Seat(seat.worker, (), ()) for seat in state.seats)
                 return self._learner(state._replace(seats=seats), ("restart", version))
             case ("dead for ever", number):
                 return self._worker(state, number, ("dead for ever",))
@@ -259,7 +290,8 @@ class World:
         worker, sent = self._events[key]
         facts = self.facts[worker]
         up = seat.up if facts.shut_out or facts.cut_off else seat.up + sent
-        return self._with(state, number, Seat(worker, up, seat.down if facts.alive else ()))
+        down, late_down = (seat.down, seat.late_down) if facts.alive else ((), ())
+        return self._with(state, number, Seat(worker, up, down, seat.late_up, late_down))
 
     def _compute_worker(self, part: int, number: int, event: Action) -> tuple[int, tuple[int, ...]]:
         worker = worker_part.loaded(self.parts[part].content, number, self.settings)
@@ -313,8 +345,8 @@ class World:
         """The same state, with its names and its workers numbered anew."""
         parts, seats = self.parts, state.seats
         numbers = [state.learner]
-        for worker, up, down in seats:
-            numbers += worker, *up, *down
+        for worker, up, down, late_up, late_down in seats:
+            numbers += worker, *up, *down, *late_up, *late_down
         names = parts[state.learner].name_set.union(*[parts[number].names for number in numbers])
         order = self._order(state)
         key = names, order
@@ -326,11 +358,18 @@ class World:
         rename = self._rename
         moved = []
         for old in order:
-            worker, up, down = seats[old]
-            moved.append(
-                Seat(rename(worker, new), tuple([rename(m, new) for m in up]), tuple([rename(m, new) for m in down]))
+            worker, up, down, late_up, late_down = seats[old]
+            late_up, late_down = (
+                self._sorted([rename(m, new) for m in late_up]),
+                self._sorted([rename(m, new) for m in late_down]),
             )
+            up, down = tuple([rename(m, new) for m in up]), tuple([rename(m, new) for m in down])
+            moved.append(Seat(rename(worker, new), up, down, late_up, late_down))
         return State(rename(state.learner, new), tuple(moved), state.faults)
+
+    def _sorted(self, messages: Sequence[int]) -> tuple[int, ...]:
+        """Messages whose order does not matter."""
+        return tuple(sorted(messages, key=lambda part: self.parts[part].digest) if len(messages) > 1 else messages)
 
     def _order(self, state: State) -> tuple[int, ...]:
         """The workers in an order that does not depend on their numbers: members first, as they joined."""
@@ -344,7 +383,9 @@ class World:
 
     def _shape(self, seat: Seat, number: int) -> tuple[int, ...]:
         """A sort key of a worker that does not contain its number."""
-        parts = [self._as_first(part, number) for part in (seat.worker, *seat.up, *seat.down)]
+        parts = [
+            self._as_first(part, number) for part in (seat.worker, *seat.up, *seat.down, *seat.late_up, *seat.late_down)
+        ]
         return tuple(self.parts[part].digest for part in parts)
 
     def _as_first(self, part: int, number: int) -> int:
@@ -368,12 +409,20 @@ class World:
         return number
 
 
+def _without(messages: tuple[int, ...], message: int) -> tuple[int, ...]:
+    index = messages.index(message)
+    return messages[:index] + messages[index + 1 :]
+
+
 def _facts(content: Content) -> Facts:
     if isinstance(content[0], str):
         return Facts()  # a message
     if len(content) == 4:
         _, (frozen, shut_out, cut_off), fields, work = content
         alive = fields is not None
-        return Facts(alive=alive, frozen=frozen, shut_out=shut_out, cut_off=cut_off, working=work is not None)
+        rejoins = alive and fields[0] is SessionState.JOINING and fields[1] is not None
+        return Facts(
+            alive=alive, frozen=frozen, shut_out=shut_out, cut_off=cut_off, working=work is not None, rejoins=rejoins
+        )
     members = tuple(member[0].value for member in content[7])
     return Facts(version=content[2], updating=content[16], checkpoints=len(content[17]), members=members)

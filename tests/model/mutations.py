@@ -1,0 +1,194 @@
+"""Mistakes that are made on purpose in the program, one at a time, to see whether the checker finds them.
+
+Rule: a mutation replaces one piece of text, which stands exactly once in its file. `python -m tests.model.mutations NAME`
+explores small runs of the program with this mistake, and exits with 1 if a rule is broken; with `--fuzz` it plays the random
+cases of tests/learner/rollouts/test_conversation.py instead.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
+from importlib.util import spec_from_loader
+from pathlib import Path
+from types import CodeType, ModuleType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+COORDINATOR = "learner.rollouts.ticket_coordinator"
+LANES = "learner.rollouts.lanes"
+MEMBERSHIP = "learner.members.membership"
+PLACEMENT = "learner.members.lane_placement"
+SESSION = "workers.session"
+HELD = "workers.collect.held_rollouts"
+
+
+@dataclass(frozen=True)
+class Mutation:
+    """A mistake."""
+
+    module: str
+    right: str
+    wrong: str
+
+
+MUTATIONS = {
+    "one update too far ahead": Mutation(COORDINATOR, "while room > 0:", "while room >= 0:"),
+    "a stale rollout is used": Mutation(
+        COORDINATOR, "if self.version - self._oldest_ready > self.max_lag:", "if self.version - self._oldest_ready > 9:"
+    ),
+    "the bound of staleness is off by one": Mutation(
+        COORDINATOR,
+        "stale = [arrived.rollout for arrived in self.ready if self.version - arrived.rollout.version > self.max_lag]",
+        "stale = [arrived.rollout for arrived in self.ready if self.version - arrived.rollout.version >= self.max_lag]",
+    ),
+    "a rollout is taken twice": Mutation(
+        COORDINATOR,
+        "self.ready[: self.rollouts_per_update], self.ready[self.rollouts_per_update :]",
+        "self.ready[: self.rollouts_per_update], self.ready[self.rollouts_per_update - 1 :]",
+    ),
+    "a late rollout is not counted": Mutation(
+        COORDINATOR, "self.ledger.transitions_late += message.env_steps", "self.ledger.transitions_late += 0"
+    ),
+    "a repeated rollout is not counted": Mutation(
+        COORDINATOR, "self.ledger.transitions_duplicate += rollout.env_steps", "self.ledger.transitions_duplicate += 0"
+    ),
+    "the arrival of a rollout is not recorded": Mutation(
+        COORDINATOR,
+        "        lane.arrived(rollout.sequence)\n        self._placement",
+        "        self._placement",
+    ),
+    "a lost Collect is not sent again": Mutation(COORDINATOR, "out += self._collect(member, lost)", "pass"),
+    "lost weights are not sent again": Mutation(
+        COORDINATOR,
+        "seen > member.sending_since:\n            member.sending = None",
+        "seen > member.sending_since:\n            pass",
+    ),
+    "heartbeats are answered with the same number": Mutation(COORDINATOR, "member.replies += 1", "member.replies += 0"),
+    "tickets of a lost worker are kept": Mutation(COORDINATOR, "for number in list(member.tickets):", "for number in ():"),
+    "a lost ticket still counts as an advance": Mutation(COORDINATOR, "self._queue.set_back(lane)\n", "pass\n"),
+    "a lane that was dealt a ticket does not count as started": Mutation(COORDINATOR, "lane.started = True", "pass"),
+    "a checkpoint repeats an incarnation": Mutation(
+        COORDINATOR, "lane.incarnation + lane.started for", "lane.incarnation + 0 for"
+    ),
+    "a ticket does not advance its lane": Mutation(COORDINATOR, "self._queue.advance(lane)", "pass"),
+    "lanes are placed after tickets are dealt": Mutation(
+        COORDINATOR, "out = self._placement.place(self.members.values())", "out: list[Outgoing] = []"
+    ),
+    "messages of an earlier session are heard": Mutation(
+        SESSION, 'getattr(message, "session", self.session) != self.session', "False"
+    ),
+    "a Welcome to an earlier Hello is taken": Mutation(SESSION, "message.attempt != self._attempt or ", ""),
+    "a repeated Welcome starts the session again": Mutation(
+        SESSION, "self.state is State.READY and message.session == self.session", "False"
+    ),
+    "a worker that joins again repeats its Hello": Mutation(SESSION, "self._attempt += 1", "self._attempt = 1"),
+    "finished work stays in progress": Mutation(
+        SESSION,
+        "self._current.in_progress = ()\n        effects: list",
+        "effects: list",
+    ),
+    "replies to heartbeats are not counted": Mutation(
+        SESSION, "self._current.replies = max(number, self._current.replies)", "pass"
+    ),
+    "new weights are acknowledged again and again": Mutation(
+        SESSION, "self._current.acknowledged_version = self._current.version\n        described", "described"
+    ),
+    "a Collect confirms nothing": Mutation(SESSION, "closed = self._received(received)", "closed: list[Effect] = []"),
+    "heartbeats are due only with new weights": Mutation(
+        SESSION,
+        "if now < self._due_s and self._current.acknowledged_version == self._current.version:",
+        "if now < self._due_s or self._current.acknowledged_version == self._current.version:",
+    ),
+    "heartbeats come at half the rate": Mutation(
+        SESSION,
+        "self._due_s = now + self.run.heartbeat_s\n        self._current",
+        "self._due_s = now + 3 * self.run.heartbeat_s\n        self._current",
+    ),
+    "an asked-for rollout is not sent again": Mutation(
+        SESSION, "return closed + [Send(rollout) for rollout in again if rollout is not None]", "return closed"
+    ),
+    "a lane whose Release was lost is kept": Mutation(
+        SESSION, "return self._release([lane for lane in self._current.lanes() if lane.lane not in listed])", "return []"
+    ),
+    "a finished ticket is forgotten": Mutation(HELD, " or permit.ticket in lane.finished:", ":"),
+    "a rollout that has not arrived is forgotten": Mutation(
+        HELD, "rollout.sequence < of_lane.next_sequence or", "rollout.sequence <= of_lane.next_sequence or"
+    ),
+    "rollouts of a lane are not counted": Mutation(HELD, "lane.sequence += 1", "pass"),
+    "a new incarnation goes on with the old lane": Mutation(
+        HELD, "if lane is None or permit.incarnation > lane.incarnation:", "if lane is None:"
+    ),
+    "the lane of a lost worker is not placed anew": Mutation(PLACEMENT, "self._unplaced |= member.lanes", "pass"),
+    "a silent worker is never removed": Mutation(MEMBERSHIP, "if now - member.alive_s > timeout_s]", "if False]"),
+    "a lane keeps its incarnation": Mutation(LANES, "self.incarnation += 1", "self.incarnation += 0"),
+}
+
+
+class _Mutator(MetaPathFinder):
+    """Imports one module with a mistake."""
+
+    def __init__(self, mutation: Mutation) -> None:
+        self._mutation = mutation
+
+    def find_spec(self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None) -> ModuleSpec | None:
+        if name != self._mutation.module:
+            return None
+        found = PathFinder.find_spec(name, path, target)
+        assert found is not None
+        assert found.origin is not None
+        return spec_from_loader(name, _MutatedLoader(name, found.origin, self._mutation))
+
+
+class _MutatedLoader(SourceFileLoader):
+    def __init__(self, name: str, path: str, mutation: Mutation) -> None:
+        super().__init__(name, path)
+        self._mutation = mutation
+
+    def get_code(self, fullname: str) -> CodeType:
+        text = Path(self.path).read_text()
+        count = text.count(self._mutation.right)
+        assert count == 1, f"{self.path}: expected this once, found it {count} times: {self._mutation.right}"
+        return compile(text.replace(self._mutation.right, self._mutation.wrong), self.path, "exec")
+
+
+def _explore() -> str:
+    """Explore small runs, the smallest first. Returns what is broken; empty: nothing was found."""
+    from tests.model.explore import RuleBroken, explore
+    from tests.model.settings import Settings
+
+    for settings in (
+        Settings(workers=1, lanes=1, updates=2, faults=1),
+        Settings(workers=2, lanes=1, updates=1, faults=1),
+        Settings(workers=1, lanes=2, updates=3, faults=1, max_lag=1, per_update=1),
+        Settings(workers=1, lanes=1, updates=2, faults=2),
+        Settings(workers=2, lanes=2, updates=1, faults=1),
+    ):
+        try:
+            explore(settings)
+        except RuleBroken as broken:
+            return f"{settings}\n{broken}"
+    return ""
+
+
+def _fuzz() -> str:
+    """Play the random cases. Returns what is broken; empty: nothing was found."""
+    from tests.learner.rollouts.test_conversation import BLOCKS, test_every_rule_holds_over_a_hostile_network
+
+    for block in range(BLOCKS):
+        try:
+            test_every_rule_holds_over_a_hostile_network(block)
+        except AssertionError as error:
+            return str(error)
+    return ""
+
+
+if __name__ == "__main__":
+    sys.meta_path.insert(0, _Mutator(MUTATIONS[sys.argv[1]]))
+    found = _fuzz() if "--fuzz" in sys.argv else _explore()
+    sys.stdout.write(found)
+    sys.exit(1 if found else 0)
