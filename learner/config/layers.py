@@ -19,7 +19,7 @@ from learner.config.did_you_mean import did_you_mean
 from learner.config.hyperparameters import HYPERPARAMETERS, algorithms_with
 from learner.config.presets import PRESETS, environment_presets, named_presets
 from learner.config.validation import convert, validate
-from learner.run_folder.run_format import check_format
+from learner.run_folder.run_format import check_format, check_whole
 from protocol.errors import UsageError
 
 
@@ -49,7 +49,7 @@ def config_from_toml(text: str, where: str = "config.toml") -> Config:
 def config_of_run(run: Path) -> Config:
     """The settings of a run folder, from its config.toml. Raises `UsageError`."""
     where = run / "config.toml"
-    return config_from_toml(where.read_text(), str(where))
+    return validate(_override_from_toml(Config(), _read_toml(where, of_run=True), str(where)), str(where))
 
 
 def lower_layers(
@@ -69,7 +69,7 @@ def lower_layers(
             raise UsageError(f"run {resume}: expected a run folder with a config.toml to resume, got none")
         check_format(resume)
     where = str(file)
-    table = {} if file is None else _read_toml(file)
+    table = {} if file is None else _read_toml(file, of_run=resume is not None)
     if resume is not None and env not in ("", table.get("env")):
         raise UsageError(f"run {resume} is of {table.get('env')}, not of {env}; resume it without naming an environment")
     named = named_presets()
@@ -126,9 +126,15 @@ def _coerce(record: msgspec.Struct, name: str, value: Any) -> Any:
     return value
 
 
-def _read_toml(file: Path) -> dict[str, Any]:
+def _read_toml(file: Path, *, of_run: bool = False) -> dict[str, Any]:
+    """Read a TOML file of settings; `of_run`: the config.toml of a run folder, which must be whole."""
     try:
-        return _parse_toml(file.read_text(), str(file))
+        text = file.read_text("utf-8")
+        check_whole(text, str(file))
+        table = _parse_toml(text, str(file))
+        if of_run and not table.keys() >= {"env", "algo", "seed"}:
+            raise UsageError(f"{file} has no env, algo or seed: it is damaged; restore it, or start a new run")
+        return table
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "it is not text"
         raise UsageError(f"config file {file} cannot be read: {why}") from error
@@ -137,7 +143,7 @@ def _read_toml(file: Path) -> dict[str, Any]:
 def _parse_toml(text: str, where: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise UsageError(f"{where} is not TOML: {error}") from error
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from learner.run_folder.metrics_log import METRICS_FILE, read_rows
 from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
-from learner.run_folder.run_format import check_format
+from learner.run_folder.run_format import check_format, check_whole
 from protocol.arrays import Doubles
 from protocol.errors import UsageError
 
@@ -52,13 +52,15 @@ def read_run_files(run: Path, purpose: Literal["plot", "report on"]) -> RunFiles
     """Read a run folder. Raises `UsageError`, with a one-line message that names `purpose`, if it cannot be read."""
     check_format(run)
     try:
-        config = tomllib.loads((run / "config.toml").read_text())
+        text = (run / "config.toml").read_text("utf-8")
+        check_whole(text, str(run / "config.toml"))
+        config = tomllib.loads(text)
         env, algo, seed = str(config["env"]), str(config["algo"]), int(config["seed"])
         return RunFiles(env, algo, seed, config, read_rows(run / METRICS_FILE))
     except FileNotFoundError as error:
         missing = f"no {Path(error.filename).name}" if run.is_dir() else "no such folder"
         raise UsageError(f"run {run}: expected a run folder to {purpose}, got {missing}") from error
-    except (OSError, ValueError, KeyError, TypeError, msgspec.MsgspecError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, msgspec.MsgspecError) as error:
         raise UsageError(f"run {run}: it is damaged, there is nothing to {purpose}: {error}") from error
 
 

@@ -101,7 +101,11 @@ def _read(path: Path) -> Checkpoint:
         raise CheckpointError(
             f"checkpoint {path}: expected format {FORMAT}, got {record['format']}; resume it with the millrace that wrote it"
         )
-    return Checkpoint(path, record["env_steps"], record["state"])
+    match record:
+        case {"env_steps": int(env_steps), "state": dict(state)}:
+            return Checkpoint(path, env_steps, state)
+        case _:
+            raise _Unreadable("it has no state")
 
 
 def _check_plain(value: object, where: str) -> None:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 import re
 import tomllib
 from pathlib import Path
 
 from learner.run_folder.checkpoint import FOLDER, SUFFIX
 from learner.run_folder.run_folder import RunSettings, as_folder_name
+from learner.run_folder.run_format import check_whole
+from protocol.bounds import one_line
+from protocol.errors import UsageError
+
+log = logging.getLogger("millrace.learner")
 
 AUTO = Path("auto")
 
@@ -28,7 +34,14 @@ def newest_run(config: RunSettings) -> Path | None:
 def _can_be_resumed(path: Path, config: RunSettings) -> bool:
     """Whether this is a folder of the same environment that can be resumed: it has a config.toml and a checkpoint."""
     try:
-        table = tomllib.loads((path / "config.toml").read_text())
-    except (OSError, ValueError):
+        text = (path / "config.toml").read_text("utf-8")
+        check_whole(text, "it")
+        table = tomllib.loads(text)
+        if "env" not in table:
+            raise UsageError("it has no env")
+    except FileNotFoundError:
+        return False
+    except (OSError, ValueError, RecursionError, UsageError) as error:
+        log.warning("run %s is passed over: its config.toml cannot be read: %s", path, one_line(str(error)))
         return False
     return table.get("env") == config.env and any((path / FOLDER).glob(f"*{SUFFIX}"))

@@ -18,10 +18,12 @@ Rule: a file is there whole or not at all. The same policy gives the same bytes.
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import shutil
 import time
+import zlib
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
@@ -32,9 +34,10 @@ import numpy as np
 
 from learner.run_folder.atomic_write import write_atomically
 from learner.run_folder.results import Summary
-from learner.run_folder.run_format import RUN_FILE, check_format, write_format
+from learner.run_folder.run_format import END, HEAD, RUN_FILE, check_format, write_format
 from learner.run_folder.run_lock import RunLock
 from protocol.arrays import Floats
+from protocol.bounds import one_line
 from protocol.env_spec import EnvSpec, Scalar
 from protocol.errors import RunError, UsageError
 from protocol.policy.layout import Field, buffer_layout, named_views, parameter_layout, total_size
@@ -44,6 +47,9 @@ POLICY_FORMAT = 1
 Which = Literal["final", "best"]
 POLICY_ARRAYS = {"final": "policy.safetensors", "best": "best.safetensors"}
 POLICY_JSON = "policy.json"
+UNREADABLE = (OSError, msgspec.MsgspecError, ValueError, RecursionError)  # what reading a damaged file raises
+
+log = logging.getLogger("millrace.learner")
 
 
 class Interrupted(KeyboardInterrupt):
@@ -192,7 +198,7 @@ class RunFolder:
             raise RunError(f"{self.path / RUN_FILE} not written: {error.strerror}") from error
         self._write(
             "config.toml",
-            f"# Repeat this run: millrace train --config THIS_FILE\n{config.to_toml()}".encode("utf-8", "surrogateescape"),
+            f"{HEAD}{config.to_toml()}{END}".encode("utf-8", "surrogateescape"),
         )
 
     def write_policy(
@@ -214,7 +220,9 @@ class RunFolder:
             arrays=_array_positions(acting),
             buffers=tuple(named_views(buffers, buffer_layout(spec))),
         )
-        self._write(POLICY_ARRAYS[which], save({name: np.ascontiguousarray(array) for name, array in arrays.items()}))
+        contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+        checksum = str(zlib.crc32(_split(save(contiguous))[1]))
+        self._write(POLICY_ARRAYS[which], save(contiguous, metadata={"crc32": checksum}))
         self._write(POLICY_JSON, msgspec.json.format(msgspec.json.encode(description), indent=2) + b"\n")
 
     def read_policy(self, which: Which = "final") -> tuple[PolicyDescription, Floats, Floats]:
@@ -229,9 +237,12 @@ class RunFolder:
             raise UsageError(f"run {self.path}: expected a {POLICY_JSON}, got none; has the run saved its policy yet?")
         try:
             description = _decode_description((self.path / POLICY_JSON).read_bytes())
-            arrays = load((self.path / POLICY_ARRAYS[which]).read_bytes())
-        except (OSError, msgspec.MsgspecError, SafetensorError) as error:
-            raise UsageError(f"policy of run {self.path} cannot be read: {error}") from error
+            content = (self.path / POLICY_ARRAYS[which]).read_bytes()
+            arrays = load(content)
+            if not _checksum_matches(content):
+                raise ValueError(f"{POLICY_ARRAYS[which]}: its checksum does not match")
+        except (*UNREADABLE, SafetensorError) as error:
+            raise UsageError(f"policy of run {self.path} cannot be read: {one_line(str(error))}") from error
         if description.format != POLICY_FORMAT:
             raise UsageError(f"policy of run {self.path}: expected format {POLICY_FORMAT}, got {description.format}")
         acting, _ = parameter_layout(description.policy)
@@ -249,7 +260,7 @@ class RunFolder:
         """The policy that policy.json describes. None if that file is missing or cannot be read."""
         try:
             return _decode_description((self.path / POLICY_JSON).read_bytes()).policy
-        except (OSError, msgspec.MsgspecError):
+        except UNREADABLE:
             return None
 
     def write_summary(self, summary: Summary) -> None:
@@ -257,10 +268,15 @@ class RunFolder:
         self._write("summary.json", msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n")
 
     def summary(self) -> Summary | None:
-        """Read summary.json. None if it is missing or damaged."""
+        """Read summary.json. None if it is missing, or damaged, which is said."""
         try:
             return msgspec.json.decode((self.path / "summary.json").read_bytes(), type=Summary)
-        except (OSError, msgspec.MsgspecError):
+        except FileNotFoundError:
+            return None
+        except UNREADABLE as error:
+            log.warning(
+                "%s cannot be read: %s; the run counts as not finished", self.path / "summary.json", one_line(str(error))
+            )
             return None
 
     def _write(self, name: str, content: bytes) -> None:
@@ -268,6 +284,21 @@ class RunFolder:
             write_atomically(self.path / name, lambda file: file.write(content))
         except OSError as error:
             raise RunError(f"{self.path / name} not written: {error.strerror}") from error
+
+
+def _split(content: bytes) -> tuple[bytes, bytes]:
+    """Head and numbers of a safetensors file."""
+    begin = 8 + int.from_bytes(content[:8], "little")
+    return content[8:begin], content[begin:]
+
+
+def _checksum_matches(content: bytes) -> bool:
+    """Whether the numbers of a safetensors file are those that were written. True for a file without a checksum."""
+    head, numbers = _split(content)
+    match msgspec.json.decode(head):
+        case {"__metadata__": {"crc32": checksum}}:
+            return bool(checksum == str(zlib.crc32(numbers)))
+    return True
 
 
 def _decode_description(text: bytes) -> PolicyDescription:

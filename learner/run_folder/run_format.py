@@ -16,6 +16,9 @@ from protocol.errors import UsageError
 
 RUN_FORMAT = 2
 RUN_FILE = "run.json"
+HEAD = "# Repeat this run: millrace train --config THIS_FILE (it is whole if it ends with # end)\n"
+END = "# end\n"
+"""The first and the last line of config.toml. A file that was cut off may still be TOML, with other settings."""
 
 
 class RunFormat(msgspec.Struct, frozen=True, kw_only=True):
@@ -32,14 +35,22 @@ def write_format(folder: Path) -> None:
     write_atomically(folder / RUN_FILE, lambda file: file.write(content + b"\n"))
 
 
+def check_whole(text: str, where: str) -> None:
+    """Raise `UsageError` if this config.toml has the first line and not the last."""
+    if text.startswith(HEAD) and not text.rstrip().endswith(END.strip()):
+        raise UsageError(f"{where} is cut off: expected {END.strip()!r} as its last line; restore it, or start a new run")
+
+
 def check_format(folder: Path) -> int:
     """The format of a run folder. Raises `UsageError`, with a one-line message, if this millrace cannot read it."""
     try:
         found = msgspec.json.decode((folder / RUN_FILE).read_bytes(), type=RunFormat)
     except (FileNotFoundError, NotADirectoryError):
         return 1
-    except (OSError, msgspec.MsgspecError) as error:
-        raise UsageError(f"run {folder}: {RUN_FILE} cannot be read: {error}") from error
+    except (OSError, msgspec.MsgspecError, UnicodeError, RecursionError) as error:
+        raise UsageError(
+            f"run {folder}: {RUN_FILE} cannot be read: {error}; if this millrace wrote the run, delete that file"
+        ) from error
     if found.format > RUN_FORMAT:
         raise UsageError(
             f"run {folder}: its format is {found.format}, and this millrace reads formats up to {RUN_FORMAT}; "

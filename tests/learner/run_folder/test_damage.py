@@ -1,0 +1,179 @@
+"""Every file of a run folder, damaged in every way: each reader works, or says one line. Generated, and counted.
+
+The ways: emptied, cut (small files at every byte, large ones at every byte of the head and at a sample), one bit flipped (at
+every byte or a sample), filled with rubbish. The readers run in this process, as their commands call them.
+"""
+
+from __future__ import annotations
+
+import logging
+import random
+import shutil
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from learner.algorithms import algorithm_class
+from learner.config.layers import resolve
+from learner.env_spaces import EnvSpaces
+from learner.policy_player import load_policy
+from learner.report.learning_curves import read_curve
+from learner.report.page import page
+from learner.run import is_finished
+from learner.run_folder.metrics_log import MetricsLog
+from learner.run_folder.resume import newest_run
+from learner.run_folder.run_folder import RunFolder
+from learner.run_spec import run_spec
+from learner.run_state import RunState, restore
+from millrace.launch.local_run import train
+from protocol.env_spec import EnvSpec
+from protocol.errors import UserFacingError
+from tests.support.described import described
+
+ENV = "workers.envs.toy:Identity-v0"
+SETTINGS: dict[str, Any] = {
+    "transport": "inproc", "workers": 1, "lanes": 2, "envs": 2, "rollout_steps": 16, "n_epochs": 1, "net": (4,),
+    "steps": 200, "eval_episodes": 2, "eval_every": 60, "checkpoint_every_updates": 1,
+}  # fmt: skip
+HEAD = 200  # bytes of a large file of which each is a place to cut
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    runs = tmp_path_factory.mktemp("whole") / "runs"
+    folder = train(resolve(ENV, run_dir=str(runs), **SETTINGS), None, lambda progress: None)
+    (folder / "workers").mkdir(exist_ok=True)
+    (folder / "workers" / "w0.log").write_text("a line of a worker\n")
+    return folder
+
+
+def resume(run: Path) -> tuple[RunState, bytes]:
+    """All that `--resume` reads before it trains."""
+    config = resolve(resume=run)
+    is_finished(config, run)
+    folder = RunFolder.open(run)
+    env = EnvSpec.of(config.env, config.env_kwargs)
+    policy = folder.policy_spec()
+    spaces = EnvSpaces.of_description(DESCRIBED) if policy is None else EnvSpaces.of_policy(policy)
+    algorithm = algorithm_class(config.algo)(
+        config.algorithm, run_spec(config, env, spaces).policy, total_steps=config.steps, seed=1
+    )
+    state = restore(folder, algorithm)
+    MetricsLog(run, state.env_steps).close()
+    return state, algorithm.weights()[0].tobytes()
+
+
+DESCRIBED = described(EnvSpec(ENV), "loop")
+READERS: dict[str, Callable[[Path], Any]] = {
+    "resume": resume,
+    "resume auto": lambda run: newest_run(resolve(ENV, run_dir=str(run.parent), **SETTINGS)),
+    "is_finished": lambda run: is_finished(resolve(ENV, run_dir=str(run.parent), **SETTINGS), run),
+    "evaluate": lambda run: load_policy(run, "final"),
+    "evaluate --best": lambda run: load_policy(run, "best"),
+    "report": lambda run: page([run]),
+    "plot": read_curve,
+}
+FILES = {
+    "config.toml": ("resume", "resume auto", "is_finished", "evaluate", "report", "plot"),
+    "run.json": ("resume", "resume auto", "is_finished", "evaluate", "report", "plot"),
+    "metrics.jsonl": ("resume", "report", "plot"),
+    "summary.json": ("resume", "is_finished", "report"),
+    "policy.json": ("resume", "evaluate", "evaluate --best"),
+    "policy.safetensors": ("evaluate", "resume"),
+    "best.safetensors": ("evaluate --best", "resume"),
+    "newest checkpoint": ("resume", "resume auto"),
+    "all checkpoints": ("resume", "resume auto"),
+    "events": ("resume", "report"),
+    "workers/w0.log": ("resume", "report"),
+}
+"""The readers that open a file, and one that does not."""
+
+
+def named(run: Path, name: str) -> list[Path]:
+    checkpoints = sorted((run / "checkpoints").glob("*.pt"))
+    match name:
+        case "newest checkpoint":
+            return checkpoints[-1:]
+        case "all checkpoints":
+            return checkpoints
+        case "events":
+            return sorted((run / "tensorboard").iterdir())[:1]
+        case _:
+            return [run / name]
+
+
+def damages(content: bytes, cuts: int, flips: int, rng: random.Random) -> Iterator[tuple[str, bytes]]:
+    """At most about so many cuts and flips, spread over the file, and all of the head's first cuts."""
+    yield "emptied", b""
+    size = len(content)
+    every = sorted({*range(min(size, HEAD if cuts >= size else cuts // 2)), *rng.sample(range(size), min(size, cuts))})
+    for at in every:
+        yield f"cut at {at}", content[:at]
+    for at in sorted(rng.sample(range(size), min(size, flips))):
+        bit = rng.randrange(8)
+        yield f"bit {bit} of byte {at} flipped", content[:at] + bytes([content[at] ^ 1 << bit]) + content[at + 1 :]
+    for length in (1, 100, size):
+        yield f"{length} bytes of rubbish", rng.randbytes(length)
+        yield f"{length} letters of rubbish", b"x" * length
+    yield "JSON of another kind", b'[1, {"a": null}]\n'
+    yield "deeply nested", b"[" * 100_000
+    yield "a NUL byte", b"\x00"
+
+
+def check(whole: Path, tmp_path: Path, name: str, cuts: int, flips: int, caplog: pytest.LogCaptureFixture) -> Counter[str]:
+    caplog.set_level(logging.WARNING, "millrace")
+    rng = random.Random(f"{name} 1")
+    run = tmp_path / "runs" / whole.name
+    counts: Counter[str] = Counter()
+    shutil.copytree(whole, run)
+    undamaged = resume(run)
+    targets = named(run, name)
+    contents = [target.read_bytes() for target in targets]
+    newest = sorted((run / "checkpoints").glob("*.pt"))[-1]
+    metrics = (run / "metrics.jsonl").read_bytes()
+    for how, damaged in damages(contents[-1], cuts, flips, rng):
+        for reader in FILES[name]:
+            (run / "metrics.jsonl").write_bytes(metrics)
+            for target in targets:
+                target.write_bytes(damaged)
+            caplog.clear()
+            try:
+                found = READERS[reader](run)
+            except UserFacingError as error:
+                counts[f"{reader}: one line"] += 1
+                wrong = "\n" in str(error) or error.exit_code not in (1, 2) or run.name not in str(error)
+                assert not wrong, (how, reader, str(error))  # noqa: PT017  # each of many errors is checked
+            except BaseException as error:
+                raise AssertionError(f"{name} {how}: {reader} raised {error!r}") from error
+            else:
+                said = [record.getMessage() for record in caplog.records]
+                assert len(said) <= 3, said
+                assert all("\n" not in line for line in said)
+                counts[f"{reader}: {'works, and says so' if said else 'works'}"] += 1
+                if name == "newest checkpoint" and reader == "resume":
+                    older = any(str(newest) in line for line in said)
+                    assert older or found == undamaged, "a damaged checkpoint was taken without a word"
+                    assert not older or found[0].version < undamaged[0].version
+    for target, content in zip(targets, contents, strict=True):
+        target.write_bytes(content)
+    (run / "metrics.jsonl").write_bytes(metrics)
+    READERS["resume"](run)
+    return counts
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_sample_of_damages(whole: Path, tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture) -> None:
+    counts = check(whole, tmp_path, name, cuts=10, flips=10, caplog=caplog)
+    sys.stdout.write(f"\n{name}: {dict(sorted(counts.items()))}\n")
+    assert counts.total() >= 25 * len(FILES[name])
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("name", FILES)
+def test_many_damages(whole: Path, tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture) -> None:
+    counts = check(whole, tmp_path, name, cuts=1000, flips=1000, caplog=caplog)
+    sys.stdout.write(f"\n{name}: {dict(sorted(counts.items()))}\n")
