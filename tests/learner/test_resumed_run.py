@@ -90,7 +90,7 @@ def test_an_update_gets_what_the_coordinator_says_of_each_rollout() -> None:
         for lane, (sequence, fresh) in sequences_and_fresh.items()
     ]
     batches: list[Batch] = []
-    algorithm = SimpleNamespace(weights=lambda: (), update=lambda batch, pulse: batches.append(batch))
+    algorithm = SimpleNamespace(weights=lambda: (), update=lambda batch, pulse: batches.append(batch), remember=lambda: None)
     service = MagicMock(gather=lambda: arrived)
     recorder = MagicMock(stop_reason=MagicMock(side_effect=[None, "done"]))
     train(algorithm, service, recorder, 1)  # type: ignore[arg-type]
