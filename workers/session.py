@@ -208,9 +208,9 @@ class Session:
                 if version > self._current.version:
                     self._current.weights = message
             case Collect(_, version, permits, received) if isinstance(self.run, RunSpec):
-                closed = self._received(received)
+                self._current.rollouts.forget_received(received)
                 again = [self._current.rollouts.take(permit, version) for permit in permits]
-                return closed + [Send(rollout) for rollout in again if rollout is not None]
+                return [Send(rollout) for rollout in again if rollout is not None]
             case Evaluate() if isinstance(self.run, RunSpec):
                 evaluated = self._current.evaluations.take(message)
                 return [] if evaluated is None else [Send(evaluated)]
@@ -219,9 +219,10 @@ class Session:
                 return [] if answer is None else [Send(answer)]
             case Release(_, lanes):
                 return self._release(lanes)
-            case HeartbeatReply(_, number, received):
-                self._current.replies = max(number, self._current.replies)
-                return self._received(received)
+            case HeartbeatReply(_, number, received) if number > self._current.replies:
+                self._current.replies = number
+                self._current.rollouts.forget_received(received)
+                return self._release_unlisted(received)
         return []
 
     def tick(self, now: float) -> list[Effect]:
@@ -392,9 +393,11 @@ class Session:
         effects: list[Effect] = [Send(message) for message in messages]
         return effects + (self._goodbye() if self.state is State.DRAINING else [])
 
-    def _received(self, received: Sequence[Received]) -> list[Effect]:
-        """Drop the rollouts that the learner has received, and the lanes that it does not list: their Release was lost."""
-        self._current.rollouts.forget_received(received)
+    def _release_unlisted(self, received: Sequence[Received]) -> list[Effect]:
+        """Drop the lanes that the learner does not list: their Release was lost.
+
+        Only a new HeartbeatReply may do so: a copy of an old message does not list the lanes that came after it.
+        """
         listed = {of_lane.lane for of_lane in received}
         return self._release([lane for lane in self._current.lanes() if lane.lane not in listed])
 

@@ -92,13 +92,15 @@ MUTATIONS = {
         "self._current.in_progress = ()\n        effects: list",
         "effects: list",
     ),
-    "replies to heartbeats are not counted": Mutation(
-        SESSION, "self._current.replies = max(number, self._current.replies)", "pass"
-    ),
+    "replies to heartbeats are not counted": Mutation(SESSION, "self._current.replies = number", "pass"),
     "new weights are acknowledged again and again": Mutation(
         SESSION, "self._current.acknowledged_version = self._current.version\n        described", "described"
     ),
-    "a Collect confirms nothing": Mutation(SESSION, "closed = self._received(received)", "closed: list[Effect] = []"),
+    "a Collect confirms nothing": Mutation(
+        SESSION,
+        "self._current.rollouts.forget_received(received)\n                again",
+        "again",
+    ),
     "heartbeats are due only with new weights": Mutation(
         SESSION,
         "if now < self._due_s and self._current.acknowledged_version == self._current.version:",
@@ -110,11 +112,14 @@ MUTATIONS = {
         "self._due_s = now + 3 * self.run.heartbeat_s\n        self._current",
     ),
     "an asked-for rollout is not sent again": Mutation(
-        SESSION, "return closed + [Send(rollout) for rollout in again if rollout is not None]", "return closed"
+        SESSION, "return [Send(rollout) for rollout in again if rollout is not None]", "return []"
     ),
-    "a lane whose Release was lost is kept": Mutation(
-        SESSION, "return self._release([lane for lane in self._current.lanes() if lane.lane not in listed])", "return []"
+    "an old reply to a heartbeat is heard": Mutation(
+        SESSION,
+        "HeartbeatReply(_, number, received) if number > self._current.replies:",
+        "HeartbeatReply(_, number, received):",
     ),
+    "a lane whose Release was lost is kept": Mutation(SESSION, "return self._release_unlisted(received)", "return []"),
     "a finished ticket is forgotten": Mutation(HELD, " or permit.ticket in lane.finished:", ":"),
     "a rollout that has not arrived is forgotten": Mutation(
         HELD, "rollout.sequence < of_lane.next_sequence or", "rollout.sequence <= of_lane.next_sequence or"

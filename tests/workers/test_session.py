@@ -417,14 +417,17 @@ def test_a_late_release_does_not_close_a_later_incarnation() -> None:
     assert session.held_count() == 1
 
 
-@pytest.mark.parametrize(
-    "message",
-    [HeartbeatReply(SESSION, 1, lanes(1)), collect((2, 1), received=lanes(1))],
-    ids=["HeartbeatReply", "Collect"],
-)
-def test_a_lane_missing_from_received_is_closed(message: ToWorker) -> None:
+def test_a_lane_missing_from_a_heartbeat_reply_is_closed() -> None:
     session = ready(collect((0, 0), (1, 1)))
-    assert session.handle(message, 1.0) == [CloseLanes((LaneIncarnation(0, 0),))]
+    assert session.handle(HeartbeatReply(SESSION, 1, lanes(1)), 1.0) == [CloseLanes((LaneIncarnation(0, 0),))]
+
+
+@pytest.mark.parametrize("copy", [HeartbeatReply(SESSION, 1, ()), collect((0, 0))], ids=["HeartbeatReply", "Collect"])
+def test_a_late_copy_of_a_message_closes_no_lane_that_came_after_it(copy: ToWorker) -> None:
+    """Else the lane would start again in the same incarnation, and count its rollouts from 0 again."""
+    session = ready(HeartbeatReply(SESSION, 1, ()), collect((0, 0)), collect((1, 1), received=lanes(0, 1)))
+    assert session.handle(copy, 0.2) == []
+    assert session.held_count() == 2
 
 
 def test_a_rollout_of_a_lane_that_was_released_while_it_was_collected_is_not_sent() -> None:
