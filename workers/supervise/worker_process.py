@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 from protocol.alive import NO_ENVIRONMENT_CODE, CallTimeouts, Doing, WorkerActivity
 from protocol.bounds import one_line
@@ -76,7 +77,7 @@ class WorkerProcess:
         secret = {NONCE_VARIABLE: str(self.process_nonce)}
         if start.token is not None:
             secret[TOKEN_VARIABLE] = start.token.to_text()
-        with (start.log or Path(os.devnull)).open("ab") as stderr:
+        with _opened(start.log) as stderr:
             self._process = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
@@ -157,7 +158,9 @@ class WorkerProcess:
     def _ending(self, code: int) -> Ending:
         """How it ended. `code` is negative if a signal ended it."""
         page = self._page.read(time.monotonic())
-        output = self._log.read_text(errors="replace") if self._log is not None else ""
+        output = ""
+        with suppress(OSError):  # the log may have been deleted
+            output = self._log.read_text(errors="replace") if self._log is not None else ""
         if self._because:
             stacks = self._page.stacks()
             self._write(stacks)
@@ -186,6 +189,15 @@ class WorkerProcess:
             else:
                 with self._log.open("a") as log:
                     log.write(text)
+
+
+def _opened(log: Path | None) -> BinaryIO:
+    """The file for a worker's output. If the folder was deleted, it is made again; if that fails, output is dropped."""
+    with suppress(OSError):
+        if log is not None:
+            log.parent.mkdir(parents=True, exist_ok=True)
+            return log.open("ab")
+    return Path(os.devnull).open("ab")
 
 
 def _is_stopped(pid: int) -> bool:

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from learner.algorithms import algorithm_class
@@ -68,6 +69,7 @@ def resume(run: Path) -> tuple[RunState, bytes]:
 
 
 DESCRIBED = described(EnvSpec(ENV), "loop")
+OBSERVED = [np.zeros((1, 1, 4), np.float32)]
 READERS: dict[str, Callable[[Path], Any]] = {
     "resume": resume,
     "resume auto": lambda run: newest_run(resolve(ENV, run_dir=str(run.parent), **SETTINGS)),
@@ -154,6 +156,10 @@ def check(whole: Path, tmp_path: Path, name: str, cuts: int, flips: int, caplog:
                 assert len(said) <= 3, said
                 assert all("\n" not in line for line in said)
                 counts[f"{reader}: {'works, and says so' if said else 'works'}"] += 1
+                if name == "config.toml" and reader == "resume":
+                    assert not how.startswith(("cut", "emptied")) or damaged.endswith(b"# end"), f"{how}: not noticed"
+                if name.endswith("safetensors") and reader.startswith("evaluate"):
+                    assert found[0](OBSERVED).tobytes() == READERS[reader](whole)[0](OBSERVED).tobytes(), how
                 if name == "newest checkpoint" and reader == "resume":
                     older = any(str(newest) in line for line in said)
                     assert older or found == undamaged, "a damaged checkpoint was taken without a word"
