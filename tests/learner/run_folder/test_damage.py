@@ -113,7 +113,8 @@ def damages(content: bytes, cuts: int, flips: int, rng: random.Random) -> Iterat
     yield "emptied", b""
     size = len(content)
     every = sorted({*range(min(size, HEAD if cuts >= size else cuts // 2)), *rng.sample(range(size), min(size, cuts))})
-    for at in every:
+    lines = [at + 1 for at in range(size - 1) if content[at : at + 1] == b"\n"]
+    for at in [*every, *rng.sample(lines, min(len(lines), cuts))]:
         yield f"cut at {at}", content[:at]
     for at in sorted(rng.sample(range(size), min(size, flips))):
         bit = rng.randrange(8)
