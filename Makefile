@@ -34,7 +34,7 @@ test-cluster: .venv/installed-dev  ## Docker, Prometheus, Slurm and Ray, for rea
 
 soak: .venv/installed-dev  ## faults for ten minutes, every two seconds one; then the faults that take too long for `make test`. Needs root
 	$(BIN)/python -m tests.system.soak --minutes $(MINUTES)
-	$(BIN)/python -m pytest -m soak tests/system
+	$(BIN)/python -m pytest -m soak tests
 
 docs: .venv/installed-dev  ## write the generated parts of protocol/README.md
 	$(BIN)/python -m tests.protocol.test_wire_document
