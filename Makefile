@@ -20,8 +20,7 @@ type: .venv/installed-dev
 	$(BIN)/mypy
 
 unit: .venv/installed-dev
-	$(BIN)/python -m pytest --numprocesses auto --ignore tests/system
-	$(BIN)/python -m pytest tests/system  # one after another: they watch clocks and whole process trees
+	$(BIN)/python -m pytest --numprocesses auto
 
 test-learning: .venv/installed-dev  ## published scores, three seeds each; ten minutes
 	$(BIN)/python -m pytest -m learning --timeout 3600 tests/learning

@@ -11,12 +11,19 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import psutil
 import pytest
 
 LEAVE_WITHIN_S = 5.0
+
+
+def _runs(process: psutil.Process) -> bool:
+    with suppress(psutil.NoSuchProcess):
+        return bool(process.status() != psutil.STATUS_ZOMBIE)
+    return False
 
 
 @pytest.fixture(autouse=True)
@@ -28,9 +35,11 @@ def nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
     threads = set(threading.enumerate())
     yield
     deadline = time.monotonic() + LEAVE_WITHIN_S
-    for child in psutil.Process().children(recursive=True):
-        if child.status() != psutil.STATUS_ZOMBIE:
-            child.wait(max(0.0, deadline - time.monotonic()))
+    children = [child for child in psutil.Process().children(recursive=True) if _runs(child)]
+    _, alive = psutil.wait_procs(children, timeout=LEAVE_WITHIN_S)
+    for child in alive:
+        child.kill()  # so that the next test does not find it too
+    assert not alive, f"processes were left behind: {alive}"
     started = [thread for thread in threading.enumerate() if thread not in threads and not thread.daemon]
     for thread in started:
         thread.join(max(0.0, deadline - time.monotonic()))
