@@ -1,6 +1,8 @@
 # `make train` and `make test` work on a fresh clone with python3 >= 3.11 and nothing else.
 PYTHON ?= python3
 MINUTES ?= 10
+# One more than there are cores, because tests of processes wait for most of their time.
+TEST_PROCESSES ?= $(shell expr $$(nproc) + 1)
 BIN := .venv/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
@@ -20,7 +22,7 @@ type: .venv/installed-dev
 	$(BIN)/mypy
 
 unit: .venv/installed-dev
-	$(BIN)/python -m pytest --numprocesses auto
+	$(BIN)/python -m pytest --numprocesses $(TEST_PROCESSES)
 
 test-learning: .venv/installed-dev  ## published scores, three seeds each; ten minutes
 	$(BIN)/python -m pytest -m learning --timeout 3600 tests/learning

@@ -164,7 +164,7 @@ def test_an_unknown_id_is_one_line_and_leaves_no_folder(tmp_path: Path) -> None:
     assert not (tmp_path / "runs").exists()
 
 
-@pytest.mark.parametrize("fault", ["close_raises", "close_hangs"])
+@pytest.mark.parametrize("fault", ["close_raises", pytest.param("close_hangs", marks=pytest.mark.soak)])
 def test_a_copy_whose_close_fails_does_not_hurt_the_run(stage: Stage, simulator: Path, fault: str) -> None:
     address = f"tcp://127.0.0.1:{free_port()}"
     learner = stage.learner(address, {"env-kwargs": f"fault {fault}"}, env="mysim:Sim-v0")
@@ -203,7 +203,7 @@ def test_a_constructor_that_takes_longer_than_the_worker_timeout_is_waited_for(t
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.soak), signal.SIGTERM])
 def test_a_start_is_interrupted_within_2_s(stage: Stage, simulator: Path, number: int) -> None:
     folder = stage.tmp_path / "mine"
     command = [sys.executable, "-m", "millrace", "train", "mysim:Sim-v0", "--run-dir", str(folder)]

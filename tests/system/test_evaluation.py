@@ -34,7 +34,7 @@ def untrained(env: str, kwargs: dict[str, Any] | None = None) -> SavedPolicy:
     return SavedPolicy(run.policy, run.env, *random_weights(run.policy))
 
 
-@pytest.mark.parametrize("env", ["CartPole-v1", "Pendulum-v1"])
+@pytest.mark.parametrize("env", ["CartPole-v1", pytest.param("Pendulum-v1", marks=pytest.mark.soak)])
 def test_the_returns_are_the_same_bits_for_any_number_of_workers_over_any_transport(env: str) -> None:
     policy, plan = untrained(env), EvaluationPlan.of(18, seed=5, copies=4, max_steps=18 * 120)
     found = {}
@@ -96,7 +96,7 @@ def test_an_environment_that_raises_ends_the_evaluation_with_its_traceback() -> 
     assert "in step" in caught.value.detail
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.soak), signal.SIGTERM])
 def test_a_signal_during_an_evaluation_ends_the_run_at_once_with_its_checkpoint(stage: Stage, number: int) -> None:
     """CliffWalking-v1 has no time limit: the greedy policy may walk on for ever."""
     command = [sys.executable, "-m", "millrace", "train", "CliffWalking-v1", "--steps", "1200", "--rollout-steps", "32"]
@@ -119,6 +119,7 @@ def _steps(checkpoint: Path) -> int:
     return int(checkpoint.stem)
 
 
+@pytest.mark.soak
 def test_an_evaluation_that_was_cut_off_is_made_when_the_run_is_resumed(stage: Stage) -> None:
     """SIGKILL: the checkpoint before the evaluation says that it is due."""
     command = [sys.executable, "-m", "millrace", "train", f"{TOY}Slow-v0", "--run-dir", str(stage.runs)]

@@ -9,7 +9,7 @@ import pytest
 from tests.system.processes import TOY, Stage
 
 
-@pytest.mark.parametrize("max_lag", [0, 1, 3])
+@pytest.mark.parametrize("max_lag", [0, 1, pytest.param(3, marks=pytest.mark.soak)])
 def test_the_lag_is_bounded_with_a_slow_worker(stage: Stage, monkeypatch: pytest.MonkeyPatch, max_lag: int) -> None:
     address = f"ipc://{stage.tmp_path}/learner"
     settings = {"envs": 4, "lanes": 4, "rollout-steps": 8, "batch-size": 32, "steps": 1200, "env-kwargs": "seconds 0.0"}

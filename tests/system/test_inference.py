@@ -159,7 +159,7 @@ def test_a_torch_policy_does_not_depend_on_the_number_of_workers(tmp_path: Path)
     assert len(policies) == 1
 
 
-@pytest.mark.parametrize("inference", ["workers", "learner"])
+@pytest.mark.parametrize("inference", [pytest.param("workers", marks=pytest.mark.soak), "learner"])
 def test_images_dtype_changes_how_images_are_processed(tmp_path: Path, inference: str) -> None:
     settings: dict[str, Any] = {"env_kwargs": {"observation": "image"}, "rollout_steps": 16, "steps": 300, **SMALL}
     settings |= {"inference": inference}

@@ -118,6 +118,7 @@ def test_a_run_on_this_machine_over_encrypted_tcp_learns_the_same(tmp_path: Path
     assert not (tmp_path / "keys").exists()
 
 
+@pytest.mark.soak
 def test_packed_frame_stacks_train_the_same_policy_as_unpacked_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Frames are packed over an encrypted connection, not between local processes. The weights are the same bits."""
 

@@ -51,7 +51,10 @@ def worker_processes() -> list[psutil.Process]:
 
 @pytest.mark.parametrize(
     ("env", "settings"),
-    [("CartPole-v1", {"steps": 5_300}), ("Pendulum-v1", {"steps": 10_700, "rollout_steps": 64, "n_epochs": 1})],
+    [
+        ("CartPole-v1", {"steps": 5_300}),
+        pytest.param("Pendulum-v1", {"steps": 10_700, "rollout_steps": 64, "n_epochs": 1}, marks=pytest.mark.soak),
+    ],
 )
 def test_the_curve_does_not_depend_on_the_number_of_workers(tmp_path: Path, env: str, settings: dict[str, Any]) -> None:
     """20 updates with one seed and the default lanes: the same weights for 1, 2 and 4 workers, over inproc, ipc and tcp."""
@@ -84,6 +87,7 @@ def test_a_learner_that_cannot_decompress_does_not_start(tmp_path: Path, monkeyp
     assert not list(tmp_path.glob("runs*"))
 
 
+@pytest.mark.soak
 def test_a_run_with_rounded_weights_learns(tmp_path: Path) -> None:
     """The run reaches a good return. Its weights differ from those of a run with exact weights, as expected."""
     settings: dict[str, Any] = {"steps": 12_000, "seed": 3, "eval_episodes": 5, "learning_rate": 0.003, "rollout_steps": 64}

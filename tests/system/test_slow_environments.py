@@ -71,7 +71,7 @@ def test_calls_that_take_longer_than_the_worker_timeout(stage: Stage, kind: str)
 
 def test_a_call_that_holds_the_interpreter_lock_for_longer_than_the_worker_timeout(stage: Stage) -> None:
     """No thread of the worker can run meanwhile: only its supervisor can speak."""
-    learner, _ = served(stage, "Slow-v0", {"env-kwargs": "make_s 1.5 step_s 1.5 holds_lock True"})
+    learner, _ = served(stage, "Slow-v0", {"env-kwargs": "make_s 1.2 step_s 1.2 holds_lock True"})
     learner.trains(2)
     never_given_up(learner)
 
@@ -112,7 +112,7 @@ def test_a_construction_and_a_reset_have_timeouts_of_their_own(stage: Stage, cal
         pytest.param("os.exit-2", "its process ended with exit code 2 in a step of its environment", marks=pytest.mark.soak),
         pytest.param("os.exit-0", "its process ended with exit code 0 in a step of its environment", marks=pytest.mark.soak),
         ("os.exit-69", "its process ended with exit code 69 in a step of its environment"),
-        ("segfault", "its process was killed by SIGSEGV in a step of its environment"),
+        pytest.param("segfault", "its process was killed by SIGSEGV in a step of its environment", marks=pytest.mark.soak),
         pytest.param("kill", "its process was killed by SIGKILL in a step of its environment", marks=pytest.mark.soak),
     ],
 )
@@ -141,7 +141,8 @@ def test_too_many_ends_of_the_process_end_the_run_and_name_the_code(stage: Stage
         supervisor.ends(15)
 
 
-@pytest.mark.parametrize("kind", ["local", ELSEWHERE])
+@pytest.mark.soak
+@pytest.mark.parametrize("kind", ["local", "elsewhere"])
 def test_what_an_environment_leaves_behind_is_gone_after_the_run(stage: Stage, kind: str, tmp_path: Path) -> None:
     """A child process, a thread that is not a daemon, ignored signals, and a `close` that does not return."""
     pid_file = tmp_path / "pids"

@@ -35,7 +35,12 @@ def case(seed: int) -> World:
     )
 
 
-@pytest.mark.parametrize("block", range(BLOCKS))
+IN_MAKE_TEST = 4  # blocks; `make soak` runs the others
+
+
+@pytest.mark.parametrize(
+    "block", [*range(IN_MAKE_TEST), *(pytest.param(n, marks=pytest.mark.soak) for n in range(IN_MAKE_TEST, BLOCKS))]
+)
 def test_every_rule_holds_over_a_hostile_network(block: int) -> None:
     for seed in range(block * CASES, (block + 1) * CASES):
         world = case(seed)
