@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
 
+from tests.model.conversation import Action, Conversation
 from tests.model.search import Broken, Share
-from tests.model.settings import Settings
-from tests.model.world import Action, State, Violation, World
+from tests.model.world import State, Violation, World
 
 
 class RuleBroken(AssertionError):
@@ -26,7 +26,7 @@ class RuleBroken(AssertionError):
 class Report:
     """What was explored."""
 
-    settings: Settings
+    conversation: Conversation
     states: int
     depth: int
     """number of actions to the farthest state"""
@@ -39,23 +39,25 @@ class Report:
     def __str__(self) -> str:
         extent = "complete" if self.complete else "not complete"
         states = f"{self.states:,} states to depth {self.depth}, {extent}; {self.in_fair_runs:,} in fair runs"
-        return f"{self.settings}: {states}; {self.parts:,} parts; {self.seconds:.1f} s"
+        return f"{self.conversation}: {states}; {self.parts:,} parts; {self.seconds:.1f} s"
 
 
-def explore(settings: Settings, *, liveness: bool = True, processes: int = 1, most_states: float = float("inf")) -> Report:
+def explore(
+    conversation: Conversation, *, liveness: bool = True, processes: int = 1, most_states: float = float("inf")
+) -> Report:
     """Explore all states, or layer after layer until there are `most_states`. Raises `RuleBroken`."""
     began_s, depth, size = time.monotonic(), 0, 1
     with ExitStack() as stack:
-        shares = [stack.enter_context(_share(settings, number, processes, liveness)) for number in range(processes)]
+        shares = [stack.enter_context(_share(conversation, number, processes, liveness)) for number in range(processes)]
         try:
             while size and sum(counts[0] for counts in _all(shares, "counts")) < most_states:
                 batches = _all(shares, "expand")
                 size = sum(_all(shares, "take", [[each[number] for each in batches] for number in range(processes)]))
                 depth += bool(size)
         except Broken as broken:
-            raise RuleBroken("\n".join(_story(settings, shares, broken))) from None
+            raise RuleBroken("\n".join(_story(conversation, shares, broken))) from None
         states, in_fair_runs, parts = (sum(column) for column in zip(*_all(shares, "counts"), strict=True))
-    return Report(settings, states, depth, not size, in_fair_runs, parts, time.monotonic() - began_s)
+    return Report(conversation, states, depth, not size, in_fair_runs, parts, time.monotonic() - began_s)
 
 
 # -------------------------------------------------------------------- processes
@@ -75,13 +77,13 @@ class _Here:
 
 
 @contextmanager
-def _share(settings: Settings, number: int, processes: int, liveness: bool) -> Iterator[Any]:
+def _share(conversation: Conversation, number: int, processes: int, liveness: bool) -> Iterator[Any]:
     if processes == 1:
-        yield _Here(Share(settings, number, processes, liveness))
+        yield _Here(Share(conversation, number, processes, liveness))
         return
     here, there = multiprocessing.Pipe()
     context = multiprocessing.get_context("fork")
-    process = context.Process(target=_serve, args=(there, settings, number, processes, liveness), daemon=True)
+    process = context.Process(target=_serve, args=(there, conversation, number, processes, liveness), daemon=True)
     process.start()
     there.close()
     try:
@@ -92,8 +94,8 @@ def _share(settings: Settings, number: int, processes: int, liveness: bool) -> I
         process.join()
 
 
-def _serve(link: Connection, settings: Settings, number: int, processes: int, liveness: bool) -> None:
-    share = Share(settings, number, processes, liveness)
+def _serve(link: Connection, conversation: Conversation, number: int, processes: int, liveness: bool) -> None:
+    share = Share(conversation, number, processes, liveness)
     while True:
         call = link.recv()
         try:
@@ -115,7 +117,7 @@ def _all(shares: list[Any], method: str, arguments: list[Any] | None = None) -> 
 # -------------------------------------------------------------------- telling what happened
 
 
-def _story(settings: Settings, shares: list[Any], broken: Broken) -> Iterator[str]:
+def _story(conversation: Conversation, shares: list[Any], broken: Broken) -> Iterator[str]:
     """Sentences that tell how this state was reached, what happened then, and how it ended."""
     keys: list[int] = []
     share, number = broken.met
@@ -123,7 +125,7 @@ def _story(settings: Settings, shares: list[Any], broken: Broken) -> Iterator[st
         shares[share].send(("met", number))
         key, share, number = shares[share].recv()
         keys.insert(0, key)
-    world = World(settings)
+    world = World(conversation)
     state = world.start()
     for key in keys[1:]:
         sentence, state = _step(world, state, key)

@@ -6,14 +6,16 @@ person reads and for times that are past. Clocks are kept relative to now. Every
 
 from __future__ import annotations
 
+from typing import Self, TypeVar
+
 from learner.members.lane_placement import LanePlacement
 from learner.members.membership import Membership, Outgoing
 from learner.rollouts.lanes import AcceptedRollout, LaneQueue, Ticket, TicketedLane
 from learner.rollouts.ledger import Ledger
 from learner.rollouts.ticket_coordinator import CollectingMember, TicketCoordinator
 from protocol.messages import ToLearner, WorkerExit
+from tests.model.conversation import Content
 from tests.model.message_content import (
-    Content,
     hello,
     incarnation,
     peer_of,
@@ -94,8 +96,7 @@ class Learner:
     def publish(self) -> list[Outgoing]:
         self.updating = False
         coordinator = self.coordinator
-        version = coordinator.version + 1
-        out = coordinator.publish(version, PARAMETERS, BUFFERS)
+        out = self._publish(coordinator.version + 1)
         return [*out, *self._checkpoint(), *self._learn()]
 
     def pass_time(self, now: float) -> list[Outgoing]:
@@ -107,7 +108,7 @@ class Learner:
     def process_ended(self, worker: int, nonce: int) -> list[Outgoing]:
         return self.coordinator.process_ended(WorkerExit(f"w{worker}", nonce, "killed", True)) + self._learn()
 
-    def restarted(self, version: int) -> tuple[Learner, list[Outgoing]]:
+    def restarted(self, version: int) -> tuple[Self, list[Outgoing]]:
         """A new learner, from the checkpoint of this version."""
         issued, used, incarnations, accepted = self.checkpoints[version]
         settings = self.settings
@@ -120,17 +121,20 @@ class Learner:
             ledger=Ledger(issued=issued.value, used=used, lost=issued.value - used),
             incarnations=[number.value for number in incarnations],
         )
-        learner = Learner(settings, coordinator)
+        learner = type(self)(settings, coordinator)
         learner.checkpoints = self.checkpoints[:version]
         learner.used = {number for number in self.used if number < issued.value}
         learner.accepted = [(-1 if number is None else number.value, None, set()) for number in accepted]
-        out = coordinator.publish(version, PARAMETERS, BUFFERS)
+        out = learner._publish(version)
         return learner, out + learner._checkpoint()
 
     def is_member(self, worker: int) -> bool:
         return peer_of(worker) in self.coordinator.members
 
     # ---------------------------------------------------------------- inside
+
+    def _publish(self, version: int) -> list[Outgoing]:
+        return self.coordinator.publish(version, PARAMETERS, BUFFERS)
 
     def _checkpoint(self) -> list[Outgoing]:
         coordinator = self.coordinator
@@ -351,9 +355,12 @@ def _waiting_for(coordinator: TicketCoordinator, number: Name, lanes: Content) -
     return gone
 
 
-def first_learner(settings: Settings) -> tuple[Learner, list[Outgoing]]:
-    """A learner that starts a run."""
-    before = Learner(
+L = TypeVar("L", bound=Learner)
+
+
+def first_learner(settings: Settings, kind: type[L]) -> tuple[L, list[Outgoing]]:
+    """A learner of this kind that starts a run."""
+    before = kind(
         settings,
         TicketCoordinator(
             settings.run,

@@ -8,9 +8,13 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
+from learner.rollouts.evaluation_tickets import FIRST_TICKET
 from protocol.messages import (
     PROTOCOL_VERSION,
     Collect,
+    EpisodeRows,
+    Evaluate,
+    Evaluated,
     Heartbeat,
     HeartbeatReply,
     Hello,
@@ -26,11 +30,13 @@ from protocol.messages import (
     Weights,
     Welcome,
 )
+from protocol.rollout import Episode
 from protocol.specs import RunSpec
+from tests.model.conversation import Content
 from tests.model.names import Kind, Name, name
-from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollout
+from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollout, fake_rows
 
-Content = tuple[Any, ...]
+EPISODE_STEPS = 2  # of each episode of an evaluation, as `tests.support.fake_ends` plays them
 
 
 def worker_of(peer: bytes) -> int:
@@ -46,6 +52,9 @@ def session(number: int) -> Name:
 
 
 def ticket(number: int) -> Name:
+    """The name of a ticket for a rollout, or for a part of an evaluation."""
+    if number >= FIRST_TICKET:
+        return name(Kind.EVALUATION, number - FIRST_TICKET)
     return name(Kind.TICKET, number)
 
 
@@ -101,6 +110,12 @@ def content_of(message: ToLearner | ToWorker, worker: int) -> Content:
             return "Release", session(number), tuple((each.lane, incarnation(each.lane, each.incarnation)) for each in lanes)
         case HeartbeatReply(number, replies, received):
             return "HeartbeatReply", session(number), name(Kind.REPLIES, replies, number), _received(received)
+        case Evaluate(number, each, version, seeds, _, _, with_rows):
+            return "Evaluate", session(number), ticket(each), version, seeds, with_rows
+        case EpisodeRows(number, each, episode, step):
+            return "EpisodeRows", session(number), ticket(each), episode, step
+        case Evaluated(number, each, episodes):
+            return "Evaluated", session(number), ticket(each), tuple(episode.reward for episode in episodes)
         case _:
             raise AssertionError(f"the model has no {type(message).__name__}")
 
@@ -130,7 +145,19 @@ def message_of(content: Content, worker: int, run: RunSpec) -> Any:
             return Release(number.value, tuple(LaneIncarnation(lane, inc.value) for lane, inc in lanes))
         case "HeartbeatReply", number, replies, received:
             return HeartbeatReply(number.value, replies.value, _received_of(received))
+        case "Evaluate", number, each, version, seeds, with_rows:
+            return Evaluate(number.value, each.value, version, seeds, True, EPISODE_STEPS, with_rows, False)
+        case "EpisodeRows", number, each, episode, step:
+            return fake_rows(number.value, each.value, episode, step)
+        case "Evaluated", number, each, returns:
+            return evaluated(number.value, each.value, returns)
     raise AssertionError(content)
+
+
+def evaluated(number: int, of_ticket: int, returns: tuple[float, ...]) -> Evaluated:
+    """An answer with episodes of these returns."""
+    episodes = tuple(Episode(each, EPISODE_STEPS, 0.0) for each in returns)
+    return Evaluated(number, of_ticket, episodes, (False,) * len(episodes))
 
 
 def rollout_content(message: Rollout) -> Content:

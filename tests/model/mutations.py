@@ -144,19 +144,19 @@ class _MutatedLoader(SourceFileLoader):
 def _explore() -> str:
     """Explore small runs, the smallest first. Returns what is broken; empty: nothing was found."""
     from tests.model.explore import RuleBroken, explore
-    from tests.model.settings import Settings
+    from tests.model.training import Training
 
-    for settings in (
-        Settings(workers=1, lanes=1, updates=2, faults=1),
-        Settings(workers=2, lanes=1, updates=1, faults=1),
-        Settings(workers=1, lanes=2, updates=3, faults=1, max_lag=1, per_update=1),
-        Settings(workers=1, lanes=1, updates=2, faults=2),
-        Settings(workers=2, lanes=2, updates=1, faults=1),
+    for training in (
+        Training(workers=1, lanes=1, updates=2, faults=1),
+        Training(workers=2, lanes=1, updates=1, faults=1),
+        Training(workers=1, lanes=2, updates=3, faults=1, max_lag=1, per_update=1),
+        Training(workers=1, lanes=1, updates=2, faults=2),
+        Training(workers=2, lanes=2, updates=1, faults=1),
     ):
         try:
-            explore(settings)
+            explore(training)
         except RuleBroken as broken:
-            return f"{settings}\n{broken}"
+            return f"{training}\n{broken}"
     return ""
 
 

@@ -13,6 +13,8 @@ from collections.abc import Iterable
 from enum import IntEnum
 from typing import Any
 
+from learner.rollouts.evaluation_tickets import FIRST_TICKET
+
 BITS = 20
 MASK = (1 << BITS) - 1
 
@@ -34,6 +36,8 @@ class Kind(IntEnum):
     """process of a worker; scope: the worker"""
     OLD_SESSION = 8
     OLD_TICKET = 9
+    EVALUATION = 10
+    """ticket of an evaluation, counted from `FIRST_TICKET`; keeps its value, which says what it is a ticket for"""
 
 
 SCOPED = {Kind.REPLIES: Kind.SESSION, Kind.ATTEMPT: Kind.WORKER, Kind.NONCE: Kind.WORKER}
@@ -53,7 +57,7 @@ class Name(int):
 
     @property
     def value(self) -> int:
-        return self & MASK
+        return self & MASK if self >> 2 * BITS != Kind.EVALUATION else FIRST_TICKET + (self & MASK)
 
     def __repr__(self) -> str:
         scope = f"{self.scope}:" if self.kind in SCOPED or self.kind is Kind.INCARNATION else ""
@@ -99,7 +103,7 @@ def renaming(names: Iterable[int], workers: dict[int, int]) -> dict[Name, Name |
             base = kind << 2 * BITS | scope << BITS
         if kind is Kind.WORKER:
             to = base | workers[old & MASK]
-        elif kind is Kind.ATTEMPT:
+        elif kind in (Kind.ATTEMPT, Kind.EVALUATION):
             to = base | old & MASK
         elif kind in OLD:
             same = new.get(OLD[kind] << 2 * BITS | old & MASK)

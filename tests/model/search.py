@@ -10,9 +10,8 @@ from array import array
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
-from tests.model.message_content import Content
-from tests.model.settings import Settings
-from tests.model.world import Action, Seat, State, Violation, World
+from tests.model.conversation import Action, Content, Conversation
+from tests.model.world import Seat, State, Violation, World
 
 LONGEST = 400  # actions of a fair run to the target
 Turn = Callable[[Iterator[Action]], Action]
@@ -39,8 +38,8 @@ class Batch(NamedTuple):
 class Share:
     """One of several shares of all states. A state belongs to the share that its hash says."""
 
-    def __init__(self, settings: Settings, number: int, shares: int, liveness: bool) -> None:
-        self.world, self.settings = World(settings), settings
+    def __init__(self, conversation: Conversation, number: int, shares: int, liveness: bool) -> None:
+        self.world, self.conversation = World(conversation), conversation
         self.number, self.shares, self.liveness = number, shares, liveness
         self._met: set[int] = set()  # keys, also of states of other shares that were sent there
         self._keys, self._before = array("q"), array("q")  # of each state of this share; `before` = number * shares + share
@@ -126,8 +125,8 @@ class Share:
         world, state = self.world, state._replace(faults=0)
         self._run_fairly(state, number, _first)
         self._run_fairly(state, number, _last)
-        if self.settings.workers > 1:
-            for worker in range(self.settings.workers):
+        if self.conversation.workers > 1:
+            for worker in range(self.conversation.workers):
                 for action, turn in ((("dead for ever", worker), _first), (("cut off for ever", worker), _last)):
                     self._run_fairly(world.canonical(world.after(state, action)), number, turn)
 

@@ -18,12 +18,13 @@ from tests.model import learner_part, worker_part
 from tests.model.explore import explore
 from tests.model.message_content import hello
 from tests.model.settings import Settings
+from tests.model.training import Training
 from workers.collect.held_rollouts import HeldRollouts, _HeldLane
 from workers.session import Identity, Session, _SessionState
 
 
 def test_two_workers_one_lane_one_fault_of_any_kind() -> None:
-    report = explore(Settings(workers=2, lanes=1, updates=1, faults=1))
+    report = explore(Training(workers=2, lanes=1, updates=1, faults=1))
     assert report.complete
     assert report.states > 10_000, f"the model has lost most of its states: {report}"
 
@@ -31,16 +32,16 @@ def test_two_workers_one_lane_one_fault_of_any_kind() -> None:
 @pytest.mark.model
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize(
-    "settings",
+    "training",
     [
-        Settings(workers=2, lanes=2, updates=1, faults=1),
-        Settings(workers=2, lanes=1, updates=2, faults=1, max_lag=1),
-        Settings(workers=2, lanes=1, updates=2, faults=2),
+        Training(workers=2, lanes=2, updates=1, faults=1),
+        Training(workers=2, lanes=1, updates=2, faults=1, max_lag=1),
+        Training(workers=2, lanes=1, updates=2, faults=2),
     ],
     ids=str,
 )
-def test_larger_runs(settings: Settings) -> None:
-    report = explore(settings, processes=2)
+def test_larger_runs(training: Training) -> None:
+    report = explore(training, processes=2)
     sys.stdout.write(f"\n{report}\n")
     assert report.complete
 
@@ -48,7 +49,7 @@ def test_larger_runs(settings: Settings) -> None:
 def test_every_field_of_the_program_is_in_the_state_or_left_out_on_purpose() -> None:
     """A field that the model does not know would make different states look the same."""
     settings = Settings(workers=1, lanes=1, updates=1, faults=0)
-    learner, _ = learner_part.first_learner(settings)
+    learner, _ = learner_part.first_learner(settings, learner_part.Learner)
     coordinator = learner.coordinator
     session = Session(Identity("w0", "host", 1, 1, "model"), 0.0)
     known = {each: learner_part.SAVED[each] | learner_part.NOT_SAVED[each] for each in learner_part.SAVED}

@@ -9,7 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from protocol.messages import ToLearner, ToWorker
-from tests.model.message_content import Content, incarnation, rollout_content, rollout_of, session, ticket, weights
+from tests.model.conversation import Action, Content
+from tests.model.message_content import incarnation, rollout_content, rollout_of, session, ticket, weights
 from tests.model.names import MASK, Kind, name
 from tests.model.settings import FOR_EVER_S, TIMEOUT_S, Settings
 from tests.support.fake_ends import fake_rollouts
@@ -82,6 +83,33 @@ class Worker:
         """The learner's endpoint rejects its key."""
         assert self.session is not None
         return self._turn(self.session.refused("its key was revoked"), now)
+
+    def event(self, event: Action, message: ToWorker | None, now: float) -> list[ToLearner]:
+        """What the worker says after this event. `message`: what it handles, if anything."""
+        match event:
+            case "handle", _:
+                assert message is not None
+                return self.handle(message, now)
+            case ("start",):
+                return self.start(now)
+            case ("finish",):
+                return self.finish(now)
+            case ("time",):
+                return self.turn(now)
+            case ("told",):
+                return self.refused(now)
+            case ("end",):
+                self.end()
+            case ("dead for ever",):
+                self.end()
+                self.cut_off = True
+            case ("cut off for ever",):
+                self.cut_off = True
+            case ("shut out",):
+                self.shut_out = True
+            case ("freeze",) | ("thaw",):
+                self.frozen = event == ("freeze",)
+        return []
 
     # ---------------------------------------------------------------- inside
 

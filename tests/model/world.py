@@ -13,17 +13,8 @@ from collections.abc import Iterator, Sequence
 from hashlib import blake2b
 from typing import Any, NamedTuple
 
-from protocol.messages import ToLearner, ToWorker
-from tests.model import learner_part, worker_part
-from tests.model.learner_part import first_learner
-from tests.model.message_content import Content, content_of, message_of, worker_of
+from tests.model.conversation import Action, Content, Conversation, Facts
 from tests.model.names import Kind, Name, name, names_in, renamed, renaming
-from tests.model.settings import TICK_S, Settings
-from tests.model.worker_part import Worker
-from workers.states import State as SessionState
-
-Action = tuple[Any, ...]
-"""What happens, and to which worker or version."""
 
 
 class Seat(NamedTuple):
@@ -51,23 +42,6 @@ class Part(NamedTuple):
     digest: int
 
 
-class Facts(NamedTuple):
-    """What decides which actions are possible, of a learner or a worker."""
-
-    version: int = 0
-    updating: bool = False
-    checkpoints: int = 0
-    members: tuple[int, ...] = ()
-    """in the order in which they joined"""
-    alive: bool = False
-    frozen: bool = False
-    shut_out: bool = False
-    cut_off: bool = False
-    working: bool = False
-    rejoins: bool = False
-    """whether the worker looks for its learner again"""
-
-
 class Violation(Exception):
     """A rule was broken by this action in this state."""
 
@@ -79,8 +53,8 @@ class Violation(Exception):
 class World:
     """All parts that were met, and the actions."""
 
-    def __init__(self, settings: Settings) -> None:
-        self.settings = settings
+    def __init__(self, conversation: Conversation) -> None:
+        self.conversation = conversation
         self.parts: list[Part] = []
         self.facts: list[Facts] = []
         self.by_digest: dict[int, int] = {}
@@ -91,15 +65,13 @@ class World:
 
     def start(self) -> State:
         """The learner has started, and no worker has."""
-        learner, _ = first_learner(self.settings)
-        numbers = range(self.settings.workers)
-        none = [self.part(worker_part.saved(Worker(self.settings, number, 0), 0.0)) for number in numbers]
-        seats = tuple(Seat(worker, (), ()) for worker in none)
-        return self.canonical(State(self.part(learner_part.saved(learner, 0.0)), seats, self.settings.faults))
+        learner, workers = self.conversation.start()
+        seats = tuple(Seat(self.part(worker), (), ()) for worker in workers)
+        return self.canonical(State(self.part(learner), seats, self.conversation.faults))
 
     def reached(self, state: State) -> bool:
         """Whether the run has reached its target."""
-        return self.facts[state.learner].version >= self.settings.updates
+        return self.facts[state.learner].reached
 
     def digests(self, state: State) -> Any:
         """The same state in any process, with a digest for each part."""
@@ -178,7 +150,7 @@ class World:
 
     def successors(self, state: State) -> Iterator[tuple[Action, State]]:
         """All that can follow, in canonical form. Raises `Violation`."""
-        no_fault_yet = state.faults == self.settings.faults
+        no_fault_yet = state.faults == self.conversation.faults
         for actions, cost in ((self.actions(state), 0), (self.faults(state), 1)):
             for action in actions:
                 after = self.after(state, action, cost)
@@ -227,7 +199,7 @@ class World:
             case "kill", number:
                 return self._worker(state, number, ("end",))
             case "kill, reported", number:
-                nonce = self.parts[state.seats[number].worker].content[0].value
+                nonce = self.facts[state.seats[number].worker].nonce
                 return self._learner(self._worker(state, number, ("end",)), ("ended", number, nonce))
             case "revoke", number:
                 state = self._with(state, number, state.seats[number]._replace(up=(), late_up=()))
@@ -264,23 +236,9 @@ class World:
         return State(learner, tuple(seats), state.faults)
 
     def _compute_learner(self, number: int, event: Action) -> tuple[int, tuple[tuple[int, int], ...]]:
-        learner = learner_part.loaded(self.parts[number].content, self.settings)
-        now = TICK_S if event == ("time",) else 0.0
-        match event:
-            case "receive", worker, message:
-                out = learner.receive(worker, message_of(self.parts[message].content, worker, self.settings.run), now)
-            case ("publish",):
-                out = learner.publish()
-            case ("time",):
-                out = learner.pass_time(now)
-            case "revoke", worker:
-                out = learner.revoke(worker)
-            case "ended", worker, nonce:
-                out = learner.process_ended(worker, nonce)
-            case "restart", version:
-                learner, out = learner.restarted(version)
-        sent = tuple((worker_of(peer), self.part(content_of(message, worker_of(peer)))) for peer, message in out)
-        return self.part(learner_part.saved(learner, now)), sent
+        message = self.parts[event[2]].content if event[0] == "receive" else None
+        learner, sent = self.conversation.learner(self.parts[number].content, event, message)
+        return self.part(learner), tuple([(worker, self.part(told)) for worker, told in sent])
 
     def _worker(self, state: State, number: int, event: Action) -> State:
         seat = state.seats[number]
@@ -294,34 +252,9 @@ class World:
         return self._with(state, number, Seat(worker, up, down, seat.late_up, late_down))
 
     def _compute_worker(self, part: int, number: int, event: Action) -> tuple[int, tuple[int, ...]]:
-        worker = worker_part.loaded(self.parts[part].content, number, self.settings)
-        now = TICK_S if event == ("time",) else 0.0
-        sent: list[ToLearner] = []
-        match event:
-            case "handle", message:
-                told: ToWorker = message_of(self.parts[message].content, number, self.settings.run)
-                sent = worker.handle(told, now)
-            case ("start",):
-                sent = worker.start(now)
-            case ("finish",):
-                sent = worker.finish(now)
-            case ("time",):
-                sent = worker.turn(now)
-            case ("told",):
-                sent = worker.refused(now)
-            case ("end",):
-                worker.end()
-            case ("dead for ever",):
-                worker.end()
-                worker.cut_off = True
-            case ("cut off for ever",):
-                worker.cut_off = True
-            case ("shut out",):
-                worker.shut_out = True
-            case ("freeze",) | ("thaw",):
-                worker.frozen = event == ("freeze",)
-        messages = tuple(self.part(content_of(message, number)) for message in sent)
-        return self.part(worker_part.saved(worker, now)), messages
+        message = self.parts[event[1]].content if event[0] == "handle" else None
+        worker, sent = self.conversation.worker(self.parts[part].content, number, event, message)
+        return self.part(worker), tuple([self.part(said) for said in sent])
 
     @staticmethod
     def _with(state: State, number: int, seat: Seat) -> State:
@@ -336,7 +269,7 @@ class World:
             names = tuple(sorted(names_in(content, set())))
             digest = int.from_bytes(blake2b(repr(content).encode(), digest_size=7).digest(), "little")
             self.parts.append(Part(content, names, frozenset(names), digest))
-            self.facts.append(_facts(content))
+            self.facts.append(self.conversation.facts(content))
             assert digest not in self.by_digest, "two parts have the same digest"
             self.by_digest[digest] = number
         return number
@@ -412,17 +345,3 @@ class World:
 def _without(messages: tuple[int, ...], message: int) -> tuple[int, ...]:
     index = messages.index(message)
     return messages[:index] + messages[index + 1 :]
-
-
-def _facts(content: Content) -> Facts:
-    if isinstance(content[0], str):
-        return Facts()  # a message
-    if len(content) == 4:
-        _, (frozen, shut_out, cut_off), fields, work = content
-        alive = fields is not None
-        rejoins = alive and fields[0] is SessionState.JOINING and fields[1] is not None
-        return Facts(
-            alive=alive, frozen=frozen, shut_out=shut_out, cut_off=cut_off, working=work is not None, rejoins=rejoins
-        )
-    members = tuple(member[0].value for member in content[7])
-    return Facts(version=content[2], updating=content[16], checkpoints=len(content[17]), members=members)

@@ -1,0 +1,147 @@
+"""The learner of a run with evaluations: that of a training run, and the tickets of the pending evaluation.
+
+Rules: while an evaluation is pending, no ticket for a rollout is dealt and the version stays; each of its tickets is with
+nobody, with one worker, or played; its episodes are those of its seeds under its version, each used once; and the rows of a
+ticket come from the session whose answer counts.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from learner.members.membership import Outgoing
+from learner.rollouts.evaluation_tickets import FIRST_TICKET, HELD_AT_ONCE, EvaluationTickets
+from protocol.messages import EpisodeRows, ToLearner
+from tests.model import learner_part
+from tests.model.conversation import Content
+from tests.model.learner_part import Learner
+from tests.model.message_content import EPISODE_STEPS, evaluated, peer_of, session, ticket, worker_of
+from tests.model.names import Kind, name
+from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rows
+
+if TYPE_CHECKING:
+    from tests.model.evaluation.evaluating import Evaluating
+
+SAVED = {"_plan", "_version", "_first", "_seeds", "_undealt", "_held", "_played", "_rows"}
+"""What of `EvaluationTickets` is saved. `_seeds` follow from the plan."""
+NOT_SAVED = {"_policy", "_on_rows"}
+
+
+class EvaluatingLearner(Learner):
+    """One state of the learner, which an event changes."""
+
+    settings: Evaluating
+    barrier = 0
+    """number of tickets for rollouts that were issued before the pending evaluation began"""
+    rows: list[tuple[int, int]]
+    """episode and step of the rows of the pending evaluation, in the order in which they came"""
+
+    # ---------------------------------------------------------------- events
+
+    def receive(self, worker: int, message: ToLearner, now: float) -> list[Outgoing]:
+        self._now_received = message
+        return super().receive(worker, message, now)
+
+    def check(self) -> None:
+        super().check()
+        tickets, members = self.coordinator.evaluation, self.coordinator.members
+        if not tickets.pending:
+            return
+        assert self.coordinator.ledger.issued == self.barrier, "a ticket for a rollout was dealt during an evaluation"
+        assert tickets._version == self.coordinator.version, "an evaluation belongs to another version"
+        held = [index for each in tickets._held.values() for index in each]
+        every = sorted([*tickets._undealt, *held, *tickets._played])
+        assert every == list(range(len(tickets._seeds))), "a ticket of an evaluation is not in one place"
+        for peer, each in tickets._held.items():
+            assert peer in members or not each, "a ticket of an evaluation is with a worker that is gone"
+            assert len(each) <= HELD_AT_ONCE, "a worker holds too many tickets of an evaluation"
+
+    # ---------------------------------------------------------------- inside
+
+    def _publish(self, version: int) -> list[Outgoing]:
+        coordinator, settings = self.coordinator, self.settings
+        evaluates = version in settings.evaluated
+        self.barrier, self.rows = coordinator.ledger.issued, []
+        out = coordinator.publish(version, PARAMETERS, BUFFERS, deal=not evaluates)
+        if evaluates:
+            out += coordinator.begin_evaluation(settings.plan, self._take_rows if settings.rows else None)
+        return out
+
+    def _take_rows(self, episode: int, rows: EpisodeRows) -> None:
+        answer = self._now_received
+        assert not isinstance(answer, EpisodeRows), "rows counted before their answer had come"
+        assert rows.session == getattr(answer, "session", None), "rows and answer are of two sessions"
+        self.rows.append((episode, rows.first_step))
+
+    def _learn(self) -> list[Outgoing]:
+        evaluation = self.coordinator.evaluation
+        if evaluation.pending:
+            if not evaluation.done:
+                return []
+            self._end_evaluation()
+        return super()._learn()
+
+    def _end_evaluation(self) -> None:
+        plan, version = self.settings.plan, self.coordinator.version
+        played = [one.episode.reward for one in self.coordinator.end_evaluation()]
+        assert played == [seed + version / 1000 for seed in plan.seeds], f"other episodes than those asked for: {played}"
+        every = [(episode, step) for episode in range(len(plan.seeds)) for step in range(EPISODE_STEPS)]
+        assert sorted(self.rows) == (every if plan.send_rows else []), "other rows than those of the episodes"
+        self.rows = []
+
+
+# -------------------------------------------------------------------- to tuples and back
+
+
+def saved(learner: EvaluatingLearner, now: float) -> Content:
+    """The training run, and the evaluation: its first ticket, and more if it is pending."""
+    content = learner_part.saved(learner, now)
+    tickets, members = learner.coordinator.evaluation, learner.coordinator.members
+    if not tickets.pending:
+        return content, (tickets._first + len(tickets._seeds) - FIRST_TICKET,)
+    held = tuple(
+        (
+            name(Kind.WORKER, worker_of(member.peer)),
+            tuple((index, name(Kind.REPLIES, sent_at, member.session)) for index, sent_at in sorted(mine.items())),
+        )
+        for member in sorted(members.values(), key=lambda member: member.join_number)
+        if (mine := tickets._held.get(member.peer))
+    )
+    played = tuple((index, tuple(e.reward for e in answer.episodes)) for index, answer in sorted(tickets._played.items()))
+    rows = tuple(
+        (index, episode, session(each.session), each.first_step)
+        for index, of_ticket in sorted(tickets._rows.items())
+        for episode, come in sorted(of_ticket.items())
+        for each in come
+    )
+    first = tickets._first - FIRST_TICKET
+    undealt = tuple(sorted(tickets._undealt))
+    return content, (first, undealt, held, played, rows, ticket(learner.barrier), tuple(learner.rows))
+
+
+def is_pending(of_evaluation: Content) -> bool:
+    """Whether an evaluation is pending in this part of a learner's content."""
+    return len(of_evaluation) > 1
+
+
+def loaded(content: Content, settings: Evaluating) -> EvaluatingLearner:
+    """A learner at the time 0 with this content."""
+    both, (first, *of_evaluation) = content
+    training = learner_part.loaded(both, settings)
+    learner = EvaluatingLearner(settings, training.coordinator)
+    vars(learner).update(vars(training))
+    learner.rows = []
+    tickets: EvaluationTickets = learner.coordinator.evaluation
+    tickets._first = FIRST_TICKET + first
+    if not of_evaluation:
+        return learner
+    undealt, held, played, rows, barrier, of_learner = of_evaluation
+    tickets.begin(settings.plan, learner.coordinator.version, learner._take_rows if settings.rows else None)
+    tickets._undealt = list(undealt)
+    tickets._held = {peer_of(worker.value): {index: at.value for index, at in mine} for worker, mine in held}
+    tickets._played = {index: evaluated(0, tickets._first + index, returns) for index, returns in played}
+    for index, episode, of_session, step in rows:
+        come = tickets._rows.setdefault(index, {}).setdefault(episode, [])
+        come.append(fake_rows(of_session.value, tickets._first + index, episode, step))
+    learner.barrier, learner.rows = barrier.value, list(of_learner)
+    return learner

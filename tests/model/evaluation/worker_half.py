@@ -1,0 +1,113 @@
+"""A worker of a run with evaluations: that of a training run, and the evaluation that it plays.
+
+Rules: an order is played under its own version and, unless its rows are asked for, once in a session; and a worker does one
+piece of work at a time. The first rows are sent when the work begins, the last ones with the answer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from protocol.messages import Evaluate, ToLearner
+from tests.model import worker_part
+from tests.model.conversation import Content
+from tests.model.message_content import EPISODE_STEPS, content_of, evaluated, session, ticket, weights
+from tests.model.worker_part import Worker
+from tests.support.fake_ends import fake_evaluated, fake_rows
+from workers.session import Effect, EvaluationTask, Send
+
+if TYPE_CHECKING:
+    from tests.model.evaluation.evaluating import Evaluating
+
+SAVED = {"_orders", "_answers"}
+"""What of `HeldEvaluations` is saved: all."""
+
+
+@dataclass
+class EvaluatingWorker(Worker):
+    """One state of a worker, which an event changes."""
+
+    evaluation: EvaluationTask | None = None
+    played: set[tuple[int, int]] = field(default_factory=set)
+    """session and ticket of the orders that were played"""
+
+    def end(self) -> None:
+        super().end()
+        self.evaluation = None
+        self.played = set()
+
+    def finish(self, now: float) -> list[ToLearner]:
+        if self.evaluation is None:
+            return super().finish(now)
+        assert self.session is not None
+        assert self.task is None, "a worker evaluates and collects at the same time"
+        task, self.evaluation = self.evaluation, None
+        effects = [*_rows(task.order, EPISODE_STEPS - 1), *self.session.evaluated(fake_evaluated(task))]
+        return self._turn(effects, now)
+
+    def _turn(self, effects: list[Effect], now: float) -> list[ToLearner]:
+        current = self.session
+        assert current is not None
+        if self.evaluation is not None and current.evaluation_abandoned(self.evaluation.order.session):
+            self.evaluation = None
+            effects = effects + current.evaluated(None)
+        if self.task is not None and current.abandoned(self.task.session):
+            self.task = None
+            effects = effects + current.finished([])
+        if self.evaluation is None and self.task is None and (task := current.next_evaluation()) is not None:
+            order, self.evaluation = task.order, task
+            assert task.weights.version == order.version, "an evaluation under other weights than those of its order"
+            assert (order.session, order.ticket) not in self.played, "an order to evaluate was played twice"
+            if not order.send_rows:
+                self.played.add((order.session, order.ticket))
+            effects = effects + _rows(order, 0)
+        return super()._turn(effects, now)
+
+
+def _rows(order: Evaluate, step: int) -> list[Effect]:
+    """The row of this step of each episode, if they are asked for."""
+    episodes = range(len(order.seeds) if order.send_rows else 0)
+    return [Send(fake_rows(order.session, order.ticket, episode, step)) for episode in episodes]
+
+
+# -------------------------------------------------------------------- to tuples and back
+
+
+def saved(worker: EvaluatingWorker, now: float) -> Content:
+    """The training run; orders and answers, and what was played; and the order that is played."""
+    content = worker_part.saved(worker, now)
+    if worker.session is None:
+        return content, None, None
+    held = worker.session._current.evaluations
+    orders = tuple(content_of(order, worker.number) for _, order in sorted(held._orders.items()))
+    answers = tuple(content_of(answer, worker.number) for answer in held._answers.values())
+    played = tuple(
+        (session(number), ticket(each)) for number, each in sorted(worker.played) if number == worker.session.session
+    )
+    task = worker.evaluation
+    running = None if task is None else (task.weights.version, content_of(task.order, worker.number))
+    return content, (orders, answers, played), running
+
+
+def loaded(content: Content, number: int, settings: Evaluating) -> EvaluatingWorker:
+    """A worker at the time 0 with this content."""
+    both, held, running = content
+    worker = EvaluatingWorker(**vars(worker_part.loaded(both, number, settings)))
+    if worker.session is None:
+        return worker
+    orders, answers, played = held
+    evaluations = worker.session._current.evaluations
+    evaluations._orders = {order.ticket: order for order in map(_order, orders)}
+    evaluations._answers = {
+        each.value: evaluated(of_session.value, each.value, returns) for _, of_session, each, returns in answers
+    }
+    worker.played = {(number.value, each.value) for number, each in played}
+    if running is not None:
+        worker.evaluation = EvaluationTask(weights(running[0]), _order(running[1]))
+    return worker
+
+
+def _order(content: Content) -> Evaluate:
+    _, number, each, version, seeds, with_rows = content
+    return Evaluate(number.value, each.value, version, seeds, True, EPISODE_STEPS, with_rows, False)

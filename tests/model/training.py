@@ -1,0 +1,82 @@
+"""The conversation of a training run: tickets, rollouts and weights, between a `TicketCoordinator` and `Session`s."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+from learner.members.membership import Outgoing
+from tests.model import learner_part, worker_part
+from tests.model.conversation import Action, Content, Facts
+from tests.model.learner_part import Learner, first_learner
+from tests.model.message_content import content_of, message_of, worker_of
+from tests.model.settings import TICK_S, Settings
+from tests.model.worker_part import Worker
+from workers.states import State as SessionState
+
+
+class Training(Settings):
+    """A run that has reached its target after some updates."""
+
+    def start(self) -> tuple[Content, list[Content]]:
+        learner, _ = first_learner(self, Learner)
+        workers = [worker_part.saved(Worker(self, number, 0), 0.0) for number in range(self.workers)]
+        return learner_part.saved(learner, 0.0), workers
+
+    def learner(self, content: Content, event: Action, message: Content | None) -> tuple[Content, list[tuple[int, Content]]]:
+        now = now_at(event)
+        learner, out = learner_event(learner_part.loaded(content, self), event, message, now)
+        return learner_part.saved(learner, now), [(worker_of(to), content_of(told, worker_of(to))) for to, told in out]
+
+    def worker(self, content: Content, number: int, event: Action, message: Content | None) -> tuple[Content, list[Content]]:
+        worker = worker_part.loaded(content, number, self)
+        now = now_at(event)
+        told = None if message is None else message_of(message, number, self.run)
+        sent = [content_of(said, number) for said in worker.event(event, told, now)]
+        return worker_part.saved(worker, now), sent
+
+    def facts(self, content: Content) -> Facts:
+        if isinstance(content[0], str):
+            return Facts()
+        if len(content) == 4:
+            nonce, (frozen, shut_out, cut_off), fields, work = content
+            alive = fields is not None
+            rejoins = alive and fields[0] is SessionState.JOINING and fields[1] is not None
+            return Facts(
+                nonce=nonce.value,
+                alive=alive,
+                frozen=frozen,
+                shut_out=shut_out,
+                cut_off=cut_off,
+                working=work is not None,
+                rejoins=rejoins,
+            )
+        members = tuple(member[0].value for member in content[7])
+        reached = content[2] >= self.updates
+        return Facts(reached=reached, updating=content[16], checkpoints=len(content[17]), members=members)
+
+
+L = TypeVar("L", bound=Learner)
+
+
+def learner_event(learner: L, event: Action, message: Content | None, now: float) -> tuple[L, list[Outgoing]]:
+    """The learner after this event, which may be another one, and what it sends."""
+    match event:
+        case "receive", worker, _:
+            assert message is not None
+            return learner, learner.receive(worker, message_of(message, worker, learner.settings.run), now)
+        case ("publish",):
+            return learner, learner.publish()
+        case ("time",):
+            return learner, learner.pass_time(now)
+        case "revoke", worker:
+            return learner, learner.revoke(worker)
+        case "ended", worker, nonce:
+            return learner, learner.process_ended(worker, nonce)
+        case "restart", version:
+            return learner.restarted(version)
+    raise AssertionError(event)
+
+
+def now_at(event: Action) -> float:
+    """The time of an event; each end is loaded at the time 0."""
+    return TICK_S if event == ("time",) else 0.0
