@@ -65,6 +65,10 @@ class Host:
         command = ["replace", "dev", "eth0", "root", "tbf", *rate] if kilobits_per_s else ["del", "dev", "eth0", "root"]
         _run(["tc", "-n", self.namespace, "qdisc", *command])
 
+    def processes(self) -> list[int]:
+        """The pids of all processes on this host, also of those whose parents have ended."""
+        return [int(pid) for pid in _ip("netns", "pids", self.namespace).split()]
+
     def vanish(self) -> None:
         """Remove the host and its connections without notifying anybody. Call `cut` and end its processes first."""
         _ip("-n", self._switch, "link", "delete", self._port)

@@ -267,13 +267,17 @@ class Stage:
         before: Sequence[str] = (),
         resume: Path | None = None,
     ) -> Learner:
-        """Start `python -m learner` at this address. `settings` override SMALL. `before`: words before the command."""
+        """Start `python -m learner` at this address. `settings` override SMALL. `before`: words before the command.
+
+        `resume`: the run to go on with, in which only `settings` change.
+        """
         arguments = ["--resume", str(resume)]
         if resume is None:
             arguments = [env, "--bind", address, "--run-dir", str(self.runs)]
-            for name, value in {**SMALL, **settings}.items():
-                if value != "":
-                    arguments += [f"--{name}", *str(value).split()]
+            settings = {**SMALL, **settings}
+        for name, value in settings.items():
+            if value != "":
+                arguments += [f"--{name}", *str(value).split()]
         said = self.tmp_path / f"learner-{next(self._numbers)}.log"
         learner = Learner([*before, sys.executable, "-m", "learner", *arguments], said, self.runs)
         self.started.append(learner)

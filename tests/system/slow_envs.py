@@ -12,9 +12,11 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from typing import Any
 
 import gymnasium
+from gymnasium.envs.classic_control import CartPoleEnv
 
 from protocol.arrays import Floats
 from workers.envs.toy import Countdown, Info
@@ -49,6 +51,41 @@ class Slow(Countdown):
     def step(self, action: Any) -> tuple[Floats, float, bool, bool, Info]:
         """Sleep, then count down."""
         self._sleep(self._step_s)
+        return super().step(action)
+
+
+class SometimesSlow(CartPoleEnv):
+    """CartPole. In each process some constructions, resets and steps take so many seconds; they are noted in a file.
+
+    A line of the file: the pid, and `construct`, `reset` or `step`.
+    """
+
+    calls: Counter[str] = Counter()
+
+    def __init__(
+        self, seconds: float = 2.5, construct: int = 9, reset: int = 200, step: int = 20_000, notes: str = ""
+    ) -> None:
+        """`construct`, `reset`, `step`: every how many such calls of this process are slow."""
+        self._seconds, self._notes = seconds, notes
+        self._every = {"construct": construct, "reset": reset, "step": step}
+        self._call("construct")
+        super().__init__()
+
+    def _call(self, name: str) -> None:
+        self.calls[name] += 1
+        if IN_WORKER and self.calls[name] % self._every[name] == 0:
+            with open(self._notes, "a") as file:
+                file.write(f"{os.getpid()} {name}\n")
+            time.sleep(self._seconds)
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> Any:
+        """As CartPole's, but now and then slow."""
+        self._call("reset")
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> Any:
+        """As CartPole's, but now and then slow."""
+        self._call("step")
         return super().step(action)
 
 
@@ -98,5 +135,6 @@ class LeavesThings(Countdown):
             time.sleep(3600)
 
 
+gymnasium.register("SometimesSlow-v0", f"{__name__}:SometimesSlow", max_episode_steps=500)
 for _kind in (Slow, Ends, LeavesThings):
     gymnasium.register(f"{_kind.__name__}-v0", f"{__name__}:{_kind.__name__}")

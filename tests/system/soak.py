@@ -1,7 +1,11 @@
-"""`python -m tests.system.soak`: eight workers on two hosts learn CartPole, with a fault every two seconds.
+"""`python -m tests.system.soak`: eight workers learn CartPole, in a slow environment, with a fault every two seconds.
 
-Rule: in spite of the faults, training ends, the policy is as good as without faults, every ticket and transition is
-accounted for, and nothing is left behind. The seed decides the faults and their times. The exit code is 1 if this fails.
+Rule: in spite of the faults, training goes on for the given time and ends; the policy is as good as without faults; every
+ticket, transition and evaluation is accounted for; memory, open files and logs do not grow; and nothing is left behind. The
+seed decides the faults. The exit code is 1 if this fails.
+
+Two of the workers are on the learner's host, and no fault happens to them. In their environment, as in all, some calls take
+longer than the worker timeout. They must never be given up for that.
 """
 
 from __future__ import annotations
@@ -9,195 +13,214 @@ from __future__ import annotations
 import argparse
 import json
 import random
+import re
 import shutil
-import signal
 import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import psutil
 
+from protocol.keys.key_folder import KeyFolder
 from tests.system.network import Network, why_not
-from tests.system.processes import START_S, Learner, Running, Stage, wait_for
-from tests.system.rubbish import NAME
+from tests.system.processes import START_S, Learner, Running, Stage, Worker, wait_for
 from tests.system.runs import accounted
+from tests.system.soak_faults import FAULTS, KILL_A_WORKER, PORT, Fault, Scene
 
-PORT, PROXY_PORT = 5555, 5556
-WORKERS = 8
+PROXY_PORT = 5556
+WORKERS, CALM_WORKERS = 6, 2
 FAULT_EVERY_S, HEALED_WITHIN_S = 2.0, (0.5, 4.0)
-STEPS_FIRST_MINUTE, STEPS_PER_MINUTE = 150_000, 270_000  # env steps that are trained with these faults on two cores, about
+EPISODES = 40  # of an evaluation
+MORE_STEPS = 20_000  # env steps of the run's last part, without faults
+SLOW = "tests.system.slow_envs:SometimesSlow-v0"
+SLOW_RESET_EVERY, SLOW_STEP_EVERY = 20, 2_000  # calls of a process, for each minute of the soak: so a soak has some dozens
 SETTINGS: dict[str, object] = {
     "env-kwargs": "",
     "rollout-steps": 32,
     "batch-size": 256,
     "n-epochs": 20,
-    "eval-episodes": 100,
+    "gamma": 0.98,
+    "gae-lambda": 0.8,
+    "eval-episodes": EPISODES,
     "checkpoint-every-s": 2,
+    "max-env-failures": 10_000,  # a hostile worker that gets a lane may say that its environment failed
 }
-WARM_S = 10.0  # seconds after a learner's start in which its memory still grows
-LIFE_S = 30.0  # the shortest time that shows a slope
-MOST_MB_PER_MIN = 6.0
-MOST_MORE_DESCRIPTORS = 40
-Undo = Callable[[], None]
+LOOK_EVERY_S = 1.0  # at memory and open files
+SETTLED_S = 15.0  # before the second half the learner is killed no more, so that its memory is that of a warm process
+MOST_MB, MOST_MB_PER_MIN = 4.0, 1.0  # growth of a process in the second half: at most this, and so much more a minute
+MOST_MORE_FILES = 5
+MOST_LOG_BYTES = 1_500_000  # of one learner process
+GONE_WITHIN_S = 10.0
+
+
+class Samples:
+    """Memory and open files of one process, over time."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[float, float, int]] = []  # seconds, MB, open files
+
+    def look(self, running: Running, now: float) -> None:
+        """Take a sample, unless the process has just ended."""
+        with suppress(psutil.Error):
+            self._rows.append((now, running.memory_mb(), running.descriptors()))
+
+    def growth(self) -> tuple[float, float, float]:
+        """MB a minute (slope of a straight line), minutes, and open files (median of the last half minus the first's)."""
+        rows = np.array(self._rows)
+        minutes = rows[:, 0] / 60
+        half = len(rows) // 2
+        files = float(np.median(rows[half:, 2]) - np.median(rows[:half, 2]))
+        return float(np.polyfit(minutes, rows[:, 1], 1)[0]), float(np.ptp(minutes)), files
 
 
 class Soak:
-    """A learner on the first host, and workers on the other two, one of which is behind a proxy; and the faults."""
+    """The course of a soak, and what was seen on the way."""
 
-    def __init__(self, stage: Stage, network: Network, steps: int, seed: int) -> None:
-        self.stage, self.random = stage, random.Random(seed)
-        self.hosts = [network.host(number) for number in (1, 2, 3)]
-        here = self.hosts[0]
+    def __init__(self, stage: Stage, network: Network, seed: int, eval_every: int, minutes: float) -> None:
+        self.seconds = 60 * minutes
+        hosts = [network.host(number) for number in (1, 2, 3)]
+        here = hosts[0]
         self.address = f"tcp://{here.address}:{PORT}"
+        self.stage, self.notes = stage, stage.tmp_path / "slow-calls"
+        self.notes.touch()
         keys, self._token = stage.keys()
-        settings = {**SETTINGS, "steps": steps, "seed": seed, "min-workers": WORKERS, "keys": keys}
-        self.learner = stage.learner(self.address, settings, env="CartPole-v1", before=here.before)
-        proxy = [*here.before, sys.executable, "-m", "tests.system.proxy", str(PORT), here.address, str(PROXY_PORT)]
-        self.proxy = stage.start(proxy, "proxy", told=True)
-        self.workers = {number: self._worker(number) for number in range(WORKERS)}
-        self.stopped: set[int] = set()
-        self.bad_ways: set[int] = set()
-        self.faults: Counter[str] = Counter()
-        self.strangers: list[Running] = []
-        self.own_ends: list[str] = []
-        self.memory: list[tuple[int, float, float]] = []  # pid of the learner, seconds, MB
-        self.descriptors: dict[int, list[int]] = {}
-        self.killed: set[int] = set()
-        self.longest_pause: tuple[float, str] = (0.0, "")
-        self._made: list[tuple[float, str]] = []
-        self._rows_bytes, self._row_s = 0, 0.0
-        self._due: list[tuple[float, Undo]] = []
-
-    def _worker(self, number: int) -> Running:
-        host = self.hosts[1 + number % 2]
-        port = PORT if number % 2 == 0 else PROXY_PORT
-        address = f"tcp://{self.hosts[0].address}:{port}"
-        return self.stage.worker(address, f"w{number}", "--token", str(self._token), before=host.before)
-
-    # ---------------------------------------------------------------- what goes wrong
-
-    def kill_a_worker(self) -> None:
-        number = self.random.choice(sorted(self.workers.keys() - self.stopped))
-        self.killed.add(self.workers[number].pid)
-        self.workers[number].kill()
-
-    def stop_a_worker(self) -> Undo | None:
-        number = self.random.choice(sorted(self.workers.keys() - self.stopped))
-        worker = self.workers[number]
-        if not worker.alive():
-            return None
-        self.stopped.add(number)
-        worker.pause()
-
-        def go_on() -> None:
-            self.stopped.discard(number)
-            worker.go_on()
-
-        return go_on
-
-    def cut_a_host(self) -> Undo | None:
-        return self._way(lambda host: self.hosts[host].cut(), lambda host: self.hosts[host].heal())
-
-    def lose_a_tenth(self) -> Undo | None:
-        return self._way(lambda host: self.hosts[host].lose(10), lambda host: self.hosts[host].lose(0))
-
-    def _way(self, spoil: Callable[[int], None], mend: Callable[[int], None]) -> Undo | None:
-        host = self.random.choice([1, 2])
-        if host in self.bad_ways:
-            return None
-        self.bad_ways.add(host)
-        spoil(host)
-
-        def heal() -> None:
-            self.bad_ways.discard(host)
-            mend(host)
-
-        return heal
-
-    def delay(self) -> Undo:
-        self.proxy.tell("delay 0.2")
-        return lambda: self.proxy.tell("delay 0")
-
-    def reset_connections(self) -> None:
-        self.proxy.tell("reset")
-
-    def talk_rubbish(self) -> None:
-        host = self.hosts[self.random.choice([1, 2])]
-        arguments = (self.hosts[0].address, str(PORT), str(self.random.getrandbits(32)))
-        self.strangers.append(
-            self.stage.start([*host.before, sys.executable, "-m", "tests.system.rubbish", *arguments], NAME.decode())
+        hostile_token = KeyFolder(keys).new("mallory", datetime.now(UTC).replace(microsecond=0))
+        often = f"reset {round(SLOW_RESET_EVERY * minutes)} step {round(SLOW_STEP_EVERY * minutes)}"
+        settings = {**SETTINGS, "env-kwargs": f"notes {self.notes} {often}", "seed": seed, "eval-every": eval_every}
+        learner = stage.learner(
+            self.address, {**settings, "min-workers": WORKERS, "keys": keys}, env=SLOW, before=here.before
         )
+        proxy = [*here.before, sys.executable, "-m", "tests.system.proxy", str(PORT), here.address, str(PROXY_PORT)]
+        self.calm = [stage.worker(self.address, f"calm{n}", *self._flags, before=here.before) for n in range(CALM_WORKERS)]
+        self.scene = Scene(
+            stage=stage,
+            hosts=hosts,
+            random=random.Random(seed),
+            learner=learner,
+            resume=self._resume,
+            proxy=stage.start(proxy, "proxy", told=True),
+            workers={},
+            hostile_token=hostile_token,
+        )
+        self.learners = [learner]
+        self.scene.workers |= {number: self._worker(number) for number in range(WORKERS)}
+        self.faults: Counter[str] = Counter()
+        self.in_evaluations: Counter[str] = Counter()
+        self.own_ends: list[str] = []
+        self._calm_pids: list[int] = []
+        self.longest_pause: tuple[float, str] = (0.0, "")
+        self.samples: dict[str, Samples] = {}  # of the second half
+        self._made: list[tuple[float, str]] = []
+        self._evaluation = ""  # the checkpoint before the evaluation that is under way, or the newest one
+        self._rows_bytes, self._row_s, self._looked_s = 0, 0.0, 0.0
+        self._due: list[tuple[float, Callable[[], None]]] = []
 
-    def kill_the_learner(self) -> None:
-        self.learner.is_open()
-        wait_for(self.learner.checkpoints, START_S, "a checkpoint")
-        self.learner.kill()
-        self.learner = self.stage.learner(self.address, resume=self.learner.folder, before=self.hosts[0].before)
+    @property
+    def _flags(self) -> tuple[str, str]:
+        return "--token", str(self._token)
+
+    def _worker(self, number: int) -> Worker:
+        host = self.scene.hosts[1 + number % 2]
+        port = PORT if number % 2 == 0 else PROXY_PORT
+        address = f"tcp://{self.scene.hosts[0].address}:{port}"
+        return self.stage.worker(address, f"w{number}", *self._flags, before=host.before)
+
+    def _resume(self, settings: Mapping[str, object] = {}) -> Learner:
+        run, here = self.scene.learner.folder, self.scene.hosts[0]
+        self.learners.append(self.stage.learner(self.address, settings, resume=run, before=here.before))
+        return self.learners[-1]
 
     # ---------------------------------------------------------------- the course of things
 
-    def play(self, deadline_s: float) -> None:
-        """Inject faults until the learner ends."""
-        draw: dict[Callable[[], Undo | None], int] = {
-            self.kill_a_worker: 6,
-            self.stop_a_worker: 6,
-            self.cut_a_host: 3,
-            self.lose_a_tenth: 3,
-            self.delay: 3,
-            self.reset_connections: 3,
-            self.talk_rubbish: 2,
-            self.kill_the_learner: 1,
-        }
-        coming = self.random.sample(list(draw), len(draw))  # each fault once, then at random
-        self.learner.is_open()
-        wait_for(self.learner.checkpoints, START_S, "the first checkpoint")
-        next_s = time.monotonic() + FAULT_EVERY_S
-        while self.learner.alive():
-            now = time.monotonic()
-            assert now < deadline_s, f"training did not end in time; the learner says:\n{self.learner.said()[-3000:]}"
-            if now >= next_s:
+    def play(self) -> None:
+        """Make faults for `seconds` after the first update, then undo them all."""
+        scene = self.scene
+        coming = scene.random.sample(FAULTS, len(FAULTS))  # each fault once, then at random
+        scene.learner.trains(1)
+        self._calm_pids = [psutil.Process(worker.pid).children()[0].pid for worker in self.calm]
+        began_s = time.monotonic()
+        half_s, end_s, next_s = began_s + self.seconds / 2, began_s + self.seconds, began_s + FAULT_EVERY_S
+        while (now := time.monotonic()) < end_s:
+            assert scene.learner.alive(), f"the learner ended:\n{scene.learner.said()[-3000:]}"
+            may_kill_it = now < half_s - SETTLED_S
+            if self._an_evaluation_began():
+                self._make(KILL_A_WORKER, now)
+            elif now >= next_s:
                 next_s = now + FAULT_EVERY_S
-                self._make(coming.pop() if coming else self.random.choices(list(draw), list(draw.values()))[0])
+                possible = [fault for fault in FAULTS if fault.at_any_time or may_kill_it]
+                fault = coming.pop() if coming else scene.random.choices(possible, [one.weight for one in possible])[0]
+                if fault in possible:
+                    self._make(fault, now)
             for due in [due for due in self._due if due[0] <= now]:
                 self._due.remove(due)
                 due[1]()
-            self._look_after(now)
+            self._look(now, judged=now >= half_s)
             time.sleep(0.1)
         for _, undo in self._due:
             undo()
 
-    def _make(self, fault: Callable[[], Undo | None]) -> None:
-        name = fault.__name__.replace("_", " ")
-        self.faults[name] += 1
-        self._made.append((time.monotonic(), name))
-        undo = fault()
-        if undo is not None:
-            self._due.append((time.monotonic() + self.random.uniform(*HEALED_WITHIN_S), undo))
+    def end(self) -> None:
+        """Without faults: kill the learner, resume the run for a little longer with all workers, and let it end."""
+        learner = self.scene.learner
+        learner.kill()
+        self._restart_workers()
+        steps = int(learner.checkpoints()[-1].stem) + MORE_STEPS
+        everybody = {"min-workers": WORKERS + CALM_WORKERS, "no-workers-timeout-s": START_S}
+        self.scene.learner = self._resume({"steps": steps, **everybody})
+        code = self.scene.learner.ends(START_S + 120)
+        assert code == 0, f"the last learner ended with {code}: {self.scene.learner.said()[-3000:]}"
 
-    def _look_after(self, now: float) -> None:
-        """Restart workers that were killed, record those that ended by themselves, and measure memory and descriptors."""
+    def _an_evaluation_began(self) -> bool:
+        """Whether an evaluation is under way that was not seen before: there is a checkpoint of it, and no row yet."""
+        checkpoints = self.scene.learner.checkpoints()
+        if not checkpoints or checkpoints[-1].name == self._evaluation or not self._evaluates(checkpoints[-1]):
+            return False
+        self._evaluation = checkpoints[-1].name
+        return True
+
+    def _evaluates(self, newest: Path) -> bool:
+        with (self.scene.learner.folder / "metrics.jsonl").open("rb") as file:
+            file.seek(max(0, file.seek(0, 2) - 20_000))
+            steps = re.findall(rb'"time/total_timesteps": ?(\d+)', file.read())
+        return bool(steps) and int(newest.stem) > int(steps[-1])
+
+    def _make(self, fault: Fault, now: float) -> None:
+        self.faults[fault.name] += 1
+        self._made.append((now, fault.name))
+        if (checkpoints := self.scene.learner.checkpoints()) and self._evaluates(checkpoints[-1]):
+            self.in_evaluations[fault.name] += 1
+        undo = fault.do(self.scene)
+        if undo is not None:
+            self._due.append((time.monotonic() + self.scene.random.uniform(*HEALED_WITHIN_S), undo))
+
+    def _look(self, now: float, *, judged: bool) -> None:
+        """Restart workers that were killed, record those that ended by themselves, and take samples."""
         self._look_at_updates(now)
-        for number, worker in self.workers.items():
-            if not worker.alive() and self.learner.alive():
-                if worker.pid not in self.killed and worker.process.returncode != 0:
-                    self.own_ends.append(f"w{number}: exit code {worker.process.returncode}: {worker.said()[-300:]}")
-                if worker.process.returncode != 0:
-                    self.workers[number] = self._worker(number)
-        for running in (self.learner, *self.workers.values()):
-            try:
-                descriptors, memory_mb = running.descriptors(), running.memory_mb()
-            except Exception:  # the process has just ended
+        self._restart_workers()
+        if not judged or now - self._looked_s < LOOK_EVERY_S:
+            return
+        self._looked_s = now
+        for name, running in {"learner": self.scene.learner, **{f"calm{n}": one for n, one in enumerate(self.calm)}}.items():
+            self.samples.setdefault(name, Samples()).look(running, now)
+
+    def _restart_workers(self) -> None:
+        for number, worker in self.scene.workers.items():
+            if worker.alive():
                 continue
-            self.descriptors.setdefault(running.pid, []).append(descriptors)
-            if running is self.learner:
-                self.memory.append((running.pid, now, memory_mb))
+            if worker.pid not in self.scene.killed:
+                self.own_ends.append(f"w{number}: exit code {worker.process.returncode}: {worker.said()[-300:]}")
+            self.scene.workers[number] = self._worker(number)
 
     def _look_at_updates(self, now: float) -> None:
         """Record the longest time without an update, and the faults shortly before and during it."""
-        rows_bytes = (self.learner.folder / "metrics.jsonl").stat().st_size
+        rows_bytes = (self.scene.learner.folder / "metrics.jsonl").stat().st_size
         if rows_bytes == self._rows_bytes:
             return
         pause_s = now - self._row_s if self._row_s else 0.0
@@ -207,119 +230,170 @@ class Soak:
             self.longest_pause = pause_s, ", ".join(causes)
         self._rows_bytes, self._row_s = rows_bytes, now
 
-    # ---------------------------------------------------------------- the account
+    # ---------------------------------------------------------------- what must hold: each returns what falls short
 
-    def slope_mb_per_min(self) -> float:
-        """Growth of the learner's memory, without the first seconds of each process: a mean, weighted by their length."""
-        slopes, weights = [], []
-        for pid in {pid for pid, _, _ in self.memory}:
-            points = np.array([(s, mb) for found, s, mb in self.memory if found == pid])
-            points = points[points[:, 0] > points[0, 0] + WARM_S]
-            if len(points) and np.ptp(points[:, 0]) > LIFE_S:
-                slopes.append(float(np.polyfit(points[:, 0] / 60, points[:, 1], 1)[0]))
-                weights.append(len(points))
-        return float(np.average(slopes, weights=weights)) if slopes else 0.0
+    def everybody_left(self) -> list[str]:
+        """The workers ended by themselves, with exit code 0, and no process of theirs is left on any host."""
+        short = list(self.own_ends)
+        workers = [*self.scene.workers.values(), *self.calm]
+        failed = [worker for worker in workers if worker.ends(START_S) != 0]
+        short += [f"{one.said_in.name}: exit code {one.process.returncode}: {one.said()[-300:]}" for one in failed]
+        for other in [*self.scene.strangers, *self.scene.hostile]:
+            if other.alive():
+                other.kill()
+        self.scene.proxy.kill()
+        hosts = self.scene.hosts
+        with suppress(AssertionError):
+            wait_for(lambda: not any(host.processes() for host in hosts), GONE_WITHIN_S)
+        left = [psutil.Process(pid).cmdline() for host in hosts for pid in host.processes()]
+        return short + [f"left behind: {' '.join(command)}" for command in left]
 
-    def more_descriptors(self) -> int:
-        """The largest growth of the number of open files and sockets of a process after its first seconds."""
-        return max((max(seen[20:]) - seen[20] for seen in self.descriptors.values() if len(seen) > 40), default=0)
+    def nobody_calm_was_given_up(self) -> list[str]:
+        """Slow is not dead: a learner never loses a worker to which nothing happened, and that made slow calls."""
+        short = []
+        for n in range(CALM_WORKERS):
+            for learner in self.learners:
+                said = learner.said()
+                if f"worker calm{n} silent" in said or len(re.findall(rf"worker calm{n} \(.*joined", said)) > 1:
+                    lines = [line for line in said.splitlines() if f"calm{n}" in line]
+                    short.append(f"calm{n} was given up: {lines}")
+            if not self.slow_calls(n):
+                short.append(f"calm{n} made no slow call")
+        missing = {"construct", "reset", "step"} - self.slow_calls().keys()
+        return short + [f"no {call} was slow" for call in sorted(missing)]
+
+    def slow_calls(self, calm: int | None = None) -> Counter[str]:
+        """How many calls were slow, by kind; of one calm worker, or of all processes."""
+        lines = [line.split() for line in self.notes.read_text().splitlines()]
+        return Counter(call for pid, call in lines if calm is None or int(pid) == self._calm_pids[calm])
+
+    def flat(self) -> list[str]:
+        """In the second half neither memory nor the number of open files grows."""
+        short = []
+        for name, samples in self.samples.items():
+            slope, minutes, files = samples.growth()
+            most = MOST_MB + MOST_MB_PER_MIN * minutes
+            if slope * minutes > most:
+                short.append(
+                    f"{name} grew by {slope * minutes:.1f} MB in {minutes:.1f} minutes, at most {most:.1f} expected"
+                )
+            if files > MOST_MORE_FILES:
+                short.append(f"{name} opened {files:.0f} more files and sockets, at most {MOST_MORE_FILES} expected")
+        return short
+
+    def little_said(self) -> list[str]:
+        """No learner process logs much, and nobody of ours a traceback or an error of the program."""
+        long = [one for one in self.learners if len(one.said()) > MOST_LOG_BYTES]
+        short = [f"{one.said_in.name}: {len(one.said()):,} bytes logged, expected {MOST_LOG_BYTES:,}" for one in long]
+        ours = [one for one in self.stage.started if one not in self.scene.strangers and one not in self.scene.hostile]
+        words = ("Traceback", "internal error", "led to an error in the learner")
+        said = [(one, word) for one in ours for word in words if word in one.said()]
+        return short + [f"{one.said_in.name} says {word}: {one.said()[-3000:]}" for one, word in said]
 
 
-def without_faults(stage: Stage, steps: int, seed: int) -> Learner:
-    """The same run on loopback, without faults."""
-    settings = {**SETTINGS, "steps": steps, "seed": seed, "min-workers": 2}
+def missing_evaluations(rows: Sequence[Mapping[str, Any]], every: int) -> list[str]:
+    """Which evaluations are missing, and which were not due. Several rows may be of the same number of env steps."""
+    found: dict[int, bool] = {}
+    for row in rows:
+        steps = int(row["time/total_timesteps"])
+        found[steps] = found.get(steps, False) or "eval/mean_reward" in row
+    due, short = every, []
+    for steps, evaluated in found.items():
+        if evaluated != (steps >= due):
+            short.append(f"after {steps:,} env steps: {'an evaluation was not due' if evaluated else 'no evaluation'}")
+        due += every * (steps >= due)
+    return short
+
+
+def without_faults(stage: Stage, steps: int, seed: int, eval_every: int) -> dict[str, Any]:
+    """The summary of as long a run on loopback, without faults and slow calls."""
+    settings = {**SETTINGS, "steps": steps, "seed": seed, "min-workers": 2, "eval-every": eval_every}
     learner = stage.learner("tcp://127.0.0.1:5557", settings, env="CartPole-v1")
     workers = [stage.worker("tcp://127.0.0.1:5557", f"w{number}") for number in range(2)]
     assert learner.ends(START_S + steps / 100) == 0, learner.said()
     for worker in workers:
         assert worker.ends() == 0, worker.said()
-    return learner
+    return learner.summary()
 
 
-def soak(minutes: float, seed: int, folder: Path) -> list[str]:
+def soak(minutes: float, seed: int, folder: Path, eval_every: int = 25_000) -> list[str]:
     """Run it and print the table. Returns the requirements that were not met."""
-    steps = STEPS_FIRST_MINUTE + int((minutes - 1) * STEPS_PER_MINUTE)
-    print(f"soak: seed {seed}, {steps:,} env steps, about {minutes:g} minutes", flush=True)
-    short: list[str] = []
-    calm_stage = Stage(folder / "calm")
-    try:
-        calm = without_faults(calm_stage, steps, seed).summary()
-    finally:
-        calm_stage.close()
+    print(f"soak: seed {seed}, {minutes:g} minutes of faults", flush=True)
     stage = Stage(folder)
     with Network() as network:
         try:
-            began_s = time.monotonic()
-            scene = Soak(stage, network, steps, seed)
-            scene.play(began_s + START_S + 180 * minutes)
-            took_s = time.monotonic() - began_s
-            learner = scene.learner
-            if learner.ends() != 0:
-                short.append(f"the learner ended with {learner.process.returncode}: {learner.said()[-3000:]}")
-            time.sleep(2.0)
-            # These were cut off, or just started, when the learner told the workers to leave.
-            deaf = [worker for worker in scene.workers.values() if worker.alive()]
-            for worker in deaf:
-                worker.signal(signal.SIGTERM)
-            for number, worker in scene.workers.items():
-                if worker.ends() != 0 and worker.pid not in scene.killed:
-                    short.append(f"w{number} ended with {worker.process.returncode}: {worker.said()[-300:]}")
-            for stranger in scene.strangers:
-                stranger.ends(60)
+            course = Soak(stage, network, seed, eval_every, minutes)
+            course.play()
+            course.end()
+            short = course.everybody_left()
         finally:
             stage.close()
+    learner = course.scene.learner
     summary = learner.summary()
     ledger = accounted(summary, rows=32 * 2)
-    found, wanted = (run["evaluation"] for run in (summary, calm))
-    if found is None:
-        return [*short, f"no evaluation; stop reason: {summary['stop_reason']}"]
-    noise = 2 * (found["return_std"] ** 2 / 100 + wanted["return_std"] ** 2 / 100) ** 0.5
-    slope, more = scene.slope_mb_per_min(), scene.more_descriptors()
+    for check in (course.nobody_calm_was_given_up, course.flat, course.little_said):
+        short += check()
+    short += missing_evaluations(learner.rows(), eval_every)
+    if not course.in_evaluations["kill a worker"]:
+        short.append("no worker was killed in an evaluation")
     if summary["stop_reason"] != "all steps done":
         short.append(f"stop reason: {summary['stop_reason']}")
+    calm_stage = Stage(folder / "calm")
+    try:
+        calm = without_faults(calm_stage, summary["env_steps"], seed, eval_every)
+    finally:
+        calm_stage.close()
+    found, wanted = (run["best"]["evaluation"] for run in (summary, calm))
+    noise = 2 * (found["return_std"] ** 2 / EPISODES + wanted["return_std"] ** 2 / EPISODES) ** 0.5
     if found["return_mean"] < wanted["return_mean"] - noise - 25:
-        short.append(f"greedy return {found['return_mean']:.1f}, without faults {wanted['return_mean']:.1f}")
-    if slope > MOST_MB_PER_MIN:
-        short.append(f"the learner grew by {slope:.1f} MB a minute, at most {MOST_MB_PER_MIN} expected")
-    if more > MOST_MORE_DESCRIPTORS:
-        short.append(f"a process opened {more} more files and sockets, at most {MOST_MORE_DESCRIPTORS} expected")
-    if any("Traceback" in running.said() for running in stage.started if running not in scene.strangers):
-        short.append("a traceback was said: " + next(r.said()[-3000:] for r in stage.started if "Traceback" in r.said()))
-    short += scene.own_ends
+        short.append(f"best greedy return {found['return_mean']:.1f}, without faults {wanted['return_mean']:.1f}")
     rows = {
-        **{f"fault: {name}": count for name, count in sorted(scene.faults.items())},
-        "seconds": f"{took_s:.0f}",
+        **{f"fault: {name}": count for name, count in sorted(course.faults.items())},
+        **{f"in an evaluation: {name}": count for name, count in sorted(course.in_evaluations.items())},
+        **{f"slow calls: {name}": count for name, count in sorted(course.slow_calls().items())},
+        "learner processes": len(course.learners),
+        "messages of hostile workers": sum(_said(running) for running in course.scene.hostile),
         "updates, env steps": f"{summary['updates']:,}, {summary['env_steps']:,}",
-        "longest pause between updates": f"{scene.longest_pause[0]:.1f} s",
-        "greedy return": f"{found['return_mean']:.1f} ± {found['return_std']:.1f}",
-        "greedy return without faults": f"{wanted['return_mean']:.1f} ± {wanted['return_std']:.1f}",
+        "evaluations": sum("eval/mean_reward" in row for row in learner.rows()),
+        "longest pause between updates": f"{course.longest_pause[0]:.1f} s",
+        "best greedy return": f"{found['return_mean']:.1f} ± {found['return_std']:.1f}",
+        "best greedy return without faults": f"{wanted['return_mean']:.1f} ± {wanted['return_std']:.1f}",
         **{f"ledger: {name}": f"{count:,}" for name, count in ledger.items()},
-        "learner's memory": f"{slope:+.2f} MB a minute",
-        "more descriptors than when warm": more,
-        "workers that did not hear the end": len(deaf),
-        "workers that ended by themselves": len(scene.own_ends),
+        **{
+            f"memory of {name}": "{:+.2f} MB a minute for {:.1f} minutes".format(*one.growth())
+            for name, one in course.samples.items()
+        },
+        **{f"open files of {name}": f"{one.growth()[2]:+.0f}" for name, one in course.samples.items()},
+        "largest log of a learner process": f"{max(len(one.said()) for one in course.learners):,} bytes",
+        "workers that ended by themselves": len(course.own_ends),
     }
     for name, value in rows.items():
         print(f"  {name:36} {value:>20}")
-    print(f"  in the longest pause: {scene.longest_pause[1]}")
+    print(f"  in the longest pause: {course.longest_pause[1]}")
     (folder / "soak.json").write_text(json.dumps(rows, indent=2))
     return short
+
+
+def _said(hostile: Running) -> int:
+    """How many messages a hostile worker said; 0 if it was ended before it could tell."""
+    found = re.search(r"said (\d+) messages", hostile.said())
+    return int(found[1]) if found else 0
 
 
 def main() -> int:
     """Run the program. Returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m tests.system.soak", description=__doc__.partition("\n")[0])
-    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--minutes", type=float, default=10.0, help="of faults, after the first update")
+    parser.add_argument("--eval-every", type=int, default=25_000, help="env steps between evaluations")
     parser.add_argument("--seed", type=int, default=random.SystemRandom().getrandbits(31), help="default: any, printed")
     options = parser.parse_args()
     if why := why_not():
         print(f"soak: {why}", file=sys.stderr)
         return 2
     folder = Path(tempfile.mkdtemp(prefix="soak-"))
-    short = soak(options.minutes, options.seed, folder)
-    if short:
-        print(f"soak: what everybody said lies in {folder}", file=sys.stderr)
-    else:
+    print(f"soak: what everybody says lies in {folder}; it is removed if all holds", flush=True)
+    short = soak(options.minutes, options.seed, folder, options.eval_every)
+    if not short:
         shutil.rmtree(folder)
     for line in short:
         print(f"falls short: {line}", file=sys.stderr)

@@ -17,9 +17,8 @@ import subprocess
 import sys
 import termios
 import threading
-import time
 import urllib.request
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
@@ -29,28 +28,14 @@ from statistics import median
 from typing import get_args
 
 import pytest
-import zmq
 
 from learner.report.page import write_page
 from millrace.cli.status import as_table, ask, in_json, observer_name
 from protocol.bounds import Stage as WorkerStage
 from protocol.keys.key_folder import KeyFolder, read_token
-from protocol.messages import (
-    PROTOCOL_VERSION,
-    Alive,
-    Failure,
-    Goodbye,
-    Heartbeat,
-    Hello,
-    Inquire,
-    ToLearner,
-    Welcome,
-)
-from protocol.wire.codec import encode
 from protocol.wire.worker_link import WorkerLink
-from tests.support.extreme_messages import MARK, SESSION, extremes, of_session
-from tests.support.fake_ends import fake_rollout
-from tests.support.hostile_messages import real
+from tests.support.extreme_messages import MARK
+from tests.system.hostile_worker import FLOODS, NAME, Hostile, sayings
 from tests.system.processes import ROOT, SMALL, START_S, TOY, Learner, Stage, free_port, wait_for
 from tests.system.runs import accounted
 
@@ -91,71 +76,6 @@ class OnTerminal(Learner):
         """Everything, after its end."""
         self._reader.join(10.0)
         return self.said_in.read_bytes()
-
-
-class Hostile:
-    """Joins as a spare worker, as often as it is refused, and says what it likes."""
-
-    def __init__(self, address: str, token: Path, stack: ExitStack) -> None:
-        self._address, self._token = address, read_token(str(token))
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        stack.callback(self._context.term)
-        self._stack = stack
-        self._nonces = itertools.count(1)
-        self.said = self.sessions = 0
-        self._link = self.link("[/red]spare")
-
-    def link(self, name: str) -> WorkerLink:
-        """A connection under a name."""
-        made = WorkerLink(self._address, name, self._context, self._token)
-        self._stack.callback(made.close, 0.0)
-        return made
-
-    def joins(self, name: str = "[/red]spare", link: WorkerLink | None = None) -> int:
-        """A session of its own: each time as another process."""
-        link, nonce = link or self._link, next(self._nonces)
-        deadline_s = time.monotonic() + START_S
-        while True:
-            link.send(encode(Hello(PROTOCOL_VERSION, name, "[bold]host", 1, nonce, "fuzz", nonce)))
-            if link.poll(2.0):
-                for message in link.receive():
-                    if isinstance(message, Welcome) and message.attempt == nonce:
-                        self.sessions += 1
-                        return message.session
-            assert time.monotonic() < deadline_s, "the hostile worker was not let in"
-
-    def says(self, sayings: Iterator[list[bytes]], at_once: int = 3) -> None:
-        """Say all of these in sessions of its own. After so many it joins again, for it may have been refused."""
-        while said := list(itertools.islice(sayings, at_once)):
-            session = self.joins()
-            for frames in said:
-                self._link.send(of_session(frames, session))
-                self.said += 1
-
-    def floods(self, make: Callable[[int], list[ToLearner | Inquire]], seconds: float, names: int) -> None:
-        """Say this again and again, each time in a new session, under so many names."""
-        links = {f"[red]{'n' * 100}{n}": None for n in range(names)}
-        opened = {name: self.link(name) for name in links}
-        until_s = time.monotonic() + seconds
-        for name in itertools.cycle(opened):
-            if time.monotonic() > until_s:
-                break
-            session = self.joins(name, opened[name])
-            for message in make(session):
-                opened[name].send(encode(message))
-                self.said += 1
-        for link in opened.values():
-            link.close(0.0)
-
-
-FLOODS: list[Callable[[int], list[ToLearner | Inquire]]] = [
-    lambda session: [Goodbye(session, "x" * 1_000, ())],
-    lambda session: [Failure(session, "[/red]boom", f"2026-11-22 05:00:00,000 learner: forged\n{MARK}" * 1_500, 0)],
-    lambda session: [Heartbeat(session, 2**53, 2**53, tuple(range(60_000)), 2**53, {"step": 1e9}, 2**53)] * 5,
-    lambda session: [Inquire()] * 20,
-    lambda session: [Alive((), ())] * 20,
-    lambda session: [fake_rollout(session, n % 2, n, n, n) for n in range(20)],
-]
 
 
 @dataclass
@@ -268,11 +188,6 @@ def compare(tmp_path: Path, settings: Mapping[str, object], attack: Callable[[Ho
     return loud
 
 
-def sayings() -> Iterator[list[bytes]]:
-    """Every field of every message at extreme values."""
-    return (frames for message in real(fake_rollout(SESSION, 0, 1, 0, 0)) for frames in extremes(message))
-
-
 def test_a_hostile_worker_changes_no_bit_of_the_weights(tmp_path: Path) -> None:
     """A twelfth of all that it can say, and a flood of each kind."""
 
@@ -282,7 +197,7 @@ def test_a_hostile_worker_changes_no_bit_of_the_weights(tmp_path: Path) -> None:
             hostile.floods(flood, 0.2, names=4)
 
     loud = compare(tmp_path, {"steps": 5_000, "env-kwargs": "seconds 0.002"}, attack, live=True)
-    assert "[/red]spare" in loud.texts["status"], "it is named as it named itself"
+    assert NAME in loud.texts["status"], "it is named as it named itself"
 
 
 @pytest.mark.soak
