@@ -23,6 +23,7 @@ from learner.env_spaces import EnvSpaces
 from learner.imports_ahead import ImportsAhead
 from learner.interrupts import Interrupts
 from learner.members.describe import DescribeSettings, described_by_workers
+from learner.members.describe_coordinator import Accept
 from learner.members.endpoint import join_lines, keyring_for
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.recording.training_recorder import TrainingRecorder
@@ -52,8 +53,8 @@ class KnownEnvironment:
 
     env: EnvSpec
     spaces: EnvSpaces
-    described: DescribedEnv | None
-    """As a worker described it; None in a resumed run that has no need of it."""
+    described: DescribedEnv
+    """As a worker described it."""
 
 
 @dataclass(frozen=True)
@@ -101,18 +102,16 @@ def is_finished(config: Config, resume: Path) -> bool:
     return reason == summary.stop_reason
 
 
-Describe = Callable[[DescribeSpec, Callable[[], None]], DescribedEnv]
-"""Has a worker describe the environment. What the second argument raises ends the wait."""
+Describe = Callable[[DescribeSpec, Callable[[], None], Accept], DescribedEnv]
+"""Has a worker describe the environment. What the second argument raises ends the wait; the third accepts a description."""
 
 
-def known_environment(
-    config: Config, env: EnvSpec, resume: Path | None, describe: Describe, *, always: bool = False
-) -> KnownEnvironment:
-    """The environment, as `describe` learns it, or as the policy in the folder of the run to `resume` knows it.
+def known_environment(config: Config, env: EnvSpec, resume: Path | None, describe: Describe) -> KnownEnvironment:
+    """The environment, as `describe` learns it. Meanwhile another thread imports PyTorch.
 
-    `always`: have it described also if that policy is there. Meanwhile another thread imports PyTorch. Raises `UsageError`
-    if there is no such environment, no policy for it, or if it is not the one that policy was made for; `RunError` if no
-    worker describes it in time; and `KeyboardInterrupt` if the user stops the program.
+    Of a run to `resume`, only an environment with the spaces of the run's policy is accepted. Raises `UsageError` if there
+    is no such environment, or no policy for it; `RunError` if no worker describes it in time; and `KeyboardInterrupt` if
+    the user stops the program.
     """
     # PyTorch's threads sleep while they wait for one another; this must be set before it is imported. By default they spin,
     # and hold the core that the slowest needs: beside other busy processes an update takes up to ten times as long.
@@ -125,22 +124,24 @@ def known_environment(
                 raise KeyboardInterrupt if resume is None else Interrupted(resume)
 
         policy = None if resume is None else RunFolder.open(resume).policy_spec()
-        if policy is not None and not (config.record or always):
-            known = KnownEnvironment(env, EnvSpaces.of_policy(policy), None)
-        else:
-            spec = DescribeSpec(env, config.chosen_vector(), heartbeat_s=config.heartbeat_s)
-            described = describe(spec, check_interrupt)
-            known = KnownEnvironment(env, EnvSpaces.of_description(described), described)
+
+        def accept(found: DescribedEnv) -> None:
             if resume is not None and policy is not None:
-                check_spaces(resume, EnvSpaces.of_policy(policy), known.spaces)
+                check_spaces(resume, EnvSpaces.of_policy(policy), EnvSpaces.of_description(found))
+
+        described = describe(
+            DescribeSpec(env, config.chosen_vector(), heartbeat_s=config.heartbeat_s), check_interrupt, accept
+        )
         imports.wait(check_interrupt)
-    return known
+    return KnownEnvironment(env, EnvSpaces.of_description(described), described)
 
 
 def describe_over(link: LearnerLink, config: Config, processes: ProcessCallbacks) -> Describe:
     """Has one of the workers at the link of the run describe the environment."""
     settings = describe_settings(config)
-    return lambda spec, check_interrupt: described_by_workers(link, spec, settings, processes, check_interrupt)
+    return lambda spec, check_interrupt, accept: described_by_workers(
+        link, spec, settings, processes, check_interrupt, accept=accept
+    )
 
 
 def describe_settings(config: Config) -> DescribeSettings:
@@ -276,7 +277,7 @@ def _why(error: BaseException) -> str:
 
 
 def _training_recorder(config: Config, folder: RunFolder, known: KnownEnvironment, spec: RunSpec) -> TrainingRecorder | None:
-    if not config.record or known.described is None:
+    if not config.record:
         return None
     about = f"All whole training episodes of millrace run {folder.path.resolve().name}, as acted."
     return TrainingRecorder(config.record, known.described, spec.policy, about)

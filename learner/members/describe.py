@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from learner.members.describe_coordinator import DescribeCoordinator
+from learner.members.describe_coordinator import Accept, DescribeCoordinator, accept_any
 from learner.members.member_server import MemberServer, ServerCallbacks, ServerSettings
 from learner.members.process_callbacks import ProcessCallbacks
 from protocol.envs.description import DescribedEnv
@@ -45,12 +45,13 @@ def described_by_workers(
     processes: ProcessCallbacks,
     check_interrupt: Callable[[], None] = lambda: None,
     clock: Callable[[], float] = time.monotonic,
+    accept: Accept = accept_any,
 ) -> DescribedEnv:
-    """The environment as the first worker describes it.
+    """The environment as the first worker describes it whose description `accept` takes.
 
     `check_interrupt` is called at least every 0.1 s: what it raises ends the wait. Raises `UsageError` if a worker of this
-    program says that there is no such environment; `EnvironmentFailed` if it fails too often; `NoWorkers` or `Stalled` if
-    a deadline passes.
+    program says that there is no such environment, or describes one that is not accepted; `EnvironmentFailed` if it fails
+    too often; `NoWorkers` or `Stalled` if a deadline passes.
     """
     coordinator = DescribeCoordinator(
         spec,
@@ -58,6 +59,7 @@ def described_by_workers(
         worker_timeout_s=settings.worker_timeout_s,
         max_env_failures=settings.max_env_failures,
         started_here=processes.expected > 0,
+        accept=accept,
     )
     members = coordinator.membership.members
     callbacks = ServerCallbacks(coordinator.receive, lambda now: coordinator.status(settings.steps, now), lambda event: None)

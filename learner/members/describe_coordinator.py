@@ -1,11 +1,14 @@
 """The conversation before a run: workers describe the environment. Pure: messages and `now` in, messages out.
 
-Rule: the first description that can be read is that of the run; other workers are compared with it when they open their
-lanes. A worker of this program that declines ends the start with its reason. One from elsewhere is refused, and the learner
-goes on waiting for another. An environment that fails counts; its worker may come back.
+Rule: the first description that can be read and is accepted is that of the run; other workers are compared with it when they
+open their lanes. A worker of this program that declines, or describes what is not accepted, ends the start with the reason.
+One from elsewhere is refused, and the learner goes on waiting for another. An environment that fails counts; its worker may
+come back.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 from learner.members.events import EnvironmentRaised
 from learner.members.membership import Member, Membership, Outgoing
@@ -30,6 +33,13 @@ from protocol.messages import (
 )
 from protocol.specs import DescribeSpec
 
+Accept = Callable[[DescribedEnv], None]
+"""Raises `UsageError` if the run cannot be made with this environment."""
+
+
+def accept_any(env: DescribedEnv) -> None:
+    """Accept every environment."""
+
 
 class DescribeCoordinator:
     """Members that describe the environment, until one has done so."""
@@ -42,6 +52,7 @@ class DescribeCoordinator:
         worker_timeout_s: float,
         max_env_failures: int,
         started_here: bool,
+        accept: Accept = accept_any,
     ) -> None:
         """`started_here`: whether the workers are processes that this program started."""
         self.spec = spec
@@ -51,7 +62,7 @@ class DescribeCoordinator:
         """Why the start cannot go on."""
         self.membership: Membership[Member] = Membership(spec, Member, lambda member, why: None, first_session)
         self._worker_timeout_s, self._max_env_failures = worker_timeout_s, max_env_failures
-        self._started_here = started_here
+        self._started_here, self._accept = started_here, accept
         self._env_failures = 0
 
     def receive(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
@@ -69,9 +80,14 @@ class DescribeCoordinator:
         match message:
             case Described(_, description) if self.described is None:
                 try:
-                    self.described = read_description(description)
+                    described = read_description(description)
                 except BadMessage as error:
                     return self.membership.refuse(member, SentUnusable, f"its description of the environment: {error}")
+                try:
+                    self._accept(described)
+                except UsageError as error:
+                    return self._unsuitable(member, Described, str(error))
+                self.described = described
             case Heartbeat():
                 member.record_heartbeat(message)
                 member.replies += 1
@@ -129,12 +145,16 @@ class DescribeCoordinator:
     def _goodbye(self, member: Member, reason: str) -> list[Outgoing]:
         if reason == TOLD_TO_STOP or self.described is not None:
             self.membership.remove(member, Goodbye, f"left: {reason}")
-        elif self._started_here:
-            self.membership.remove(member, Goodbye, f"left: {reason}")
-            self.membership.take_events()  # the reason is the error's text, and need not be logged too
-            self.failure = self.failure or UsageError(reason)
-        else:
-            return self.membership.refuse(member, Goodbye, reason)
+            return []
+        return self._unsuitable(member, Goodbye, reason)
+
+    def _unsuitable(self, member: Member, event: type, reason: str) -> list[Outgoing]:
+        """The run cannot be made with this worker's environment."""
+        if not self._started_here:
+            return self.membership.refuse(member, event, reason)
+        self.membership.remove(member, event, f"left: {reason}")
+        self.membership.take_events()  # the reason is the error's text, and need not be logged too
+        self.failure = self.failure or UsageError(reason)
         return []
 
     def _count_exit(self, worker_exit: WorkerExit) -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 import zmq
 
 from learner.config.config import Config
+from learner.members.describe_coordinator import Accept
 from learner.members.endpoint import BindSettings
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.run import Run, RunSetup, Watch, describe_settings, known_environment, prometheus_observer, run_folder
@@ -64,11 +65,10 @@ def train(
         folder = stack.enter_context(run_folder(config, resume))
         started = listening.start(worker_flags(config, folder.path), config.call_timeouts())
 
-        def describe(spec: DescribeSpec, check_interrupt: Callable[[], None]) -> DescribedEnv:
-            return started.describe(describe_settings(config), check_interrupt)
+        def describe(spec: DescribeSpec, check_interrupt: Callable[[], None], accept: Accept) -> DescribedEnv:
+            return started.describe(describe_settings(config), check_interrupt, accept)
 
-        known = known_environment(config, env_spec, resume, describe, always=True)
-        assert known.described is not None
+        known = known_environment(config, env_spec, resume, describe)
         env = started.vector_env(known.described)
         stack.callback(env.close)
         workers = config.min_workers or (1 if elsewhere else min(config.workers, config.envs))

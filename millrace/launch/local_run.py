@@ -52,7 +52,7 @@ def train(config: Config, resume: Path | None, watch: Watch, factory: Callable[.
         stack.callback(supervisor.stop)
         processes = ProcessCallbacks(supervisor.poll, supervisor.activities, expected=config.workers)
         with stopped_on_error(supervisor):
-            known = known_environment(config, env, resume, describe_over(link, config, processes), always=True)
+            known = known_environment(config, env, resume, describe_over(link, config, processes))
         run = Run(RunSetup(config, known, folder, resume is not None), link, processes, watch, observer)
         run.train(config.min_workers or config.workers)
         return run.folder.path

@@ -16,6 +16,7 @@ from datetime import UTC, datetime
 import zmq
 
 from learner.members.describe import DescribeSettings, described_by_workers
+from learner.members.describe_coordinator import Accept, accept_any
 from learner.members.endpoint import BindSettings, join_lines, keyring_for
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.vector_env.env import ZmqVectorEnv
@@ -135,14 +136,22 @@ class StartedVectorEnv:
     listening: ListeningVectorEnv
     supervisor: Supervisor | None
 
-    def describe(self, settings: DescribeSettings, check_interrupt: Callable[[], None] = lambda: None) -> DescribedEnv:
-        """Have a worker describe the environment. Raises `UserFacingError`, and what `check_interrupt` raises."""
+    def describe(
+        self,
+        settings: DescribeSettings,
+        check_interrupt: Callable[[], None] = lambda: None,
+        accept: Accept = accept_any,
+    ) -> DescribedEnv:
+        """Have a worker describe the environment; `accept` takes the description, or not.
+
+        Raises `UserFacingError`, and what `check_interrupt` raises.
+        """
         spec, processes = self.listening.requested.to_describe, ProcessCallbacks()
         if self.supervisor is not None:
             processes = ProcessCallbacks(
                 self.supervisor.poll, self.supervisor.activities, expected=self.listening.settings.local_workers
             )
-        return described_by_workers(self.listening.link, spec, settings, processes, check_interrupt)
+        return described_by_workers(self.listening.link, spec, settings, processes, check_interrupt, accept=accept)
 
     def vector_env(self, described: DescribedEnv) -> ZmqVectorEnv:
         """The vector environment. Call it once; it does not wait until workers have joined."""

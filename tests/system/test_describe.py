@@ -22,7 +22,9 @@ from protocol.space_spec import MAX_ELEMENTS, BoxSpace, DiscreteSpace, EnvDescri
 from protocol.wire.codec import encode
 from protocol.wire.plain_values import pack
 from protocol.wire.worker_link import WorkerLink
+from tests.learner.config.test_on_resume import content
 from tests.system.processes import ROOT, START_S, Stage, crowding, free_port, wait_for
+from tests.system.runs import finish
 from workers.envs.toy import Countdown
 
 SIMULATOR = '''
@@ -134,23 +136,36 @@ def test_a_learner_without_the_simulator_trains_with_workers_that_have_it(stage:
     assert "0.1" in card
 
 
-def test_a_resumed_learner_needs_no_description(stage: Stage, simulator: Path) -> None:
+def test_a_resumed_learner_does_not_train_with_workers_that_have_another_environment(
+    stage: Stage, simulator: Path, tmp_path: Path
+) -> None:
+    """One that lacks it, and one whose version has other spaces, are refused; the run goes on with one that has it."""
     address = f"tcp://127.0.0.1:{free_port()}"
-    learner = stage.learner(address, {"env-kwargs": "", "max-env-failures": 100}, env="mysim:Sim-v0")
+    learner = stage.learner(address, {"env-kwargs": ""}, env="mysim:Sim-v0")
     learner.is_open()
     worker = stage.worker(address, "w0", before=with_path(simulator))
     learner.trains(2)
     learner.signal(signal.SIGTERM)
     assert learner.ends() == 130
     assert worker.ends() == 0
+    before = content(learner.folder)
+    newer = tmp_path / "newer"
+    newer.mkdir()
+    (newer / "mysim.py").write_text(SIMULATOR.replace("(3,)", "(4,)").replace("np.full(3,", "np.full(4,"))
+
     again = stage.learner(address, resume=learner.folder)
-    again.hears("waiting for workers", START_S)
+    again.is_open()
     bare = stage.worker(address, "bare")
-    bare.hears("no module named mysim", START_S)  # it is welcomed to the run itself, and fails when it opens a lane
-    bare.signal(signal.SIGTERM)
-    bare.ends()
-    stage.worker(address, "w1", before=with_path(simulator))
+    changed = stage.worker(address, "changed", before=with_path(newer))
+    says = f"run {learner.folder}: the environment's observations have changed: expected .*, got .*; install the version"
+    for refused, why in ((bare, "no module named mysim"), (changed, says)):
+        assert refused.ends(START_S) == 2
+        refused.hears(why)
+        again.hears(f"worker {refused.said_in.name.partition('-')[0]} was refused: .*{why}")
+    assert {name: made for name, made in content(learner.folder).items() if name in before} == before
+    worker = stage.worker(address, "w1", before=with_path(simulator))
     again.trains(2)
+    finish(again, [worker])
 
 
 # ------------------------------------------------------------------------------------------- faults

@@ -11,10 +11,11 @@ import pytest
 from gymnasium import spaces
 
 from learner.members.describe import LOG_WAITING_EVERY_S, DescribeSettings, described_by_workers
-from learner.members.describe_coordinator import DescribeCoordinator
+from learner.members.describe_coordinator import Accept, DescribeCoordinator, accept_any
 from learner.members.membership import Outgoing
 from learner.members.process_callbacks import ProcessCallbacks
 from protocol.env_spec import EnvSpec
+from protocol.envs.description import DescribedEnv
 from protocol.errors import EnvironmentFailed, NoWorkers, Stalled, UsageError
 from protocol.messages import (
     PROTOCOL_VERSION,
@@ -43,12 +44,19 @@ SPEC = DescribeSpec(EnvSpec("Fake-v0"))
 A, B = b"w0", b"w1"
 NOTHING = np.frombuffer(pack({}), np.uint8)
 DESCRIPTION = EnvDescription(DiscreteSpace(3, 0, "int64"), DiscreteSpace(2, 0, "int64"), NOTHING, "", 7, "")
+OF_NINE = msgspec.structs.replace(DESCRIPTION, observation=DiscreteSpace(9, 0, "int64"))
 BROKEN = msgspec.structs.replace(DESCRIPTION, observation=BoxSpace((2,), "float32", np.ones(3), np.ones(())))
 SETTINGS = DescribeSettings(worker_timeout_s=5, no_workers_timeout_s=60, stall_timeout_s=100, max_env_failures=1)
 
 
-def coordinator(*, started_here: bool = True) -> DescribeCoordinator:
-    return DescribeCoordinator(SPEC, 10, worker_timeout_s=5, max_env_failures=1, started_here=started_here)
+def coordinator(*, started_here: bool = True, accept: Accept = accept_any) -> DescribeCoordinator:
+    return DescribeCoordinator(SPEC, 10, worker_timeout_s=5, max_env_failures=1, started_here=started_here, accept=accept)
+
+
+def of_three(env: DescribedEnv) -> None:
+    """Accepts environments with three observations."""
+    if env.observation_space != spaces.Discrete(3):
+        raise UsageError(f"expected Discrete(3), got {env.observation_space}")
 
 
 def hello(name: bytes, nonce: int = 1, attempt: int = 1) -> Hello:
@@ -69,8 +77,7 @@ def test_the_first_description_is_the_run_s_and_all_members_say_hello_again() ->
     made = coordinator()
     one, two = join(made, A), join(made, B)
     assert made.receive(A, Described(one, DESCRIPTION), 1.0) == []
-    other = msgspec.structs.replace(DESCRIPTION, observation=DiscreteSpace(9, 0, "int64"))
-    assert made.receive(B, Described(two, other), 1.0) == []
+    assert made.receive(B, Described(two, OF_NINE), 1.0) == []
     assert made.described is not None
     assert made.described.observation_space == spaces.Discrete(3)
     assert made.described.max_episode_steps == 7
@@ -120,6 +127,25 @@ def test_a_worker_from_elsewhere_that_declines_is_refused_and_the_learner_waits_
     assert refusal == Refuse("environment Fake-v0 is not registered")
     made.receive(B, Described(join(made, B), DESCRIPTION), 2.0)
     assert made.described is not None
+
+
+def test_a_description_that_is_not_accepted_ends_the_start_if_the_worker_is_ours() -> None:
+    made = coordinator(accept=of_three)
+    made.receive(A, Described(join(made, A), OF_NINE), 1.0)
+    assert made.described is None
+    assert isinstance(made.failure, UsageError)
+    assert str(made.failure) == "expected Discrete(3), got Discrete(9)"
+    assert not made.membership.take_events()  # the error's line is the only one
+
+
+def test_a_worker_from_elsewhere_whose_description_is_not_accepted_is_refused_and_another_is_used() -> None:
+    made = coordinator(started_here=False, accept=of_three)
+    ((peer, refusal),) = made.receive(A, Described(join(made, A), OF_NINE), 1.0)
+    assert (peer, refusal) == (A, Refuse("expected Discrete(3), got Discrete(9)"))
+    assert made.described is made.failure is None
+    made.receive(B, Described(join(made, B), DESCRIPTION), 2.0)
+    assert made.described is not None
+    assert made.failure is None
 
 
 @pytest.mark.parametrize("started_here", [True, False])
