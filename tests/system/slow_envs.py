@@ -63,7 +63,7 @@ class SometimesSlow(CartPoleEnv):
     calls: Counter[str] = Counter()
 
     def __init__(
-        self, seconds: float = 2.5, construct: int = 9, reset: int = 200, step: int = 20_000, notes: str = ""
+        self, seconds: float = 2.5, construct: int = 9, reset: int = 50, step: int = 10_000, notes: str = ""
     ) -> None:
         """`construct`, `reset`, `step`: every how many such calls of this process are slow."""
         self._seconds, self._notes = seconds, notes
@@ -86,7 +86,7 @@ class SometimesSlow(CartPoleEnv):
     def step(self, action: Any) -> Any:
         """As CartPole's, but now and then slow."""
         self._call("step")
-        return super().step(action)
+        return super().step(action)  # type: ignore[no-untyped-call]
 
 
 class Ends(Countdown):

@@ -40,7 +40,7 @@ FAULT_EVERY_S, HEALED_WITHIN_S = 2.0, (0.5, 4.0)
 EPISODES = 40  # of an evaluation
 MORE_STEPS = 20_000  # env steps of the run's last part, without faults
 SLOW = "tests.system.slow_envs:SometimesSlow-v0"
-SLOW_RESET_EVERY, SLOW_STEP_EVERY = 20, 2_000  # calls of a process, for each minute of the soak: so a soak has some dozens
+SLOW_RESET_EVERY, SLOW_STEP_EVERY = 5, 1_000  # calls of a process, for each minute of the soak: so a soak has some dozens
 SETTINGS: dict[str, object] = {
     "env-kwargs": "",
     "rollout-steps": 32,

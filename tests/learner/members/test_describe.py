@@ -142,7 +142,7 @@ def test_a_worker_from_elsewhere_whose_description_is_not_accepted_is_refused_an
     made = coordinator(started_here=False, accept=of_three)
     ((peer, refusal),) = made.receive(A, Described(join(made, A), OF_NINE), 1.0)
     assert (peer, refusal) == (A, Refuse("expected Discrete(3), got Discrete(9)"))
-    assert made.described is made.failure is None
+    assert (made.described, made.failure) == (None, None)
     made.receive(B, Described(join(made, B), DESCRIPTION), 2.0)
     assert made.described is not None
     assert made.failure is None
