@@ -8,9 +8,10 @@ model = PPO("MlpPolicy", make_vec_env("CartPole-v1", n_envs=8, workers=2))
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+import gymnasium
 import numpy as np
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
@@ -18,6 +19,7 @@ import millrace
 from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.settings import EnvLike
 from protocol.arrays import Array
+from protocol.env_spec import EnvSpec, Scalar
 
 Indices = int | Iterable[int] | None
 
@@ -28,20 +30,39 @@ def make_vec_env(
     seed: int | None = None,
     *,
     monitor: bool = True,
+    wrapper_class: Callable[..., gymnasium.Env[Any, Any]] | None = None,
     env_kwargs: dict[str, Any] | None = None,
+    wrapper_kwargs: dict[str, Any] | None = None,
     **keywords: Any,
 ) -> VecEnv:
     """Make a vector environment, as `stable_baselines3.common.env_util.make_vec_env` does.
 
-    `env_kwargs` go to the environment, `keywords` to `millrace.make_vec`. `monitor` records the return and length of each
-    episode, as SB3's `VecMonitor` does, for `rollout/ep_rew_mean`. Raises the errors of `millrace.make_vec`.
+    Args:
+        env_id: as in `millrace.make_vec`.
+        n_envs: number of env copies; by default 1, or the length of the list.
+        seed: of the first reset: copy n gets `seed + n`.
+        monitor: record the return and length of each episode, for `rollout/ep_rew_mean`: those of the environment without
+            `wrapper_class`, as SB3 does.
+        wrapper_class: called with each env copy, in the workers: a wrapper, or a function that applies several. It is code,
+            so it is sent over TCP only to workers that have a key.
+        env_kwargs: keyword arguments of the environment.
+        wrapper_kwargs: keyword arguments of `wrapper_class`.
+        keywords: those of `millrace.make_vec`.
+
+    Raises the errors of `millrace.make_vec`.
+
+    env = make_vec_env("CartPole-v1", 8, wrapper_class=TimeLimit, wrapper_kwargs={"max_episode_steps": 100}, workers=2)
     """
     from stable_baselines3.common.vec_env import VecMonitor
 
-    env = Sb3VecEnv(millrace.make_vec(env_id, n_envs, autoreset_mode="SameStep", **keywords, **(env_kwargs or {})))
+    envs = env_id
+    if wrapper_class is not None:
+        wrap = _Wrapping(wrapper_class, wrapper_kwargs or {}, monitor)
+        envs = wrap(env_id) if isinstance(env_id, str) or callable(env_id) else [wrap(each) for each in env_id]
+    env = Sb3VecEnv(millrace.make_vec(envs, n_envs, autoreset_mode="SameStep", **keywords, **(env_kwargs or {})))
     if seed is not None:
         env.seed(seed)
-    return VecMonitor(env) if monitor else env
+    return VecMonitor(env) if monitor and wrapper_class is None else env
 
 
 class Sb3VecEnv(VecEnv):
@@ -131,3 +152,35 @@ def _info_of_copy(infos: dict[str, Any], n: int) -> dict[str, Any]:
         if mask is None or mask[n]:
             info[key] = _info_of_copy(values, n) if isinstance(values, dict) else values[n]
     return info
+
+
+class _Wrapping:
+    """Makes factories of wrapped environments, one for each environment."""
+
+    def __init__(
+        self, wrapper_class: Callable[..., gymnasium.Env[Any, Any]], keywords: dict[str, Any], monitor: bool
+    ) -> None:
+        self._wrapper_class, self._keywords, self._monitor = wrapper_class, keywords, monitor
+        self._made: dict[EnvLike, Callable[..., gymnasium.Env[Any, Any]]] = {}
+
+    def __call__(self, env: EnvLike) -> Callable[..., gymnasium.Env[Any, Any]]:
+        """A factory of this environment, wrapped. The same one for the same environment, so that it is sent once."""
+        if env not in self._made:
+            self._made[env] = _wrapped(env, self._wrapper_class, self._keywords, self._monitor)
+        return self._made[env]
+
+
+def _wrapped(
+    env: EnvLike, wrapper_class: Callable[..., gymnasium.Env[Any, Any]], keywords: dict[str, Any], monitor: bool
+) -> Callable[..., gymnasium.Env[Any, Any]]:
+    """A factory that a worker can call without this module, which needs Stable-Baselines3: it is a nested function."""
+
+    def make(render_mode: str | None = None, **kwargs: Scalar) -> gymnasium.Env[Any, Any]:
+        if isinstance(env, str):
+            made = EnvSpec(env, kwargs).make(render_mode)
+        else:
+            made = env(**kwargs, **({} if render_mode is None else {"render_mode": render_mode}))
+        return wrapper_class(gymnasium.wrappers.RecordEpisodeStatistics(made) if monitor else made, **keywords)
+
+    make.__name__ = env if isinstance(env, str) else getattr(env, "__name__", type(env).__name__)
+    return make

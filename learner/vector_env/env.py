@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
-from gymnasium.vector import VectorEnv
+from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from learner.vector_env.arguments import action_arrays, seed_list, take_reset_mask
@@ -62,6 +62,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         step = description.step
         self.num_envs = N = len(step.copies)
         self.metadata = description.metadata
+        self.autoreset_mode = AutoresetMode(step.autoreset)  # as SyncVectorEnv has it; TorchRL reads it
         self.render_mode = description.render_mode
         self.spec = description.spec
         self.single_observation_space = description.observation_space
@@ -69,6 +70,12 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self.observation_space = batch_space(self.single_observation_space, N)
         self.action_space = batch_space(self.single_action_space, N)
         self.timeout_s, self.on_worker_loss, self.copy = timeout_s, on_worker_loss, copy
+        self._described = {
+            "spec": self.spec,
+            "observation_space": self.single_observation_space,
+            "action_space": self.single_action_space,
+        }
+        """attributes of every copy that are no plain data"""
         self._hub, self._memory = hub, memory
         self._autoreset, self._action_leaves = step.autoreset, step.action
         self._read_actions = make_flatten(self.single_action_space)
@@ -252,18 +259,21 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
     # ---------------------------------------------------------------- calls
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Call a method of every copy, or get an attribute. Arguments and results must be plain data."""
+        """Call a method of every copy, or get an attribute. Arguments and results must be plain data.
+
+        `spec`, `observation_space` and `action_space` are as a worker described them, for such objects cannot travel.
+        """
         return self.call_some(range(self.num_envs), name, *args, **kwargs)
 
     def call_some(self, copies: Sequence[int], name: str, /, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """As `call`, for some copies. The results are in ascending order of the copies."""
+        if name in self._described:
+            return (self._described[name],) * len(copies)
         self._check_idle("call")
         return self._results_of_call(name, call_orders(self._layout, copies, name, args, kwargs))
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
-        """An attribute of every copy. `spec` is as a worker described it, for an object of its own cannot travel."""
-        if name == "spec" and self.spec is not None:
-            return (self.spec,) * self.num_envs
+        """An attribute of every copy; see `call`."""
         return self.call(name)
 
     def set_attr(self, name: str, values: Any) -> None:

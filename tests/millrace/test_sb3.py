@@ -13,6 +13,7 @@ from tests.support.bit_equality import bit_equal
 
 sb3 = pytest.importorskip("stable_baselines3")
 
+from stable_baselines3.common import env_util  # noqa: E402
 from stable_baselines3.common.vec_env import DummyVecEnv  # noqa: E402
 
 from millrace.sb3 import Sb3VecEnv, make_vec_env  # noqa: E402
@@ -62,4 +63,69 @@ def test_ppo_learns_on_it() -> None:
     model.learn(256)
     assert model.num_timesteps == 256
     assert model.ep_info_buffer[0]["r"] > 0
+    env.close()
+
+
+class TenTimes(gymnasium.RewardWrapper[Any, Any]):
+    """Rewards times a factor."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any], factor: float = 10.0) -> None:
+        super().__init__(env)
+        self.factor = factor
+
+    def reward(self, reward: Any) -> float:
+        return self.factor * float(reward)
+
+
+def test_wrapper_class_wraps_each_copy_and_episodes_are_those_of_the_environment() -> None:
+    """As Stable-Baselines3's own function: rewards, observations, and the return and length of each episode."""
+    keywords: dict[str, Any] = {"wrapper_class": TenTimes, "wrapper_kwargs": {"factor": 3.0}}
+    ours = make_vec_env("CartPole-v1", 2, seed=1, workers=1, env_kwargs={"max_episode_steps": 12}, **keywords)
+    theirs = env_util.make_vec_env("CartPole-v1", 2, seed=1, env_kwargs={"max_episode_steps": 12}, **keywords)
+    try:
+        assert ours.get_attr("factor") == [3.0, 3.0]
+        assert bit_equal(ours.reset(), theirs.reset())
+        episodes = 0
+        for t in range(60):
+            action = np.random.default_rng(t).integers(0, 2, 2)
+            (*mine, infos), (*wanted, their_infos) = ours.step(action), theirs.step(action)
+            assert bit_equal(mine, wanted)
+            for info, other in zip(infos, their_infos, strict=True):
+                assert ("episode" in info) == ("episode" in other)
+                if "episode" in info:
+                    episodes += 1
+                    assert [info["episode"][key] for key in "rl"] == [other["episode"][key] for key in "rl"]
+        assert episodes > 6
+    finally:
+        ours.close(), theirs.close()
+
+
+def test_a_worker_that_wraps_needs_no_stable_baselines3() -> None:
+    def loaded(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
+        import sys
+
+        env.unwrapped.loaded = [name for name in ("stable_baselines3", "torch") if name in sys.modules]  # type: ignore[attr-defined]
+        return env
+
+    env = make_vec_env("CartPole-v1", 1, wrapper_class=loaded, workers=1)
+    assert env.get_attr("loaded") == [[]]
+    env.close()
+
+
+def test_a_list_of_environments_and_callables_are_wrapped() -> None:
+    def short() -> gymnasium.Env[Any, Any]:
+        return gymnasium.make("CartPole-v1", max_episode_steps=7)
+
+    env = make_vec_env(["CartPole-v1", short], wrapper_class=TenTimes, transport="inproc", monitor=False)
+    env.seed(1), env.reset()
+    ends = [env.step(np.array([t % 2] * 2)) for t in range(7)]
+    assert ends[0][1].tolist() == [10.0, 10.0]
+    assert ends[6][2].tolist() == [False, True]
+    env.close()
+
+
+def test_the_spec_and_the_spaces_are_those_that_a_worker_described() -> None:
+    env = make_vec_env("CartPole-v1", 2, monitor=False, workers=1)
+    assert [spec.id for spec in env.get_attr("spec")] == ["CartPole-v1"] * 2
+    assert env.get_attr("action_space", indices=[1]) == [env.action_space]
     env.close()

@@ -91,6 +91,11 @@ def test_its_attributes_equal_those_of_sync_vector_env() -> None:
         for name in ("num_envs", "observation_space", "action_space", "single_observation_space", "single_action_space"):
             assert getattr(ours, name) == getattr(theirs, name)
         assert ours.metadata == theirs.metadata
+        assert ours.autoreset_mode is theirs.autoreset_mode
+        assert ours.get_attr("spec") == theirs.get_attr("spec")
+        for name in ("observation_space", "action_space"):
+            assert ours.get_attr(name) == theirs.get_attr(name)
+            assert ours.call(name) == theirs.call(name)
         assert ours.render_mode is None
         assert repr(ours) == "ZmqVectorEnv(CartPole-v1, num_envs=3)"
         assert ours.unwrapped is ours
