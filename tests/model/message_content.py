@@ -31,7 +31,7 @@ from protocol.messages import (
     Welcome,
 )
 from protocol.rollout import Episode
-from protocol.specs import RunSpec
+from protocol.specs import RunSpec, StepSpec
 from tests.model.conversation import Content
 from tests.model.names import Kind, Name, name
 from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollout, fake_rows
@@ -120,7 +120,7 @@ def content_of(message: ToLearner | ToWorker, worker: int) -> Content:
             raise AssertionError(f"the model has no {type(message).__name__}")
 
 
-def message_of(content: Content, worker: int, run: RunSpec) -> Any:
+def message_of(content: Content, worker: int, run: RunSpec | StepSpec) -> Any:
     """The message of this content, from or to this worker."""
     match content:
         case "Hello", nonce, attempt:

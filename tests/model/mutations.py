@@ -114,7 +114,7 @@ MUTATIONS = {
 }
 
 
-class _Mutator(MetaPathFinder):
+class Mutator(MetaPathFinder):
     """Imports one module with a mistake."""
 
     def __init__(self, mutation: Mutation) -> None:
@@ -173,7 +173,7 @@ def _fuzz() -> str:
 
 
 if __name__ == "__main__":
-    sys.meta_path.insert(0, _Mutator(MUTATIONS[sys.argv[1]]))
+    sys.meta_path.insert(0, Mutator(MUTATIONS[sys.argv[1]]))
     found = _fuzz() if "--fuzz" in sys.argv else _explore()
     sys.stdout.write(found)
     sys.exit(1 if found else 0)

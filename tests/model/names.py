@@ -61,7 +61,7 @@ class Name(int):
 
     def __repr__(self) -> str:
         scope = f"{self.scope}:" if self.kind in SCOPED or self.kind is Kind.INCARNATION else ""
-        return f"{self.kind.name.lower()} {scope}{self.value}"
+        return f"{self.kind.name.lower()} {scope}{self & MASK}"
 
 
 def name(kind: Kind, value: int, scope: int = 0) -> Name:

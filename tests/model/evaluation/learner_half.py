@@ -94,11 +94,11 @@ class EvaluatingLearner(Learner):
 
 
 def saved(learner: EvaluatingLearner, now: float) -> Content:
-    """The training run, and the evaluation: its first ticket, and more if it is pending."""
+    """The training run, and the evaluation: its first ticket, their number, and more if it is pending."""
     content = learner_part.saved(learner, now)
     tickets, members = learner.coordinator.evaluation, learner.coordinator.members
     if not tickets.pending:
-        return content, (tickets._first + len(tickets._seeds) - FIRST_TICKET,)
+        return content, (tickets._first - FIRST_TICKET, len(tickets._seeds))
     held = tuple(
         (
             name(Kind.WORKER, worker_of(member.peer)),
@@ -116,17 +116,17 @@ def saved(learner: EvaluatingLearner, now: float) -> Content:
     )
     first = tickets._first - FIRST_TICKET
     undealt = tuple(sorted(tickets._undealt))
-    return content, (first, undealt, held, played, rows, ticket(learner.barrier), tuple(learner.rows))
+    return content, (first, len(tickets._seeds), undealt, held, played, rows, ticket(learner.barrier), tuple(learner.rows))
 
 
 def is_pending(of_evaluation: Content) -> bool:
     """Whether an evaluation is pending in this part of a learner's content."""
-    return len(of_evaluation) > 1
+    return len(of_evaluation) > 2
 
 
 def loaded(content: Content, settings: Evaluating) -> EvaluatingLearner:
     """A learner at the time 0 with this content."""
-    both, (first, *of_evaluation) = content
+    both, (first, number, *of_evaluation) = content
     training = learner_part.loaded(both, settings)
     learner = EvaluatingLearner(settings, training.coordinator)
     vars(learner).update(vars(training))
@@ -134,6 +134,7 @@ def loaded(content: Content, settings: Evaluating) -> EvaluatingLearner:
     tickets: EvaluationTickets = learner.coordinator.evaluation
     tickets._first = FIRST_TICKET + first
     if not of_evaluation:
+        tickets._seeds = [()] * number
         return learner
     undealt, held, played, rows, barrier, of_learner = of_evaluation
     tickets.begin(settings.plan, learner.coordinator.version, learner._take_rows if settings.rows else None)

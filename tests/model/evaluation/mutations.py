@@ -1,0 +1,81 @@
+"""Mistakes made on purpose in the program's evaluations, one at a time, to see whether the checker finds them.
+
+`python -m tests.model.evaluation.mutations NAME` explores small runs with this mistake. Exit code 1: a rule is
+broken.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from tests.model.mutations import COORDINATOR, SESSION, Mutation, Mutator
+
+TICKETS = "learner.rollouts.evaluation_tickets"
+HELD = "workers.evaluate.held_evaluations"
+
+OF_THE_LEARNER = {
+    "an evaluation of the version before": Mutation(TICKETS, "version=self._version,", "version=max(0, self._version - 1),"),
+    "a ticket that was put back is lost": Mutation(TICKETS, "heapq.heappush(self._undealt, index)", "pass"),
+    "tickets for rollouts are dealt before an evaluation": Mutation(
+        COORDINATOR, "self._held_back = not deal", "self._held_back = False"
+    ),
+    "a lost order to evaluate is not sent again": Mutation(
+        COORDINATOR, "out += self.evaluation.send_again(member, heartbeat)", "pass"
+    ),
+    "the evaluation's tickets of a lost worker are kept": Mutation(
+        COORDINATOR, "self.evaluation.removed(member.peer)", "pass"
+    ),
+    "two evaluations number their tickets alike": Mutation(TICKETS, "self._first += len(self._seeds)", "pass"),
+    "a ticket of an evaluation is dealt twice": Mutation(TICKETS, "heapq.heappop(self._undealt)", "self._undealt[0]"),
+    "an answer leaves its ticket with the worker": Mutation(TICKETS, "del self._held[member.peer][index]", "pass"),
+    "rows of a lost worker are kept": Mutation(TICKETS, "self._rows.pop(index, None)\n        heapq", "heapq"),
+    "an answer counts without its rows": Mutation(TICKETS, "!= [one.length for one in answer.episodes]:", "== []:"),
+    "an evaluation that was played again is forgotten": Mutation(
+        TICKETS, "self._put_back(index)  # a message with rows was lost", "pass  # a message with rows was lost"
+    ),
+}
+OF_THE_WORKER = {
+    "an answer to an order to evaluate is not sent again": Mutation(
+        HELD, "return self._answers[order.ticket]", "return None"
+    ),
+    "an order to evaluate is executed when it is repeated": Mutation(HELD, "if order.ticket in self._answers:", "if False:"),
+    "an evaluation under any weights": Mutation(HELD, "if order.version == version]", "if True]"),
+    "an executed order to evaluate stays": Mutation(
+        HELD, "order = self._orders.pop(answer.ticket, None)", "order = self._orders.get(answer.ticket)"
+    ),
+    "an answer is kept although rows belong to it": Mutation(
+        HELD, "if not (order.send_rows or order.send_frames):", "if True:"
+    ),
+    "a worker that evaluates takes other work": Mutation(SESSION, "self._current.in_progress = (order.ticket,)", "pass"),
+    "an evaluation of an earlier session goes on": Mutation(
+        SESSION, "return self.state is not State.READY or session != self.session", "return False"
+    ),
+}
+MUTATIONS = {**OF_THE_LEARNER, **OF_THE_WORKER}
+
+
+def explored() -> str:
+    """Explore small runs, the smallest first. Returns what is broken; empty: nothing was found."""
+    from tests.model.evaluation.evaluating import Evaluating
+    from tests.model.explore import RuleBroken, explore
+
+    for run in (
+        Evaluating(workers=1, lanes=1, updates=1, faults=1),
+        Evaluating(workers=1, lanes=1, updates=1, faults=1, episodes=1, rows=True),
+        Evaluating(workers=1, lanes=1, updates=1, faults=1, evaluated=(0, 1)),
+        Evaluating(workers=1, lanes=1, updates=2, faults=1, max_lag=1, evaluated=(1,)),
+        Evaluating(workers=1, lanes=1, updates=1, faults=2, episodes=1, rows=True),
+        Evaluating(workers=2, lanes=1, updates=1, faults=1),
+    ):
+        try:
+            explore(run)
+        except RuleBroken as broken:
+            return f"{run}\n{broken}"
+    return ""
+
+
+if __name__ == "__main__":
+    sys.meta_path.insert(0, Mutator(MUTATIONS[sys.argv[1]]))
+    found = explored()
+    sys.stdout.write(found)
+    sys.exit(1 if found else 0)

@@ -1,0 +1,186 @@
+"""The learner of a vector environment: a real `OrderCoordinator` and the program that calls, to tuples and back.
+
+Rule: nothing is lost on the way, except for what only a person reads. After every event, the rules that hold in every state
+are checked: a lane has one owner, an order is with the owner of its lane, and a lane has one order at a time.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from learner.members.membership import Member, Outgoing
+from learner.vector_env.order_coordinator import OrderCoordinator
+from protocol.messages import ToLearner, WorkerExit
+from tests.model.conversation import Action, Content
+from tests.model.message_content import hello, incarnation, peer_of, session, ticket, worker_of
+from tests.model.names import Kind, name
+from tests.model.settings import TIMEOUT_S
+from tests.model.vector_env.caller import Caller
+from tests.model.vector_env.order_content import content_of, make_order, message_of, order_content, order_of
+
+if TYPE_CHECKING:
+    from tests.model.vector_env.stepping import Stepping
+
+SAVED = {"membership", "lanes", "orders", "answers", "lost", "_tickets"}
+"""What of `OrderCoordinator` is saved."""
+NOT_SAVED = {"spec", "worker_timeout_s", "shared_orders", "infos", "failures", "_placement"}
+"""What is not: constants, steps through shared memory, environments that raise; and placement, which remembers nothing
+in the methods that are used."""
+
+
+class Learner:
+    """One state of the learner, which an event changes."""
+
+    def __init__(self, settings: Stepping, first_session: int, now: float) -> None:
+        self.settings = settings
+        self.coordinator = OrderCoordinator(settings.run, first_session, TIMEOUT_S)
+        self.caller = Caller(self.coordinator, settings, now)
+
+    def event(self, event: Action, message: Content | None) -> tuple[Learner, list[Outgoing]]:
+        """The learner after this event, and what it sends."""
+        coordinator, caller = self.coordinator, self.caller
+        sent = caller.server.sent
+        match event:
+            case "receive", worker, _:
+                assert message is not None
+                heard: ToLearner = message_of(message, worker, self.settings.run)
+                sent += coordinator.receive(peer_of(worker), heard, caller.now)
+            case ("publish",):
+                caller.go_on()
+            case ("time",):
+                caller.pass_time()
+            case "revoke", worker:
+                sent += coordinator.revoke(peer_of(worker), "its key was revoked")
+            case "ended", worker, nonce:
+                sent += coordinator.process_ended(WorkerExit(f"w{worker}", nonce, "killed", True))
+            case "restart", _:
+                return Learner(self.settings, coordinator.membership._next_session, caller.now), []
+        caller.turn()
+        return self, sent
+
+    def check(self) -> None:
+        """The rules that hold in every state."""
+        coordinator = self.coordinator
+        members = coordinator.members
+        for lane in coordinator.lanes:
+            owners = [member.peer for member in members.values() if lane.number in member.lanes]
+            assert owners == ([] if lane.owner is None else [lane.owner]), (
+                "a lane has two owners, or its owner does not know"
+            )
+        lanes = [order.lane for order in coordinator.orders.values()]
+        assert len(lanes) == len(set(lanes)), "a lane has two orders at a time"
+        for number, order in coordinator.orders.items():
+            member = coordinator.owner(order.lane)
+            assert member is not None, "an order is with nobody"
+            assert number in member.tickets, "an order is not with the owner of its lane"
+            assert order.session == member.session, "an order of an earlier session"
+            assert order.incarnation == coordinator.lanes[order.lane].incarnation, "an order of an earlier incarnation"
+        assert sum(len(member.tickets) for member in members.values()) == len(lanes), (
+            "a worker holds an order that is not out"
+        )
+        assert not set(lanes) & set(coordinator.answers), "a lane has an answer and an order"
+
+
+# -------------------------------------------------------------------- to tuples and back
+
+
+def saved(learner: Learner) -> Content:
+    """The members, the lanes, the orders, and the caller."""
+    learner.check()
+    coordinator, caller = learner.coordinator, learner.caller
+    coordinator.membership.events.clear()
+    membership, now = coordinator.membership, caller.now
+    members = sorted(coordinator.members.values(), key=lambda member: member.join_number)
+    return (
+        tuple(_member(member, now) for member in members),
+        tuple(
+            (
+                incarnation(lane.number, lane.incarnation),
+                None if lane.owner is None else name(Kind.WORKER, worker_of(lane.owner)),
+                lane.started,
+            )
+            for lane in coordinator.lanes
+        ),
+        tuple(
+            (session(order.session), order_content(order), caller.ages.get(number, 0))
+            for number, order in sorted(coordinator.orders.items())
+        ),
+        tuple(content_of(answer, 0) for _, answer in sorted(coordinator.answers.items())),
+        tuple(sorted(coordinator.lost)),
+        ticket(coordinator._tickets),
+        session(membership._next_session),
+        max(0.0, membership._none_silent_before_s - now),
+        tuple(sorted(name(Kind.NONCE, nonce, worker_of(peer)) for peer, (nonce, _) in membership._refused.items())),
+        _caller(caller),
+    )
+
+
+def _member(member: Member, now: float) -> Content:
+    worker = worker_of(member.peer)
+    return (
+        name(Kind.WORKER, worker),
+        name(Kind.NONCE, member.hello.process_nonce, worker),
+        name(Kind.ATTEMPT, member.hello.attempt, worker),
+        session(member.session),
+        max(member.heard_s - now, -TIMEOUT_S - 1.0),
+        tuple(sorted(member.lanes)),
+        tuple((ticket(each), name(Kind.REPLIES, at, member.session)) for each, at in sorted(member.tickets.items())),
+        name(Kind.REPLIES, member.replies, member.session),
+    )
+
+
+def _caller(caller: Caller) -> Content:
+    waits = caller.deadline_s is not None
+    return (
+        caller.at,
+        None if caller.deadline_s is None else max(caller.deadline_s - caller.now, -1.0),
+        caller.attempt if waits else 0,
+        tuple(sorted(caller.unreset)) if waits else (),
+        tuple(sorted(caller.ordered.items())) if waits else (),
+        tuple(sorted(caller.hub._waiting_orders)) if waits else (),
+        tuple((lane, incarnation(lane, life), state) for lane, (life, state) in sorted(caller.copies.items())),
+        tuple(sorted(caller.lost_lanes.unreported)),
+        tuple(sorted(caller.lost_lanes.awaiting_reset)),
+        tuple(sorted(caller.told)),
+    )
+
+
+def loaded(content: Content, settings: Stepping, now: float) -> Learner:
+    """A learner at this time, with the content that it had at the time 0."""
+    members, lanes, orders, answers, lost, tickets, next_session, none_silent, refused, of_caller = content
+    learner = Learner(settings, next_session.value, now)
+    coordinator, caller = learner.coordinator, learner.caller
+    membership = coordinator.membership
+    for join_number, fields in enumerate(members):
+        worker, nonce, attempt, number, heard, of_lanes, held, replies = fields
+        said = hello(worker.value, nonce.value, attempt.value)
+        member = Member(peer_of(worker.value), said, number.value, join_number, heard, lanes=set(of_lanes))
+        member.tickets, member.replies = {each.value: at.value for each, at in held}, replies.value
+        membership.members[member.peer] = member
+        membership._of_process[said.worker, said.process_nonce] = member
+    membership._joins, membership._none_silent_before_s = len(members), none_silent
+    membership._refused = {peer_of(nonce.scope): (nonce.value, "refused") for nonce in refused}
+    for lane, (life, owner, started) in zip(coordinator.lanes, lanes, strict=True):
+        lane.incarnation, lane.started = life.value, started
+        lane.owner = None if owner is None else peer_of(owner.value)
+    for number, of_order, age in orders:
+        order = order_of(number.value, of_order)
+        caller.ages[order.ticket] = age
+        coordinator.orders[order.ticket] = order
+    for each in answers:
+        answer = message_of(each, 0, settings.run)
+        coordinator.answers[answer.lane] = answer
+    coordinator.lost = dict.fromkeys(lost, "lost")
+    coordinator._tickets = tickets.value
+    _load_caller(caller, of_caller)
+    return learner
+
+
+def _load_caller(caller: Caller, content: Content) -> None:
+    at, deadline, attempt, unreset, ordered, waiting, copies, unreported, awaiting, told = content
+    caller.at, caller.deadline_s, caller.attempt = at, deadline, attempt
+    caller.unreset, caller.ordered, caller.told = set(unreset), dict(ordered), set(told)
+    caller.hub._waiting_orders = {lane: make_order(*caller.ordered[lane]) for lane in waiting}
+    caller.copies = {lane: (life.value, state) for lane, life, state in copies}
+    caller.lost_lanes.add(dict.fromkeys(unreported, "lost"))
+    caller.lost_lanes.expect_reset(awaiting)

@@ -1,0 +1,75 @@
+"""Mistakes made on purpose in the vector environment's conversation, one at a time, to see whether the checker finds them.
+
+`python -m tests.model.vector_env.mutations NAME` explores small runs with this mistake. Exit code 1: a rule is broken.
+
+Not in the list, because runs of this size do not show it: a lost lane that keeps its incarnation. The lane must come back to
+a worker that has not heard that it was moved away, which takes three faults.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from tests.model.mutations import SESSION, Mutation, Mutator
+
+COORDINATOR = "learner.vector_env.order_coordinator"
+HUB = "learner.vector_env.step_hub"
+LOST = "learner.vector_env.lost_lanes"
+HELD = "workers.step.held_orders"
+
+OF_THE_LEARNER = {
+    "a lost order is not sent again": Mutation(COORDINATOR, "out.append((member.peer, self.orders[ticket]))", "pass"),
+    "heartbeats of a vector environment are answered alike": Mutation(
+        COORDINATOR, "member.replies += 1", "member.replies += 0"
+    ),
+    "a lost lane is not reported": Mutation(COORDINATOR, "if self.lanes[lane].started:", "if False:"),
+    "an order does not start its lane": Mutation(COORDINATOR, "record.started = True", "pass"),
+    "answers to the last orders are kept": Mutation(COORDINATOR, "self.answers.clear()", "pass"),
+    "the orders of a lost worker are kept": Mutation(
+        COORDINATOR, "            del self.orders[ticket]\n", "            pass\n"
+    ),
+    "an answer leaves its order open": Mutation(
+        COORDINATOR, "del self.orders[answer.ticket], member.tickets[answer.ticket]", "pass"
+    ),
+    "an order that was sent waits on": Mutation(HUB, "del self._waiting_orders[lane]", "pass"),
+    "a lane that was reset is reset again": Mutation(LOST, "self._awaiting_reset -= lanes", "pass"),
+    "a lane whose loss was reported is not reset": Mutation(LOST, "self.expect_reset(reported)", "pass"),
+}
+OF_THE_WORKER = {
+    "a repeated order is executed again": Mutation(HELD, "order.ticket > lane.newest:", "order.ticket >= lane.newest:"),
+    "an answer is not sent again": Mutation(HELD, "return lane.answer if lane.answer is not None and", "return None if"),
+    "an executed order stays": Mutation(HELD, "lane.order, lane.answer = None, answer", "lane.answer = answer"),
+    "an answer is not kept": Mutation(HELD, "lane.order, lane.answer = None, answer", "lane.order = None"),
+    "a late reply to a heartbeat counts": Mutation(
+        SESSION, "if number > self._current.replies:", "if number >= self._current.replies:"
+    ),
+    "replies to heartbeats are not counted": Mutation(SESSION, "self._current.replies = number", "pass"),
+    "an answered order stays in progress": Mutation(
+        SESSION, "self._current.in_progress = ()\n        effects: list", "effects: list"
+    ),
+}
+MUTATIONS = {**OF_THE_LEARNER, **OF_THE_WORKER}
+
+
+def explored() -> str:
+    """Explore small runs, the smallest first. Returns what is broken; empty: nothing was found."""
+    from tests.model.explore import RuleBroken, explore
+    from tests.model.vector_env.stepping import Stepping
+
+    for run in (
+        Stepping(workers=1, lanes=1, calls=("reset", "step", "step", "step"), faults=1),
+        Stepping(workers=1, lanes=2, calls=("reset", "step"), faults=1),
+        Stepping(workers=2, lanes=1, calls=("reset", "step", "step"), faults=1),
+    ):
+        try:
+            explore(run)
+        except RuleBroken as broken:
+            return f"{run}\n{broken}"
+    return ""
+
+
+if __name__ == "__main__":
+    sys.meta_path.insert(0, Mutator(MUTATIONS[sys.argv[1]]))
+    found = explored()
+    sys.stdout.write(found)
+    sys.exit(1 if found else 0)

@@ -1,0 +1,80 @@
+"""The conversation of a vector environment: orders and answers, between an `OrderCoordinator` and `Session`s.
+
+Rule: the program makes its calls one after the other. A call that raises `NoWorkers`, and a reset that raises `WorkerLost`,
+is made again. The target is reached when all calls have returned. After a restart of the learner the program starts anew.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from protocol.specs import StepSpec
+from tests.model.conversation import Action, Content, Facts
+from tests.model.message_content import worker_of
+from tests.model.settings import TICK_S, TIMEOUT_S
+from tests.model.training import now_at
+from tests.model.vector_env import learner_half, worker_half
+from tests.model.vector_env.learner_half import Learner
+from tests.model.vector_env.order_content import content_of, step_spec
+from tests.model.vector_env.worker_half import Worker
+from workers.states import State as SessionState
+
+
+@dataclass(frozen=True)
+class Stepping:
+    """A program that uses a vector environment."""
+
+    workers: int
+    lanes: int
+    calls: tuple[str, ...]
+    """each "reset", "step" or "call" """
+    faults: int
+
+    @property
+    def run(self) -> StepSpec:
+        return step_spec(self.lanes, TICK_S, TIMEOUT_S)
+
+    @property
+    def call_timeout_s(self) -> float:
+        """How long a call waits, at most."""
+        return 3.0 + 3.0 * self.faults
+
+    @property
+    def most_ticks(self) -> int:
+        """In so many ticks a worker that is heard must have answered: a fault costs at most three."""
+        return 2 + 3 * self.faults
+
+    def start(self) -> tuple[Content, list[Content]]:
+        workers = [worker_half.saved(Worker(number, 0), 0.0) for number in range(self.workers)]
+        return learner_half.saved(Learner(self, 0, 0.0)), workers
+
+    def learner(self, content: Content, event: Action, message: Content | None) -> tuple[Content, list[tuple[int, Content]]]:
+        learner, out = learner_half.loaded(content, self, now_at(event)).event(event, message)
+        return learner_half.saved(learner), [(worker_of(to), content_of(told, worker_of(to))) for to, told in out]
+
+    def worker(self, content: Content, number: int, event: Action, message: Content | None) -> tuple[Content, list[Content]]:
+        worker, now = worker_half.loaded(content, number, self), now_at(event)
+        sent = [content_of(said, number) for said in worker.event(event, message, self, now)]
+        return worker_half.saved(worker, now), sent
+
+    def facts(self, content: Content) -> Facts:
+        if isinstance(content[0], str):
+            return Facts()
+        if len(content) == 4:
+            nonce, (frozen, shut_out, cut_off), fields, work = content
+            return Facts(
+                nonce=nonce.value,
+                alive=fields is not None,
+                frozen=frozen,
+                shut_out=shut_out,
+                cut_off=cut_off,
+                working=work is not None,
+                rejoins=fields is not None and fields[0] is SessionState.JOINING and fields[1] is not None,
+            )
+        members, *_, caller = content
+        reached = caller[0] == len(self.calls)
+        going_on = caller[1] is None and not reached
+        return Facts(reached=reached, updating=going_on, checkpoints=1, members=tuple(each[0].value for each in members))
+
+    def __str__(self) -> str:
+        return f"{self.workers} workers, {self.lanes} lanes, {', '.join(self.calls)}, {self.faults} faults"
