@@ -8,21 +8,21 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # before numpy; --torch-threads sets the learner's
 
 import logging
-import shlex
 import sys
 import time
 
 from learner.config.command_line import read_config
+from learner.last_line import last_line
 from learner.run_folder.json_log import JsonLines
 from learner.run_folder.progress import Progress
-from learner.run_folder.run_folder import Interrupted
 from learner.standard_streams import open_closed, unfailing
-from protocol.bounds import escaped, indented
+from protocol.bounds import indented
 from protocol.errors import UserFacingError
 
 log = logging.getLogger("millrace.learner")
 
 LINE_EVERY_S = 10.0
+RESUME = "python -m learner"
 
 
 def main(argv: list[str]) -> int:
@@ -47,15 +47,16 @@ def _serve(argv: list[str]) -> int:
 
     try:
         config, resume = read_config("learner", argv)
+        from learner.resumption import unless_finished
         from learner.run import serve  # torch: not before the flags are known to be right
 
-        log.info("run folder: %s", serve(config, resume, watch))
+        folder = unless_finished(config, resume, lambda checked: serve(config, checked, watch))
+        log.info("run folder: %s", folder)
     except UserFacingError as error:
-        line = "; ".join([f"learner: {error}", *getattr(error, "__notes__", ())])
-        sys.stderr.write("\n".join(filter(None, [escaped(line), indented(error.detail)])) + "\n")
+        sys.stderr.write("\n".join(filter(None, [last_line("learner", error, RESUME), indented(error.detail)])) + "\n")
         return error.exit_code
-    except Interrupted as interrupt:
-        sys.stderr.write(f"learner: interrupted; go on with: python -m learner --resume {shlex.quote(str(interrupt.run))}\n")
+    except KeyboardInterrupt as interrupt:
+        sys.stderr.write(last_line("learner", interrupt, RESUME) + "\n")
         return 130
     return 0
 

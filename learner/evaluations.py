@@ -16,6 +16,7 @@ from learner.run_folder.results import Best, Evaluation
 from learner.run_folder.run_folder import RunFolder
 from learner.run_state import RunState
 from learner.service import RolloutService
+from protocol.arrays import Floats
 from protocol.errors import RunError, UsageError
 from protocol.specs import RunSpec
 
@@ -38,20 +39,25 @@ class Evaluations:
         watch: Callable[[], None],
     ) -> None:
         """`state`: where the run stands. `watch` is called several times a second during an evaluation."""
-        self.newest: Evaluation | None = None
-        """The newest evaluation since this learner started."""
+        self.newest = state.newest_evaluation
+        """The newest evaluation."""
+        self.version = state.evaluated_version
+        """The version that `newest` belongs to."""
         self.best = state.best
         """Mean return and env steps of the best evaluation during training."""
+        self.best_policy: tuple[Floats, Floats] | None = state.best_policy
+        """Parameters and buffers of the best policy."""
         self.note = ""
         """The newest evaluation as one line of text for the user."""
         self.doing = ""
         """How far the evaluation in progress is, as text for the user; empty if there is none."""
         self._settings, self._folder, self._spec = settings, folder, spec
         self._algorithm, self._service, self._watch = algorithm, service, watch
-        self._version = -1  # of the weights that `newest` evaluated
         due_at = state.env_steps + settings.every_env_steps
         self.next_at = min(state.next_evaluation or due_at, due_at)
         """Env steps at which the next evaluation is due."""
+        if self.best_policy is not None:
+            self._write_best(*self.best_policy)  # the folder may have that of a later version, which was lost
 
     def is_due(self, env_steps: int) -> bool:
         """Whether an evaluation is due after so many env steps."""
@@ -71,25 +77,27 @@ class Evaluations:
             self._keep_if_best(found, env_steps)
         if self.best is None:
             return None
-        try:
-            _, parameters, buffers = self._folder.read_policy("best")
-        except UsageError as error:  # the disk was full when it was written
-            log.warning("%s", error)
-            return None
+        if self.best_policy is None:
+            try:
+                _, parameters, buffers = self._folder.read_policy("best")
+            except UsageError as error:
+                log.warning("%s", error)
+                return None
+            self.best_policy = parameters, buffers
         chosen_by, at_env_steps = self.best
-        self._service.publish(version + 1, parameters, buffers, deal=False)  # training is over: no update has this number
+        self._service.publish(version + 1, *self.best_policy, deal=False)  # training is over: no update has this number
         confirmed = self._evaluate("the best policy", CONFIRMATION_SEED)
         return Best(env_steps=int(at_env_steps), chosen_by=chosen_by, evaluation=confirmed)
 
     def of_version(self, version: int) -> Evaluation | None:
         """The evaluation of this version, if there is one."""
-        return self.newest if self._version == version else None
+        return self.newest if self.version == version else None
 
     def _evaluate_version(self, version: int, env_steps: int) -> Evaluation:
         """Evaluate the newest policy, which is this version; the same version is not evaluated twice."""
-        if self.newest is None or self._version != version:
+        if self.newest is None or self.version != version or self.newest.episodes != self._settings.episodes:
             self.newest = self._evaluate("", EVALUATION_SEED)
-            self._version = version
+            self.version = version
             self.note = f"{env_steps:,} env steps: greedy {self.newest}"
         return self.newest
 
@@ -111,8 +119,12 @@ class Evaluations:
         """Keep the evaluation if it is the best. A tie keeps the earlier one, which needed fewer steps."""
         if self.best is None or found.return_mean > self.best[0]:
             self.best = [found.return_mean, env_steps]
-            weights = self._algorithm.weights()
-            warn_on_error(lambda: self._folder.write_policy(self._spec.policy, self._spec.env, *weights, which="best"))
+            self.best_policy = self._algorithm.weights()
+            self._write_best(*self.best_policy)
+
+    def _write_best(self, parameters: Floats, buffers: Floats) -> None:
+        policy, env = self._spec.policy, self._spec.env
+        warn_on_error(lambda: self._folder.write_policy(policy, env, parameters, buffers, which="best"))
 
 
 def warn_on_error(write: Callable[[], object]) -> None:

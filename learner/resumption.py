@@ -1,12 +1,14 @@
 """What is checked before a run is resumed: that the settings and the environment are still those of its weights and state.
 
-Rule: all of this is checked before anything is written into the run folder, so a refused resume changes nothing.
+Rule: all of this is checked before anything is written into the run folder, so a refused resume changes nothing. A launcher
+gets a `Resumption`, which only `unless_finished` makes, so no launcher can skip the check.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from learner.config.config import Config
 from learner.config.hyperparameters import DQNConfig
@@ -16,6 +18,26 @@ from learner.env_spaces import EnvSpaces
 from learner.run_folder.run_folder import RunFolder
 from protocol.bounds import one_line
 from protocol.errors import UsageError
+
+
+class Resumption(NamedTuple):
+    """A run that can be resumed with the given settings, and has something left to do."""
+
+    run: Path
+    differences: tuple[str, ...]
+    """Lines about what will be different."""
+
+
+def unless_finished(config: Config, resume: Path | None, train: Callable[[Resumption | None], Path]) -> Path:
+    """Check the run to `resume`, if there is one, then train. Returns the run folder.
+
+    A run that is finished returns at once: then no worker is needed. Raises `UsageError` if there is no such run, or if it
+    cannot be resumed with these settings, and what `train` raises.
+    """
+    if resume is None:
+        return train(None)
+    lines = check_settings(config, resume)
+    return resume if _is_finished(config, RunFolder.open(resume)) else train(Resumption(resume, tuple(lines)))
 
 
 def check_settings(config: Config, run: Path) -> list[str]:
@@ -49,6 +71,19 @@ def check_spaces(run: Path, made_for: EnvSpaces, now: EnvSpaces) -> None:
             f"run {run}: the environment's {what} have changed: expected {one}, got {other}; "
             "install the version of the environment that the run was started with, or start a new run"
         )
+
+
+def _is_finished(config: Config, folder: RunFolder) -> bool:
+    """Whether the run has nothing left to do: it ended for a reason that holds with this configuration too."""
+    summary = folder.summary()
+    if summary is None or summary.evaluation is None:
+        return False
+    reason = config.stop_rule().reason_to_stop(
+        env_steps_after_next_update=summary.env_steps + config.algorithm.rollout_steps * config.envs,
+        evaluation_return=summary.evaluation.return_mean,
+        training_return=summary.return_mean_100,
+    )
+    return reason == summary.stop_reason
 
 
 def _differences(before: Config, config: Config, changed: Sequence[Change]) -> list[str]:

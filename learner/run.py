@@ -27,7 +27,7 @@ from learner.members.describe_coordinator import Accept
 from learner.members.endpoint import join_lines, keyring_for
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.recording.training_recorder import TrainingRecorder
-from learner.resumption import check_settings, check_spaces
+from learner.resumption import Resumption, check_spaces
 from learner.rollouts.hub import Hub, HubObserver, HubSettings
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 from learner.run_folder.progress import Progress
@@ -68,16 +68,15 @@ class RunSetup:
 
 
 @contextmanager
-def run_folder(config: Config, resume: Path | None) -> Iterator[RunFolder]:
+def run_folder(config: Config, resume: Resumption | None) -> Iterator[RunFolder]:
     """A new run folder, or the folder of the run to `resume`, locked. A new one is removed if no `Run` can be made of it.
 
-    Raises `UsageError`, also if the run cannot be resumed with these settings, or if another process trains it.
+    Raises `UsageError`, also if another process trains the run.
     """
-    lines = [] if resume is None else check_settings(config, resume)
-    folder = RunFolder.create(config) if resume is None else RunFolder.open(resume)
+    folder = RunFolder.create(config) if resume is None else RunFolder.open(resume.run)
     try:
         with RunLock(folder.path) as folder.lock:
-            for line in lines:
+            for line in () if resume is None else resume.differences:
                 log.warning("%s", line)
             yield folder
     except BaseException:
@@ -85,28 +84,11 @@ def run_folder(config: Config, resume: Path | None) -> Iterator[RunFolder]:
         raise
 
 
-def is_finished(config: Config, resume: Path) -> bool:
-    """Whether the run to `resume` has nothing left to do: it ended for a reason that holds with this configuration too.
-
-    Then no worker is needed. Raises `UsageError` if there is no such run, or if it cannot be resumed with these settings.
-    """
-    check_settings(config, resume)
-    summary = RunFolder.open(resume).summary()
-    if summary is None or summary.evaluation is None:
-        return False
-    reason = config.stop_rule().reason_to_stop(
-        env_steps_after_next_update=summary.env_steps + config.algorithm.rollout_steps * config.envs,
-        evaluation_return=summary.evaluation.return_mean,
-        training_return=summary.return_mean_100,
-    )
-    return reason == summary.stop_reason
-
-
 Describe = Callable[[DescribeSpec, Callable[[], None], Accept], DescribedEnv]
 """Has a worker describe the environment. What the second argument raises ends the wait; the third accepts a description."""
 
 
-def known_environment(config: Config, env: EnvSpec, resume: Path | None, describe: Describe) -> KnownEnvironment:
+def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, describe: Describe) -> KnownEnvironment:
     """The environment, as `describe` learns it. Meanwhile another thread imports PyTorch.
 
     Of a run to `resume`, only an environment with the spaces of the run's policy is accepted. Raises `UsageError` if there
@@ -121,13 +103,13 @@ def known_environment(config: Config, env: EnvSpec, resume: Path | None, describ
 
         def check_interrupt() -> None:
             if interrupts.received:
-                raise KeyboardInterrupt if resume is None else Interrupted(resume)
+                raise KeyboardInterrupt if resume is None else Interrupted(resume.run)
 
-        policy = None if resume is None else RunFolder.open(resume).policy_spec()
+        policy = None if resume is None else RunFolder.open(resume.run).policy_spec()
 
         def accept(found: DescribedEnv) -> None:
             if resume is not None and policy is not None:
-                check_spaces(resume, EnvSpaces.of_policy(policy), EnvSpaces.of_description(found))
+                check_spaces(resume.run, EnvSpaces.of_policy(policy), EnvSpaces.of_description(found))
 
         described = describe(
             DescribeSpec(env, config.chosen_vector(), heartbeat_s=config.heartbeat_s), check_interrupt, accept
@@ -210,6 +192,7 @@ class Run:
         hub = Hub(link, coordinator, settings, processes, self._check_interrupt, observer)
         self.service = RolloutService(hub, processes.expected)
         episodes = _training_recorder(config, self.folder, setup.known, spec)
+        self.folder.remove_temporary()
         self.folder.write_config(config)  # nothing of a resumed run is written before everything fits
         self.recorder = RunRecorder(config, self.folder, spec, self.algorithm, self.service, state, watch, episodes)
         self.folder.keep()
@@ -245,12 +228,10 @@ class Run:
             self.folder.lock.check()
 
 
-def serve(config: Config, resume: Path | None, watch: Watch) -> Path:
+def serve(config: Config, resume: Resumption | None, watch: Watch) -> Path:
     """Train with workers that are started elsewhere and join at `config.bind`. Returns the run folder."""
     if config.inference == "learner":
         raise UsageError("--inference learner does not work with python -m learner; use millrace learner")
-    if resume is not None and is_finished(config, resume):
-        return resume
     keyring = keyring_for(config, datetime.now(UTC).replace(microsecond=0))
     with ExitStack() as stack:
         # The run is locked before the port is bound: of two learners of one run, the second is told so.

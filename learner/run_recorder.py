@@ -282,6 +282,9 @@ class RunRecorder:
             incarnations=snapshot.incarnations,
             episodes=self._window.state(),
             best=self._evaluations.best,
+            best_policy=self._evaluations.best_policy,
+            newest_evaluation=self._evaluations.newest,
+            evaluated_version=self._evaluations.version,
             next_evaluation=self._evaluations.next_at,
         )
 

@@ -10,6 +10,7 @@ import msgspec
 from learner.algorithms import Algorithm
 from learner.rollouts.ledger import Ledger
 from learner.run_folder import checkpoint
+from learner.run_folder.results import Evaluation
 from learner.run_folder.run_folder import RunFolder
 from protocol.errors import CheckpointError
 
@@ -28,13 +29,24 @@ class RunState(msgspec.Struct, kw_only=True):
     episodes: list[Any] = []
     """State of the `EpisodeWindow`."""
     best: list[float] | None = None
-    """Mean return and env steps of the best evaluation. Its policy is in the run folder."""
+    """Mean return and env steps of the best evaluation."""
+    best_policy: Any = None
+    """Parameters [P] and buffers of the best policy, both float32. None if there is none, or if a checkpoint of an earlier
+    millrace lacks it; then the run folder has it.
+    """
+    newest_evaluation: Evaluation | None = None
+    evaluated_version: int = -1
+    """The version that `newest_evaluation` belongs to."""
     next_evaluation: int = 0
     """Env steps at which the next evaluation is due; 0 if that is not known."""
 
     def checkpoint_content(self, algorithm: Algorithm) -> dict[str, Any]:
         """The content of a checkpoint: plain data and tensors."""
-        return {"past": msgspec.to_builtins(self), "algorithm": algorithm.state_dict()}
+        import torch
+
+        best = None if self.best_policy is None else [torch.from_numpy(array) for array in self.best_policy]
+        past = msgspec.to_builtins(msgspec.structs.replace(self, best_policy=None))
+        return {"past": past, "best_policy": best, "algorithm": algorithm.state_dict()}
 
 
 def restore(folder: RunFolder, algorithm: Algorithm) -> RunState:
@@ -44,6 +56,8 @@ def restore(folder: RunFolder, algorithm: Algorithm) -> RunState:
         log.warning("%s", line)
     try:
         state = msgspec.convert(found.state["past"], RunState)
+        if (best := found.state.get("best_policy")) is not None:
+            state.best_policy = tuple(array.numpy() for array in best)
         algorithm.load_state_dict(found.state["algorithm"])
     except (KeyError, ValueError, TypeError, RuntimeError) as error:
         raise CheckpointError(

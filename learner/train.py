@@ -15,14 +15,14 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import numpy as np
-
 from learner.algorithms import Algorithm
 from learner.rollouts.lanes import AcceptedRollout
 from learner.run_recorder import RunRecorder
 from learner.service import RolloutService
 from protocol.errors import RunError
 from protocol.rollout import stack_rollouts
+
+ADVICE = "try a lower learning_rate, or normalize_observations"
 
 
 def train(algorithm: Algorithm, service: RolloutService, recorder: RunRecorder, workers: int) -> str:
@@ -44,14 +44,14 @@ def train(algorithm: Algorithm, service: RolloutService, recorder: RunRecorder, 
             with _whole_update(algorithm, service, arrived):
                 batch = stack_rollouts([one.rollout for one in arrived], [one.fresh for one in arrived])
                 metrics = algorithm.update(batch, service.pulse)
-                weights = algorithm.weights()
-                if not all(np.isfinite(array).all() for array in weights):
-                    raise RunError(f"learner: update {recorder.version}: the weights are not finite after it")
+                if not algorithm.is_finite():
+                    raise RunError(f"learner: update {recorder.version}: the weights are not finite after it; {ADVICE}")
             recorder.count(batch)
-            service.publish(recorder.version, *weights, deal=recorder.training_goes_on())
+            service.publish(recorder.version, *algorithm.weights(), deal=recorder.training_goes_on())
             recorder.updated(metrics, time.monotonic() - began_s)
         recorder.save()
         recorder.conclude()
+        recorder.save_unless_saved()  # the final policy may be the best
     except BaseException:
         recorder.save_unless_saved()
         raise

@@ -58,6 +58,10 @@ class Algorithm(Protocol):
         """Copies of the acting parameters [P] and of the policy's buffers, both float32, for a `Weights` message."""
         ...
 
+    def is_finite(self) -> bool:
+        """Whether all weights are finite, also those that do not act, and the policy's buffers. Called after each update."""
+        ...
+
     def state_dict(self) -> dict[str, Any]:
         """A copy of everything that the next update depends on, as tensors and plain data."""
         ...

@@ -25,7 +25,7 @@ from learner.algorithms.kernels.loss_gradients import Numbers, OutputGradients
 from learner.algorithms.kernels.optimizer_step import avoid_compiler_import, state_of, take_step
 from learner.algorithms.minibatches import Index, LossInput, Minibatch, NetworkInput, Observations, rows_of_columns
 from learner.algorithms.normalization import ObservationNormalizer, RewardScaler
-from learner.algorithms.updates import check_finite, check_finite_weights, scheduled
+from learner.algorithms.updates import check_finite, scheduled
 from learner.config.hyperparameters import ActorCriticHyperparameters, RecurrentHyperparameters
 from protocol.arrays import Array, Bools, Floats
 from protocol.policy.features import features, normalize
@@ -186,7 +186,6 @@ class ActorCritic:
             epochs.append(self._epoch(next(minibatches_of_epochs), pulse))
             if epochs[-1] and self.stops(epochs[-1][-1]):
                 break
-        check_finite_weights(self.net.flat, self.version, ADVICE)
         self.count_update(batch, observations, len(epochs))
         return self.metrics(epochs, estimates)
 
@@ -409,6 +408,10 @@ class ActorCritic:
     def weights(self) -> tuple[Floats, Floats]:
         """Copies of the acting parameters [P] and of the buffers, as `protocol.policy.layout` lays them out."""
         return self.net.flat[: self.net.acting_size].cpu().numpy().copy(), self._buffers.copy()
+
+    def is_finite(self) -> bool:
+        """Whether all weights are finite, also those that do not act, and the observation statistics."""
+        return bool(torch.isfinite(self.net.flat).all() and np.isfinite(self._buffers).all())
 
     def state_dict(self) -> dict[str, Any]:
         """A copy of everything that the next update depends on: tensors and plain data (`torch.load(weights_only=True)`)."""

@@ -22,7 +22,7 @@ from learner.algorithms.kernels.action_values import action_values
 from learner.algorithms.kernels.optimizer_step import avoid_compiler_import, state_of, take_step
 from learner.algorithms.normalization import ObservationNormalizer
 from learner.algorithms.replay import ReplayBuffer, Sample
-from learner.algorithms.updates import check_finite, check_finite_weights, scheduled
+from learner.algorithms.updates import check_finite, scheduled
 from learner.config.hyperparameters import DQNConfig
 from protocol.arrays import Array, Floats
 from protocol.errors import UsageError
@@ -119,7 +119,6 @@ class DQN:
             for _ in range(config.gradient_steps):
                 measured.append(self.step(self.replay.sample(config.batch_size, beta)))
                 pulse()
-        check_finite_weights(self.net.flat, self.version, ADVICE)
         metrics = {
             "rollout/exploration_rate": exploration_rate(config, self.env_steps),
             "train/learning_rate": learning_rate,
@@ -189,6 +188,10 @@ class DQN:
         """Copies of the Q-network's parameters [P] and of the buffers: the observation statistics, then ε."""
         epsilon = np.float32(exploration_rate(self.config, self.env_steps))
         return self.net.flat.cpu().numpy().copy(), np.append(self._statistics, epsilon)
+
+    def is_finite(self) -> bool:
+        """Whether all weights are finite, also those that do not act, and the observation statistics."""
+        return bool(torch.isfinite(self.net.flat).all() and np.isfinite(self._statistics).all())
 
     def state_dict(self) -> dict[str, Any]:
         """A copy of everything that the next update depends on: tensors and plain data (`torch.load(weights_only=True)`)."""

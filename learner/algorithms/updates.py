@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-import torch
-
 from protocol.errors import RunError
 
 
@@ -17,12 +15,6 @@ def check_finite(metrics: Mapping[str, float], update: int, advice: str) -> None
             raise RunError(
                 f"learner: update {update}: {name}: expected finite, got {number}; this step was not taken; try {advice}"
             )
-
-
-def check_finite_weights(flat: torch.Tensor, update: int, advice: str) -> None:
-    """Raise `RunError` if one of the weights is not finite after the steps of this update."""
-    if not torch.isfinite(flat).all():
-        raise RunError(f"learner: update {update}: the weights are not finite after it; try {advice}")
 
 
 def scheduled(first: float, schedule: str, remaining: float) -> float:

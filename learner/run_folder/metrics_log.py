@@ -1,7 +1,7 @@
 """The metrics of a run on disk: metrics.jsonl and TensorBoard.
 
-Rule: a file ends with a whole row. A resumed run first removes the rows that its checkpoint knows nothing of, so no curve
-covers the same env steps twice.
+Rule: a file ends with a whole row, and there is one row for each update. A resumed run first removes the rows that its
+checkpoint knows nothing of. If it makes the evaluation before which it was interrupted, that update's row gets its metrics.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import Any
 import msgspec
 
 from learner.run_folder.atomic_write import write_atomically
-from learner.run_folder.progress import ENV_STEPS_KEY, Progress, Row
+from learner.run_folder.progress import ENV_STEPS_KEY, UPDATES_KEY, Progress, Row, named
 from protocol.errors import RunError
 
 log = logging.getLogger("millrace.learner")
@@ -43,6 +43,7 @@ class MetricsLog:
         """
         table = folder / METRICS_FILE
         events = folder / "tensorboard" / f"events.out.tfevents.{time.time_ns()}.{socket.gethostname()}.{os.getpid()}"
+        kept: list[dict[str, Any]] = []
         try:
             if table.exists():
                 kept = [row for row in read_rows(table) if row[ENV_STEPS_KEY] <= from_env_steps]
@@ -52,6 +53,7 @@ class MetricsLog:
             raise RunError(f"{error.filename or table} cannot be written: {error.strerror}") from error
         self._events.append(_first_event(from_env_steps))
         self._clock, self._last_event_s = clock, -math.inf
+        self._newest: Row = kept[-1] if kept else {}
         self._unwritten: tuple[Row, int] | None = None  # the newest row and its env steps, if TensorBoard has not got it
 
     @property
@@ -62,10 +64,15 @@ class MetricsLog:
     def write(self, progress: Progress, train: Mapping[str, float]) -> None:
         """Add a row. `train`: the metrics of the algorithm, and of an evaluation if there was one.
 
-        Raises `RunError`, with a one-line message, if the disk does not take the row. The rows before it stay readable.
+        If the newest row is of the same update, these metrics are added to it. Raises `RunError`, with a one-line message,
+        if the disk does not take the row. The rows before it stay readable.
         """
-        row = progress.row(train)
-        self._table.append(_json_line(row))
+        row, replaced = progress.row(train), b""
+        if all(self._newest.get(key) == row[key] for key in (UPDATES_KEY, ENV_STEPS_KEY)):
+            row, replaced = {**self._newest, **named(train)}, _json_line(self._newest)
+        self._newest = {}  # unless the disk takes it
+        self._table.append(_json_line(row), len(replaced))
+        self._newest = row
         self._unwritten = row, progress.env_steps
         if self._clock() - self._last_event_s >= EVENTS_EVERY_S or any(name.startswith("eval/") for name in row):
             self._write_event()
@@ -99,12 +106,16 @@ class _RecordFile:
     def deleted(self) -> bool:
         return os.fstat(self._number).st_nlink == 0
 
-    def append(self, record: bytes) -> None:
+    def append(self, record: bytes, replaced: int = 0) -> None:
+        """Add a record in place of the last `replaced` bytes. Raises `RunError`."""
         try:
             if self.deleted:
                 deleted = self._file
                 self._open()
                 deleted.close()
+            if replaced and replaced <= self._bytes:
+                self._file.truncate(self._bytes - replaced)
+                self._bytes -= replaced
             if self._file.write(record) != len(record):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 import msgspec
 
 ENV_STEPS_KEY = "time/total_timesteps"
+UPDATES_KEY = "time/iterations"
 RETURN_KEY = "rollout/ep_rew_mean"
 EVALUATION_KEY = "eval/mean_reward"
 Row = Mapping[str, float | None]
@@ -52,7 +53,7 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
             RETURN_KEY: self.return_mean,
             "rollout/ep_len_mean": self.length_mean,
             "time/fps": self.steps_per_s,
-            "time/iterations": self.updates,
+            UPDATES_KEY: self.updates,
             "time/time_elapsed": self.wall_s,
             ENV_STEPS_KEY: self.env_steps,
             "lag/mean": self.lag_mean,
@@ -61,4 +62,9 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
         }
         row |= {f"ledger/{name}": count for name, count in self.ledger.items()}
         row |= {f"stage/{name}": seconds for name, seconds in self.stages.items()}
-        return row | {name if "/" in name else f"train/{name}": value for name, value in train.items()}
+        return row | named(train)
+
+
+def named(train: Mapping[str, float]) -> dict[str, float]:
+    """The metrics of an algorithm or an evaluation under the names by which they are logged."""
+    return {name if "/" in name else f"train/{name}": value for name, value in train.items()}

@@ -32,7 +32,7 @@ from typing import Any, Literal, Protocol
 import msgspec
 import numpy as np
 
-from learner.run_folder.atomic_write import write_atomically
+from learner.run_folder.atomic_write import TEMPORARY, write_atomically
 from learner.run_folder.results import Summary
 from learner.run_folder.run_format import END, HEAD, RUN_FILE, check_format, write_format
 from learner.run_folder.run_lock import RunLock
@@ -168,6 +168,12 @@ class RunFolder:
                 break
             with suppress(OSError):  # another run is in it, or has removed it
                 parent.rmdir()
+
+    def remove_temporary(self) -> None:
+        """Remove what a process that was killed has left: files that it had not written whole."""
+        for left in self.path.glob(f"*{TEMPORARY}"):
+            with suppress(OSError):
+                left.unlink()
 
     def keep(self) -> None:
         """The run has begun: `remove` does nothing from now on."""

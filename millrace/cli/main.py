@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import errno
 import os
-import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -19,14 +18,16 @@ from typing import TYPE_CHECKING, NamedTuple
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # before numpy; --torch-threads sets the learner's
 
+from learner.last_line import last_line
 from learner.standard_streams import open_closed, unfailing
 from protocol.bounds import MAX_SEEDS, escaped, indented
-from protocol.errors import UsageError, UserFacingError, first_line
+from protocol.errors import UsageError, UserFacingError
 
 if TYPE_CHECKING:
     from learner.run import Watch
 
 ABOUT = "Worker processes step copies of a gymnasium environment; one learner trains a policy in PyTorch."
+RESUME = "millrace train"
 HELP_FLAGS = ("-h", "--help")
 NOT_IN_WORKERS = {"matplotlib", "prometheus_client", "rich", "safetensors", "tensorboard", "tomli_w", "torch", "tyro"}
 """Packages that the learner needs and a worker does not. An installation only for workers lacks them."""
@@ -57,14 +58,12 @@ def _exit_code(argv: list[str]) -> int:
         sys.stdout.flush()
         return exit_code
     except UserFacingError as error:
-        _print_error("; ".join([f"millrace: {error}", *_notes(error)]))
+        _print_error(last_line("millrace", error, RESUME))
         if error.detail:
             _print_error(indented(error.detail))
         return _failed(argv, error.exit_code)
     except KeyboardInterrupt as interrupt:
-        run = getattr(interrupt, "run", None)
-        more = [f"go on with: millrace train --resume {shlex.quote(str(run))}"] if run else _notes(interrupt)
-        _print_error("; ".join(["millrace: interrupted", *more]))
+        _print_error(last_line("millrace", interrupt, RESUME))
         return _failed(argv, 130)
     except BrokenPipeError:  # nobody reads our output any more (`| head`), so a message is useless
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -84,11 +83,6 @@ def _exit_code(argv: list[str]) -> int:
         return _failed(argv, 2)
     except Exception as error:
         return _internal_error(argv, error)
-
-
-def _notes(error: BaseException) -> list[str]:
-    """What was added to the error on its way here: how to go on with the run."""
-    return list(getattr(error, "__notes__", ()))
 
 
 def _dispatch(argv: list[str]) -> int:
@@ -140,17 +134,16 @@ def _learner(argv: list[str]) -> int:
     from learner.config.command_line import read_config
 
     config, resume = read_config("learner", argv)
-    from learner.run import is_finished, serve
+    from learner.resumption import Resumption, unless_finished
+    from learner.run import serve
     from millrace.launch import learner_inference as inference
 
-    def train(watch: Watch) -> Path:
-        if resume is not None and is_finished(config, resume):
-            return resume
+    def train(checked: Resumption | None, watch: Watch) -> Path:
         if config.inference == "learner":
-            return inference.train(config, resume, watch, elsewhere=True)
-        return serve(config, resume, watch)
+            return inference.train(config, checked, watch, elsewhere=True)
+        return serve(config, checked, watch)
 
-    return _run(argv, train)
+    return _run(argv, lambda watch: unless_finished(config, resume, lambda checked: train(checked, watch)))
 
 
 def _run(argv: list[str], train: Callable[[Watch], Path]) -> int:
@@ -407,8 +400,7 @@ def _print_error(line: str) -> None:
 
 
 def _internal_error(argv: list[str], error: Exception) -> int:
-    hints = [*_notes(error), *([] if "--debug" in argv else ["--debug shows the traceback"])]
-    _print_error("; ".join([f"millrace: internal error: {type(error).__name__}: {first_line(error)}", *hints]))
+    _print_error(last_line("millrace", error, RESUME, [] if "--debug" in argv else ["--debug shows the traceback"]))
     return _failed(argv, 1)
 
 

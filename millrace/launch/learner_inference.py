@@ -19,6 +19,7 @@ from learner.config.config import Config
 from learner.members.describe_coordinator import Accept
 from learner.members.endpoint import BindSettings
 from learner.members.process_callbacks import ProcessCallbacks
+from learner.resumption import Resumption
 from learner.run import Run, RunSetup, Watch, describe_settings, known_environment, prometheus_observer, run_folder
 from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.settings import VectorEnvSettings
@@ -43,7 +44,7 @@ NEVER_S = 1e9
 
 def train(
     config: Config,
-    resume: Path | None,
+    resume: Resumption | None,
     watch: Watch,
     factory: Callable[..., object] | None = None,
     *,

@@ -13,7 +13,8 @@ import zmq
 
 from learner.config.config import Config
 from learner.members.process_callbacks import ProcessCallbacks
-from learner.run import Run, RunSetup, Watch, describe_over, is_finished, known_environment, prometheus_observer, run_folder
+from learner.resumption import Resumption, unless_finished
+from learner.run import Run, RunSetup, Watch, describe_over, known_environment, prometheus_observer, run_folder
 from millrace.launch.local_worker_options import private_address, stopped_on_error, temporary_keys, worker_flags
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
@@ -29,8 +30,10 @@ def train(config: Config, resume: Path | None, watch: Watch, factory: Callable[.
 
     Raises `UserFacingError`, or `Interrupted` if the user stopped the run.
     """
-    if resume is not None and is_finished(config, resume):
-        return resume
+    return unless_finished(config, resume, lambda checked: _train(config, checked, watch, factory))
+
+
+def _train(config: Config, resume: Resumption | None, watch: Watch, factory: Callable[..., object] | None) -> Path:
     if config.inference == "learner":
         from millrace.launch import learner_inference as inference
 

@@ -16,6 +16,7 @@ import ray
 
 from learner.config.command_line import read_config
 from learner.members.endpoint import keyring_for
+from learner.resumption import unless_finished
 from learner.run import Watch, serve
 from millrace.cli.flags import RayFlags
 from millrace.launch.launcher_flags import learner_flags
@@ -39,7 +40,7 @@ def launch(flags: RayFlags, rest: Sequence[str], watch: Watch) -> Path:
         actors = [actor.options(name=f"{flags.name}-{number}").remote() for number in range(flags.workers)]
         for each in actors:
             each.run.options(retry_exceptions=True).remote(config.bind, token, flags.processes)
-        return serve(config, resume, watch)
+        return unless_finished(config, resume, lambda checked: serve(config, checked, watch))
 
 
 def _token_text(keyring: Keyring | None) -> str:

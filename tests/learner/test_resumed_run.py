@@ -14,9 +14,9 @@ from learner.algorithms.ppo import PPO
 from learner.config.config import Config
 from learner.config.hyperparameters import PPOConfig
 from learner.config.layers import resolve
+from learner.resumption import unless_finished
 from learner.rollouts.lanes import AcceptedRollout
 from learner.rollouts.ledger import Ledger
-from learner.run import is_finished
 from learner.run_folder import checkpoint
 from learner.run_folder.results import Evaluation, Summary
 from learner.run_folder.run_folder import RunFolder
@@ -90,7 +90,12 @@ def test_an_update_gets_what_the_coordinator_says_of_each_rollout() -> None:
         for lane, (sequence, fresh) in sequences_and_fresh.items()
     ]
     batches: list[Batch] = []
-    algorithm = SimpleNamespace(weights=lambda: (), update=lambda batch, pulse: batches.append(batch), remember=lambda: None)
+    algorithm = SimpleNamespace(
+        weights=lambda: (),
+        update=lambda batch, pulse: batches.append(batch),
+        remember=lambda: None,
+        is_finite=lambda: True,
+    )
     service = MagicMock(gather=lambda: arrived)
     recorder = MagicMock(stop_reason=MagicMock(side_effect=[None, "done"]))
     train(algorithm, service, recorder, 1)  # type: ignore[arg-type]
@@ -122,6 +127,18 @@ def test_a_checkpoint_of_another_network_is_refused_in_one_line(tmp_path: Path) 
     with pytest.raises(CheckpointError, match="expected the state of this configuration") as failure:
         restore(folder, other)
     assert "\n" not in str(failure.value)
+
+
+def is_finished(config: Config, run: Path) -> bool:
+    """Whether the run is not launched again."""
+    launched: list[object] = []
+
+    def launch(checked: object) -> Path:
+        launched.append(checked)
+        return run
+
+    assert unless_finished(config, run, launch) == run
+    return not launched
 
 
 def test_a_run_is_finished_while_its_reason_to_stop_holds(tmp_path: Path) -> None:

@@ -161,13 +161,16 @@ def test_an_update_that_fails_in_the_middle_is_taken_back(tmp_path: Path, monkey
     assert summary(resumed)["stop_reason"] == "all steps done"
 
 
-def test_weights_that_are_not_finite_are_never_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("parameter", [0, -1], ids=["acting", "critic"])
+def test_weights_that_are_not_finite_are_never_saved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, parameter: int
+) -> None:
     update = PPO.update
 
     def broken(self: PPO, batch: Any, pulse: Any) -> dict[str, float]:
         metrics = update(self, batch, pulse)
         if self.version == 3:
-            self.net.flat[0] = float("inf")
+            self.net.flat[parameter] = float("inf")
         return metrics
 
     monkeypatch.setattr(PPO, "update", broken)

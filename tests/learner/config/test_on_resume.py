@@ -13,8 +13,7 @@ from learner.config.hyperparameters import HYPERPARAMETERS, Hyperparameters
 from learner.config.layers import resolve
 from learner.config.on_resume import Free, OnResume, declared
 from learner.env_spaces import EnvSpaces
-from learner.resumption import check_settings, check_spaces
-from learner.run import is_finished, run_folder
+from learner.resumption import Resumption, check_settings, check_spaces, unless_finished
 from learner.run_folder.run_folder import RunFolder
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import UsageError
@@ -99,13 +98,23 @@ def test_each_fixed_setting_of_an_algorithm_is_refused_and_nothing_is_written(tm
     before = content(run)
     had = getattr(resolve(resume=run).algorithm, name)
     given = resolve(resume=run, **{name: another_value(algo, name, had)})
-    for refused in (lambda: is_finished(given, run), lambda: run_folder(given, run).__enter__()):
-        with pytest.raises(
-            UsageError, match=rf"^run {run}: {name}: expected .* as in its config.toml, got .*; a run"
-        ) as why:
-            refused()
-        assert "\n" not in str(why.value)
+    with pytest.raises(UsageError, match=rf"^run {run}: {name}: expected .* as in its config.toml, got .*; a run") as why:
+        unless_finished(given, run, lambda checked: pytest.fail("it was launched"))
+    assert "\n" not in str(why.value)
     assert content(run) == before
+
+
+def test_a_launcher_gets_the_run_and_what_is_different(tmp_path: Path) -> None:
+    run, launched = a_run(tmp_path), list[Resumption | None]()
+
+    def launch(checked: Resumption | None) -> Path:
+        launched.append(checked)
+        return tmp_path
+
+    assert unless_finished(resolve("CartPole-v1"), None, launch) == tmp_path
+    assert unless_finished(resolve(resume=run, lanes=2), run, launch) == tmp_path
+    (line,) = check_settings(resolve(resume=run, lanes=2), run)
+    assert launched == [None, Resumption(run, (line,))]
 
 
 @pytest.mark.parametrize(

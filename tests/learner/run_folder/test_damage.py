@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -24,7 +25,7 @@ from learner.env_spaces import EnvSpaces
 from learner.policy_player import load_policy
 from learner.report.learning_curves import read_curve
 from learner.report.page import page
-from learner.run import is_finished
+from learner.resumption import unless_finished
 from learner.run_folder.metrics_log import MetricsLog
 from learner.run_folder.resume import newest_run
 from learner.run_folder.run_folder import RunFolder
@@ -52,10 +53,10 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def resume(run: Path) -> tuple[RunState, bytes]:
+def resume(run: Path) -> tuple[RunState, tuple[bytes, ...]]:
     """All that `--resume` reads before it trains."""
     config = resolve(resume=run)
-    is_finished(config, run)
+    unless_finished(config, run, lambda checked: run)
     folder = RunFolder.open(run)
     env = EnvSpec.of(config.env, config.env_kwargs)
     policy = folder.policy_spec()
@@ -65,7 +66,8 @@ def resume(run: Path) -> tuple[RunState, bytes]:
     )
     state = restore(folder, algorithm)
     MetricsLog(run, state.env_steps).close()
-    return state, algorithm.weights()[0].tobytes()
+    arrays = (algorithm.weights()[0], *(state.best_policy or ()))
+    return msgspec.structs.replace(state, best_policy=None), tuple(array.tobytes() for array in arrays)
 
 
 DESCRIBED = described(EnvSpec(ENV), "loop")
@@ -73,7 +75,7 @@ OBSERVED = [np.zeros((1, 1, 4), np.float32)]
 READERS: dict[str, Callable[[Path], Any]] = {
     "resume": resume,
     "resume auto": lambda run: newest_run(resolve(ENV, run_dir=str(run.parent), **SETTINGS)),
-    "is_finished": lambda run: is_finished(resolve(ENV, run_dir=str(run.parent), **SETTINGS), run),
+    "is_finished": lambda run: unless_finished(resolve(ENV, run_dir=str(run.parent), **SETTINGS), run, lambda checked: run),
     "evaluate": lambda run: load_policy(run, "final"),
     "evaluate --best": lambda run: load_policy(run, "best"),
     "report": lambda run: page([run]),

@@ -273,3 +273,18 @@ def test_the_window_holds_the_last_hundred_episodes() -> None:
     assert again.return_mean == window.return_mean
     again.extend([Episode(0.0, 0, 0.0)])
     assert again.return_mean == (np.sum(range(51, 150))) / 100
+
+
+def test_a_resumed_run_adds_an_evaluation_to_the_row_of_its_update(tmp_path: Path) -> None:
+    log = MetricsLog(tmp_path)
+    for update in (1, 2, 3):
+        log.write(Progress(updates=update, env_steps=10 * update, lag_max=2), {"loss": 0.5})
+    log.close()
+    log = MetricsLog(tmp_path, from_env_steps=20)
+    log.write(Progress(updates=2, env_steps=20), {"eval/mean_reward": 7.0})
+    log.write(Progress(updates=3, env_steps=30), {"loss": 0.25})
+    log.close()
+    first, second, third = read_rows(tmp_path / "metrics.jsonl")
+    assert (second["time/iterations"], second["train/loss"], second["lag/max"], second["eval/mean_reward"]) == (2, 0.5, 2, 7)
+    assert (third["time/iterations"], third["train/loss"]) == (3, 0.25)
+    assert "eval/mean_reward" not in first | third
