@@ -12,8 +12,8 @@ import sys
 import time
 
 from learner.config.command_line import read_config
-from learner.last_line import last_line
 from learner.run_folder.json_log import JsonLines
+from learner.run_folder.last_line import last_line
 from learner.run_folder.progress import Progress
 from learner.standard_streams import open_closed, unfailing
 from protocol.bounds import indented

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # before numpy; --torch-threads sets the learner's
 
-from learner.last_line import last_line
+from learner.run_folder.last_line import last_line
 from learner.standard_streams import open_closed, unfailing
 from protocol.bounds import MAX_SEEDS, escaped, indented
 from protocol.errors import UsageError, UserFacingError
