@@ -1,0 +1,328 @@
+"""`python -m tests.system.killed_runs`: small runs, each killed at random times, and resumed until it is done.
+
+Rule: only the learner is killed, by SIGKILL; its workers must end by themselves. Each run ends, its ledger is exact, every
+update has one row of metrics, every evaluation was made once, and with a checkpoint after every k-th update a kill costs the
+work of at most k updates: of those that were whole and not saved, and of the one in progress. The seed decides the settings
+and the kills. The exit code is 1 if this fails.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from learner.run_folder import checkpoint
+from learner.run_folder.metrics_log import read_rows
+from tests.system.marked_train import Marks, Phase, read_marks
+from tests.system.processes import ROOT, crowding, wait_for
+from tests.system.runs import accounted
+
+AT_ONCE = 3  # runs at a time
+ENDS_S = 120.0  # a run that is not killed any more
+GONE_S = 15.0  # the workers of a learner that was killed, on an idle machine
+LOOK_EVERY_S = 0.001
+LANES, ENVS, EVERY = 2, 4, 200  # EVERY: env steps between evaluations
+COMMON: dict[str, object] = {
+    "lanes": LANES, "envs": ENVS, "net": 8, "steps": 1000, "rollout-steps": 16, "checkpoint-every-s": 1000,
+    "eval-every": EVERY, "eval-episodes": 4, "eval-copies": 2,
+}  # fmt: skip
+DQN: dict[str, object] = {"algo": "dqn", "learning-starts": 64, "gradient-steps": 4, "replay-size": 600, "batch-size": 16}
+PPO: dict[str, object] = {"n-epochs": 2, "batch-size": 32}
+VARIANTS: dict[str, dict[str, object]] = {
+    "ppo": {**PPO, "checkpoint-every-updates": 1, "workers": 2},
+    "dqn, prioritized": {**DQN, "replay": "prioritized", "checkpoint-every-updates": 1, "workers": 1},
+    "a2c, lag 1": {"algo": "a2c", "max-lag": 1, "checkpoint-every-updates": 2, "workers": 2},
+    "impala, lag 2": {"algo": "impala", "max-lag": 2, "checkpoint-every-updates": 1, "workers": 1},
+    "reinforce": {
+        "algo": "reinforce", "rollout-steps": 501, "steps": 12_000, "eval-every": 3_000, "checkpoint-every-updates": 1,
+        "workers": 1,
+    },
+    "ppo, lstm": {**PPO, "core": "lstm", "core-size": 8, "checkpoint-every-updates": 3, "workers": 1},
+    "ppo, learner inference": {**PPO, "inference": "learner", "checkpoint-every-updates": 1, "workers": 1},
+    "dqn, lag 1, tcp": {
+        **DQN, "max-lag": 1, "transport": "tcp", "checkpoint-every-updates": 3, "keep-checkpoints": 1, "workers": 2,
+    },
+    "ppo to a return": {**PPO, "target-return": 9, "checkpoint-every-updates": 1, "workers": 1},
+}  # fmt: skip
+"""Flags of `millrace train CartPole-v1`."""
+TIMES_S = {  # from the beginning of a phase until the kill, at most, on an idle machine
+    Phase.STARTING: 4.0,
+    Phase.COLLECTING: 0.01,
+    Phase.UPDATING: 0.02,
+    Phase.RECORDING: 0.01,
+    Phase.CHECKPOINTING: 0.03,
+    Phase.EVALUATING: 0.1,
+    Phase.DRAINING: 0.2,
+    Phase.LEAVING: 0.3,
+}
+OCCURS = {Phase.STARTING: 1, Phase.EVALUATING: 3, Phase.DRAINING: 1, Phase.LEAVING: 1}  # how often at least; else 12 times
+
+
+class Kill(NamedTuple):
+    """When a learner is killed: so long after it entered a phase for the n-th time."""
+
+    phase: Phase
+    occurrence: int
+    after_s: float
+
+    @staticmethod
+    def drawn(generator: random.Random) -> Kill:
+        """A kill in any phase."""
+        phase = generator.choice(list(Phase))
+        return Kill(phase, generator.randint(1, OCCURS.get(phase, 12)), generator.uniform(0, TIMES_S[phase]))
+
+
+@dataclass
+class Account:
+    """What has happened in all runs."""
+
+    kills: Counter[str] = field(default_factory=Counter)
+    """By the phase in which they hit."""
+    lost: Counter[str] = field(default_factory=Counter)
+    """Kills by whole updates that were made again, and updates between two checkpoints."""
+    runs: Counter[str] = field(default_factory=Counter)
+    again: int = 0
+    """Learners that ended before they were killed."""
+    torn: int = 0
+    """Kills that left a file that was not written whole."""
+    tickets: Counter[str] = field(default_factory=Counter)
+    short: list[str] = field(default_factory=list)
+    """What was not as it must be."""
+
+
+class OneRun:
+    """One run: its flags, its kills and its processes."""
+
+    def __init__(self, folder: Path, seed: str, variant: str, account: Account) -> None:
+        self.folder, self.variant, self.account = folder, variant, account
+        self.random = random.Random(seed)
+        self.flags = {**COMMON, **VARIANTS[variant], "seed": self.random.randint(1, 1000)}
+        self._name = f"{folder.name}-{os.getpid()}"
+        self._numbers = itertools.count()
+        folder.mkdir(parents=True)
+
+    def play(self) -> None:
+        """Kill and resume the run, then let it end, and check it. Raises AssertionError."""
+        kills = self.random.choices([1, 2, 3], [6, 3, 1])[0]
+        made = 0
+        while made < kills:
+            if self._killed(Kill.drawn(self.random)):
+                made += 1
+            else:
+                self.account.again += 1
+                if not made:  # each run is killed at least once
+                    shutil.rmtree(self.folder / "runs")
+        process, said, _ = self._start()
+        try:
+            wait_for(lambda: process.poll() is not None, ENDS_S * crowding(), lambda: f"the end: {said.read_text()}", 0.05)
+        finally:
+            process.kill()
+        assert process.wait() == 0, said.read_text()
+        self._nothing_is_left()
+        self._check()
+
+    # ---------------------------------------------------------------- a learner
+
+    def _start(self) -> tuple[subprocess.Popen[bytes], Path, Path]:
+        """Start the run, or go on with it. Returns the process, what it says and its marks."""
+        number = next(self._numbers)
+        said, marks = self.folder / f"said-{number}.log", self.folder / f"marks-{number}"
+        command = [sys.executable, "-m", "tests.system.marked_train", str(marks), "train", "CartPole-v1"]
+        command += ["--preset", "none", "--resume", "auto", "--run-dir", str(self.folder / "runs")]
+        for name, value in self.flags.items():
+            command += [f"--{name}", str(value)]
+        (self.folder / "tmp").mkdir(exist_ok=True)
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(self.folder / "tmp"), "KILLED_RUN": self._name}
+        with said.open("wb") as file:
+            process = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=file, stderr=file, cwd=ROOT, env=environment
+            )
+        return process, said, marks
+
+    def _killed(self, kill: Kill) -> bool:
+        """Start a learner and kill it. False if it ended before."""
+        process, said, file = self._start()
+        if not self._wait(process, file, kill):
+            assert process.wait() == 0, said.read_text()
+            self._nothing_is_left()
+            return False
+        process.kill()
+        process.wait()
+        marks = read_marks(file)
+        self.account.kills[marks.phase.name.lower()] += 1
+        self._nothing_is_left()
+        self.account.torn += any((self.folder / "runs").glob("**/*.tmp"))
+        self._compare(marks)
+        return True
+
+    def _wait(self, process: subprocess.Popen[bytes], file: Path, kill: Kill) -> bool:
+        """Wait until it is time for the kill. False if the process has ended."""
+        deadline, count, entered = time.monotonic() + ENDS_S * crowding(), 0, -1
+        while process.poll() is None:
+            marks = read_marks(file)
+            if marks.phase is kill.phase and marks.entered != entered:
+                entered, count = marks.entered, count + 1
+            if count >= kill.occurrence:
+                break
+            assert time.monotonic() < deadline, f"{kill} did not come"
+            time.sleep(LOOK_EVERY_S)
+        hit_s = time.monotonic() + kill.after_s * (crowding() if kill.phase is Phase.STARTING else 1)
+        while time.monotonic() < hit_s and process.poll() is None:
+            time.sleep(min(LOOK_EVERY_S, max(0.0, hit_s - time.monotonic())))
+        return process.poll() is None
+
+    def _nothing_is_left(self) -> None:
+        """Wait until all processes of this run have ended, by themselves."""
+        wait_for(
+            lambda: not self._processes(),
+            GONE_S * crowding(),
+            lambda: f"the end of the workers {[Path(f'/proc/{one}/cmdline').read_text() for one in self._processes()]}",
+            0.05,
+        )
+        left = [path.name for path in (self.folder / "tmp").iterdir() if path.name.startswith("millrace-")]
+        assert not left, f"temporary folders were left behind: {left}"
+
+    def _processes(self) -> list[int]:
+        mark = f"KILLED_RUN={self._name}".encode()
+        found = []
+        for path in Path("/proc").glob("[0-9]*/environ"):
+            with suppress(OSError):  # it has ended, or is not ours
+                if mark in path.read_bytes().split(b"\0"):
+                    found.append(int(path.parent.name))
+        return found
+
+    # ---------------------------------------------------------------- what must hold
+
+    def _run(self) -> Path | None:
+        """The run folder, if there is one with a checkpoint."""
+        found = {path.parent.parent for path in (self.folder / "runs").glob("*/checkpoints/*.pt")}
+        assert len(found) < 2, f"the run was begun again: {found}"
+        return next(iter(found), None)
+
+    def _compare(self, marks: Marks) -> None:
+        """Compare what was done with the checkpoint that the run goes on from."""
+        run = self._run()
+        if run is None:
+            assert marks.saved < 0, f"a checkpoint was written and is gone: {marks}"
+            return
+        found, warnings = checkpoint.newest(run)
+        assert not warnings, warnings
+        saved, every = int(found.state["past"]["version"]), int(str(self.flags["checkpoint-every-updates"]))
+        assert saved >= marks.saved, f"an older checkpoint than the one that was written: {saved}, {marks}"
+        table = run / "metrics.jsonl"
+        seen = max((int(row["time/iterations"]) for row in read_rows(table)), default=0) if table.exists() else 0
+        done = max(seen, marks.whole)
+        lost = max(0, done - saved)
+        assert lost <= every, f"{lost} whole updates are lost, at most {every} may be: {saved} saved, {seen} seen, {marks}"
+        if marks.phase in (Phase.COLLECTING, Phase.UPDATING):
+            assert lost < every, f"{lost} whole updates and a part of one are lost: {saved} saved, {seen} seen, {marks}"
+        self.account.lost[f"{lost} of {every}"] += 1
+
+    def _check(self) -> None:
+        """Check the run that has ended."""
+        run = self._run()
+        assert run is not None
+        summary: dict[str, Any] = json.loads((run / "summary.json").read_text())
+        to_a_return = "target-return" in self.flags
+        assert summary["stop_reason"] == ("target return 9 reached" if to_a_return else "all steps done"), summary
+        T, steps, most_lag = (int(str(self.flags.get(name, 0))) for name in ("rollout-steps", "steps", "max-lag"))
+        assert to_a_return or steps - T * ENVS < summary["env_steps"] <= steps
+        ledger = accounted(summary, lanes=LANES, rows=T * ENVS // LANES, max_lag=most_lag)
+        self.account.tickets.update({name: ledger[name] for name in ("issued", "used", "stale", "lost", "outstanding")})
+        rows = read_rows(run / "metrics.jsonl")
+        assert [row["time/iterations"] for row in rows] == list(range(1, summary["updates"] + 1)), "rows of metrics"
+        assert all("train/n_updates" in row for row in rows[1:] if "eval/mean_reward" not in row)
+        self._check_evaluations(rows, summary)
+        left = [path.name for path in run.glob("**/*.tmp")] + [path.name for path in run.glob("run.lock")]
+        assert not left, f"files that a killed process left: {left}"
+
+    def _check_evaluations(self, rows: list[dict[str, Any]], summary: dict[str, Any]) -> None:
+        """Each evaluation was made when it was due, and the best of them was kept."""
+        every = due = int(str(self.flags["eval-every"]))
+        returns = []
+        for row in rows:
+            is_due = row["time/total_timesteps"] >= due
+            assert is_due == ("eval/mean_reward" in row), f"an evaluation at {row['time/total_timesteps']}, due at {due}"
+            if is_due:
+                due += every
+                returns.append(row["eval/mean_reward"])
+        best = summary["best"]
+        assert best["chosen_by"] == max([*returns, summary["evaluation"]["return_mean"]]), (best, returns)
+
+
+def killed_runs(runs: int, seed: int, folder: Path, account: Account, at_once: int = AT_ONCE) -> None:
+    """Make this many runs, `at_once` at a time, and count into `account`."""
+    variants = list(VARIANTS)
+
+    def one(number: int) -> None:
+        run = OneRun(folder / f"run-{number}", f"{seed}-{number}", variants[number % len(variants)], account)
+        try:
+            run.play()
+        except AssertionError as error:
+            account.short.append(f"run {number}, {run.variant}: {error}")
+        else:
+            account.runs[run.variant] += 1
+            shutil.rmtree(run.folder)
+
+    with ThreadPoolExecutor(at_once) as pool:
+        for done, _ in enumerate(pool.map(one, range(runs)), 1):
+            if done % 10 == 0:
+                print(f"{done} of {runs} runs, {sum(account.kills.values())} kills", flush=True)
+
+
+def show(account: Account, seconds: float) -> None:
+    """Print the account."""
+    rows: dict[str, object] = {f"kills while {phase}": count for phase, count in sorted(account.kills.items())}
+    rows |= {f"runs that ended: {name}": count for name, count in sorted(account.runs.items())}
+    rows |= {f"kills after which {name} updates were made again": count for name, count in sorted(account.lost.items())}
+    rows |= {f"tickets {name}": f"{count:,}" for name, count in account.tickets.items()}
+    rows |= {
+        "kills": sum(account.kills.values()),
+        "kills that left a file that was not whole": account.torn,
+        "learners that ended before their kill": account.again,
+        "runs that ended": sum(account.runs.values()),
+        "seconds": f"{seconds:.0f}",
+    }
+    for name, value in rows.items():
+        print(f"  {name:52} {value:>12}")
+
+
+def main() -> int:
+    """Run the program. Returns the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m tests.system.killed_runs", description=__doc__.partition("\n")[0])
+    parser.add_argument("--runs", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=random.SystemRandom().getrandbits(31), help="default: any, printed")
+    parser.add_argument("--at-once", type=int, default=AT_ONCE, help="runs at a time")
+    options = parser.parse_args()
+    folder = Path(tempfile.mkdtemp(prefix="killed-runs-"))
+    print(f"killed runs: seed {options.seed}, {options.runs} runs", flush=True)
+    began_s, account = time.monotonic(), Account()
+    killed_runs(options.runs, options.seed, folder, account, options.at_once)
+    show(account, time.monotonic() - began_s)
+    if account.short:
+        print(f"killed runs: what the runs said lies in {folder}", file=sys.stderr)
+    else:
+        shutil.rmtree(folder)
+    for line in account.short:
+        print(f"falls short: {line}", file=sys.stderr)
+    held = "falls short" if account.short else "all held"
+    print(f"killed runs: {held}; again with --runs {options.runs} --seed {options.seed}")
+    return 1 if account.short else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

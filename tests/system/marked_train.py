@@ -1,0 +1,127 @@
+"""`python -m tests.system.marked_train FILE ARGUMENTS`: `millrace ARGUMENTS`, which writes into FILE what it is doing.
+
+Rule: FILE is mapped memory, so what was written last is there also if the process is killed in the middle of it. The program
+is wrapped from outside: the modules that import PyTorch are not imported earlier than they would be.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+import sys
+from collections.abc import Callable
+from enum import IntEnum
+from pathlib import Path
+from typing import Any, NamedTuple, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class Phase(IntEnum):
+    """What a learner is doing."""
+
+    STARTING = 0
+    COLLECTING = 1
+    UPDATING = 2
+    RECORDING = 3
+    CHECKPOINTING = 4
+    EVALUATING = 5
+    DRAINING = 6
+    LEAVING = 7
+
+
+class Marks(NamedTuple):
+    """The content of FILE. Versions are -1 while there is none."""
+
+    phase: Phase = Phase.STARTING
+    entered: int = 0
+    """how many times a phase has begun"""
+    first: int = -1
+    """version with which this process began"""
+    whole: int = -1
+    """version of the newest whole update"""
+    saved: int = -1
+    """version in the newest checkpoint that this process has written"""
+
+
+LAYOUT = struct.Struct("5q")
+
+
+def read_marks(file: Path) -> Marks:
+    """What was written last; the defaults if the process has not begun to write."""
+    content = file.read_bytes() if file.exists() else b""
+    if len(content) < LAYOUT.size:
+        return Marks()
+    phase, *rest = LAYOUT.unpack(content[: LAYOUT.size])
+    return Marks(Phase(phase), *rest)
+
+
+class Marker:
+    """Writes the marks of this process, and wraps what it marks."""
+
+    def __init__(self, file: Path) -> None:
+        file.write_bytes(LAYOUT.pack(*Marks()))
+        with file.open("r+b") as opened:
+            self._page = mmap.mmap(opened.fileno(), LAYOUT.size)
+        self._marks = Marks()
+        self._gathered = 0
+
+    def mark(self, **changed: int) -> None:
+        """Write these marks."""
+        if "phase" in changed:
+            changed["entered"] = self._marks.entered + 1
+        self._marks = self._marks._replace(**changed)  # type: ignore[arg-type]
+        self._page[:] = LAYOUT.pack(*self._marks)
+
+    def during(self, phase: Phase, function: Callable[P, R], then: Phase | None = None) -> Callable[P, R]:
+        """The function, in this phase. Afterwards: `then`, or the phase before it."""
+
+        def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
+            before = self._marks.phase
+            self.mark(phase=phase)
+            try:
+                return function(*args, **kwargs)
+            finally:
+                self.mark(phase=before if then is None else then)
+
+        return wrapped
+
+    def wrap(self) -> None:
+        """Wrap the functions in which the phases of a learner begin."""
+        from learner.run_folder import checkpoint
+        from learner.run_folder.run_folder import RunFolder
+        from learner.service import RolloutService
+
+        gather, publish, save = RolloutService.gather, RolloutService.publish, checkpoint.save
+
+        def marked_gather(service: RolloutService) -> Any:
+            found = self.during(Phase.COLLECTING, gather, Phase.UPDATING)(service)
+            self._gathered += 1
+            return found
+
+        def marked_publish(service: RolloutService, version: int, *args: Any, **kwargs: Any) -> None:
+            if self._marks.first < 0:
+                self.mark(first=version, whole=version)
+            elif version == self._marks.first + self._gathered:  # the best policy is published under a number beyond it
+                self.mark(whole=version, phase=Phase.RECORDING)
+            publish(service, version, *args, **kwargs)
+
+        def marked_save(folder: Path, state: dict[str, Any], *args: Any) -> Path:
+            found = self.during(Phase.CHECKPOINTING, save)(folder, state, *args)
+            self.mark(saved=state["past"]["version"])
+            return found
+
+        RolloutService.gather = marked_gather  # type: ignore[method-assign]
+        RolloutService.publish = marked_publish  # type: ignore[assignment]
+        RolloutService.evaluate = self.during(Phase.EVALUATING, RolloutService.evaluate)  # type: ignore[method-assign]
+        RolloutService.drain = self.during(Phase.DRAINING, RolloutService.drain, Phase.LEAVING)  # type: ignore[method-assign]
+        checkpoint.save = marked_save
+        RunFolder.write_policy = self.during(Phase.CHECKPOINTING, RunFolder.write_policy)  # type: ignore[method-assign]
+
+
+if __name__ == "__main__":
+    Marker(Path(sys.argv[1])).wrap()
+    from millrace.cli.main import main
+
+    sys.exit(main(sys.argv[2:]))
