@@ -124,8 +124,9 @@ class OneRun:
                 made += 1
             else:
                 self.account.again += 1
-                if not made:  # each run is killed at least once
-                    shutil.rmtree(self.folder / "runs")
+                if made:
+                    break  # the run has ended
+                shutil.rmtree(self.folder / "runs")  # each run is killed at least once
         process, said, _ = self._start()
         try:
             wait_for(lambda: process.poll() is not None, ENDS_S * crowding(), lambda: f"the end: {said.read_text()}", 0.05)

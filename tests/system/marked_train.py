@@ -112,11 +112,11 @@ class Marker:
             self.mark(saved=state["past"]["version"])
             return found
 
-        RolloutService.gather = marked_gather  # type: ignore[method-assign]
+        RolloutService.gather = marked_gather  # type: ignore[assignment,method-assign]
         RolloutService.publish = marked_publish  # type: ignore[assignment]
         RolloutService.evaluate = self.during(Phase.EVALUATING, RolloutService.evaluate)  # type: ignore[method-assign]
         RolloutService.drain = self.during(Phase.DRAINING, RolloutService.drain, Phase.LEAVING)  # type: ignore[method-assign]
-        checkpoint.save = marked_save
+        checkpoint.save = marked_save  # type: ignore[assignment]
         RunFolder.write_policy = self.during(Phase.CHECKPOINTING, RunFolder.write_policy)  # type: ignore[method-assign]
 
 
