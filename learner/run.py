@@ -28,12 +28,11 @@ from learner.members.endpoint import join_lines, keyring_for
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.recording.training_recorder import TrainingRecorder
 from learner.resumption import Resumption, check_spaces
-from learner.rollouts.hub import Hub, HubObserver, HubSettings
-from learner.rollouts.ticket_coordinator import TicketCoordinator
+from learner.rollouts.hub import HubObserver
 from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import Interrupted, RunFolder
 from learner.run_folder.run_lock import RunLock
-from learner.service import RolloutService
+from learner.service import rollout_service
 from protocol.bounds import one_line
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
@@ -172,25 +171,9 @@ class Run:
         state = RunState()
         if setup.resumed:
             state = restore(self.folder, self.algorithm)
-        coordinator = TicketCoordinator(
-            spec,
-            rollouts_per_update=config.lanes,
-            max_lag=config.max_lag,
-            worker_timeout_s=config.worker_timeout_s,
-            first_session=int.from_bytes(os.urandom(6), "little"),
-            ledger=state.ledger,
-            incarnations=state.incarnations,
-        )
-        settings = HubSettings(
-            config.no_workers_timeout_s,
-            config.stall_timeout_s,
-            config.max_env_failures,
-            config.weights_dtype,
-            config.call_timeouts(),
-        )
         self._interrupts = Interrupts()
-        hub = Hub(link, coordinator, settings, processes, self._check_interrupt, observer)
-        self.service = RolloutService(hub, processes.expected)
+        past = (state.ledger, state.incarnations)
+        self.service = rollout_service(config, spec, link, processes, self._check_interrupt, observer, past)
         episodes = _training_recorder(config, self.folder, setup.known, spec)
         self.folder.remove_temporary()
         self.folder.write_config(config)  # nothing of a resumed run is written before everything fits

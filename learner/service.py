@@ -1,19 +1,26 @@
 """The workers as a training loop sees them: wait for workers, publish, gather, evaluate, drain, take a snapshot.
 
-This is all that `learner.train` knows of the rest. Who starts worker processes is not known here either: the launchers in
-`millrace` pass them in as `ProcessCallbacks`.
+This is all that `learner.train` knows of the rest, and what `millrace.RolloutService` gives to a user's own loop. Who starts
+worker processes is not known here: the launchers in `millrace` pass them in as `ProcessCallbacks`. Imports no torch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Sequence
 
+from learner.config.rollout_config import RolloutConfig
+from learner.members.process_callbacks import ProcessCallbacks
 from learner.rollouts.evaluation_tickets import EvaluationPlan, evaluation_of
-from learner.rollouts.hub import Hub, HubSnapshot
+from learner.rollouts.hub import Hub, HubObserver, HubSettings, HubSnapshot
 from learner.rollouts.lanes import AcceptedRollout
+from learner.rollouts.ledger import Ledger
+from learner.rollouts.ticket_coordinator import TicketCoordinator
 from learner.run_folder.progress import Progress
 from learner.run_folder.results import Evaluation
 from protocol.arrays import Floats
+from protocol.specs import RunSpec
+from protocol.wire.learner_link import LearnerLink
 
 
 class RolloutService:
@@ -79,3 +86,38 @@ class RolloutService:
     def first_use_s(self) -> dict[str, float]:
         """For each worker: median seconds from publishing weights to the arrival of its first rollout under them."""
         return self._hub.first_use_s()
+
+
+def rollout_service(
+    config: RolloutConfig,
+    run: RunSpec,
+    link: LearnerLink,
+    processes: ProcessCallbacks,
+    check_interrupt: Callable[[], None],
+    observer: HubObserver = lambda hub: None,
+    past: tuple[Ledger, Sequence[int]] | None = None,
+) -> RolloutService:
+    """The service of a run for the workers that connect to this link. An update takes one rollout for each lane.
+
+    `processes`: the worker processes that this program started. `check_interrupt` is called while the service waits: what it
+    raises ends the wait. `observer` is called each time the service has listened. `past`: the ledger, and the next
+    incarnation of each lane, of a run that goes on.
+    """
+    ledger, incarnations = (None, ()) if past is None else past
+    coordinator = TicketCoordinator(
+        run,
+        rollouts_per_update=config.lanes,
+        max_lag=config.max_lag,
+        worker_timeout_s=config.worker_timeout_s,
+        first_session=int.from_bytes(os.urandom(6), "little"),
+        ledger=ledger,
+        incarnations=incarnations,
+    )
+    settings = HubSettings(
+        config.no_workers_timeout_s,
+        config.stall_timeout_s,
+        config.max_env_failures,
+        config.weights_dtype,
+        config.call_timeouts(),
+    )
+    return RolloutService(Hub(link, coordinator, settings, processes, check_interrupt, observer), processes.expected)

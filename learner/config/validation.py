@@ -9,6 +9,7 @@ import msgspec
 
 from learner.config.config import Config
 from learner.config.hyperparameters import HYPERPARAMETERS, DQNConfig
+from learner.config.rollout_config import RolloutConfig
 from protocol.address import advertised_address, check_address
 from protocol.errors import UsageError
 
@@ -33,6 +34,17 @@ def validate(config: Config, where: str = "") -> Config:
     config = convert(msgspec.to_builtins(config), where)
     if not config.env:
         raise UsageError(f"{at}which environment? expected one that gymnasium.make takes, as in: millrace train CartPole-v1")
+    check_rollout_settings(config, at)
+    match config.algorithm:
+        case DQNConfig(replay_size=size, rollout_steps=steps) if size < (most := (steps + 1) * config.envs // config.lanes):
+            raise UsageError(f"{at}replay_size {size}: a rollout takes up to {most}; take --replay-size {most} or more")
+    if config.inference == "learner":
+        _check_learner_inference(config, at)
+    return config
+
+
+def check_rollout_settings(config: RolloutConfig, at: str = "") -> None:
+    """Raise `UsageError` if rollouts cannot be collected with these settings. `at` begins the message."""
     if config.envs % config.lanes:
         fewer = config.envs - config.envs % config.lanes
         near = f"{fewer} or {fewer + config.lanes}" if fewer else f"{config.lanes}"
@@ -40,11 +52,6 @@ def validate(config: Config, where: str = "") -> Config:
         raise UsageError(
             f"{at}{config.envs} envs cannot be shared evenly among {config.lanes} lanes; take {near}, or {divisor} lanes"
         )
-    match config.algorithm:
-        case DQNConfig(replay_size=size, rollout_steps=steps) if size < (most := (steps + 1) * config.envs // config.lanes):
-            raise UsageError(f"{at}replay_size {size}: a rollout takes up to {most}; take --replay-size {most} or more")
-    if config.inference == "learner":
-        _check_learner_inference(config, at)
     check_address(config.bind)
     if config.metrics_bind:
         try:
@@ -58,7 +65,6 @@ def validate(config: Config, where: str = "") -> Config:
         raise UsageError(
             f"{at}advertise {config.advertise}: expected a host name or an IP address, without a port"
         ) from None
-    return config
 
 
 def _check_learner_inference(config: Config, at: str) -> None:

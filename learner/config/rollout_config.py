@@ -1,0 +1,129 @@
+"""The settings of collecting rollouts: which environment, how many env copies, which workers, when to give up. Pure.
+
+A training run has these settings and those of `Config`. A `RolloutService` that is used without our training has these.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+from tyro.conf import Positional
+
+from learner.config.on_resume import Adaptable, Fixed, Free
+from protocol.alive import CallTimeouts
+from protocol.specs import ImagesDtype, Vector
+from protocol.wire.weight_dtypes import WeightsDtype
+
+Scalar = bool | int | float | str
+Count = Annotated[int, Meta(ge=1)]
+Natural = Annotated[int, Meta(ge=0)]
+Seconds = Annotated[float, Meta(gt=0)]
+SecondsOrNever = Annotated[float, Meta(ge=0)]
+
+
+class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The settings of collecting rollouts."""
+
+    # ------------------------------------------------------------------------------------------------------------ basics
+
+    env: Fixed[Positional[str]] = ""
+    """Environment id for gymnasium.make, as CartPole-v1, ALE/Pong-v5 or my_package.envs:MyEnv-v0."""
+    env_kwargs: Fixed[dict[str, Scalar]] = {}
+    """Keyword arguments for gymnasium.make: NAME VALUE NAME VALUE ..."""
+    seed: Fixed[Natural] = 1
+    """Seed of all random numbers of the run."""
+    workers: Free[Count] = 2
+    """Number of worker processes on this machine (train only)."""
+    envs: Adaptable[Count] = 8
+    """Number of env copies, summed over all workers. Must be a multiple of lanes."""
+
+    # ----------------------------------------------------------------------------------------------------------- workers
+
+    lanes: Adaptable[Count] = 4
+    """Number of groups of env copies. The copies of a lane are stepped together, on one worker at a time. Lanes are
+    distributed over the workers. Results depend on lanes and envs, not on the number of workers.
+    """
+    max_lag: Free[Natural] = 0
+    """Largest lag of a rollout: how many versions its weights may be older than the learner's. 0: workers and learner take
+    turns, and results are reproducible. Above 0: both run at the same time; impala and dqn are made for that.
+    """
+    vector: Free[Literal["auto", "loop", "native", "envpool"]] = "auto"
+    """How the env copies of a lane are stepped. loop: one after another. native: by the environment's own vector version.
+    envpool: by envpool (pip install 'millrace-rl[envpool]'). auto: loop. The others use other random numbers.
+    """
+    images_dtype: Free[ImagesDtype] = "float32"
+    """Precision in which the acting policy processes images. bfloat16 halves the work on CPUs with AMX and is slower
+    elsewhere. The learner always computes in float32.
+    """
+    pin_workers: Free[bool | None] = None
+    """Keep each local worker process on one core (train only). none: do so if max_lag is 0 and the number of workers is a
+    multiple of the number of cores.
+    """
+    min_workers: Free[Natural] = 0
+    """Start training when this many workers have joined. 0: wait for all local workers (train), for one worker (learner)."""
+
+    # ----------------------------------------------------------------------------------------------------------- network
+
+    transport: Free[Literal["inproc", "ipc", "tcp"]] = "ipc"
+    """How local workers are connected (train only). inproc: as threads of this process, which then runs the environment.
+    ipc: local sockets. tcp: TCP on 127.0.0.1.
+    """
+    bind: Free[str] = "tcp://127.0.0.1:5555"
+    """Address at which the learner listens for workers (learner only). With tcp://0.0.0.0:5555 other machines can join; this
+    needs keys.
+    """
+    advertise: Free[str] = ""
+    """Host name or IP address at which workers on other machines reach this one (learner only). Default: the name of this
+    machine.
+    """
+    keys: Free[str] = ""
+    """Key folder. Default: MILLRACE_KEYS, else ~/.config/millrace/keys. If a folder is named here or in MILLRACE_KEYS, TCP
+    connections on this machine need keys too.
+    """
+    insecure: Free[bool] = False
+    """Accept workers of other machines without keys. Whoever reaches the port can then read, disturb and stop the run."""
+    compress: Free[Literal["none", "zstd"]] = "none"
+    """Compression of rollouts. zstd reduces the size of images, which pays on almost any network
+    (pip install 'millrace-rl[compress]' for the learner and every worker).
+    """
+    weights_dtype: Free[WeightsDtype] = "float32"
+    """Precision of the weights that are sent to workers. bfloat16 and float16 halve the bytes. Workers act with the rounded
+    weights; the learner's stay float32.
+    """
+    metrics_bind: Free[str] = ""
+    """HOST:PORT at which Prometheus can read the metrics, as 127.0.0.1:9464. With 0.0.0.0:9464 everybody in the network can
+    read them. Default: nowhere.
+    """
+
+    # --------------------------------------------------------------------------------------------- timeouts and failures
+
+    heartbeat_s: Free[Seconds] = 1.0
+    """Seconds between two heartbeats of a worker."""
+    worker_timeout_s: Free[Seconds] = 5.0
+    """A worker that has been silent for this many seconds is given up, and other workers take over its lanes. A worker is
+    not silent while its supervisor says that its environment is busy, however long that takes.
+    """
+    no_workers_timeout_s: Free[Seconds] = 60.0
+    """Write a checkpoint and end the run if there has been no worker for this many seconds."""
+    construct_timeout_s: Free[SecondsOrNever] = 600.0
+    """A local worker process is restarted if making one env copy takes longer than this many seconds. 0: never."""
+    reset_timeout_s: Free[SecondsOrNever] = 600.0
+    """A local worker process is restarted if a reset of an env copy takes longer than this many seconds. 0: never."""
+    step_timeout_s: Free[SecondsOrNever] = 600.0
+    """A local worker process is restarted if one step of an env copy takes longer than this many seconds. 0: never."""
+    stall_timeout_s: Free[Seconds] = 600.0
+    """Write a checkpoint and end the run if no env step, reset or construction has ended for this many seconds, and none
+    is under way within its timeout.
+    """
+    max_env_failures: Free[Natural] = 3
+    """End the run if the environment has raised more exceptions, or ended more worker processes, than this."""
+
+    def call_timeouts(self) -> CallTimeouts:
+        """How long a call of an env copy may take."""
+        return CallTimeouts(self.construct_timeout_s, self.reset_timeout_s, self.step_timeout_s)
+
+    def chosen_vector(self) -> Vector:
+        """How the env copies of a lane are stepped."""
+        return "loop" if self.vector == "auto" else self.vector
