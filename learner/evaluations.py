@@ -11,11 +11,11 @@ from collections.abc import Callable
 
 from learner.algorithms import Algorithm
 from learner.config.run_rules import EvaluationSettings
+from learner.rollout_service.service import RolloutService
 from learner.rollouts.evaluation_tickets import EvaluationPlan
 from learner.run_folder.results import Best, Evaluation
 from learner.run_folder.run_folder import RunFolder
 from learner.run_state import RunState
-from learner.service import RolloutService
 from protocol.arrays import Floats
 from protocol.errors import RunError, UsageError
 from protocol.specs import RunSpec

@@ -28,11 +28,11 @@ from learner.members.endpoint import join_lines, keyring_for
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.recording.training_recorder import TrainingRecorder
 from learner.resumption import Resumption, check_spaces
+from learner.rollout_service.service import rollout_service
 from learner.rollouts.hub import HubObserver
 from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import Interrupted, RunFolder
 from learner.run_folder.run_lock import RunLock
-from learner.service import rollout_service
 from protocol.bounds import one_line
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv

@@ -18,6 +18,7 @@ from learner.algorithms import Algorithm
 from learner.config.config import Config
 from learner.evaluations import Evaluations, warn_on_error
 from learner.recording.training_recorder import TrainingRecorder
+from learner.rollout_service.service import RolloutService
 from learner.rollouts.hub import HubSnapshot
 from learner.rollouts.lanes import AcceptedRollout
 from learner.run_folder import checkpoint
@@ -28,7 +29,6 @@ from learner.run_folder.results import Best, Summary
 from learner.run_folder.run_folder import RunFolder
 from learner.run_folder.versions import versions
 from learner.run_state import RunState
-from learner.service import RolloutService
 from protocol.bounds import one_line
 from protocol.errors import RunError
 from protocol.rollout import Batch

@@ -16,9 +16,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from learner.algorithms import Algorithm
+from learner.rollout_service.service import RolloutService
 from learner.rollouts.lanes import AcceptedRollout
 from learner.run_recorder import RunRecorder
-from learner.service import RolloutService
 from protocol.errors import RunError
 from protocol.rollout import stack_rollouts
 

@@ -9,6 +9,7 @@ run = millrace.train("CartPole-v1", seed=1)
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,14 +17,42 @@ from millrace.import_conflict import check_imports
 
 check_imports()
 
+from protocol.errors import (  # noqa: E402
+    CheckpointError,
+    EnvironmentFailed,
+    MillraceError,
+    NoWorkers,
+    RunError,
+    Stalled,
+    UsageError,
+    UserFacingError,
+    WorkerLost,
+)
+
 if TYPE_CHECKING:
     from gymnasium.vector import AutoresetMode
 
     from learner.run_folder.progress import Progress
     from learner.vector_env.env import ZmqVectorEnv
     from learner.vector_env.settings import EnvLike
+    from millrace.policies import CNN, MLP, PolicyParameters, Recurrent
+    from millrace.rollout_service import RolloutBatch, RolloutService
 
-__all__ = ["__version__", "make_vec", "train"]
+__all__ = [
+    "CNN", "MLP", "CheckpointError", "EnvironmentFailed", "MillraceError", "NoWorkers", "PolicyParameters", "Recurrent",
+    "RolloutBatch", "RolloutService", "RunError", "Stalled", "UsageError", "UserFacingError", "WorkerLost", "__version__",
+    "make_vec", "train",
+]  # fmt: skip
+
+_IMPORTED_WHEN_USED = {
+    "CNN": "millrace.policies",
+    "MLP": "millrace.policies",
+    "PolicyParameters": "millrace.policies",
+    "Recurrent": "millrace.policies",
+    "RolloutBatch": "millrace.rollout_service",
+    "RolloutService": "millrace.rollout_service",
+}
+"""Public names, and the module of each. They are imported when they are used, because that takes longer than this file."""
 
 
 def train(
@@ -140,8 +169,10 @@ def make_vec(
     )
 
 
-def __getattr__(name: str) -> str:
-    """Look up `__version__` when it is first used, because that takes longer than the rest of this file."""
+def __getattr__(name: str) -> Any:
+    """Import a public name, or look up `__version__`, when it is first used."""
+    if (module := _IMPORTED_WHEN_USED.get(name)) is not None:
+        return getattr(import_module(module), name)
     if name != "__version__":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import metadata
@@ -150,3 +181,7 @@ def __getattr__(name: str) -> str:
         return metadata.version("millrace-rl")
     except metadata.PackageNotFoundError:
         return "0+uninstalled"
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -29,6 +29,7 @@ LEARNER = {  # what each folder of the learner may import of the learner; train.
     "members": set[str](),
     "rollouts": {"members", "run_folder"},
     "vector_env": {"members"},
+    "rollout_service": {"config", "members", "rollouts", "run_folder"},
     "run_folder": set[str](),
     "recording": {"run_folder", "rollouts", "policy_player"},
     "report": {"run_folder"},

@@ -43,6 +43,16 @@ def validate(config: Config, where: str = "") -> Config:
     return config
 
 
+def convert_rollout_settings(settings: dict[str, Any]) -> RolloutConfig:
+    """The record of these settings, checked. Raises `UsageError`."""
+    try:
+        config = msgspec.convert(settings, RolloutConfig)
+    except msgspec.ValidationError as error:
+        raise UsageError(_reworded(str(error), settings)) from error
+    check_rollout_settings(config)
+    return config
+
+
 def check_rollout_settings(config: RolloutConfig, at: str = "") -> None:
     """Raise `UsageError` if rollouts cannot be collected with these settings. `at` begins the message."""
     if config.envs % config.lanes:
@@ -81,10 +91,11 @@ def _check_learner_inference(config: Config, at: str) -> None:
 
 def _reworded(message: str, settings: dict[str, Any]) -> str:
     """Msgspec's message in our words: the setting, what was expected and what was given."""
+    algorithm = settings.get("algorithm", {})
     expected, _, path = message.replace(" | null", ' or "none"').replace("`object`", "table").partition(" - at `$.")
     name = re.split(r"[.\[`]", path)[0]
-    record = HYPERPARAMETERS[settings["algo"]] if name in settings["algorithm"] else Config
-    given = settings["algorithm"].get(name, settings.get(name))
+    record = HYPERPARAMETERS[settings["algo"]] if name in algorithm else Config
+    given = algorithm.get(name, settings.get(name))
     if expected.startswith("Invalid enum value"):
         return f"{name}: expected one of {', '.join(_choices(get_type_hints(record)[name]))}, got {given!r}"
     return f"{name}: {expected.replace('`', '').replace('Expected', 'expected').partition(', got ')[0]}, got {given!r}"

@@ -15,6 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from learner.config.config import Config
+from learner.config.rollout_config import RolloutConfig
 from learner.members.endpoint import generate_run_keys
 from protocol.errors import UsageError
 from protocol.keys.key_folder import Keyring, chosen_key_folder
@@ -70,7 +71,7 @@ def worker_flags(config: Config, run: Path) -> WorkerFlags:
     return flags
 
 
-def worker_cores(config: Config) -> list[int]:
+def worker_cores(config: RolloutConfig) -> list[int]:
     """The cores that local workers are pinned to, in turn; empty if they are not pinned. Raises `UsageError`.
 
     New weights wake all workers at once, while the learner still runs. Linux then often puts two workers on one core and

@@ -89,9 +89,9 @@ class Marker:
 
     def wrap(self) -> None:
         """Wrap the functions in which the phases of a learner begin."""
+        from learner.rollout_service.service import RolloutService
         from learner.run_folder import checkpoint
         from learner.run_folder.run_folder import RunFolder
-        from learner.service import RolloutService
 
         gather, publish, save = RolloutService.gather, RolloutService.publish, checkpoint.save
 

@@ -1,0 +1,1 @@
+"""What collects rollouts: the service, the specification of its workers, and its saved state."""

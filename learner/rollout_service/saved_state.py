@@ -1,0 +1,69 @@
+"""The file of a `RolloutService`: its state beside the user's own arrays, one .npz, written whole or not at all."""
+
+from __future__ import annotations
+
+import hashlib
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from learner.rollouts.ledger import Ledger
+from learner.run_folder.atomic_write import write_atomically
+from protocol.arrays import Array
+from protocol.errors import CheckpointError, UsageError
+from protocol.specs import PolicySpec
+
+OURS = "millrace"  # name of our entry, JSON as bytes; the user's arrays have other names
+FORMAT = 1
+
+
+class ServiceState(msgspec.Struct, frozen=True, kw_only=True):
+    """What a service goes on from."""
+
+    env: str
+    """id or name of the environment"""
+    policy: str
+    """digest of the policy's specification"""
+    version: int
+    """of the newest weights that were published"""
+    env_steps: int
+    ledger: Ledger
+    incarnations: list[int]
+    """the next incarnation of each lane"""
+    format: int = FORMAT
+
+
+def digest(policy: PolicySpec) -> str:
+    """A short text that differs for different policies."""
+    return hashlib.sha256(msgspec.msgpack.encode(policy)).hexdigest()[:32]
+
+
+def write(path: Path, state: ServiceState, arrays: Mapping[str, Any]) -> None:
+    """Write the state and the user's arrays. Raises `UsageError` for arrays that cannot be kept, and OSError."""
+    kept = {}
+    for name, value in arrays.items():
+        array = np.asarray(value)
+        if name == OURS or array.dtype.hasobject:
+            raise UsageError(f"save: {name}: expected an array of numbers under another name than {OURS}, got {array.dtype}")
+        kept[name] = array
+    ours = np.frombuffer(msgspec.json.encode(state), np.uint8)
+    write_atomically(path, lambda file: np.savez(file, **{OURS: ours}, **kept))  # type: ignore[arg-type]
+
+
+def read(path: Path) -> tuple[ServiceState, dict[str, Array]]:
+    """The state, and the user's arrays by name. Raises `CheckpointError`."""
+    try:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:  # numpy leaves a damaged file open
+            arrays = {name: file[name] for name in file.files}
+        state = msgspec.json.decode(arrays.pop(OURS).tobytes(), type=ServiceState)
+    except (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile, msgspec.MsgspecError) as error:
+        raise CheckpointError(
+            f"{path}: expected a file that RolloutService.save wrote, cannot read it: {error}; restore an older one"
+        ) from error
+    if state.format != FORMAT:
+        raise CheckpointError(f"{path}: expected format {FORMAT}, got {state.format}; use the millrace that wrote it")
+    return state, arrays

@@ -1,0 +1,197 @@
+"""The policies that workers can act with: how a user chooses one, and where its parameters are in the flat vector.
+
+A policy here is the acting part alone: observation in, distribution over actions out. What else a learner trains (a critic,
+say) is its own business. Imports no torch.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, Protocol
+
+import numpy as np
+
+from protocol.arrays import Array, Floats
+from protocol.errors import UsageError
+from protocol.policy.layout import Field, acting_size, buffer_layout, named_views, parameter_layout, total_size
+from protocol.specs import ActionSpec, Leaf, PolicySpec
+
+Activation = Literal["tanh", "relu"]
+
+
+class PolicyChoice(Protocol):
+    """`MLP`, `CNN` or `Recurrent`: settings from which a policy is made once the spaces are known."""
+
+    def spec(self, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
+        """The policy for these spaces. Raises `UsageError` if there is none."""
+        ...
+
+
+@dataclass(frozen=True, init=False)
+class MLP:
+    """Hidden layers and a linear output: `MLP(64, 64)`.
+
+    If the observation has images, they go through convolutions first, as with `CNN`.
+    """
+
+    net: tuple[int, ...]
+    """widths of the hidden layers"""
+    activation: Activation
+    normalize_observations: bool
+    """subtract a mean and divide by a standard deviation, which are published as buffers; clip to ±10"""
+
+    def __init__(self, *net: int, activation: Activation = "tanh", normalize_observations: bool = False) -> None:
+        object.__setattr__(self, "net", net or (64, 64))
+        object.__setattr__(self, "activation", activation)
+        object.__setattr__(self, "normalize_observations", normalize_observations)
+
+    def spec(self, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
+        """The policy for these spaces."""
+        if not all(type(width) is int and width > 0 for width in self.net):
+            raise UsageError(f"policy: expected widths of hidden layers, as in MLP(64, 64), got {self.net}")
+        return PolicySpec(
+            observation,
+            action,
+            net=self.net,
+            activation=self.activation,
+            normalize_observations=self.normalize_observations,
+        )
+
+
+@dataclass(frozen=True, init=False)
+class CNN(MLP):
+    """Convolutions for images, then hidden layers: `CNN(512)`. Large images get those of Mnih et al. (2015)."""
+
+    def __init__(self, *net: int, activation: Activation = "relu", normalize_observations: bool = False) -> None:
+        super().__init__(*(net or (512,)), activation=activation, normalize_observations=normalize_observations)
+
+    def spec(self, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
+        """The policy for these spaces. Raises `UsageError` if the observation has no image."""
+        found = super().spec(observation, action)
+        if not found.convolves:
+            shapes = ", ".join(f"{leaf.dtype}{list(leaf.shape)}" for leaf in observation)
+            raise UsageError(f"policy CNN: expected an image (uint8, three dimensions, sides of 5 or more), got {shapes}")
+        return found
+
+
+@dataclass(frozen=True, init=False)
+class Recurrent(MLP):
+    """A recurrent core, then hidden layers: `Recurrent(64, core="lstm", core_size=64)`.
+
+    A batch has the core's state before its first row in `state`.
+    """
+
+    core: Literal["lstm", "gru"]
+    core_size: int
+    """number of units of the core"""
+
+    def __init__(
+        self,
+        *net: int,
+        core: Literal["lstm", "gru"] = "lstm",
+        core_size: int = 64,
+        activation: Activation = "tanh",
+        normalize_observations: bool = False,
+    ) -> None:
+        super().__init__(*(net or (64,)), activation=activation, normalize_observations=normalize_observations)
+        object.__setattr__(self, "core", core)
+        object.__setattr__(self, "core_size", core_size)
+
+    def spec(self, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
+        """The policy for these spaces."""
+        from msgspec.structs import replace
+
+        return replace(super().spec(observation, action), core=self.core, core_size=self.core_size)
+
+
+class Piece(NamedTuple):
+    """One array of the flat parameter vector: `flat[offset : offset + size].reshape(shape)`."""
+
+    name: str
+    """as `actor.0.weight`; weights are [outputs, inputs]"""
+    shape: tuple[int, ...]
+    offset: int
+    gain: float
+    """gain of the orthogonal initialization; 0: it starts at zero"""
+
+    @property
+    def size(self) -> int:
+        """Number of its elements."""
+        return math.prod(self.shape)
+
+
+class PolicyParameters:
+    """The parameters of a policy: names, shapes and offsets in the flat float32 vector, and initial values."""
+
+    def __init__(self, spec: PolicySpec) -> None:
+        self.spec = spec
+        """The policy as plain data."""
+        self.size = acting_size(spec)
+        """P, the length of the flat vector."""
+        self.layout = _pieces(parameter_layout(spec)[0])
+        """Its pieces, in order."""
+        self.buffers = _pieces(buffer_layout(spec))
+        """The pieces of the buffers: `observation_mean` and `observation_std` if observations are normalized."""
+        self._fields = parameter_layout(spec)[0]
+        self._buffer_fields = buffer_layout(spec)
+
+    def initial(self, seed: int = 1) -> Floats:
+        """Initial parameters [P] float32: orthogonal weights with the gains of the layout, biases 0."""
+        generator = np.random.default_rng(seed)
+        flat = np.zeros(self.size, np.float32)
+        for piece in self.layout:
+            if piece.gain:
+                rows, columns = piece.shape[0], math.prod(piece.shape[1:])
+                normal = generator.standard_normal((max(rows, columns), min(rows, columns)))
+                q, r = np.linalg.qr(normal)
+                q = q * np.sign(np.diag(r))
+                weight = piece.gain * (q if rows >= columns else q.T)
+                flat[piece.offset : piece.offset + piece.size] = weight.ravel()
+        return flat
+
+    def named(self, flat: Floats) -> dict[str, Array]:
+        """Views of the pieces of a flat vector [P], by name."""
+        return named_views(flat, self._fields)
+
+    def flat(self, parameters: Mapping[str, Array] | Array) -> Floats:
+        """A flat copy [P] float32 of a flat vector, or of arrays by name. Raises `UsageError`."""
+        return _flat(parameters, self._fields, "parameters")
+
+    def flat_buffers(self, buffers: Mapping[str, Array] | Array | None) -> Floats:
+        """A flat float32 copy of buffers. None: mean 0 and standard deviation 1. Raises `UsageError`."""
+        if buffers is None:
+            buffers = {
+                field.name: np.full(field.shape, 1.0 if field.name.endswith("std") else 0.0) for field in self._buffer_fields
+            }
+        return _flat(buffers, self._buffer_fields, "buffers")
+
+
+def _pieces(fields: tuple[Field, ...]) -> tuple[Piece, ...]:
+    pieces, offset = [], 0
+    for field in fields:
+        pieces.append(Piece(field.name, field.shape, offset, field.gain))
+        offset += math.prod(field.shape)
+    return tuple(pieces)
+
+
+def _flat(given: Mapping[str, Array] | Array, fields: tuple[Field, ...], what: str) -> Floats:
+    flat = np.empty(total_size(fields), np.float32)
+    if isinstance(given, Mapping):
+        names = [field.name for field in fields]
+        if missing := [name for name in names if name not in given]:
+            raise UsageError(f"{what}: expected {', '.join(names)}; {missing[0]} is missing")
+        for name, view in named_views(flat, fields).items():
+            array = np.asarray(given[name])
+            if array.shape != view.shape:
+                raise UsageError(f"{what}: {name}: expected shape {list(view.shape)}, got {list(array.shape)}")
+            view[...] = array
+    else:
+        array = np.asarray(given)
+        if array.shape != flat.shape:
+            raise UsageError(f"{what}: expected a vector of {len(flat)} numbers, got shape {list(array.shape)}")
+        flat[:] = array
+    if not np.isfinite(flat).all():
+        raise UsageError(f"{what}: expected finite numbers, got NaN or infinity; they were not published")
+    return flat

@@ -1,0 +1,339 @@
+"""Rollouts for a learner of your own: any framework, any loop. millrace collects; you learn.
+
+    with millrace.RolloutService("CartPole-v1", policy=millrace.MLP(64, 64), workers=2, envs=64) as service:
+        parameters = service.policy.initial(seed=1)
+        service.publish(parameters)
+        for batch in service:
+            parameters = update(parameters, batch)
+            service.publish(parameters)
+
+The built-in trainer runs on the same service: tickets, ledger, lags, faults and reproducible results are
+those of `millrace train`. Imports no torch.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import gymnasium
+import numpy as np
+
+from learner.config.did_you_mean import did_you_mean
+from learner.config.rollout_config import RolloutConfig
+from learner.config.validation import convert_rollout_settings
+from learner.interrupts import Interrupts
+from learner.rollout_service.saved_state import ServiceState, digest, read, write
+from learner.rollouts.evaluation_tickets import EvaluationPlan
+from learner.rollouts.lanes import AcceptedRollout
+from learner.rollouts.ledger import Ledger
+from learner.run_folder.results import Evaluation
+from millrace.launch.rollouts import start
+from millrace.policies import MLP, PolicyChoice, PolicyParameters
+from protocol.arrays import Array, Bools, Floats, Ints
+from protocol.env_spec import EnvSpec
+from protocol.errors import CheckpointError, UsageError, first_line
+from protocol.rollout import Episode, stack_rollouts
+from protocol.specs import PolicySpec
+
+PULSE_S = 0.005  # how often messages are answered while the user computes
+EVALUATION_COPIES = 4  # episodes that a worker plays side by side
+
+
+@dataclass(frozen=True)
+class RolloutBatch:
+    """One rollout of each lane, side by side: T steps of N env copies. All arrays are writable and yours.
+
+    Row t says: in `obs[t]` we did `action[t]`, got `reward[t]` and saw `obs[t + 1]`, wherever `valid[t]`. A row that is not
+    valid only resets its env copy: leave it out of every loss, return and count.
+    """
+
+    obs: Any
+    """[T+1, N, *shape]; for a Dict or Tuple observation a dict with such an array for each leaf, by its path `a/b`"""
+    action: Array
+    """[T, N, *shape] as sampled: int64 counted from 0, or float32 before clipping"""
+    log_prob: Floats
+    """[T, N] of the action, under the policy that acted"""
+    reward: Floats
+    """[T, N] raw"""
+    terminated: Bools
+    """[T, N] the task ended: do not bootstrap"""
+    truncated: Bools
+    """[T, N] a time limit ended the episode: bootstrap from obs[t + 1]"""
+    valid: Bools
+    """[T, N]"""
+    state: Floats
+    """[N, S] state of the recurrent core before obs[0]; S is 0 without a core"""
+    lane: Ints
+    """[N] the lane of each column"""
+    version: Ints
+    """[N] the version of the weights that acted"""
+    fresh: Bools
+    """[N] False where the column goes on where it ended in the batch before"""
+    episodes: tuple[Episode, ...] = field(repr=False)
+    """the episodes that ended: `reward` (the return), `length`, `seconds`"""
+
+    @property
+    def env_steps(self) -> int:
+        """Number of valid transitions."""
+        return int(np.count_nonzero(self.valid))
+
+
+class RolloutService:
+    """Collects rollouts of one policy with worker processes, here or elsewhere, for a learner of your own.
+
+    Use it in a `with` statement and from one thread. While you compute, a thread of the service answers the workers, so a
+    long computation loses none of them. Iterating gives a `RolloutBatch` for each update; it waits until one rollout of each
+    lane is there. A batch can be at most `max_lag` versions old.
+    """
+
+    def __init__(
+        self,
+        env: str | Any,
+        policy: PolicyChoice | None = None,
+        *,
+        rollout_steps: int = 128,
+        restore: str | Path | None = None,
+        **settings: Any,
+    ) -> None:
+        """Start the workers and wait until they have joined.
+
+        Args:
+            env: an id that `gymnasium.make` takes, or a callable that returns an environment.
+            policy: `MLP`, `CNN` or `Recurrent`; by default `MLP(64, 64)`.
+            rollout_steps: T, env steps of an env copy in a batch.
+            restore: a file that `save` wrote; `restored` then has its arrays.
+            **settings: the settings of `millrace train` for environments, workers, network and timeouts, by the same names:
+                `workers=2`, `envs=8`, `lanes=4`, `max_lag=0`, `seed=1`, `env_kwargs={}`, `vector`, `transport`, `keys`,
+                `worker_timeout_s` and so on. With `bind="tcp://0.0.0.0:5555"` no worker is started here: workers elsewhere
+                join with `millrace worker`.
+
+        Raises `UsageError` if an argument is wrong, `NoWorkers` if too few workers join in time, and `EnvironmentFailed` if
+        the environment cannot be made.
+        """
+        listens = bool(settings.get("bind"))
+        config = _config(env, settings)
+        if not (type(rollout_steps) is int and rollout_steps > 0):
+            raise UsageError(f"rollout_steps: expected a whole number above 0, got {rollout_steps!r}")
+        self.restored: dict[str, Array] = {}
+        """The arrays of the file that was restored, by name."""
+        past, self._version, self.env_steps = None, -1, 0
+        state: ServiceState | None = None
+        if restore is not None:
+            state, self.restored = read(Path(restore))
+            past = _past(state)
+            self._version, self.env_steps = state.version - 1, state.env_steps
+        self.config = config
+        """All settings of collecting rollouts."""
+        self._interrupts = Interrupts()
+        self._lock = threading.Lock()
+        self._over = threading.Event()
+        self._owner = threading.get_ident()
+        self._taken, self._published = 0, 0
+        self._resources = ExitStack()
+        spec = EnvSpec.of(env, config.env_kwargs)
+        try:
+            with self._interrupts:
+                started = start(
+                    config,
+                    spec,
+                    policy or MLP(),
+                    rollout_steps,
+                    self._check_interrupt,
+                    self._resources,
+                    listens=listens,
+                    past=past,
+                )
+            if state is not None:
+                _check_restored(state, spec.id, started.run.policy, str(restore))
+        except BaseException:
+            self._resources.close()
+            raise
+        self._service, self.run = started.service, started.run
+        self.policy = PolicyParameters(started.run.policy)
+        """Names, shapes and offsets of the parameters, and initial values."""
+        self.observation_space: gymnasium.Space[Any] = started.described.observation_space
+        self.action_space: gymnasium.Space[Any] = started.described.action_space
+        self._thread = threading.Thread(target=self._answer_workers, name="millrace-service", daemon=True)
+        self._thread.start()
+
+    # ---------------------------------------------------------------- a learner's loop
+
+    @property
+    def version(self) -> int:
+        """The version of the newest weights; -1 before the first were published."""
+        return self._version
+
+    def publish(self, parameters: Mapping[str, Array] | Array, buffers: Mapping[str, Array] | Array | None = None) -> int:
+        """Send new weights to all workers; they may now collect the rollouts of the next batch. Returns their version.
+
+        `parameters`: the flat vector [P], or an array for each name in `policy.layout`. `buffers` likewise, for a policy
+        that normalizes observations. They are copied. Raises `UsageError` for wrong shapes, or numbers that are not finite.
+        """
+        self._check_open()
+        flat, flat_buffers = self.policy.flat(parameters), self.policy.flat_buffers(buffers)
+        with self._lock:
+            self._service.publish(self._version + 1, flat, flat_buffers)
+        self._version += 1
+        self._published += 1
+        return self._version
+
+    def gather(self) -> RolloutBatch:
+        """Wait for the next batch. Raises `RunError` when no worker is left, or the environment failed too often."""
+        self._check_open()
+        if self._taken >= self._published + self.config.max_lag or not self._published:
+            raise UsageError(
+                f"rollout service: expected new weights before the next batch (max_lag {self.config.max_lag}); call publish"
+            )
+        with self._lock, self._interrupts:
+            arrived = self._service.gather()
+        self._taken += 1
+        batch = self._batch(arrived)
+        self.env_steps += batch.env_steps
+        return batch
+
+    def __iter__(self) -> Iterator[RolloutBatch]:
+        """Batches without end: `gather` again and again."""
+        while True:
+            yield self.gather()
+
+    def evaluate(self, episodes: int = 100, *, seed: int = 1_000_000, max_steps: int = 1_000_000) -> Evaluation:
+        """Let the workers play greedy episodes under the newest weights, on env copies apart from those of the rollouts.
+
+        The result does not depend on the number of workers. `max_steps`: env steps of the whole evaluation at most; each
+        episode gets an equal share.
+        """
+        self._check_open()
+        if not self._published:
+            raise UsageError("rollout service: expected weights to evaluate; call publish first")
+        plan = EvaluationPlan.of(episodes, seed, EVALUATION_COPIES, max_steps)
+        with self._lock, self._interrupts:
+            return self._service.evaluate(plan, lambda played: None)
+
+    # ---------------------------------------------------------------- saving, and what else there is to know
+
+    def save(self, path: str | Path, **arrays: Any) -> None:
+        """Write the service's state and your arrays into one .npz file, which is there whole or not at all.
+
+        Call it right after `publish`. `RolloutService(..., restore=path)` goes on from it: ledger, versions and lanes
+        continue, and `restored` has the arrays. Rollouts that were under way are collected anew.
+        """
+        self._check_open()
+        with self._lock:
+            snapshot = self._service.snapshot()
+        state = ServiceState(
+            env=self.run.env.id,
+            policy=digest(self.run.policy),
+            version=self._version,
+            env_steps=self.env_steps,
+            ledger=snapshot.ledger,
+            incarnations=snapshot.incarnations,
+        )
+        write(Path(path), state, arrays)
+
+    def ledger(self) -> dict[str, int]:
+        """What became of every ticket and every transition: `used`, `stale`, `lost` and so on."""
+        with self._lock:
+            return self._service.snapshot().ledger.counts()
+
+    def lags(self) -> dict[str, int]:
+        """Number of rollouts used, by lag."""
+        with self._lock:
+            return self._service.lag_histogram()
+
+    def workers(self) -> list[str]:
+        """The names of the workers that have joined."""
+        with self._lock:
+            return sorted(member.hello.worker for member in self._service.snapshot().members)
+
+    def close(self, reason: str = "the learner has ended") -> None:
+        """Ask the workers to leave, and release everything. Does nothing the second time."""
+        if self._over.is_set():
+            return
+        self._over.set()
+        self._thread.join()
+        try:
+            self._service.drain(reason)
+        finally:
+            self._resources.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close("the learner has ended" if error is None else f"the learner failed: {first_line(error, str(kind))}")
+
+    def __repr__(self) -> str:
+        state = "closed" if self._over.is_set() else f"version {self._version}, {self.env_steps:,} env steps"
+        return f"RolloutService({self.run.env.id!r}, {state})"
+
+    # ---------------------------------------------------------------- inside
+
+    def _answer_workers(self) -> None:
+        """Answer the workers while the user computes. `publish`, `gather` and `evaluate` do it themselves."""
+        while not self._over.wait(PULSE_S):
+            with self._lock:
+                self._service.pulse()
+
+    def _batch(self, arrived: Sequence[AcceptedRollout]) -> RolloutBatch:
+        stacked = stack_rollouts([one.rollout for one in arrived], [one.fresh for one in arrived])
+        in_order = sorted((one.rollout for one in arrived), key=lambda rollout: rollout.lane)
+        leaves = self.run.policy.observation
+        named = {leaf.path: array for leaf, array in zip(leaves, stacked.obs, strict=True)}
+        return RolloutBatch(
+            obs=stacked.obs[0] if not leaves[0].path else named,
+            action=stacked.action,
+            log_prob=stacked.log_prob,
+            reward=stacked.reward,
+            terminated=stacked.terminated,
+            truncated=stacked.truncated,
+            valid=stacked.valid,
+            state=stacked.state,
+            lane=stacked.lane,
+            version=np.repeat(np.array([rollout.version for rollout in in_order]), stacked.copies),
+            fresh=stacked.fresh,
+            episodes=stacked.episodes,
+        )
+
+    def _check_interrupt(self) -> None:
+        if self._interrupts.received:
+            self._interrupts.received = False
+            raise KeyboardInterrupt
+
+    def _check_open(self) -> None:
+        if self._over.is_set():
+            raise UsageError("rollout service: expected an open one, but it was closed")
+        if threading.get_ident() != self._owner:
+            raise UsageError("rollout service: expected calls from the thread that made it, got one from another thread")
+
+
+def _config(env: object, settings: dict[str, Any]) -> RolloutConfig:
+    """The settings as a record, checked. Raises `UsageError`."""
+    known = RolloutConfig.__struct_fields__
+    if unknown := [name for name in settings if name not in known or name == "env"]:
+        raise UsageError(f"rollout service: unknown setting {unknown[0]}{did_you_mean(unknown[0], known)}")
+    name = env if isinstance(env, str) else getattr(env, "__name__", type(env).__name__)
+    given = {**settings, "env": name}
+    if not given.get("bind"):
+        given.pop("bind", None)
+    return convert_rollout_settings(given)
+
+
+def _past(state: ServiceState) -> tuple[Ledger, Sequence[int]]:
+    """Ledger and incarnations. What was under way when the file was written is lost, and counted."""
+    ledger = state.ledger
+    ledger.lost += ledger.outstanding
+    ledger.transitions_late += ledger.transitions_waiting
+    return ledger, state.incarnations
+
+
+def _check_restored(state: ServiceState, env: str, policy: PolicySpec, file: str) -> None:
+    if state.env != env:
+        raise CheckpointError(f"{file}: expected environment {state.env} as it was saved, got {env}")
+    if state.policy != digest(policy):
+        raise CheckpointError(f"{file}: expected the policy it was saved with, got another; its spaces or settings differ")

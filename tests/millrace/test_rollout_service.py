@@ -1,0 +1,262 @@
+"""`millrace.RolloutService`: batches for a learner of one's own, with workers in threads of this process."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import millrace
+from millrace.policies import PolicyParameters
+from protocol.envs.spaces import action_spec, observation_leaves
+from protocol.errors import CheckpointError, UsageError
+from protocol.policy.networks import ActorCriticNetwork
+
+SMALL: dict[str, Any] = {"workers": 1, "envs": 4, "lanes": 2, "transport": "inproc"}
+
+
+@contextmanager
+def service(env: Any = "CartPole-v1", *policy: Any, **settings: Any) -> Iterator[millrace.RolloutService]:
+    with millrace.RolloutService(env, *policy, **{"rollout_steps": 8, **SMALL, **settings}) as made:
+        yield made
+
+
+def batches(count: int, **settings: Any) -> list[millrace.RolloutBatch]:
+    """Batches of a policy whose weights change with each version."""
+    found = []
+    with service(**settings) as made:
+        parameters = made.policy.initial(seed=3)
+        made.publish(parameters)
+        for batch in itertools.islice(made, count):
+            found.append(batch)
+            parameters = parameters * np.float32(1.01)
+            made.publish(parameters)
+    return found
+
+
+def same(some: millrace.RolloutBatch, others: millrace.RolloutBatch) -> bool:
+    names = ("obs", "action", "log_prob", "reward", "terminated", "truncated", "valid", "lane", "version", "fresh")
+    return all(np.array_equal(getattr(some, name), getattr(others, name)) for name in names)
+
+
+def test_a_batch_has_one_rollout_of_each_lane_under_the_newest_weights() -> None:
+    first, second = batches(2)
+    assert first.obs.shape == (9, 4, 4)
+    assert first.action.shape == (8, 4)
+    assert first.lane.tolist() == [0, 0, 1, 1]
+    assert first.version.tolist() == [0] * 4
+    assert second.version.tolist() == [1] * 4
+    assert first.fresh.all()
+    assert not second.fresh.any()
+    assert np.array_equal(first.obs[-1], second.obs[0])
+    assert first.env_steps == np.count_nonzero(first.valid)
+    assert first.reward.flags.writeable
+
+
+def test_batches_do_not_depend_on_workers_or_transport() -> None:
+    reference = batches(3)
+    for settings in ({"workers": 2}, {"transport": "ipc", "workers": 2}):
+        assert all(itertools.starmap(same, zip(reference, batches(3, **settings), strict=True)))
+    assert not same(reference[0], batches(1, seed=2)[0])
+
+
+def test_log_probs_are_those_of_the_parameters_that_were_published() -> None:
+    (batch,) = batches(1)
+    with service() as made:
+        parameters = made.policy.named(made.policy.initial(seed=3))
+    h = batch.obs[:-1]
+    for layer in ("actor.0", "actor.1"):
+        h = np.tanh(h @ parameters[f"{layer}.weight"].T + parameters[f"{layer}.bias"])
+    logits = h @ parameters["actor.out.weight"].T + parameters["actor.out.bias"]
+    log_probs = logits - np.log(np.exp(logits).sum(-1, keepdims=True))
+    expected = np.take_along_axis(log_probs, batch.action[..., None], -1)[..., 0]
+    # Two layers of 64 and logits below 1: a few hundred roundings of numbers below 1.
+    assert np.abs(expected - batch.log_prob)[batch.valid].max() < 500 * 2**-24
+
+
+def test_episodes_are_those_of_the_rows() -> None:
+    found = batches(6, rollout_steps=32)
+    rewards = sum(float(batch.reward[batch.valid].sum()) for batch in found)
+    episodes = [episode for batch in found for episode in batch.episodes]
+    assert sum(episode.length for episode in episodes) <= sum(batch.env_steps for batch in found)
+    assert all(episode.reward == episode.length for episode in episodes)  # CartPole's reward is 1 a step
+    assert rewards >= sum(episode.reward for episode in episodes) > 0
+
+
+def test_a_batch_before_new_weights_is_refused() -> None:
+    with service() as made:
+        with pytest.raises(UsageError, match="call publish"):
+            made.gather()
+        made.publish(made.policy.initial())
+        made.gather()
+        with pytest.raises(UsageError, match="expected new weights before the next batch"):
+            made.gather()
+
+
+def test_with_a_lag_a_batch_may_be_gathered_before_its_weights_are_published() -> None:
+    with service(max_lag=1) as made:
+        made.publish(made.policy.initial())
+        lags = []
+        for _ in range(4):
+            batch = made.gather()
+            lags.append(made.version - int(batch.version.min()))
+            made.publish(made.policy.initial())
+        made.gather()
+        made.gather()
+        with pytest.raises(UsageError, match="max_lag 1"):
+            made.gather()
+        assert max(lags) <= 1
+        counts = made.ledger()
+        assert counts["used"] == 12
+        assert counts["issued"] == counts["used"] + counts["outstanding"] + counts["stale"] + counts["lost"]
+        assert sum(made.lags().values()) == counts["used"]
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        (np.zeros(3, np.float32), "parameters: expected a vector of 4610 numbers"),
+        ({"actor.0.weight": np.zeros((64, 4))}, "actor.0.bias is missing"),
+        (np.full(4610, np.nan, np.float32), "expected finite numbers"),
+    ],
+)
+def test_weights_that_cannot_be_used_are_refused_and_cost_nothing(parameters: Any, message: str) -> None:
+    with service() as made:
+        with pytest.raises(UsageError, match=message):
+            made.publish(parameters)
+        assert made.version == -1
+        made.publish(made.policy.named(made.policy.initial()))
+        assert made.gather().version.tolist() == [0] * 4
+
+
+def test_published_arrays_may_change_afterwards() -> None:
+    with service() as made:
+        parameters = made.policy.initial(seed=3)
+        made.publish(parameters)
+        parameters[:] = 0
+        assert same(made.gather(), batches(1)[0])
+
+
+def test_an_evaluation_does_not_disturb_the_rollouts() -> None:
+    with service() as made:
+        made.publish(made.policy.initial(seed=3))
+        first = made.evaluate(4)
+        assert first == made.evaluate(4)
+        assert first.episodes == 4
+        assert same(made.gather(), batches(1)[0])
+
+
+def test_a_saved_service_goes_on(tmp_path: Path) -> None:
+    file = tmp_path / "state.npz"
+    with service() as made:
+        made.publish(made.policy.initial(seed=3))
+        made.gather()
+        made.publish(made.policy.initial(seed=4))
+        made.save(file, parameters=made.policy.initial(seed=4), step=np.int64(7))
+        issued, env_steps = made.ledger()["issued"], made.env_steps
+    with service(restore=file) as made:
+        assert made.env_steps == env_steps
+        assert set(made.restored) == {"parameters", "step"}
+        assert made.publish(made.restored["parameters"]) == 1
+        batch = made.gather()
+        assert batch.version.tolist() == [1] * 4
+        assert batch.fresh.all()
+        counts = made.ledger()
+        assert counts["issued"] > issued
+        assert counts["issued"] == counts["used"] + counts["outstanding"] + counts["stale"] + counts["lost"]
+        assert not np.array_equal(batch.obs[0], batches(1)[0].obs[0])  # lanes are started anew, with other seeds
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"policy": millrace.MLP(32)}, "expected the policy"), ({"env": "Acrobot-v1"}, "expected environment CartPole-v1")],
+)
+def test_a_saved_service_of_something_else_is_refused(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    with service() as made:
+        made.save(tmp_path / "state.npz")
+    with pytest.raises(CheckpointError, match=message), service(restore=tmp_path / "state.npz", **change):
+        pass
+
+
+def test_a_damaged_file_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "state.npz"
+    with service() as made:
+        made.save(file, a=np.ones(3))
+        with pytest.raises(UsageError, match="another name"):
+            made.save(file, millrace=np.ones(3))
+    whole = file.read_bytes()
+    for damaged in (b"", whole[: len(whole) // 2], b"rubbish"):
+        file.write_bytes(damaged)
+        with pytest.raises(CheckpointError, match=r"state\.npz"):
+            millrace.RolloutService("CartPole-v1", restore=file, **SMALL)
+
+
+def test_calls_from_another_thread_and_after_the_end_are_refused() -> None:
+    errors: list[Exception] = []
+
+    def call(made: millrace.RolloutService) -> None:
+        try:
+            made.gather()
+        except UsageError as error:
+            errors.append(error)
+
+    with service() as made:
+        made.publish(made.policy.initial())
+        thread = threading.Thread(target=call, args=(made,))
+        thread.start()
+        thread.join(10)
+    assert "from another thread" in str(errors[0])
+    with pytest.raises(UsageError, match="it was closed"):
+        made.gather()
+    made.close()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"worker": 2}, "unknown setting worker; did you mean workers"),
+        ({"envs": 5}, "5 envs cannot be shared evenly among 2 lanes"),
+        ({"rollout_steps": 0}, "rollout_steps: expected a whole number above 0, got 0"),
+        ({"workers": "two"}, "workers: expected int, got 'two'"),
+        ({"policy": millrace.CNN()}, "expected an image"),
+        ({"policy": millrace.MLP(0)}, "expected widths of hidden layers"),
+    ],
+)
+def test_wrong_arguments_are_named(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(UsageError, match=message), service(**settings):
+        pass
+
+
+@pytest.mark.parametrize(
+    "policy", [millrace.Recurrent(16, core="gru", core_size=8), millrace.MLP(8, normalize_observations=True)]
+)
+def test_other_policies(policy: Any) -> None:
+    with service("CartPole-v1", policy) as made:
+        made.publish(made.policy.initial())
+        batch = made.gather()
+        assert batch.state.shape == (4, made.run.policy.state_size)
+        assert np.isfinite(batch.log_prob).all()
+
+
+def test_the_layout_is_that_of_the_trained_network() -> None:
+    import gymnasium
+
+    observation = observation_leaves(gymnasium.spaces.Box(-1, 1, (3,)))
+    action = action_spec(gymnasium.spaces.Box(-1, 1, (2,)))
+    spec = millrace.MLP(8, 8).spec(observation, action)
+    parameters, network = PolicyParameters(spec), ActorCriticNetwork(spec)
+    assert parameters.size == network.acting_size
+    for piece in parameters.layout:
+        view = network.parameters[piece.name]
+        assert view.shape == piece.shape
+        assert view.storage_offset() == piece.offset
+    initial = parameters.named(parameters.initial())
+    weight = initial["actor.1.weight"]
+    assert np.allclose(weight @ weight.T, 2 * np.eye(8), atol=1e-5)
+    assert not initial["actor.0.bias"].any()
