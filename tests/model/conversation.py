@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple, Protocol
 
 Content = tuple[Any, ...]
-Action = tuple[Any, ...]
-"""What happens, and to which worker or version."""
+Event = tuple[Any, ...]
+"""What happens to an end: its kind, and more of it."""
 
 
 class Facts(NamedTuple):
@@ -28,10 +28,14 @@ class Facts(NamedTuple):
     alive: bool = False
     frozen: bool = False
     shut_out: bool = False
-    cut_off: bool = False
     working: bool = False
     rejoins: bool = False
     """whether the worker looks for its learner again"""
+
+    @property
+    def awake(self) -> bool:
+        """Whether the worker can do something."""
+        return self.alive and not self.frozen
 
 
 class Conversation(Protocol):
@@ -44,14 +48,24 @@ class Conversation(Protocol):
 
     @property
     def faults(self) -> int:
-        """Number of faults, of any kinds, at any moments."""
+        """Number of faults, at any moments."""
+        ...
+
+    @property
+    def only(self) -> tuple[str, ...]:
+        """Kinds of faults; empty: all."""
+        ...
+
+    @property
+    def few_losses(self) -> bool:
+        """Whether all that can go wrong is so little that no worker may be given up, or give up."""
         ...
 
     def start(self) -> tuple[Content, list[Content]]:
         """A learner that has started, and each worker, none of which has."""
         ...
 
-    def learner(self, content: Content, event: Action, message: Content | None) -> tuple[Content, list[tuple[int, Content]]]:
+    def learner(self, content: Content, event: Event, message: Content | None) -> tuple[Content, list[tuple[int, Content]]]:
         """The learner after this event, and what it sends to which worker. `message`: what is received, if anything.
 
         Events: ("receive", worker, …), ("publish",), ("time",), ("revoke", worker), ("ended", worker, nonce),
@@ -59,12 +73,16 @@ class Conversation(Protocol):
         """
         ...
 
-    def worker(self, content: Content, number: int, event: Action, message: Content | None) -> tuple[Content, list[Content]]:
+    def worker(self, content: Content, number: int, event: Event, message: Content | None) -> tuple[Content, list[Content]]:
         """The worker after this event, and what it sends. `message`: what it handles, if anything.
 
-        Events: ("handle", …), ("start",), ("finish",), ("time",), ("told",), ("end",), ("dead for ever",),
-        ("cut off for ever",), ("shut out",), ("freeze",), ("thaw",).
+        Events: ("handle", …), ("start",), ("finish",), ("time",), ("told",), ("end",), ("shut out",), ("freeze",),
+        ("thaw",).
         """
+        ...
+
+    def without_checkpoints(self, learner: Content) -> Content:
+        """A learner that will not restart."""
         ...
 
     def facts(self, content: Content) -> Facts:

@@ -110,6 +110,17 @@ MUTATIONS = {
     "rollouts of a lane are not counted": Mutation(HELD, "lane.sequence += 1", "pass"),
     "the lane of a lost worker is not placed anew": Mutation(PLACEMENT, "self._unplaced |= member.lanes", "pass"),
     "a silent worker is never removed": Mutation(MEMBERSHIP, "if now - member.alive_s > timeout_s]", "if False]"),
+    "heartbeats at half the rate needed": Mutation(
+        SESSION,
+        "self._due_s = now + self.run.heartbeat_s",
+        "self._due_s = now + 2 * self.run.heartbeat_s",
+    ),
+    "a lost Release is never said again": Mutation(SESSION, "return self._release_unlisted(received)", "return []"),
+    "a lane reopened on a new incarnation keeps the old lane's state": Mutation(
+        HELD,
+        "lane = self._lanes[permit.lane] = _HeldLane(permit.incarnation)",
+        "lane = self._lanes[permit.lane] = lane or _HeldLane(0)\n            lane.incarnation = permit.incarnation",
+    ),
     "a lane keeps its incarnation": Mutation(LANES, "self.incarnation += 1", "self.incarnation += 0"),
 }
 
@@ -143,15 +154,18 @@ class _MutatedLoader(SourceFileLoader):
 
 def _explore() -> str:
     """Explore small runs, the smallest first. Returns what is broken; empty: nothing was found."""
-    from tests.model.explore import RuleBroken, explore
+    from tests.model.search import RuleBroken, explore
     from tests.model.training import Training
 
     for training in (
         Training(workers=1, lanes=1, updates=2, faults=1),
+        Training(workers=1, lanes=1, updates=1, faults=2, only=("drop up", "drop down")),
         Training(workers=2, lanes=1, updates=1, faults=1),
         Training(workers=1, lanes=2, updates=3, faults=1, max_lag=1, per_update=1),
         Training(workers=1, lanes=1, updates=2, faults=2),
+        Training(workers=2, lanes=2, updates=2, faults=1, only=("drop down",)),
         Training(workers=2, lanes=2, updates=1, faults=1),
+        Training(workers=2, lanes=2, updates=2, faults=2, only=("drop down", "kill, reported")),
     ):
         try:
             explore(training)

@@ -41,6 +41,7 @@ class Kind(IntEnum):
 
 
 SCOPED = {Kind.REPLIES: Kind.SESSION, Kind.ATTEMPT: Kind.WORKER, Kind.NONCE: Kind.WORKER}
+OF_WORKER = {kind for kind, scope in SCOPED.items() if scope is Kind.WORKER}
 OLD = {Kind.OLD_SESSION: Kind.SESSION, Kind.OLD_TICKET: Kind.TICKET}
 
 

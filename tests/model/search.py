@@ -1,157 +1,143 @@
 """Breadth-first search over all states, and whether the run reaches its target from each of them.
 
-Rule: of a state that was met only a hash and the state before it are kept. Liveness: from every state, once faults stop, a
-fair run reaches the target, whoever's turn comes first; also if one worker is dead for ever, or one link is cut for ever.
+Rule of safety: no state is broken. Rule of liveness: from every state in which nothing goes wrong any more, or one worker
+or its link is gone for ever, two runs reach the target: in one the first thing that can happen always happens next, in the
+other the last thing. So both fair and unfair orders of turns reach it, and the target can be reached from everywhere.
 """
 
 from __future__ import annotations
 
+import resource
+import time
 from array import array
-from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass
 
-from tests.model.conversation import Action, Content, Conversation
-from tests.model.world import Seat, State, Violation, World
+import numpy as np
 
-LONGEST = 400  # actions of a fair run to the target
-Turn = Callable[[Iterator[Action]], Action]
-Digests = tuple[int, tuple[tuple[Any, ...], ...], int]
+from tests.model.conversation import Conversation
+from tests.model.story import sentences
+from tests.model.world import Action, Move, State, World
 
-
-class Broken(Exception):
-    """A rule does not hold: the keys of the states on the way there, and what happened then."""
-
-    def __init__(self, met: tuple[int, int], keys: list[int], why: str) -> None:
-        """`met`: the share and number of a state that was met; `keys`: of the states of a fair run from there."""
-        super().__init__(met, keys, why)
-        self.met, self.keys, self.why = met, keys, why
+TARGET = -1  # in place of the number of a state in which the run has reached its target
+UNKNOWN = -2  # in place of the number of a state that nothing follows
 
 
-class Batch(NamedTuple):
-    """States for another share, with the parts that it may not have."""
-
-    parts: list[Content]
-    states: list[tuple[Digests, int]]
-    """each with the number of the state before it"""
+class RuleBroken(AssertionError):
+    """A rule of safety or liveness does not hold. The text tells what happened."""
 
 
-class Share:
-    """One of several shares of all states. A state belongs to the share that its hash says."""
+@dataclass(frozen=True)
+class Report:
+    """What was explored."""
 
-    def __init__(self, conversation: Conversation, number: int, shares: int, liveness: bool) -> None:
-        self.world, self.conversation = World(conversation), conversation
-        self.number, self.shares, self.liveness = number, shares, liveness
-        self._met: set[int] = set()  # keys, also of states of other shares that were sent there
-        self._keys, self._before = array("q"), array("q")  # of each state of this share; `before` = number * shares + share
-        self._proven: set[int] = set()
-        self._layer: list[State] = []
-        self._first_of_layer = 0
-        self._sent = [0] * shares  # number of parts that each share was sent
-        start = self.world.canonical(self.world.start())
-        if self._owner(key := self.world.key(start)) == number:
-            self._add(start, key, -1)
+    conversation: Conversation
+    states: int
+    """without those in which the run has reached its target"""
+    depth: int
+    """number of actions to the farthest state"""
+    complete: bool
+    parts: int
+    seconds: float
+    """of processor time"""
+    memory_mb: int
+    """most memory of this process so far"""
 
-    def counts(self) -> tuple[int, int, int]:
-        """Number of states, of states in fair runs, and of parts."""
-        return len(self._keys), len(self._proven), len(self.world.parts)
-
-    def met(self, number: int) -> tuple[int, int, int]:
-        """The key of a state of this share, and the share and number of the state before it; -1 for the first."""
-        before = self._before[number]
+    def __str__(self) -> str:
+        extent = f"{self.states:,} states, {'all' if self.complete else 'not all'}, to depth {self.depth}"
         return (
-            (self._keys[number], -1, -1) if before < 0 else (self._keys[number], before % self.shares, before // self.shares)
+            f"{self.conversation}: {extent}; {self.parts:,} parts; {self.seconds:.0f} s of one core; {self.memory_mb:,} MB"
         )
 
-    def take(self, batches: list[Batch]) -> int:
-        """Take states from other shares. Returns the number of states of the next layer."""
-        numbers = self.world.by_digest
-        for parts, states in batches:
-            for content in parts:
-                self.world.part(content)
-            for (learner, seats, faults), before in states:
-                here = [
-                    Seat(numbers[worker], *[tuple([numbers[each] for each in messages]) for messages in channels])
-                    for worker, *channels in seats
-                ]
-                state = State(numbers[learner], tuple(here), faults)
-                key = self.world.key(state)
-                if key not in self._met:
-                    self._add(state, key, before)
-        return len(self._layer)
 
-    def expand(self) -> list[Batch]:
-        """Look at all states of this layer. Returns what belongs to each other share. Raises `Broken`."""
-        world, met, shares = self.world, self._met, self.shares
-        layer, self._layer = self._layer, []
-        first, self._first_of_layer = self._first_of_layer, len(self._keys)
-        others: list[list[tuple[Digests, int]]] = [[] for _ in range(shares)]
-        for number, state in enumerate(layer, first):
-            if self.liveness:
-                self._prove(state, number)
-            if world.reached(state):
-                continue
-            try:
-                for _, after in world.successors(state):
-                    key = world.key(after)
-                    if key in met:
-                        continue
-                    if (owner := self._owner(key)) == self.number:
-                        self._add(after, key, number * shares + self.number)
-                    else:
-                        met.add(key)
-                        others[owner].append((world.digests(after), number * shares + self.number))
-            except Violation as violation:
-                raise Broken((self.number, number), [], violation.why) from violation
-        return [self._batch(share, states) for share, states in enumerate(others)]
+def explore(conversation: Conversation, *, reduced: bool = True, most_states: float = float("inf")) -> Report:
+    """Explore all states, or stop when there are `most_states`. Raises `RuleBroken`."""
+    return Search(World(conversation, reduced=reduced)).run(most_states)
 
-    def _owner(self, key: int) -> int:
-        return (key >> 1) % self.shares
 
-    def _add(self, state: State, key: int, before: int) -> None:
-        self._met.add(key)
-        self._keys.append(key)
+class Search:
+    """One search."""
+
+    def __init__(self, world: World) -> None:
+        self.world = world
+        self.states: list[State] = []
+        self._numbers: dict[State, int] = {}
+        self._before = array("i")  # for each state the number of the one from which it was found
+        self._first, self._last = array("i"), array("i")  # the number of the one that is next in the two runs
+
+    def run(self, most_states: float = float("inf")) -> Report:
+        world, began_s = self.world, time.process_time()
+        self._add(world.start(), -1)
+        depth, end_of_layer = 0, 1
+        for number, state in enumerate(self.states):
+            if number == end_of_layer:
+                if number >= most_states:
+                    break
+                depth, end_of_layer = depth + 1, len(self.states)
+            self._expand(number, state)
+        complete = len(self._first) == len(self.states)
+        for following in (self._first, self._last):
+            self._check_liveness(following)
+        seconds, memory_mb = time.process_time() - began_s, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+        return Report(world.conversation, len(self.states), depth, complete, len(world.parts), seconds, memory_mb)
+
+    def _expand(self, number: int, state: State) -> None:
+        world = self.world
+        moves = world.moves(state)
+        after = [self._found(number, move) for move in moves]
+        for move in (*world.faults(state), *world.ends_of_faults(state)):
+            self._found(number, move)
+        if state[-1] > 0:
+            after = []  # something can still go wrong
+        elif moves[-1][0].what == "time" and len(moves) > 1:
+            after = [after[0], after[-2]]  # time passes only after everything else
+        self._first.append(after[0] if after else UNKNOWN)
+        self._last.append(after[-1] if after else UNKNOWN)
+        if state[-1] == world.conversation.faults or (world.conversation.few_losses and state[-1] >= 0):
+            for action, later in moves:
+                if world.gave_up(state, later):
+                    raise self._broken(
+                        number, "a worker was given up, or gave up, although at most two messages were lost", action
+                    )
+
+    def _found(self, before: int, move: Move) -> int:
+        """The number of the state after this move."""
+        world = self.world
+        if world.reached(move[1]):
+            return TARGET
+        state = world.canonical(move[1])
+        number = self._numbers.get(state)
+        if number is None:
+            number = self._add(state, before)
+            if why := world.why_broken(state):
+                raise self._broken(number, why)
+        return number
+
+    def _add(self, state: State, before: int) -> int:
+        number = self._numbers[state] = len(self.states)
+        self.states.append(state)
         self._before.append(before)
-        self._layer.append(state)
+        return number
 
-    def _batch(self, share: int, states: list[tuple[Digests, int]]) -> Batch:
-        new = self.world.parts[self._sent[share] :] if share != self.number else []
-        self._sent[share] = len(self.world.parts)
-        return Batch([part.content for part in new], states)
+    def _check_liveness(self, following: array[int]) -> None:
+        """Every state leads to the target, if the next state is always the one that is given here."""
+        end = len(self.states)
+        jump = np.full(end + 1, end, dtype=np.int32)
+        jump[: len(following)] = following
+        jump[jump < 0] = end
+        for _ in range(end.bit_length()):
+            jump = jump[jump]
+        stuck = np.flatnonzero(jump != end)
+        if stuck.size:
+            number = int(stuck[0])
+            onwards = [number]
+            while (number := following[number]) not in onwards:
+                onwards.append(number)
+            raise self._broken(onwards[0], "and so on: the run never reaches its target", onwards=[*onwards[1:], number])
 
-    # ---------------------------------------------------------------- liveness
-
-    def _prove(self, state: State, number: int) -> None:
-        """The run reaches its target from here, without further faults, or with one that stays for ever."""
-        world, state = self.world, state._replace(faults=0)
-        self._run_fairly(state, number, _first)
-        self._run_fairly(state, number, _last)
-        if self.conversation.workers > 1:
-            for worker in range(self.conversation.workers):
-                for action, turn in ((("dead for ever", worker), _first), (("cut off for ever", worker), _last)):
-                    self._run_fairly(world.canonical(world.after(state, action)), number, turn)
-
-    def _run_fairly(self, here: State, number: int, turn: Turn) -> None:
-        world, proven, passed = self.world, self._proven, dict[int, None]()
-        while not world.reached(here):
-            key = world.key(here)
-            mark = key ^ (turn is _last)
-            if mark in proven:
-                break
-            if mark in passed or len(passed) > LONGEST:
-                raise Broken((self.number, number), [*passed, mark], "and so on: the run never reaches its target")
-            passed[mark] = None
-            try:
-                here = world.canonical(world.after(here, turn(world.actions(here))))
-            except Violation as violation:
-                raise Broken((self.number, number), list(passed), violation.why) from violation
-        proven.update(passed)
-
-
-def _first(actions: Iterator[Action]) -> Action:
-    return next(actions)
-
-
-def _last(actions: Iterator[Action]) -> Action:
-    """The last, but time passes only after everything else."""
-    *others, last = actions
-    return others[-1] if others and last == ("time",) else last
+    def _broken(self, number: int, why: str, action: Action | None = None, onwards: Sequence[int] = ()) -> RuleBroken:
+        path = [number]
+        while (before := self._before[path[0]]) >= 0:
+            path.insert(0, before)
+        told = sentences(self.world, [self.states[each] for each in (*path, *onwards)], action)
+        return RuleBroken("\n".join([*told, f"Then: {why}"]))

@@ -31,10 +31,17 @@ class Settings:
     max_lag: int = 0
     per_update: int | None = None
     """rollouts of an update; None: one of each lane"""
+    only: tuple[str, ...] = ()
+    """kinds of faults; empty: all"""
 
     @property
     def rollouts_per_update(self) -> int:
         return self.lanes if self.per_update is None else self.per_update
+
+    @property
+    def few_losses(self) -> bool:
+        """Whether at most two messages are lost. One of them makes that time passes, so at most one Heartbeat is lost."""
+        return self.faults <= 2 and bool(self.only) and set(self.only) <= {"drop up", "drop down"}
 
     @cached_property
     def run(self) -> RunSpec:
@@ -42,4 +49,5 @@ class Settings:
 
     def __str__(self) -> str:
         size = f"{self.workers} workers, {self.lanes} lanes, {self.updates} updates, {self.faults} faults"
-        return f"{size}, max_lag {self.max_lag}, {self.rollouts_per_update} rollouts per update"
+        size += f", max_lag {self.max_lag}, {self.rollouts_per_update} rollouts per update"
+        return ", ".join([size, *[f"only {each}" for each in self.only]])

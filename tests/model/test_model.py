@@ -1,12 +1,14 @@
 """Every interleaving of messages, faults and time in small runs: no rule is ever broken, and every run reaches its target.
 
 Rule: the real `TicketCoordinator` and the real `Session` are explored, not a description of them. Faults: a message is lost,
-repeated or delayed; a worker is killed, frozen or shut out; the learner restarts from any of its checkpoints.
+repeated or delayed; a worker is killed, frozen or shut out; the learner restarts from any of its checkpoints. After all
+faults one worker, or its link, may be gone for ever.
 """
 
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 import pytest
 
@@ -15,16 +17,21 @@ from learner.members.membership import Membership
 from learner.rollouts.lanes import LaneQueue, Ticket, TicketedLane
 from learner.rollouts.ticket_coordinator import CollectingMember, TicketCoordinator
 from tests.model import learner_part, worker_part
-from tests.model.explore import explore
+from tests.model.conversation import Content
 from tests.model.message_content import hello
+from tests.model.names import names_in, renamed, renaming
+from tests.model.search import Search, explore
 from tests.model.settings import Settings
 from tests.model.training import Training
+from tests.model.world import World
 from workers.collect.held_rollouts import HeldRollouts, _HeldLane
 from workers.session import Identity, Session, _SessionState
 
+SMALL = Training(workers=2, lanes=1, updates=1, faults=1)
+
 
 def test_two_workers_one_lane_one_fault_of_any_kind() -> None:
-    report = explore(Training(workers=2, lanes=1, updates=1, faults=1))
+    report = explore(SMALL)
     assert report.complete
     assert report.states > 10_000, f"the model has lost most of its states: {report}"
 
@@ -34,16 +41,37 @@ def test_two_workers_one_lane_one_fault_of_any_kind() -> None:
 @pytest.mark.parametrize(
     "training",
     [
-        Training(workers=2, lanes=2, updates=1, faults=1),
-        Training(workers=2, lanes=1, updates=2, faults=1, max_lag=1),
         Training(workers=2, lanes=1, updates=2, faults=2),
+        Training(workers=2, lanes=1, updates=2, faults=1, max_lag=1),
+        Training(workers=2, lanes=2, updates=1, faults=1),
+        Training(workers=1, lanes=1, updates=2, faults=3),
+        Training(workers=2, lanes=1, updates=1, faults=2, only=("drop up", "drop down")),
     ],
     ids=str,
 )
 def test_larger_runs(training: Training) -> None:
-    report = explore(training, processes=2)
+    report = explore(training)
     sys.stdout.write(f"\n{report}\n")
     assert report.complete
+
+
+def test_the_reductions_leave_out_no_state_of_the_learner_or_of_a_worker() -> None:
+    """Every rule is about the learner or about one worker, so a broken one shows in the same states with and without."""
+
+    def parts(search: Search) -> tuple[set[Any], set[Any]]:
+        assert search.run().complete
+        of = search.world.parts
+        learners = {learner for learner, *_ in search.states}
+        workers = {of[seat].worker for _, *seats, _ in search.states for seat in seats}
+        return {alone(SMALL.without_checkpoints(of[each])) for each in learners}, {alone(of[each]) for each in workers}
+
+    def alone(content: Content) -> Any:
+        """Under names that do not depend on the other parts of the state."""
+        return renamed(content, renaming(names_in(content, set()), {worker: worker for worker in range(SMALL.workers)}))
+
+    reduced, not_reduced = Search(World(SMALL)), Search(World(SMALL, reduced=False))
+    assert parts(reduced) == parts(not_reduced)
+    assert len(reduced.states) < len(not_reduced.states) / 2
 
 
 def test_every_field_of_the_program_is_in_the_state_or_left_out_on_purpose() -> None:

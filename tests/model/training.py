@@ -6,7 +6,7 @@ from typing import TypeVar
 
 from learner.members.membership import Outgoing
 from tests.model import learner_part, worker_part
-from tests.model.conversation import Action, Content, Facts
+from tests.model.conversation import Content, Event, Facts
 from tests.model.learner_part import Learner, first_learner
 from tests.model.message_content import content_of, message_of, worker_of
 from tests.model.settings import TICK_S, Settings
@@ -22,23 +22,26 @@ class Training(Settings):
         workers = [worker_part.saved(Worker(self, number, 0), 0.0) for number in range(self.workers)]
         return learner_part.saved(learner, 0.0), workers
 
-    def learner(self, content: Content, event: Action, message: Content | None) -> tuple[Content, list[tuple[int, Content]]]:
+    def learner(self, content: Content, event: Event, message: Content | None) -> tuple[Content, list[tuple[int, Content]]]:
         now = now_at(event)
         learner, out = learner_event(learner_part.loaded(content, self), event, message, now)
         return learner_part.saved(learner, now), [(worker_of(to), content_of(told, worker_of(to))) for to, told in out]
 
-    def worker(self, content: Content, number: int, event: Action, message: Content | None) -> tuple[Content, list[Content]]:
+    def worker(self, content: Content, number: int, event: Event, message: Content | None) -> tuple[Content, list[Content]]:
         worker = worker_part.loaded(content, number, self)
         now = now_at(event)
         told = None if message is None else message_of(message, number, self.run)
         sent = [content_of(said, number) for said in worker.event(event, told, now)]
         return worker_part.saved(worker, now), sent
 
+    def without_checkpoints(self, learner: Content) -> Content:
+        return learner_part.without_checkpoints(learner)
+
     def facts(self, content: Content) -> Facts:
         if isinstance(content[0], str):
             return Facts()
         if len(content) == 4:
-            nonce, (frozen, shut_out, cut_off), fields, work = content
+            nonce, (frozen, shut_out), fields, work = content
             alive = fields is not None
             rejoins = alive and fields[0] is SessionState.JOINING and fields[1] is not None
             return Facts(
@@ -46,7 +49,6 @@ class Training(Settings):
                 alive=alive,
                 frozen=frozen,
                 shut_out=shut_out,
-                cut_off=cut_off,
                 working=work is not None,
                 rejoins=rejoins,
             )
@@ -58,7 +60,7 @@ class Training(Settings):
 L = TypeVar("L", bound=Learner)
 
 
-def learner_event(learner: L, event: Action, message: Content | None, now: float) -> tuple[L, list[Outgoing]]:
+def learner_event(learner: L, event: Event, message: Content | None, now: float) -> tuple[L, list[Outgoing]]:
     """The learner after this event, which may be another one, and what it sends."""
     match event:
         case "receive", worker, _:
@@ -77,6 +79,6 @@ def learner_event(learner: L, event: Action, message: Content | None, now: float
     raise AssertionError(event)
 
 
-def now_at(event: Action) -> float:
+def now_at(event: Event) -> float:
     """The time of an event; each end is loaded at the time 0."""
     return TICK_S if event == ("time",) else 0.0

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from protocol.messages import ToLearner, ToWorker
-from tests.model.conversation import Action, Content
+from protocol.messages import HeartbeatReply, ToLearner, ToWorker
+from tests.model.conversation import Content, Event
 from tests.model.message_content import incarnation, rollout_content, rollout_of, session, ticket, weights
 from tests.model.names import MASK, Kind, name
 from tests.model.settings import FOR_EVER_S, TIMEOUT_S, Settings
@@ -47,8 +47,6 @@ class Worker:
     frozen: bool = False
     shut_out: bool = False
     """whether its key was revoked: the learner hears nothing of it"""
-    cut_off: bool = False
-    """whether its link, or its process, is gone for ever"""
 
     # ---------------------------------------------------------------- events
 
@@ -67,7 +65,13 @@ class Worker:
 
     def handle(self, message: ToWorker, now: float) -> list[ToLearner]:
         assert self.session is not None
-        return self._turn(self.session.handle(message, now), now)
+        held = self.session._current
+        replies = held.replies
+        effects = self.session.handle(message, now)
+        if isinstance(message, HeartbeatReply) and held.replies > replies:
+            listed = {each.lane for each in message.received}
+            assert all(lane.lane in listed for lane in held.lanes()), "a worker keeps a lane that is not its own"
+        return self._turn(effects, now)
 
     def finish(self, now: float) -> list[ToLearner]:
         assert self.session is not None
@@ -84,7 +88,7 @@ class Worker:
         assert self.session is not None
         return self._turn(self.session.refused("its key was revoked"), now)
 
-    def event(self, event: Action, message: ToWorker | None, now: float) -> list[ToLearner]:
+    def event(self, event: Event, message: ToWorker | None, now: float) -> list[ToLearner]:
         """What the worker says after this event. `message`: what it handles, if anything."""
         match event:
             case "handle", _:
@@ -100,11 +104,6 @@ class Worker:
                 return self.refused(now)
             case ("end",):
                 self.end()
-            case ("dead for ever",):
-                self.end()
-                self.cut_off = True
-            case ("cut off for ever",):
-                self.cut_off = True
             case ("shut out",):
                 self.shut_out = True
             case ("freeze",) | ("thaw",):
@@ -138,7 +137,7 @@ class Worker:
 
 def saved(worker: Worker, now: float) -> Content:
     nonce = name(Kind.NONCE, worker.nonce, worker.number)
-    flags = worker.frozen, worker.shut_out, worker.cut_off
+    flags = worker.frozen, worker.shut_out
     current = worker.session
     if current is None:
         return nonce, flags, None, None
@@ -146,7 +145,7 @@ def saved(worker: Worker, now: float) -> Content:
     fields = (
         current.state,
         None if current.run is None else session(current.session),
-        name(Kind.ATTEMPT, 1 if worker.cut_off else current._attempt, worker.number),
+        name(Kind.ATTEMPT, current._attempt, worker.number),
         max(current._last_heard_s - now, -TIMEOUT_S - 1.0),
         max(current._due_s - now, 0.0),
         tuple(_lane(number, lane) for number, lane in held.rollouts._lanes.items()),
@@ -175,8 +174,8 @@ def _work(assignment: Assignment) -> Content:
 
 def loaded(content: Content, number: int, settings: Settings) -> Worker:
     """A worker at the time 0 with this content."""
-    nonce, (frozen, shut_out, cut_off), fields, work = content
-    worker = Worker(settings, number, nonce.value, None, None, frozen, shut_out, cut_off)
+    nonce, (frozen, shut_out), fields, work = content
+    worker = Worker(settings, number, nonce.value, None, None, frozen, shut_out)
     if fields is None:
         return worker
     state, of_session, attempt, heard, due, lanes, version, in_progress, replies, acknowledged = fields

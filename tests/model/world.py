@@ -1,347 +1,387 @@
 """The model: the learner, the workers and the messages between them, and what can happen next.
 
-Rule: a state is a few numbers of parts: the learner, each worker, each message. What an event makes of a part is computed
-once, by the program's own code, and remembered; so a state costs a few look-ups. A connection keeps the order of messages;
-only a copy of a message that has arrived can arrive again at any time. (A fault repeats a message.)
-Time passes only when nothing else can happen without a fault; if it passes earlier, what is under way is delayed by a fault.
-States that differ only in the numbers of the workers, or in names, are one state.
+Rule: a state is a tuple of small numbers: of the learner, of a seat for each worker (the worker and its messages under way),
+and of the faults left. What an event makes of the learner or of a worker is computed once, by the program's own code, and
+remembered; so a state costs a few look-ups. A connection keeps the order of messages; only a copy of a message that has
+arrived can arrive again at any time. (A fault repeats a message.)
+
+So that there are few states:
+ - Time passes only when nothing else is under way. If it passes earlier, a fault has delayed what is under way.
+ - States that differ only in the numbers of the workers, or in names (`names.py`), are one state.
+ - Without faults left the learner does not restart, so its checkpoints are forgotten.
+ - Without faults left, a worker that has a message to handle moves at once: see `moves`.
+ - A worker that is gone for ever goes when time is about to pass: see `ends_of_faults`.
+`reduced=False` explores without the last three.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from hashlib import blake2b
+from functools import cache
 from typing import Any, NamedTuple
 
-from tests.model.conversation import Action, Content, Conversation, Facts
-from tests.model.names import Kind, Name, name, names_in, renamed, renaming
+from tests.model.conversation import Content, Conversation, Event
+from tests.model.names import OF_WORKER, Name, name, names_in, renamed, renaming
+
+State = tuple[int, ...]
+"""Number of the learner, number of the seat of each worker, faults that can still happen."""
+
+BROKEN = "broken"
+FOR_EVER = -1  # instead of the number of faults left: one worker or its link is gone for ever, and nothing else goes wrong
+
+
+class Action(NamedTuple):
+    """What happens."""
+
+    what: str
+    """one of `story.SENTENCES`"""
+    number: int = 0
+    """of the worker or the version"""
+    message: int | None = None
+
+
+Move = tuple[Action, State]
+"""What can happen, and the state after it, which is not in canonical form."""
+
+
+WorkerMove = tuple[str, int | None, int]
+"""What can happen to a worker alone, with which message, and its seat after it."""
 
 
 class Seat(NamedTuple):
     """A worker, and the messages that are on their way, oldest first; all by the number of the part."""
 
     worker: int
-    up: tuple[int, ...]
-    down: tuple[int, ...]
+    up: tuple[int, ...] = ()
+    down: tuple[int, ...] = ()
     late_up: tuple[int, ...] = ()
     """copies of messages that have arrived; they can arrive at any time"""
     late_down: tuple[int, ...] = ()
 
 
-class State(NamedTuple):
-    learner: int
-    seats: tuple[Seat, ...]
-    faults: int
-    """number of faults that can still happen"""
+GONE: Content = ("gone",)
+"""in place of a worker that is gone for ever, or whose link is"""
 
 
-class Part(NamedTuple):
-    content: Content
-    names: tuple[Name, ...]
-    name_set: frozenset[Name]
-    digest: int
-
-
-class Violation(Exception):
-    """A rule was broken by this action in this state."""
-
-    def __init__(self, action: Action, why: BaseException) -> None:
-        super().__init__(f"{action}: {why!r}")
-        self.why = f"{type(why).__name__}: {why}"
+def broken(error: Exception) -> Content:
+    """In place of a learner or worker: a rule does not hold, or the program raised."""
+    return BROKEN, f"{type(error).__name__}: {error}"
 
 
 class World:
-    """All parts that were met, and the actions."""
+    """All parts that were met, and what can happen."""
 
-    def __init__(self, conversation: Conversation) -> None:
-        self.conversation = conversation
-        self.parts: list[Part] = []
-        self.facts: list[Facts] = []
-        self.by_digest: dict[int, int] = {}
-        self._numbers: dict[Content, int] = {}
-        self._events: dict[Any, Any] = {}
-        self._renamed: dict[Any, int] = {}
+    def __init__(self, conversation: Conversation, *, reduced: bool = True) -> None:
+        self.conversation, self.reduced = conversation, reduced
+        self.parts: list[Any] = []
+        """contents of learners, workers and messages; and seats"""
+        self._numbers: dict[Any, int] = {}
+        self._names: list[frozenset[Name]] = []  # of each part
         self._renamings: dict[Any, dict[Name, Name | None]] = {}
+        self._renamed: dict[Any, int] = {}
+        # What follows is computed once for each argument. (A decorator would keep all worlds alive.)
+        self.facts = cache(lambda part: conversation.facts(self.parts[part]))
+        self.worker = cache(lambda seat: self.facts(self.parts[seat].worker))
+        self._learner_event = cache(self._compute_learner_event)
+        self._worker_event = cache(self._compute_worker_event)
+        self._worker_moves = cache(self._compute_worker_moves)
+        self._worker_faults = cache(self._compute_worker_faults)
+        self._arrived = cache(self._compute_arrived)
+        self._sent = cache(self._compute_sent)
+        self._shape = cache(self._compute_shape)
+        self._without_checkpoints = cache(self._compute_without_checkpoints)
 
     def start(self) -> State:
         """The learner has started, and no worker has."""
         learner, workers = self.conversation.start()
-        seats = tuple(Seat(self.part(worker), (), ()) for worker in workers)
-        return self.canonical(State(self.part(learner), seats, self.conversation.faults))
+        seats = [self._part(Seat(self._part(worker))) for worker in workers]
+        return self.canonical(self._at_most(self.conversation.faults, self._part(learner), *seats))
+
+    def why_broken(self, state: State) -> str:
+        """Which rule does not hold in this state; empty: none."""
+        workers = [self.parts[seat].worker for seat in state[1:-1]]
+        return next((self.parts[part][1] for part in (state[0], *workers) if self.parts[part][0] == BROKEN), "")
 
     def reached(self, state: State) -> bool:
         """Whether the run has reached its target."""
-        return self.facts[state.learner].reached
-
-    def digests(self, state: State) -> Any:
-        """The same state in any process, with a digest for each part."""
-        parts = self.parts
-        seats = [
-            (parts[worker].digest, *[tuple([parts[each].digest for each in messages]) for messages in channels])
-            for worker, *channels in state.seats
-        ]
-        return parts[state.learner].digest, tuple(seats), state.faults
-
-    def key(self, state: State) -> int:
-        """A hash of 63 bits, even, the same in any process."""
-        return hash(self.digests(state)) >> 2 << 1
+        return self.facts(state[0]).reached
 
     # ---------------------------------------------------------------- what can happen
 
-    def actions(self, state: State) -> Iterator[Action]:
-        """All actions that need no fault. The order is that of a fair run without faults."""
-        learner = self.facts[state.learner]
-        under_way = learner.updating
-        for number, (worker, up, down, late_up, late_down) in enumerate(state.seats):
-            facts = self.facts[worker]
-            awake = facts.alive and not facts.frozen
-            if not facts.alive and not facts.cut_off:
-                yield "start", number
-            if facts.frozen:
-                yield "thaw", number
-            if awake and facts.shut_out:
-                yield "told", number
-            if awake and down:
-                under_way = True
-                yield "down", number
-            if up:
-                under_way = True
-                yield "up", number
-            if awake and facts.working:
-                under_way = True
-                yield "finish", number
-            for each in late_up:
-                yield "late up", number, each
-            for each in late_down if awake else ():
-                yield "late down", number, each
-        if learner.updating:
-            yield ("publish",)
+    def moves(self, state: State) -> list[Move]:
+        """Enough of what can happen without a fault to show every broken rule.
+
+        Without faults left, only the moves of one worker that has a message to handle. Why: every rule is about the learner
+        or about one worker. Nothing that happens elsewhere changes what this worker can do or what that leads to, and no
+        time passes before it has moved. So what happens elsewhere leads to the same states if it happens after the move. A
+        worker handles finitely many messages without the others, so nothing is put off for ever. (Whether a worker moves
+        before it is gone for ever makes no difference.)
+        """
+        if state[-1] <= 0 and self.reduced:
+            for number, seat in enumerate(state[1:-1]):
+                if self.worker(seat).awake and self.parts[seat].down:
+                    return self._moves_of(state, number, self._worker_moves(number, seat))
+        return self.all_moves(state)
+
+    def all_moves(self, state: State) -> list[Move]:
+        """All that can happen without a fault. Time comes last."""
+        learner, *seats, _ = state
+        moves: list[Move] = []
+        under_way = updating = self.facts(learner).updating
+        for number, seat in enumerate(seats):
+            moves += self._moves_of(state, number, self._worker_moves(number, seat))
+            up, late_up = self.parts[seat].up, self.parts[seat].late_up
+            arrivals = *[("up", each) for each in up[:1]], *[("late up", each) for each in dict.fromkeys(late_up)]
+            moves += [(Action(what, number, each), self._receive(state, number, what, each)) for what, each in arrivals]
+            under_way = under_way or self._under_way(seat)
+        if updating:
+            moves.append((Action("publish"), self._after_learner(state, ("publish",))))
         if not under_way:
-            yield ("time",)
+            moves.append((Action("time"), self._after_time(state)))
+        return moves
 
-    def faults(self, state: State) -> Iterator[Action]:
+    def faults(self, state: State) -> list[Move]:
         """All faults that can happen."""
-        if not state.faults:
-            return
-        learner = self.facts[state.learner]
-        under_way = learner.updating
-        for number, (worker, up, down, _, _) in enumerate(state.seats):
-            facts = self.facts[worker]
-            awake = facts.alive and not facts.frozen
-            under_way = under_way or bool(up or (awake and (down or facts.working)))
+        learner, *seats, faults = state
+        if faults <= 0:
+            return []
+        moves: list[Move] = []
+        for number, seat in enumerate(seats):
+            worker, up, down, _, late_down = self.parts[seat]
+            moves += self._moves_of(state, number, self._worker_faults(number, seat))
             if up:
-                yield "drop up", number
-                yield "repeat up", number
-            if down:
-                yield "drop down", number
-                if awake:
-                    yield "repeat down", number
-            if facts.alive:
-                yield "kill", number
-                yield "kill, reported", number
-                if not facts.frozen:
-                    yield "freeze", number
-            if number in learner.members and not facts.shut_out:
-                yield "revoke", number
-        if under_way:
-            yield ("delay",)
-        for version in range(learner.checkpoints):
-            yield "restart", version
+                moves.append((Action("repeat up", number, up[0]), self._receive(state, number, "repeat up", up[0])))
+            if self.worker(seat).alive:
+                dead = _with(state, number, self._after_worker(number, seat, ("end",)))
+                event = "ended", number, self.worker(seat).nonce
+                moves.append((Action("kill, reported", number), self._after_learner(dead, event)))
+            if number in self.facts(learner).members and not self.worker(seat).shut_out:
+                unheard = self._part(Seat(worker, (), down, (), late_down))
+                shut_out = _with(state, number, self._after_worker(number, unheard, ("shut out",)))
+                moves.append((Action("revoke", number), self._after_learner(shut_out, ("revoke", number))))
+        if self.facts(learner).updating or any(self._under_way(seat) for seat in seats):
+            moves.append((Action("delay"), self._after_time(state)))
+        for version in range(self.facts(learner).checkpoints):
+            silent = [self._part(Seat(self.parts[seat].worker)) for seat in seats]
+            after = self._after_learner((learner, *silent, faults), ("restart", version))
+            moves.append((Action("restart", version), after))
+        only = self.conversation.only
+        return [
+            (action, self._at_most(faults - 1, *after[:-1])) for action, after in moves if not only or action.what in only
+        ]
 
-    def successors(self, state: State) -> Iterator[tuple[Action, State]]:
-        """All that can follow, in canonical form. Raises `Violation`."""
-        no_fault_yet = state.faults == self.conversation.faults
-        for actions, cost in ((self.actions(state), 0), (self.faults(state), 1)):
-            for action in actions:
-                after = self.after(state, action, cost)
-                if no_fault_yet and not cost and self._gave_up(state, after):
-                    raise Violation(action, AssertionError("a worker was given up, or gave up, although nothing went wrong"))
-                yield action, self.canonical(after)
+    def ends_of_faults(self, state: State) -> list[Move]:
+        """Nothing goes wrong any more; then, at any time, one worker or its link is gone for ever."""
+        learner, *seats, faults = state
+        if faults > 0:
+            return [(Action("calm"), self._at_most(0, learner, *seats))]
+        if faults == FOR_EVER or self.conversation.workers == 1:
+            return []
+        moves: list[Move] = []
+        gone = self._part(GONE)
+        for number, seat in enumerate(seats):
+            # Until time passes, a worker that is gone does not differ from one whose turn does not come. So it goes when
+            # only what it does or has said keeps time from passing. (If what it said did arrive, it goes after that.)
+            if not self.reduced or not self._others_under_way(state, number):
+                nothing = self._part(Seat(gone, late_up=self.parts[seat].late_up))
+                moves.append((Action("gone for ever", number), (*_with(state, number, nothing)[:-1], FOR_EVER)))
+        return moves
 
-    def _gave_up(self, before: State, after: State) -> bool:
+    def _others_under_way(self, state: State, number: int) -> bool:
+        """Whether anything but this worker, or what it said, is under way."""
+        others = (each for each in state[1 : number + 1] + state[number + 2 : -1])
+        return self.facts(state[0]).updating or any(self._under_way(each) for each in others)
+
+    def gave_up(self, before: State, after: State) -> bool:
         """Whether the learner has fewer members, or a worker says Hello anew."""
-        lost = len(self.facts[after.learner].members) < len(self.facts[before.learner].members)
-        return lost or any(self.facts[seat.worker].rejoins for seat in after.seats)
-
-    def after(self, state: State, action: Action, cost: int = 0) -> State:
-        """The state after this action. Raises `Violation`."""
-        try:
-            after = self._after(state, action)
-        except Exception as error:
-            raise Violation(action, error) from error
-        return after._replace(faults=state.faults - cost) if cost else after
-
-    def _after(self, state: State, action: Action) -> State:
-        match action:
-            case "down" | "drop down" | "repeat down" as what, number:
-                seat = state.seats[number]
-                first, late = seat.down[0], seat.late_down
-                late = self._sorted((*late, first)) if what == "repeat down" else late
-                state = self._with(state, number, seat._replace(down=seat.down[1:], late_down=late))
-                return state if what == "drop down" else self._worker(state, number, ("handle", first))
-            case "up" | "drop up" | "repeat up" as what, number:
-                seat = state.seats[number]
-                first, late = seat.up[0], seat.late_up
-                late = self._sorted((*late, first)) if what == "repeat up" else late
-                state = self._with(state, number, seat._replace(up=seat.up[1:], late_up=late))
-                return state if what == "drop up" else self._learner(state, ("receive", number, first))
-            case "late down", number, message:
-                seat = state.seats[number]
-                rest = _without(seat.late_down, message)
-                state = self._with(state, number, seat._replace(late_down=rest))
-                return self._worker(state, number, ("handle", message))
-            case "late up", number, message:
-                seat = state.seats[number]
-                state = self._with(state, number, seat._replace(late_up=_without(seat.late_up, message)))
-                return self._learner(state, ("receive", number, message))
-            case "start" | "finish" | "thaw" | "freeze" | "told" as what, number:
-                return self._worker(state, number, (what,))
-            case "kill", number:
-                return self._worker(state, number, ("end",))
-            case "kill, reported", number:
-                nonce = self.facts[state.seats[number].worker].nonce
-                return self._learner(self._worker(state, number, ("end",)), ("ended", number, nonce))
-            case "revoke", number:
-                state = self._with(state, number, state.seats[number]._replace(up=(), late_up=()))
-                return self._learner(self._worker(state, number, ("shut out",)), ("revoke", number))
-            case ("publish",):
-                return self._learner(state, ("publish",))
-            case ("time",) | ("delay",):
-                state = self._learner(state, ("time",))
-                for number in range(len(state.seats)):
-                    state = self._worker(state, number, ("time",))
-                return state
-            case "restart", version:
-                seats = tuple(Seat(seat.worker, (), ()) for seat in state.seats)
-                return self._learner(state._replace(seats=seats), ("restart", version))
-            case ("dead for ever", number):
-                return self._worker(state, number, ("dead for ever",))
-            case ("cut off for ever", number):
-                seat = Seat(state.seats[number].worker, (), ())
-                return self._worker(self._with(state, number, seat), number, ("cut off for ever",))
-        raise AssertionError(action)
-
-    # ---------------------------------------------------------------- events of parts
-
-    def _learner(self, state: State, event: Action) -> State:
-        key = state.learner, event
-        if key not in self._events:
-            self._events[key] = self._compute_learner(state.learner, event)
-        learner, out = self._events[key]
-        seats = list(state.seats)
-        for number, message in out:
-            facts = self.facts[seats[number].worker]
-            if facts.alive and not facts.cut_off:
-                seats[number] = seats[number]._replace(down=(*seats[number].down, message))
-        return State(learner, tuple(seats), state.faults)
-
-    def _compute_learner(self, number: int, event: Action) -> tuple[int, tuple[tuple[int, int], ...]]:
-        message = self.parts[event[2]].content if event[0] == "receive" else None
-        learner, sent = self.conversation.learner(self.parts[number].content, event, message)
-        return self.part(learner), tuple([(worker, self.part(told)) for worker, told in sent])
-
-    def _worker(self, state: State, number: int, event: Action) -> State:
-        seat = state.seats[number]
-        key = seat.worker, number, event
-        if key not in self._events:
-            self._events[key] = self._compute_worker(seat.worker, number, event)
-        worker, sent = self._events[key]
-        facts = self.facts[worker]
-        up = seat.up if facts.shut_out or facts.cut_off else seat.up + sent
-        down, late_down = (seat.down, seat.late_down) if facts.alive else ((), ())
-        return self._with(state, number, Seat(worker, up, down, seat.late_up, late_down))
-
-    def _compute_worker(self, part: int, number: int, event: Action) -> tuple[int, tuple[int, ...]]:
-        message = self.parts[event[1]].content if event[0] == "handle" else None
-        worker, sent = self.conversation.worker(self.parts[part].content, number, event, message)
-        return self.part(worker), tuple([self.part(said) for said in sent])
+        lost = len(self.facts(after[0]).members) < len(self.facts(before[0]).members)
+        return lost or any(self.worker(seat).rejoins for seat in after[1:-1])
 
     @staticmethod
-    def _with(state: State, number: int, seat: Seat) -> State:
-        return State(state.learner, (*state.seats[:number], seat, *state.seats[number + 1 :]), state.faults)
+    def _moves_of(state: State, number: int, moves: list[WorkerMove]) -> list[Move]:
+        return [(Action(what, number, message), _with(state, number, after)) for what, message, after in moves]
+
+    def _compute_worker_moves(self, number: int, at: int) -> list[WorkerMove]:
+        """What the worker of this number, in this seat, can do without the learner."""
+        seat, facts = self.parts[at], self.worker(at)
+        happens = {
+            "start": not facts.alive and self.parts[seat.worker] != GONE,
+            "thaw": facts.frozen,
+            "told": facts.awake and facts.shut_out,
+            "finish": facts.awake and facts.working,
+        }
+        moves: list[WorkerMove] = [
+            (what, None, self._after_worker(number, at, (what,))) for what in happens if happens[what]
+        ]
+        if facts.awake:
+            moves += [self._handle(number, at, "down", each) for each in seat.down[:1]]
+            moves += [self._handle(number, at, "late down", each) for each in dict.fromkeys(seat.late_down)]
+        return moves
+
+    def _handle(self, number: int, seat: int, what: str, message: int) -> WorkerMove:
+        rest = self._arrived(seat, what, message)
+        return what, message, self._after_worker(number, rest, ("handle", message))
+
+    def _compute_worker_faults(self, number: int, at: int) -> list[WorkerMove]:
+        """What can go wrong with this worker and its messages without the learner."""
+        seat, facts = self.parts[at], self.worker(at)
+        faults: list[WorkerMove] = [("drop up", each, self._arrived(at, "up", each)) for each in seat.up[:1]]
+        faults += [("drop down", each, self._arrived(at, "down", each)) for each in seat.down[:1]]
+        if facts.awake:
+            faults += [self._handle(number, at, "repeat down", each) for each in seat.down[:1]]
+            faults.append(("freeze", None, self._after_worker(number, at, ("freeze",))))
+        if facts.alive:
+            faults.append(("kill", None, self._after_worker(number, at, ("end",))))
+        return faults
+
+    def _under_way(self, seat: int) -> bool:
+        facts, messages = self.worker(seat), self.parts[seat]
+        return bool(messages.up or (facts.awake and (messages.down or facts.working)))
+
+    # ---------------------------------------------------------------- what an event leads to
+
+    def _at_most(self, faults: int, learner: int, *seats: int) -> State:
+        """The state with so many faults left. Without any the learner will not restart, so its checkpoints do not matter."""
+        return (learner if faults > 0 or not self.reduced else self._without_checkpoints(learner), *seats, faults)
+
+    def _compute_without_checkpoints(self, learner: int) -> int:
+        content = self.parts[learner]
+        return learner if content[0] == BROKEN else self._part(self.conversation.without_checkpoints(content))
+
+    def _after_time(self, state: State) -> State:
+        learner, *seats, faults = self._after_learner(state, ("time",))
+        return (learner, *[self._after_worker(number, seat, ("time",)) for number, seat in enumerate(seats)], faults)
+
+    def _receive(self, state: State, number: int, what: str, message: int) -> State:
+        seat = self._arrived(state[number + 1], what, message)
+        return self._after_learner(_with(state, number, seat), ("receive", number, message))
+
+    def _compute_arrived(self, number: int, what: str, message: int) -> int:
+        """The seat without this message, or with a copy of it that arrives later."""
+        seat = self.parts[number]
+        match what:
+            case "up":
+                return self._part(seat._replace(up=seat.up[1:]))
+            case "down":
+                return self._part(seat._replace(down=seat.down[1:]))
+            case "repeat up":
+                return self._part(seat._replace(up=seat.up[1:], late_up=_sorted((*seat.late_up, message))))
+            case "repeat down":
+                return self._part(seat._replace(down=seat.down[1:], late_down=_sorted((*seat.late_down, message))))
+            case "late up":
+                return self._part(seat._replace(late_up=_without(seat.late_up, message)))
+            case "late down":
+                return self._part(seat._replace(late_down=_without(seat.late_down, message)))
+        raise AssertionError(what)
+
+    def _after_learner(self, state: State, event: Event) -> State:
+        before, *seats, faults = state
+        learner, out = self._learner_event(before, event)
+        for number, message in out:
+            seats[number] = self._sent(seats[number], message)
+        return self._at_most(faults, learner, *seats)
+
+    def _compute_sent(self, number: int, message: int) -> int:
+        """The seat after the learner has sent this message. It is lost if no process is there."""
+        seat = self.parts[number]
+        return self._part(seat._replace(down=(*seat.down, message))) if self.worker(number).alive else number
+
+    def _compute_learner_event(self, learner: int, event: Event) -> tuple[int, tuple[tuple[int, int], ...]]:
+        message = self.parts[event[2]] if event[0] == "receive" else None
+        try:
+            after, sent = self.conversation.learner(self.parts[learner], event, message)
+        except Exception as error:
+            return self._part(broken(error)), ()
+        return self._part(after), tuple([(worker, self._part(told)) for worker, told in sent])
+
+    def _after_worker(self, number: int, seat: int, event: Event) -> int:
+        """The seat of the worker of this number, after this event."""
+        before, up, down, late_up, late_down = self.parts[seat]
+        worker, sent = self._worker_event(number, before, event)
+        facts = self.facts(worker)
+        if not facts.shut_out:
+            up += sent
+        if not facts.alive:
+            down = late_down = ()
+        return self._part(Seat(worker, up, down, late_up, late_down))
+
+    def _compute_worker_event(self, number: int, worker: int, event: Event) -> tuple[int, tuple[int, ...]]:
+        if self.parts[worker] == GONE:
+            return worker, ()  # time passes
+        message = self.parts[event[1]] if event[0] == "handle" else None
+        try:
+            after, sent = self.conversation.worker(self.parts[worker], number, event, message)
+        except Exception as error:
+            return self._part(broken(error)), ()
+        return self._part(after), tuple([self._part(said) for said in sent])
 
     # ---------------------------------------------------------------- parts and names
 
-    def part(self, content: Content) -> int:
-        number = self._numbers.get(content)
+    def _part(self, part: Content | Seat) -> int:
+        """The number of this part."""
+        number = self._numbers.get(part)
         if number is None:
-            number = self._numbers[content] = len(self.parts)
-            names = tuple(sorted(names_in(content, set())))
-            digest = int.from_bytes(blake2b(repr(content).encode(), digest_size=7).digest(), "little")
-            self.parts.append(Part(content, names, frozenset(names), digest))
-            self.facts.append(self.conversation.facts(content))
-            assert digest not in self.by_digest, "two parts have the same digest"
-            self.by_digest[digest] = number
+            number = self._numbers[part] = len(self.parts)
+            self.parts.append(part)
+            if isinstance(part, Seat):
+                numbers = part.worker, *part.up, *part.down, *part.late_up, *part.late_down
+                self._names.append(frozenset().union(*[self._names[each] for each in numbers]))
+            else:
+                self._names.append(frozenset(names_in(part, set())))
         return number
 
     def canonical(self, state: State) -> State:
         """The same state, with its names and its workers numbered anew."""
-        parts, seats = self.parts, state.seats
-        numbers = [state.learner]
-        for worker, up, down, late_up, late_down in seats:
-            numbers += worker, *up, *down, *late_up, *late_down
-        names = parts[state.learner].name_set.union(*[parts[number].names for number in numbers])
-        order = self._order(state)
-        key = names, order
+        learner, *seats, faults = state
+        order = self._order(learner, seats)
+        key = order, *[self._names[each] for each in state[:-1]]
         new = self._renamings.get(key)
         if new is None:
+            names = frozenset().union(*key[1:])
             new = self._renamings[key] = renaming(names, {old: number for number, old in enumerate(order)})
         if not new:
             return state
-        rename = self._rename
-        moved = []
-        for old in order:
-            worker, up, down, late_up, late_down = seats[old]
-            late_up, late_down = (
-                self._sorted([rename(m, new) for m in late_up]),
-                self._sorted([rename(m, new) for m in late_down]),
-            )
-            up, down = tuple([rename(m, new) for m in up]), tuple([rename(m, new) for m in down])
-            moved.append(Seat(rename(worker, new), up, down, late_up, late_down))
-        return State(rename(state.learner, new), tuple(moved), state.faults)
+        return (self._rename(learner, new), *[self._rename(seats[old], new) for old in order], faults)
 
-    def _sorted(self, messages: Sequence[int]) -> tuple[int, ...]:
-        """Messages whose order does not matter."""
-        return tuple(sorted(messages, key=lambda part: self.parts[part].digest) if len(messages) > 1 else messages)
-
-    def _order(self, state: State) -> tuple[int, ...]:
+    def _order(self, learner: int, seats: list[int]) -> tuple[int, ...]:
         """The workers in an order that does not depend on their numbers: members first, as they joined."""
-        members = self.facts[state.learner].members
-        if len(members) == len(state.seats):
+        members = self.facts(learner).members
+        if len(members) == len(seats):
             return members
-        others = [number for number in range(len(state.seats)) if number not in members]
-        if len(others) > 1:
-            others.sort(key=lambda number: self._shape(state.seats[number], number))
-        return (*members, *others)
+        others = [number for number in range(len(seats)) if number not in members]
+        return (*members, *sorted(others, key=lambda number: self._shape(seats[number])))
 
-    def _shape(self, seat: Seat, number: int) -> tuple[int, ...]:
-        """A sort key of a worker that does not contain its number."""
-        parts = [
-            self._as_first(part, number) for part in (seat.worker, *seat.up, *seat.down, *seat.late_up, *seat.late_down)
-        ]
-        return tuple(self.parts[part].digest for part in parts)
+    def _compute_shape(self, seat: int) -> int:
+        """The same seat, if it belonged to worker 0."""
+        own = [each for each in self._names[seat] if each.kind in OF_WORKER]
+        return self._rename(seat, {each: name(each.kind, each.value, 0) for each in own})
 
-    def _as_first(self, part: int, number: int) -> int:
-        """The same part, if it belonged to worker 0."""
-        new: dict[Name, Name | None] = {
-            each: name(each.kind, each.value, 0)
-            for each in self.parts[part].names
-            if each.kind in (Kind.NONCE, Kind.ATTEMPT) and each.scope == number
-        }
-        return self._rename(part, new)
+    def _rename(self, number: int, new: dict[Name, Name | None]) -> int:
+        """The same part under other names."""
+        names = self._names[number]
+        if names.isdisjoint(new):
+            return number
+        key = number, tuple([new.get(each, each) for each in names])
+        found = self._renamed.get(key)
+        if found is None:
+            found = self._renamed[key] = self._part(self._compute_renamed(self.parts[number], new))
+        return found
 
-    def _rename(self, part: int, new: dict[Name, Name | None]) -> int:
-        _, names, name_set, _ = self.parts[part]
-        if name_set.isdisjoint(new):
-            return part
-        to = tuple([new.get(each, each) for each in names])
-        key = part, to
-        number = self._renamed.get(key)
-        if number is None:
-            number = self._renamed[key] = self.part(renamed(self.parts[part].content, new))
-        return number
+    def _compute_renamed(self, part: Content | Seat, new: dict[Name, Name | None]) -> Any:
+        if not isinstance(part, Seat):
+            return renamed(part, new)
+        up, down, late_up, late_down = (tuple([self._rename(each, new) for each in messages]) for messages in part[1:])
+        return Seat(self._rename(part.worker, new), up, down, _sorted(late_up), _sorted(late_down))
+
+
+def _with(state: State, number: int, seat: int) -> State:
+    return (*state[: number + 1], seat, *state[number + 2 :])
 
 
 def _without(messages: tuple[int, ...], message: int) -> tuple[int, ...]:
     index = messages.index(message)
     return messages[:index] + messages[index + 1 :]
+
+
+def _sorted(messages: tuple[int, ...]) -> tuple[int, ...]:
+    """Copies whose order does not matter."""
+    return tuple(sorted(messages)) if len(messages) > 1 else messages

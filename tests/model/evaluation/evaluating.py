@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from learner.rollouts.evaluation_tickets import EvaluationPlan
-from tests.model.conversation import Action, Content, Facts
+from tests.model.conversation import Content, Event, Facts
 from tests.model.evaluation import learner_half, worker_half
 from tests.model.learner_part import first_learner
 from tests.model.message_content import EPISODE_STEPS, content_of, message_of, worker_of
@@ -38,16 +38,20 @@ class Evaluating(Training):
         workers = [worker_half.EvaluatingWorker(self, number, 0) for number in range(self.workers)]
         return learner_half.saved(learner, 0.0), [worker_half.saved(worker, 0.0) for worker in workers]
 
-    def learner(self, content: Content, event: Action, message: Content | None) -> tuple[Content, list[tuple[int, Content]]]:
+    def learner(self, content: Content, event: Event, message: Content | None) -> tuple[Content, list[tuple[int, Content]]]:
         now = now_at(event)
         learner, out = learner_event(learner_half.loaded(content, self), event, message, now)
         return learner_half.saved(learner, now), [(worker_of(to), content_of(told, worker_of(to))) for to, told in out]
 
-    def worker(self, content: Content, number: int, event: Action, message: Content | None) -> tuple[Content, list[Content]]:
+    def worker(self, content: Content, number: int, event: Event, message: Content | None) -> tuple[Content, list[Content]]:
         now = now_at(event)
         worker = worker_half.loaded(content, number, self)
         said = worker.event(event, None if message is None else message_of(message, number, self.run), now)
         return worker_half.saved(worker, now), [content_of(each, number) for each in said]
+
+    def without_checkpoints(self, learner: Content) -> Content:
+        both, of_evaluation = learner
+        return super().without_checkpoints(both), of_evaluation
 
     def facts(self, content: Content) -> Facts:
         if isinstance(content[0], str):

@@ -57,7 +57,7 @@ MUTATIONS = {**OF_THE_LEARNER, **OF_THE_WORKER}
 def explored() -> str:
     """Explore small runs, the smallest first. Returns what is broken; empty: nothing was found."""
     from tests.model.evaluation.evaluating import Evaluating
-    from tests.model.explore import RuleBroken, explore
+    from tests.model.search import RuleBroken, explore
 
     for run in (
         Evaluating(workers=1, lanes=1, updates=1, faults=1),

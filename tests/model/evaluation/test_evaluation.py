@@ -15,7 +15,7 @@ from learner.rollouts.evaluation_tickets import EvaluationTickets
 from tests.model.evaluation import learner_half, worker_half
 from tests.model.evaluation.evaluating import Evaluating
 from tests.model.evaluation.mutations import MUTATIONS, OF_THE_LEARNER, OF_THE_WORKER
-from tests.model.explore import explore
+from tests.model.search import explore
 from tests.support.fake_ends import run_spec
 from tests.test_architecture import ROOT
 from workers.evaluate.held_evaluations import HeldEvaluations

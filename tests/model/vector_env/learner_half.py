@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from learner.members.membership import Member, Outgoing
 from learner.vector_env.order_coordinator import OrderCoordinator
 from protocol.messages import ToLearner, WorkerExit
-from tests.model.conversation import Action, Content
+from tests.model.conversation import Content, Event
 from tests.model.message_content import hello, incarnation, peer_of, session, ticket, worker_of
 from tests.model.names import Kind, name
 from tests.model.settings import TIMEOUT_S
@@ -36,7 +36,7 @@ class Learner:
         self.coordinator = OrderCoordinator(settings.run, first_session, TIMEOUT_S)
         self.caller = Caller(self.coordinator, settings, now)
 
-    def event(self, event: Action, message: Content | None) -> tuple[Learner, list[Outgoing]]:
+    def event(self, event: Event, message: Content | None) -> tuple[Learner, list[Outgoing]]:
         """The learner after this event, and what it sends."""
         coordinator, caller = self.coordinator, self.caller
         sent = caller.server.sent

@@ -53,7 +53,7 @@ MUTATIONS = {**OF_THE_LEARNER, **OF_THE_WORKER}
 
 def explored() -> str:
     """Explore small runs, the smallest first. Returns what is broken; empty: nothing was found."""
-    from tests.model.explore import RuleBroken, explore
+    from tests.model.search import RuleBroken, explore
     from tests.model.vector_env.stepping import Stepping
 
     for run in (

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from protocol.specs import StepSpec
-from tests.model.conversation import Action, Content, Facts
+from tests.model.conversation import Content, Event, Facts
 from tests.model.message_content import worker_of
 from tests.model.settings import TICK_S, TIMEOUT_S
 from tests.model.training import now_at
@@ -29,6 +29,8 @@ class Stepping:
     calls: tuple[str, ...]
     """each "reset", "step" or "call" """
     faults: int
+    only: tuple[str, ...] = ()
+    few_losses = False
 
     @property
     def run(self) -> StepSpec:
@@ -48,26 +50,28 @@ class Stepping:
         workers = [worker_half.saved(Worker(number, 0), 0.0) for number in range(self.workers)]
         return learner_half.saved(Learner(self, 0, 0.0)), workers
 
-    def learner(self, content: Content, event: Action, message: Content | None) -> tuple[Content, list[tuple[int, Content]]]:
+    def learner(self, content: Content, event: Event, message: Content | None) -> tuple[Content, list[tuple[int, Content]]]:
         learner, out = learner_half.loaded(content, self, now_at(event)).event(event, message)
         return learner_half.saved(learner), [(worker_of(to), content_of(told, worker_of(to))) for to, told in out]
 
-    def worker(self, content: Content, number: int, event: Action, message: Content | None) -> tuple[Content, list[Content]]:
+    def worker(self, content: Content, number: int, event: Event, message: Content | None) -> tuple[Content, list[Content]]:
         worker, now = worker_half.loaded(content, number, self), now_at(event)
         sent = [content_of(said, number) for said in worker.event(event, message, self, now)]
         return worker_half.saved(worker, now), sent
+
+    def without_checkpoints(self, learner: Content) -> Content:
+        return learner  # it has none
 
     def facts(self, content: Content) -> Facts:
         if isinstance(content[0], str):
             return Facts()
         if len(content) == 4:
-            nonce, (frozen, shut_out, cut_off), fields, work = content
+            nonce, (frozen, shut_out), fields, work = content
             return Facts(
                 nonce=nonce.value,
                 alive=fields is not None,
                 frozen=frozen,
                 shut_out=shut_out,
-                cut_off=cut_off,
                 working=work is not None,
                 rejoins=fields is not None and fields[0] is SessionState.JOINING and fields[1] is not None,
             )

@@ -12,7 +12,7 @@ import sys
 import pytest
 
 from learner.vector_env.order_coordinator import OrderCoordinator, OrderedLane
-from tests.model.explore import explore
+from tests.model.search import explore
 from tests.model.vector_env import learner_half, worker_half
 from tests.model.vector_env.mutations import MUTATIONS, OF_THE_LEARNER, OF_THE_WORKER
 from tests.model.vector_env.stepping import Stepping

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from protocol.messages import Answer, ToLearner
-from tests.model.conversation import Action, Content
+from tests.model.conversation import Content, Event
 from tests.model.message_content import incarnation, session, ticket
 from tests.model.names import MASK, Kind, name
 from tests.model.settings import FOR_EVER_S, TIMEOUT_S
@@ -53,9 +53,8 @@ class Worker:
     """session and ticket of the order that was executed last"""
     frozen: bool = False
     shut_out: bool = False
-    cut_off: bool = False
 
-    def event(self, event: Action, message: Content | None, run: Stepping, now: float) -> list[ToLearner]:
+    def event(self, event: Event, message: Content | None, run: Stepping, now: float) -> list[ToLearner]:
         """What the worker says after this event."""
         current = self.session
         match event:
@@ -79,11 +78,8 @@ class Worker:
             case ("told",):
                 assert current is not None
                 return self._turn(current.refused("its key was revoked"), now)
-            case ("end",) | ("dead for ever",):
+            case ("end",):
                 self._end()
-                self.cut_off = self.cut_off or event == ("dead for ever",)
-            case ("cut off for ever",):
-                self.cut_off = True
             case ("shut out",):
                 self.shut_out = True
             case ("freeze",) | ("thaw",):
@@ -133,7 +129,7 @@ class Worker:
 def saved(worker: Worker, now: float) -> Content:
     """The process, its session, the orders that it holds, its copies, and what it executes."""
     nonce = name(Kind.NONCE, worker.nonce, worker.number)
-    flags = worker.frozen, worker.shut_out, worker.cut_off
+    flags = worker.frozen, worker.shut_out
     current = worker.session
     if current is None:
         return nonce, flags, None, None
@@ -141,7 +137,7 @@ def saved(worker: Worker, now: float) -> Content:
     fields = (
         current.state,
         None if current.run is None else session(current.session),
-        name(Kind.ATTEMPT, 1 if worker.cut_off else current._attempt, worker.number),
+        name(Kind.ATTEMPT, current._attempt, worker.number),
         max(current._last_heard_s - now, -TIMEOUT_S - 1.0),
         max(current._due_s - now, 0.0),
         tuple(_lane(number, lane) for number, lane in sorted(held.orders._lanes.items())),
@@ -161,8 +157,8 @@ def _lane(number: int, lane: _HeldLane) -> Content:
 
 def loaded(content: Content, number: int, run: Stepping) -> Worker:
     """A worker at the time 0 with this content."""
-    nonce, (frozen, shut_out, cut_off), fields, work = content
-    worker = Worker(number, nonce.value, frozen=frozen, shut_out=shut_out, cut_off=cut_off)
+    nonce, (frozen, shut_out), fields, work = content
+    worker = Worker(number, nonce.value, frozen=frozen, shut_out=shut_out)
     if fields is None:
         return worker
     state, of_session, attempt, heard, due, lanes, in_progress, replies, copies, newest = fields
