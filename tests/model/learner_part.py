@@ -91,6 +91,8 @@ class Learner:
         for arrived in self.coordinator.ready[waiting:]:
             assert arrived.rollout is message, "a rollout that did not arrive was accepted"
             self._accept(arrived)
+        rejected = self.coordinator.ledger.transitions_invalid
+        assert rejected == 0, "a rollout of a worker that does all right was rejected"
         return out + self._learn()
 
     def publish(self) -> list[Outgoing]:
@@ -182,10 +184,12 @@ class Learner:
         coordinator, ledger = self.coordinator, self.coordinator.ledger
         in_flight = len(coordinator.tickets) + len(coordinator.ready)
         assert ledger.outstanding == in_flight, "the ledger does not balance"
-        assert ledger.transitions_waiting == len(coordinator.ready), "transitions do not balance"
-        assert ledger.transitions_invalid == 0, "a rollout of a worker that does all right was rejected"
-        bound = coordinator.rollouts_per_update * (coordinator.version + 1 + coordinator.max_lag)
-        assert ledger.used + in_flight <= bound, "more tickets than the bound allows"
+        waiting_steps = sum(arrived.rollout.env_steps for arrived in coordinator.ready)
+        assert ledger.transitions_waiting == waiting_steps, "transitions do not balance"
+        versions = coordinator.version - coordinator._first_version + 1 + coordinator.max_lag
+        bound = coordinator.rollouts_per_update * versions
+        used = ledger.used - coordinator._used_before
+        assert coordinator._weights is None or used + in_flight <= bound, "more tickets than the bound allows"
         members = coordinator.members
         for lane in coordinator.lanes:
             owners = [member.peer for member in members.values() if lane.number in member.lanes]

@@ -25,6 +25,7 @@ import psutil
 
 from learner.run_folder.metrics_log import read_rows
 from protocol.keys.key_folder import KeyFolder
+from tests.model.traces.recorder import FOLDER
 
 ROOT = Path(__file__).parents[2]
 T = TypeVar("T")
@@ -246,9 +247,15 @@ class Learner(Running):
 class Stage:
     """Starts the processes of one test, and ends them after it."""
 
-    def __init__(self, tmp_path: Path) -> None:
+    def __init__(self, tmp_path: Path, traces: Path | None = None) -> None:
+        """`traces`: learners and workers record themselves in this folder, for `tests.model.traces.accept`."""
         tmp_path.mkdir(exist_ok=True)
         self.tmp_path = tmp_path
+        self._recording: list[str] = []  # words before a command
+        if traces is not None:
+            traces.mkdir()
+            hook = ROOT / "tests" / "model" / "traces" / "hook"
+            self._recording = ["env", f"PYTHONPATH={hook}{os.pathsep}{ROOT}", f"{FOLDER}={traces}"]
         self.runs = tmp_path / "runs"
         self.started: list[Running] = []
         self._numbers = itertools.count()
@@ -279,13 +286,13 @@ class Stage:
             if value != "":
                 arguments += [f"--{name}", *str(value).split()]
         said = self.tmp_path / f"learner-{next(self._numbers)}.log"
-        learner = Learner([*before, sys.executable, "-m", "learner", *arguments], said, self.runs)
+        learner = Learner([*before, *self._recording, sys.executable, "-m", "learner", *arguments], said, self.runs)
         self.started.append(learner)
         return learner
 
     def worker(self, address: str, name: str, *flags: str, before: Sequence[str] = ()) -> Worker:
         """Start `python -m workers` for the learner at this address."""
-        command = [*before, sys.executable, "-m", "workers", address, "--name", name, *flags]
+        command = [*before, *self._recording, sys.executable, "-m", "workers", address, "--name", name, *flags]
         worker = Worker(command, self.tmp_path / f"{name}-{next(self._numbers)}.log")
         self.started.append(worker)
         return worker

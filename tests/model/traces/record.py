@@ -1,0 +1,205 @@
+"""What is written of one call of a coordinator or a session: plain data, and messages as their frames or digests.
+
+Rule: two messages with the same digest are the same, bit for bit. Of rollouts and weights, only what the two halves read is
+kept besides the digest: they are large.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Iterator
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from learner.members.membership import Member
+from learner.rollouts.lanes import AcceptedRollout
+from protocol.arrays import Array
+from protocol.messages import Rollout, ToLearner, ToWorker, Weights
+from protocol.wire.codec import decode_to_learner, decode_to_worker, encode
+from workers.session import CloseLanes, EvaluationTask, Leave, Send, StartSession, Task
+
+SUFFIX = ".trace"
+KEPT_WEIGHTS = 64  # digests of weights: the learner of a soak must not grow by them
+
+
+class Record(NamedTuple):
+    """One call."""
+
+    at_s: float
+    """when it had returned, by the monotonic clock, which all processes of a machine share"""
+    part: str
+    """class of the object that was called"""
+    method: str
+    arguments: tuple[Any, ...]
+    keywords: dict[str, Any]
+    result: Any
+
+
+class Said(NamedTuple):
+    """A message."""
+
+    kind: str
+    digest: bytes
+    frames: tuple[bytes, ...] = ()
+    """empty in results, because a replay makes them again"""
+
+
+class SaidRollout(NamedTuple):
+    """A rollout, without its arrays."""
+
+    kind: str
+    digest: bytes
+    numbers: tuple[int, int, int, int, int]
+    """session, lane, ticket, version, sequence"""
+    env_steps: int
+    is_bool: bool
+    """whether `valid` has the right dtype"""
+
+
+class SaidWeights(NamedTuple):
+    """Weights, without their arrays."""
+
+    kind: str
+    digest: bytes
+    version: int
+
+
+class SaidMember(NamedTuple):
+    """A worker as the learner sees it, by its routing id."""
+
+    peer: bytes
+
+
+class Digests:
+    """Digests of messages. A message that stands for a large one has the digest of that one."""
+
+    def __init__(self) -> None:
+        self.weights: dict[int, bytes] = {}
+        """by version, of the weights that were published or received"""
+        self._of: dict[int, tuple[Any, bytes]] = {}
+
+    def published(self, version: int, digest: bytes) -> None:
+        """Weights of this version have this digest. Those of much older versions are forgotten."""
+        self.weights[version] = digest
+        while len(self.weights) > KEPT_WEIGHTS:
+            del self.weights[next(iter(self.weights))]
+
+    def set(self, message: Any, digest: bytes) -> None:
+        """The message stands for another one, which has the digest."""
+        self._of[id(message)] = message, digest
+
+    def of(self, message: ToLearner | ToWorker) -> bytes:
+        """The digest."""
+        found = self._of.get(id(message))
+        if found is not None and found[0] is message:
+            return found[1]
+        if isinstance(message, Weights):
+            if message.version not in self.weights:
+                self.weights[message.version] = digest_of(message)
+            return self.weights[message.version]
+        return digest_of(message)
+
+    def result(self, value: Any) -> Any:
+        """What is written of the result of a call."""
+        match value:
+            case Send(message):
+                return type(message).__name__, self.of(message)
+            case StartSession():
+                return "StartSession"
+            case CloseLanes(lanes):
+                return "CloseLanes", lanes
+            case Leave():
+                return "Leave", value.exit_code, value.reason
+            case Task():
+                return "Task", value.session, value.weights.version, value.assignments
+            case EvaluationTask():
+                return "EvaluationTask", value.weights.version, self.of(value.order)
+            case AcceptedRollout():
+                return value.rollout.ticket, value.rollout.version, value.incarnation, value.fresh
+            case list() | tuple():
+                return tuple(self.result(each) for each in value)
+            case None | bool() | int() | float() | str() | bytes():
+                return value
+        if isinstance(value, ToLearner | ToWorker):
+            return type(value).__name__, self.of(value)
+        return type(value).__name__
+
+
+def digest_of(message: ToLearner | ToWorker) -> bytes:
+    """Digest of all that the message says, unpacked."""
+    found = blake2b(digest_size=8)
+    for frame in encode(message):
+        found.update(len(frame).to_bytes(8, "little"))
+        found.update(frame)
+    return found.digest()
+
+
+def argument(value: Any) -> Any:
+    """What is written of an argument."""
+    match value:
+        case Rollout():
+            numbers = value.session, value.lane, value.ticket, value.version, value.sequence
+            is_bool = value.valid.dtype == bool
+            return SaidRollout("Rollout", digest_of(value), numbers, value.env_steps, bool(is_bool))
+        case Weights():
+            return SaidWeights("Weights", digest_of(value), value.version)
+        case Member():
+            return SaidMember(value.peer)
+        case AcceptedRollout():
+            return value.rollout.ticket
+        case list():
+            return [argument(each) for each in value]
+        case np.ndarray():
+            return None
+    if isinstance(value, ToLearner | ToWorker):
+        return Said(type(value).__name__, digest_of(value), tuple(bytes(frame) for frame in encode(value)))
+    return value if not callable(value) or isinstance(value, type) else None
+
+
+def message_of(said: Any, digests: Digests, *, to_learner: bool) -> Any:
+    """A message that says the same as far as the two halves read it."""
+    match said:
+        case SaidRollout():
+            message: Any = _rollout(said)
+        case SaidWeights():
+            message = Weights(said.version, np.zeros(1, np.float32), np.zeros(0, np.float32))
+            digests.published(said.version, said.digest)
+        case Said():
+            return decode_to_learner(said.frames) if to_learner else decode_to_worker(said.frames)
+        case _:
+            return said
+    digests.set(message, said.digest)
+    return message
+
+
+def _rollout(said: SaidRollout) -> Rollout:
+    nothing: Array = np.zeros(0, np.float32)
+    session, lane, ticket, version, sequence = said.numbers
+    return Rollout(
+        session=session,
+        lane=lane,
+        ticket=ticket,
+        version=version,
+        sequence=sequence,
+        obs=(),
+        action=nothing,
+        log_prob=nothing,
+        reward=nothing,
+        terminated=nothing,
+        truncated=nothing,
+        valid=np.ones(said.env_steps, bool if said.is_bool else np.int8),
+        state=nothing,
+    )
+
+
+def read(path: Path) -> Iterator[Record]:
+    """The records of a trace. The last one may be cut, if its process was killed."""
+    with path.open("rb") as file:
+        while True:
+            try:
+                yield Record(*pickle.load(file))
+            except (EOFError, pickle.UnpicklingError):
+                return

@@ -1,0 +1,148 @@
+"""Calls of a trace are made again, of a new object of the same class: each must have the same result, bit for bit.
+
+Rule: a coordinator and a session depend on nothing but their calls. After each call of a learner, the rules of the model
+hold (`tests/model/learner_part.py`), and those of evaluations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from learner.members.describe_coordinator import DescribeCoordinator, accept_any
+from learner.rollouts.lanes import AcceptedRollout
+from learner.rollouts.ticket_coordinator import TicketCoordinator
+from tests.model import learner_part
+from tests.model.traces.record import Digests, Record, SaidMember, message_of
+from workers.session import Session
+
+CLASSES: dict[str, Any] = {each.__name__: each for each in (DescribeCoordinator, TicketCoordinator, Session)}
+
+
+class NotAccepted(AssertionError):
+    """The trace is not one of the model. The text says which call, and what was expected."""
+
+
+class Rules:
+    """The rules of the model, for one learner."""
+
+    def __init__(self, coordinator: TicketCoordinator, used: set[int]) -> None:
+        """`used`: tickets whose rollouts were used before the checkpoint from which it started."""
+        self.used = used
+        self._coordinator = coordinator
+        settings: Any = SimpleNamespace(lanes=coordinator.run.lanes)
+        self._learner = learner_part.Learner(settings, coordinator)
+
+    def taken(self, taken: Sequence[AcceptedRollout]) -> None:
+        """The rollouts of an update."""
+        coordinator = self._coordinator
+        assert len(taken) == coordinator.rollouts_per_update, "an update has another number of rollouts"
+        for rollout in (arrived.rollout for arrived in taken):
+            assert rollout.ticket not in self.used, "a ticket was used twice"
+            self.used.add(rollout.ticket)
+            lag = coordinator.version - rollout.version
+            assert 0 <= lag <= coordinator.max_lag, f"a rollout of lag {lag} was used"
+
+    def check(self, accepted: Sequence[AcceptedRollout]) -> None:
+        """Those that hold after every call. `accepted`: by this call."""
+        for arrived in accepted:
+            self._learner._accept(arrived)
+        self._learner.check()
+        evaluation = self._coordinator.evaluation
+        if evaluation.pending:
+            held = [index for each in evaluation._held.values() for index in each]
+            every = sorted([*evaluation._undealt, *held, *evaluation._played])
+            assert every == list(range(len(evaluation._seeds))), "a ticket of an evaluation is not in one place"
+            assert evaluation._version == self._coordinator.version, "an evaluation belongs to another version"
+
+
+class Replay:
+    """One process, call by call."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.calls = 0
+        self.parts: dict[str, Any] = {}
+        """what was called, by class"""
+        self._digests = Digests()
+        self._rules: Rules | None = None
+        self._taken: list[AcceptedRollout] = []
+
+    def play(self, record: Record, used: set[int] | None = None) -> Any:
+        """Make a call again. Returns its arguments. `used`: for a new learner, the tickets that the run had used."""
+        self.calls += 1
+        to_learner = record.part != "Session" or record.method in ("finished", "evaluated", "answered")
+        given = [self._made(each, to_learner=to_learner) for each in record.arguments]
+        named = {name: self._made(value, to_learner=to_learner) for name, value in record.keywords.items()}
+        try:
+            if record.method == "__init__":
+                self._begin(record.part, given, named, used or set())
+            else:
+                self._call(record, given, named)
+        except Exception as error:
+            where = f"{self.name}: call {self.calls}, at {record.at_s:.3f} s, {record.part}.{record.method}"
+            raise NotAccepted(f"{where}{record.arguments}: {error}") from error
+        return given
+
+    @property
+    def used(self) -> set[int]:
+        """The tickets that the run has used by now."""
+        return self._rules.used if self._rules is not None else set()
+
+    # ---------------------------------------------------------------- inside
+
+    def _made(self, said: Any, *, to_learner: bool) -> Any:
+        if isinstance(said, list):
+            return [self._made(each, to_learner=to_learner) for each in said]
+        return message_of(said, self._digests, to_learner=to_learner)
+
+    def _begin(self, part: str, given: list[Any], named: dict[str, Any], used: set[int]) -> None:
+        if part == "DescribeCoordinator":
+            named["accept"] = accept_any
+        made = self.parts[part] = CLASSES[part](*given, **named)
+        if part == "TicketCoordinator":
+            self._rules = Rules(made, {each for each in used if each < made.ledger.issued})
+
+    def _call(self, record: Record, given: list[Any], named: dict[str, Any]) -> None:
+        coordinator: Any = self.parts.get("TicketCoordinator", self.parts.get("DescribeCoordinator"))
+        called = coordinator.membership if record.part == "Membership" else self.parts[record.part]
+        given = [_member(each, coordinator) for each in given]
+        waiting = len(coordinator.ready) if record.part == "TicketCoordinator" else 0
+        match record.method:
+            case "publish":
+                version, digest = given
+                self._digests.published(version, digest)
+                given = [version, np.zeros(1, np.float32), np.zeros(0, np.float32)]
+            case "not_used":
+                given = [self._taken]
+        result = getattr(called, record.method)(*given, **named)
+        found = self._digests.result(result)
+        if record.method == "incarnations":
+            found = coordinator.version, tuple(result), coordinator.ledger.issued, coordinator.ledger.used
+        assert found == record.result, f"expected {record.result}, got {found}"
+        if coordinator is not None:
+            coordinator.membership.events.clear()
+        if record.part == "TicketCoordinator":
+            self._follow(record.method, result, waiting)
+
+    def _follow(self, method: str, result: Any, waiting: int) -> None:
+        """See to it that the rules hold."""
+        assert self._rules is not None
+        if method == "take":
+            self._taken = result or []
+            if result is not None:
+                self._rules.taken(result)
+        if method == "not_used":
+            self._rules.used -= {arrived.rollout.ticket for arrived in self._taken}
+        accepted = self.parts["TicketCoordinator"].ready[waiting:] if method == "receive" else []
+        self._rules.check(accepted)
+
+
+def _member(said: Any, coordinator: Any) -> Any:
+    """The member of this routing id, if an argument is one."""
+    if isinstance(said, SaidMember):
+        return coordinator.membership.members[said.peer]
+    return said
