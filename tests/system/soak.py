@@ -1,8 +1,9 @@
 """`python -m tests.system.soak`: eight workers learn CartPole, in a slow environment, with a fault every two seconds.
 
 Rule: in spite of the faults, training goes on for the given time and ends; the policy is as good as without faults; every
-ticket, transition and evaluation is accounted for; memory, open files and logs do not grow; and nothing is left behind. The
-seed decides the faults. The exit code is 1 if this fails.
+ticket, transition and evaluation is accounted for; memory, open files and logs do not grow; nothing is left behind; and the
+traces of the learner and of the workers are accepted by the model (`tests/model/traces/accept.py`). The seed decides the
+faults. The exit code is 1 if this fails.
 
 Two of the workers are on the learner's host, and no fault happens to them. In their environment, as in all, some calls take
 longer than the worker timeout. They must never be given up for that.
@@ -29,6 +30,8 @@ import numpy as np
 import psutil
 
 from protocol.keys.key_folder import KeyFolder
+from tests.model.traces.accept import accept
+from tests.model.traces.replay import NotAccepted
 from tests.system.network import Network, why_not
 from tests.system.processes import START_S, Learner, Running, Stage, Worker, wait_for
 from tests.system.runs import accounted
@@ -319,7 +322,8 @@ def without_faults(stage: Stage, steps: int, seed: int, eval_every: int) -> dict
 def soak(minutes: float, seed: int, folder: Path, eval_every: int = 25_000) -> list[str]:
     """Run it and print the table. Returns the requirements that were not met."""
     print(f"soak: seed {seed}, {minutes:g} minutes of faults", flush=True)
-    stage = Stage(folder)
+    traces = folder / "traces"
+    stage = Stage(folder, traces)
     with Network() as network:
         try:
             course = Soak(stage, network, seed, eval_every, minutes)
@@ -336,6 +340,11 @@ def soak(minutes: float, seed: int, folder: Path, eval_every: int = 25_000) -> l
     short += missing_evaluations(learner.rows(), eval_every)
     if not course.in_evaluations["kill a worker"]:
         short.append("no worker was killed in an evaluation")
+    accepted = "not accepted"
+    try:
+        accepted = str(accept(traces))
+    except NotAccepted as error:
+        short.append(f"traces: {error}")
     if summary["stop_reason"] != "all steps done":
         short.append(f"stop reason: {summary['stop_reason']}")
     calm_stage = Stage(folder / "calm")
@@ -370,6 +379,7 @@ def soak(minutes: float, seed: int, folder: Path, eval_every: int = 25_000) -> l
     for name, value in rows.items():
         print(f"  {name:36} {value:>20}")
     print(f"  in the longest pause: {course.longest_pause[1]}")
+    print(f"  traces: {sum(path.stat().st_size for path in traces.iterdir()) / 1e6:.1f} MB; {accepted}")
     (folder / "soak.json").write_text(json.dumps(rows, indent=2))
     return short
 
