@@ -136,4 +136,3 @@ def test_a_trace_that_is_cut_in_a_record_is_read_up_to_there(copy: Path) -> None
     whole = len(list(read(path)))
     path.write_bytes(path.read_bytes()[:-3])
     assert len(list(read(path))) == whole - 1
-    accept(copy)
