@@ -2,6 +2,7 @@
 
 Rule: the worker reads all messages before a rollout or an evaluation starts, and again between env steps, so it answers
 while it works and acts under the newest weights that it holds. Every failure of the environment is reported to the learner.
+A connection that only looks open is given up for another.
 In a vector environment, where one step may take as long as the caller allows, a second thread sends the heartbeats.
 """
 
@@ -46,11 +47,13 @@ from workers.session import (
     Statistics,
     Task,
 )
+from workers.states import State
 from workers.step.stepper import Stepper
 from workers.supervise.activity import WAITING, activity
 
 log = logging.getLogger("millrace.worker")
 
+CONNECT_AGAIN_S = 20.0  # a learner that can be reached answers a Hello sooner
 PULSE_S = 0.05  # time between two looks for messages while environments are stepped
 IDLE_S = 0.5  # longest wait while idle, so that a signal or the end of the parent process is noticed
 AFTER_WAKE_UP_S = 0.02  # longest wait for a message after a wake-up, which is faster than the message
@@ -121,12 +124,14 @@ class Worker:
         self._left: Leave | None = None
         self._heartbeats = HeartbeatThread(lambda: self._do(self._session.heartbeat_if_due(self._clock())))
         self._waited_s = 0.0
+        self._heard_s = clock()  # when the learner was last heard, or the connection was made
 
     def run(self) -> Leave:
         """Work until the conversation is over. Raises nothing that the environment raised."""
         try:
             while self._left is None:
                 self._do(self._session.tick(self._clock()))
+                self._connect_again_if_unheard()
                 if self._left is None:
                     idle_s = min(IDLE_S, max(0.0, self._session.next_due_s() - self._clock()))
                     self._listen(self._serve_shared_memory(idle_s))
@@ -163,11 +168,22 @@ class Worker:
             self._do(self._session.refused(problem.line))
         if not arrived:
             return
+        self._heard_s = self._clock()
         for message in self._link.receive():
             if isinstance(message, BadMessage):
                 log.warning("the learner sent an unreadable message: %s", message)
             else:
                 self._do(self._session.handle(message, self._clock()))
+
+    def _connect_again_if_unheard(self) -> None:
+        """Something on the way (a proxy, a tunnel) may keep a connection open whose other end is gone."""
+        now = self._clock()
+        if self._session.state is State.JOINING and self._link.connected and now - self._heard_s > CONNECT_AGAIN_S:
+            log.warning(
+                "no answer over the connection to %s for %.0f s; connecting again", self._link.address, CONNECT_AGAIN_S
+            )
+            self._heard_s = now
+            self._link.connect_again()
 
     def _collect(self, task: Task) -> None:
         collector = self._collector

@@ -50,9 +50,10 @@ class WorkerLink:
         self.address, self.token = address, token
         self.problem: ConnectionProblem | None = None
         """why there is no connection, if known"""
+        self.connected = False
+        """whether there seems to be a connection; known of tcp only"""
         self.packing = Packing(stack=token is not None or not is_local(address))
         """how rollouts are packed: frame stacks only if the connection is encrypted or leaves this machine"""
-        self._connected = False
         self._log_limiter = LogRateLimiter()
         self.context = context or zmq.Context.instance()
         self._socket = self.context.socket(zmq.DEALER)
@@ -102,13 +103,13 @@ class WorkerLink:
             while True:
                 event, value = struct.unpack("=HI", self._monitor.recv_multipart(zmq.NOBLOCK)[0])
                 if event == zmq.EVENT_DISCONNECTED:
-                    if not self._connected and self.problem is None:
+                    if not self.connected and self.problem is None:
                         self._report(
                             ConnectionProblem(f"{self.address} closes the connection at once; is it a millrace learner?")
                         )
-                    self._connected = False
+                    self.connected = False
                 elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
-                    self._connected, self.problem = True, None
+                    self.connected, self.problem = True, None
                 else:
                     self._report(connection_problem(event, value, self.address, self.token))
 
@@ -136,6 +137,11 @@ class WorkerLink:
         """Send, or queue while the learner is out of reach (the conversation repairs what is lost)."""
         with suppress(zmq.Again):
             send_frames(self._socket, frames)
+
+    def connect_again(self) -> None:
+        """Give up the connection and make another. What was queued is lost (the conversation repairs that)."""
+        self._socket.disconnect(self.address)
+        self._socket.connect(self.address)
 
     def close(self, linger_s: float = LINGER_MS / 1000) -> None:
         """Send what is queued, at most `linger_s`, and close."""

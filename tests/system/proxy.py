@@ -54,6 +54,10 @@ class Proxy:
         """Forward everything again, beginning with what arrived in the meantime."""
         self._loop.call_soon_threadsafe(self._flowing.set)
 
+    def freeze(self) -> None:
+        """Forward nothing more over the connections that are open now, and keep them open. New ones work."""
+        self._do(self._freeze())
+
     def reset(self) -> None:
         """Reset every connection (RST)."""
         self._do(self._reset())
@@ -84,28 +88,31 @@ class Proxy:
             return
         self._writers |= {writer, back}
         for source, target in ((reader, back), (there, writer)):
-            self._spawn(self._carry(source, target))
+            self._spawn(self._carry(source, target, self._flowing))
 
     def _spawn(self, work: Coroutine[Any, Any, None]) -> None:
         task = self._loop.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    async def _carry(self, source: asyncio.StreamReader, target: asyncio.StreamWriter) -> None:
+    async def _carry(self, source: asyncio.StreamReader, target: asyncio.StreamWriter, flowing: asyncio.Event) -> None:
         """Forward one direction: read at once, write when the delay has passed."""
         chunks: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(QUEUED)
 
         async def read() -> None:
             chunk = b" "
             while chunk:
-                chunk = await source.read(READ_BYTES)
+                try:
+                    chunk = await source.read(READ_BYTES)
+                except OSError:  # the source reset the connection
+                    chunk = b""
                 await chunks.put((self._loop.time() + self.latency_s, chunk))
 
         async def write() -> None:
             while True:
                 due, chunk = await chunks.get()
                 await asyncio.sleep(max(0.0, due - self._loop.time()))
-                await self._flowing.wait()
+                await flowing.wait()
                 if not chunk:
                     return
                 size = self.slice_bytes or len(chunk)
@@ -125,6 +132,11 @@ class Proxy:
             await asyncio.gather(reading, return_exceptions=True)
             self._writers.discard(target)
             target.close()
+
+    async def _freeze(self) -> None:
+        self._flowing.clear()
+        self._flowing = asyncio.Event()
+        self._flowing.set()
 
     async def _reset(self) -> None:
         for writer in list(self._writers):
@@ -149,16 +161,18 @@ def _with_reset(writer: asyncio.StreamWriter) -> None:
 
 
 def main(port: int, at: str, listen: int) -> None:
-    """Run the proxy until stdin ends. A line of stdin is a command: `reset` or `delay SECONDS`."""
+    """Run the proxy until stdin ends. A line of stdin is a command: `reset`, `freeze` or `delay SECONDS`."""
     with Proxy(port, at=at, listen=listen) as proxy:
         for line in sys.stdin:
             match line.split():
                 case ["reset"]:
                     proxy.reset()
+                case ["freeze"]:
+                    proxy.freeze()
                 case ["delay", seconds]:
                     proxy.latency_s = float(seconds)
                 case _:
-                    raise ValueError(f"proxy: expected reset or delay SECONDS, got {line!r}")
+                    raise ValueError(f"proxy: expected reset, freeze or delay SECONDS, got {line!r}")
 
 
 if __name__ == "__main__":

@@ -107,6 +107,12 @@ def reset_connections(scene: Scene) -> Undo:
     return None
 
 
+def freeze_connections(scene: Scene) -> Undo:
+    """The proxy keeps its connections open and forwards nothing more over them; new connections work."""
+    scene.proxy.tell("freeze")
+    return None
+
+
 def talk_rubbish(scene: Scene) -> Undo:
     """A stranger without a key connects and sends random bytes."""
     host = scene.hosts[scene.random.choice([1, 2])]
@@ -165,6 +171,7 @@ FAULTS = (
     Fault(lose_a_tenth, 3),
     Fault(delay, 3),
     Fault(reset_connections, 3),
+    Fault(freeze_connections, 1),
     Fault(talk_rubbish, 2),
     Fault(say_extremes, 2),
     Fault(stop_the_learner, 2),

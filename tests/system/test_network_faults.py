@@ -18,6 +18,7 @@ from tests.system.proxy import Proxy
 from tests.system.rubbish import talk_rubbish
 from tests.system.runs import NOTICED_S, dealt_again, far_apart, finish, play, within
 
+LEARNER_TIMEOUT_S = 30.0  # after so long a worker says Hello again
 AGAIN_S = 5.0  # after a cut: at most 2 s until a connection attempt fails, 2 s until the next attempt, and a Hello
 
 # ---------------------------------------------------------------- cut, and healed
@@ -190,6 +191,23 @@ def test_a_worker_joins_again_after_its_connection_forwarded_nothing(stage: Stag
         began_s = time.monotonic()
         learner.hears(r"worker far \(.*\) joined", times=2)
         within("it flows again, joined again", time.monotonic() - began_s, 2.0)
+        learner.trains()
+        finish(learner, [near, far])
+
+
+@pytest.mark.soak
+def test_a_worker_whose_connection_is_dead_but_looks_open_makes_another(stage: Stage) -> None:
+    """A proxy on the way keeps its connections open and forwards nothing more. New connections work."""
+    port = free_port()
+    learner = stage.learner(f"tcp://127.0.0.1:{port}", {"min-workers": 2})
+    with Proxy(port) as way:
+        near, far = stage.worker(f"tcp://127.0.0.1:{port}", "near"), stage.worker(way.address, "far")
+        learner.trains(2)
+        way.freeze()
+        began_s = time.monotonic()
+        learner.hears(r"worker far \(.*\) joined", 60.0, times=2)
+        within("a connection is dead but looks open, joined again", time.monotonic() - began_s, LEARNER_TIMEOUT_S + 5)
+        far.hears("no answer over the connection to .* for 20 s; connecting again")
         learner.trains()
         finish(learner, [near, far])
 

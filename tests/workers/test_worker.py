@@ -41,7 +41,7 @@ RUN = msgspec.structs.replace(run_of("CartPole-v1", T=40, N=8), learner_timeout_
 class FakeLink:
     """Says one message each time it is asked, and keeps what is answered."""
 
-    address, problem = "fake", None
+    address, problem, connected = "fake", None, False
 
     def __init__(self, messages: Sequence[ToWorker], stack: bool = False) -> None:
         self.packing = Packing(stack=stack)
@@ -62,6 +62,24 @@ class FakeLink:
 
     def heard(self, room: int = 0) -> list[ToLearner | Inquire]:
         return [decode_to_learner(frames, room) for frames in self.sent]
+
+
+class Unanswered(FakeLink):
+    """A connection that looks open, over which nothing comes. Its clock runs while the worker waits."""
+
+    connected = True
+
+    def __init__(self) -> None:
+        super().__init__([])
+        self.now = 0.0
+        self.made_at: list[float] = []
+
+    def poll(self, timeout_s: float) -> bool:
+        self.now += timeout_s
+        return False
+
+    def connect_again(self) -> None:
+        self.made_at.append(self.now)
 
 
 def work(link: FakeLink) -> Leave:
@@ -112,3 +130,13 @@ def test_a_worker_acts_under_the_weights_that_travelled(dtype: WeightsDtype) -> 
         found.append(bits(collect(collector, RUN)[0])["log_prob"])
     assert rollout.log_prob.tobytes() == found[0]
     assert (found[0] == found[1]) == (dtype == "float32")
+
+
+@pytest.mark.parametrize("looks_open", [True, False])
+def test_a_connection_without_an_answer_is_made_again_if_it_looks_open(looks_open: bool) -> None:
+    """If it does not, the link connects by itself, again and again."""
+    link = Unanswered()
+    link.connected = looks_open
+    left = Worker(cast(WorkerLink, link), Session(identity("w0"), 0.0, join_timeout_s=50.0), clock=lambda: link.now).run()
+    assert left.exit_code == 1
+    assert [round(at) for at in link.made_at] == ([20, 41] if looks_open else [])

@@ -444,6 +444,18 @@ def test_a_returning_worker_takes_over_while_its_old_connection_still_looks_open
     assert not old.poll(0)
 
 
+def test_a_link_that_connects_again_keeps_its_name_and_hears_and_is_heard(ends: Ends) -> None:
+    learner = ends.learner()
+    worker = ends.worker(learner)
+    joined(learner, worker)
+    for session in (2, 3):
+        worker.connect_again()
+        joined(learner, worker)
+        assert learner.send(b"w0", encode(Rejoin(session)))
+        assert told(worker) == [Rejoin(session)]
+    assert worker.problem is None
+
+
 def test_what_was_said_last_still_goes_out_when_a_link_closes(ends: Ends) -> None:
     learner = ends.learner()
     worker = ends.worker(learner)
