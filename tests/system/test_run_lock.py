@@ -1,8 +1,15 @@
-"""One process trains a run at a time: real learners, one killed, one that is replaced, and runs that start together."""
+"""One process trains a run at a time: real learners, one killed, one that is replaced, and runs that start together.
+
+Machines that share a folder are processes here. Each has its own host name, its own boot id of the kernel and its own mount
+point of the folder (namespaces), and no system lock. So only the lease decides between them.
+"""
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -14,7 +21,90 @@ from learner.run_folder.lease import Owner
 from learner.run_folder.run_lock import LOCK_FILE
 from millrace.launch.local_run import train
 from tests.learner.config.test_on_resume import content
-from tests.system.processes import START_S, Stage, free_port
+from tests.system.processes import SMALL, START_S, TOY, Learner, Stage, free_port
+
+WITHOUT_FLOCK = """
+import errno, fcntl, runpy, sys
+
+def flock(file, operation):
+    raise OSError(errno.ENOLCK, "No locks available")
+
+fcntl.flock = flock
+sys.argv[0] = "learner"
+runpy.run_module("learner", run_name="__main__", alter_sys=True)
+"""
+AS_MACHINE = 'mount --bind "$1" /proc/sys/kernel/random/boot_id; hostname "$2"; mount --bind "$3" "$4"; shift 4; exec "$@"'
+
+
+class Machine:
+    """A machine of its own, as far as the run lock can tell, which mounts the shared folder."""
+
+    def __init__(self, stage: Stage, name: str) -> None:
+        self._stage, self._name = stage, name
+        self._boot, self._mounted = stage.tmp_path / f"boot-{name}", stage.tmp_path / f"mounted-{name}"
+        self._boot.write_text(f"kernel-of-{name}\n")
+        self._mounted.mkdir()
+
+    def learner(self, *arguments: object, resume: Path | None = None) -> Learner:
+        """Start a learner. Returns it with the shared folder as this test sees it."""
+        stage = self._stage
+        stage.runs.mkdir(exist_ok=True)
+        if resume is None:
+            arguments = (TOY, "--run-dir", self._mounted, *arguments)
+        else:
+            arguments = ("--resume", self._mounted / resume.name, *arguments)
+        machine = ["unshare", "--mount", "--uts", "sh", "-ec", AS_MACHINE, "sh"]
+        machine += [str(self._boot), self._name, str(stage.runs), str(self._mounted)]
+        command = [*machine, sys.executable, "-c", WITHOUT_FLOCK, *map(str, arguments)]
+        made = Learner(command, stage.tmp_path / f"{self._name}-{len(stage.started)}.log", stage.runs)
+        stage.started.append(made)
+        return made
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(600)
+@pytest.mark.skipif(os.geteuid() != 0, reason="mount namespaces take root")
+def test_machines_that_share_a_folder_without_system_locks_judge_by_the_lease(stage: Stage) -> None:
+    """The owner lives: refused. It is killed: taken over after 30 s. It is stopped for so long: it ends when it goes on."""
+    ports = [free_port() for _ in range(2)]
+    settings = [word for name, value in SMALL.items() for word in (f"--{name}", *str(value).split())]
+    one, two, three = (Machine(stage, name) for name in ("one", "two", "three"))
+
+    first = one.learner("--bind", f"tcp://127.0.0.1:{ports[0]}", *settings, "--checkpoint-every-s", 0.3)
+    worker = stage.worker(f"tcp://127.0.0.1:{ports[0]}", "w0")
+    first.trains(2)
+    began_s = time.monotonic()
+    refused = two.learner(resume=first.folder)
+    assert refused.ends(START_S) == 2, refused.said()
+    assert time.monotonic() - began_s < START_S
+    assert f"process {first.pid} on one is training it" in refused.said()
+    assert "takes over" not in refused.said()
+    first.trains(1)
+
+    first.kill()
+    began_s = time.monotonic()
+    second = two.learner(resume=first.folder)
+    second.hears(f"its lock names process {first.pid} on one; waiting up to 30 s", START_S)
+    second.hears(f"process {first.pid} on one held its lock and is gone; this process takes over", START_S)
+    assert time.monotonic() - began_s > 29.0
+    second.trains(2)
+
+    second.pause()
+    third = three.learner("--bind", f"tcp://127.0.0.1:{ports[1]}", resume=first.folder)
+    third.hears(f"process {second.pid} on two held its lock and is gone; this process takes over", START_S)
+    stage.worker(f"tcp://127.0.0.1:{ports[1]}", "w1")
+    third.trains(2)
+    second.go_on()
+    assert second.ends(START_S) == 1, second.said()
+    assert f"process {third.pid} on three has taken it over" in second.said().splitlines()[-1]
+    assert not (first.folder / "summary.json").exists(), "it wrote into a run that is not its own any more"
+    third.trains(2)
+    third.signal(signal.SIGTERM)
+    assert third.ends() == 130, third.said()
+    steps = [row["time/total_timesteps"] for row in third.rows()]
+    assert steps == sorted(set(steps)), "two learners wrote rows"
+    assert LOCK_FILE not in content(first.folder)
+    worker.kill()
 
 
 @pytest.mark.soak

@@ -182,6 +182,7 @@ def test_a_sample_of_damages(whole: Path, tmp_path: Path, name: str, caplog: pyt
 
 
 @pytest.mark.soak
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("name", FILES)
 def test_many_damages(whole: Path, tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture) -> None:
     counts = check(whole, tmp_path, name, cuts=1000, flips=1000, caplog=caplog)
