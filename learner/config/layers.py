@@ -75,7 +75,10 @@ def lower_layers(
     named = named_presets()
     whole_run = named[preset].settings if preset in named else {}
     env = env or str(table.get("env", whole_run.get("env", "")))
-    config = _defaults_of(algo or str(table.get("algo", whole_run.get("algo", "ppo"))))
+    if algo is None and "algo" in table:
+        config = _defaults_of(str(table["algo"]), f"{where}: ")
+    else:
+        config = _defaults_of(algo or str(whole_run.get("algo", "ppo")))
     if preset != "none":
         by_env = environment_presets(config.algo)
         name = env if preset == "auto" or preset in named else preset
@@ -85,6 +88,8 @@ def lower_layers(
         config = override(config, by_env.get(name, {}), str(PRESETS))
         config = override(config, {**whole_run, "algo": config.algo}, str(PRESETS))
     config = _override_from_toml(config, {**table, "algo": config.algo}, where)
+    if resume is not None:
+        validate(config, where)  # so that an error names the file, and not what is given beside it
     return override(config, {"env": env}, "ENV")
 
 
@@ -93,7 +98,7 @@ def override(config: Config, values: Mapping[str, Any], where: str) -> Config:
 
     `values` has settings of the run and of the algorithm side by side. `env_kwargs` are merged with those that are there.
     """
-    config = _defaults_of(values["algo"]) if values.get("algo", config.algo) != config.algo else config
+    config = _defaults_of(values["algo"], f"{where}: ") if values.get("algo", config.algo) != config.algo else config
     settings: dict[str, Any] = msgspec.to_builtins(config)
     algorithm: dict[str, Any] = settings["algorithm"]
     for name, value in values.items():
@@ -109,10 +114,10 @@ def override(config: Config, values: Mapping[str, Any], where: str) -> Config:
     return convert(settings, where)
 
 
-def _defaults_of(algo: str) -> Config:
+def _defaults_of(algo: str, where: str = "") -> Config:
     if algo not in HYPERPARAMETERS:
         names = ", ".join(HYPERPARAMETERS)
-        raise UsageError(f"algo {algo}: expected one of {names}{did_you_mean(algo, HYPERPARAMETERS)}")
+        raise UsageError(f"{where}algo {algo}: expected one of {names}{did_you_mean(algo, HYPERPARAMETERS)}")
     return Config(algo=algo, algorithm=HYPERPARAMETERS[algo]())
 
 

@@ -62,7 +62,10 @@ def check_rollout_settings(config: RolloutConfig, at: str = "") -> None:
         raise UsageError(
             f"{at}{config.envs} envs cannot be shared evenly among {config.lanes} lanes; take {near}, or {divisor} lanes"
         )
-    check_address(config.bind)
+    try:
+        check_address(config.bind)
+    except UsageError as error:
+        raise UsageError(f"{at}{error}") from None
     if config.metrics_bind:
         try:
             check_address(f"tcp://{config.metrics_bind}")

@@ -33,7 +33,7 @@ from learner.run_spec import run_spec
 from learner.run_state import RunState, restore
 from millrace.launch.local_run import train
 from protocol.env_spec import EnvSpec
-from protocol.errors import UserFacingError
+from protocol.errors import UsageError, UserFacingError
 from tests.support.described import described
 
 ENV = "workers.envs.toy:Identity-v0"
@@ -172,6 +172,30 @@ def check(whole: Path, tmp_path: Path, name: str, cuts: int, flips: int, caplog:
     (run / "metrics.jsonl").write_bytes(metrics)
     READERS["resume"](run)
     return counts
+
+
+@pytest.mark.parametrize(
+    ("good", "bad"),
+    [
+        ('algo = "ppo"', 'algo = "`po"'),
+        ("lanes = 2", "lanes = 6"),
+        ("tcp://127.0.0.1:5555", "tcp:+/127.0.0.1:5555"),
+        ("batch_size", "bathc_size"),
+    ],
+)
+def test_a_value_that_no_run_can_have_is_one_line_with_the_name_of_the_file(
+    whole: Path, tmp_path: Path, good: str, bad: str
+) -> None:
+    run = tmp_path / "runs" / whole.name
+    shutil.copytree(whole, run)
+    text = (run / "config.toml").read_text()
+    assert text.count(good) == 1
+    (run / "config.toml").write_text(text.replace(good, bad))
+    for reader in ("resume", "is_finished"):
+        with pytest.raises(UsageError) as why:
+            READERS[reader](run)
+        assert str(why.value).startswith(f"{run}/config.toml: ")
+        assert "\n" not in str(why.value)
 
 
 @pytest.mark.parametrize("name", FILES)
