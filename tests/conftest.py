@@ -18,6 +18,13 @@ import psutil
 import pytest
 
 LEAVE_WITHIN_S = 5.0
+SOAK_TIMEOUT_S = 1200  # of a test of that mark: it takes minutes, and longer on a busy machine
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if item.get_closest_marker("soak") and not item.get_closest_marker("timeout"):
+            item.add_marker(pytest.mark.timeout(SOAK_TIMEOUT_S))
 
 
 def _runs(process: psutil.Process) -> bool:

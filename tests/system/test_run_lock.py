@@ -62,7 +62,6 @@ class Machine:
 
 
 @pytest.mark.soak
-@pytest.mark.timeout(600)
 @pytest.mark.skipif(os.geteuid() != 0, reason="mount namespaces take root")
 def test_machines_that_share_a_folder_without_system_locks_judge_by_the_lease(stage: Stage) -> None:
     """The owner lives: refused. It is killed: taken over after 30 s. It is stopped for so long: it ends when it goes on."""

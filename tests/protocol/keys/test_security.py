@@ -392,7 +392,7 @@ def test_the_authenticator_answers_while_the_learner_learns(net: Net) -> None:
     """Nobody polls the learner's link here."""
     learner = net.keyed()
     good, bad = net.worker(learner, token()), net.worker(learner, token(STRANGER), "w1")
-    until(lambda: good._connected and bad.problem is not None, good, bad)
+    until(lambda: good.connected and bad.problem is not None, good, bad)
 
 
 def test_whatever_goes_wrong_with_one_visitor_the_next_is_answered(net: Net, monkeypatch: pytest.MonkeyPatch) -> None:
