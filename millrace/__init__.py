@@ -35,18 +35,35 @@ if TYPE_CHECKING:
     from learner.run_folder.progress import Progress
     from learner.vector_env.env import ZmqVectorEnv
     from learner.vector_env.settings import EnvLike
-    from millrace.policies import CNN, MLP, PolicyParameters, Recurrent
+    from millrace.policies import CNN, MLP, Piece, PolicyParameters, Recurrent
     from millrace.rollout_service import RolloutBatch, RolloutService
 
 __all__ = [
-    "CNN", "MLP", "CheckpointError", "EnvironmentFailed", "MillraceError", "NoWorkers", "PolicyParameters", "Recurrent",
-    "RolloutBatch", "RolloutService", "RunError", "Stalled", "UsageError", "UserFacingError", "WorkerLost", "__version__",
-    "make_vec", "train",
+    "CNN",
+    "MLP",
+    "CheckpointError",
+    "EnvironmentFailed",
+    "MillraceError",
+    "NoWorkers",
+    "Piece",
+    "PolicyParameters",
+    "Recurrent",
+    "RolloutBatch",
+    "RolloutService",
+    "RunError",
+    "Stalled",
+    "UsageError",
+    "UserFacingError",
+    "WorkerLost",
+    "__version__",
+    "make_vec",
+    "train",
 ]  # fmt: skip
 
 _IMPORTED_WHEN_USED = {
     "CNN": "millrace.policies",
     "MLP": "millrace.policies",
+    "Piece": "millrace.policies",
     "PolicyParameters": "millrace.policies",
     "Recurrent": "millrace.policies",
     "RolloutBatch": "millrace.rollout_service",
