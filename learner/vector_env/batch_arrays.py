@@ -6,6 +6,7 @@ messages are written to the same arrays.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -54,6 +55,10 @@ class BatchArrays:
     def observation(self, *, copy: bool) -> Any:
         """Observations of all env copies, nested as in the space. Without `copy` the next step overwrites them."""
         return self._nest([array.copy() for array in self._observation] if copy else self._observation)
+
+    def observation_of_some(self, copies: Sequence[int]) -> Any:
+        """Copies of the newest observations of these env copies, nested as in the space: [len(copies), *leaf] each."""
+        return self._nest([array[list(copies)] for array in self._observation])
 
     def observation_of(self, n: int) -> Any:
         """A copy of the newest observation of env copy `n`."""

@@ -43,3 +43,22 @@ class BatchLayout:
             lane = self.lane_of(copy)
             grouped.setdefault(lane, []).append(copy - self._firsts[lane])
         return grouped
+
+    def check(self, copies: Sequence[int]) -> None:
+        """Raises `ValueError` unless these are different copies that exist, at least one."""
+        if not copies or len(set(copies)) != len(copies) or not 0 <= min(copies) <= max(copies) < self.num_envs:
+            raise ValueError(f"env_ids: expected different numbers from 0 to {self.num_envs - 1}, got {list(copies)}")
+
+    def positions(self, copies: Sequence[int]) -> dict[int, list[int]]:
+        """Where in `copies` the copies of each lane are, by lane. Raises `ValueError` unless all are whole lanes."""
+        self.check(copies)
+        at = {copy: position for position, copy in enumerate(copies)}
+        found = {lane: [at.get(copy, -1) for copy in self.copies(lane)] for lane in self.by_lane(sorted(copies))}
+        for lane, positions in found.items():
+            if -1 in positions:
+                of_lane = self.copies(lane)
+                raise ValueError(
+                    f"env_ids: expected all copies of lane {lane}, {of_lane[0]} to {of_lane[-1]}, got "
+                    f"{[copy for copy in of_lane if copy in at]}; with lanes=num_envs every copy is a lane of its own"
+                )
+        return found

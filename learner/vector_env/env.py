@@ -21,10 +21,11 @@ from learner.vector_env.arguments import action_arrays, seed_list, take_reset_ma
 from learner.vector_env.batch_arrays import BatchArrays
 from learner.vector_env.batch_layout import BatchLayout
 from learner.vector_env.calls import assign_orders, call_orders, call_results
-from learner.vector_env.infos import Infos, unpack_infos
+from learner.vector_env.infos import Infos, OfSomeCopies, unpack_infos
 from learner.vector_env.lane_orders import packed, reset_order, step_order
-from learner.vector_env.lost_lanes import RESET_ATTEMPTS, UNKNOWN_REASON, LostLanes, replacement_seeds, worker_lost
+from learner.vector_env.lost_lanes import RESET_ATTEMPTS, UNKNOWN_REASON, LostLanes, worker_lost
 from learner.vector_env.order_coordinator import MakeOrder
+from learner.vector_env.send_recv import SendRecv, VectorEnvParts, WaitSettings, numbered
 from learner.vector_env.spec import VectorEnvDescription
 from learner.vector_env.step_hub import StepHub
 from protocol.arrays import Array
@@ -77,8 +78,8 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         }
         """attributes of every copy that are no plain data"""
         self._hub, self._memory = hub, memory
-        self._autoreset, self._action_leaves = step.autoreset, step.action
-        self._read_actions = make_flatten(self.single_action_space)
+        self._autoreset = step.autoreset
+        read = make_flatten(self.single_action_space)
         self._layout = BatchLayout(step.lanes)
         self._batch = BatchArrays(step, self._layout, self.single_observation_space, memory)
         self._lost_lanes = LostLanes()
@@ -88,6 +89,18 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._ever_reset, self._all_were_reset = np.zeros(N, bool), False
         self._seeds: list[int | None] = [None] * N  # of each copy's last seeded reset
         self._warned_infos: set[str] = set()  # keys of infos that arrived as their repr
+        parts = VectorEnvParts(
+            hub=hub,
+            layout=self._layout,
+            batch=self._batch,
+            memory=memory,
+            lost_lanes=self._lost_lanes,
+            read_actions=lambda actions, count: action_arrays(actions, read, step.action, count),
+            autoreset=step.autoreset,
+            seeds=self._seeds,
+            ever_reset=self._ever_reset,
+        )
+        self._parts, self._send_recv = parts, SendRecv(parts)
         self._close_once = weakref.finalize(self, _call_in_process, os.getpid(), on_close)
 
     # ---------------------------------------------------------------- reset
@@ -102,14 +115,13 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._check_idle("reset")
         seeds = seed_list(seed, self.num_envs)
         mask, options = take_reset_mask(options, self.num_envs)
-        self._seeds = [new if new is not None else old for new, old in zip(seeds, self._seeds, strict=True)]
+        self._seeds[:] = [new if new is not None else old for new, old in zip(seeds, self._seeds, strict=True)]
         if mask.all():
             self._hub.rebalance()
             self._lost_lanes.forget_unreported()
             self._hub.take_lost()
         infos = self._reset_copies(self._layout.by_lane(np.flatnonzero(mask).tolist()), seeds, options)
         self._ever_reset |= mask
-        self._all_were_reset = bool(self._ever_reset.all())
         return self._batch.observation(copy=self.copy), self._merge_infos(infos)
 
     def _reset_copies(
@@ -157,9 +169,11 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
 
     def _order_step(self, lanes: Sequence[int], actions: Any) -> None:
         self._check_idle("step_async")
-        arrays, fit = action_arrays(actions, self._read_actions, self._action_leaves, self.num_envs)
-        if not self._all_were_reset and (never := [n for n in self._copies_of(lanes) if not self._ever_reset[n]]):
-            raise UsageError(f"step before reset of copies {never}: call reset() first")
+        arrays, fit = self._parts.read_actions(actions, self.num_envs)
+        if not self._all_were_reset:
+            if never := [n for n in self._copies_of(lanes) if not self._ever_reset[n]]:
+                raise UsageError(f"step before reset of copies {never}: call reset() first")
+            self._all_were_reset = bool(self._ever_reset.all())
         if self._autoreset == "Disabled" and (ended := self._batch.terminated | self._batch.truncated).any():
             raise UsageError(
                 f"copies {np.flatnonzero(ended).tolist()} have ended: autoreset_mode is Disabled, expected "
@@ -223,7 +237,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
     def _step_order(self, lane: int, actions: Sequence[Array]) -> MakeOrder:
         rows = self._layout.rows[lane]
         if lane in self._lost_lanes.awaiting_reset:  # as NEXT_STEP: the step after a truncation resets
-            seeds = replacement_seeds(self._seeds[rows], self._hub.incarnation(lane))
+            seeds = self._parts.replacement_seeds(lane)
             return reset_order(range(len(seeds)), seeds, packed(None))
         return step_order([array[rows] for array in actions])
 
@@ -252,9 +266,75 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         """The seeds of all copies, with new ones for the copies of lost lanes."""
         seeds = list(self._seeds)
         for lane in lost:
-            rows = self._layout.rows[lane]
-            seeds[rows] = replacement_seeds(seeds[rows], self._hub.incarnation(lane))
+            seeds[self._layout.rows[lane]] = self._parts.replacement_seeds(lane)
         return seeds
+
+    # ---------------------------------------------------------------- lanes that do not wait for each other
+
+    def async_reset(
+        self,
+        env_ids: Sequence[int] | Array | None = None,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> None:
+        """Begin episodes in these copies, by default in all. `recv` returns their first observations, with reward 0.
+
+        A single seed s gives copy n the seed s + n; a list has one for each of `env_ids`. Raises `AlreadyPendingCallError`
+        if one of the copies, or another one of its lane, has not come back.
+        """
+        self._check_no_step("async_reset")
+        copies = numbered(env_ids, self.num_envs)
+        seeds = seed_list(seed, len(copies))
+        if isinstance(seed, int | np.integer):
+            seeds = [int(seed) + n for n in copies]
+        self._send_recv.reset(copies, seeds, options)
+
+    def send(self, actions: Any, env_ids: Sequence[int] | Array | None = None) -> None:
+        """Step these copies, by default all, with one action each, in the order of `env_ids`; `recv` returns the results.
+
+        A lane is stepped as a whole: `env_ids` has all copies of a lane or none (`make_vec(lanes=num_envs)` makes each copy
+        a lane). Actions are [len(env_ids), *leaf]. Autoreset is that of `step`.
+
+        Raises `AlreadyPendingCallError` if one of the copies has not come back, `ValueError` for other numbers or a wrong
+        number of actions, `UsageError` for copies that must be reset first. Then nothing was sent.
+
+        envs = millrace.make_vec("CartPole-v1", 8, workers=2, lanes=8)
+        envs.async_reset(seed=1)
+        for _ in range(1000):
+            observation, reward, terminated, truncated, infos = envs.recv()
+            envs.send(policy(observation), infos["env_id"])
+        """
+        self._check_no_step("send")
+        self._send_recv.send(actions, numbered(env_ids, self.num_envs), self.on_worker_loss)
+
+    def recv(self, min_envs: int = 1, timeout: float | None = None) -> StepResult:
+        """The results of all copies that are ready; waits until at least `min_envs` are. 0 does not wait.
+
+        Observations, rewards, terminated and truncated have a row for each of these copies, in ascending order of the
+        copies; so have the infos, which also have `env_id`: int64[rows], the numbers of the copies. The arrays are the
+        caller's. Each row is that which `step` or `reset` would have given.
+
+        A worker that does not answer within `timeout` seconds (`timeout_s` by default), counted from the order while the
+        caller waits, is given up, as by `step`. Raises `NoAsyncCallError` if nothing was sent, `EnvironmentFailed`,
+        `WorkerLost` and `NoWorkers`. After an error, all other copies can still be received, and those that are lost come
+        back truncated or are named by `WorkerLost`.
+        """
+        self._check_no_step("recv")
+        wait = WaitSettings(min_envs, self.timeout_s if timeout is None else timeout, self.on_worker_loss)
+        ready = self._send_recv.recv(wait)
+        batch, copies = self._batch, [n for lane in ready for n in lane.copies]
+        truncated = batch.truncated[copies]
+        loss_infos = {n: dict(info) for lane in ready for n, info in lane.loss_infos.items()}
+        truncated[[n in loss_infos for n in copies]] = True
+        infos = self._merge_infos({lane.lane: lane.infos for lane in ready}, loss_infos, copies)
+        infos["env_id"] = np.array(copies, np.int64)
+        return batch.observation_of_some(copies), batch.reward[copies], batch.terminated[copies], truncated, infos
+
+    @property
+    def outstanding(self) -> list[int]:
+        """The copies that were sent an action or a reset, and that `recv` has not returned."""
+        return self._send_recv.copies()
 
     # ---------------------------------------------------------------- calls
 
@@ -342,6 +422,11 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
     # ---------------------------------------------------------------- inside
 
     def _check_idle(self, doing: str) -> None:
+        self._check_no_step(doing)
+        if copies := self._send_recv.copies():
+            raise AlreadyPendingCallError(f"{doing} while copies {copies} have not come back: expected recv() first", "send")
+
+    def _check_no_step(self, doing: str) -> None:
         if self.closed:
             raise ClosedEnvironmentError(f"{doing} after close()")
         if self._pending:
@@ -357,8 +442,13 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._lost_lanes.answered(answers.keys())
         return infos
 
-    def _merge_infos(self, packed_infos: Mapping[int, bytes], loss_infos: Mapping[int, Infos] | None = None) -> Infos:
-        """Infos of all copies as gymnasium merges them, in the order of the copies."""
+    def _merge_infos(
+        self,
+        packed_infos: Mapping[int, bytes],
+        loss_infos: Mapping[int, Infos] | None = None,
+        copies: Sequence[int] | None = None,
+    ) -> Infos:
+        """Infos as gymnasium merges them, in the order of the copies, with a row for each of `copies`; None: for all."""
         by_copy: dict[int, Infos] = dict(loss_infos or {})
         for lane, data in packed_infos.items():
             if not data:
@@ -369,8 +459,10 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
             except BadMessage as error:
                 self._hub.refuse_owner(lane, f"lane {lane}: infos cannot be read: {error}")
         infos: Infos = {}
+        merged: VectorEnv[Any, Any, Array] = self if copies is None else OfSomeCopies(len(copies))
+        row_of = range(self.num_envs) if copies is None else {n: row for row, n in enumerate(copies)}
         for n in sorted(by_copy):
-            infos = self._add_info(infos, by_copy[n], n)
+            infos = merged._add_info(infos, by_copy[n], row_of[n])
             for key in repr_paths(by_copy[n]):
                 if key not in self._warned_infos:
                     self._warned_infos.add(key)

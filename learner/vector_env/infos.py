@@ -1,13 +1,25 @@
-"""The infos of one lane: packed bytes to one dict for each env copy. Pure."""
+"""The infos of one lane: packed bytes to one dict for each env copy; and gymnasium's merging for some copies. Pure."""
 
 from __future__ import annotations
 
 from typing import Any
 
+from gymnasium.vector import VectorEnv
+
+from protocol.arrays import Array
 from protocol.errors import BadMessage
 from protocol.wire.plain_values import unpack
 
 Infos = dict[str, Any]
+
+
+class OfSomeCopies(VectorEnv[Any, Any, Array]):
+    """Merges the infos of some copies, as gymnasium's vector environments merge those of all."""
+
+    closed = True  # there is nothing to close
+
+    def __init__(self, count: int) -> None:
+        self.num_envs = count
 
 
 def unpack_infos(packed: bytes, copies: range) -> dict[int, Infos]:

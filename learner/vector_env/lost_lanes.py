@@ -48,6 +48,11 @@ class LostLanes:
         """These lanes answered an order: they have been reset if they had to be."""
         self._awaiting_reset -= lanes
 
+    def forget(self, lanes: Iterable[int]) -> None:
+        """These lanes begin new episodes: earlier losses no longer matter."""
+        for lane in lanes:
+            self._unreported.pop(lane, None)
+
     def forget_unreported(self) -> None:
         """All lanes begin new episodes: earlier losses no longer matter."""
         self._unreported.clear()

@@ -12,7 +12,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from learner.members.events import Event, WorkerLeft
 from learner.members.member_server import MemberServer, ServerCallbacks, ServerSettings
@@ -95,6 +95,13 @@ class SharedSteps:
     """Pipe that wakes the worker, and pipe by which it wakes us; by worker name."""
 
 
+class WaitingOrder(NamedTuple):
+    """An order that is sent as soon as its lane is placed."""
+
+    make: MakeOrder
+    since_s: float
+
+
 class StepHub:
     """Everything the vector environment knows of workers."""
 
@@ -118,14 +125,14 @@ class StepHub:
         self._local_workers: LocalWorkers = local_workers or NoLocalWorkers()
         self._shared, self._spin_s, self._clock = shared, spin_s, clock
         self._spin_wait = SpinWait()
-        self._waiting_orders: dict[int, MakeOrder] = {}  # lane -> an order that is sent as soon as the lane is placed
-        self._waiting_since_s = 0.0
+        self._waiting_orders: dict[int, WaitingOrder] = {}  # by lane
         self._patience_s = PATIENCE_S
         self._while_waiting: Callable[[], None] = lambda: None
         self.stepped: set[int] = set()
         """Lanes whose last step, through shared memory, is done."""
         self._under_way: dict[int, int] = {}  # lane -> number of its order through shared memory
         self._wake_pipes: dict[int, tuple[WakePipe, WakePipe] | None] = {}  # lane -> its worker's pipes, if it has any
+        self._wake_ins = [] if shared is None else list({id(pipe): pipe for _, pipe in shared.wake_pipes.values()}.values())
         self._listen_due_s = 0.0
         # To lose a worker costs the user's episodes. So a worker has its whole timeout to be heard again, not only the
         # server's short grace: after a long suspension even its connection must be made anew.
@@ -156,8 +163,8 @@ class StepHub:
         """Send an order to each of these lanes. Lanes that have no worker are placed while `wait_for_answers` waits."""
         self._coordinator.begin()
         self.stepped.clear()
-        self._waiting_orders = dict(makes)
-        self._waiting_since_s = self._clock()
+        now = self._clock()
+        self._waiting_orders = {lane: WaitingOrder(make, now) for lane, make in makes.items()}
         self._send_waiting_orders()
 
     def uses_shared_memory(self, lane: int) -> bool:
@@ -183,6 +190,92 @@ class StepHub:
             assert pipes is not None
             pipes[0].wake()
 
+    # ---------------------------------------------------------------- lanes that do not wait for each other
+
+    def send_order(self, lane: int, make: MakeOrder) -> None:
+        """Send an order to this lane, whatever other lanes do. `take_result` returns its result."""
+        self._forget(lane)
+        self._waiting_orders[lane] = WaitingOrder(make, self._clock())
+        self._send_waiting_orders()
+
+    def begin_shared_step(self, lane: int) -> None:
+        """Step this lane with the actions that are in shared memory, whatever other lanes do."""
+        self._forget(lane)
+        pipes = self._wake_pipes[lane]
+        assert self._shared is not None
+        assert pipes is not None
+        memory = self._shared.memory
+        self._under_way[lane] = self._coordinator.shared_orders[lane] = number = memory.ordered(lane) + 1
+        memory.order(lane, number, wake=True)
+        pipes[0].wake()
+
+    def take_result(self, lane: int) -> Answer | bytes | None:
+        """What became of the lane's order: the answer that came as a message, or the packed infos of a step through shared
+        memory. None: nothing yet, or the lane is lost.
+        """
+        if lane in self._under_way and self._is_answered(lane):
+            self._step_ended(lane)
+        result: Answer | bytes | None = self._coordinator.answers.get(lane)
+        if lane in self.stepped:
+            assert self._shared is not None
+            result = self._shared.memory.infos(lane)
+            if result is None:
+                result = self._coordinator.infos.get(lane)
+            if result is None and lane not in self._coordinator.shared_orders:
+                result = b""  # its worker is gone, and the lane is in `take_lost`
+        if result is not None:
+            self._forget(lane)
+        return result
+
+    def is_ordered(self, lane: int) -> bool:
+        """Whether the lane has an order that is not answered, or waits for a worker to take it."""
+        return lane in self._waiting_orders or lane in self._under_way or self._coordinator.is_ordered(lane)
+
+    def listen_if_due(self) -> None:
+        """Read the messages that have come, if some may matter."""
+        if self._waiting_orders or self._coordinator.orders or self._clock() > self._listen_due_s:
+            self._turn(0.0)
+
+    def wait_for_any(self, timeout_s: float) -> None:
+        """Wait until a lane may have a result, for a short time at most. `timeout_s`: how long a worker may take."""
+        self._patience_s = min(PATIENCE_S, timeout_s / 2)
+        only_shared = bool(self._under_way) and not self._waiting_orders and not self._coordinator.orders
+        if only_shared and self._spin_wait.wait(lambda: any(map(self._is_answered, self._under_way)), self._spin_s):
+            return
+        if self._under_way:
+            self._link.poll_beside([pipe.read_fd for pipe in self._wake_ins], POLL_S)
+            for pipe in self._wake_ins:
+                pipe.wait(0.0)
+            if only_shared and self._clock() <= self._listen_due_s:
+                return
+            self._turn(0.0)
+        else:
+            self._turn(POLL_S)
+
+    def give_up(self, lane: int, timeout_s: float) -> None:
+        """Give up the worker of a lane that took longer than this. Raises `NoWorkers` if the lane had none all the time."""
+        if lane in self._waiting_orders:
+            raise self._server.no_workers(1, timeout_s)
+        self._give_up_lane(lane, f"did not answer within {timeout_s:g} s")
+
+    def raise_failures(self) -> None:
+        """Raise `EnvironmentFailed` if an environment raised."""
+        if self._coordinator.failures:
+            self._raise_failure()
+
+    def now(self) -> float:
+        """Time by the hub's clock."""
+        return self._clock()
+
+    def _forget(self, lane: int) -> None:
+        """The result of the lane's last order was taken, or is not wanted any more."""
+        self._coordinator.forget(lane)
+        self.stepped.discard(lane)
+        self._under_way.pop(lane, None)
+
+    def _is_answered(self, lane: int) -> bool:
+        return self._shared is not None and self._shared.memory.answered(lane) == self._under_way[lane]
+
     # ---------------------------------------------------------------- waiting
 
     def wait_for_answers(self, timeout_s: float) -> dict[int, Answer]:
@@ -201,8 +294,7 @@ class StepHub:
                 self._give_up(timeout_s)
         if self._clock() > self._listen_due_s:
             self._turn(0.0)
-        if self._coordinator.failures:
-            self._raise_failure()
+        self.raise_failures()
         return dict(self._coordinator.answers)
 
     def infos(self, lane: int, timeout_s: float) -> bytes:
@@ -301,11 +393,11 @@ class StepHub:
 
     def _send_waiting_orders(self) -> None:
         awaited = len(self._coordinator.membership.active()) < self._local_workers.count  # one of ours has yet to join
-        patient = awaited and self._clock() - self._waiting_since_s < self._patience_s
-        for lane, make in list(self._waiting_orders.items()):
-            if self._coordinator.place(lane, patient):
+        now = self._clock()
+        for lane, waiting in list(self._waiting_orders.items()):
+            if self._coordinator.place(lane, awaited and now - waiting.since_s < self._patience_s):
                 del self._waiting_orders[lane]
-                self._server.send(self._coordinator.order(lane, make))
+                self._server.send(self._coordinator.order(lane, waiting.make))
 
     def _wake_sleeping(self, peer: bytes) -> None:
         """Wake a worker that was sent a message: it may sleep until its next step through shared memory."""

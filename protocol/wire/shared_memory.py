@@ -103,9 +103,16 @@ class SharedMemory:
         """Number of the lane's newest order."""
         return self._words[2 * WORDS * lane]
 
-    def order(self, lane: int, number: int) -> None:
-        """Order a step, after its actions were written."""
+    def order(self, lane: int, number: int, *, wake: bool = False) -> None:
+        """Order a step, after its actions were written. `wake`: the worker wakes the learner when this lane is done, even if
+        others are not.
+        """
+        self._words[2 * WORDS * lane + 1] = wake
         self._words[2 * WORDS * lane] = number
+
+    def wakes(self, lane: int) -> bool:
+        """Whether the learner is to be woken when the lane's newest order is done, whatever the other lanes do."""
+        return bool(self._words[2 * WORDS * lane + 1])
 
     def answered(self, lane: int) -> int:
         """Number of the lane's newest finished order."""

@@ -120,7 +120,7 @@ class Stepper:
             step = Step(session, -order, number, lane.incarnation, ())
             send(_stepped(step, lane.rows, infos))
         pending = memory.unanswered_orders()
-        if not pending or not CAN_SPIN:
+        if not pending or not CAN_SPIN or memory.wakes(number):
             self._wake_out.wake()
         finished_before = len(memory.lanes) - len(self._lanes) - pending
         self._spin_s = SPIN_S if finished_before < self._cores - 1 else 0.0
