@@ -141,15 +141,19 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
             infos |= self._store(answers)
             waiting = {lane: chosen for lane, chosen in waiting.items() if lane not in answers}
             lost = self._hub.take_lost()
-            self._lost_lanes.add(
-                {lane: why for lane, why in lost.items() if lane not in waiting and not self._hub.is_started(lane)}
-            )
+            self._lost_lanes.add({lane: why for lane, why in lost.items() if self._is_to_report(lane, waiting)})
             if not waiting:
                 return infos
             if self.on_worker_loss == "raise" or attempt == RESET_ATTEMPTS - 1:
                 self._lost_lanes.expect_reset(waiting)
                 raise worker_lost(lost, self._layout)
         return infos
+
+    def _is_to_report(self, lane: int, waiting: Mapping[int, list[int]]) -> bool:
+        """Whether the next step reports a lane that was lost during a reset: if copies were lost that are not reset."""
+        if lane in waiting:
+            return len(waiting[lane]) < self._layout.size(lane)
+        return not self._hub.is_started(lane)
 
     # ---------------------------------------------------------------- step
 
@@ -174,12 +178,12 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
             if never := [n for n in self._copies_of(lanes) if not self._ever_reset[n]]:
                 raise UsageError(f"step before reset of copies {never}: call reset() first")
             self._all_were_reset = bool(self._ever_reset.all())
-        if self._autoreset == "Disabled" and (ended := self._batch.terminated | self._batch.truncated).any():
-            raise UsageError(
-                f"copies {np.flatnonzero(ended).tolist()} have ended: autoreset_mode is Disabled, expected "
-                "reset(options={'reset_mask': ended}) before the next step"
-            )
         self._lost_lanes.add(self._hub.take_lost())
+        if ended := self._parts.ended_copies(range(self.num_envs)):
+            raise UsageError(
+                f"copies {ended} have ended: autoreset_mode is Disabled, expected reset(options={{'reset_mask': ended}}) "
+                "before the next step"
+            )
         awaiting_reset, lost = self._lost_lanes.awaiting_reset, self._lost_lanes.unreported
         if awaiting_reset and self.on_worker_loss == "raise":
             raise WorkerLost(f"lanes {sorted(awaiting_reset)} were lost with their worker; call reset() first")

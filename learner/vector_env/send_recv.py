@@ -46,10 +46,13 @@ class VectorEnvParts:
     """[num_envs] whether the copy was ever reset"""
 
     def ended_copies(self, copies: Sequence[int]) -> list[int]:
-        """Those of these copies that cannot step: they have ended, and nothing resets them but the caller."""
+        """Those of these copies that cannot step: they have ended, as the caller knows, and only the caller resets them."""
         if self.autoreset != "Disabled":
             return []
-        return [n for n in copies if self.batch.terminated[n] or self.batch.truncated[n]]
+        ended = self.batch.terminated | self.batch.truncated
+        for lane in self.lost_lanes.unreported:
+            ended[self.layout.rows[lane]] = False  # the caller learns it from the result of the next step
+        return [n for n in copies if ended[n]]
 
     def replacement_seeds(self, lane: int) -> tuple[int | None, ...]:
         """Seeds for the copies that replace those of a lost lane."""
@@ -110,11 +113,11 @@ class SendRecv:
         arrays, fit = parts.read_actions(actions, len(copies))
         if never := [n for n in copies if not parts.ever_reset[n]]:
             raise UsageError(f"send before reset of copies {never}: call reset(), or async_reset() and recv(), first")
+        lost_lanes.add(parts.hub.take_lost())
         if ended := parts.ended_copies(copies):
             raise UsageError(
                 f"copies {ended} have ended: autoreset_mode is Disabled, expected async_reset({ended}) before the next send"
             )
-        lost_lanes.add(parts.hub.take_lost())
         awaiting_reset = [lane for lane in positions if lane in lost_lanes.awaiting_reset]
         if awaiting_reset and on_worker_loss == "raise":
             again = [n for lane in awaiting_reset for n in parts.layout.copies(lane)]

@@ -243,12 +243,11 @@ class StepHub:
         if only_shared and self._spin_wait.wait(lambda: any(map(self._is_answered, self._under_way)), self._spin_s):
             return
         if self._under_way:
-            self._link.poll_beside([pipe.read_fd for pipe in self._wake_ins], POLL_S)
+            arrived = self._link.poll_beside([pipe.read_fd for pipe in self._wake_ins], POLL_S)
             for pipe in self._wake_ins:
                 pipe.wait(0.0)
-            if only_shared and self._clock() <= self._listen_due_s:
-                return
-            self._turn(0.0)
+            if arrived or not only_shared or self._clock() > self._listen_due_s:
+                self._turn(0.0)
         else:
             self._turn(POLL_S)
 

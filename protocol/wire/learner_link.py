@@ -79,9 +79,15 @@ class LearnerLink:
             raise RunError(f"authenticator of {self.address}: its thread has ended, see the log; start again with --resume")
         return bool(self._socket.poll(max(0, int(timeout_s * 1000))))
 
-    def poll_beside(self, fds: Sequence[int], timeout_s: float) -> None:
-        """Wait until something arrives, or one of these file descriptors can be read, at most `timeout_s`."""
-        zmq.zmq_poll([(self._socket, zmq.POLLIN), *((fd, zmq.POLLIN) for fd in fds)], max(0, int(timeout_s * 1000)))
+    def poll_beside(self, fds: Sequence[int], timeout_s: float) -> bool:
+        """Wait until something arrives, or one of these file descriptors can be read, at most `timeout_s`.
+
+        True if something has arrived.
+        """
+        poller = zmq.Poller()
+        for each in (self._socket, *fds):
+            poller.register(each, zmq.POLLIN)
+        return any(ready is self._socket for ready, _ in poller.poll(max(0, int(timeout_s * 1000))))
 
     def receive(self) -> Iterator[tuple[bytes, ToLearner | Inquire | BadMessage]]:
         """Messages that have arrived, each with its sender; at most MAX_MESSAGES. An unreadable one comes as its error."""

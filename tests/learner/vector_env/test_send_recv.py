@@ -1,0 +1,550 @@
+"""`send` and `recv`: in any order of completion each copy has the rows of lock-step; a loss costs the others nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from copy import deepcopy
+from functools import partial
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector.utils import iterate
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from learner.vector_env.env import ZmqVectorEnv
+from learner.vector_env.sent_lanes import LONGEST_GAP_S, Sent, SentLanes, WatchedTime
+from learner.vector_env.settings import VectorEnvSettings
+from protocol.errors import EnvironmentFailed, NoWorkers, UsageError, WorkerLost
+from protocol.messages import Reset, Step
+from tests.support.any_order import AnyOrder, any_order
+from tests.support.bit_equality import bit_equal
+
+INFORMS = "workers.envs.toy:Informs-v0"
+COUNTDOWN = "workers.envs.toy:Countdown-v0"
+BOTH_WAYS = pytest.mark.parametrize("shared", [True, False], ids=["shared memory", "messages"])
+
+
+class Row(NamedTuple):
+    """What one copy gives at one step or reset."""
+
+    observation: Any
+    reward: Any
+    terminated: Any
+    truncated: Any
+    info: dict[str, Any]
+
+
+def info_of(infos: dict[str, Any], row: int) -> dict[str, Any]:
+    """The info of one copy, out of merged infos. The order of its keys depends on the other copies: they are sorted."""
+    return {
+        key: info_of(values, row) if isinstance(values, dict) else values[row]
+        for key, values in sorted(infos.items())
+        if f"_{key}" in infos and infos[f"_{key}"][row]
+    }
+
+
+def received(env: ZmqVectorEnv, min_envs: int = 1) -> dict[int, Row]:
+    """What `recv` returns, by copy."""
+    observation, reward, terminated, truncated, infos = env.recv(min_envs)
+    numbers = reward, terminated, truncated
+    ids = infos["env_id"]
+    assert ids.dtype == np.int64
+    assert ids.tolist() == sorted(set(ids.tolist()))
+    each = of_copies(env, observation)
+    assert all(len(array) == len(ids) for array in (each, *numbers))
+    rows = zip(each, reward, terminated, truncated, (info_of(infos, row) for row in range(len(ids))), strict=True)
+    return {int(n): Row(*row) for n, row in zip(ids, rows, strict=True)}
+
+
+def of_copies(env: VectorEnv[Any, Any, Any], observation: Any) -> list[Any]:
+    """The observation of each copy, out of a batch."""
+    return [deepcopy(one) for one in iterate(env.observation_space, observation)]
+
+
+@contextmanager
+def made(
+    env: str = COUNTDOWN, copies: int = 3, lanes: int = 3, workers: int = 3, *, shared: bool = True, **changes: Any
+) -> Iterator[tuple[ZmqVectorEnv, AnyOrder]]:
+    """A vector environment whose workers do what the test says."""
+    with any_order(VectorEnvSettings(env, copies, lanes=lanes, **changes), workers, shared=shared) as pair:
+        yield pair
+
+
+# ---------------------------------------------------------------- the same rows as in lock-step
+
+
+def rows_in_lock_step(env: SyncVectorEnv[Any, Any], mode: AutoresetMode, actions: Sequence[Any]) -> list[list[Row]]:
+    """The rows of each copy: of the reset, of each step and, with `Disabled`, of each reset after an episode's end."""
+
+    def of_reset(batch: Any, infos: dict[str, Any], n: int) -> Row:
+        return Row(of_copies(env, batch)[n], np.float64(0), np.False_, np.False_, info_of(infos, n))
+
+    copies = range(env.num_envs)
+    first = env.reset(seed=5)
+    found = [[of_reset(*first, n)] for n in copies]
+    for action in actions:
+        observation, reward, terminated, truncated, infos = env.step(action)
+        each = of_copies(env, observation)
+        for n in copies:
+            found[n].append(Row(each[n], reward[n], terminated[n], truncated[n], info_of(infos, n)))
+        ended = terminated | truncated
+        if mode is AutoresetMode.DISABLED and ended.any():
+            again = env.reset(options={"reset_mask": ended.copy()})
+            for n in np.flatnonzero(ended).tolist():
+                found[n].append(of_reset(*again, n))
+    return found
+
+
+def rows_apart(env: ZmqVectorEnv, actions: Sequence[Any], draw: Any) -> list[list[Row]]:
+    """The rows of each copy when each lane is sent its next action whenever `draw` likes."""
+    layout, found = env._layout, list[list[Row]]([] for _ in range(env.num_envs))
+    sent = dict.fromkeys(layout.lanes, 0)  # how many actions each lane was sent
+    idle: set[int] = set()
+
+    def ended(lane: int) -> list[int]:
+        """Copies of the lane that only the caller resets."""
+        disabled = env.autoreset_mode is AutoresetMode.DISABLED
+        return [n for n in layout.copies(lane) if disabled and (found[n][-1].terminated or found[n][-1].truncated)]
+
+    env.async_reset(seed=5)
+    while env.outstanding or any(sent[lane] < len(actions) or ended(lane) for lane in idle):
+        if env.outstanding:
+            for n, row in received(env, draw(0 if idle else 1, len(env.outstanding))).items():
+                found[n].append(row)
+                idle.add(layout.lane_of(n))
+        for lane in sorted(idle):
+            if (over := ended(lane)) and draw(0, 1):
+                env.async_reset(over)
+                idle.remove(lane)
+        ready = [lane for lane in sorted(idle) if sent[lane] < len(actions) and not ended(lane)]
+        chosen = ready[draw(0, len(ready)) :]
+        ids = [n for lane in chosen[::-1] for n in layout.copies(lane)]  # not in the order of the copies
+        if ids:
+            each = [(n, actions[sent[layout.lane_of(n)]]) for n in ids]
+            env.send({key: np.stack([action[key][n] for n, action in each]) for key in actions[0]}, ids)
+        for lane in chosen:
+            sent[lane] += 1
+            idle.remove(lane)
+    return found
+
+
+@settings(max_examples=40, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate, Phase.shrink))
+@given(
+    st.sampled_from(list(AutoresetMode)), st.booleans(), st.sampled_from([(3, 3), (3, 1), (2, 2)]), st.integers(2, 12),
+    st.data(),
+)  # fmt: skip
+def test_each_copy_has_the_rows_of_lock_step_in_any_order_of_completion(
+    mode: AutoresetMode, shared: bool, lanes_and_workers: tuple[int, int], steps: int, data: st.DataObject
+) -> None:
+    def draw(least: int, most: int) -> int:
+        return data.draw(st.integers(least, most))
+
+    lanes, workers = lanes_and_workers
+    theirs = SyncVectorEnv([lambda: gymnasium.make(INFORMS, disable_env_checker=True)] * 3, autoreset_mode=mode)
+    theirs.action_space.seed(3)
+    actions = [theirs.action_space.sample() for _ in range(steps)]
+    wanted = rows_in_lock_step(theirs, mode, actions)
+    theirs.close()
+    with made(INFORMS, 3, lanes, workers, shared=shared, autoreset_mode=mode.value) as (env, link):
+        link.choose = lambda count: draw(0, count - 1)
+        found = rows_apart(env, actions, draw)
+        for mine, other in zip(found, wanted, strict=True):
+            assert len(mine) == len(other)
+            for t, (row, wanted_row) in enumerate(zip(mine, other, strict=True)):
+                assert bit_equal(tuple(row), tuple(wanted_row)), f"row {t}: {row} is not {wanted_row}"
+
+
+@BOTH_WAYS
+def test_actions_go_to_their_copies_also_where_shared_memory_would_round_them(shared: bool) -> None:
+    """The results of `recv` are the caller's own: later steps do not change them."""
+    with made("Pendulum-v1", 2, 2, 2, shared=shared) as (env, link):
+        theirs = SyncVectorEnv([lambda: gymnasium.make("Pendulum-v1")] * 2)
+        theirs.reset(seed=1)
+        env.async_reset(seed=1)
+        env.recv(2)
+        kept = []
+        for t in range(6):
+            actions = np.random.default_rng(t).uniform(-2, 2, (2, 1)).astype(np.float64 if t % 2 else np.float32)
+            env.send(actions[::-1], [1, 0])
+            wanted, (*mine, infos) = theirs.step(actions), env.recv(2)
+            assert infos["env_id"].tolist() == [0, 1]
+            kept += [(one, np.copy(two)) for one, two in zip(mine, wanted[:4], strict=True)]
+            assert all(bit_equal(one, two) for one, two in kept)
+        assert [type(order) for order in link.orders] == [Reset, Reset, *[Step] * (6 if shared else 12)]
+        theirs.close()
+
+
+# ---------------------------------------------------------------- losses
+
+NEXT, SAME, DISABLED = "NextStep", "SameStep", "Disabled"
+
+
+def zeros(ids: Sequence[int]) -> Any:
+    return np.zeros(len(ids), np.int64)
+
+
+def send(env: ZmqVectorEnv, ids: Sequence[int]) -> None:
+    env.send(zeros(ids), ids)
+
+
+@BOTH_WAYS
+def test_a_worker_lost_under_way_comes_back_truncated_and_costs_no_other_its_results(shared: bool) -> None:
+    with made(shared=shared) as (env, link):
+        env.async_reset(seed=1)
+        env.recv(3)
+        send(env, [0, 1, 2])
+        env.recv(3)
+        link.frozen = {"w1"}
+        send(env, [0, 1, 2])
+        assert sorted(received(env, 2)) == [0, 2]
+        send(env, [0])
+        link.leave("w1")
+        rows = received(env, 2)
+        assert {n: row.truncated for n, row in rows.items()} == {0: False, 1: True}
+        assert rows[1].observation == np.float32(0.8), "the newest that arrived"
+        assert (rows[1].reward, rows[1].terminated, rows[1].info) == (0.0, False, {"worker_lost": True})
+        send(env, [1, 0])
+        rows = received(env, 2)
+        assert rows[1].observation == 1.0, "this step resets the new copy"
+        assert (rows[1].reward, rows[1].truncated, rows[1].info) == (0.0, False, {})
+        assert rows[0].observation == np.float32(0.2), "the other episode went on"
+        send(env, [1])
+        assert received(env)[1].observation == np.float32(0.8)
+
+
+@BOTH_WAYS
+def test_a_worker_lost_while_its_copies_are_here_is_reported_for_the_next_step(shared: bool) -> None:
+    with made(shared=shared) as (env, link):
+        env.async_reset(seed=1)
+        env.recv(3)
+        link.leave("w2")
+        send(env, [0, 2])
+        rows = received(env, 2)
+        assert (rows[2].truncated, rows[2].info) == (True, {"worker_lost": True})
+        send(env, [2])
+        row = received(env)[2]
+        assert (row.observation, row.truncated) == (1.0, False)
+
+
+@BOTH_WAYS
+def test_results_that_came_before_the_loss_are_returned_first(shared: bool) -> None:
+    with made(shared=shared) as (env, link):
+        env.async_reset(seed=1)
+        env.recv(3)
+        send(env, [0, 1, 2])
+        link.frozen = {"w0"}
+        assert sorted(received(env, 2)) == [1, 2]
+        link.frozen = set()
+        link.execute()
+        link.leave("w0")
+        rows = received(env)
+        assert (rows[0].observation, rows[0].truncated, rows[0].info) == (np.float32(0.8), False, {})
+        send(env, [0])
+        assert received(env)[0].info == {"worker_lost": True}
+
+
+@BOTH_WAYS
+def test_with_same_step_the_row_of_a_lost_copy_has_its_last_observation_and_a_new_first_one(shared: bool) -> None:
+    with made(shared=shared, autoreset_mode=SAME) as (env, link):
+        env.async_reset(seed=1)
+        env.recv(3)
+        send(env, [0, 1, 2])
+        env.recv(3)
+        link.frozen = {"w1"}
+        send(env, [1])
+        link.leave("w1")
+        row = received(env)[1]
+        assert (row.observation, row.reward, row.truncated) == (1.0, 0.0, True)
+        assert row.info["final_obs"] == np.float32(0.8)
+        assert row.info["worker_lost"]
+        assert row.info["final_info"] == {"worker_lost": True}
+        resets = [order for order in link.orders if isinstance(order, Reset)]
+        assert len(resets) == 4
+        assert resets[-1].seeds[0] not in (None, 2), "a seed of its own, but the same whenever this loss is repeated"
+        send(env, [1])
+        assert received(env)[1].observation == np.float32(0.8)
+
+
+def test_with_disabled_the_caller_resets_a_lost_copy() -> None:
+    with made(autoreset_mode=DISABLED) as (env, link):
+        env.async_reset(seed=1)
+        env.recv(3)
+        link.frozen = {"w1"}
+        send(env, [1])
+        link.leave("w1")
+        assert received(env)[1].truncated
+        with pytest.raises(UsageError, match=r"copies \[1\] have ended: .* expected async_reset\(\[1\]\) before"):
+            send(env, [1])
+        env.async_reset([1])
+        assert received(env)[1].observation == 1.0
+        send(env, [1])
+        assert received(env)[1].observation == np.float32(0.8)
+
+
+def test_a_reset_is_repeated_when_its_worker_is_lost() -> None:
+    with made() as (env, link):
+        link.frozen = {"w1"}
+        env.async_reset(seed=7)
+        assert sorted(received(env, 2)) == [0, 2]
+        link.leave("w1")
+        row = received(env)[1]
+        assert (row.observation, row.truncated, row.info) == (1.0, False, {})
+        assert [order.seeds for order in link.orders if isinstance(order, Reset) and order.lane == 1] == [(8,), (8,)]
+        send(env, [1])
+        assert received(env)[1].observation == np.float32(0.8)
+
+
+def test_after_three_lost_resets_the_loss_is_raised() -> None:
+    with made(copies=1, lanes=1, workers=4) as (env, link):
+        link.frozen = {f"w{n}" for n in range(4)}
+        env.async_reset(seed=7)
+        for n in range(3):
+            assert not env.recv(0)[1].size
+            link.leave(f"w{n}")
+        with pytest.raises(WorkerLost, match=r"worker w2 \(host\) left: killed: lane 0 \(copies 0 to 0\) is lost"):
+            env.recv()
+        assert env.outstanding == []
+        link.frozen = set()
+        env.async_reset([0], seed=7)
+        assert received(env)[0].observation == 1.0
+
+
+def test_copies_of_a_lane_that_were_not_asked_for_a_reset_are_reported_when_it_is_lost() -> None:
+    with made(copies=2, lanes=1, workers=2, autoreset_mode=DISABLED) as (env, link):
+        env.async_reset(seed=1)
+        env.recv(2)
+        send(env, [0, 1])
+        env.recv(2)
+        link.frozen = {"w0"}
+        env.async_reset([1])
+        link.leave("w0")
+        assert {n: row.observation for n, row in received(env).items()} == {1: 1.0}
+        send(env, [0, 1])
+        rows = received(env, 2)
+        assert [row.info for row in rows.values()] == [{"worker_lost": True}] * 2, "never hidden: the lane is new"
+
+
+@pytest.mark.parametrize("mode", [NEXT, DISABLED])
+def test_also_a_reset_in_lock_step_of_some_copies_does_not_hide_that_the_others_of_the_lane_were_lost(mode: str) -> None:
+    with made(copies=2, lanes=1, workers=2, autoreset_mode=mode) as (env, link):
+        env.reset(seed=1), env.step(zeros([0, 1]))
+        link.frozen = {"w0"}
+        gone = iter([lambda: link.leave("w0")])
+        env.watch(lambda: next(gone, lambda: None)())
+        env.reset(options={"reset_mask": np.array([False, True])})
+        _, reward, _, truncated, infos = env.step(zeros([0, 1]))
+        assert (reward.tolist(), truncated.tolist()) == ([0.0, 0.0], [True, True])
+        assert infos["worker_lost"].tolist() == [True, True]
+
+
+def test_with_raise_recv_names_the_lost_copies_once_and_the_others_can_be_received() -> None:
+    with made(on_worker_loss="raise") as (env, link):
+        env.async_reset(seed=1)
+        env.recv(3)
+        link.frozen = {"w1"}
+        send(env, [0, 1, 2])
+        link.leave("w1")
+        with pytest.raises(WorkerLost, match=r"worker w1 \(host\) left: killed: lane 1 \(copies 1 to 1\) is lost"):
+            env.recv(3)
+        assert env.outstanding == [0, 2]
+        assert sorted(received(env, 2)) == [0, 2]
+        with pytest.raises(WorkerLost, match=r"lanes \[1\] were lost with their worker; call async_reset\(\[1\]\) first"):
+            send(env, [1])
+        env.async_reset([1])
+        assert received(env)[1].observation == 1.0
+        send(env, [1])
+        assert received(env)[1].observation == np.float32(0.8)
+
+
+@BOTH_WAYS
+def test_a_worker_that_takes_too_long_is_given_up_while_the_others_go_on(shared: bool) -> None:
+    with made(shared=shared, timeout_s=10.0) as (env, link):
+        env.async_reset(seed=1)
+        env.recv(3)
+        send(env, [0, 1, 2])
+        link.frozen = {"w1"}
+        began_s, others = link.now, 0
+        while True:
+            link.now += 0.1
+            rows = received(env)
+            if 1 in rows:
+                break
+            others += len(rows)
+            send(env, list(rows))
+        assert rows[1].info == {"worker_lost": True}
+        assert 9.9 < link.now - began_s < 10.5
+        assert others > 150
+
+
+def test_time_in_which_the_caller_did_other_things_counts_little() -> None:
+    with made(timeout_s=10.0) as (env, link):
+        env.async_reset(seed=1)
+        env.recv(3)
+        link.frozen = {"w1"}
+        send(env, [0, 1, 2])
+        assert sorted(received(env, 2)) == [0, 2]
+        link.now += 3600.0
+        assert not env.recv(0)[1].size
+        link.frozen = set()
+        assert received(env)[1].observation == np.float32(0.8)
+
+
+def test_an_error_of_an_environment_is_raised_and_costs_the_others_nothing() -> None:
+    with made("workers.envs.toy:Raises-v0", kwargs={"after": 1, "only_seed": 2}) as (env, _):
+        env.async_reset(seed=1)
+        env.recv(3)
+        send(env, [0, 1, 2])
+        env.recv(3)
+        send(env, [0, 1, 2])
+        with pytest.raises(EnvironmentFailed, match="lane 1, copy 0, step 1: its environment raised ValueError"):
+            env.recv(3)
+        rows = received(env, 3)
+        assert {n: row.info for n, row in rows.items()} == {0: {}, 1: {"worker_lost": True}, 2: {}}
+        send(env, [0, 1, 2])
+        assert {n: float(row.observation[0]) for n, row in received(env, 3).items()} == pytest.approx(
+            {0: 0.4, 1: 1.0, 2: 0.4}
+        )
+
+
+def test_without_any_worker_the_wait_ends_and_goes_on_when_one_joins() -> None:
+    with made(copies=1, lanes=1, workers=1, timeout_s=5.0) as (env, link):
+        link.leave("w0")
+        env.async_reset(seed=1)
+        with pytest.raises(NoWorkers, match="waited 5 s for 1 worker"):
+            env.recv()
+        assert env.outstanding == [0]
+        link.join("w9")
+        assert received(env)[0].observation == 1.0
+
+
+def test_long_infos_come_with_their_step_and_a_loss_before_they_came_is_reported_later() -> None:
+    with made(INFORMS, 1, 1, 1, kwargs={"wordy": 1_500_000}) as (env, link):
+        env.async_reset(seed=1)
+        env.recv()
+        action = {"move": np.zeros((1, 2), np.float32), "pick": np.zeros(1, np.int64)}
+        env.send(action)
+        assert len(received(env)[0].info["word"]) > 1_500_000
+        env.send(action)
+        link.execute()
+        link.inbox.clear()
+        link.leave("w0")
+        link.join("w1")
+        row = received(env)[0]
+        assert row.info == {}
+        assert row.observation["clock"] == 2
+        env.send(action)
+        assert received(env)[0].info == {"worker_lost": True}
+
+
+# ---------------------------------------------------------------- wrong use loses nothing
+
+
+def test_wrong_arguments_are_refused_in_one_line_and_nothing_is_sent() -> None:
+    with made(copies=4, lanes=2, workers=2) as (env, link):
+        with pytest.raises(NoAsyncCallError, match="recv without send"):
+            env.recv()
+        with pytest.raises(UsageError, match=r"send before reset of copies \[0, 1, 2, 3\]: call reset\(\), or async_reset"):
+            env.send(zeros(range(4)))
+        env.async_reset(seed=1)
+        for many in (5, -1):
+            with pytest.raises(ValueError, match=f"min_envs: expected 0 to 4, the copies that .*; got {many}"):
+                env.recv(many)
+        env.recv(4)
+        for wrong, line in (
+            ([0], r"expected all copies of lane 0, 0 to 1, got \[0\]; with lanes=num_envs every copy is a lane"),
+            ([0, 1, 1], "expected different numbers from 0 to 3, got"),
+            ([3, 4], "expected different numbers from 0 to 3, got"),
+            ([-1, 3], "expected different numbers from 0 to 3, got"),
+            ([], "expected different numbers from 0 to 3, got"),
+        ):
+            with pytest.raises(ValueError, match=f"env_ids: {line}"):
+                send(env, wrong)
+        for not_numbers in (["a"], [0.5], 3, [[0, 1]]):
+            with pytest.raises(TypeError, match="env_ids: expected a list of whole numbers"):
+                env.send(zeros(range(2)), not_numbers)  # type: ignore[arg-type]
+        with pytest.raises(ValueError, match="actions: expected one for each of 2 copies"):
+            env.send(zeros(range(4)), [0, 1])
+        with pytest.raises(ValueError, match="env_ids: expected different numbers"):
+            env.async_reset([2, 2])
+        with pytest.raises(ValueError, match="seed: expected one for each of 2 copies, got 3"):
+            env.async_reset([2, 3], seed=[1, 2, 3])
+        with pytest.raises(TypeError):
+            env.async_reset(options={"what": object()})
+        assert env.outstanding == []
+        assert len(link.orders) == 2
+
+
+def test_lock_step_and_send_do_not_mix() -> None:
+    with made() as (env, _):
+        env.reset(seed=1)
+        send(env, [1])
+        step, attribute = partial(env.step, zeros(range(3))), partial(env.set_attr, "x", 1)
+        call: Callable[[], object]
+        for call in (step, env.reset, attribute, partial(env.call, "level")):
+            with pytest.raises(AlreadyPendingCallError, match=r"while copies \[1\] have not .* expected recv\(\) first"):
+                call()
+        for again in (partial(send, env, [0, 1]), partial(env.async_reset, [1])):
+            with pytest.raises(AlreadyPendingCallError, match=r"copies \[1\] have not come back: expected recv\(\)"):
+                again()
+        assert env.get_attr("spec") == (env.spec,) * 3
+        assert sorted(received(env)) == [1]
+        env.step_async(zeros(range(3)))
+        for call in (env.recv, partial(send, env, [0]), env.async_reset):
+            with pytest.raises(AlreadyPendingCallError, match=r"while a step is pending: expected step_wait\(\) first"):
+                call()
+        observation = env.step_wait()[0]
+        assert observation[:, 0].tolist() == pytest.approx([0.8, 0.6, 0.8]), "each copy has made its own steps"
+        env.close()
+        for call in (env.recv, partial(send, env, [0]), env.async_reset):
+            with pytest.raises(ClosedEnvironmentError):
+                call()
+
+
+def test_what_a_watch_raises_ends_the_wait_and_loses_nothing() -> None:
+    with made() as (env, link):
+        env.async_reset(seed=1)
+        env.recv(3)
+        link.frozen = {"w0", "w1", "w2"}
+        send(env, [0, 1, 2])
+
+        def stop() -> None:
+            raise InterruptedError("stop")
+
+        env.watch(stop)
+        with pytest.raises(InterruptedError):
+            env.recv()
+        env.watch(lambda: None)
+        link.frozen = set()
+        assert sorted(received(env, 3)) == [0, 1, 2]
+
+
+# ---------------------------------------------------------------- the pure parts
+
+
+def test_a_lane_comes_back_once_and_takes_no_other_order_before() -> None:
+    lanes = SentLanes()
+    lanes.send(1, Sent((2, 3), 0.0))
+    lanes.send(0, Sent((0, 1), 5.0))
+    assert lanes.copies() == [0, 1, 2, 3]
+    with pytest.raises(ValueError, match="lane 1: expected one that has come back"):
+        lanes.send(1, Sent((2, 3), 1.0))
+    assert lanes.overdue(4.0, 3.0) == [1]
+    lanes.ready(1, b"infos")
+    assert (lanes.ready_copies, lanes.overdue(9.0, 3.0), lanes.among([0, 1, 2])) == (2, [0], [0, 1])
+    lanes.ready(0, b"")
+    assert [(one.lane, one.copies, one.infos) for one in lanes.take()] == [(0, (0, 1), b""), (1, (2, 3), b"infos")]
+    assert (list(lanes.take()), lanes.copies()) == ([], [])
+    lanes.send(1, Sent((2, 3), 1.0))
+
+
+def test_a_long_time_between_two_looks_counts_as_a_short_one() -> None:
+    watched = WatchedTime(100.0)
+    assert watched.look(100.1) == pytest.approx(0.1)
+    assert watched.look(4000.0) == pytest.approx(0.1 + LONGEST_GAP_S)
+    assert watched.look(4000.2) == pytest.approx(0.3 + LONGEST_GAP_S)
