@@ -3,8 +3,9 @@
 PPO with 64 steps, minibatches of 256 and 10 epochs, on 16 env copies in 16 processes. The environment sleeps
 (`benchmarks/slow_env.py`), so that the number of cores does not matter and waiting is all that is measured. The ideal is 16
 copies that never wait: 16 processes that step and do nothing else. They reach less than the durations say, because a machine
-wakes a process a little late. Each run is a process tree of its own; all take turns. `--peers` adds the installed systems
-that can run 16 processes. `--picture FILE` draws who waits for whom.
+wakes a process a little late. Each run is a process tree of its own; all take turns. Two more rows are loops over
+`millrace.make_vec` that act at random and learn nothing: by `step`, and by `send` and `recv`. `--only-loops` measures these
+and the ideal. `--peers` adds the installed systems that can run 16 processes. `--picture FILE` draws who waits for whom.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+import millrace
 from benchmarks import programs
 from benchmarks.programs import CONTENDERS, Contender, contenders
 from benchmarks.slow_env import STEPS_PER_S, TIMELINE, Lognormal
@@ -34,6 +36,8 @@ COPIES = 16
 IDEAL = COPIES * STEPS_PER_S  # if a machine woke every process in time
 NEVER_WAIT, NEVER_WAIT_S = "copies that never wait", 12.0
 WARM_UP = 3  # updates
+LOOPS_WARM_UP_S = 2.0
+BY_STEP, BY_RECV = "make_vec, step", "make_vec, send and recv"
 SETTINGS: dict[str, Any] = {
     "env": "benchmarks.slow_env:Lognormal-v0", "algo": "ppo", "envs": COPIES, "rollout_steps": 64, "batch_size": 256,
     "n_epochs": 10, "gamma": 0.99, "gae_lambda": 0.95, "ent_coef": 0.0, "vf_coef": 0.5, "max_grad_norm": 0.5,
@@ -90,6 +94,29 @@ def _step_only(seed: int, begin: Barrier, counts: multiprocessing.Queue[int]) ->
     counts.put(steps)
 
 
+def rate_of_loop(seed: int, *, by_recv: bool) -> float:
+    """Env steps/s of a loop over a vector environment that acts at random; each copy has a worker of its own.
+
+    With SameStep every row of a step is an env step, whether it also resets or not.
+    """
+    env_id = f"{Lognormal.__module__}:Lognormal-v0"
+    actions = np.random.default_rng(seed)
+    with millrace.make_vec(env_id, COPIES, workers=COPIES, lanes=COPIES, autoreset_mode="SameStep") as env:
+        env.reset(seed=COPIES * seed)
+        ids, steps = np.arange(COPIES), 0
+        if by_recv:
+            env.send(actions.integers(0, 2, COPIES))
+        began_s = time.monotonic() + LOOPS_WARM_UP_S
+        while (now := time.monotonic()) < began_s + NEVER_WAIT_S:
+            if by_recv:
+                ids = env.recv()[4]["env_id"]
+                env.send(actions.integers(0, 2, len(ids)), ids)
+            else:
+                env.step(actions.integers(0, 2, COPIES))
+            steps += len(ids) * (now >= began_s)
+        return steps / (time.monotonic() - began_s)
+
+
 def timelines(name: str, contender: Contender, seed: int) -> list[np.ndarray[Any, Any]]:
     """For each env copy, its calls [calls, 3]: start, end, whether it was a reset."""
     with tempfile.TemporaryDirectory() as folder:
@@ -140,6 +167,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3, help="number of turns, each with another seed")
     parser.add_argument("--peers", action="store_true", help="compare with all installed systems that run 16 processes")
     parser.add_argument("--picture", type=Path, help="draw who waits for whom into this PNG, and measure nothing else")
+    parser.add_argument("--only-loops", action="store_true", help="measure the two loops and the ideal only")
     arguments = parser.parse_args()
     here = contenders(arguments.peers)
     others = {name: CONTENDERS[name] for name in (SUBPROC, *(PEERS if arguments.peers else ())) if name in here}
@@ -148,10 +176,13 @@ def main() -> None:
         draw({name: timelines(name, each, 1) for name, each in chosen.items()}, arguments.picture)
         print(arguments.picture)
         return
-    found: dict[str, list[float]] = {name: [] for name in (*others, *OURS, NEVER_WAIT)}
+    trained = {} if arguments.only_loops else others | OURS
+    found: dict[str, list[float]] = {name: [] for name in (*trained, BY_STEP, BY_RECV, NEVER_WAIT)}
     for turn in range(arguments.rounds):
         found[NEVER_WAIT].append(rate_without_waiting(turn + 1))
-        for name, each in (others | OURS).items():
+        for name in (BY_STEP, BY_RECV):
+            found[name].append(rate_of_loop(turn + 1, by_recv=name == BY_RECV))
+        for name, each in trained.items():
             try:
                 found[name].append(rate(name, each, turn + 1))
             except RuntimeError as error:

@@ -228,6 +228,56 @@ def test_a_reset_is_repeated_when_workers_are_lost() -> None:
     close_and_check(env)
 
 
+# ---------------------------------------------------------------- send and recv
+
+
+def test_a_loop_by_recv_does_not_wait_for_a_copy_that_hangs(tmp_path: Path, shared_memory: bool) -> None:
+    env = make("workers.envs.toy:Hangs-v0", after=1, once=str(tmp_path / "once"), only_seed=2, k=50, workers=4, lanes=4,
+               timeout=60.0, shared_memory=shared_memory)  # fmt: skip
+    env.async_reset(seed=1)
+    rows = dict.fromkeys(range(4), 0)
+    while sum(rows.values()) < 400:
+        ids = env.recv()[4]["env_id"]
+        for n in ids.tolist():
+            rows[n] += 1
+        env.send(np.zeros(len(ids), np.int64), ids)
+    assert rows[1] == 2, "its reset and its first step"
+    assert all(rows[n] > 50 for n in (0, 2, 3))
+    close_and_check(env)
+
+
+def test_recv_reports_a_worker_that_is_killed_or_hangs_and_goes_on(tmp_path: Path, shared_memory: bool) -> None:
+    env = make("workers.envs.toy:Hangs-v0", after=3, once=str(tmp_path / "once"), only_seed=2, k=50, workers=4, lanes=4,
+               timeout=10.0, shared_memory=shared_memory)  # fmt: skip
+    env.async_reset(seed=1)
+    local_workers()[3].kill()  # perhaps during its reset, which is then repeated
+    lost, rows, after_losses = [0] * 4, 0, 0
+    began = time.monotonic()
+    while after_losses < 200 and time.monotonic() - began < 60.0:
+        _, reward, _, truncated, infos = env.recv()
+        ids = infos["env_id"]
+        rows += len(ids)
+        if "worker_lost" in infos:
+            assert (truncated == infos["worker_lost"]).all()
+            assert not reward[infos["worker_lost"]].any()
+            for n in ids[infos["worker_lost"]]:
+                lost[n] += 1
+        after_losses += lost[1] > 0
+        env.send(np.zeros(len(ids), np.int64), ids)
+    assert after_losses == 200
+    assert (lost[0], lost[1], lost[2]) == (0, 1, 0)
+    assert lost[3] <= 1
+    close_and_check(env)
+
+
+def test_close_does_not_wait_for_what_was_sent() -> None:
+    env = make("workers.envs.toy:Hangs-v0", after=0, workers=4, lanes=4)
+    env.async_reset(seed=1)
+    env.recv(4)
+    env.send(ZEROS)
+    close_and_check(env)
+
+
 def test_many_environments_leave_nothing_open() -> None:
     def use_one() -> None:
         with make() as env:
