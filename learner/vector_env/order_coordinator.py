@@ -56,8 +56,6 @@ class OrderedLane(PlacedLane):
 
     started: bool = False
     """Whether an order of this incarnation was sent. If so, its env copies exist and can be lost."""
-    ticket: int = 0
-    """Ticket of the newest order that was sent as a message and whose answer is wanted; 0: none."""
 
     def restart(self) -> None:
         """The lane left its worker."""
@@ -166,15 +164,10 @@ class OrderCoordinator:
         self.infos.clear()
 
     def forget(self, lane: int) -> None:
-        """Forget the answer to the last order of one lane; the caller has taken it, or does not want it any more."""
+        """Forget the answer to the last order of one lane; the caller has taken it."""
         self.answers.pop(lane, None)
         self.shared_orders.pop(lane, None)
         self.infos.pop(lane, None)
-        self.lanes[lane].ticket = 0
-
-    def is_ordered(self, lane: int) -> bool:
-        """Whether the lane's newest order, sent as a message, is not answered."""
-        return self.lanes[lane].ticket in self.orders
 
     def place(self, lane: int, patient: bool) -> bool:
         """Assign the lane to a worker. False if there is none; if `patient`, also if every worker has a lane already."""
@@ -201,7 +194,7 @@ class OrderCoordinator:
             raise ValueError(f"lane {lane}: expected a worker, got none")
         self._tickets += 1
         order = make_order(member.session, self._tickets, LaneIncarnation(lane, record.incarnation))
-        record.started, record.ticket = True, order.ticket
+        record.started = True
         self.orders[order.ticket] = order
         member.tickets[order.ticket] = member.replies
         return [(member.peer, order)]
@@ -219,8 +212,7 @@ class OrderCoordinator:
         except BadMessage as error:
             return self.reject_message(member.peer, str(error), member.heard_s)
         del self.orders[answer.ticket], member.tickets[answer.ticket]
-        if answer.ticket == self.lanes[answer.lane].ticket:  # else it is that of an order for which nobody waits any more
-            self.answers[answer.lane] = answer
+        self.answers[answer.lane] = answer
         return []
 
     def _long_infos(self, member: Member, answer: Answer) -> list[Outgoing]:

@@ -12,7 +12,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from learner.members.events import Event, WorkerLeft
 from learner.members.member_server import MemberServer, ServerCallbacks, ServerSettings
@@ -21,7 +21,7 @@ from learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator
 from learner.vector_env.status import status
 from protocol.address import worker_name
 from protocol.errors import EnvironmentFailed
-from protocol.messages import Answer, WorkerActivity, WorkerExit
+from protocol.messages import Answer, Order, WorkerActivity, WorkerExit
 from protocol.specs import StepSpec
 from protocol.wire.learner_link import LearnerLink
 from protocol.wire.shared_memory import SharedMemory
@@ -95,13 +95,6 @@ class SharedSteps:
     """Pipe that wakes the worker, and pipe by which it wakes us; by worker name."""
 
 
-class WaitingOrder(NamedTuple):
-    """An order that is sent as soon as its lane is placed."""
-
-    make: MakeOrder
-    since_s: float
-
-
 class StepHub:
     """Everything the vector environment knows of workers."""
 
@@ -125,7 +118,9 @@ class StepHub:
         self._local_workers: LocalWorkers = local_workers or NoLocalWorkers()
         self._shared, self._spin_s, self._clock = shared, spin_s, clock
         self._spin_wait = SpinWait()
-        self._waiting_orders: dict[int, WaitingOrder] = {}  # by lane
+        self._waiting_orders: dict[int, MakeOrder] = {}  # lane -> an order that is sent as soon as the lane is placed
+        self._waiting_since_s: dict[int, float] = {}  # of these lanes
+        self._newest_tickets: dict[int, int] = {}  # lane -> ticket of its newest order, if its answer is wanted
         self._patience_s = PATIENCE_S
         self._while_waiting: Callable[[], None] = lambda: None
         self.stepped: set[int] = set()
@@ -163,8 +158,8 @@ class StepHub:
         """Send an order to each of these lanes. Lanes that have no worker are placed while `wait_for_answers` waits."""
         self._coordinator.begin()
         self.stepped.clear()
-        now = self._clock()
-        self._waiting_orders = {lane: WaitingOrder(make, now) for lane, make in makes.items()}
+        self._waiting_orders = dict(makes)
+        self._waiting_since_s = dict.fromkeys(makes, self._clock())
         self._send_waiting_orders()
 
     def uses_shared_memory(self, lane: int) -> bool:
@@ -195,7 +190,7 @@ class StepHub:
     def send_order(self, lane: int, make: MakeOrder) -> None:
         """Send an order to this lane, whatever other lanes do. `take_result` returns its result."""
         self._forget(lane)
-        self._waiting_orders[lane] = WaitingOrder(make, self._clock())
+        self._waiting_orders[lane], self._waiting_since_s[lane] = make, self._clock()
         self._send_waiting_orders()
 
     def begin_shared_step(self, lane: int) -> None:
@@ -215,7 +210,10 @@ class StepHub:
         """
         if lane in self._under_way and self._is_answered(lane):
             self._step_ended(lane)
-        result: Answer | bytes | None = self._coordinator.answers.get(lane)
+        result: Answer | bytes | None = None
+        answer = self._coordinator.answers.get(lane)
+        if answer is not None and answer.ticket == self._newest_tickets.get(lane):  # else nobody waits for it any more
+            result = answer
         if lane in self.stepped:
             assert self._shared is not None
             result = self._shared.memory.infos(lane)
@@ -229,7 +227,8 @@ class StepHub:
 
     def is_ordered(self, lane: int) -> bool:
         """Whether the lane has an order that is not answered, or waits for a worker to take it."""
-        return lane in self._waiting_orders or lane in self._under_way or self._coordinator.is_ordered(lane)
+        ticket = self._newest_tickets.get(lane)
+        return lane in self._waiting_orders or lane in self._under_way or ticket in self._coordinator.orders
 
     def listen_if_due(self) -> None:
         """Read the messages that have come, if some may matter."""
@@ -271,6 +270,7 @@ class StepHub:
         self._coordinator.forget(lane)
         self.stepped.discard(lane)
         self._under_way.pop(lane, None)
+        self._newest_tickets.pop(lane, None)
 
     def _is_answered(self, lane: int) -> bool:
         return self._shared is not None and self._shared.memory.answered(lane) == self._under_way[lane]
@@ -393,10 +393,14 @@ class StepHub:
     def _send_waiting_orders(self) -> None:
         awaited = len(self._coordinator.membership.active()) < self._local_workers.count  # one of ours has yet to join
         now = self._clock()
-        for lane, waiting in list(self._waiting_orders.items()):
-            if self._coordinator.place(lane, awaited and now - waiting.since_s < self._patience_s):
+        for lane, make in list(self._waiting_orders.items()):
+            if self._coordinator.place(lane, awaited and now - self._waiting_since_s[lane] < self._patience_s):
                 del self._waiting_orders[lane]
-                self._server.send(self._coordinator.order(lane, waiting.make))
+                sent = self._coordinator.order(lane, make)
+                for _, order in sent:
+                    assert isinstance(order, Order)
+                    self._newest_tickets[lane] = order.ticket
+                self._server.send(sent)
 
     def _wake_sleeping(self, peer: bytes) -> None:
         """Wake a worker that was sent a message: it may sleep until its next step through shared memory."""
