@@ -46,7 +46,7 @@ def check_settings(config: Config, run: Path) -> list[str]:
     Raises `UsageError` that names the fixed settings that differ, or if this is no run folder.
     """
     RunFolder.open(run)
-    before = config_of_run(run)
+    before = config_of_run(run, config.algo)
     changed = [*changes(before, config)]
     if before.algo == config.algo:  # else the settings of the two algorithms cannot be compared
         changed += changes(before.algorithm, config.algorithm)

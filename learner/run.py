@@ -94,9 +94,6 @@ def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, d
     is no such environment, or no policy for it; `RunError` if no worker describes it in time; and `KeyboardInterrupt` if
     the user stops the program.
     """
-    # PyTorch's threads sleep while they wait for one another; this must be set before it is imported. By default they spin,
-    # and hold the core that the slowest needs: beside other busy processes an update takes up to ten times as long.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     imports = ImportsAhead(config.algo)
     with Interrupts() as interrupts:
 

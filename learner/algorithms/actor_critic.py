@@ -1,4 +1,4 @@
-"""The base of PPO, A2C, IMPALA and REINFORCE: everything about an update except advantages, value targets and the loss.
+"""The base of PPO, A2C, IMPALA and REINFORCE, and of a user's own actor-critic: everything about an update except the loss.
 
 Rows that are not valid never enter a minibatch. An update raises before a number that is not finite reaches the weights, or
 when a step makes one; `roll_back` then takes back what it did.
@@ -19,14 +19,16 @@ from msgspec.structs import replace
 from torch import Tensor
 
 from learner.algorithms import losses
+from learner.algorithms.algorithm import Algorithm
 from learner.algorithms.kernels import loss_gradients
 from learner.algorithms.kernels.fused import MAX_ROWS, FusedActorCritic, can_fuse
 from learner.algorithms.kernels.loss_gradients import Numbers, OutputGradients
 from learner.algorithms.kernels.optimizer_step import avoid_compiler_import, state_of, take_step
 from learner.algorithms.minibatches import Index, LossInput, Minibatch, NetworkInput, Observations, rows_of_columns
 from learner.algorithms.normalization import ObservationNormalizer, RewardScaler
+from learner.algorithms.returns import EpisodeEnds, gae
 from learner.algorithms.updates import check_finite, scheduled
-from learner.config.hyperparameters import ActorCriticHyperparameters, RecurrentHyperparameters
+from learner.config.hyperparameters import ActorCriticConfig, AlgorithmConfig, PolicyGradientConfig, RecurrentConfig
 from protocol.arrays import Array, Bools, Floats
 from protocol.policy.features import features, normalize
 from protocol.policy.networks import ActorCriticNetwork, RecurrentInput
@@ -51,10 +53,16 @@ class Estimates(NamedTuple):
     metrics: Metrics  # without the prefix "train/"
 
 
-class ActorCritic:
+class ActorCritic(Algorithm):
     """The network, the optimizer, schedules and running statistics, and the update that uses them.
 
-    A subclass defines `estimate`. It also defines `loss`, unless its loss is the policy gradient with a squared value loss.
+    A subclass defines `loss`, unless its loss is the policy gradient with a squared value loss. Advantages are generalized
+    advantage estimates; for another rule it defines `estimate`. What else changes in an update, it adds to `state_dict` and
+    `load_state_dict`.
+
+    `Config` is the record of the settings, and `self.config` holds their values. Beside those of `PolicyGradientConfig`,
+    this class uses `gae_lambda`, `n_epochs`, `batch_size`, `normalize_advantage` and `optimizer` where the record has them.
+    Otherwise λ is 1, an update is one step on all rows with their advantages as they are, and the optimizer is Adam.
 
     How a gradient is computed: `loss` is written with ordinary torch operations, and autograd differentiates it. A built-in
     algorithm also defines `loss_gradients`: the same loss, and its derivatives with respect to the network's outputs,
@@ -68,29 +76,22 @@ class ActorCritic:
     except for rounding errors, which the tests limit. The choice never depends on measured time.
     """
 
-    whole_episodes: ClassVar[bool] = False  # see `Algorithm`
-    n_epochs = 1  # how many times an update uses each row
+    Config: ClassVar[type[AlgorithmConfig]] = ActorCriticConfig  # see `Algorithm`
+    n_epochs = 1  # how many times an update uses each row, if the settings do not say it
     estimates_each_epoch: ClassVar[bool] = False  # True: `estimate` is called before each epoch, under the newest weights
     shuffles_single_minibatch: ClassVar[bool] = False  # whether an epoch of one minibatch shuffles its rows
 
     @staticmethod
-    def policy_spec(config: ActorCriticHyperparameters, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
+    def policy_spec(config: PolicyGradientConfig, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
         """An actor and a critic. All spaces that we know are supported."""
-        spec = PolicySpec(
-            observation,
-            action,
-            net=config.net,
-            activation=config.activation,
-            normalize_observations=config.normalize_observations,
-            shared_net=config.shared_net,
-        )
-        if isinstance(config, RecurrentHyperparameters):
+        spec = replace(Algorithm.policy_spec(config, observation, action), shared_net=config.shared_net)
+        if isinstance(config, RecurrentConfig):
             spec = replace(spec, core=config.core, core_size=config.core_size)
         return spec
 
     def __init__(
         self,
-        config: ActorCriticHyperparameters,
+        config: PolicyGradientConfig,
         policy: PolicySpec,
         *,
         total_steps: int,
@@ -99,6 +100,7 @@ class ActorCritic:
     ) -> None:
         self.config = config
         self.policy = policy
+        self.n_epochs = getattr(config, "n_epochs", self.n_epochs)
         self.net = ActorCriticNetwork(policy, device, seed=seed)
         if policy.action.kind == "box":
             self.net.parameters["actor.log_std"].detach().fill_(config.log_std_init)
@@ -119,12 +121,15 @@ class ActorCritic:
     # ---------------------------------------------------------------- what an algorithm defines
 
     def estimate(self, batch: Batch, observations: Observations, reward: Floats, pulse: Pulse) -> Estimates:
-        """Advantages and value targets. `reward` [T, ΣN]: scaled if the settings say so."""
-        raise NotImplementedError
+        """Generalized advantage estimates A, and the targets A + V. `reward` [T, ΣN]: scaled if the settings say so."""
+        values = self.values(observations, pulse)
+        gae_lambda: float = getattr(self.config, "gae_lambda", 1.0)
+        advantage = gae(reward, values, EpisodeEnds.of(batch), self.config.gamma, gae_lambda)
+        return Estimates(advantage, advantage + values[:-1], values, batch.valid, {})
 
     def standardizes_advantages(self) -> bool:
         """Whether the advantages of each minibatch get mean 0 and standard deviation 1."""
-        return False
+        return bool(getattr(self.config, "normalize_advantage", False))
 
     def loss(self, rows: LossInput) -> tuple[Tensor, Mapping[str, Tensor | float]]:
         """The loss of a minibatch, a tensor of no dimension, and numbers to log by name. Every row is a valid one.
@@ -153,7 +158,8 @@ class ActorCritic:
 
     def minibatch_count(self, rows: int) -> int:
         """Number of minibatches, of nearly equal size, in an epoch of `rows` rows."""
-        return 1
+        batch_size: int | None = getattr(self.config, "batch_size", None)
+        return 1 if batch_size is None else math.ceil(rows / batch_size)
 
     def stops(self, metrics: Metrics) -> bool:
         """Whether a minibatch with these metrics ends the update, before its gradient step is taken."""
@@ -240,11 +246,21 @@ class ActorCritic:
                 numbers, by_outputs = self.loss_gradients(rows)
             torch.autograd.backward((rows.log_prob_now, rows.entropy, rows.value), by_outputs)
         else:
-            loss, logged = self.loss(rows)
+            loss, logged = self._checked_loss(rows)
             loss.backward()  # type: ignore[no-untyped-call]
-            numbers = {name: torch.as_tensor(each, dtype=loss.dtype, device=loss.device) for name, each in logged.items()}
+            named = {"loss": loss, **logged}
+            numbers = {name: torch.as_tensor(each, dtype=loss.dtype, device=loss.device) for name, each in named.items()}
         read = torch.stack((*(number.detach() for number in numbers.values()), gradient.norm())).tolist()
         return dict(zip((*numbers, "grad_norm"), read, strict=True))
+
+    def _checked_loss(self, rows: LossInput) -> tuple[Tensor, Mapping[str, Tensor | float]]:
+        match self.loss(rows):
+            case (Tensor() as loss, Mapping() as logged) if loss.dim() == 0 and loss.requires_grad:
+                return loss, logged
+        raise TypeError(
+            f"{type(self).__name__}.loss: expected a tensor of no dimension that depends on log_prob_now, entropy or value "
+            "of its rows, and a dict of numbers to log"
+        )
 
     def count_update(self, batch: Batch, observations: Observations, epochs: int) -> None:
         """Count an update of `epochs` epochs with this batch: steps, versions, observation statistics."""

@@ -11,12 +11,13 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 import torch
 
+from learner.algorithms.algorithm import Algorithm
 from learner.algorithms.kernels import loss_gradients
 from learner.algorithms.kernels.action_values import action_values
 from learner.algorithms.kernels.optimizer_step import avoid_compiler_import, state_of, take_step
@@ -50,10 +51,10 @@ def exploration_rate(config: DQNConfig, env_steps: int) -> float:
     return end + (start - end) * (max(0.0, 1 - done) if config.epsilon_schedule == "linear" else math.exp(-done))
 
 
-class DQN:
+class DQN(Algorithm):
     """The Q-network, the target network, their optimizer and the replay buffer."""
 
-    whole_episodes: ClassVar[bool] = False
+    Config = DQNConfig
 
     @staticmethod
     def policy_spec(config: DQNConfig, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:

@@ -14,21 +14,15 @@ from learner.algorithms.returns import EpisodeEnds, vtrace
 from learner.config.hyperparameters import ImpalaConfig
 from protocol.arrays import Floats
 from protocol.rollout import Batch
-from protocol.specs import PolicySpec
 
 
 class Impala(ActorCritic):
     """The policy gradient with V-trace, which is computed anew in each epoch."""
 
+    Config = ImpalaConfig
     config: ImpalaConfig
     estimates_each_epoch = True
     shuffles_single_minibatch = True  # kept so that older runs can be repeated bit for bit
-
-    def __init__(
-        self, config: ImpalaConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu"
-    ) -> None:
-        super().__init__(config, policy, total_steps=total_steps, seed=seed, device=device)
-        self.n_epochs = config.n_epochs
 
     def minibatch_count(self, rows: int) -> int:
         """See `ActorCritic`."""

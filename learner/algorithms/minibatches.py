@@ -84,19 +84,28 @@ class Minibatch(NamedTuple):
 
 
 class LossInput(NamedTuple):
-    """Input of a loss: B rows of a minibatch, and the network's present outputs for them.
+    """Input of a loss: B rows of a minibatch, and the network's present outputs for them. Every row is valid.
 
-    Tensors for `ActorCritic.loss`; for `ActorCritic.loss_gradients` tensors or numpy arrays.
+    Tensors for `ActorCritic.loss`; for `ActorCritic.loss_gradients` tensors or numpy arrays. All are float32, except actions
+    that are choices. Gradients flow through the last three.
     """
 
-    action: Any  # [B, *action]
-    log_prob: Any  # [B] log-probability of the action under the policy that acted
-    advantage: Any  # [B], standardized if the settings ask for it
-    raw_advantage: Any  # [B], not standardized
-    target: Any  # [B]
-    log_prob_now: Any  # [B] log-probability of the action under the present policy
-    entropy: Any  # [B], of the present policy
-    value: Any  # [B]
+    action: Any
+    """[B, *action] what was done: int64 counted from 0, or float32 that is not clipped to the action space (Box)"""
+    log_prob: Any
+    """[B] log-probability of the action under the policy that acted"""
+    advantage: Any
+    """[B] how much better the action was than expected; mean 0 and standard deviation 1 if `normalize_advantage` is set"""
+    raw_advantage: Any
+    """[B] the advantage as it was estimated"""
+    target: Any
+    """[B] what the value is fitted to"""
+    log_prob_now: Any
+    """[B] log-probability of the action under the present policy"""
+    entropy: Any
+    """[B] entropy of the present policy"""
+    value: Any
+    """[B] the critic's present value of the observation"""
 
 
 def rows_of_columns(steps: int, columns: int, chosen: Tensor) -> Tensor:

@@ -13,14 +13,12 @@ import numpy as np
 from torch import Tensor
 
 from learner.algorithms import losses
-from learner.algorithms.actor_critic import ActorCritic, Estimates, Metrics, Pulse
+from learner.algorithms.actor_critic import ActorCritic, Estimates, Metrics
 from learner.algorithms.kernels import loss_gradients
 from learner.algorithms.kernels.loss_gradients import Numbers, OutputGradients
 from learner.algorithms.minibatches import LossInput, Observations
-from learner.algorithms.returns import EpisodeEnds, gae
 from learner.algorithms.updates import scheduled
 from learner.config.hyperparameters import PPOConfig
-from protocol.arrays import Floats
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
 
@@ -28,11 +26,11 @@ from protocol.specs import PolicySpec
 class PPO(ActorCritic):
     """The clipped surrogate loss with GAE, for several epochs of minibatches per batch."""
 
+    Config = PPOConfig
     config: PPOConfig
 
     def __init__(self, config: PPOConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
         super().__init__(config, policy, total_steps=total_steps, seed=seed, device=device)
-        self.n_epochs = config.n_epochs
         self.clip_range = config.clip_range  # by the schedule, in this update
         self.epochs = 0  # epochs made so far: what Stable-Baselines3 calls n_updates
         self._kl_limit = math.inf if config.target_kl is None else 1.5 * config.target_kl
@@ -42,23 +40,9 @@ class PPO(ActorCritic):
         super().set_schedules()
         self.clip_range = scheduled(self.config.clip_range, self.config.clip_range_schedule, self.remaining())
 
-    def minibatch_count(self, rows: int) -> int:
-        """See `ActorCritic`."""
-        return math.ceil(rows / self.config.batch_size)
-
-    def standardizes_advantages(self) -> bool:
-        """See `ActorCritic`."""
-        return self.config.normalize_advantage
-
     def stops(self, metrics: Metrics) -> bool:
         """Whether the KL divergence from the policy that acted is more than 1.5 times `target_kl`."""
         return metrics["approx_kl"] > self._kl_limit
-
-    def estimate(self, batch: Batch, observations: Observations, reward: Floats, pulse: Pulse) -> Estimates:
-        """Generalized advantage estimates A, and the targets A + V."""
-        config, values = self.config, self.values(observations, pulse)
-        advantage = gae(reward, values, EpisodeEnds.of(batch), config.gamma, config.gae_lambda)
-        return Estimates(advantage, advantage + values[:-1], values, batch.valid, {})
 
     def loss(self, rows: LossInput) -> tuple[Tensor, Mapping[str, Tensor | float]]:
         """L = clipped surrogate + vf_coef · value loss, clipped if `clip_range_vf` is set, − ent_coef E[H(π)]."""

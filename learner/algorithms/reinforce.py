@@ -20,6 +20,7 @@ from protocol.rollout import Batch
 class REINFORCE(ActorCritic):
     """The policy gradient with Monte-Carlo returns of whole episodes."""
 
+    Config = REINFORCEConfig
     config: REINFORCEConfig
     whole_episodes = True
 

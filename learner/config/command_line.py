@@ -9,10 +9,11 @@ from typing import Any
 from learner.config.config import Config
 from learner.config.flag_help import show_help
 from learner.config.flag_parser import parse_flags
-from learner.config.hyperparameters import HYPERPARAMETERS, algorithms_with
+from learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig, PPOConfig, algorithms_with
 from learner.config.layers import lower_layers, override
 from learner.config.validation import validate
 from learner.run_folder.resume import AUTO, newest_run
+from protocol.errors import UsageError
 
 
 class RunFlags(Config, frozen=True, kw_only=True):
@@ -52,14 +53,18 @@ def _read_layers(command: str, argv: list[str], resumed: Path | None = None) -> 
     The settings of a resumed run lie below the flags. The flags are parsed more than once, because the layers below them
     depend on some of them (--config, --preset, --resume, --algo, ENV).
     """
-    argv = _none_for_tyro(argv)
+    argv = _none_for_tyro(argv, PPOConfig())
     without_help = [flag for flag in argv if flag not in ("-h", "--help")]
     parse = functools.partial(parse_flags, RunFlags, command=command, hint=algorithms_with)
-    first = parse(without_help, default=RunFlags(algo=""), ignore_unknown=True)
+    try:
+        first = parse(without_help, default=RunFlags(algo=""), ignore_unknown=True)
+    except UsageError:  # perhaps because another algorithm has a flag of the same name and another type
+        first = parse(without_help, default=RunFlags(algo="", algorithm=AlgorithmConfig()), ignore_unknown=True)
     resume = resumed if first.resume == AUTO else first.resume
     file = None if resumed else first.config  # a resumed run already contains the settings of its --config
     below = functools.partial(lower_layers, algo=first.algo or None, file=file, resume=resume, preset=first.preset)
     algorithm = below("").algorithm
+    argv, without_help = _none_for_tyro(argv, algorithm), _none_for_tyro(without_help, algorithm)
     if type(algorithm) is not type(first.algorithm):  # then the values of its own flags may have been mistaken for ENV
         first = parse(without_help, default=RunFlags(algo="", algorithm=algorithm), ignore_unknown=True)
     base = below(first.env)
@@ -71,9 +76,9 @@ def _read_layers(command: str, argv: list[str], resumed: Path | None = None) -> 
     return validate(override(config, {"env_kwargs": base.env_kwargs | config.env_kwargs}, "")), flags.resume
 
 
-def _none_for_tyro(argv: list[str]) -> list[str]:
+def _none_for_tyro(argv: list[str], algorithm: AlgorithmConfig) -> list[str]:
     """`--core none`, as it stands in a TOML file, becomes `--core None`; likewise all settings whose default may be None."""
-    records = [Config(), *(kind() for kind in HYPERPARAMETERS.values())]
+    records = [Config(), *(kind() for kind in (*HYPERPARAMETERS.values(), type(algorithm)))]
     optional = {f"--{name}" for record in records for name in record.__struct_fields__ if getattr(record, name) is None}
     return [
         "None" if word == "none" and before.replace("-", "_").replace("__", "--", 1) in optional else word

@@ -13,7 +13,7 @@ import msgspec
 import tomli_w
 from msgspec import Meta
 
-from learner.config.hyperparameters import Hyperparameters, PPOConfig
+from learner.config.hyperparameters import AlgorithmConfig, PPOConfig
 from learner.config.on_resume import Fixed, Free
 from learner.config.rollout_config import Count, Natural, RolloutConfig, Seconds
 from learner.config.run_rules import CheckpointPolicy, EvaluationSettings, StopRule
@@ -28,8 +28,8 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     # ------------------------------------------------------------------------------------------------------------ basics
 
     algo: Fixed[str] = "ppo"
-    """Learning algorithm. `--algo NAME --help` shows its settings."""
-    algorithm: Fixed[Hyperparameters] = PPOConfig()
+    """Learning algorithm: one of ours, or one of your own as my_module:MyClass. `--algo NAME --help` shows its settings."""
+    algorithm: Fixed[AlgorithmConfig] = PPOConfig()
     """Settings of the algorithm."""
     steps: Free[Count] = 100_000
     """Env steps to train for, summed over all env copies. Training ends before an update that would exceed them."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import itertools
 import os
 import shutil
 from collections.abc import Sequence
@@ -42,7 +43,7 @@ GROUPS = {
 }  # fmt: skip
 """The settings of each group, by its title. Before them come `BASIC` and the settings of the algorithm."""
 METAVARS = {
-    "algo": f"{{{','.join(HYPERPARAMETERS)}}}",
+    "algo": f"{{{','.join(HYPERPARAMETERS)}}}|MODULE:CLASS",
     "env_kwargs": "NAME VALUE ...",
     "net": "INT ...",
     "config": "PATH",
@@ -68,7 +69,7 @@ def show_help(flags: Any, command: str) -> NoReturn:
 def _grouped(flags: Any, description: str) -> msgspec.Struct:
     """The same settings with the same values, nested in groups."""
     algorithm = flags.algorithm
-    groups = {flags.algo: _fields(algorithm, list(field_texts(type(algorithm))))}
+    groups = {flags.algo.rpartition(":")[2]: _fields(algorithm, list(field_texts(type(algorithm))))}
     groups |= {title: _fields(flags, names) for title, names in GROUPS.items()}
     nested: list[tuple[str, Any, msgspec.Struct]] = []
     for title, fields in groups.items():
@@ -80,18 +81,29 @@ def _grouped(flags: Any, description: str) -> msgspec.Struct:
 
 
 def field_texts(record: type) -> dict[str, str]:
-    """The text under each field of a record in the source code. Inherited fields come first."""
+    """The text under each field of a record in the source code, empty if it has none. Inherited fields come first."""
     texts: dict[str, str] = {}
     for base in reversed(record.__mro__):
         if base is msgspec.Struct or not issubclass(base, msgspec.Struct):
             continue
-        (definition,) = ast.parse(inspect.getsource(base)).body
-        assert isinstance(definition, ast.ClassDef)
-        for statement, following in zip(definition.body, definition.body[1:], strict=False):
+        texts |= {name: "" for name in base.__struct_fields__ if name not in texts}
+        body = _class_body(base)
+        for statement, following in itertools.pairwise(body):
             match statement, following:
                 case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
                     texts[name] = " ".join(text.split())
     return texts
+
+
+def _class_body(record: type) -> list[ast.stmt]:
+    """The statements of a class; none if its source code cannot be read, as that of a class typed into a Python prompt."""
+    try:
+        source = inspect.getsource(record)
+        # The source of a class in a class is indented.
+        tree = ast.parse(f"if True:\n{source}" if source[:1].isspace() else source)
+    except (OSError, TypeError, SyntaxError):
+        return []
+    return next((node.body for node in ast.walk(tree) if isinstance(node, ast.ClassDef)), [])
 
 
 def _fields(record: msgspec.Struct, names: Sequence[str]) -> list[tuple[str, Any, Any]]:

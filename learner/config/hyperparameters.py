@@ -1,6 +1,7 @@
 """The settings (hyperparameters) of each algorithm. The texts under the fields are the help of the command line.
 
-Plain data, apart from the algorithms, so that reading a command line needs no torch.
+Plain data, apart from the algorithms, so that reading a command line needs no torch. An algorithm of the user's own has its
+record as its attribute `Config` (learner/config/algorithm_names.py).
 """
 
 from __future__ import annotations
@@ -19,8 +20,12 @@ Schedule = Literal["constant", "linear"]
 Optimizer = Literal["rmsprop", "adam"]
 
 
-class Hyperparameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings that every algorithm has."""
+class AlgorithmConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings that every algorithm has. The record of each algorithm derives from this one.
+
+    Every field has a default. Its type says which values are allowed, and what becomes of another value when a run is
+    resumed: `Free[...]`, `Adaptable[...]` or `Fixed[...]` (learner/config/on_resume.py).
+    """
 
     rollout_steps: Free[Count] = 128
     """T, the steps of each env copy in a rollout."""
@@ -40,7 +45,7 @@ class Hyperparameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     """Discount factor."""
 
 
-class ActorCriticHyperparameters(Hyperparameters, frozen=True):
+class PolicyGradientConfig(AlgorithmConfig, frozen=True):
     """Settings of every algorithm with an actor and a critic."""
 
     shared_net: Fixed[bool] = False
@@ -61,7 +66,7 @@ class ActorCriticHyperparameters(Hyperparameters, frozen=True):
     """Divide rewards by the running standard deviation of the discounted return."""
 
 
-class RecurrentHyperparameters(ActorCriticHyperparameters, frozen=True):
+class RecurrentConfig(PolicyGradientConfig, frozen=True):
     """Settings of every algorithm that can train a recurrent policy."""
 
     core: Fixed[Literal["lstm", "gru"] | None] = None
@@ -72,8 +77,8 @@ class RecurrentHyperparameters(ActorCriticHyperparameters, frozen=True):
     """Number of units of the recurrent layer."""
 
 
-class PPOConfig(RecurrentHyperparameters, frozen=True):
-    """Proximal policy optimization (Schulman et al. 2017)."""
+class ActorCriticConfig(RecurrentConfig, frozen=True):
+    """Settings of an actor-critic with generalized advantage estimation and several epochs of minibatches."""
 
     batch_size: Free[Count] = 64
     """Largest number of rows (steps of one env copy) in a minibatch."""
@@ -81,19 +86,24 @@ class PPOConfig(RecurrentHyperparameters, frozen=True):
     """Number of epochs: how often an update uses each row."""
     gae_lambda: Free[Fraction] = 0.95
     """λ of generalized advantage estimation. 1: Monte Carlo return. 0: one-step TD error."""
+    normalize_advantage: Free[bool] = True
+    """Normalize the advantages of each minibatch to mean 0 and standard deviation 1."""
+
+
+class PPOConfig(ActorCriticConfig, frozen=True):
+    """Proximal policy optimization (Schulman et al. 2017)."""
+
     clip_range: Free[Positive] = 0.2
     """ε of the clipped objective: the ratio of new to old action probability is clipped to 1 ± ε."""
     clip_range_schedule: Free[Schedule] = "constant"
     """linear: clip_range falls to zero over the run."""
     clip_range_vf: Free[Positive | None] = None
     """Clip the change of a value in an update to this, in units of (normalized) reward. none: no clipping."""
-    normalize_advantage: Free[bool] = True
-    """Normalize the advantages of each minibatch to mean 0 and standard deviation 1."""
     target_kl: Free[Positive | None] = None
     """End an update when the KL divergence from the old policy exceeds 1.5 times this. none: never."""
 
 
-class A2CConfig(RecurrentHyperparameters, frozen=True):
+class A2CConfig(RecurrentConfig, frozen=True):
     """Advantage actor-critic: one gradient step on each batch (Mnih et al. 2016)."""
 
     rollout_steps: Free[Count] = 8
@@ -108,7 +118,7 @@ class A2CConfig(RecurrentHyperparameters, frozen=True):
     """Normalize the advantages of each batch to mean 0 and standard deviation 1."""
 
 
-class ImpalaConfig(RecurrentHyperparameters, frozen=True):
+class ImpalaConfig(RecurrentConfig, frozen=True):
     """Actor-critic with V-trace, which corrects for rollouts of older weights, max_lag above 0 (Espeholt et al. 2018)."""
 
     rollout_steps: Free[Count] = 32
@@ -131,7 +141,7 @@ class ImpalaConfig(RecurrentHyperparameters, frozen=True):
     """c̄ of V-trace: importance weights of traces are clipped to this. It decides how far back a TD error has effect."""
 
 
-class REINFORCEConfig(ActorCriticHyperparameters, frozen=True):
+class REINFORCEConfig(PolicyGradientConfig, frozen=True):
     """Monte Carlo policy gradient on whole episodes (Williams 1992)."""
 
     rollout_steps: Fixed[Count] = 1001
@@ -150,7 +160,7 @@ class REINFORCEConfig(ActorCriticHyperparameters, frozen=True):
     """Normalize the returns of each batch (less the baseline) to mean 0 and standard deviation 1."""
 
 
-class DQNConfig(Hyperparameters, frozen=True):
+class DQNConfig(AlgorithmConfig, frozen=True):
     """Deep Q-learning (Mnih et al. 2015), with the usual extensions."""
 
     rollout_steps: Free[Count] = 32
@@ -213,7 +223,7 @@ class DQNConfig(Hyperparameters, frozen=True):
     """Clip each entry of the gradient to ± this, before its norm is clipped. none: no clipping."""
 
 
-HYPERPARAMETERS: dict[str, type[Hyperparameters]] = {
+HYPERPARAMETERS: dict[str, type[AlgorithmConfig]] = {
     "ppo": PPOConfig,
     "a2c": A2CConfig,
     "dqn": DQNConfig,

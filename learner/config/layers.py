@@ -14,6 +14,7 @@ from typing import Any
 
 import msgspec
 
+from learner.config.algorithm_names import is_own, name_of, settings_record, with_algorithm
 from learner.config.config import Config
 from learner.config.did_you_mean import did_you_mean
 from learner.config.hyperparameters import HYPERPARAMETERS, algorithms_with
@@ -32,8 +33,10 @@ def resolve(
 
     `file`: a TOML file of settings. `resume`: a run folder; its config.toml takes the place of file and preset.
     `preset`: "auto" (that of the environment, if there is one), "none", the environment whose preset to take, or a whole run
-    by name.
+    by name. `algo` may be a class (`algorithm_names.name_of`).
     """
+    if isinstance(keywords.get("algo"), type):
+        keywords["algo"] = name_of(keywords["algo"])
     below = lower_layers(env, algo=keywords.get("algo"), file=file, resume=resume, preset=preset)
     return validate(override(below, keywords, "keyword argument"))
 
@@ -46,10 +49,14 @@ def config_from_toml(text: str, where: str = "config.toml") -> Config:
     return validate(_override_from_toml(Config(), _parse_toml(text, where), where), where)
 
 
-def config_of_run(run: Path) -> Config:
-    """The settings of a run folder, from its config.toml. Raises `UsageError`."""
+def config_of_run(run: Path, algo: str | None = None) -> Config:
+    """The settings of a run folder, from its config.toml. Raises `UsageError`.
+
+    `algo`: the name that its algorithm has now, if it may be another one (`algorithm_names.moved`).
+    """
     where = run / "config.toml"
-    return validate(_override_from_toml(Config(), _read_toml(where, of_run=True), str(where)), str(where))
+    table = with_algorithm(_read_toml(where, of_run=True), algo)
+    return validate(_override_from_toml(Config(), table, str(where)), str(where))
 
 
 def lower_layers(
@@ -70,6 +77,7 @@ def lower_layers(
         check_format(resume)
     where = str(file)
     table = {} if file is None else _read_toml(file, of_run=resume is not None)
+    table = table if resume is None else with_algorithm(table, algo)
     if resume is not None and env not in ("", table.get("env")):
         raise UsageError(f"run {resume} is of {table.get('env')}, not of {env}; resume it without naming an environment")
     named = named_presets()
@@ -115,10 +123,10 @@ def override(config: Config, values: Mapping[str, Any], where: str) -> Config:
 
 
 def _defaults_of(algo: str, where: str = "") -> Config:
-    if algo not in HYPERPARAMETERS:
-        names = ", ".join(HYPERPARAMETERS)
-        raise UsageError(f"{where}algo {algo}: expected one of {names}{did_you_mean(algo, HYPERPARAMETERS)}")
-    return Config(algo=algo, algorithm=HYPERPARAMETERS[algo]())
+    try:
+        return Config(algo=algo, algorithm=settings_record(algo)())
+    except UsageError as error:
+        raise UsageError(f"{where}{error}", error.detail) from error
 
 
 def _coerce(record: msgspec.Struct, name: str, value: Any) -> Any:
@@ -155,12 +163,17 @@ def _parse_toml(text: str, where: str) -> dict[str, Any]:
 def _override_from_toml(config: Config, table: dict[str, Any], where: str) -> Config:
     """Tables of other algorithms are ignored, so that one file can hold the settings of several."""
     algo = str(table.get("algo", config.algo))
-    of_run = {name: value for name, value in table.items() if name not in HYPERPARAMETERS}
+    of_run = {name: value for name, value in table.items() if name not in HYPERPARAMETERS and not is_own(name)}
     of_algorithm = table.get(algo, {})
     if not isinstance(of_algorithm, dict):
-        raise UsageError(f"{where}: {algo}: expected a table, [{algo}], got {of_algorithm}")
+        raise UsageError(f"{where}: {algo}: expected a table, {_header(algo)}, got {of_algorithm}")
     if misplaced := of_run.keys() & set(msgspec.structs.asdict(config.algorithm)):
-        raise UsageError(f"{where}: {min(misplaced)} is a setting of the algorithm; put it in the table [{algo}]")
+        raise UsageError(f"{where}: {min(misplaced)} is a setting of the algorithm; put it in the table {_header(algo)}")
     if misplaced := of_algorithm.keys() & set(msgspec.structs.asdict(config)):
-        raise UsageError(f"{where}: {min(misplaced)} is a setting of the run; put it above the table [{algo}]")
+        raise UsageError(f"{where}: {min(misplaced)} is a setting of the run; put it above the table {_header(algo)}")
     return override(config, of_run | of_algorithm, where)
+
+
+def _header(algo: str) -> str:
+    """The header of an algorithm's table in TOML."""
+    return f'["{algo}"]' if is_own(algo) else f"[{algo}]"

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from enum import Enum
-from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
+from types import NoneType
+from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -38,18 +39,22 @@ class Change(NamedTuple):
     given: Any
 
 
-def declared(record: type[msgspec.Struct]) -> dict[str, OnResume]:
+def declared(record: type[msgspec.Struct], *, by_type: bool = False) -> dict[str, OnResume]:
     """How a resumed run takes each setting of a record, in the order of its fields.
 
-    Raises TypeError for a field that does not declare it exactly once.
+    `by_type`: a field of a user's own record need not declare it. Then a float is free, because it is usually a coefficient,
+    and anything else is fixed, because the weights or the saved state may have its form. A field that overrides one of a
+    base keeps the declaration of that one.
+
+    Raises TypeError for a field that does not declare it exactly once, and NameError for a type that cannot be found.
     """
     hints = get_type_hints(record, include_extras=True)
-    return {name: _declaration(record, name, hints[name]) for name in record.__struct_fields__}
+    return {name: _declaration(record, name, hints[name], by_type) for name in record.__struct_fields__}
 
 
 def changes(run: msgspec.Struct, given: msgspec.Struct) -> Iterator[Change]:
     """The settings that differ, in the order of the fields. Both records are of one type."""
-    for name, on_resume in declared(type(run)).items():
+    for name, on_resume in declared(type(run), by_type=True).items():
         before, now = getattr(run, name), getattr(given, name)
         if not isinstance(before, msgspec.Struct) and before != now:
             yield Change(name, on_resume, before, now)
@@ -63,11 +68,24 @@ def refusal(changed: list[Change]) -> str:
     )
 
 
-def _declaration(record: type[msgspec.Struct], name: str, hint: Any) -> OnResume:
+def _declaration(record: type[msgspec.Struct], name: str, hint: Any, by_type: bool) -> OnResume:
     found = [mark for mark in getattr(hint, "__metadata__", ()) if isinstance(mark, OnResume)]
+    if by_type and not found:
+        bases = [base for base in record.__mro__[1:] if issubclass(base, msgspec.Struct) and base is not msgspec.Struct]
+        overridden = next((base for base in bases if name in base.__struct_fields__), None)
+        if overridden is not None:
+            return declared(overridden, by_type=True)[name]
+        return OnResume.FREE if _is_float(hint) else OnResume.FIXED
     if len(found) != 1:
         raise TypeError(f"{record.__name__}.{name}: expected one of Free, Adaptable and Fixed, got {len(found)}")
     return found[0]
+
+
+def _is_float(hint: Any) -> bool:
+    """Whether a type is float, or float or None, perhaps with bounds."""
+    hint = get_args(hint)[0] if get_origin(hint) is Annotated else hint
+    options = [option for option in get_args(hint) if option is not NoneType]
+    return hint is float or (bool(options) and all(map(_is_float, options)))
 
 
 def _shown(value: Any) -> str:

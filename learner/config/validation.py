@@ -7,8 +7,9 @@ from typing import Any, get_args, get_type_hints
 
 import msgspec
 
+from learner.config.algorithm_names import settings_record
 from learner.config.config import Config
-from learner.config.hyperparameters import HYPERPARAMETERS, DQNConfig
+from learner.config.hyperparameters import DQNConfig
 from learner.config.rollout_config import RolloutConfig
 from protocol.address import advertised_address, check_address
 from protocol.errors import UsageError
@@ -20,7 +21,7 @@ def convert(settings: dict[str, Any], where: str) -> Config:
     Raises `UsageError` that names the setting, what was expected and what was given. `where` says in which file it stands.
     """
     try:
-        kind: type[msgspec.Struct] = HYPERPARAMETERS[settings["algo"]]
+        kind: type[msgspec.Struct] = settings_record(settings["algo"])
         algorithm = msgspec.convert(settings["algorithm"], kind)
         config = msgspec.convert({**settings, "algorithm": {}}, Config)
         return msgspec.structs.replace(config, algorithm=algorithm)
@@ -97,7 +98,7 @@ def _reworded(message: str, settings: dict[str, Any]) -> str:
     algorithm = settings.get("algorithm", {})
     expected, _, path = message.replace(" | null", ' or "none"').replace("`object`", "table").partition(" - at `$.")
     name = re.split(r"[.\[`]", path)[0]
-    record = HYPERPARAMETERS[settings["algo"]] if name in algorithm else Config
+    record = settings_record(settings["algo"]) if name in algorithm else Config
     given = algorithm.get(name, settings.get(name))
     if expected.startswith("Invalid enum value"):
         return f"{name}: expected one of {', '.join(_choices(get_type_hints(record)[name]))}, got {given!r}"

@@ -48,6 +48,12 @@ class RunFiles(NamedTuple):
         return Curve(self.env, self.algo, self.seed, *np.asarray(points, np.float64).T) if points else None
 
 
+def algorithm_label(algo: str) -> str:
+    """The name of an algorithm in a legend: PPO, or the class of one of the user's own."""
+    _, own, name = algo.rpartition(":")
+    return name if own else algo.upper()
+
+
 def read_run_files(run: Path, purpose: Literal["plot", "report on"]) -> RunFiles:
     """Read a run folder. Raises `UsageError`, with a one-line message that names `purpose`, if it cannot be read."""
     check_format(run)

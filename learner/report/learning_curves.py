@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from learner.report.curve import Curve, common_grid, read_run_files
+from learner.report.curve import Curve, algorithm_label, common_grid, read_run_files
 from learner.run_folder.atomic_write import write_atomically
 from learner.run_folder.episode_window import WINDOW_EPISODES
 from protocol.errors import RunError, UsageError
@@ -70,7 +70,7 @@ def plot(runs: Sequence[Path], out: Path) -> Path:
 
 
 def _draw(panel: Axes, group: Sequence[Curve], color: str) -> None:
-    algo = group[0].algo.upper()
+    algo = algorithm_label(group[0].algo)
     if len(group) == 1:
         (only,) = group
         panel.plot(only.env_steps, only.returns, color=color, linewidth=1.8, label=f"{algo}, seed {only.seed}")

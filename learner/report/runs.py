@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from learner.report.curve import Curve, read_run_files
+from learner.report.curve import Curve, algorithm_label, read_run_files
 from learner.run_folder.progress import ENV_STEPS_KEY, EVALUATION_KEY, RETURN_KEY
 from learner.run_folder.results import Evaluation
 from learner.run_folder.run_folder import RunFolder
@@ -148,13 +148,13 @@ def differing_settings(runs: Sequence[Run], ignore: Iterable[str] = ()) -> list[
 def _name(run: Run, firsts: Sequence[Run]) -> tuple[str, str]:
     """Name and differences of the group whose first run this is. `firsts`: the first runs of all groups of its algorithm."""
     if len(firsts) == 1:
-        return run.algo.upper(), ""
+        return algorithm_label(run.algo), ""
     differing = differing_settings(firsts, MAY_DIFFER_IN_A_GROUP)
     names = [name for name in differing if all(name in first.settings for first in firsts)]
     names.sort(key=lambda name: name not in run.algorithm_settings)  # settings of the algorithm first, because they say most
     more = [f"{len(names) - MOST_DIFFERENCES} more"] if len(names) > MOST_DIFFERENCES else []
     differences = ", ".join([*(f"{name} {run.settings[name]}" for name in names[:MOST_DIFFERENCES]), *more])
-    return f"{run.algo.upper()} {_letters(firsts.index(run))}", differences
+    return f"{algorithm_label(run.algo)} {_letters(firsts.index(run))}", differences
 
 
 def _letters(i: int) -> str:

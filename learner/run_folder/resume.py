@@ -23,7 +23,7 @@ def newest_run(config: RunSettings) -> Path | None:
 
     The name of a run folder ends with the start time, and a number if several began in that second.
     """
-    name = re.escape(f"{as_folder_name(config.env)}-{config.algo}-s{config.seed}-")
+    name = re.escape(f"{as_folder_name(config.env)}-{as_folder_name(config.algo)}-s{config.seed}-")
     pattern = re.compile(name + r"(\d{8}-\d{6})(?:-(\d{1,9}))?")
     root = Path(config.run_dir)
     named = [(found, path) for path in (root.iterdir() if root.is_dir() else ()) if (found := pattern.fullmatch(path.name))]
@@ -32,7 +32,7 @@ def newest_run(config: RunSettings) -> Path | None:
 
 
 def _can_be_resumed(path: Path, config: RunSettings) -> bool:
-    """Whether this is a folder of the same environment that can be resumed: it has a config.toml and a checkpoint."""
+    """Whether this is a run of the same environment and algorithm that can be resumed: it has a checkpoint."""
     try:
         text = (path / "config.toml").read_text("utf-8")
         check_whole(text, "it")
@@ -44,4 +44,5 @@ def _can_be_resumed(path: Path, config: RunSettings) -> bool:
     except (OSError, ValueError, RecursionError, UsageError) as error:
         log.warning("run %s is passed over: its config.toml cannot be read: %s", path, one_line(str(error)))
         return False
-    return table.get("env") == config.env and any((path / FOLDER).glob(f"*{SUFFIX}"))
+    same = (table.get("env"), table.get("algo")) == (config.env, config.algo)
+    return same and any((path / FOLDER).glob(f"*{SUFFIX}"))

@@ -124,7 +124,8 @@ class RunFolder:
         `started_s` is wall-clock time. Raises `UsageError` if no folder can be made.
         """
         stamp = time.strftime("%Y%m%d-%H%M%S", time.localtime(started_s))
-        path = first = Path(config.run_dir) / f"{as_folder_name(config.env)}-{config.algo}-s{config.seed}-{stamp}"
+        name = f"{as_folder_name(config.env)}-{as_folder_name(config.algo)}-s{config.seed}"
+        path = first = Path(config.run_dir) / f"{name}-{stamp}"
         try:
             os.fsencode(path).decode()
         except UnicodeError as error:
@@ -318,7 +319,7 @@ def _decode_description(text: bytes) -> PolicyDescription:
 
 
 def as_folder_name(env: str) -> str:
-    """The name of an environment as part of a folder's name."""
+    """The name of an environment or an algorithm as part of a folder's name."""
     return re.sub(r"[^A-Za-z0-9._]+", "-", env).strip("-.") or "env"
 
 

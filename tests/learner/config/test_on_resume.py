@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from learner.config.config import Config
-from learner.config.hyperparameters import HYPERPARAMETERS, Hyperparameters
+from learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig
 from learner.config.layers import resolve
 from learner.config.on_resume import Free, OnResume, declared
 from learner.env_spaces import EnvSpaces
@@ -185,7 +185,7 @@ def test_an_environment_with_other_spaces_is_refused() -> None:
 def table() -> list[str]:
     """The rows of the page's table."""
     rows = ["| settings of | fixed | adaptable | free |", "|---|---|---|---|"]
-    shared = declared(Hyperparameters)
+    shared = declared(AlgorithmConfig)
     own = {
         algo: {name: how for name, how in declared(record).items() if shared.get(name) is not how}
         for algo, record in HYPERPARAMETERS.items()

@@ -1,0 +1,83 @@
+"""The base of every algorithm: what the training loop of `learner.train` calls. No torch is needed for this file."""
+
+from __future__ import annotations
+
+import copy
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import numpy as np
+
+from learner.config.hyperparameters import AlgorithmConfig
+from protocol.arrays import Floats
+from protocol.rollout import Batch
+from protocol.specs import ActionSpec, Leaf, PolicySpec
+
+
+class Algorithm(ABC):
+    """The base of every algorithm: it learns from batches, and gives the weights of the policy that collects the next ones.
+
+    A subclass writes `__init__`, `update`, `weights`, `state_dict` and `load_state_dict`, and has its settings in `Config`.
+    """
+
+    Config: ClassVar[type[AlgorithmConfig]] = AlgorithmConfig
+    """The record of the settings. Its fields are flags, TOML keys and keyword arguments of a run."""
+
+    whole_episodes: ClassVar[bool] = False
+    """True if the algorithm learns only from whole episodes: a run whose rollouts are too short for one is refused."""
+
+    @staticmethod
+    def policy_spec(config: Any, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
+        """The policy to train: an actor and a critic with the layers of the settings, for any space that we know.
+
+        Raises `UsageError`, with a one-line message, if the algorithm cannot use these spaces.
+        """
+        return PolicySpec(
+            observation,
+            action,
+            net=config.net,
+            activation=config.activation,
+            normalize_observations=config.normalize_observations,
+        )
+
+    @abstractmethod
+    def __init__(self, config: Any, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
+        """Make the weights of version 0.
+
+        `config` is a record of `Config`. `total_steps`: env steps of the run, for schedules. `seed`: all random numbers must
+        derive from it. `device`: "cpu" or "cuda". Raises `UsageError` if this machine cannot do what the settings ask for.
+        """
+
+    @abstractmethod
+    def update(self, batch: Batch, pulse: Callable[[], None]) -> dict[str, float]:
+        """Learn from a batch and return metrics by name, as "train/loss".
+
+        Calls `pulse` between gradient steps, so that the learner can answer its workers meanwhile; what `pulse` raises must
+        pass. Uses only rows where `batch.valid`, and changes no array of the batch. Raises `RunError` when a loss or a
+        gradient is not finite, before it reaches the weights (`check_finite`).
+        """
+
+    @abstractmethod
+    def weights(self) -> tuple[Floats, Floats]:
+        """Copies of the acting parameters [P] and of the policy's buffers, both float32, as workers get them."""
+
+    def is_finite(self) -> bool:
+        """Whether all weights are finite, also those that do not act, and the policy's buffers. Called after each update."""
+        return all(bool(np.isfinite(array).all()) for array in self.weights())
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, Any]:
+        """A copy of everything that the next update depends on: tensors, numbers, text, and lists and dicts of these."""
+
+    @abstractmethod
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a `state_dict`: the next update is the one that would have followed it, bit for bit."""
+
+    def remember(self) -> None:
+        """Remember this state, for `roll_back`. Called before each update, so it must be quick."""
+        self._remembered = copy.deepcopy(self.state_dict())
+
+    def roll_back(self) -> None:
+        """Return to the state that was remembered last, from any state in between: an update was not made whole."""
+        self.load_state_dict(copy.deepcopy(self._remembered))

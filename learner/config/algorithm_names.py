@@ -1,0 +1,221 @@
+"""The algorithm that a run names: one of ours by its short name, or `module:Class` for one of the user's own.
+
+Rules: a module of the user's is imported when the settings of its algorithm are first needed. What a class lacks is said
+then, in one line, before a worker or a run folder is made. A class that was given in Python and that no import finds again
+(of a notebook, of a function) is found in this process only.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+import traceback
+from collections.abc import Mapping
+from functools import cache
+from types import ModuleType
+from typing import Any
+
+import msgspec
+import tomli_w
+
+from learner.config.config import Config
+from learner.config.did_you_mean import did_you_mean
+from learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig
+from learner.config.on_resume import declared
+from protocol.bounds import one_line
+from protocol.errors import UsageError, first_line
+
+ALGORITHMS = {
+    "ppo": "learner.algorithms.ppo:PPO",
+    "a2c": "learner.algorithms.a2c:A2C",
+    "dqn": "learner.algorithms.dqn:DQN",
+    "impala": "learner.algorithms.impala:Impala",
+    "reinforce": "learner.algorithms.reinforce:REINFORCE",
+}
+"""`module:Class` of each algorithm of ours, imported when it is used"""
+
+NEEDED = (
+    "__init__", "policy_spec", "update", "weights", "is_finite", "state_dict", "load_state_dict", "remember", "roll_back",
+)  # fmt: skip
+"""The methods of an algorithm, as `learner.algorithms.Algorithm` describes them"""
+
+NOT_SETTINGS = {"config", "preset", "resume", "log_json", "debug", "watch", "callbacks", "wrappers"}
+"""Flags and arguments of `millrace train` and `millrace.train` that are not settings"""
+
+_given: dict[str, type] = {}
+"""The classes that were given in Python and that no import finds again, by name. The newest of a name counts."""
+
+
+def is_own(algo: str) -> bool:
+    """Whether this names an algorithm of the user's own."""
+    return ":" in algo
+
+
+def settings_record(algo: str) -> type[AlgorithmConfig]:
+    """The record of this algorithm's settings. Raises `UsageError`, in one line, if there is no such algorithm."""
+    if algo in HYPERPARAMETERS:
+        return HYPERPARAMETERS[algo]
+    if not is_own(algo):
+        hint = did_you_mean(algo, HYPERPARAMETERS) or "; one of your own is named as module:Class"
+        raise UsageError(f"algo {algo}: expected one of {', '.join(HYPERPARAMETERS)}{hint}")
+    record: type[AlgorithmConfig] = own_class(algo).Config
+    return record
+
+
+def own_class(name: str) -> Any:
+    """The user's class that is called so. Imports its module. Raises `UsageError` if it is not there, or lacks something."""
+    return _checked(name, _given[name] if name in _given else _found(name))
+
+
+def name_of(algorithm: type) -> str:
+    """The name of a class, for `Config.algo`: under it this process finds the class again, and other processes if they can.
+
+    Raises `UsageError` if the class lacks something.
+    """
+    module, qualname = algorithm.__module__, algorithm.__qualname__
+    for short, name in ALGORITHMS.items():
+        if name == f"{module}:{qualname}":
+            return short
+    main = sys.modules["__main__"]
+    spec = getattr(main, "__spec__", None)
+    in_main = module == "__main__" and _attribute(main, qualname) is algorithm
+    name = (
+        f"{spec.name if spec is not None and in_main else module}:{qualname}"  # `python -m mine`: others import it as mine
+    )
+    _given.pop(name, None)
+    if module == "__main__" or _attribute(sys.modules.get(module), qualname) is not algorithm or not _importable(module):
+        _given[name] = algorithm
+    _checked(name, algorithm)
+    return name
+
+
+def moved(before: str, now: str) -> bool:
+    """Whether a run of the algorithm `before` may go on as one of `now`: the same class, which an import finds now."""
+    module, _, qualname = before.partition(":")
+    return (module == "__main__" or "<locals>" in qualname) and is_own(now) and _last(before) == _last(now)
+
+
+def with_algorithm(table: dict[str, Any], algo: str | None) -> dict[str, Any]:
+    """The settings of a config.toml under the name that its algorithm has now, if it is another one."""
+    before = str(table.get("algo"))
+    if not algo or algo == before or not moved(before, algo):
+        return table
+    return {algo if name == before else name: value for name, value in table.items()} | {"algo": algo}
+
+
+def _found(name: str) -> object:
+    module_name, _, qualname = name.partition(":")
+    if module_name == "__main__" or "<locals>" in qualname:
+        found = _attribute(sys.modules.get(module_name), qualname)
+        if found is None:
+            raise UsageError(
+                f"algo {name}: this class was made in a script, a notebook or a function; go on with it there: "
+                f"millrace.train(resume=…, algo={_last(name)}), or put it into a module: --algo module:{_last(name)}"
+            )
+        return found
+    if not all(part.isidentifier() for text in (module_name, qualname) for part in text.split(".")):
+        raise UsageError(f"algo {name}: expected module:Class, as in mine:ClippedPlus")
+    module = _imported(module_name, name)
+    found = _attribute(module, qualname)
+    if found is None:
+        classes = [key for key, value in vars(module).items() if isinstance(value, type)]
+        where = getattr(module, "__file__", None) or "built-in"
+        raise UsageError(f"algo {name}: module {module_name} ({where}) has no {qualname}{did_you_mean(qualname, classes)}")
+    return found
+
+
+def _imported(module_name: str, name: str) -> ModuleType:
+    try:
+        return importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        if error.name is not None and f"{module_name}.".startswith(f"{error.name}."):
+            raise UsageError(
+                f"algo {name}: no module {error.name}; expected one in the current folder, on PYTHONPATH or installed"
+            ) from error
+        raise _import_failed(name, module_name, error) from error
+    except (Exception, SystemExit) as error:
+        raise _import_failed(name, module_name, error) from error
+
+
+def _import_failed(name: str, module: str, error: BaseException) -> UsageError:
+    why = one_line(f"{type(error).__name__}: {first_line(error)}")
+    return UsageError(f"algo {name}: the import of {module} failed: {why}", "".join(traceback.format_exception(error)))
+
+
+def _attribute(module: ModuleType | None, qualname: str) -> object:
+    """What a module has under this dotted name; None if nothing."""
+    found: object = module
+    for part in qualname.split("."):
+        found = getattr(found, part, None)
+    return found
+
+
+def _importable(module: str) -> bool:
+    """Whether another process that has our search path could import this module."""
+    try:
+        return importlib.util.find_spec(module) is not None
+    except (ImportError, ValueError, AttributeError):
+        return False
+
+
+def _last(name: str) -> str:
+    return name.rpartition(":")[2].rpartition(".")[2]
+
+
+def _checked(name: str, found: object) -> Any:
+    """The class, if it has what the learner needs. Raises `UsageError` that names what is missing or wrong."""
+    if not isinstance(found, type):
+        raise UsageError(f"algo {name}: expected a class, got {type(found).__name__}")
+    if why := _what_is_wrong(found):
+        raise UsageError(f"algo {name}: {why}")
+    return found
+
+
+@cache
+def _what_is_wrong(algorithm: type) -> str:
+    """One line about what an algorithm lacks; empty if it can be used."""
+    unwritten: frozenset[str] = getattr(algorithm, "__abstractmethods__", frozenset())
+    missing = [name for name in NEEDED if name in unwritten or getattr(algorithm, name, None) in (None, object.__init__)]
+    if not hasattr(algorithm, "whole_episodes"):
+        missing.append("whole_episodes")
+    if missing:
+        return (
+            f"it lacks {', '.join(missing)}; derive it from ActorCritic or Algorithm of millrace.algorithms, and write these"
+        )
+    record = getattr(algorithm, "Config", None)
+    if not (isinstance(record, type) and issubclass(record, AlgorithmConfig)):
+        expected = "a class derived from ActorCriticConfig or AlgorithmConfig of millrace.algorithms"
+        return f"Config: expected {expected}, got {'none' if record is None else one_line(repr(record))}"
+    return _what_is_wrong_with_settings(record)
+
+
+def _what_is_wrong_with_settings(record: type[AlgorithmConfig]) -> str:
+    own = set(record.__struct_fields__) - set(AlgorithmConfig.__struct_fields__)
+    if shadows := own & ({*Config.__struct_fields__} | NOT_SETTINGS):
+        return f"its setting {min(shadows)} has the name of a setting of the run; give it another name"
+    try:
+        declared(record, by_type=True)
+        required = [field.name for field in msgspec.structs.fields(record) if field.required]
+    except (NameError, TypeError, AttributeError) as error:
+        return f"the types of its settings cannot be read: {one_line(first_line(error))}"
+    if required:
+        return f"its setting {required[0]}: expected a default value, got none"
+    for setting in record.__struct_fields__:
+        if why := _why_not_plain(record, setting):
+            return f"its setting {setting}: {why}"
+    return ""
+
+
+def _why_not_plain(record: type[AlgorithmConfig], setting: str) -> str:
+    """Why the default of a setting cannot stand in config.toml; empty if it can."""
+    default = getattr(record(), setting)
+    try:
+        plain: Mapping[str, Any] = {} if default is None else {setting: msgspec.to_builtins(default)}
+        tomli_w.dumps(plain)
+        msgspec.convert(plain, record)
+    except msgspec.ValidationError as error:
+        return f"its default does not fit its type: {one_line(str(error))}"
+    except (TypeError, ValueError):
+        return f"expected a default of numbers, text, true or false, or lists of these, got {one_line(repr(default))}"
+    return ""

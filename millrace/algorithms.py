@@ -1,0 +1,107 @@
+"""All that an algorithm of one's own needs. Importing this module imports PyTorch.
+
+There are two levels. On the first, an algorithm is a loss; everything else about an update is done for it:
+
+    from millrace.algorithms import ActorCritic, ActorCriticConfig
+
+    class Mine(ActorCritic):
+        class Config(ActorCriticConfig, frozen=True):
+            penalty: float = 0.1
+            "Weight of the squared log-ratio."
+
+        def loss(self, rows):
+            log_ratio = rows.log_prob_now - rows.log_prob
+            ...
+            return loss, {"penalty": log_ratio.square().mean()}
+
+On the second, a class derives from `Algorithm` and makes the whole update. `millrace.testing.check_algorithm` tells what is
+wrong with a class of either level. A run takes it as `millrace train CartPole-v1 --algo my_module:Mine --penalty 0.2`, or as
+`millrace.train("CartPole-v1", algo=Mine, penalty=0.2)`.
+
+The algorithm itself:
+
+- `Algorithm`, the base of all; `ActorCritic`, the base of those with an actor and a critic. `PPO`, `A2C`, `Impala`,
+  `REINFORCE` and `DQN` stand on the same two.
+- `AlgorithmConfig` and `ActorCriticConfig`, the bases of `Config`; `PPOConfig` and so on. Every setting has a default value
+  and a type, perhaps with bounds: `Annotated[float, msgspec.Meta(gt=0)]`. The text under it is its help.
+- `Free`, `Adaptable` and `Fixed` say what becomes of another value in a resumed run: `n_steps: Free[int] = 3`. Without one,
+  a float is free and anything else is fixed.
+
+What it learns from:
+
+- `Batch`: rollouts side by side, numpy arrays [T, ΣN, …]. `LossInput`: the rows of a minibatch that `ActorCritic.loss` gets.
+- `Observations` and `Estimates`: argument and result of `ActorCritic.estimate`.
+- `PolicySpec`, `ActionSpec` and `Leaf`: the policy and the spaces, as plain data.
+
+Tools:
+
+- `gae`, `vtrace` and `EpisodeEnds`: advantages and targets of arrays [T, N].
+- `ActorCriticNetwork` and `QNetwork`: the networks that workers act with, and `log_prob_and_entropy` of their outputs.
+- `features` and `normalize`: observations as these networks take them.
+- `check_finite` and `scheduled`: the check before a gradient step, and settings that fall over the run.
+"""
+
+from __future__ import annotations
+
+from learner.algorithms.a2c import A2C
+from learner.algorithms.actor_critic import ActorCritic, Estimates
+from learner.algorithms.algorithm import Algorithm
+from learner.algorithms.dqn import DQN
+from learner.algorithms.impala import Impala
+from learner.algorithms.minibatches import LossInput, Observations
+from learner.algorithms.ppo import PPO
+from learner.algorithms.reinforce import REINFORCE
+from learner.algorithms.returns import EpisodeEnds, gae, vtrace
+from learner.algorithms.updates import check_finite, scheduled
+from learner.config.hyperparameters import (
+    A2CConfig,
+    ActorCriticConfig,
+    AlgorithmConfig,
+    DQNConfig,
+    ImpalaConfig,
+    PPOConfig,
+    REINFORCEConfig,
+)
+from learner.config.on_resume import Adaptable, Fixed, Free
+from protocol.policy.features import features, normalize
+from protocol.policy.networks import ActorCriticNetwork, QNetwork
+from protocol.policy.torch_distributions import log_prob_and_entropy
+from protocol.rollout import Batch
+from protocol.specs import ActionSpec, Leaf, PolicySpec
+
+__all__ = [
+    "A2C",
+    "DQN",
+    "PPO",
+    "REINFORCE",
+    "A2CConfig",
+    "ActionSpec",
+    "ActorCritic",
+    "ActorCriticConfig",
+    "ActorCriticNetwork",
+    "Adaptable",
+    "Algorithm",
+    "AlgorithmConfig",
+    "Batch",
+    "DQNConfig",
+    "EpisodeEnds",
+    "Estimates",
+    "Fixed",
+    "Free",
+    "Impala",
+    "ImpalaConfig",
+    "Leaf",
+    "LossInput",
+    "Observations",
+    "PPOConfig",
+    "PolicySpec",
+    "QNetwork",
+    "REINFORCEConfig",
+    "check_finite",
+    "features",
+    "gae",
+    "log_prob_and_entropy",
+    "normalize",
+    "scheduled",
+    "vtrace",
+]
