@@ -56,9 +56,11 @@ __all__ = [
     "UserFacingError",
     "WorkerLost",
     "__version__",
+    "algorithms",
     "make_vec",
+    "testing",
     "train",
-]  # fmt: skip
+]
 
 _IMPORTED_WHEN_USED = {
     "CNN": "millrace.policies",
@@ -70,6 +72,9 @@ _IMPORTED_WHEN_USED = {
     "RolloutService": "millrace.rollout_service",
 }
 """Public names, and the module of each. They are imported when they are used, because that takes longer than this file."""
+
+_MODULES = ("algorithms", "testing")
+"""Public modules, which are imported when they are used, too"""
 
 
 def train(
@@ -90,7 +95,8 @@ def train(
             and seed if there is one, else a new run.
         preset: The name of a preset (`millrace presets` lists them); "auto" takes that of `env`; "none" takes none.
         watch: Called with a `Progress` after each update.
-        **keywords: The flags of `millrace train`, by the same names: `learning_rate=1e-3`.
+        **keywords: The flags of `millrace train`, by the same names: `learning_rate=1e-3`. `algo` may be a class of your own
+            (`millrace.algorithms`). A class that was made in a script or a notebook is given again on resume.
 
     Returns the run folder. Raises `UserFacingError` with a message of one line. In a script, guard the call with
     `if __name__ == "__main__":`.
@@ -190,6 +196,8 @@ def __getattr__(name: str) -> Any:
     """Import a public name, or look up `__version__`, when it is first used."""
     if (module := _IMPORTED_WHEN_USED.get(name)) is not None:
         return getattr(import_module(module), name)
+    if name in _MODULES:
+        return import_module(f"millrace.{name}")
     if name != "__version__":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import metadata

@@ -1,0 +1,1 @@
+"""The conformance test of an algorithm: `millrace.testing.check_algorithm`."""

@@ -1,0 +1,439 @@
+"""What is wrong with an algorithm: each rule of `learner.algorithms.Algorithm` is one function here, which yields mistakes.
+
+A mistake is one line. Every rule gets objects of its own, made with the same seed, and copies of the same batches. So one
+broken rule does not hide another. The rules run in this process, on toy batches, with one PyTorch thread.
+"""
+
+from __future__ import annotations
+
+import copy
+import io
+import math
+import random
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+import torch
+
+from learner.algorithms import Algorithm, algorithm_class
+from learner.config.algorithm_names import name_of, settings_record
+from learner.config.hyperparameters import AlgorithmConfig
+from learner.conformance.same_bits import first_difference
+from learner.conformance.toy_batches import (
+    ACTIONS,
+    CHOICES,
+    OBSERVATION,
+    Acting,
+    identity_batch,
+    noise_batch,
+    with_other_invalid_rows,
+    with_rewards,
+)
+from protocol.bounds import one_line
+from protocol.errors import UsageError, first_line
+from protocol.policy.encoder import describe_encoder
+from protocol.policy.layout import acting_size, buffer_size
+from protocol.rollout import Batch
+from protocol.specs import PolicySpec
+
+MOST_STEPS = 64  # of a rollout here
+MOST_WARM_UP = 24  # updates before the first gradient step: an algorithm may fill a replay buffer first
+MORE_UPDATES = 3  # after the first gradient step
+TOTAL_STEPS = 20_000  # env steps of the toy run, for schedules
+LEARNING_STEPS = 40_000  # env steps in which the identity environment must be learned
+LEARNED = 0.5  # of the way from random actions to perfect ones
+MEASURED_BATCHES = 5
+SEED = 3
+
+Pulse = Callable[[], None]
+
+
+class Stopped(Exception):
+    """What a pulse raises here."""
+
+
+class Subject(NamedTuple):
+    """The algorithm under test: its class, settings and policy, and recorded batches."""
+
+    algorithm: type[Algorithm]
+    config: AlgorithmConfig
+    policy: PolicySpec
+    steps: int
+    batches: tuple[Batch, ...]
+    """The last `MORE_UPDATES` of them are learned from with gradient steps."""
+
+    def new(self, total_steps: int = TOTAL_STEPS) -> Algorithm:
+        """A new object. The global random numbers begin at the same point for each."""
+        _seed_everything(0)
+        return self.algorithm(self.config, self.policy, total_steps=total_steps, seed=SEED)
+
+    def copies(self) -> list[Batch]:
+        """Copies of the batches."""
+        return copy.deepcopy(list(self.batches))
+
+
+def mistakes(algorithm: type, settings: dict[str, Any], *, learns: bool) -> Iterator[str]:
+    """All mistakes that are found, one line each. `learns`: also try whether it learns the identity environment."""
+    with _undisturbed():
+        try:
+            subject = _subject(algorithm, settings)
+            found = [*weights_have_the_policy_s_shape(subject)]
+        except Exception as error:
+            yield _raised("it cannot be made", error)
+            return
+        if found:  # then no policy can act
+            yield from found
+            return
+        try:
+            subject = _with_batches(subject, found)
+        except Exception as error:
+            yield from found
+            yield _raised("update", error)
+            return
+        yield from found
+        for rule in (*RULES, *([learns_the_identity_environment] if learns else [])):
+            try:
+                yield from rule(subject)
+            except Exception as error:
+                yield _raised(rule.__name__.replace("_", " "), error)
+
+
+def _subject(algorithm: type, settings: dict[str, Any]) -> Subject:
+    name = name_of(algorithm)
+    record = settings_record(name)
+    try:
+        config = msgspec.convert(msgspec.to_builtins(record()) | settings, record)
+    except msgspec.ValidationError as error:
+        raise UsageError(f"settings: {one_line(str(error))}") from error
+    made = algorithm_class(name)
+    for action in ACTIONS:
+        try:
+            policy = made.policy_spec(config, OBSERVATION, action)
+            break
+        except UsageError as error:
+            refused = error
+    else:
+        raise refused
+    if not isinstance(policy, PolicySpec):
+        raise UsageError(f"policy_spec: expected a PolicySpec, got {type(policy).__name__}")
+    if config.encoder is not None:
+        encoder = describe_encoder(config.encoder, policy.observation, policy.action)
+        policy = msgspec.structs.replace(policy, encoder=encoder)
+    return Subject(made, config, policy, min(config.rollout_steps, MOST_STEPS), ())
+
+
+def _with_batches(subject: Subject, found: list[str]) -> Subject:
+    """The subject with batches that its own policy collected. Adds mistakes about gradient steps to `found`."""
+    algorithm, generator = subject.new(), np.random.default_rng(1)
+    batches: list[Batch] = []
+    pulses = [0]
+
+    def pulse() -> None:
+        pulses[0] += 1
+
+    before = _weights(algorithm)
+    goes_on = MOST_WARM_UP
+    while goes_on:
+        acting = Acting(subject.policy, *_weights(algorithm))
+        batch = noise_batch(acting, subject.steps, generator, fresh=not batches)
+        batches.append(copy.deepcopy(batch))
+        algorithm.update(batch, pulse)
+        goes_on = min(goes_on - 1, MORE_UPDATES) if pulses[0] else goes_on - 1
+    if not pulses[0]:
+        found.append(f"update: expected calls of pulse between gradient steps, got none in {len(batches)} updates")
+    if first_difference(before, _weights(algorithm)) is None:
+        found.append(f"weights: expected others after {len(batches)} updates, got the same")
+    return subject._replace(batches=tuple(batches))
+
+
+# ------------------------------------------------------------------------------------------------------------- the rules
+
+
+def weights_have_the_policy_s_shape(subject: Subject) -> Iterator[str]:
+    """Float32, as many as the policy has, finite, and copies."""
+    algorithm = subject.new()
+    weights = algorithm.weights()
+    if not isinstance(weights, tuple) or len(weights) != 2:
+        yield f"weights: expected a pair of arrays, got {type(weights).__name__}"
+        return
+    sizes = {"parameters": acting_size(subject.policy), "buffers": buffer_size(subject.policy)}
+    for (name, size), array in zip(sizes.items(), weights, strict=True):
+        if not isinstance(array, np.ndarray):
+            yield f"weights: {name}: expected a numpy array, got {type(array).__name__}"
+        elif array.dtype != np.float32 or array.shape != (size,):
+            yield f"weights: {name}: expected float32[{size}], got {array.dtype}{list(array.shape)}"
+        elif not np.isfinite(array).all():
+            yield f"weights: {name}: expected finite numbers, got {array[~np.isfinite(array)][0]}"
+
+
+def weights_are_copies(subject: Subject) -> Iterator[str]:
+    """A worker may still be sent weights while the next update changes those of the learner."""
+    algorithm = subject.new()
+    given, kept = algorithm.weights(), _weights(algorithm)
+    for batch in subject.copies():
+        algorithm.update(batch, _no_pulse)
+    if first_difference(given, kept) is not None:
+        yield "weights: expected a copy, got an array that the next update changes"
+
+
+def metrics_are_finite_numbers(subject: Subject) -> Iterator[str]:
+    """Names and floats, as they are logged."""
+    algorithm = subject.new()
+    for batch in subject.copies():
+        metrics = algorithm.update(batch, _no_pulse)
+        if not isinstance(metrics, dict):
+            yield f"update: expected a dict of metrics, got {type(metrics).__name__}"
+            return
+        for name, number in metrics.items():
+            if not isinstance(name, str) or isinstance(number, bool) or not isinstance(number, int | float):
+                yield f"update: metric {name}: expected a name and a float, got {type(number).__name__}"
+                return
+            if not math.isfinite(number):
+                yield f"update: metric {name}: expected a finite number, got {number}"
+                return
+
+
+def an_update_changes_no_batch(subject: Subject) -> Iterator[str]:
+    """The recorder counts the batch after the update."""
+    algorithm, changed = subject.new(), set[str]()
+    for batch, kept in zip(subject.copies(), subject.batches, strict=True):
+        algorithm.update(batch, _no_pulse)
+        for name in batch.__struct_fields__:
+            if first_difference(getattr(batch, name), getattr(kept, name)) is not None:
+                changed.add(name)
+    if changed:
+        yield f"update: expected that the batch stays as it is, got another {', '.join(sorted(changed))}"
+
+
+def rows_that_are_not_valid_change_nothing(subject: Subject) -> Iterator[str]:
+    """They are the steps in which a finished copy is reset."""
+    one, other, generator = subject.new(), subject.new(), np.random.default_rng(2)
+    for batch in subject.copies():
+        pairs = (
+            one.update(copy.deepcopy(batch), _no_pulse),
+            other.update(with_other_invalid_rows(batch, generator), _no_pulse),
+        )
+        if (where := first_difference(*pairs)) is not None:
+            yield f"update: rows that are not valid change the metrics{where}; use only those where batch.valid"
+            return
+    if first_difference(_weights(one), _weights(other)) is not None:
+        yield "update: rows that are not valid change the weights; use only those where batch.valid"
+
+
+def the_same_seed_and_batches_give_the_same_bits(subject: Subject) -> Iterator[str]:
+    """Whatever the global random numbers of torch, numpy and Python are."""
+    results = [_learned(subject, global_seed) for global_seed in (0, 0, 1)]
+    if first_difference(results[0], results[1]) is not None:
+        yield "update: the same seed and batches give other weights or metrics each time; all random numbers must be seeded"
+    elif first_difference(results[0], results[2]) is not None:
+        yield "update: it depends on global random numbers (torch, numpy or random); use a generator with the seed"
+
+
+def a_saved_state_goes_on_as_if_nothing_had_happened(subject: Subject) -> Iterator[str]:
+    """Save, load into a new object, and learn on: bit for bit as the one that was saved."""
+    *first, second, third = subject.copies()
+    saved, restored = subject.new(), subject.new()
+    for batch in first:
+        saved.update(batch, _no_pulse)
+    state = saved.state_dict()
+    kept, file = copy.deepcopy(state), io.BytesIO()
+    if where := _not_plain(state):
+        yield f"state_dict{where}: expected tensors, numbers, text, and lists and dicts of these; a checkpoint takes no more"
+        return
+    torch.save(state, file)
+    file.seek(0)
+    loaded = torch.load(file, weights_only=True)
+    restored.load_state_dict(loaded)
+    if (where := first_difference(_weights(saved), _weights(restored))) is not None:
+        yield "load_state_dict: expected the weights that were saved, got others"
+        return
+    if (where := first_difference(kept, restored.state_dict())) is not None:
+        yield f"load_state_dict: expected the state that was saved, got another state_dict(){where}"
+    for batch in (second, third):
+        pairs = (each.update(copy.deepcopy(batch), _no_pulse) for each in (saved, restored))
+        if (where := first_difference(*pairs)) is not None or first_difference(
+            _weights(saved), _weights(restored)
+        ) is not None:
+            what = f"metrics{where}" if where else "weights"
+            yield (
+                f"state_dict: after a load the next update gives other {what}; it lacks something that an update changes "
+                "(optimizer, random generator, schedule, running statistics)"
+            )
+            break
+    if (where := first_difference(state, kept)) is not None:
+        yield f"state_dict{where}: expected a copy, got something that the next update changes"
+    file.seek(0)
+    if (where := first_difference(loaded, torch.load(file, weights_only=True))) is not None:
+        yield f"load_state_dict: expected that it copies the state, got one whose next update changes state{where}"
+
+
+def an_update_can_be_taken_back(subject: Subject) -> Iterator[str]:
+    """`roll_back` after a whole update and after one that stopped in the middle, and then the update that follows."""
+    *first, second, third = subject.copies()
+    disturbed, undisturbed = subject.new(), subject.new()
+    for batch in first:
+        disturbed.update(copy.deepcopy(batch), _no_pulse)
+        undisturbed.update(batch, _no_pulse)
+    before, weights = copy.deepcopy(disturbed.state_dict()), _weights(disturbed)
+    disturbed.remember()
+    for stop in (False, True, False):
+        pulse = _stopping() if stop else _no_pulse
+        try:
+            disturbed.update(copy.deepcopy(third), pulse)
+        except Stopped:
+            pass
+        else:
+            if stop:
+                yield "update: expected that it lets pass what pulse raises, got none"
+        disturbed.roll_back()
+        when = "an update that stopped in the middle" if stop else "an update"
+        if (where := first_difference(before, disturbed.state_dict())) is not None:
+            yield f"roll_back: after {when}, expected the state that was remembered, got another state_dict(){where}"
+            return
+        if first_difference(weights, _weights(disturbed)) is not None:
+            yield f"roll_back: after {when}, expected the weights that were remembered, got others"
+            return
+    pairs = (each.update(copy.deepcopy(second), _no_pulse) for each in (disturbed, undisturbed))
+    where = first_difference(*pairs)
+    if where is not None or first_difference(_weights(disturbed), _weights(undisturbed)) is not None:
+        yield "roll_back: the next update differs from one before which nothing was taken back"
+
+
+def numbers_that_are_not_finite_are_raised(subject: Subject) -> Iterator[str]:
+    """Rewards of NaN make the loss NaN, whatever it is. Rewards that are too large may do so."""
+    for reward in (math.nan, 3e38):
+        algorithm = subject.new()
+        *first, last = subject.copies()
+        for batch in first:
+            algorithm.update(batch, _no_pulse)
+        try:
+            with np.errstate(all="ignore"):
+                metrics = algorithm.update(with_rewards(last, reward), _no_pulse)
+        except Exception:
+            continue
+        if math.isnan(reward):
+            yield "update: rewards of NaN: expected an error (check_finite), got metrics, as if nothing had happened"
+            return
+        bad = next((name for name, number in metrics.items() if not math.isfinite(number)), None)
+        if bad is not None:
+            yield f"update: rewards of {reward:g}: expected an error or finite numbers, got {bad} {metrics[bad]}"
+        elif not all(np.isfinite(array).all() for array in _weights(algorithm)):
+            yield f"update: rewards of {reward:g}: expected an error or finite numbers, got weights that are not finite"
+
+
+def learns_the_identity_environment(subject: Subject) -> Iterator[str]:
+    """The right action is what is observed. Random actions get a quarter of the reward of right ones."""
+    algorithm, generator = subject.new(LEARNING_STEPS), np.random.default_rng(4)
+    env_steps, rewards = 0, list[float]()
+    box = subject.policy.action.kind == "box"
+    goal = math.nan
+    while env_steps < LEARNING_STEPS:
+        acting = Acting(subject.policy, *_weights(algorithm))
+        batch, reward = identity_batch(acting, subject.steps, generator)
+        rewards.append(reward)
+        if len(rewards) == MEASURED_BATCHES:
+            first = float(np.mean(rewards)) if box else 1 / CHOICES
+            goal = first + LEARNED * ((0 if box else 1) - first)
+        if float(np.mean(rewards[-MEASURED_BATCHES:])) >= goal:
+            return
+        algorithm.update(batch, _no_pulse)
+        env_steps += batch.env_steps
+    yield (
+        f"it does not learn the identity environment: after {env_steps:,} env steps the mean reward is "
+        f"{np.mean(rewards[-MEASURED_BATCHES:]):.2f}, expected at least {goal:.2f}"
+    )
+
+
+RULES = (
+    weights_are_copies,
+    metrics_are_finite_numbers,
+    an_update_changes_no_batch,
+    rows_that_are_not_valid_change_nothing,
+    the_same_seed_and_batches_give_the_same_bits,
+    a_saved_state_goes_on_as_if_nothing_had_happened,
+    an_update_can_be_taken_back,
+    numbers_that_are_not_finite_are_raised,
+)
+
+
+# ----------------------------------------------------------------------------------------------------------------- tools
+
+
+def _no_pulse() -> None:
+    pass
+
+
+def _stopping() -> Pulse:
+    """A pulse that raises `Stopped` when it is called for the second time."""
+    calls = [0]
+
+    def pulse() -> None:
+        calls[0] += 1
+        if calls[0] == 2:
+            raise Stopped
+
+    return pulse
+
+
+def _weights(algorithm: Algorithm) -> Any:
+    """Copies of the weights."""
+    return copy.deepcopy(algorithm.weights())
+
+
+def _learned(subject: Subject, global_seed: int) -> Any:
+    """The weights and metrics after all batches."""
+    _seed_everything(global_seed)
+    algorithm = subject.algorithm(subject.config, subject.policy, total_steps=TOTAL_STEPS, seed=SEED)
+    metrics = [algorithm.update(batch, _no_pulse) for batch in subject.copies()]
+    return [_weights(algorithm), metrics]
+
+
+def _seed_everything(seed: int) -> None:
+    torch.manual_seed(seed)
+    np.random.seed(seed)
+    random.seed(seed)
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """One PyTorch thread; afterwards that number and all global random numbers are what they were."""
+    threads, of_torch, of_numpy, of_python = (
+        torch.get_num_threads(),
+        torch.get_rng_state(),
+        np.random.get_state(),
+        random.getstate(),
+    )
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        torch.set_rng_state(of_torch)
+        np.random.set_state(of_numpy)
+        random.setstate(of_python)
+
+
+def _not_plain(state: object, where: str = "") -> str:
+    """Where a state has something that a checkpoint does not take; empty if nowhere."""
+    match state:
+        case dict():
+            return next((found for key, value in state.items() if (found := _not_plain(value, f"{where}[{key!r}]"))), "")
+        case list() | tuple():
+            return next((found for i, value in enumerate(state) if (found := _not_plain(value, f"{where}[{i}]"))), "")
+        case torch.Tensor():
+            return ""
+    return "" if type(state) in (bool, int, float, str, bytes, type(None)) else where or " "
+
+
+def _raised(what: str, error: Exception) -> str:
+    """One line about an exception of the user's code, with the place where it was raised."""
+    if isinstance(error, UsageError):
+        return str(error)
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    where = f"{Path(frame.filename).name}:{frame.lineno}"
+    return f"{what}: {type(error).__name__} at {where}: {one_line(first_line(error))}"

@@ -1,0 +1,126 @@
+"""Batches for the conformance test, made in this process: noise with ends of both kinds, and the identity environment.
+
+Both keep the row format (`protocol.rollout`). Rows that are not valid hold rewards that an algorithm must not use. Pure:
+weights and a generator in, a batch out.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from protocol.arrays import Array, Bools, Floats
+from protocol.policy.distributions import distribution
+from protocol.policy.policy import make_policy
+from protocol.rollout import Batch
+from protocol.specs import ActionSpec, Leaf, PolicySpec
+
+CHOICES = 4
+OBSERVATION = (Leaf("", "box", (CHOICES,), "float32"),)
+ACTIONS = (
+    ActionSpec("discrete", (), "int64", (CHOICES,), (0,)),
+    ActionSpec("box", (2,), "float32", low=(-1.0,) * 2, high=(1.0,) * 2),
+)
+"""The action spaces that an algorithm is tried with; the first that it can use is taken"""
+LANES, COPIES = 2, 4
+GARBAGE_REWARD = 50.0  # on rows that are not valid
+
+
+class Acting(NamedTuple):
+    """A policy and its weights."""
+
+    spec: PolicySpec
+    parameters: Floats
+    buffers: Floats
+
+
+def noise_batch(acting: Acting, steps: int, generator: np.random.Generator, fresh: bool) -> Batch:
+    """Random observations and rewards; an episode ends on one of seven rows. `fresh`: the lanes begin here."""
+    columns = LANES * COPIES
+    obs = generator.normal(1, 2, (steps + 1, columns, CHOICES)).astype(np.float32)
+    ended = generator.random((steps, columns)) < 1 / 7
+    valid = np.ones((steps, columns), bool)
+    for t in range(1, steps):
+        valid[t] = ~ended[t - 1]
+        ended[t] &= valid[t]
+    terminated = ended & (generator.random((steps, columns)) < 0.5)
+    reward = generator.normal(1, 2, (steps, columns)).astype(np.float32)
+    return _batch(acting, generator, obs, _Rows(reward, terminated, ended & ~terminated, valid), fresh)
+
+
+def identity_batch(acting: Acting, steps: int, generator: np.random.Generator) -> tuple[Batch, float]:
+    """The identity environment: the right action is what is observed. Also returns the mean reward.
+
+    Each episode has one step. Discrete actions: reward 1 for the right choice. Box: minus the squared distance.
+    """
+    columns = LANES * COPIES
+    choice = generator.integers(0, CHOICES, (steps + 1, columns))
+    obs = np.eye(CHOICES, dtype=np.float32)[choice]
+    valid = np.zeros((steps, columns), bool)
+    valid[::2] = True
+    none = np.zeros((steps, columns), bool)
+    batch = _batch(acting, generator, obs, _Rows(np.zeros((steps, columns), np.float32), valid.copy(), none, valid), False)
+    if acting.spec.action.kind == "box":
+        reward = -np.square(batch.action - obs[:-1, :, :2]).sum(-1)
+    else:
+        reward = (batch.action == choice[:-1]).astype(np.float32)
+    rewarded = np.where(valid, reward, np.float32(GARBAGE_REWARD))
+    return msgspec.structs.replace(batch, reward=rewarded), float(reward[valid].mean())
+
+
+def with_other_invalid_rows(batch: Batch, generator: np.random.Generator) -> Batch:
+    """The same batch with other finite values on rows that are not valid. Observations stay: the row before uses them."""
+    other = generator.permutation(batch.action.reshape(-1, *batch.action.shape[2:])).reshape(batch.action.shape)
+    if batch.action.dtype == np.int64:
+        other = (batch.action + 1) % CHOICES
+    at = batch.valid.reshape(*batch.valid.shape, *[1] * (batch.action.ndim - 2))
+    return msgspec.structs.replace(
+        batch,
+        action=np.where(at, batch.action, other),
+        log_prob=np.where(batch.valid, batch.log_prob, np.float32(-7)),
+        reward=np.where(batch.valid, batch.reward, np.float32(-1000)),
+    )
+
+
+def with_rewards(batch: Batch, reward: float) -> Batch:
+    """The same batch with this reward on every valid row."""
+    return msgspec.structs.replace(batch, reward=np.where(batch.valid, np.float32(reward), batch.reward))
+
+
+class _Rows(NamedTuple):
+    """What a row says besides observation and action. [T, ΣN] each."""
+
+    reward: Floats
+    terminated: Bools
+    truncated: Bools
+    valid: Bools
+
+
+def _batch(acting: Acting, generator: np.random.Generator, obs: Array, rows: _Rows, fresh: bool) -> Batch:
+    """A batch in which the policy acts on these observations [T+1, ΣN, CHOICES]."""
+    steps, columns = rows.valid.shape
+    policy, over = make_policy(acting.spec), distribution(acting.spec)
+    policy.load(acting.parameters, acting.buffers)
+    first = generator.uniform(-0.5, 0.5, (columns, acting.spec.state_size)).astype(np.float32)
+    state, params = first[None].copy(), []
+    for observed, valid in zip(obs, rows.valid, strict=False):
+        params.append(policy([observed[None]], state)[0])
+        state[0, ~valid] = 0
+    stacked = np.stack(params)
+    action = over.sample(stacked, over.noise(generator, (steps, columns)))
+    return Batch(
+        obs=(obs,),
+        action=action,
+        log_prob=over.log_prob(stacked, action),
+        reward=rows.reward,
+        terminated=rows.terminated,
+        truncated=rows.truncated,
+        valid=rows.valid,
+        state=first,
+        lane=np.repeat(np.arange(LANES), COPIES),
+        fresh=np.full(columns, fresh),
+        copies=COPIES,
+        episodes=(),
+    )

@@ -1,0 +1,105 @@
+"""examples/own_loss.py: a run of it trains, is resumed, evaluated and reported, by name and by class."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+
+import millrace
+from examples.own_loss import ClippedPlus
+from learner.algorithms import algorithm_class
+from learner.run_folder.run_folder import RunFolder
+from millrace.cli.main import main
+from millrace.testing import check_algorithm
+
+NAME = "examples.own_loss:ClippedPlus"
+SMALL: dict[str, Any] = {
+    "transport": "inproc", "workers": 1, "envs": 4, "lanes": 2, "rollout_steps": 16, "n_epochs": 2, "net": (8,),
+    "eval_episodes": 2, "torch_threads": 1, "preset": "none",
+}  # fmt: skip
+
+
+def trained(tmp_path: Path, **settings: Any) -> Path:
+    return millrace.train("CartPole-v1", run_dir=str(tmp_path), **{**SMALL, "steps": 600, **settings})
+
+
+def policy(run: Path) -> dict[str, Any]:
+    return load_file(run / "policy.safetensors")
+
+
+def same_policy(left: Path, right: Path) -> bool:
+    one, other = policy(left), policy(right)
+    return one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one)
+
+
+def env_steps(run: Path) -> int:
+    summary = RunFolder(run).summary()
+    assert summary is not None
+    return summary.env_steps
+
+
+def test_the_example_is_short_and_right() -> None:
+    assert len(Path(sys.modules["examples.own_loss"].__file__ or "").read_text().splitlines()) <= 40
+    check_algorithm(ClippedPlus, net=(16,), learning_rate=3e-3, n_epochs=2)
+
+
+def test_a_run_by_class_is_the_run_by_name_and_can_be_resumed(tmp_path: Path) -> None:
+    by_class, by_name = trained(tmp_path / "a", algo=ClippedPlus), trained(tmp_path / "b", algo=NAME)
+    assert same_policy(by_class, by_name)
+    assert tomllib.loads((by_class / "config.toml").read_text())[NAME]["penalty"] == 0.1
+    assert by_class.name.startswith("CartPole-v1-examples.own_loss-ClippedPlus-s1-")
+    assert not same_policy(by_class, trained(tmp_path / "c", algo=NAME, penalty=50.0)), "its settings have an effect"
+
+    before, copied = env_steps(by_class), tmp_path / "copy"
+    shutil.copytree(by_class, copied)
+    assert millrace.train(resume=by_class, steps=1200) == by_class
+    assert env_steps(by_class) > before
+    millrace.train(resume=copied, steps=1200, algo=ClippedPlus)
+    assert same_policy(by_class, copied), "what is resumed twice goes on twice with the same bits"
+
+
+def test_what_looks_at_a_run_does_not_need_its_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = Path(sys.modules["examples.own_loss"].__file__ or "").read_text()
+    (tmp_path / "my_own_loss.py").write_text(source)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    run = trained(tmp_path / "runs", algo="my_own_loss:ClippedPlus")
+    (tmp_path / "my_own_loss.py").unlink()
+    monkeypatch.delitem(sys.modules, "my_own_loss")
+    looks = ["--episodes", "2", "--workers", "1", "--transport", "inproc"]
+    assert main(["evaluate", str(run), *looks]) == 0
+    assert main(["plot", str(run)]) == 0
+    assert main(["report", str(run)]) == 0
+    assert "ClippedPlus" in (run / "report.html").read_text()
+    capsys.readouterr()
+    assert main(["train", "--resume", str(run), "--steps", "1200"]) == 2
+    missing = "no module my_own_loss; expected one in the current folder, on PYTHONPATH or installed"
+    assert capsys.readouterr().err == f"millrace: algo my_own_loss:ClippedPlus: {missing}\n"
+
+
+def test_a_class_of_a_notebook_is_given_again_to_resume(tmp_path: Path) -> None:
+    class Mine(ClippedPlus):
+        """Made in a function, as if in a notebook."""
+
+    run = trained(tmp_path, algo=Mine)
+    name = tomllib.loads((run / "config.toml").read_text())["algo"]
+    assert algorithm_class(name) is Mine
+    assert millrace.train(resume=run, algo=Mine, steps=1200) == run
+
+
+def test_the_help_shows_its_settings(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["train", "--algo", NAME, "--help"])
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "--penalty FLOAT Weight of the mean squared log-ratio of new to old action probability. (default: 0.1)" in text
+    assert os.getcwd() in sys.path
