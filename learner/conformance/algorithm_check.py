@@ -113,7 +113,7 @@ def _subject(algorithm: type, settings: dict[str, Any]) -> Subject:
     made = algorithm_class(name)
     for action in ACTIONS:
         try:
-            policy = made.policy_spec(config, OBSERVATION, action)
+            policy: Any = made.policy_spec(config, OBSERVATION, action)
             break
         except UsageError as error:
             refused = error
@@ -156,8 +156,7 @@ def _with_batches(subject: Subject, found: list[str]) -> Subject:
 
 def weights_have_the_policy_s_shape(subject: Subject) -> Iterator[str]:
     """Float32, as many as the policy has, finite, and copies."""
-    algorithm = subject.new()
-    weights = algorithm.weights()
+    weights: Any = subject.new().weights()
     if not isinstance(weights, tuple) or len(weights) != 2:
         yield f"weights: expected a pair of arrays, got {type(weights).__name__}"
         return
@@ -185,7 +184,7 @@ def metrics_are_finite_numbers(subject: Subject) -> Iterator[str]:
     """Names and floats, as they are logged."""
     algorithm = subject.new()
     for batch in subject.copies():
-        metrics = algorithm.update(batch, _no_pulse)
+        metrics: Any = algorithm.update(batch, _no_pulse)
         if not isinstance(metrics, dict):
             yield f"update: expected a dict of metrics, got {type(metrics).__name__}"
             return
@@ -242,8 +241,8 @@ def a_saved_state_goes_on_as_if_nothing_had_happened(subject: Subject) -> Iterat
         saved.update(batch, _no_pulse)
     state = saved.state_dict()
     kept, file = copy.deepcopy(state), io.BytesIO()
-    if where := _not_plain(state):
-        yield f"state_dict{where}: expected tensors, numbers, text, and lists and dicts of these; a checkpoint takes no more"
+    if odd := _not_plain(state):
+        yield f"state_dict{odd}: expected tensors, numbers, text, and lists and dicts of these; a checkpoint takes no more"
         return
     torch.save(state, file)
     file.seek(0)
@@ -255,8 +254,8 @@ def a_saved_state_goes_on_as_if_nothing_had_happened(subject: Subject) -> Iterat
     if (where := first_difference(kept, restored.state_dict())) is not None:
         yield f"load_state_dict: expected the state that was saved, got another state_dict(){where}"
     for batch in (second, third):
-        pairs = (each.update(copy.deepcopy(batch), _no_pulse) for each in (saved, restored))
-        if (where := first_difference(*pairs)) is not None or first_difference(
+        one, other = (each.update(copy.deepcopy(batch), _no_pulse) for each in (saved, restored))
+        if (where := first_difference(one, other)) is not None or first_difference(
             _weights(saved), _weights(restored)
         ) is not None:
             what = f"metrics{where}" if where else "weights"
@@ -298,8 +297,8 @@ def an_update_can_be_taken_back(subject: Subject) -> Iterator[str]:
         if first_difference(weights, _weights(disturbed)) is not None:
             yield f"roll_back: after {when}, expected the weights that were remembered, got others"
             return
-    pairs = (each.update(copy.deepcopy(second), _no_pulse) for each in (disturbed, undisturbed))
-    where = first_difference(*pairs)
+    one, other = (each.update(copy.deepcopy(second), _no_pulse) for each in (disturbed, undisturbed))
+    where = first_difference(one, other)
     if where is not None or first_difference(_weights(disturbed), _weights(undisturbed)) is not None:
         yield "roll_back: the next update differs from one before which nothing was taken back"
 

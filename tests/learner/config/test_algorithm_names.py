@@ -305,7 +305,7 @@ def test_a_class_of_the_running_script_is_found_without_being_given(monkeypatch:
     main = ModuleType("__main__")
     main.Here = own({}, "__main__", "Here")  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "__main__", main)
-    assert algorithm_class("__main__:Here") is main.Here  # type: ignore[attr-defined]
+    assert algorithm_class("__main__:Here") is main.Here
 
 
 # ---------------------------------------------------------------------------------------------------------- a resumed run

@@ -260,6 +260,7 @@ def test_it_passes_with_other_settings(settings: dict[str, Any]) -> None:
     check_algorithm(Sound, learns=False, **SMALL, **settings)
 
 
+@pytest.mark.timeout(600)  # on a busy machine
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_the_algorithms_of_ours_pass(name: str) -> None:
     check_algorithm(algorithm_class(name))
