@@ -6,10 +6,16 @@ Rule: it is one line. Notes that were added to the error on its way (`BaseExcept
 from __future__ import annotations
 
 import shlex
+import sysconfig
+import traceback
 from collections.abc import Sequence
+from pathlib import Path
 
 from protocol.bounds import escaped
 from protocol.errors import UserFacingError, first_line
+
+OURS = {"learner", "millrace", "protocol", "workers"}
+"""Our packages"""
 
 
 def last_line(program: str, error: BaseException, command: str, hints: Sequence[str] = ()) -> str:
@@ -23,5 +29,20 @@ def last_line(program: str, error: BaseException, command: str, hints: Sequence[
         case UserFacingError():
             why = str(error)
         case _:
-            why = f"internal error: {type(error).__name__}: {first_line(error)}"
+            why = f"{users_code(error) or 'internal error'}: {type(error).__name__}: {first_line(error)}"
     return escaped("; ".join([f"{program}: {why}", *more, *hints]))  # it may quote what a worker said
+
+
+def users_code(error: BaseException) -> str:
+    """FILE:LINE where code of the user's own raised this, as the loss of an algorithm; empty if it was our code.
+
+    What a library raised belongs to the code that called it.
+    """
+    libraries = tuple(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib"))
+    for frame, line in reversed([*traceback.walk_tb(error.__traceback__)]):
+        if str(frame.f_globals.get("__name__", "")).partition(".")[0] in OURS:
+            return ""
+        file = frame.f_code.co_filename
+        if Path(file).is_absolute() and not file.startswith(libraries):
+            return f"{Path(file).name}:{line}"
+    return ""

@@ -103,3 +103,20 @@ def test_the_help_shows_its_settings(capsys: pytest.CaptureFixture[str]) -> None
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "--penalty FLOAT Weight of the mean squared log-ratio of new to old action probability. (default: 0.1)" in text
     assert os.getcwd() in sys.path
+
+
+def test_an_error_in_its_code_names_the_place_and_keeps_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "my_broken_loss.py").write_text(
+        "import torch\nfrom examples.own_loss import ClippedPlus\n\n\n"
+        "class Broken(ClippedPlus):\n    def loss(self, rows):\n        torch.zeros(2) + torch.zeros(2 + self.version)\n"
+        "        return super().loss(rows)\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    words = ["--transport", "inproc", "--workers", "1", "--rollout-steps", "16", "--run-dir", str(tmp_path / "runs")]
+    assert main(["train", "CartPole-v1", "--algo", "my_broken_loss:Broken", *words]) == 1
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.startswith("millrace: my_broken_loss.py:7: RuntimeError: The size of tensor a (2) must match"), said
+    assert "--resume" in said
+    assert said.endswith("--debug shows the traceback")
