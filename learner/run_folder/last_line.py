@@ -34,15 +34,17 @@ def last_line(program: str, error: BaseException, command: str, hints: Sequence[
 
 
 def users_code(error: BaseException) -> str:
-    """FILE:LINE where code of the user's own raised this, as the loss of an algorithm; empty if it was our code.
+    """FILE:LINE where code that the learner calls for the user raised this, as the loss of an algorithm; else empty.
 
     What a library raised belongs to the code that called it.
     """
+    where = ""
     libraries = tuple(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib"))
     for frame, line in reversed([*traceback.walk_tb(error.__traceback__)]):
-        if str(frame.f_globals.get("__name__", "")).partition(".")[0] in OURS:
-            return ""
+        package = str(frame.f_globals.get("__name__", "")).partition(".")[0]
+        if package in OURS:
+            return where if package == "learner" else ""
         file = frame.f_code.co_filename
-        if Path(file).is_absolute() and not file.startswith(libraries):
-            return f"{Path(file).name}:{line}"
+        if not where and Path(file).is_absolute() and not file.startswith(libraries):
+            where = f"{Path(file).name}:{line}"
     return ""
