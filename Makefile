@@ -1,13 +1,15 @@
 # `make train` and `make test` work on a fresh clone with python3 >= 3.11 and nothing else.
 PYTHON ?= python3
 MINUTES ?= 10
+VERSIONS ?= 3.12 3.13 lowest
 # One more than there are cores, because tests of processes wait for most of their time.
 TEST_PROCESSES ?= $(shell expr $$(nproc) + 1)
 BIN := .venv/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: train test lint type unit docs bench bench-peers test-learning test-cluster test-model soak clean
+.PHONY: train test lint type unit docs bench bench-peers test-learning test-cluster test-model test-processors test-versions \
+	soak clean
 
 train: .venv/installed  ## train CartPole-v1 on two worker processes until a greedy evaluation averages 475
 	$(BIN)/millrace train CartPole-v1 --workers 2 --target-return 475 --eval-episodes 20 --eval-every 5000
@@ -33,6 +35,13 @@ test-model: .venv/installed-dev  ## every interleaving of messages, faults and t
 test-cluster: .venv/installed-dev  ## Docker, Prometheus, Slurm and Ray, for real. Needs root, Debian's packages, the extra `ray`; says which
 	$(BIN)/python -m pytest -m cluster -rs -o log_cli=true -o log_cli_level=INFO tests/cluster
 
+test-processors: .venv/installed-dev  ## the tests that compare floats, with the code that PyTorch and numpy run on other processors
+	$(BIN)/python -m tests.processors
+
+test-versions:  ## all tests on other Pythons, and with the lowest versions that pyproject.toml allows
+	$(PYTHON) -m tests.versions $(VERSIONS)
+
+soak: export TESTS_EXEC := 1
 soak: .venv/installed-dev  ## faults for ten minutes, every two seconds one; then the faults that take too long for `make test`. Needs root
 	$(BIN)/python -m tests.system.soak --minutes $(MINUTES)
 	$(BIN)/python -m pytest -m soak tests
@@ -58,4 +67,4 @@ bench-peers: .venv/installed-dev  ## training beside seven other systems, each i
 	touch $@
 
 clean:
-	rm -rf .venv .cluster benchmarks/peers/envs .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv .versions .cluster benchmarks/peers/envs .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -17,6 +17,8 @@ from pathlib import Path
 import psutil
 import pytest
 
+from tests.support import preloaded
+
 LEAVE_WITHIN_S = 5.0
 SOAK_TIMEOUT_S = 1200  # of a test of that mark: it takes minutes, and longer on a busy machine
 
@@ -33,6 +35,10 @@ def _runs(process: psutil.Process) -> bool:
     return False
 
 
+def pytest_unconfigure() -> None:
+    preloaded.close_parent()
+
+
 @pytest.fixture(autouse=True)
 def nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     temporary = tmp_path / "tmp"
@@ -43,7 +49,9 @@ def nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
     yield
     deadline = time.monotonic() + LEAVE_WITHIN_S
     children = [child for child in psutil.Process().children(recursive=True) if _runs(child)]
+    children = [child for child in children if child.pid != preloaded.parent_pid()]
     _, alive = psutil.wait_procs(children, timeout=LEAVE_WITHIN_S)
+    alive = [child for child in alive if _runs(child)]
     for child in alive:
         child.kill()  # so that the next test does not find it too
     assert not alive, f"processes were left behind: {alive}"

@@ -26,6 +26,7 @@ import psutil
 from learner.run_folder.metrics_log import read_rows
 from protocol.keys.key_folder import KeyFolder
 from tests.model.traces.recorder import FOLDER
+from tests.support.preloaded import start
 
 ROOT = Path(__file__).parents[2]
 T = TypeVar("T")
@@ -80,7 +81,7 @@ class Running:
         self.said_in = said
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
         with said.open("ab") as file:
-            self.process = subprocess.Popen(
+            self.process = start(
                 command,
                 stdin=subprocess.PIPE if told else subprocess.DEVNULL,
                 stdout=file,

@@ -23,6 +23,7 @@ from protocol.wire.codec import encode
 from protocol.wire.plain_values import pack
 from protocol.wire.worker_link import WorkerLink
 from tests.learner.config.test_on_resume import content
+from tests.support import preloaded
 from tests.system.processes import ROOT, START_S, Stage, crowding, free_port, wait_for
 from tests.system.runs import finish
 from workers.envs.toy import Countdown
@@ -97,15 +98,7 @@ def train(
     for name, value in {**TINY, "run-dir": folder / "runs", **settings}.items():
         command += [f"--{name}", *str(value).split("|")]
     found = os.pathsep.join(map(str, filter(None, [path, ROOT])))
-    return subprocess.run(
-        command,
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": found},
-        capture_output=True,
-        text=True,
-        timeout=within_s * crowding(),
-        check=False,
-    )
+    return preloaded.run(command, cwd=folder, env={**os.environ, "PYTHONPATH": found}, timeout=within_s * crowding())
 
 
 # ------------------------------------------------------------------------------------------- without the simulator

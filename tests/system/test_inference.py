@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -22,6 +21,7 @@ from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.progress import Progress
 from millrace.launch.local_run import train
 from protocol.errors import EnvironmentFailed, NoWorkers, UsageError
+from tests.support import preloaded
 from tests.system.processes import Stage, free_port, wait_for
 from tests.system.test_local_run import assert_balanced, run, start, summary, worker_processes
 
@@ -294,9 +294,7 @@ def test_workers_elsewhere_step_while_the_policy_acts_in_the_learner(tmp_path: P
 def test_an_occupied_port_leaves_no_folder(tmp_path: Path) -> None:
     address = f"ipc://{tmp_path}/nowhere/learner"
     command = [sys.executable, "-m", "millrace", "learner", "CartPole-v1", "--bind", address, "--inference", "learner"]
-    refused = subprocess.run(
-        [*command, "--run-dir", str(tmp_path / "runs")], capture_output=True, text=True, timeout=60, check=False
-    )
+    refused = preloaded.run([*command, "--run-dir", str(tmp_path / "runs")], timeout=60)
     assert refused.returncode == 2
     assert refused.stderr.count("\n") == 1
     assert not (tmp_path / "runs").exists()
@@ -308,7 +306,7 @@ def test_unsupported_settings_are_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="inference: expected one of workers, learner, got 'gpu'"):
         resolve("CartPole-v1", inference="gpu")
     command = [sys.executable, "-m", "learner", "CartPole-v1", "--inference", "learner", "--run-dir", str(tmp_path / "runs")]
-    refused = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    refused = preloaded.run(command, timeout=60)
     assert refused.returncode == 2
     assert "use millrace learner" in refused.stderr
     assert not (tmp_path / "runs").exists()

@@ -24,6 +24,7 @@ from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.progress import Progress
 from millrace.launch.local_run import train
 from protocol.errors import EnvironmentFailed, NoWorkers, RunError, UsageError
+from tests.support import preloaded
 
 SMALL: dict[str, Any] = {"n_epochs": 2, "eval_episodes": 2}  # these tests do not need a run that learns much
 
@@ -278,7 +279,7 @@ def test_learner_and_workers_train_as_separate_processes(tmp_path: Path) -> None
     address = f"ipc://{tmp_path}/learner"
     flags = ["CartPole-v1", "--bind", address, "--min-workers", "2", "--steps", "2000", "--eval-episodes", "2"]
     command = [sys.executable, "-m", "learner", *flags, "--run-dir", str(tmp_path / "runs")]
-    learner = subprocess.Popen(command, stderr=subprocess.PIPE)
+    learner = preloaded.start(command, stderr=subprocess.PIPE)
     workers = [subprocess.Popen([sys.executable, "-m", "workers", address], stderr=subprocess.PIPE) for _ in range(2)]
     _, said = learner.communicate(timeout=60)
     assert learner.returncode == 0, said
@@ -287,9 +288,7 @@ def test_learner_and_workers_train_as_separate_processes(tmp_path: Path) -> None
         assert worker.returncode == 0, said
     (folder,) = (tmp_path / "runs").iterdir()
     assert summary(folder)["stop_reason"] == "all steps done"
-    again = subprocess.run(
-        [sys.executable, "-m", "learner", "--resume", str(folder)], capture_output=True, timeout=60, check=False
-    )
+    again = preloaded.run([sys.executable, "-m", "learner", "--resume", str(folder)], timeout=60)
     assert again.returncode == 0, "a run that is done waits for workers"
 
 
@@ -306,9 +305,7 @@ def test_an_occupied_port_is_one_line_and_leaves_no_folder(tmp_path: Path) -> No
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
         command = [sys.executable, "-m", "millrace", "learner", "CartPole-v1", "--bind", address]
-        learner = subprocess.run(
-            [*command, "--run-dir", str(tmp_path / "runs")], capture_output=True, text=True, timeout=60, check=False
-        )
+        learner = preloaded.run([*command, "--run-dir", str(tmp_path / "runs")], timeout=60)
     assert learner.returncode == 2
     assert (
         learner.stderr
@@ -320,9 +317,9 @@ def test_an_occupied_port_is_one_line_and_leaves_no_folder(tmp_path: Path) -> No
 # ---------------------------------------------------------------- the learner as a process
 
 
-def start(tmp_path: Path, *flags: str) -> subprocess.Popen[bytes]:
+def start(tmp_path: Path, *flags: str) -> subprocess.Popen[bytes] | preloaded.ForkedProcess:
     command = [sys.executable, "-m", "millrace", "train", "CartPole-v1", "--run-dir", str(tmp_path / "runs"), *flags]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    return preloaded.start(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
 def wait_for(condition: Any, within_s: float = 60.0) -> Any:
