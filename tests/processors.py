@@ -1,8 +1,9 @@
 """`python -m tests.processors`: the numeric tests with the code that PyTorch and numpy run on other processors.
 
 Rule: a setting counts only if the library that reads it says that it is in force; if not, the exit code is 1. A test is
-numeric if its file compares floats (`COMPARES`). NumPy multiplies with OpenBLAS; PyTorch with MKL (oneDNN for images), and
-the rest of its work depends on ATen's setting. Learners and workers that a test starts have the same settings.
+numeric if its file compares floats (`COMPARES`). NumPy multiplies with OpenBLAS, and its own functions have code for several
+processors; PyTorch multiplies with MKL (images: oneDNN), and ATen does the rest. Learners and workers that a test starts
+have the same settings.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 ROOT = Path(__file__).parents[1]
 COMPARES = re.compile(r"allclose|assert_close|approx\(|assert_within|array_equal|torch\.equal|policy\.safetensors")
@@ -29,18 +30,28 @@ class Setting(NamedTuple):
     says: tuple[str, ...]
 
 
+def cpu_features() -> list[str]:
+    """The extensions beyond its baseline for which this numpy has code, and which this process uses."""
+    try:
+        from numpy._core._multiarray_umath import __cpu_dispatch__, __cpu_features__
+    except ImportError:  # numpy 1
+        from numpy.core._multiarray_umath import __cpu_dispatch__, __cpu_features__
+    return [name for name in __cpu_dispatch__ if __cpu_features__[name]]
+
+
 # OpenBLAS as numpy's wheels have it names the kernels of Prescott by an older name, and runs those of Haswell for Zen.
 PRESCOTT = Setting("OPENBLAS_CORETYPE", "Prescott", ("openblas Prescott", "openblas Katmai"))
 HASWELL = Setting("OPENBLAS_CORETYPE", "Haswell", ("openblas Haswell",))
 ZEN = Setting("OPENBLAS_CORETYPE", "Zen", ("openblas Zen", "openblas Haswell"))
 ATEN_DEFAULT = Setting("ATEN_CPU_CAPABILITY", "default", ("aten DEFAULT",))
 ATEN_AVX2 = Setting("ATEN_CPU_CAPABILITY", "avx2", ("aten AVX2",))
+NUMPY_BASELINE = Setting("NPY_DISABLE_CPU_FEATURES", " ".join(cpu_features()), ("numpy baseline",))
 ONEDNN_SSE41 = Setting("ONEDNN_MAX_CPU_ISA", "SSE41", ("onednn Intel SSE4.1",))
 ONEDNN_AVX2 = Setting("ONEDNN_MAX_CPU_ISA", "AVX2", ("onednn Intel AVX2",))
 MKL_ANY = Setting("MKL_CBWR", "COMPATIBLE", ("mkl COMPATIBLE",))
 
 PROCESSORS = {
-    "oldest": (ATEN_DEFAULT, PRESCOTT, ONEDNN_SSE41, MKL_ANY),
+    "oldest": (ATEN_DEFAULT, PRESCOTT, NUMPY_BASELINE, ONEDNN_SSE41, MKL_ANY),
     "avx2": (ATEN_AVX2, HASWELL, ONEDNN_AVX2),
     "zen": (ATEN_DEFAULT, ZEN, ONEDNN_AVX2),
 }
@@ -56,7 +67,7 @@ def say_what_is_in_force() -> None:
     """Print a line for each library: its name, and what it runs on. For a process with settings of its own."""
     import torch
 
-    said = [f"aten {torch.backends.cpu.get_cpu_capability()}"]
+    said = [f"aten {torch.backends.cpu.get_cpu_capability()}", f"numpy {' '.join(cpu_features()) or 'baseline'}"]
     maps = Path("/proc/self/maps").read_text().splitlines()
     for path in sorted({line.split()[-1] for line in maps if "openblas" in line}):
         library = ctypes.CDLL(path)
@@ -66,9 +77,10 @@ def say_what_is_in_force() -> None:
                 asks.restype = ctypes.c_char_p
                 said.append(f"openblas {asks().decode()}")
     print("\n".join(said), flush=True)
-    with torch.backends.mkldnn.verbose(torch.backends.mkldnn.VERBOSE_ON):  # it prints to the descriptor
+    backends: Any = torch.backends  # its classes have no types
+    with backends.mkldnn.verbose(backends.mkldnn.VERBOSE_ON):  # it prints to the descriptor
         torch.nn.functional.conv2d(torch.ones(4, 16, 32, 32), torch.ones(32, 16, 3, 3))
-    with torch.backends.mkl.verbose(torch.backends.mkl.VERBOSE_ON):
+    with backends.mkl.verbose(backends.mkl.VERBOSE_ON):
         torch.ones(32, 32) @ torch.ones(32, 32)
 
 
@@ -84,7 +96,7 @@ def in_force(variables: dict[str, str]) -> set[str]:
         timeout=PROBED_WITHIN_S,
         check=True,
     )
-    said = set(re.findall(r"^(?:aten|openblas) .+$", done.stdout, re.MULTILINE))
+    said = set(re.findall(r"^(?:aten|numpy|openblas) .+$", done.stdout, re.MULTILINE))
     said |= {f"onednn {isa.strip()}" for isa in re.findall(r"^onednn_verbose.*,cpu,isa:(.+)$", done.stdout, re.MULTILINE)}
     return said | {f"mkl {mode}" for mode in re.findall(r"^MKL_VERBOSE .*CNR:(\w+)", done.stdout, re.MULTILINE)}
 

@@ -19,11 +19,16 @@ NOTICED_S = WORKER_TIMEOUT_S + 1  # a worker is silent, and new tickets are deal
 
 
 def play(
-    stage: Stage, settings: Mapping[str, object] = {}, *, env: str = TOY, workers: int = 2
+    stage: Stage,
+    settings: Mapping[str, object] = {},
+    *,
+    env: str = TOY,
+    workers: int = 2,
+    before: Sequence[str] = (),
 ) -> tuple[Learner, list[Worker]]:
-    """Start a learner and workers on loopback, and wait until they train."""
+    """Start a learner and workers on loopback, and wait until they train. `before`: words before the learner's command."""
     address = f"tcp://127.0.0.1:{free_port()}"
-    learner = stage.learner(address, {"min-workers": workers, **settings}, env=env)
+    learner = stage.learner(address, {"min-workers": workers, **settings}, env=env, before=before)
     started = [stage.worker(address, f"w{number}") for number in range(workers)]
     learner.trains(2)
     return learner, started
