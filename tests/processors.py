@@ -10,12 +10,15 @@ from __future__ import annotations
 
 import argparse
 import ctypes
+import importlib
 import os
 import re
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import numpy as np
 
 ROOT = Path(__file__).parents[1]
 COMPARES = re.compile(r"allclose|assert_close|approx\(|assert_within|array_equal|torch\.equal|policy\.safetensors")
@@ -32,11 +35,9 @@ class Setting(NamedTuple):
 
 def cpu_features() -> list[str]:
     """The extensions beyond its baseline for which this numpy has code, and which this process uses."""
-    try:
-        from numpy._core._multiarray_umath import __cpu_dispatch__, __cpu_features__
-    except ImportError:  # numpy 1
-        from numpy.core._multiarray_umath import __cpu_dispatch__, __cpu_features__
-    return [name for name in __cpu_dispatch__ if __cpu_features__[name]]
+    numpy_1 = np.__version__.startswith("1.")
+    core: Any = importlib.import_module(f"numpy.{'core' if numpy_1 else '_core'}._multiarray_umath")
+    return [name for name in core.__cpu_dispatch__ if core.__cpu_features__[name]]
 
 
 # OpenBLAS as numpy's wheels have it names the kernels of Prescott by an older name, and runs those of Haswell for Zen.
