@@ -305,7 +305,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
 
         envs = millrace.make_vec("CartPole-v1", 8, workers=2, lanes=8)
         envs.async_reset(seed=1)
-        for _ in range(1000):
+        for _ in range(100):
             observation, reward, terminated, truncated, infos = envs.recv()
             envs.send(policy(observation), infos["env_id"])
         """

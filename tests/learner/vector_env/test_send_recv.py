@@ -4,67 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from copy import deepcopy
 from functools import partial
-from typing import Any, NamedTuple
+from textwrap import dedent
+from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
-from gymnasium.vector.utils import iterate
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
+import millrace
 from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.sent_lanes import LONGEST_GAP_S, Sent, SentLanes, WatchedTime
 from learner.vector_env.settings import VectorEnvSettings
 from protocol.errors import EnvironmentFailed, NoWorkers, UsageError, WorkerLost
 from protocol.messages import Reset, Step
+from protocol.wire.wake_up import WakeReason
 from tests.support.any_order import AnyOrder, any_order
 from tests.support.bit_equality import bit_equal
+from tests.support.rows_of_copies import Row, info_of, of_copies, received
 
 INFORMS = "workers.envs.toy:Informs-v0"
 COUNTDOWN = "workers.envs.toy:Countdown-v0"
 BOTH_WAYS = pytest.mark.parametrize("shared", [True, False], ids=["shared memory", "messages"])
-
-
-class Row(NamedTuple):
-    """What one copy gives at one step or reset."""
-
-    observation: Any
-    reward: Any
-    terminated: Any
-    truncated: Any
-    info: dict[str, Any]
-
-
-def info_of(infos: dict[str, Any], row: int) -> dict[str, Any]:
-    """The info of one copy, out of merged infos. The order of its keys depends on the other copies: they are sorted."""
-    return {
-        key: info_of(values, row) if isinstance(values, dict) else values[row]
-        for key, values in sorted(infos.items())
-        if f"_{key}" in infos and infos[f"_{key}"][row]
-    }
-
-
-def received(env: ZmqVectorEnv, min_envs: int = 1) -> dict[int, Row]:
-    """What `recv` returns, by copy."""
-    observation, reward, terminated, truncated, infos = env.recv(min_envs)
-    numbers = reward, terminated, truncated
-    ids = infos["env_id"]
-    assert ids.dtype == np.int64
-    assert ids.tolist() == sorted(set(ids.tolist()))
-    each = of_copies(env, observation)
-    assert all(len(array) == len(ids) for array in (each, *numbers))
-    rows = zip(each, reward, terminated, truncated, (info_of(infos, row) for row in range(len(ids))), strict=True)
-    return {int(n): Row(*row) for n, row in zip(ids, rows, strict=True)}
-
-
-def of_copies(env: VectorEnv[Any, Any, Any], observation: Any) -> list[Any]:
-    """The observation of each copy, out of a batch."""
-    return [deepcopy(one) for one in iterate(env.observation_space, observation)]
 
 
 @contextmanager
@@ -180,6 +145,26 @@ def test_actions_go_to_their_copies_also_where_shared_memory_would_round_them(sh
         theirs.close()
 
 
+def test_a_worker_wakes_the_learner_when_its_lane_is_done_although_others_are_not() -> None:
+    with made() as (env, link):
+        env.async_reset(seed=1)
+        env.recv(3)
+        link.frozen = {"w0", "w2"}
+        send(env, [0, 1, 2])
+        link.execute()
+        assert link.memory is not None
+        assert link.memory.unanswered_orders() == 2
+        assert env._hub._wake_ins[0].wait(0.0) is WakeReason.STEP
+
+
+def test_the_example_of_send_runs() -> None:
+    _, _, example = (ZmqVectorEnv.send.__doc__ or "").partition("envs = ")
+    names: dict[str, Any] = {"millrace": millrace, "policy": lambda observation: np.zeros(len(observation), np.int64)}
+    exec(dedent("        envs = " + example), names)
+    assert names["envs"].outstanding
+    names["envs"].close()
+
+
 # ---------------------------------------------------------------- losses
 
 NEXT, SAME, DISABLED = "NextStep", "SameStep", "Disabled"
@@ -230,6 +215,39 @@ def test_a_worker_lost_while_its_copies_are_here_is_reported_for_the_next_step(s
         send(env, [2])
         row = received(env)[2]
         assert (row.observation, row.truncated) == (1.0, False)
+
+
+def test_a_copy_that_is_reset_after_its_loss_is_not_reported() -> None:
+    with made(shared=False) as (env, link):
+        env.async_reset(seed=1)
+        env.recv(3)
+        link.leave("w2")
+        send(env, [0])
+        env.recv()  # hears of the loss
+        env.async_reset([2])
+        assert received(env)[2].observation == 1.0
+        send(env, [2])
+        row = received(env)[2]
+        assert (row.observation, row.info) == (np.float32(0.8), {})
+
+
+def test_the_answer_to_an_order_for_which_nobody_waits_any_more_is_not_taken_for_a_later_one() -> None:
+    def stop() -> None:
+        raise InterruptedError("stop")
+
+    with made(shared=False) as (env, link):
+        env.reset(seed=1)
+        link.frozen = {"w0", "w1", "w2"}
+        env.step_async(zeros(range(3)))
+        env.watch(stop)
+        with pytest.raises(InterruptedError):
+            env.step_wait()
+        env.watch(lambda: None)
+        env.async_reset(seed=1)
+        link.frozen = set()
+        abandoned = [0, 0, 0]
+        link.choose = lambda count: abandoned.pop() if abandoned else count - 1  # only the old orders at first
+        assert {n: float(row.observation[0]) for n, row in received(env, 3).items()} == {0: 1.0, 1: 1.0, 2: 1.0}
 
 
 @BOTH_WAYS

@@ -23,6 +23,7 @@ from millrace.cli.status import as_table, ask, observer_name
 from protocol.errors import EnvironmentFailed, UsageError
 from protocol.wire.worker_link import WorkerLink
 from tests.support.bit_equality import bit_equal
+from tests.support.rows_of_copies import Row, info_of, of_copies, received
 
 MODES = tuple(AutoresetMode)
 TRANSPORTS: dict[str, dict[str, Any]] = {
@@ -285,6 +286,7 @@ calls = st.lists(
     st.one_of(
         st.tuples(st.just("step"), st.integers(1, 4)),
         st.tuples(st.just("step_async"), st.none()),
+        st.tuples(st.just("send"), st.tuples(st.permutations([(0, 1), (2,)]), st.integers(0, 3))),
         st.tuples(st.just("reset"), st.tuples(seeds, options)),
         st.tuples(st.just("mask"), st.tuples(seeds, options, masks)),
         st.tuples(st.just("call"), st.tuples(st.text(max_size=3), st.integers(0, 2))),
@@ -339,6 +341,22 @@ def play_sequence(
                     else:
                         wanted = same("step", action)
                     ended = wanted[2] | wanted[3]
+            case "send":
+                if mode is AutoresetMode.DISABLED and ended.any():
+                    same("reset", options={"reset_mask": ended, "why": "ended"})
+                action = theirs.action_space.sample()
+                for ids in value[0]:
+                    ours.send({key: part[list(ids)] for key, part in action.items()}, ids)
+                rows: dict[int, Row] = {}
+                while ours.outstanding:
+                    rows |= received(ours, min(value[1], len(ours.outstanding)))
+                wanted = theirs.step(action)
+                ended = wanted[2] | wanted[3]
+                each = of_copies(theirs, wanted[0])
+                for n, row in rows.items():
+                    of_copy = Row(each[n], wanted[1][n], wanted[2][n], wanted[3][n], info_of(wanted[4], n))
+                    assert bit_equal(tuple(row), tuple(of_copy)), f"copy {n}: {row} is not {of_copy}"
+                assert sorted(rows) == [0, 1, 2]
             case "reset":
                 same("reset", seed=value[0], options=value[1])
                 ended[:] = False
