@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,8 +14,9 @@ import pytest
 
 from tests.model.traces.accept import Acceptance, accept
 from tests.model.traces.record import Record, SaidRollout, read
+from tests.model.traces.recorder import FOLDER
 from tests.model.traces.replay import NotAccepted
-from tests.system.processes import SMALL, TOY, Stage, free_port
+from tests.system.processes import ROOT, SMALL, TOY, Stage, free_port
 
 ADDRESS = "tcp://127.0.0.1:{}"
 UPDATES = 4
@@ -136,3 +140,16 @@ def test_a_trace_that_is_cut_in_a_record_is_read_up_to_there(copy: Path) -> None
     whole = len(list(read(path)))
     path.write_bytes(path.read_bytes()[:-3])
     assert len(list(read(path))) == whole - 1
+
+
+def test_without_a_wish_for_traces_the_program_is_what_it_always_is() -> None:
+    """The hook alone imports nothing; the classes are the program's own."""
+    code = (
+        "import sys, learner.rollouts.ticket_coordinator as t, workers.session as s; print(len(t.TicketCoordinator.__mro__)"
+    )
+    code += ", len(s.Session.__mro__), 'sitecustomize' in sys.modules, any('traces' in name for name in sys.modules))"
+    path = os.pathsep.join(map(str, (ROOT / "tests/model/traces/hook", ROOT)))
+    environment = {**os.environ, "PYTHONPATH": path}
+    environment.pop(FOLDER, None)
+    said = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True).stdout
+    assert said.split() == ["2", "2", "True", "False"]
