@@ -1,9 +1,11 @@
 """A program that uses a vector environment: its calls, cut where they wait. It has the real `StepHub` and `LostLanes`.
 
 Rule: each call does what `ZmqVectorEnv` does before it waits, and does the rest when `StepHub.wait_for_answers` would
-return. (`ZmqVectorEnv` itself cannot be cut there.) Rules of safety: each result is that of the order it was asked for, from
-copies that executed every order before it once; copies of a lost lane are reset before they step; a step resets a lane only
-after its loss was reported; and a worker that is heard answers in time.
+return. (`ZmqVectorEnv` itself cannot be cut there; `test_caller.py` compares the two.)
+
+Rules of safety: each result is that of the order it was asked for, from copies that executed every order before it once;
+copies of a lost lane are reset before they step; a step resets a lane only after its loss was reported; and a worker that is
+heard answers in time.
 """
 
 from __future__ import annotations
@@ -116,7 +118,12 @@ class Caller:
             member = self.coordinator.owner(order.lane)
             heard = member is not None and self.now - member.heard_s <= TICK_S
             assert age < self.oldest or not heard, "a worker that is heard does not answer"
-        if self.now > self.deadline_s and (self.hub._waiting_orders or self.coordinator.orders):
+        self.give_up_if_late()
+
+    def give_up_if_late(self) -> None:
+        """Give up what was not answered in time, and go on."""
+        late = self.deadline_s is not None and self.now > self.deadline_s
+        if late and (self.hub._waiting_orders or self.coordinator.orders):
             try:
                 self.hub._give_up(self.timeout_s)
             except NoWorkers:
