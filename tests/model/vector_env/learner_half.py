@@ -181,6 +181,7 @@ def _load_caller(caller: Caller, content: Content) -> None:
     caller.at, caller.deadline_s, caller.attempt = at, deadline, attempt
     caller.unreset, caller.ordered, caller.told = set(unreset), dict(ordered), set(told)
     caller.hub._waiting_orders = {lane: make_order(*caller.ordered[lane]) for lane in waiting}
+    caller.hub._waiting_since_s = dict.fromkeys(waiting, 0.0)
     caller.copies = {lane: (life.value, state) for lane, life, state in copies}
     caller.lost_lanes.add(dict.fromkeys(unreported, "lost"))
     caller.lost_lanes.expect_reset(awaiting)

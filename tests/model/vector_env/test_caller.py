@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 
 from learner.members.membership import Outgoing
-from learner.vector_env import env as env_module
-from learner.vector_env import step_hub
+from learner.vector_env import send_recv, step_hub
 from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator
 from learner.vector_env.spec import VectorEnvDescription
@@ -180,7 +179,7 @@ def told(settings: Stepping, heard: Heard) -> Caller:
 
 def test_the_model_of_a_program_sends_what_a_vector_environment_sends(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(step_hub, "OrderCoordinator", Heard)
-    monkeypatch.setattr(env_module, "replacement_seeds", lambda seeds, incarnation: (REPLACED,) * len(tuple(seeds)))
+    monkeypatch.setattr(send_recv, "replacement_seeds", lambda seeds, incarnation: (REPLACED,) * len(tuple(seeds)))
     outcomes: Counter[str] = Counter()
     for seed in range(40):
         fate = random.Random(seed)
