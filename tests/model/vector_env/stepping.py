@@ -2,6 +2,10 @@
 
 Rule: the program makes its calls one after the other. A call that raises `NoWorkers`, and a reset that raises `WorkerLost`,
 is made again. The target is reached when all calls have returned. After a restart of the learner the program starts anew.
+
+One fault at a time. With two, a Step of copies that were never reset is found: the process after a killed one takes the
+Welcome that answers a repeated Hello of the killed one, before its own Hello is heard. Over ZeroMQ this starts nothing: when
+the new process connects, what the killed one said loses its name, so none of its later messages counts.
 """
 
 from __future__ import annotations
