@@ -41,6 +41,8 @@ from protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")
 
+DRAIN_S = 2.0  # for the workers to leave, when a run is cut short
+
 Watch = Callable[[Progress], None]
 """Called with the progress of the run after each update."""
 
@@ -63,6 +65,7 @@ class RunSetup:
     known: KnownEnvironment
     folder: RunFolder
     resumed: bool
+    interrupts: Interrupts
 
 
 @contextmanager
@@ -167,7 +170,7 @@ class Run:
         state = RunState()
         if setup.resumed:
             state = restore(self.folder, self.algorithm)
-        self._interrupts = Interrupts()
+        self._interrupts = setup.interrupts
         past = (state.ledger, state.incarnations)
         self.service = rollout_service(config, spec, link, processes, self._check_interrupt, observer, past)
         episodes = _training_recorder(config, self.folder, setup.known, spec)
@@ -185,15 +188,15 @@ class Run:
 
         try:
             with self._interrupts:
-                train(self.algorithm, self.service, self.recorder, workers)
+                train(self.algorithm, self.service, self.recorder, workers, self._check_time)
         except RunTakenOver as error:
-            self.service.drain(str(error), timeout_s=2.0)
+            self.service.drain(str(error), timeout_s=DRAIN_S)
             raise
         except BaseException as error:
             if line := self.recorder.saved():
                 error.add_note(line)
             reason = "interrupted" if isinstance(error, KeyboardInterrupt) else _why(error)
-            self.service.drain(reason, timeout_s=2.0)
+            self.service.drain(reason, timeout_s=self._interrupts.at_most(DRAIN_S))
             with suppress(Exception):  # `watch` may raise again, and the error of the run is what counts
                 self.recorder.finish(reason)
             raise
@@ -205,6 +208,10 @@ class Run:
             raise Interrupted(self.folder.path)
         if self.folder.lock is not None:
             self.folder.lock.check()
+
+    def _check_time(self) -> None:
+        if self._interrupts.time_is_up(self.recorder.longest_save_s):
+            raise Interrupted(self.folder.path)
 
 
 def serve(config: Config, resume: Resumption | None, watch: Watch) -> Path:
@@ -225,7 +232,9 @@ def serve(config: Config, resume: Resumption | None, watch: Watch) -> Path:
         env, processes = EnvSpec.of(config.env, config.env_kwargs), ProcessCallbacks()
         known = known_environment(config, env, resume, describe_over(link, config, processes))
         folder = folder or stack.enter_context(run_folder(config, None))
-        run = Run(RunSetup(config, known, folder, resume is not None), link, processes, watch, observer)
+        run = Run(
+            RunSetup(config, known, folder, resume is not None, Interrupts(config.grace_s)), link, processes, watch, observer
+        )
         run.train(config.min_workers or 1)
         return run.folder.path
 

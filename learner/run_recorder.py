@@ -74,6 +74,8 @@ class RunRecorder:
         self._wall_before_s, self._steps_before = state.wall_s, state.env_steps
         self._started_s = self._saved_s = time.monotonic()
         self._episodes_since_save = 0
+        self.longest_save_s = 0.0
+        """How long the longest checkpoint took to write, in this process."""
         self._saved: tuple[int, int, list[float] | None] | None = None  # what `_position` was in the newest checkpoint
         self._saved_env_steps: int | None = None
         self._finished = False
@@ -139,14 +141,15 @@ class RunRecorder:
         """Write a checkpoint and the policy. Raises `RunTakenOver` if another process trains this run now."""
         if self._folder.lock is not None:
             self._folder.lock.confirm()
+        began_s = self._saved_s = time.monotonic()
         state = self._state().checkpoint_content(self._algorithm)
-        self._saved_s = time.monotonic()
         self._episodes_since_save = 0
         if not self._make_folder_again():
             return
         warn_on_error(lambda: self._save_checkpoint(state))
         policy, env = self._spec.policy, self._spec.env
         warn_on_error(lambda: self._folder.write_policy(policy, env, *self._algorithm.weights()))
+        self._took_to_save(time.monotonic() - began_s)
 
     def save_unless_saved(self) -> None:
         """Write a checkpoint and the policy, unless the newest checkpoint already has this state."""
@@ -207,6 +210,13 @@ class RunRecorder:
         )
 
     # ---------------------------------------------------------------- inside
+
+    def _took_to_save(self, seconds: float) -> None:
+        """Remember the longest time, and say once if it is longer than the grace time."""
+        grace_s = self._config.grace_s
+        if grace_s and self.longest_save_s <= grace_s < seconds:
+            log.warning("a checkpoint takes %.0f s, but --grace-s %g: a SIGTERM may lose work; allow more", seconds, grace_s)
+        self.longest_save_s = max(self.longest_save_s, seconds)
 
     def _make_folder_again(self) -> bool:
         """Make the run folder again if it was deleted. False if that is not possible; the run goes on without it."""

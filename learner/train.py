@@ -12,7 +12,7 @@ weights which are not finite, is taken back.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from learner.algorithms import Algorithm
@@ -25,13 +25,25 @@ from protocol.rollout import stack_rollouts
 ADVICE = "try a lower learning_rate, or normalize_observations"
 
 
-def train(algorithm: Algorithm, service: RolloutService, recorder: RunRecorder, workers: int) -> str:
+def train(
+    algorithm: Algorithm,
+    service: RolloutService,
+    recorder: RunRecorder,
+    workers: int,
+    check_time: Callable[[], None] = lambda: None,
+) -> str:
     """Train until `recorder` gives a reason to stop. Returns that reason.
 
     `workers`: number of workers to wait for before the first rollout. If the run cannot go on (no worker is left, the
     environment raised too often, the user interrupted the run, a loss is not finite, the user's code raised), the state
-    after the last whole update is saved. Then the error is raised.
+    after the last whole update is saved. Then the error is raised. `check_time` is called between gradient steps: what it
+    raises takes the update back.
     """
+
+    def pulse() -> None:
+        service.pulse()
+        check_time()
+
     recorder.save()
     try:
         service.wait_for_workers(workers)
@@ -43,7 +55,7 @@ def train(algorithm: Algorithm, service: RolloutService, recorder: RunRecorder, 
             began_s = time.monotonic()
             with _whole_update(algorithm, service, arrived):
                 batch = stack_rollouts([one.rollout for one in arrived], [one.fresh for one in arrived])
-                metrics = algorithm.update(batch, service.pulse)
+                metrics = algorithm.update(batch, pulse)
                 if not algorithm.is_finite():
                     raise RunError(f"learner: update {recorder.version}: the weights are not finite after it; {ADVICE}")
             recorder.count(batch)

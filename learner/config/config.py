@@ -15,7 +15,7 @@ from msgspec import Meta
 
 from learner.config.hyperparameters import AlgorithmConfig, PPOConfig
 from learner.config.on_resume import Fixed, Free
-from learner.config.rollout_config import Count, Natural, RolloutConfig, Seconds
+from learner.config.rollout_config import Count, Natural, RolloutConfig, Seconds, SecondsOrNever
 from learner.config.run_rules import CheckpointPolicy, EvaluationSettings, StopRule
 from protocol.bounds import MAX_SEEDS
 
@@ -67,6 +67,11 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Number of PyTorch threads in the learner. none: chosen when the run starts, and kept in its config.toml: 1;
     or with images, an encoder or a layer of 512 x 512 weights all cores. If max_lag is above 0, one core is left to each
     local worker, unless half of the cores or less would remain. Another number changes the last bits of results.
+    """
+
+    grace_s: Free[SecondsOrNever] = 30.0
+    """Seconds from SIGTERM, SIGHUP or Ctrl-C to the end of the process. The current update gets at most half of them; then
+    it is given up, and the state before it is saved. 0: as long as the update takes.
     """
 
     # -------------------------------------------------------------------------------------------------------------- files

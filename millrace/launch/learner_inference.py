@@ -16,6 +16,7 @@ from pathlib import Path
 import zmq
 
 from learner.config.config import Config
+from learner.interrupts import Interrupts
 from learner.members.describe_coordinator import Accept
 from learner.members.endpoint import BindSettings
 from learner.members.process_callbacks import ProcessCallbacks
@@ -37,7 +38,7 @@ from workers.env_loop import Pulse
 from workers.evaluate.evaluator import Evaluator
 from workers.evaluate.split_evaluation_copies import SplitEvaluationCopies
 from workers.supervise.worker_thread import WorkerThread
-from workers.supervisor import Supervisor
+from workers.supervisor import STOP_WITHIN_S, Supervisor
 
 NEVER_S = 1e9
 
@@ -84,7 +85,8 @@ def train(
             return Collector(spec, policy, lanes.open_lane, lanes.step_all), evaluator
 
         supervisor = Supervisor(lambda name: WorkerThread(link.address, name, context, collector), 1, prefix="inference")
-        stack.callback(supervisor.stop)
+        interrupts = Interrupts(config.grace_s)
+        stack.callback(lambda: supervisor.stop(interrupts.at_most(STOP_WITHIN_S)))
         stack.callback(supervisor.ask_to_leave)  # if it is asked a second time, the worker leaves at once
 
         def ended() -> list[WorkerExit]:
@@ -92,7 +94,7 @@ def train(
             return supervisor.poll()
 
         processes = ProcessCallbacks(ended, supervisor.activities, lambda: env.workers, 0 if elsewhere else config.workers)
-        run = Run(RunSetup(config, known, folder, resume is not None), link, processes, watch, observer)
+        run = Run(RunSetup(config, known, folder, resume is not None, interrupts), link, processes, watch, observer)
         run.train(1)
         return run.folder.path
 

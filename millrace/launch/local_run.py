@@ -12,6 +12,7 @@ from pathlib import Path
 import zmq
 
 from learner.config.config import Config
+from learner.interrupts import Interrupts
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.resumption import Resumption, unless_finished
 from learner.run import Run, RunSetup, Watch, describe_over, known_environment, prometheus_observer, run_folder
@@ -22,7 +23,7 @@ from protocol.keys.keys import Token
 from protocol.wire.learner_link import LearnerLink
 from workers.supervise.worker_process import WorkerCommand, WorkerProcess
 from workers.supervise.worker_thread import WorkerThread
-from workers.supervisor import Running, Supervisor
+from workers.supervisor import STOP_WITHIN_S, Running, Supervisor
 
 
 def train(config: Config, resume: Path | None, watch: Watch, factory: Callable[..., object] | None = None) -> Path:
@@ -52,11 +53,12 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, factory: Cal
         folder = stack.enter_context(run_folder(config, resume))
         start = _starter(config, link.address, token, context, folder.path)
         supervisor = Supervisor(start, config.workers, timeouts=config.call_timeouts())
-        stack.callback(supervisor.stop)
+        interrupts = Interrupts(config.grace_s)
+        stack.callback(lambda: supervisor.stop(interrupts.at_most(STOP_WITHIN_S)))
         processes = ProcessCallbacks(supervisor.poll, supervisor.activities, expected=config.workers)
         with stopped_on_error(supervisor):
             known = known_environment(config, env, resume, describe_over(link, config, processes))
-        run = Run(RunSetup(config, known, folder, resume is not None), link, processes, watch, observer)
+        run = Run(RunSetup(config, known, folder, resume is not None, interrupts), link, processes, watch, observer)
         run.train(config.min_workers or config.workers)
         return run.folder.path
 

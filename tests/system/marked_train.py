@@ -1,19 +1,31 @@
 """`python -m tests.system.marked_train FILE ARGUMENTS`: `millrace ARGUMENTS`, which writes into FILE what it is doing.
 
+With `--fork` instead it starts such processes by forking itself, so that only it imports PyTorch, which takes longest.
+
 Rule: FILE is mapped memory, so what was written last is there also if the process is killed in the middle of it. The program
 is wrapped from outside: the modules that import PyTorch are not imported earlier than they would be.
 """
 
 from __future__ import annotations
 
+import json
 import mmap
+import os
 import struct
 import sys
+import tempfile
 from collections.abc import Callable
 from enum import IntEnum
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
+IMPORTED = (
+    "millrace.cli.main", "millrace.launch.local_run", "millrace.launch.learner_inference", "learner.run_recorder",
+    "learner.train", "learner.run_spec", "learner.run_state", "learner.torch_setup", "learner.algorithms.ppo",
+    "learner.algorithms.dqn", "learner.algorithms.a2c", "learner.algorithms.impala", "learner.algorithms.reinforce",
+    "tensorboard.compat.proto.event_pb2", "tensorboard.summary.writer.record_writer", "safetensors.numpy",
+)  # fmt: skip
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -120,8 +132,37 @@ class Marker:
         RunFolder.write_policy = self.during(Phase.CHECKPOINTING, RunFolder.write_policy)  # type: ignore[method-assign]
 
 
-if __name__ == "__main__":
-    Marker(Path(sys.argv[1])).wrap()
+def run(file: Path, arguments: list[str]) -> int:
+    """Run `millrace ARGUMENTS` and mark what it does. Returns the exit code."""
+    Marker(file).wrap()
     from millrace.cli.main import main
 
-    sys.exit(main(sys.argv[2:]))
+    return main(arguments)
+
+
+def serve_forks() -> None:
+    """For each line of stdin, a JSON object, fork a process that runs it. Prints its pid, then its exit code."""
+    for module in IMPORTED:
+        import_module(module)
+    for line in sys.stdin:
+        order = json.loads(line)
+        sys.stdout.flush()
+        if (pid := os.fork()) == 0:
+            os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+            said = os.open(order["said"], os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+            os.dup2(said, 1)
+            os.dup2(said, 2)
+            os.environ.update(order["environment"])
+            tempfile.tempdir = None  # TMPDIR may be another
+            sys.exit(run(Path(order["marks"]), order["arguments"]))
+        sys.stdout.write(f"{pid}\n")
+        sys.stdout.flush()
+        sys.stdout.write(f"{os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])}\n")
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    if sys.argv[1:] == ["--fork"]:
+        serve_forks()
+    else:
+        sys.exit(run(Path(sys.argv[1]), sys.argv[2:]))

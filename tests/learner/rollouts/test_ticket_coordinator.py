@@ -994,6 +994,9 @@ def test_a_rollout_is_fresh_unless_it_continues_the_one_that_was_used_before() -
     assert used(second) == [(1, False)]
     assert used(fourth) == [(3, True)]  # it came before the third
     assert used(third) == [(2, True)]
+    assert [coordinator.lanes[0].use(0, sequence) for sequence in (4, 5)] == [False, True], (
+        "the fifth follows the fourth only"
+    )
 
 
 def test_a_rollout_continues_only_one_of_its_own_incarnation() -> None:
