@@ -2,6 +2,7 @@
 PYTHON ?= python3
 MINUTES ?= 10
 VERSIONS ?= 3.12 3.13 lowest
+RUNS ?= 200
 # One more than there are cores, because tests of processes wait for most of their time.
 TEST_PROCESSES ?= $(shell expr $$(nproc) + 1)
 BIN := .venv/bin
@@ -9,7 +10,7 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .PHONY: train test lint type unit docs bench bench-peers test-learning test-cluster test-model test-processors test-versions \
-	soak clean
+	test-kill soak clean
 
 train: .venv/installed  ## train CartPole-v1 on two worker processes until a greedy evaluation averages 475
 	$(BIN)/millrace train CartPole-v1 --workers 2 --target-return 475 --eval-episodes 20 --eval-every 5000
@@ -40,6 +41,9 @@ test-processors: .venv/installed-dev  ## the tests that compare floats, with the
 
 test-versions:  ## all tests on other Pythons, and with the lowest versions that pyproject.toml allows
 	$(PYTHON) -m tests.versions $(VERSIONS)
+
+test-kill: .venv/installed-dev  ## small runs, each killed at random times and resumed until it is done; half an hour
+	$(BIN)/python -m tests.system.killed_runs --runs $(RUNS)
 
 soak: export TESTS_EXEC := 1
 soak: .venv/installed-dev  ## faults for ten minutes, every two seconds one; then the faults that take too long for `make test`. Needs root
