@@ -1,9 +1,9 @@
 """SIGINT, SIGTERM and SIGHUP of a learner: the first ends the run, within the grace time if there is one.
 
 Rule: the first signal lets the current update end; `time_is_up` says when it must be given up, so that the rest of the
-grace time is enough to save. A second SIGINT (Ctrl-C) ends the run at once. SIGTERM and SIGHUP may come again and change
-nothing: they often go to a process and to its group, and the time is limited already. SIGHUP says that the terminal is gone.
-A learner that was told to ignore it (`nohup`) goes on ignoring it.
+grace time is enough to save. A second SIGINT (Ctrl-C) ends the run at once. If there is a grace time, SIGTERM and SIGHUP may
+come again and change nothing: they often go to a process and to its group, and the time is limited already. SIGHUP says that
+the terminal is gone. A learner that was told to ignore it (`nohup`) goes on ignoring it.
 """
 
 from __future__ import annotations
@@ -53,5 +53,6 @@ class Interrupts:
     def _note(self, number: int, frame: FrameType | None) -> None:
         if not self.received:
             self.received, self._end_s = True, monotonic() + self._grace_s
-            if signal.SIGINT in self._handlers_before:  # the second one does what it would have done without us
-                signal.signal(signal.SIGINT, self._handlers_before[signal.SIGINT])
+            for each, handler in self._handlers_before.items():
+                if each == signal.SIGINT or math.isinf(self._grace_s):
+                    signal.signal(each, handler)  # the second one does what it would have done without us

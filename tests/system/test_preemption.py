@@ -267,6 +267,11 @@ def test_a_second_sigterm_changes_nothing_and_a_second_ctrl_c_ends_at_once() -> 
         assert interrupts.received
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
+    before = signal.getsignal(signal.SIGTERM)
+    with Interrupts() as interrupts:
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert interrupts.received
+        assert signal.getsignal(signal.SIGTERM) == before, "without a grace time, the second one must be able to end it"
 
 
 @pytest.mark.parametrize("grace_s", [1.5, 8.0])
