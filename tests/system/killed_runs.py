@@ -23,6 +23,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
@@ -137,7 +138,7 @@ class Forker:
             command, bufsize=0, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT, env=environment
         )
 
-    def start(self, order: dict[str, object]) -> Forked:
+    def start(self, order: Mapping[str, object]) -> Forked:
         """Fork a learner."""
         assert self._server.stdin is not None
         assert self._server.stdout is not None

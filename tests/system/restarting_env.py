@@ -30,12 +30,14 @@ class Restarting(CartPoleEnv):
         if seed is not None:
             self._calls = -1
         self._count()
-        return super().reset(seed=seed, options=options)
+        found: tuple[Any, dict[str, Any]] = super().reset(seed=seed, options=options)
+        return found
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Step, and count a row."""
         self._count()
-        return super().step(action)
+        found: tuple[Any, float, bool, bool, dict[str, Any]] = super().step(action)  # type: ignore[no-untyped-call]
+        return found
 
     def _count(self) -> None:
         self._calls += 1

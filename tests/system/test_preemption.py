@@ -97,7 +97,7 @@ def same(left: Any, right: Any) -> bool:
         case list() | tuple():
             return len(left) == len(right) and all(map(same, left, right))
         case torch.Tensor():
-            return left.dtype == right.dtype and left.numpy().tobytes() == right.numpy().tobytes()
+            return bool(left.dtype == right.dtype and left.numpy().tobytes() == right.numpy().tobytes())
         case _:
             return bool(left == right)
 
