@@ -152,7 +152,7 @@ class Soak:
         half_s, end_s, next_s = began_s + self.seconds / 2, began_s + self.seconds, began_s + FAULT_EVERY_S
         while (now := time.monotonic()) < end_s:
             assert scene.learner.alive(), f"the learner ended:\n{scene.learner.said()[-3000:]}"
-            may_kill_it = now < half_s - SETTLED_S
+            may_kill_it = now < min(half_s - SETTLED_S, began_s + 0.4 * self.seconds)
             if self._an_evaluation_began():
                 self._make(KILL_A_WORKER, now)
             elif now >= next_s:

@@ -38,6 +38,8 @@ class Scene:
     bad_links: set[int] = field(default_factory=set)
     killed: set[int] = field(default_factory=set)
     """pids of workers"""
+    updates_when_killed: int = 0
+    """Of the run, when the learner was killed last."""
     strangers: list[Running] = field(default_factory=list)
     hostile: list[Running] = field(default_factory=list)
 
@@ -141,10 +143,13 @@ def stop_the_learner(scene: Scene) -> Undo:
 
 
 def kill_the_learner(scene: Scene) -> Undo:
-    """SIGKILL; then it is resumed at the same address."""
-    scene.learner.is_open()
+    """SIGKILL; then it is resumed at the same address. Only if the run got further since the last time."""
+    updates = scene.learner.updates()
+    if updates <= scene.updates_when_killed:
+        return None
     wait_for(scene.learner.checkpoints, START_S, "a checkpoint")
     scene.learner.kill()
+    scene.updates_when_killed = updates
     scene.learner = scene.resume()
     return None
 

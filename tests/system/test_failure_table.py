@@ -111,11 +111,13 @@ def test_workers_join_a_resumed_learner_on_the_same_port(stage: Stage) -> None:
     workers = [stage.worker(address, f"w{number}") for number in range(2)]
     wait_for(lambda: len(killed.checkpoints()) >= 3, START_S, "the third checkpoint")
     killed.kill()
-    saved = int(killed.checkpoints()[-1].stem)
+    seen = killed.rows()[-1]["time/total_timesteps"]  # its last rows may be newer than its last checkpoint
     learner = stage.learner(address, resume=killed.folder)
     learner.is_open()
-    seconds = learner.until(lambda row: row["time/total_timesteps"] > saved, START_S, "an update after the checkpoint")
-    within("learner killed -9 and resumed", seconds, 3.0)
+    seconds = learner.until(
+        lambda row: row["time/total_timesteps"] > seen, START_S, "an update after those of the first learner"
+    )
+    within("learner killed -9 and resumed", seconds, 5.0)
     learner.trains()
     assert all(worker.alive() for worker in workers), "a worker had to be restarted"
     steps = [row["time/total_timesteps"] for row in learner.rows()]
