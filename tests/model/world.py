@@ -20,7 +20,8 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from tests.model.conversation import Content, Conversation, Event
-from tests.model.names import OF_WORKER, Name, name, names_in, renamed, renaming
+from tests.model.names import Name, renaming
+from tests.model.parts import Parts, Seat
 
 State = tuple[int, ...]
 """Number of the learner, number of the seat of each worker, faults that can still happen."""
@@ -47,17 +48,6 @@ WorkerMove = tuple[str, int | None, int]
 """What can happen to a worker alone, with which message, and its seat after it."""
 
 
-class Seat(NamedTuple):
-    """A worker, and the messages that are on their way, oldest first; all by the number of the part."""
-
-    worker: int
-    up: tuple[int, ...] = ()
-    down: tuple[int, ...] = ()
-    late_up: tuple[int, ...] = ()
-    """copies of messages that have arrived; they can arrive at any time"""
-    late_down: tuple[int, ...] = ()
-
-
 GONE: Content = ("gone",)
 """in place of a worker that is gone for ever, or whose link is"""
 
@@ -72,12 +62,8 @@ class World:
 
     def __init__(self, conversation: Conversation, *, reduced: bool = True) -> None:
         self.conversation, self.reduced = conversation, reduced
-        self.parts: list[Any] = []
-        """contents of learners, workers and messages; and seats"""
-        self._numbers: dict[Any, int] = {}
-        self._names: list[frozenset[Name]] = []  # of each part
+        self.parts = Parts()
         self._renamings: dict[Any, dict[Name, Name | None]] = {}
-        self._renamed: dict[Any, int] = {}
         # What follows is computed once for each argument. (A decorator would keep all worlds alive.)
         self.facts = cache(lambda part: conversation.facts(self.parts[part]))
         self.worker = cache(lambda seat: self.facts(self.parts[seat].worker))
@@ -87,14 +73,14 @@ class World:
         self._worker_faults = cache(self._compute_worker_faults)
         self._arrived = cache(self._compute_arrived)
         self._sent = cache(self._compute_sent)
-        self._shape = cache(self._compute_shape)
+        self._of_worker_0 = cache(self.parts.of_worker_0)
         self._without_checkpoints = cache(self._compute_without_checkpoints)
 
     def start(self) -> State:
         """The learner has started, and no worker has."""
         learner, workers = self.conversation.start()
-        seats = [self._part(Seat(self._part(worker))) for worker in workers]
-        return self.canonical(self._at_most(self.conversation.faults, self._part(learner), *seats))
+        seats = [self.parts.number(Seat(self.parts.number(worker))) for worker in workers]
+        return self.canonical(self._at_most(self.conversation.faults, self.parts.number(learner), *seats))
 
     def why_broken(self, state: State) -> str:
         """Which rule does not hold in this state; empty: none."""
@@ -155,13 +141,13 @@ class World:
                 event = "ended", number, self.worker(seat).nonce
                 moves.append((Action("kill, reported", number), self._after_learner(dead, event)))
             if number in self.facts(learner).members and not self.worker(seat).shut_out:
-                unheard = self._part(Seat(worker, (), down, (), late_down))
+                unheard = self.parts.number(Seat(worker, (), down, (), late_down))
                 shut_out = _with(state, number, self._after_worker(number, unheard, ("shut out",)))
                 moves.append((Action("revoke", number), self._after_learner(shut_out, ("revoke", number))))
         if self.facts(learner).updating or any(self._under_way(seat) for seat in seats):
             moves.append((Action("delay"), self._after_time(state)))
         for version in range(self.facts(learner).checkpoints):
-            silent = [self._part(Seat(self.parts[seat].worker)) for seat in seats]
+            silent = [self.parts.number(Seat(self.parts[seat].worker)) for seat in seats]
             after = self._after_learner((learner, *silent, faults), ("restart", version))
             moves.append((Action("restart", version), after))
         only = self.conversation.only
@@ -177,12 +163,12 @@ class World:
         if faults == FOR_EVER or self.conversation.workers == 1:
             return []
         moves: list[Move] = []
-        gone = self._part(GONE)
+        gone = self.parts.number(GONE)
         for number, seat in enumerate(seats):
             # Until time passes, a worker that is gone does not differ from one whose turn does not come. So it goes when
             # only what it does or has said keeps time from passing. (If what it said did arrive, it goes after that.)
             if not self.reduced or not self._others_under_way(state, number):
-                nothing = self._part(Seat(gone, late_up=self.parts[seat].late_up))
+                nothing = self.parts.number(Seat(gone, late_up=self.parts[seat].late_up))
                 moves.append((Action("gone for ever", number), (*_with(state, number, nothing)[:-1], FOR_EVER)))
         return moves
 
@@ -245,7 +231,7 @@ class World:
 
     def _compute_without_checkpoints(self, learner: int) -> int:
         content = self.parts[learner]
-        return learner if content[0] == BROKEN else self._part(self.conversation.without_checkpoints(content))
+        return learner if content[0] == BROKEN else self.parts.number(self.conversation.without_checkpoints(content))
 
     def _after_time(self, state: State) -> State:
         learner, *seats, faults = self._after_learner(state, ("time",))
@@ -256,22 +242,17 @@ class World:
         return self._after_learner(_with(state, number, seat), ("receive", number, message))
 
     def _compute_arrived(self, number: int, what: str, message: int) -> int:
-        """The seat without this message, or with a copy of it that arrives later."""
+        """The seat without this message, or with a copy of it that arrives later: `what` begins with "repeat"."""
         seat = self.parts[number]
-        match what:
-            case "up":
-                return self._part(seat._replace(up=seat.up[1:]))
-            case "down":
-                return self._part(seat._replace(down=seat.down[1:]))
-            case "repeat up":
-                return self._part(seat._replace(up=seat.up[1:], late_up=_sorted((*seat.late_up, message))))
-            case "repeat down":
-                return self._part(seat._replace(down=seat.down[1:], late_down=_sorted((*seat.late_down, message))))
-            case "late up":
-                return self._part(seat._replace(late_up=_without(seat.late_up, message)))
-            case "late down":
-                return self._part(seat._replace(late_down=_without(seat.late_down, message)))
-        raise AssertionError(what)
+        *how, way = what.split()
+        late = f"late_{way}"
+        channel = late if how == ["late"] else way
+        rest = list(getattr(seat, channel))
+        rest.remove(message)
+        seat = seat._replace(**{channel: tuple(rest)})
+        if how == ["repeat"]:
+            seat = seat._replace(**{late: tuple(sorted((*getattr(seat, late), message)))})
+        return self.parts.number(seat)
 
     def _after_learner(self, state: State, event: Event) -> State:
         before, *seats, faults = state
@@ -283,15 +264,15 @@ class World:
     def _compute_sent(self, number: int, message: int) -> int:
         """The seat after the learner has sent this message. It is lost if no process is there."""
         seat = self.parts[number]
-        return self._part(seat._replace(down=(*seat.down, message))) if self.worker(number).alive else number
+        return self.parts.number(seat._replace(down=(*seat.down, message))) if self.worker(number).alive else number
 
     def _compute_learner_event(self, learner: int, event: Event) -> tuple[int, tuple[tuple[int, int], ...]]:
         message = self.parts[event[2]] if event[0] == "receive" else None
         try:
             after, sent = self.conversation.learner(self.parts[learner], event, message)
         except Exception as error:
-            return self._part(broken(error)), ()
-        return self._part(after), tuple([(worker, self._part(told)) for worker, told in sent])
+            return self.parts.number(broken(error)), ()
+        return self.parts.number(after), tuple([(worker, self.parts.number(told)) for worker, told in sent])
 
     def _after_worker(self, number: int, seat: int, event: Event) -> int:
         """The seat of the worker of this number, after this event."""
@@ -302,7 +283,7 @@ class World:
             up += sent
         if not facts.alive:
             down = late_down = ()
-        return self._part(Seat(worker, up, down, late_up, late_down))
+        return self.parts.number(Seat(worker, up, down, late_up, late_down))
 
     def _compute_worker_event(self, number: int, worker: int, event: Event) -> tuple[int, tuple[int, ...]]:
         if self.parts[worker] == GONE:
@@ -311,36 +292,23 @@ class World:
         try:
             after, sent = self.conversation.worker(self.parts[worker], number, event, message)
         except Exception as error:
-            return self._part(broken(error)), ()
-        return self._part(after), tuple([self._part(said) for said in sent])
+            return self.parts.number(broken(error)), ()
+        return self.parts.number(after), tuple([self.parts.number(said) for said in sent])
 
-    # ---------------------------------------------------------------- parts and names
-
-    def _part(self, part: Content | Seat) -> int:
-        """The number of this part."""
-        number = self._numbers.get(part)
-        if number is None:
-            number = self._numbers[part] = len(self.parts)
-            self.parts.append(part)
-            if isinstance(part, Seat):
-                numbers = part.worker, *part.up, *part.down, *part.late_up, *part.late_down
-                self._names.append(frozenset().union(*[self._names[each] for each in numbers]))
-            else:
-                self._names.append(frozenset(names_in(part, set())))
-        return number
+    # ---------------------------------------------------------------- canonical form
 
     def canonical(self, state: State) -> State:
         """The same state, with its names and its workers numbered anew."""
         learner, *seats, faults = state
         order = self._order(learner, seats)
-        key = order, *[self._names[each] for each in state[:-1]]
+        key = order, *[self.parts.names[each] for each in state[:-1]]
         new = self._renamings.get(key)
         if new is None:
             names = frozenset().union(*key[1:])
             new = self._renamings[key] = renaming(names, {old: number for number, old in enumerate(order)})
         if not new:
             return state
-        return (self._rename(learner, new), *[self._rename(seats[old], new) for old in order], faults)
+        return (self.parts.renamed(learner, new), *[self.parts.renamed(seats[old], new) for old in order], faults)
 
     def _order(self, learner: int, seats: list[int]) -> tuple[int, ...]:
         """The workers in an order that does not depend on their numbers: members first, as they joined."""
@@ -348,40 +316,8 @@ class World:
         if len(members) == len(seats):
             return members
         others = [number for number in range(len(seats)) if number not in members]
-        return (*members, *sorted(others, key=lambda number: self._shape(seats[number])))
-
-    def _compute_shape(self, seat: int) -> int:
-        """The same seat, if it belonged to worker 0."""
-        own = [each for each in self._names[seat] if each.kind in OF_WORKER]
-        return self._rename(seat, {each: name(each.kind, each.value, 0) for each in own})
-
-    def _rename(self, number: int, new: dict[Name, Name | None]) -> int:
-        """The same part under other names."""
-        names = self._names[number]
-        if names.isdisjoint(new):
-            return number
-        key = number, tuple([new.get(each, each) for each in names])
-        found = self._renamed.get(key)
-        if found is None:
-            found = self._renamed[key] = self._part(self._compute_renamed(self.parts[number], new))
-        return found
-
-    def _compute_renamed(self, part: Content | Seat, new: dict[Name, Name | None]) -> Any:
-        if not isinstance(part, Seat):
-            return renamed(part, new)
-        up, down, late_up, late_down = (tuple([self._rename(each, new) for each in messages]) for messages in part[1:])
-        return Seat(self._rename(part.worker, new), up, down, _sorted(late_up), _sorted(late_down))
+        return (*members, *sorted(others, key=lambda number: self._of_worker_0(seats[number])))
 
 
 def _with(state: State, number: int, seat: int) -> State:
     return (*state[: number + 1], seat, *state[number + 2 :])
-
-
-def _without(messages: tuple[int, ...], message: int) -> tuple[int, ...]:
-    index = messages.index(message)
-    return messages[:index] + messages[index + 1 :]
-
-
-def _sorted(messages: tuple[int, ...]) -> tuple[int, ...]:
-    """Copies whose order does not matter."""
-    return tuple(sorted(messages)) if len(messages) > 1 else messages
