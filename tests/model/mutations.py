@@ -11,6 +11,7 @@ session before anything of it arrives. With the repeated Welcome these are at le
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from dataclasses import dataclass
 from importlib.abc import MetaPathFinder
@@ -18,11 +19,14 @@ from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from importlib.util import spec_from_loader
 from pathlib import Path
 from types import CodeType, ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
+    from tests.model.conversation import Conversation
+
+ROOT = Path(__file__).parent.parent.parent
 COORDINATOR = "learner.rollouts.ticket_coordinator"
 LANES = "learner.rollouts.lanes"
 MEMBERSHIP = "learner.members.membership"
@@ -159,12 +163,11 @@ class _MutatedLoader(SourceFileLoader):
         return compile(text.replace(self._mutation.right, self._mutation.wrong), self.path, "exec")
 
 
-def _explore() -> str:
-    """Explore small runs, the smallest first. Returns what is broken; empty: nothing was found."""
-    from tests.model.search import RuleBroken, explore
+def runs() -> list[Conversation]:
+    """Small runs, the smallest first."""
     from tests.model.training import Training
 
-    for training in (
+    return [
         Training(workers=1, lanes=1, updates=2, faults=1),
         Training(workers=1, lanes=1, updates=1, faults=2, only=("drop up", "drop down")),
         Training(workers=2, lanes=1, updates=1, faults=1),
@@ -174,12 +177,7 @@ def _explore() -> str:
         Training(workers=2, lanes=2, updates=1, faults=1),
         Training(workers=2, lanes=1, updates=2, faults=2, max_lag=1, only=("repeat down", "freeze")),
         Training(workers=2, lanes=2, updates=2, faults=2, only=("drop down", "kill, reported")),
-    ):
-        try:
-            explore(training)
-        except RuleBroken as broken:
-            return f"{training}\n{broken}"
-    return ""
+    ]
 
 
 def _fuzz() -> str:
@@ -194,8 +192,41 @@ def _fuzz() -> str:
     return ""
 
 
-if __name__ == "__main__":
-    sys.meta_path.insert(0, Mutator(MUTATIONS[sys.argv[1]]))
-    found = _fuzz() if "--fuzz" in sys.argv else _explore()
+def _explored(conversations: list[Conversation]) -> str:
+    """Explore them. Returns what is broken; empty: nothing was found."""
+    from tests.model.search import RuleBroken, explore
+
+    for conversation in conversations:
+        try:
+            explore(conversation)
+        except RuleBroken as broken:
+            return f"{conversation}\n{broken}"
+    return ""
+
+
+def play(mutations: dict[str, Mutation], runs: Callable[[], list[Conversation]]) -> NoReturn:
+    """The program with the mistake that the command line names. Nothing of `learner` or `workers` is imported before."""
+    sys.meta_path.insert(0, Mutator(mutations[sys.argv[1]]))
+    found = _fuzz() if "--fuzz" in sys.argv else _explored(runs())
     sys.stdout.write(found)
     sys.exit(1 if found else 0)
+
+
+def find(name: str, module: str = "tests.model.mutations") -> str:
+    """What the checker says of the program with a mistake of this module's list."""
+    command = [sys.executable, "-m", module, name]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1200, check=False)
+    assert result.returncode == 1, f"not found: {name}\n{result.stdout}{result.stderr}"
+    assert "\nThen: " in result.stdout
+    return result.stdout
+
+
+def check_that_they_fit(mutations: dict[str, Mutation]) -> None:
+    """The text that each of them replaces stands once in its file."""
+    for name, mutation in mutations.items():
+        text = (ROOT / (mutation.module.replace(".", "/") + ".py")).read_text()
+        assert text.count(mutation.right) == 1, f"{name}: expected this once in {mutation.module}: {mutation.right}"
+
+
+if __name__ == "__main__":
+    play(MUTATIONS, runs)

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import pytest
 
-from tests.model.mutations import MUTATIONS
-from tests.test_architecture import ROOT
+from tests.model.mutations import MUTATIONS, check_that_they_fit, find
 
 
 def test_a_mistake_is_found_and_told_as_a_story() -> None:
@@ -23,18 +19,8 @@ def test_a_mistake_is_found_and_told_as_a_story() -> None:
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("name", MUTATIONS)
 def test_every_mistake_is_found(name: str) -> None:
-    assert "\nThen: " in find(name)
-
-
-def find(name: str) -> str:
-    """What the checker says of the program with this mistake."""
-    command = [sys.executable, "-m", "tests.model.mutations", name]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1200, check=False)
-    assert result.returncode == 1, f"not found: {name}\n{result.stdout}{result.stderr}"
-    return result.stdout
+    find(name)
 
 
 def test_every_mutation_fits_the_program() -> None:
-    for name, mutation in MUTATIONS.items():
-        text = (ROOT / (mutation.module.replace(".", "/") + ".py")).read_text()
-        assert text.count(mutation.right) == 1, f"{name}: expected this once in {mutation.module}: {mutation.right}"
+    check_that_they_fit(MUTATIONS)

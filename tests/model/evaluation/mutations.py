@@ -6,9 +6,12 @@ broken.
 
 from __future__ import annotations
 
-import sys
+from typing import TYPE_CHECKING
 
-from tests.model.mutations import COORDINATOR, SESSION, Mutation, Mutator
+from tests.model.mutations import COORDINATOR, SESSION, Mutation, play
+
+if TYPE_CHECKING:
+    from tests.model.conversation import Conversation
 
 TICKETS = "learner.rollouts.evaluation_tickets"
 HELD = "workers.evaluate.held_evaluations"
@@ -54,28 +57,19 @@ OF_THE_WORKER = {
 MUTATIONS = {**OF_THE_LEARNER, **OF_THE_WORKER}
 
 
-def explored() -> str:
-    """Explore small runs, the smallest first. Returns what is broken; empty: nothing was found."""
+def runs() -> list[Conversation]:
+    """Small runs, the smallest first."""
     from tests.model.evaluation.evaluating import Evaluating
-    from tests.model.search import RuleBroken, explore
 
-    for run in (
+    return [
         Evaluating(workers=1, lanes=1, updates=1, faults=1),
         Evaluating(workers=1, lanes=1, updates=1, faults=1, episodes=1, rows=True),
         Evaluating(workers=1, lanes=1, updates=1, faults=1, evaluated=(0, 1)),
         Evaluating(workers=1, lanes=1, updates=2, faults=1, max_lag=1, evaluated=(1,)),
         Evaluating(workers=1, lanes=1, updates=1, faults=2, episodes=1, rows=True),
         Evaluating(workers=2, lanes=1, updates=1, faults=1),
-    ):
-        try:
-            explore(run)
-        except RuleBroken as broken:
-            return f"{run}\n{broken}"
-    return ""
+    ]
 
 
 if __name__ == "__main__":
-    sys.meta_path.insert(0, Mutator(MUTATIONS[sys.argv[1]]))
-    found = explored()
-    sys.stdout.write(found)
-    sys.exit(1 if found else 0)
+    play(MUTATIONS, runs)

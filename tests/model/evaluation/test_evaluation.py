@@ -6,7 +6,6 @@ count once, no ticket for a rollout is dealt meanwhile, and every run goes on af
 
 from __future__ import annotations
 
-import subprocess
 import sys
 
 import pytest
@@ -15,11 +14,12 @@ from learner.rollouts.evaluation_tickets import EvaluationTickets
 from tests.model.evaluation import learner_half, worker_half
 from tests.model.evaluation.evaluating import Evaluating
 from tests.model.evaluation.mutations import MUTATIONS, OF_THE_LEARNER, OF_THE_WORKER
+from tests.model.mutations import check_that_they_fit, find
 from tests.model.search import explore
 from tests.support.fake_ends import run_spec
-from tests.test_architecture import ROOT
 from workers.evaluate.held_evaluations import HeldEvaluations
 
+LIST = "tests.model.evaluation.mutations"
 SMALL = [
     Evaluating(workers=1, lanes=1, updates=1, faults=1),
     Evaluating(workers=1, lanes=1, updates=1, faults=1, episodes=1, rows=True),
@@ -56,26 +56,16 @@ def test_every_field_is_in_the_state_or_left_out_on_purpose() -> None:
 
 def test_a_mistake_is_found() -> None:
     """So that it is known in every `make test` that the checker can fail."""
-    assert find("a ticket that was put back is lost").endswith("a ticket of an evaluation is not in one place")
+    assert find("a ticket that was put back is lost", LIST).endswith("a ticket of an evaluation is not in one place")
 
 
 @pytest.mark.model
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("name", MUTATIONS)
 def test_every_mistake_is_found(name: str) -> None:
-    assert "\nThen: " in find(name)
-
-
-def find(name: str) -> str:
-    """What the checker says of the program with this mistake."""
-    command = [sys.executable, "-m", "tests.model.evaluation.mutations", name]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1200, check=False)
-    assert result.returncode == 1, f"not found: {name}\n{result.stdout}{result.stderr}"
-    return result.stdout
+    find(name, LIST)
 
 
 def test_every_mutation_fits_the_program() -> None:
     assert min(len(OF_THE_LEARNER), len(OF_THE_WORKER)) >= 5
-    for name, mutation in MUTATIONS.items():
-        text = (ROOT / (mutation.module.replace(".", "/") + ".py")).read_text()
-        assert text.count(mutation.right) == 1, f"{name}: expected this once in {mutation.module}: {mutation.right}"
+    check_that_they_fit(MUTATIONS)

@@ -9,9 +9,12 @@ must have come between the two).
 
 from __future__ import annotations
 
-import sys
+from typing import TYPE_CHECKING
 
-from tests.model.mutations import SESSION, Mutation, Mutator
+from tests.model.mutations import SESSION, Mutation, play
+
+if TYPE_CHECKING:
+    from tests.model.conversation import Conversation
 
 COORDINATOR = "learner.vector_env.order_coordinator"
 HUB = "learner.vector_env.step_hub"
@@ -49,25 +52,16 @@ OF_THE_WORKER = {
 MUTATIONS = {**OF_THE_LEARNER, **OF_THE_WORKER}
 
 
-def explored() -> str:
-    """Explore small runs, the smallest first. Returns what is broken; empty: nothing was found."""
-    from tests.model.search import RuleBroken, explore
+def runs() -> list[Conversation]:
+    """Small runs, the smallest first."""
     from tests.model.vector_env.stepping import Stepping
 
-    for run in (
+    return [
         Stepping(workers=1, lanes=1, calls=("reset", "step", "step", "step"), faults=1),
         Stepping(workers=1, lanes=2, calls=("reset", "step"), faults=1),
         Stepping(workers=2, lanes=1, calls=("reset", "step", "step"), faults=1),
-    ):
-        try:
-            explore(run)
-        except RuleBroken as broken:
-            return f"{run}\n{broken}"
-    return ""
+    ]
 
 
 if __name__ == "__main__":
-    sys.meta_path.insert(0, Mutator(MUTATIONS[sys.argv[1]]))
-    found = explored()
-    sys.stdout.write(found)
-    sys.exit(1 if found else 0)
+    play(MUTATIONS, runs)

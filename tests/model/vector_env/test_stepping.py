@@ -6,19 +6,19 @@ once; a lane has one owner; a lost lane is reported once and reset before it ste
 
 from __future__ import annotations
 
-import subprocess
 import sys
 
 import pytest
 
 from learner.vector_env.order_coordinator import OrderCoordinator, OrderedLane
+from tests.model.mutations import check_that_they_fit, find
 from tests.model.search import explore
 from tests.model.vector_env import learner_half, worker_half
 from tests.model.vector_env.mutations import MUTATIONS, OF_THE_LEARNER, OF_THE_WORKER
 from tests.model.vector_env.stepping import Stepping
-from tests.test_architecture import ROOT
 from workers.step.held_orders import HeldOrders, _HeldLane
 
+LIST = "tests.model.vector_env.mutations"
 SMALL = [
     Stepping(workers=1, lanes=1, calls=("reset", "step", "call", "step"), faults=1),
 ]
@@ -56,26 +56,16 @@ def test_every_field_is_in_the_state_or_left_out_on_purpose() -> None:
 
 def test_a_mistake_is_found() -> None:
     """So that it is known in every `make test` that the checker can fail."""
-    assert find("a lost order is not sent again").endswith("a worker that is heard does not answer")
+    assert find("a lost order is not sent again", LIST).endswith("a worker that is heard does not answer")
 
 
 @pytest.mark.model
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("name", MUTATIONS)
 def test_every_mistake_is_found(name: str) -> None:
-    assert "\nThen: " in find(name)
-
-
-def find(name: str) -> str:
-    """What the checker says of the program with this mistake."""
-    command = [sys.executable, "-m", "tests.model.vector_env.mutations", name]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1200, check=False)
-    assert result.returncode == 1, f"not found: {name}\n{result.stdout}{result.stderr}"
-    return result.stdout
+    find(name, LIST)
 
 
 def test_every_mutation_fits_the_program() -> None:
     assert min(len(OF_THE_LEARNER), len(OF_THE_WORKER)) >= 5
-    for name, mutation in MUTATIONS.items():
-        text = (ROOT / (mutation.module.replace(".", "/") + ".py")).read_text()
-        assert text.count(mutation.right) == 1, f"{name}: expected this once in {mutation.module}: {mutation.right}"
+    check_that_they_fit(MUTATIONS)
