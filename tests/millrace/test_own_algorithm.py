@@ -84,7 +84,7 @@ def test_what_looks_at_a_run_does_not_need_its_code(
     capsys.readouterr()
     assert main(["train", "--resume", str(run), "--steps", "1200"]) == 2
     missing = "no module my_own_loss; expected one in the current folder, on PYTHONPATH or installed"
-    assert capsys.readouterr().err == f"millrace: algo my_own_loss:ClippedPlus: {missing}\n"
+    assert capsys.readouterr().err == f"millrace: {run / 'config.toml'}: algo my_own_loss:ClippedPlus: {missing}\n"
 
 
 def test_a_class_of_a_notebook_is_given_again_to_resume(tmp_path: Path) -> None:
