@@ -118,14 +118,16 @@ def test_moments_that_fade_are_zero_before_they_are_denormal_and_only_they(kind:
     assert 0 < denormal * 1 < smallest  # to whatever runs in this thread afterwards
 
 
-@pytest.mark.parametrize("algo", ["ppo", "a2c", "dqn"])
-def test_a_run_that_compiles_nothing_does_not_import_the_compiler(algo: str, tmp_path: Path) -> None:
+def test_runs_that_compile_nothing_do_not_import_the_compiler(tmp_path: Path) -> None:
     program = f"""
 import sys, millrace
-run = millrace.train("CartPole-v1", algo="{algo}", steps=2000, run_dir={str(tmp_path)!r}, transport="inproc")
-assert "torch" in sys.modules
-assert "torch._dynamo" not in sys.modules
+for algo in ("ppo", "a2c", "dqn"):
+    millrace.train("CartPole-v1", algo=algo, steps=2000, run_dir={str(tmp_path)!r}, transport="inproc")
+    assert "torch" in sys.modules
+    assert "torch._dynamo" not in sys.modules, algo
 """
     root = Path(__file__).parents[3]
-    done = subprocess.run([sys.executable, "-c", program], cwd=root, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=root, capture_output=True, text=True, timeout=100, check=False
+    )
     assert done.returncode == 0, done.stderr

@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from learner.config.layers import resolve
@@ -103,6 +103,7 @@ def taken(action: Array) -> Array:
     return action + 100
 
 
+@settings(deadline=None)  # a busy machine takes longer for an example
 @given(rollouts())
 def test_the_episodes_of_a_copy_are_its_rows_without_the_resets(stream: list[tuple[int, Rollout]]) -> None:
     assembler = EpisodeAssembler(taken)
@@ -137,6 +138,7 @@ def test_the_episodes_of_a_copy_are_its_rows_without_the_resets(stream: list[tup
                 assert np.array_equal(np.concatenate([e.truncated for e in mine]), truncated[kept, n])
 
 
+@settings(deadline=None)
 @given(rollouts(), st.data())
 def test_an_episode_has_no_hole_whatever_is_dropped_or_late(stream: list[tuple[int, Rollout]], data: st.DataObject) -> None:
     came = data.draw(st.lists(st.sampled_from(range(len(stream))), max_size=len(stream), unique=True))
