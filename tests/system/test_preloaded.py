@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from tests.support.preloaded import ForkedProcess, may_be_forked
+from tests.support.preloaded import ENVIRONMENT, ForkedProcess, may_be_forked
 from tests.system.processes import ROOT, wait_for
 
 WITHIN_S = 60.0
@@ -124,7 +124,8 @@ def test_one_that_nobody_waits_for_is_no_process_any_more(probe: dict[str, str])
 def test_only_learners_whose_environment_is_the_parents_are_forked(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("TESTS_EXEC", raising=False)
     learner = [sys.executable, "-m", "learner", "CartPole-v1"]
-    assert may_be_forked(learner)
+    changed = {name for name in {*os.environ, *ENVIRONMENT} if os.environ.get(name) != ENVIRONMENT.get(name)}
+    assert may_be_forked(learner), changed
     assert may_be_forked([sys.executable, "-m", "millrace", "train"], {**os.environ, "PYTHONPATH": "x", "TMPDIR": "/x"})
     for other in (
         [sys.executable, "-P", *learner[1:]],

@@ -7,6 +7,7 @@ import os
 import signal
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,15 @@ SMALL: dict[str, Any] = {"envs": 4, "lanes": 2, "rollout_steps": 16}
 
 
 def children() -> list[psutil.Process]:
-    return psutil.Process().children(recursive=True)
+    """The worker processes of this process that run."""
+    return [child for child in psutil.Process().children() if "workers" in _command(child)]
+
+
+def _command(process: psutil.Process) -> list[str]:
+    with suppress(psutil.NoSuchProcess, psutil.ZombieProcess):
+        found: list[str] = process.cmdline()
+        return found
+    return []
 
 
 def test_a_long_computation_loses_no_worker() -> None:
