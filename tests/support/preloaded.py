@@ -26,7 +26,9 @@ LEARNERS = (["learner"], ["millrace", "train"], ["millrace", "learner"], ["millr
 """Modules, and their first argument. Other commands do without PyTorch, and must be seen to."""
 PER_COMMAND = {"COLUMNS", "PYTEST_CURRENT_TEST", "PYTHONPATH", "PYTHONUNBUFFERED", "TMPDIR"}
 """Variables that a child may have otherwise than its parent: nobody reads them before the command runs, or `become` does."""
-BY_IMPORTS = {"LD_LIBRARY_PATH", "OMP_WAIT_POLICY", "PYGAME_HIDE_SUPPORT_PROMPT", "SDL_VIDEODRIVER"}
+BY_IMPORTS = {
+    "LD_LIBRARY_PATH", "OMP_WAIT_POLICY", "PYGAME_HIDE_SUPPORT_PROMPT", "SDL_VIDEODRIVER", "TORCHINDUCTOR_CACHE_DIR",
+}  # fmt: skip
 """Set by packages, and by `known_environment`, that a test has used in its own process. No test is about them."""
 
 ENVIRONMENT = {name: value for name, value in os.environ.items() if name not in PER_COMMAND}
