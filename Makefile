@@ -30,7 +30,7 @@ unit: .venv/installed-dev
 test-learning: .venv/installed-dev  ## published scores, three seeds each; ten minutes
 	$(BIN)/python -m pytest -m learning --timeout 3600 tests/learning
 
-test-model: .venv/installed-dev  ## every interleaving of messages, faults and time in small runs, and mistakes made on purpose; ten minutes on two cores
+test-model: .venv/installed-dev  ## every interleaving of messages, faults and time in small runs, and mistakes made on purpose; five minutes on two cores
 	$(BIN)/python -m pytest -m model -rP --numprocesses 2 tests/model
 
 test-cluster: .venv/installed-dev  ## Docker, Prometheus, Slurm and Ray, for real. Needs root, Debian's packages, the extra `ray`; says which
