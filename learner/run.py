@@ -21,13 +21,13 @@ from learner.config.config import Config
 from learner.env_spaces import EnvSpaces
 from learner.imports_ahead import ImportsAhead
 from learner.interrupts import Interrupts
-from learner.members.describe import DescribeSettings, described_by_workers
+from learner.members.describe import described_by_workers
 from learner.members.describe_coordinator import Accept
 from learner.members.endpoint import join_lines, keyring_for
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.recording.training_recorder import TrainingRecorder
 from learner.resumption import Resumption, check_spaces
-from learner.rollout_service.service import rollout_service
+from learner.rollout_service.service import describe_settings, rollout_service
 from learner.rollouts.hub import HubObserver
 from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import Interrupted, RunFolder
@@ -118,20 +118,9 @@ def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, d
 
 def describe_over(link: LearnerLink, config: Config, processes: ProcessCallbacks) -> Describe:
     """Has one of the workers at the link of the run describe the environment."""
-    settings = describe_settings(config)
+    settings = describe_settings(config, config.steps)
     return lambda spec, check_interrupt, accept: described_by_workers(
         link, spec, settings, processes, check_interrupt, accept=accept
-    )
-
-
-def describe_settings(config: Config) -> DescribeSettings:
-    """The settings of the conversation in which a worker describes the environment."""
-    return DescribeSettings(
-        worker_timeout_s=config.worker_timeout_s,
-        no_workers_timeout_s=config.no_workers_timeout_s,
-        stall_timeout_s=config.stall_timeout_s,
-        max_env_failures=config.max_env_failures,
-        steps=config.steps,
     )
 
 

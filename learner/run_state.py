@@ -64,7 +64,5 @@ def restore(folder: RunFolder, algorithm: Algorithm) -> RunState:
             f"checkpoint {found.path}: expected the state of this configuration, got another ({error}); "
             "resume it with the settings it was made with"
         ) from error
-    # The learner that dealt the outstanding tickets is gone. So are these tickets, and the rollouts that were not yet used.
-    state.ledger.lost += state.ledger.outstanding
-    state.ledger.transitions_late += state.ledger.transitions_waiting
+    state.ledger.end_outstanding()
     return state

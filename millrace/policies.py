@@ -130,12 +130,11 @@ class PolicyParameters:
         """The policy as plain data."""
         self.size = acting_size(spec)
         """P, the length of the flat vector."""
-        self.layout = _pieces(parameter_layout(spec)[0])
+        self._fields, self._buffer_fields = parameter_layout(spec)[0], buffer_layout(spec)
+        self.layout = _pieces(self._fields)
         """Its pieces, in order."""
-        self.buffers = _pieces(buffer_layout(spec))
+        self.buffers = _pieces(self._buffer_fields)
         """The pieces of the buffers: `observation_mean` and `observation_std` if observations are normalized."""
-        self._fields = parameter_layout(spec)[0]
-        self._buffer_fields = buffer_layout(spec)
 
     def initial(self, seed: int = 1) -> Floats:
         """Initial parameters [P] float32: orthogonal weights with the gains of the layout, biases 0."""

@@ -122,11 +122,13 @@ class RolloutService:
             raise UsageError(f"rollout_steps: expected a whole number above 0, got {rollout_steps!r}")
         self.restored: dict[str, Array] = {}
         """The arrays of the file that was restored, by name."""
-        past, self._version, self.env_steps = None, -1, 0
+        past: tuple[Ledger, Sequence[int]] | None = None
+        self._version, self.env_steps = -1, 0
         state: ServiceState | None = None
         if restore is not None:
             state, self.restored = read(Path(restore))
-            past = _past(state)
+            state.ledger.end_outstanding()
+            past = state.ledger, state.incarnations
             self._version, self.env_steps = state.version - 1, state.env_steps
         self.config = config
         """All settings of collecting rollouts."""
@@ -322,14 +324,6 @@ def _config(env: object, settings: dict[str, Any]) -> RolloutConfig:
     if not given.get("bind"):
         given.pop("bind", None)
     return convert_rollout_settings(given)
-
-
-def _past(state: ServiceState) -> tuple[Ledger, Sequence[int]]:
-    """Ledger and incarnations. What was under way when the file was written is lost, and counted."""
-    ledger = state.ledger
-    ledger.lost += ledger.outstanding
-    ledger.transitions_late += ledger.transitions_waiting
-    return ledger, state.incarnations
 
 
 def _check_restored(state: ServiceState, env: str, policy: PolicySpec, file: str) -> None:

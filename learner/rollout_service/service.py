@@ -10,6 +10,7 @@ import os
 from collections.abc import Callable, Sequence
 
 from learner.config.rollout_config import RolloutConfig
+from learner.members.describe import DescribeSettings
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.rollouts.evaluation_tickets import EvaluationPlan, evaluation_of
 from learner.rollouts.hub import Hub, HubObserver, HubSettings, HubSnapshot
@@ -121,3 +122,14 @@ def rollout_service(
         config.call_timeouts(),
     )
     return RolloutService(Hub(link, coordinator, settings, processes, check_interrupt, observer), processes.expected)
+
+
+def describe_settings(config: RolloutConfig, steps: int = 0) -> DescribeSettings:
+    """The settings of the conversation in which a worker describes the environment. `steps`: env steps of the run."""
+    return DescribeSettings(
+        worker_timeout_s=config.worker_timeout_s,
+        no_workers_timeout_s=config.no_workers_timeout_s,
+        stall_timeout_s=config.stall_timeout_s,
+        max_env_failures=config.max_env_failures,
+        steps=steps,
+    )

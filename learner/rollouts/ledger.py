@@ -46,6 +46,11 @@ class Ledger(msgspec.Struct, kw_only=True):
         dropped = self.transitions_stale + self.transitions_duplicate + self.transitions_late + self.transitions_invalid
         return self.transitions_received - self.transitions_used - dropped
 
+    def end_outstanding(self) -> None:
+        """The learner that dealt the outstanding tickets is gone. So are they, and the rollouts that were not yet used."""
+        self.lost += self.outstanding
+        self.transitions_late += self.transitions_waiting
+
     def copy(self) -> Ledger:
         """The same counts, which do not change any more."""
         return msgspec.structs.replace(self)

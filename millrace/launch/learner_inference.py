@@ -21,7 +21,8 @@ from learner.members.describe_coordinator import Accept
 from learner.members.endpoint import BindSettings
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.resumption import Resumption
-from learner.run import Run, RunSetup, Watch, describe_settings, known_environment, prometheus_observer, run_folder
+from learner.rollout_service.service import describe_settings
+from learner.run import Run, RunSetup, Watch, known_environment, prometheus_observer, run_folder
 from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.settings import VectorEnvSettings
 from millrace.launch.local_worker_options import private_address, worker_flags
@@ -68,7 +69,7 @@ def train(
         started = listening.start(worker_flags(config, folder.path), config.call_timeouts())
 
         def describe(spec: DescribeSpec, check_interrupt: Callable[[], None], accept: Accept) -> DescribedEnv:
-            return started.describe(describe_settings(config), check_interrupt, accept)
+            return started.describe(describe_settings(config, config.steps), check_interrupt, accept)
 
         known = known_environment(config, env_spec, resume, describe)
         env = started.vector_env(known.described)

@@ -15,10 +15,10 @@ import zmq
 
 from learner.config.rollout_config import RolloutConfig
 from learner.env_spaces import EnvSpaces
-from learner.members.describe import DescribeSettings, described_by_workers
+from learner.members.describe import described_by_workers
 from learner.members.endpoint import join_lines, keyring_for
 from learner.members.process_callbacks import ProcessCallbacks
-from learner.rollout_service.service import RolloutService, rollout_service
+from learner.rollout_service.service import RolloutService, describe_settings, rollout_service
 from learner.rollout_service.spec import rollout_spec
 from learner.rollouts.ledger import Ledger
 from millrace.launch.local_worker_options import private_address, stopped_on_error, temporary_keys, worker_cores
@@ -91,18 +91,9 @@ def start(
         if supervisor is not None:
             starting.enter_context(stopped_on_error(supervisor))
         spec = DescribeSpec(env, config.chosen_vector(), heartbeat_s=config.heartbeat_s)
-        described = described_by_workers(link, spec, _describe_settings(config), processes, check_interrupt)
+        described = described_by_workers(link, spec, describe_settings(config), processes, check_interrupt)
         spaces = EnvSpaces.of_description(described)
         run = rollout_spec(config, env, policy.spec(spaces.observation, spaces.action), rollout_steps)
         service = rollout_service(config, run, link, processes, check_interrupt, past=past)
         service.wait_for_workers(config.min_workers or (1 if listens else config.workers))
     return StartedService(service, run, described)
-
-
-def _describe_settings(config: RolloutConfig) -> DescribeSettings:
-    return DescribeSettings(
-        worker_timeout_s=config.worker_timeout_s,
-        no_workers_timeout_s=config.no_workers_timeout_s,
-        stall_timeout_s=config.stall_timeout_s,
-        max_env_failures=config.max_env_failures,
-    )
