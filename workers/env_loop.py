@@ -102,42 +102,43 @@ class EnvLoop:
         infos: Infos = []
         # What the worker does is written here in full, because this loop must be fast: once per step of the lane, when a
         # copy is reset, and every `PULSE_S`.
-        numbers, seconds, counted = self._activity.numbers, self._activity.seconds, 0
-        seconds[SINCE_S] = began_s = perf_counter()
+        numbers, seconds, begin, counted = self._activity.numbers, self._activity.seconds, self._activity.begin, 0
+        seconds[SINCE_S] = now_s = perf_counter()
         numbers[DOING] = STEPPING
-        pulse_due_s = began_s + PULSE_S
+        pulse_due_s = now_s + PULSE_S
         for n, (step, action) in enumerate(zip(self._step_functions, actions, strict=True)):
             resets = next_step and (terminated[n] or truncated[n])
             try:
                 if resets:
-                    with self._activity.during(RESETTING):
-                        observation, info = self.envs[n].reset()
-                    numbers[DOING] = STEPPING
+                    begin(RESETTING)
+                    observation, info = self.envs[n].reset()
+                    begin(STEPPING)
                     reward[n], terminated[n], truncated[n] = 0.0, False, False
                 else:
                     observation, reward[n], terminated[n], truncated[n], info = step(action)
                     if same_step and (terminated[n] or truncated[n]):
                         resets = True
                         last = {"final_obs": observation, "final_info": info}
-                        with self._activity.during(RESETTING):
-                            observation, info = self.envs[n].reset()
-                        numbers[DOING] = STEPPING
+                        begin(RESETTING)
+                        observation, info = self.envs[n].reset()
+                        begin(STEPPING)
                         info = last | info
                 into[n] = observation
             except BaseException as error:
+                begin(WAITING)
                 raise CopyRaised(n, "reset" if resets else f"step {self.steps}") from error
             if info:
                 infos.append((n, info))
-            if perf_counter() > pulse_due_s:
+            if (now_s := perf_counter()) > pulse_due_s:
                 numbers[ENV_CALLS] += n + 1 - counted
                 counted = n + 1
                 numbers[DOING] = WAITING
                 pulse()
-                seconds[SINCE_S] = began_s = perf_counter()
+                seconds[SINCE_S] = now_s = perf_counter()
                 numbers[DOING] = STEPPING
-                pulse_due_s = began_s + PULSE_S
+                pulse_due_s = now_s + PULSE_S
         numbers[ENV_CALLS] += len(reward) - counted
-        seconds[SINCE_S] = perf_counter()
+        seconds[SINCE_S] = now_s
         numbers[DOING] = WAITING
         self.steps += 1
         return infos

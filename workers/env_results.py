@@ -32,27 +32,32 @@ class LeafWriter:
         self._shape = (copies, *leaf.shape)
         # Observations of one dimension or more are joined along their first one, which is the fastest way.
         self._lengths = [leaf.shape[0]] * copies if leaf.shape else None
-        self._joined_shape = (copies * leaf.shape[0], *leaf.shape[1:]) if leaf.shape else ()
+        self._joined_shape = (copies * leaf.shape[0], *leaf.shape[1:]) if leaf.shape else (copies,)
         # "same_kind" is the default, and naming it would cost a tenth of the time.
         self._join: Callable[..., Any] = partial(np.concatenate, casting="safe") if self._is_whole else np.concatenate
 
-    def write(self, row: Array, values: Any) -> None:
-        """Write into `row`, a contiguous array [N, *leaf]. `values`: an array of this shape, or N observations in order.
+    def joined(self, array: Array) -> Array:
+        """A view of a contiguous array [*rows, N, *leaf], with the N observations joined along their first dimension."""
+        return array.reshape(array.shape[: array.ndim - len(self._shape)] + self._joined_shape)
+
+    def write(self, joined: Array, values: Any) -> None:
+        """Write into one row of a `joined` array. `values`: an array [N, *leaf], or N observations in order.
 
         Raises `Unusable`; some copies may be written then.
         """
         try:
             if self._lengths is not None and isinstance(values, (list, tuple)):
                 if list(map(len, values)) == self._lengths:
-                    self._join(values, out=row.reshape(self._joined_shape))
+                    self._join(values, out=joined)
                     return
             else:
                 array = np.asarray(values)
                 if array.shape == self._shape and (array.dtype == self._dtype or self._keeps_values(array)):
-                    row[...] = array
+                    joined[...] = array.reshape(self._joined_shape)
                     return
         except (TypeError, ValueError):  # the loop below finds what is wrong, if anything is
             pass
+        row = joined.reshape(self._shape)
         if len(values) != len(row):
             raise Unusable(None, f"{_name(self._leaf)}: expected those of {len(row)} copies, got {len(values)}")
         for n, value in enumerate(values):
@@ -107,17 +112,18 @@ def missing_leaf(n: int | None, observation: Any, error: Exception) -> Unusable:
     )
 
 
-def write_numbers(rows: Numbers, values: Numbers) -> None:
-    """Write reward, terminated and truncated of N copies into `rows`, [N] each.
+def write_numbers(arrays: Numbers, row: int | slice, values: Numbers) -> None:
+    """Write reward, terminated and truncated of N copies into this row of three arrays: `array[row]` has the shape [N].
 
     An array of one element counts as a number, as in gymnasium. Raises `Unusable`, which names the copy.
     """
+    reward, terminated, truncated = arrays
     try:
-        rows[0][:], rows[1][:], rows[2][:] = values
+        reward[row], terminated[row], truncated[row] = values
     except (TypeError, ValueError):
-        for name, row, of_copies in zip(("reward", "terminated", "truncated"), rows, values, strict=True):
+        for name, array, of_copies in zip(("reward", "terminated", "truncated"), arrays, values, strict=True):
             for n, value in enumerate(of_copies):
-                row[n] = _number(name, n, value)
+                array[row][n] = _number(name, n, value)
 
 
 def _number(name: str, n: int, value: Any) -> Any:

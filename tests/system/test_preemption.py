@@ -292,7 +292,8 @@ def test_a_process_ends_within_its_grace_time_though_a_worker_does_not_leave(sta
     assert started.ends() == 130, started.said()
     seconds = time.monotonic() - began_s
     sys.stdout.write(f"\n--grace-s {grace_s:g}: it ended after {seconds:.2f} s\n")
-    assert seconds <= grace_s + 0.5 * crowding()
+    # It ends the worker when the time is up; then the interpreter exits. Without the limit it would wait for five seconds.
+    assert seconds <= grace_s + 1.5 * crowding()
 
 
 @pytest.mark.soak

@@ -53,14 +53,18 @@ class CollectedLane:
             )
         try:
             leaves = self.copies.reset(self._seeds, pulse)
-            self.write_observations([array[None] for array in self.obs], 0, leaves)
+            self.write_observations(self.joined([array[None] for array in self.obs]), 0, leaves)
         except CopyRaised as error:
             raise lane_failed(self.number, "first reset", error) from error
         self._start_s = [perf_counter()] * len(self._start_s)
 
-    def write_observations(self, arrays: Iterable[Array], t: int, leaves: Leaves) -> None:
-        """Write observations into row `t` of `arrays`, [rows, N, *leaf] each. Raises `Unusable`, an error of one copy."""
-        for writer, array, values in zip(self._writers, arrays, leaves, strict=True):
+    def joined(self, arrays: Iterable[Array]) -> list[Array]:
+        """Views of arrays [rows, N, *leaf] for `write_observations`."""
+        return [writer.joined(array) for writer, array in zip(self._writers, arrays, strict=True)]
+
+    def write_observations(self, joined: Iterable[Array], t: int, leaves: Leaves) -> None:
+        """Write observations into row `t` of the arrays. Raises `Unusable`, an error of one copy."""
+        for writer, array, values in zip(self._writers, joined, leaves, strict=True):
             writer.write(array[t], values)
 
     def check_values(self, obs: Sequence[Array], reward: Array) -> None:

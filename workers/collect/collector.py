@@ -178,10 +178,10 @@ class Collector:
         """Step all lanes T times."""
         is_recurrent = rows.state.size > 0
         resets = np.stack([lane.ended for lane in lanes])  # [L, N] row t is not valid
-        numbers = [lane.number for lane in lanes]
+        lane_numbers = [lane.number for lane in lanes]
         stages = self.stages
         views = [  # of every lane
-            (i, lane, rows.reward[i], rows.terminated[i], rows.truncated[i], [array[i] for array in rows.obs])
+            (i, lane, (rows.reward[i], rows.terminated[i], rows.truncated[i]), lane.joined(array[i] for array in rows.obs))
             for i, lane in enumerate(lanes)
         ]
         for t in range(self._run.rollout_steps):
@@ -194,11 +194,11 @@ class Collector:
             rows.params[:, t] = params
             rows.action[:, t] = action
             acted = perf_counter()
-            self._step_all(numbers, taken, pulse)
-            for i, lane, reward, terminated, truncated, obs in views:
+            self._step_all(lane_numbers, taken, pulse)
+            for i, lane, numbers, obs in views:
                 try:
                     row = lane.copies.step(taken[i], pulse)
-                    write_numbers((reward[t], terminated[t], truncated[t]), (row.reward, row.terminated, row.truncated))
+                    write_numbers(numbers, t, (row.reward, row.terminated, row.truncated))
                     lane.write_observations(obs, t + 1, row.leaves)
                 except CopyRaised as error:
                     raise lane_failed(lane.number, f"step {t}", error) from error

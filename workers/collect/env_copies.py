@@ -87,7 +87,8 @@ class LoopedCopies:
         """Step each copy, or reset it if its episode has ended."""
         loop = self._loop
         loop.step(actions, self._observations, pulse)
-        return StepResult(self._leaves(), loop.reward, loop.terminated, loop.truncated)
+        leaves = self._leaves() if self._nested else (self._observations,)
+        return StepResult(leaves, loop.reward, loop.terminated, loop.truncated)
 
     def _leaves(self) -> Leaves:
         if self._nested:

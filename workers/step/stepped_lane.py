@@ -57,6 +57,7 @@ class SteppedLane:
         self._read = make_flatten(env.observation_space)
         self._observations: list[Any] = [None] * len(self._loop.envs)  # as the copies returned them last
         self._writers = leaf_writers(spec.observation, len(self._loop.envs))
+        self._joined = [writer.joined(array) for writer, array in zip(self._writers, rows.obs, strict=True)]
 
     def reset(self, copies: Sequence[int], seeds: Sequence[int | None], options: Any, pulse: Pulse) -> Infos:
         """Start episodes in these copies, with a seed for each."""
@@ -75,7 +76,7 @@ class SteppedLane:
         infos = self._loop.step(each, self._observations, pulse)
         try:
             leaves = read_leaves(self._read, self._observations) if self._nested_observations else (self._observations,)
-            for writer, row, values in zip(self._writers, self.rows.obs, leaves, strict=True):
+            for writer, row, values in zip(self._writers, self._joined, leaves, strict=True):
                 writer.write(row, values)
             self._write_numbers()
         except Unusable as error:
@@ -84,7 +85,8 @@ class SteppedLane:
 
     def _write_numbers(self) -> None:
         rows, loop = self.rows, self._loop
-        write_numbers((rows.reward, rows.terminated, rows.truncated), (loop.reward, loop.terminated, loop.truncated))
+        of_all = slice(None)
+        write_numbers((rows.reward, rows.terminated, rows.truncated), of_all, (loop.reward, loop.terminated, loop.truncated))
 
     def call(self, copies: Sequence[int], name: str, args: Sequence[Any], kwargs: dict[str, Any]) -> list[Any]:
         """The attribute of each of these copies, or its result if it can be called. Its exceptions are not caught."""
