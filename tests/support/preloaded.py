@@ -1,8 +1,8 @@
 """Starts `python -m learner` and `python -m millrace` as children that a preloaded parent forks: PyTorch is imported once.
 
 Rule: a command is forked only if nothing that the interpreter or a library reads when it starts differs from the parent's:
-else it is executed (`may_be_forked`). With TESTS_EXEC=1 every command is executed. There is one parent for each process of
-pytest; it starts with the first command and ends with pytest.
+else it is executed (`may_be_forked`). With TESTS_EXEC=1, and outside a test, every command is executed. There is one
+parent for each process of pytest; it starts with the first command and ends with pytest.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ def run(
 
 def may_be_forked(command: Sequence[str], env: Mapping[str, str] | None = None) -> bool:
     """Whether a command is one of ours, and its environment is the parent's as far as it is read at the start."""
-    if os.environ.get("TESTS_EXEC") or not hasattr(os, "pidfd_open"):
-        return False
+    if os.environ.get("TESTS_EXEC") or "PYTEST_CURRENT_TEST" not in os.environ or not hasattr(os, "pidfd_open"):
+        return False  # a benchmark or the soak starts processes as a user does
     if list(command[:2]) != [sys.executable, "-m"] or not any(list(command[2:][: len(each)]) == each for each in LEARNERS):
         return False
     return _read_at_start(os.environ if env is None else env) == _read_at_start(ENVIRONMENT)

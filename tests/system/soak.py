@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import random
 import re
 import shutil
@@ -395,7 +394,6 @@ def _said(hostile: Running) -> int:
 
 def main() -> int:
     """Run the program. Returns the exit code."""
-    os.environ.setdefault("TESTS_EXEC", "1")  # learners are real processes, as a user starts them
     parser = argparse.ArgumentParser(prog="python -m tests.system.soak", description=__doc__.partition("\n")[0])
     parser.add_argument("--minutes", type=float, default=10.0, help="of faults, after the first update")
     parser.add_argument("--eval-every", type=int, default=25_000, help="env steps between evaluations")

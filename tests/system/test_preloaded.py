@@ -142,6 +142,9 @@ def test_only_learners_whose_environment_is_the_parents_are_forked(monkeypatch: 
     fewer = dict(os.environ)
     del fewer["OMP_NUM_THREADS"]
     assert not may_be_forked(learner, fewer)
+    with monkeypatch.context() as outside_a_test:
+        outside_a_test.delenv("PYTEST_CURRENT_TEST")
+        assert not may_be_forked(learner)
     monkeypatch.setenv("TESTS_EXEC", "1")
     assert not may_be_forked(learner)
 
