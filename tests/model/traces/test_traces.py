@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.model.traces.accept import Acceptance, accept
+from tests.model.traces.accept import Acceptance, LearnerTrace, Moment, WorkerTrace, accept, processes_by_sender
 from tests.model.traces.record import Record, SaidRollout, read
 from tests.model.traces.recorder import FOLDER
 from tests.model.traces.replay import NotAccepted
@@ -61,6 +61,13 @@ def test_the_run_is_one_of_the_model(accepted: Acceptance) -> None:
     assert counts["messages from workers"] > 100
     assert counts["messages to workers"] > 100
     assert counts["messages of strangers"] == 0
+
+
+def test_what_arrives_from_an_old_connection_is_a_strangers() -> None:
+    """libzmq numbers old connections from the same number in every process, so two workers can have had the same one."""
+    worker, hello = WorkerTrace("w0", nonce=7), Moment(1.0, "Hello", b"digest")
+    learner = LearnerTrace(heard=[(b"\0k\x8bEg\0key", 7, hello), (b"w0\0key", 7, hello)])
+    assert processes_by_sender([worker], [learner]) == {b"w0\0key": [worker]}
 
 
 # ---------------------------------------------------------------- traces that were tampered with
