@@ -64,7 +64,7 @@ def test_the_run_is_one_of_the_model(accepted: Acceptance) -> None:
 
 
 def test_what_arrives_from_an_old_connection_is_a_strangers() -> None:
-    """libzmq numbers old connections from the same number in every process, so two workers can have had the same one."""
+    """In every process libzmq numbers old connections from the same number, so two workers can have had the same one."""
     worker, hello = WorkerTrace("w0", nonce=7), Moment(1.0, "Hello", b"digest")
     learner = LearnerTrace(heard=[(b"\0k\x8bEg\0key", 7, hello), (b"w0\0key", 7, hello)])
     assert processes_by_sender([worker], [learner]) == {b"w0\0key": [worker]}
