@@ -219,7 +219,7 @@ def _check_up(
             heard[processes[0].nonce].append(moment)
     for worker in workers:
         where = f"the learners heard of a process of {worker.name}"
-        _check_order(where, worker.said, heard[worker.nonce], accepted, "from workers")
+        check_order(where, worker.said, heard[worker.nonce], accepted, "from workers")
 
 
 def _check_down(
@@ -232,10 +232,10 @@ def _check_down(
             said[peer].append(moment)
     for worker in workers:
         where = f"a process of {worker.name} heard"
-        _check_order(where, said[peers.get(worker.nonce, b"")], worker.heard, accepted, "to workers")
+        check_order(where, said[peers.get(worker.nonce, b"")], worker.heard, accepted, "to workers")
 
 
-def _check_order(where: str, said: list[Moment], heard: Iterable[Moment], accepted: Acceptance, direction: str) -> None:
+def check_order(where: str, said: list[Moment], heard: Iterable[Moment], accepted: Acceptance, direction: str) -> None:
     """All that was heard was said before; count what came twice, or out of order."""
     places: dict[tuple[str, bytes], list[int]] = defaultdict(list)
     for number, moment in enumerate(said):
