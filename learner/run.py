@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,6 +17,7 @@ from pathlib import Path
 import msgspec
 import zmq
 
+from learner.callbacks.callbacks import Callbacks, Watch
 from learner.config.config import Config
 from learner.env_spaces import EnvSpaces
 from learner.imports_ahead import ImportsAhead
@@ -29,7 +30,6 @@ from learner.recording.training_recorder import TrainingRecorder
 from learner.resumption import Resumption, check_spaces
 from learner.rollout_service.service import describe_settings, rollout_service
 from learner.rollouts.hub import HubObserver
-from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import Interrupted, RunFolder
 from learner.run_folder.run_lock import RunLock
 from protocol.bounds import one_line
@@ -42,9 +42,6 @@ from protocol.wire.learner_link import LearnerLink
 log = logging.getLogger("millrace.learner")
 
 DRAIN_S = 2.0  # for the workers to leave, when a run is cut short
-
-Watch = Callable[[Progress], None]
-"""Called with the progress of the run after each update."""
 
 
 @dataclass(frozen=True)
@@ -135,9 +132,9 @@ class Run:
         watch: Watch,
         observer: HubObserver,
     ) -> None:
-        """`watch` is called after each update, `observer` each time the hub has listened. Raises `MillraceError`.
+        """`watch`: the callbacks of the run, or a function to call after each update. Raises `MillraceError`.
 
-        `processes` are the worker processes that this program started.
+        `observer` is called each time the hub has listened. `processes` are the worker processes that this program started.
         """
         import torch
 
@@ -148,6 +145,7 @@ class Run:
         from learner.torch_setup import threads, torch_device
 
         config, self.folder = setup.config, setup.folder
+        made = Callbacks.of(watch).with_named(config.callback)
         spec = run_spec(config, setup.known.env, setup.known.spaces)
         if config.torch_threads is None:
             # Another number changes the last bits, so the run keeps it, wherever it is resumed or repeated.
@@ -165,7 +163,7 @@ class Run:
         episodes = _training_recorder(config, self.folder, setup.known, spec)
         self.folder.remove_temporary()
         self.folder.write_config(config)  # nothing of a resumed run is written before everything fits
-        self.recorder = RunRecorder(config, self.folder, spec, self.algorithm, self.service, state, watch, episodes)
+        self.recorder = RunRecorder(config, self.folder, spec, self.algorithm, self.service, state, made, episodes)
         self.folder.keep()
 
     def train(self, workers: int) -> None:
@@ -186,8 +184,10 @@ class Run:
                 error.add_note(line)
             reason = "interrupted" if isinstance(error, KeyboardInterrupt) else _why(error)
             self.service.drain(reason, timeout_s=self._interrupts.at_most(DRAIN_S))
-            with suppress(Exception):  # `watch` may raise again, and the error of the run is what counts
+            try:
                 self.recorder.finish(reason)
+            except Exception as later:  # a callback may raise again, and the error of the run is what counts
+                log.warning("%s", _why(later))
             raise
         finally:
             self.recorder.close()
@@ -222,7 +222,11 @@ def serve(config: Config, resume: Resumption | None, watch: Watch) -> Path:
         known = known_environment(config, env, resume, describe_over(link, config, processes))
         folder = folder or stack.enter_context(run_folder(config, None))
         run = Run(
-            RunSetup(config, known, folder, resume is not None, Interrupts(config.grace_s)), link, processes, watch, observer
+            RunSetup(config, known, folder, resume is not None, Interrupts(config.grace_s)),
+            link,
+            processes,
+            watch,
+            observer,
         )
         run.train(config.min_workers or 1)
         return run.folder.path

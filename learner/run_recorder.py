@@ -1,8 +1,8 @@
-"""Metrics, checkpoints, evaluations and the decision to stop: everything that a run does between two updates.
+"""Metrics, checkpoints, evaluations, callbacks and the decision to stop: everything that a run does between two updates.
 
 Rule: a checkpoint is written between two updates, never during one, and holds everything that the next update depends on.
-It is written before an evaluation, which may take long. If the disk is full, the run logs a warning and goes on. The seconds
-of evaluations are a stage of their own and do not count as training.
+It is written after the callbacks of its update, and before an evaluation, which may take long. If the disk is full, the run
+logs a warning and goes on. The seconds of evaluations are a stage of their own and do not count as training.
 """
 
 from __future__ import annotations
@@ -10,11 +10,14 @@ from __future__ import annotations
 import logging
 import shlex
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+import msgspec
+
 from learner.algorithms import Algorithm
+from learner.callbacks.callbacks import Callbacks
 from learner.config.config import Config
 from learner.evaluations import Evaluations, warn_on_error
 from learner.recording.training_recorder import TrainingRecorder
@@ -24,13 +27,14 @@ from learner.rollouts.lanes import AcceptedRollout
 from learner.run_folder import checkpoint
 from learner.run_folder.episode_window import EpisodeWindow
 from learner.run_folder.metrics_log import MetricsLog
-from learner.run_folder.progress import Progress
+from learner.run_folder.progress import Progress, Row, named
+from learner.run_folder.requests import Requests
 from learner.run_folder.results import Best, Summary
 from learner.run_folder.run_folder import RunFolder
 from learner.run_folder.versions import versions
 from learner.run_state import RunState
 from protocol.bounds import one_line
-from protocol.errors import RunError
+from protocol.errors import RunError, first_line
 from protocol.rollout import Batch
 from protocol.specs import RunSpec
 
@@ -51,22 +55,22 @@ class RunRecorder:
         algorithm: Algorithm,
         service: RolloutService,
         state: RunState,
-        watch: Callable[[Progress], None],
+        callbacks: Callbacks,
         episode_recorder: TrainingRecorder | None,
     ) -> None:
-        """`state`: where the run stands. `watch` is called with the progress after each update.
-
-        `episode_recorder` is closed with this recorder.
-        """
+        """`state`: where the run stands. `episode_recorder` is closed with this recorder."""
         self.version, self.env_steps = state.version, state.env_steps
         self._config, self._folder, self._spec = config, folder, spec
-        self._algorithm, self._service, self._watch = algorithm, service, watch
+        self._algorithm, self._service, self._callbacks = algorithm, service, callbacks
         self._stop_rule, self._checkpoints = config.stop_rule(), config.checkpoint_policy()
         settings = config.evaluation_settings()
         self._evaluations = Evaluations(settings, folder, spec, algorithm, service, state, self._show_evaluation)
         self._evaluating_since_s: float | None = None
         self._shown_s = 0.0
         self._confirmed: Best | None = None
+        self._requests = Requests()
+        self._settings = msgspec.to_builtins(config)
+        self._update: dict[str, Any] = {}  # facts of the last update: fields of `Progress`
         self._window = EpisodeWindow.from_state(state.episodes)
         self._metrics = MetricsLog(folder.path, state.env_steps)
         self._episode_recorder = episode_recorder
@@ -78,6 +82,7 @@ class RunRecorder:
         """How long the longest checkpoint took to write, in this process."""
         self._saved: tuple[int, int, list[float] | None] | None = None  # what `_position` was in the newest checkpoint
         self._saved_env_steps: int | None = None
+        self._saved_to = ""  # path of the newest checkpoint
         self._finished = False
         self._said_s = -SAY_AGAIN_S
         self._trouble = ""  # with the folder, as it was said last
@@ -88,6 +93,8 @@ class RunRecorder:
 
     def stop_reason(self) -> str | None:
         """Why the run should end now, or None."""
+        if self._callbacks.stop_reason is not None:
+            return self._callbacks.stop_reason
         newest = self._evaluations.newest
         steps_per_update = self._spec.rollout_steps * self._config.envs
         return self._stop_rule.reason_to_stop(
@@ -96,16 +103,30 @@ class RunRecorder:
             training_return=self._window.return_mean if self._window.full else None,
         )
 
-    def gathered(self, rollouts: Sequence[AcceptedRollout]) -> None:
-        """Record the episodes of these rollouts, if the run records episodes. An update will use them next."""
+    def start(self) -> None:
+        """The run begins, or goes on, and workers have joined: tell the callbacks."""
+        self._callbacks.on_start(self.progress())
+
+    def gathered(self, rollouts: Sequence[AcceptedRollout]) -> bool:
+        """These rollouts have come. True if an update is to be made of them: no callback ends the run.
+
+        Their episodes are recorded, if the run records episodes.
+        """
+        if self._callbacks.wants("on_rollouts"):
+            progress = msgspec.structs.replace(self.progress(), rollouts=tuple(one.rollout for one in rollouts))
+            self._callbacks.on_rollouts(progress)
+            if self._callbacks.stop_reason is not None:
+                return False
         if self._episode_recorder is not None:
             self._episode_recorder.add(rollouts)
+        return True
 
     def count(self, batch: Batch) -> None:
         """An update was made of this batch."""
         self.version += 1
         self.env_steps += batch.env_steps
         self._window.extend(batch.episodes)
+        self._update = {"episodes": batch.episodes}
         self._episodes_since_save += len(batch.episodes)
 
     def training_goes_on(self) -> bool:
@@ -113,18 +134,23 @@ class RunRecorder:
         return not self._evaluations.is_due(self.env_steps) and self.stop_reason() is None
 
     def updated(self, metrics: Mapping[str, float], update_s: float) -> None:
-        """The update that was counted last was published: evaluate it and write what is due."""
+        """The update that was counted last was published: tell the callbacks, evaluate it and write what is due."""
         began_s, evaluated_s = time.monotonic(), self._stages_s.get("evaluate", 0.0)
         self._workers_alive = self._service.workers_alive()
         self._stages_s["update"] += update_s
-        evaluation: dict[str, float] = {}
+        self._update |= {"metrics": named(metrics), "lags": tuple(self._service.snapshot().lags)}
+        progress = self.progress()
+        self._write_row(progress, metrics)
+        self._service.report(progress)
         try:
-            if self._evaluations.is_due(self.env_steps):
-                self.save()
-                evaluation = self._evaluate()
+            self._callbacks.on_update(progress)
         finally:
-            self._report({**metrics, **evaluation})
-        if evaluation or self._checkpoints.is_due(
+            self._write_logged()
+        evaluates = self._evaluations.is_due(self.env_steps) and self._callbacks.stop_reason is None
+        if evaluates:
+            self.save()
+            self._evaluate()
+        if evaluates or self._checkpoints.is_due(
             since_last_s=began_s - self._saved_s, episodes_since_last=self._episodes_since_save, updates=self.version
         ):
             self.save()
@@ -133,8 +159,8 @@ class RunRecorder:
 
     def evaluate_if_due(self) -> None:
         """Make the evaluation before which the run was interrupted, if there is one. The weights must be published."""
-        if self._evaluations.is_due(self.env_steps):
-            self._report(self._evaluate())
+        if self._evaluations.is_due(self.env_steps) and self._callbacks.stop_reason is None:
+            self._evaluate()
             self.save()
 
     def save(self) -> None:
@@ -150,11 +176,22 @@ class RunRecorder:
         policy, env = self._spec.policy, self._spec.env
         warn_on_error(lambda: self._folder.write_policy(policy, env, *self._algorithm.weights()))
         self._took_to_save(time.monotonic() - began_s)
+        if self._saved == self._position() and self._callbacks.wants("on_checkpoint"):
+            self._callbacks.on_checkpoint(self.progress())
 
     def save_unless_saved(self) -> None:
         """Write a checkpoint and the policy, unless the newest checkpoint already has this state."""
         if self._saved != self._position():
             self.save()
+
+    def save_after_error(self) -> None:
+        """As `save_unless_saved`. What a callback raises now is logged: the error that ended the run counts."""
+        try:
+            self.save_unless_saved()
+        except Exception as error:
+            if self._saved != self._position():
+                raise
+            log.warning("%s: %s", type(error).__name__, first_line(error))
 
     def saved(self) -> str:
         """One line that says what can be resumed, and where; empty if nothing was learned yet."""
@@ -168,15 +205,18 @@ class RunRecorder:
 
     def conclude(self) -> None:
         """Evaluate the final policy, which must be published, and the best one."""
+        before = self._evaluations.of_version(self.version)
         with self._evaluation_time():
             self._confirmed = self._evaluations.conclude(self.version, self.env_steps)
+        if self._evaluations.of_version(self.version) is not before:
+            self._callbacks.on_evaluation(self.progress())
 
     def finish(self, reason: str) -> None:
-        """Write the summary, and show the last progress. Does nothing if that was done."""
+        """Write the summary, and tell the callbacks. Does nothing if that was done."""
         if not self._finished:
             self._finished = True
             warn_on_error(lambda: self._folder.write_summary(self._summary(reason)))
-            self._watch(self.progress())
+            self._callbacks.on_end(msgspec.structs.replace(self.progress(), stop_reason=reason))
 
     def close(self) -> None:
         """Close the metrics, and the dataset if episodes were recorded. Also for a run that was cut short."""
@@ -207,6 +247,11 @@ class RunRecorder:
             stages=self._stages(snapshot),
             note=self._evaluations.note,
             doing=self._evaluations.doing,
+            settings=self._settings,
+            evaluation=self._evaluations.newest,
+            checkpoint=self._saved_to,
+            requests=self._requests,
+            **self._update,
         )
 
     # ---------------------------------------------------------------- inside
@@ -232,7 +277,7 @@ class RunRecorder:
         self._trouble = line
         return made
 
-    def _write_row(self, progress: Progress, metrics: Mapping[str, float]) -> None:
+    def _write_row(self, progress: Progress, metrics: Row) -> None:
         """Write a row of metrics. A disk that does not take rows is said once a minute, not for each row."""
         if self._metrics.deleted:
             self._make_folder_again()
@@ -245,17 +290,30 @@ class RunRecorder:
                 log.warning("%s; the run goes on, and says so at most once a minute", error)
 
     def _save_checkpoint(self, state: dict[str, Any]) -> None:
-        checkpoint.save(self._folder.path, state, self.env_steps, self._checkpoints.keep)
+        path = checkpoint.save(self._folder.path, state, self.env_steps, self._checkpoints.keep)
+        self._saved_to = one_line(str(path))
         self._saved, self._saved_env_steps = self._position(), self.env_steps
 
     def _position(self) -> tuple[int, int, list[float] | None]:
         """What of the state changes when the run goes on: the version, the next evaluation, the best policy."""
         return self.version, self._evaluations.next_at, self._evaluations.best
 
-    def _evaluate(self) -> dict[str, float]:
-        """Evaluate the newest policy. Returns the metrics."""
+    def _write_logged(self) -> None:
+        """Add what callbacks logged to the row of this update."""
+        if logged := self._requests.take_logged():
+            self._write_row(self.progress(), logged)
+
+    def _evaluate(self) -> None:
+        """Evaluate the newest policy, add the metrics to the row of its update, and tell the callbacks."""
         with self._evaluation_time():
-            return self._evaluations.evaluate_newest(self.version, self.env_steps)
+            metrics = self._evaluations.evaluate_newest(self.version, self.env_steps)
+        progress = self.progress()
+        self._write_row(progress, metrics)
+        self._service.report(progress)
+        try:
+            self._callbacks.on_evaluation(progress)
+        finally:
+            self._write_logged()
 
     @contextmanager
     def _evaluation_time(self) -> Iterator[None]:
@@ -273,14 +331,7 @@ class RunRecorder:
         now = time.monotonic()
         if now - self._shown_s >= SHOW_EVERY_S:
             self._shown_s = now
-            self._watch(self.progress())
-
-    def _report(self, metrics: Mapping[str, float]) -> None:
-        """Write a row of metrics, and tell how far the run is."""
-        progress = self.progress()
-        self._write_row(progress, metrics)
-        self._service.report(progress)
-        self._watch(progress)
+            self._callbacks.evaluating(self.progress())
 
     def _state(self) -> RunState:
         snapshot = self._service.snapshot()

@@ -6,7 +6,7 @@ With `max_lag` 0 the learner publishes weights, gathers rollouts and learns, one
 workers already collect the next rollouts while the learner learns. The loop is the same: only the number of tickets differs.
 
 Rule: whatever ends the run, the state after the last whole update is saved first. An update that raises, or that makes
-weights which are not finite, is taken back.
+weights which are not finite, is taken back; so is one whose rollouts a callback does not accept.
 """
 
 from __future__ import annotations
@@ -47,13 +47,16 @@ def train(
     recorder.save()
     try:
         service.wait_for_workers(workers)
+        recorder.start()
         service.publish(recorder.version, *algorithm.weights(), deal=recorder.training_goes_on())
         recorder.evaluate_if_due()
         while (reason := recorder.stop_reason()) is None:
             arrived = service.gather()
-            recorder.gathered(arrived)
             began_s = time.monotonic()
             with _whole_update(algorithm, service, arrived):
+                if not recorder.gathered(arrived):
+                    service.not_used(arrived)
+                    continue
                 batch = stack_rollouts([one.rollout for one in arrived], [one.fresh for one in arrived])
                 metrics = algorithm.update(batch, pulse)
                 if not algorithm.is_finite():
@@ -65,7 +68,7 @@ def train(
         recorder.conclude()
         recorder.save_unless_saved()  # the final policy may be the best
     except BaseException:
-        recorder.save_unless_saved()
+        recorder.save_after_error()
         raise
     service.drain(reason)
     recorder.finish(reason)

@@ -32,6 +32,7 @@ from protocol.errors import (  # noqa: E402
 if TYPE_CHECKING:
     from gymnasium.vector import AutoresetMode
 
+    from learner.callbacks.callback import Callback
     from learner.run_folder.progress import Progress
     from learner.vector_env.env import ZmqVectorEnv
     from learner.vector_env.settings import EnvLike
@@ -41,12 +42,14 @@ if TYPE_CHECKING:
 __all__ = [
     "CNN",
     "MLP",
+    "Callback",
     "CheckpointError",
     "EnvironmentFailed",
     "MillraceError",
     "NoWorkers",
     "Piece",
     "PolicyParameters",
+    "Progress",
     "Recurrent",
     "RolloutBatch",
     "RolloutService",
@@ -64,9 +67,11 @@ __all__ = [
 
 _IMPORTED_WHEN_USED = {
     "CNN": "millrace.policies",
+    "Callback": "learner.callbacks.callback",
     "MLP": "millrace.policies",
     "Piece": "millrace.policies",
     "PolicyParameters": "millrace.policies",
+    "Progress": "learner.run_folder.progress",
     "Recurrent": "millrace.policies",
     "RolloutBatch": "millrace.rollout_service",
     "RolloutService": "millrace.rollout_service",
@@ -83,7 +88,8 @@ def train(
     config: str | Path | None = None,
     resume: str | Path | None = None,
     preset: str = "auto",
-    watch: Callable[[Progress], None] | None = None,
+    callbacks: Sequence[object] = (),
+    watch: Callable[[Progress], object] | None = None,
     **keywords: Any,
 ) -> Path:
     """Train a policy on this machine: the learner runs in this process, the workers in processes that it starts.
@@ -94,13 +100,15 @@ def train(
         resume: A run folder to continue from its newest checkpoint, or "auto": the newest run of this environment, algorithm
             and seed if there is one, else a new run.
         preset: The name of a preset (`millrace presets` lists them); "auto" takes that of `env`; "none" takes none.
-        watch: Called with a `Progress` after each update.
+        callbacks: Objects with some of the methods of `Callback`. They are called between updates, and may end the run.
+        watch: Called with a `Progress` after each update, and several times a second during an evaluation.
         **keywords: The flags of `millrace train`, by the same names: `learning_rate=1e-3`. `algo` may be a class of your own
             (`millrace.algorithms`). A class that was made in a script or a notebook is given again on resume.
 
     Returns the run folder. Raises `UserFacingError` with a message of one line. In a script, guard the call with
     `if __name__ == "__main__":`.
     """
+    from learner.callbacks.callbacks import Callbacks
     from learner.config.layers import resolve
     from learner.run_folder.resume import AUTO, newest_run
     from millrace.launch import local_run
@@ -111,7 +119,7 @@ def train(
         run = newest_run(resolve(name, file=file, preset=preset, **keywords))
         file = None if run else file
     settings = resolve(name, file=file, resume=run, preset=preset, **keywords)
-    return local_run.train(settings, run, watch or (lambda progress: None), factory=None if isinstance(env, str) else env)
+    return local_run.train(settings, run, Callbacks(callbacks, watch), factory=None if isinstance(env, str) else env)
 
 
 def make_vec(

@@ -26,6 +26,7 @@ FORBIDDEN = {
 LEARNER = {  # what each folder of the learner may import of the learner; train.py, run.py and the like may import all
     "config": {"run_folder"},
     "algorithms": {"config"},
+    "callbacks": {"config", "run_folder"},
     "conformance": {"algorithms", "config"},
     "members": set[str](),
     "rollouts": {"members", "run_folder"},

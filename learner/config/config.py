@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 import tomli_w
 from msgspec import Meta
+from tyro.conf import UseAppendAction
 
 from learner.config.hyperparameters import AlgorithmConfig, PPOConfig
 from learner.config.on_resume import Fixed, Free
@@ -72,6 +73,11 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     grace_s: Free[SecondsOrNever] = 30.0
     """Seconds from SIGTERM, SIGHUP or Ctrl-C to the end of the process. The current update gets at most half of them; then
     it is given up, and the state before it is saved. 0: as long as the update takes.
+    """
+
+    callback: Free[UseAppendAction[tuple[str, ...]]] = ()
+    """A callback of your own, as my_module:factory: code that the learner calls between updates. Repeat the flag for more.
+    docs/callbacks.md describes them.
     """
 
     # -------------------------------------------------------------------------------------------------------------- files

@@ -38,7 +38,7 @@ GROUPS = {
     ),
     "file and log": (
         "checkpoint_every_s", "checkpoint_every_episodes", "checkpoint_every_updates", "keep_checkpoints", "record",
-        "metrics_bind", "log_json", "debug",
+        "callback", "metrics_bind", "log_json", "debug",
     ),
 }  # fmt: skip
 """The settings of each group, by its title. Before them come `BASIC` and the settings of the algorithm."""
@@ -46,6 +46,7 @@ METAVARS = {
     "algo": f"{{{','.join(HYPERPARAMETERS)}}}|MODULE:CLASS",
     "env_kwargs": "NAME VALUE ...",
     "net": "INT ...",
+    "callback": "MODULE:FACTORY",
     "config": "PATH",
     "resume": "PATH",
 }
@@ -141,4 +142,4 @@ def _hint(name: str, value: Any) -> str | None:
     """The hint after the help text. None: `(default: VALUE)`."""
     if value is None:
         return "" if name in METAVARS else "(default: none)"
-    return "" if value in ("", {}) else None
+    return "" if value in ("", {}, ()) else None

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from learner.report.curve import Curve, algorithm_label, read_run_files
-from learner.run_folder.progress import ENV_STEPS_KEY, EVALUATION_KEY, RETURN_KEY
-from learner.run_folder.results import Evaluation
+from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
+from learner.run_folder.results import EVALUATION_KEY, Evaluation
 from learner.run_folder.run_folder import RunFolder
 from protocol.arrays import Doubles
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import msgspec
 
-from learner.run_folder.progress import Progress
+from learner.run_folder.progress import NOT_SHOWN, Progress
 
 
 class JsonLines(logging.Formatter):
@@ -31,7 +31,9 @@ class JsonLines(logging.Formatter):
 def progress_line(progress: Progress, now: float) -> str:
     """The progress of the run as one line of JSON. `now` is wall-clock time."""
     message = f"{progress.env_steps} of {progress.total_steps} env steps"
-    return _line(now, "info", "progress", message, msgspec.to_builtins(progress))
+    shown = (name for name in progress.__struct_fields__ if name not in NOT_SHOWN)
+    fields = {name: msgspec.to_builtins(getattr(progress, name)) for name in shown}
+    return _line(now, "info", "progress", message, fields)
 
 
 def _line(time: float, level: str, event: str, message: str, fields: dict[str, Any]) -> str:

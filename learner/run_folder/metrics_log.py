@@ -13,7 +13,7 @@ import math
 import os
 import socket
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -61,19 +61,21 @@ class MetricsLog:
         """Whether metrics.jsonl was deleted since its last row. `write` makes it again."""
         return self._table.deleted
 
-    def write(self, progress: Progress, train: Mapping[str, float]) -> None:
-        """Add a row. `train`: the metrics of the algorithm, and of an evaluation if there was one.
+    def write(self, progress: Progress, train: Row) -> None:
+        """Add a row. `train`: the metrics of the algorithm, of an evaluation if there was one, and of callbacks.
 
         If the newest row is of the same update, these metrics are added to it. Raises `RunError`, with a one-line message,
         if the disk does not take the row. The rows before it stay readable.
         """
         row, replaced = progress.row(train), b""
+        event: Row = row
         if all(self._newest.get(key) == row[key] for key in (UPDATES_KEY, ENV_STEPS_KEY)):
             row, replaced = {**self._newest, **named(train)}, _json_line(self._newest)
+            event = row if self._unwritten is not None else named(train)  # TensorBoard would show a number twice
         self._newest = {}  # unless the disk takes it
         self._table.append(_json_line(row), len(replaced))
         self._newest = row
-        self._unwritten = row, progress.env_steps
+        self._unwritten = event, progress.env_steps
         if self._clock() - self._last_event_s >= EVENTS_EVERY_S or any(name.startswith("eval/") for name in row):
             self._write_event()
 

@@ -6,18 +6,35 @@ The names are those of Stable-Baselines3 where it has one. The x axis is env ste
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any, SupportsFloat
 
 import msgspec
+
+from learner.run_folder.requests import Requests
+from learner.run_folder.results import Evaluation
+from protocol.errors import UsageError
+from protocol.rollout import Episode, Rollout
 
 ENV_STEPS_KEY = "time/total_timesteps"
 UPDATES_KEY = "time/iterations"
 RETURN_KEY = "rollout/ep_rew_mean"
-EVALUATION_KEY = "eval/mean_reward"
+NOT_SHOWN = ("settings", "episodes", "rollouts", "requests")
+"""Fields of `Progress` that a log of it leaves out."""
 Row = Mapping[str, float | None]
 
 
 class Progress(msgspec.Struct, frozen=True, kw_only=True):
-    """The progress of a run, which the terminal shows and the metrics record after each update."""
+    """The progress of a run: the terminal shows it, the metrics record it after each update, and callbacks get it.
+
+    ```python
+    import millrace
+
+    def show(progress: millrace.Progress) -> None:
+        print(progress.env_steps, progress.return_mean, progress.metrics.get("train/value_loss"))
+
+    run = millrace.train("CartPole-v1", watch=show)
+    ```
+    """
 
     run: str = ""
     """path of the run folder"""
@@ -47,7 +64,36 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
     doing: str = ""
     """what the run does instead of training, as "evaluating: 37 of 100 episodes"; empty while it trains"""
 
-    def row(self, train: Mapping[str, float]) -> dict[str, float | None]:
+    settings: dict[str, Any] = {}
+    """all settings of the run, by name; those of the algorithm in `algorithm`"""
+    metrics: dict[str, float] = {}
+    """numbers of the last update, by the names under which they are logged: losses and the like"""
+    episodes: tuple[Episode, ...] = ()
+    """the episodes that ended in the rollouts of the last update"""
+    lags: tuple[int, ...] = ()
+    """lag of each rollout of the last update"""
+    evaluation: Evaluation | None = None
+    """the last evaluation"""
+    checkpoint: str = ""
+    """path of the newest checkpoint; empty before the first"""
+    rollouts: tuple[Rollout, ...] = ()
+    """in `Callback.on_rollouts`: the rollouts of the next update, in the order in which they came"""
+    stop_reason: str = ""
+    """in `Callback.on_end`: why the run ended"""
+    requests: Requests | None = None
+    """what callbacks ask of the run"""
+
+    def log(self, name: str, value: SupportsFloat) -> None:
+        """Log a number with the metrics of this update. A name without a slash is logged as custom/NAME.
+
+        For `on_rollouts`, `on_update` and `on_evaluation`. A value that is not finite is logged as missing. Raises
+        `UsageError` for anything but a name of one line and a number.
+        """
+        if self.requests is None:
+            raise UsageError(f"log {name}: this is not the progress of a run")
+        self.requests.log(name, value)
+
+    def row(self, train: Row) -> dict[str, float | None]:
         """One flat row of metrics. `train`: the metrics of the algorithm."""
         row: dict[str, float | None] = {
             RETURN_KEY: self.return_mean,
@@ -65,6 +111,6 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
         return row | named(train)
 
 
-def named(train: Mapping[str, float]) -> dict[str, float]:
+def named(train: Row) -> dict[str, float | None]:
     """The metrics of an algorithm or an evaluation under the names by which they are logged."""
     return {name if "/" in name else f"train/{name}": value for name, value in train.items()}

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from learner.run_folder.progress import EVALUATION_KEY
+EVALUATION_KEY = "eval/mean_reward"
 
 
 class Evaluation(msgspec.Struct, frozen=True, kw_only=True):

@@ -24,7 +24,7 @@ from protocol.bounds import MAX_SEEDS, escaped, indented
 from protocol.errors import UsageError, UserFacingError
 
 if TYPE_CHECKING:
-    from learner.run import Watch
+    from learner.callbacks.callbacks import Watch
 
 ABOUT = "Worker processes step copies of a gymnasium environment; one learner trains a policy in PyTorch."
 RESUME = "millrace train"

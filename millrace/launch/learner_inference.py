@@ -15,6 +15,7 @@ from pathlib import Path
 
 import zmq
 
+from learner.callbacks.callbacks import Watch
 from learner.config.config import Config
 from learner.interrupts import Interrupts
 from learner.members.describe_coordinator import Accept
@@ -22,7 +23,7 @@ from learner.members.endpoint import BindSettings
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.resumption import Resumption
 from learner.rollout_service.service import describe_settings
-from learner.run import Run, RunSetup, Watch, known_environment, prometheus_observer, run_folder
+from learner.run import Run, RunSetup, known_environment, prometheus_observer, run_folder
 from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.settings import VectorEnvSettings
 from millrace.launch.local_worker_options import private_address, worker_flags

@@ -11,11 +11,12 @@ from pathlib import Path
 
 import zmq
 
+from learner.callbacks.callbacks import Watch
 from learner.config.config import Config
 from learner.interrupts import Interrupts
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.resumption import Resumption, unless_finished
-from learner.run import Run, RunSetup, Watch, describe_over, known_environment, prometheus_observer, run_folder
+from learner.run import Run, RunSetup, describe_over, known_environment, prometheus_observer, run_folder
 from millrace.launch.local_worker_options import private_address, stopped_on_error, temporary_keys, worker_flags
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError

@@ -14,10 +14,11 @@ from pathlib import Path
 
 import ray
 
+from learner.callbacks.callbacks import Watch
 from learner.config.command_line import read_config
 from learner.members.endpoint import keyring_for
 from learner.resumption import unless_finished
-from learner.run import Watch, serve
+from learner.run import serve
 from millrace.cli.flags import RayFlags
 from millrace.launch.launcher_flags import learner_flags
 from millrace.launch.ray_worker import WorkerHost

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import millrace
+from learner.callbacks.callbacks import Callbacks
 from learner.config.config import Config
 from learner.config.hyperparameters import HYPERPARAMETERS
 from learner.config.layers import resolve
@@ -51,7 +52,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
 
     def train(config: Config, resume: Path | None, watch: Any, factory: Any = None) -> Path:
         calls.append((config, resume, factory))
-        watch(Progress(env_steps=5, total_steps=10))
+        Callbacks.of(watch).on_update(Progress(env_steps=5, total_steps=10))
         return Path("runs/a-run")
 
     monkeypatch.setattr("millrace.launch.local_run.train", train)

@@ -1,0 +1,154 @@
+"""All callbacks of a run as one: it calls them in order, and remembers whether one of them ended the run.
+
+Rule: what a callback raises passes through, with a note that names the callback. `on_end` is called for every callback that
+was started, also if an earlier one raised.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from typing import Any, Self
+
+from learner.callbacks.callback import Callback
+from learner.callbacks.named import named_callback
+from learner.config.did_you_mean import did_you_mean
+from learner.run_folder.progress import Progress
+from protocol.bounds import one_line
+from protocol.errors import UsageError, first_line
+
+log = logging.getLogger("millrace.learner")
+
+MOMENTS = ("on_start", "on_rollouts", "on_update", "on_evaluation", "on_checkpoint", "on_end")
+Show = Callable[[Progress], object]
+"""Called with the progress of the run after each update and evaluation, several times a second during an evaluation, and at
+the end. It is a callback like any other: it may end the run.
+"""
+
+
+class Callbacks:
+    """The callbacks of one run."""
+
+    def __init__(self, callbacks: Sequence[object] = (), watch: Show | None = None) -> None:
+        """`callbacks`: objects with some of the methods of `Callback`. Raises `UsageError` for an object without any."""
+        self.stop_reason: str | None = None
+        """Why a callback ended the run, or None."""
+        self._callbacks = [_checked(callback) for callback in callbacks]
+        self._watch = watch
+        self._started = False
+
+    @staticmethod
+    def of(watch: Watch) -> Callbacks:
+        """The callbacks of a run that was given its callbacks, or a function to call."""
+        return watch if isinstance(watch, Callbacks) else Callbacks(watch=watch)
+
+    def with_named(self, names: Sequence[str]) -> Self:
+        """Add the callbacks of these names, `module:factory`. Raises `UsageError` if one cannot be made."""
+        self._callbacks += [_checked(named_callback(name), name) for name in dict.fromkeys(names)]
+        return self
+
+    def wants(self, moment: str) -> bool:
+        """Whether any callback has this method."""
+        return any(_method(callback, moment) for callback in self._callbacks)
+
+    def on_start(self, progress: Progress) -> None:
+        """The run begins, or goes on."""
+        self._started = True
+        self._call("on_start", progress)
+
+    def on_rollouts(self, progress: Progress) -> None:
+        """Rollouts have come."""
+        self._call("on_rollouts", progress)
+
+    def on_update(self, progress: Progress) -> None:
+        """An update was made."""
+        self._show(progress)
+        self._call("on_update", progress)
+
+    def on_evaluation(self, progress: Progress) -> None:
+        """The policy was evaluated."""
+        self._show(progress)
+        self._call("on_evaluation", progress)
+
+    def evaluating(self, progress: Progress) -> None:
+        """An evaluation goes on; `progress.doing` says how far it is."""
+        self._show(progress)
+
+    def on_checkpoint(self, progress: Progress) -> None:
+        """A checkpoint was written. That before `on_start` is not told."""
+        if self._started:
+            self._call("on_checkpoint", progress)
+
+    def on_end(self, progress: Progress) -> None:
+        """The run has ended. Raises what the first callback raised; what others raise is logged."""
+        raised: BaseException | None = None
+        calls = [self._show]
+        if self._started:
+            calls += [lambda progress, each=each: _call(each, "on_end", progress) for each in self._callbacks]  # type: ignore[misc]
+        for call in calls:
+            try:
+                call(progress)
+            except BaseException as error:
+                if raised is None:
+                    raised = error
+                else:
+                    log.warning("on_end raised %s: %s", type(error).__name__, first_line(error))
+        if raised is not None:
+            raise raised
+
+    def _show(self, progress: Progress) -> None:
+        if self._watch is not None and _ends_the_run(self._watch(progress)):
+            self._stop("watch")
+
+    def _call(self, moment: str, progress: Progress) -> None:
+        for callback in self._callbacks:
+            if _ends_the_run(_call(callback, moment, progress)):
+                self._stop(f"{_name(callback)}.{moment}")
+
+    def _stop(self, who: str) -> None:
+        if self.stop_reason is None:
+            self.stop_reason = one_line(f"ended by {who}", 300)
+
+
+Watch = Callbacks | Show
+
+
+def _ends_the_run(answer: object) -> bool:
+    return answer is False or (type(answer).__name__ == "bool" and not answer)  # numpy's bool too
+
+
+def _call(callback: object, moment: str, progress: Progress) -> object:
+    method = _method(callback, moment)
+    if method is None:
+        return None
+    try:
+        return method(progress)
+    except BaseException as error:
+        error.add_note(one_line(f"raised in {_name(callback)}.{moment}", 300))
+        raise
+
+
+def _method(callback: object, moment: str) -> Callable[[Progress], object] | None:
+    """The method of this callback, unless it is that of `Callback`, which does nothing."""
+    found: Any = getattr(callback, moment, None)
+    return None if getattr(found, "__func__", None) is getattr(Callback, moment) else found
+
+
+def _name(callback: object) -> str:
+    return type(callback).__qualname__.rpartition("<locals>.")[2]
+
+
+def _checked(callback: object, name: str = "") -> object:
+    who = one_line(f"callback {name or repr(callback)}", 300)
+    if isinstance(callback, type):
+        raise UsageError(f"{who}: expected an object, got a class; make one: {callback.__name__}()")
+    for attribute in dir(callback):
+        if attribute.startswith("on_") and attribute not in MOMENTS and callable(getattr(callback, attribute, None)):
+            hint = did_you_mean(attribute, MOMENTS)
+            raise UsageError(f"{who}: a run never calls {attribute}{hint}; expected {', '.join(MOMENTS)}")
+    methods = [getattr(callback, moment, None) for moment in MOMENTS]
+    if not any(map(callable, methods)):
+        raise UsageError(f"{who}: expected an object with some of the methods {', '.join(MOMENTS)}")
+    if wrong := next((m for m, f in zip(MOMENTS, methods, strict=True) if f is not None and not callable(f)), None):
+        raise UsageError(f"{who}: {wrong}: expected a method, got {type(getattr(callback, wrong)).__name__}")
+    return callback

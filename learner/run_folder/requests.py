@@ -1,0 +1,44 @@
+"""What callbacks ask of a run, until the run takes it: numbers to log.
+
+Rule: everything is checked when it is asked for, so that an error names the user's line.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from protocol.bounds import one_line
+from protocol.errors import UsageError
+
+MOST_LOGGED = 1_000  # numbers of one row
+LONGEST_NAME = 200  # characters
+
+
+class Requests:
+    """The requests that were not taken yet."""
+
+    def __init__(self) -> None:
+        self._logged: dict[str, float | None] = {}
+
+    def log(self, name: str, value: Any) -> None:
+        """Log this number with the row of this update. Raises `UsageError` for anything but a name and a number."""
+        if not isinstance(name, str) or not name or name != one_line(name, LONGEST_NAME):
+            raise UsageError(f"log: expected a name of 1 to {LONGEST_NAME} characters in one line, got {_shown(name)}")
+        try:
+            number = float("text" if isinstance(value, str | bytes) else value)
+        except (TypeError, ValueError, OverflowError, RuntimeError):  # torch raises RuntimeError
+            raise UsageError(f"log {name}: expected a number, got {_shown(value)}") from None
+        name = name if "/" in name else f"custom/{name}"
+        if name not in self._logged and len(self._logged) >= MOST_LOGGED:
+            raise UsageError(f"log {name}: expected at most {MOST_LOGGED} names in one row")
+        self._logged[name] = number if math.isfinite(number) else None
+
+    def take_logged(self) -> dict[str, float | None]:
+        """The numbers that were logged since the last call."""
+        taken, self._logged = self._logged, {}
+        return taken
+
+
+def _shown(value: object) -> str:
+    return one_line(f"{type(value).__name__} {value!r}", 80)
