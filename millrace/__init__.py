@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from learner.run_folder.progress import Progress
     from learner.vector_env.env import ZmqVectorEnv
     from learner.vector_env.settings import EnvLike
+    from millrace.own_policy import OwnPolicy
     from millrace.policies import CNN, MLP, Piece, PolicyParameters, Recurrent
     from millrace.rollout_service import RolloutBatch, RolloutService
 
@@ -47,6 +48,7 @@ __all__ = [
     "EnvironmentFailed",
     "MillraceError",
     "NoWorkers",
+    "OwnPolicy",
     "Piece",
     "PolicyParameters",
     "Progress",
@@ -69,6 +71,7 @@ _IMPORTED_WHEN_USED = {
     "CNN": "millrace.policies",
     "Callback": "learner.callbacks.callback",
     "MLP": "millrace.policies",
+    "OwnPolicy": "millrace.own_policy",
     "Piece": "millrace.policies",
     "PolicyParameters": "millrace.policies",
     "Progress": "learner.run_folder.progress",

@@ -16,13 +16,23 @@ import numpy as np
 from protocol.arrays import Array, Floats
 from protocol.errors import UsageError
 from protocol.policy.layout import Field, acting_size, buffer_layout, named_views, parameter_layout, total_size
-from protocol.specs import ActionSpec, Leaf, PolicySpec
+from protocol.specs import ActionSpec, ExtraArray, Leaf, PolicySpec
 
 Activation = Literal["tanh", "relu"]
 
 
 class PolicyChoice(Protocol):
-    """`MLP`, `CNN` or `Recurrent`: settings from which a policy is made once the spaces are known."""
+    """`MLP`, `CNN`, `Recurrent` or `OwnPolicy`: settings from which a policy is made once the spaces are known."""
+
+    @property
+    def extra_arrays(self) -> tuple[ExtraArray, ...]:
+        """Further arrays that it returns with its actions."""
+        ...
+
+    @property
+    def is_code(self) -> bool:
+        """Whether it travels as a pickled callable."""
+        ...
 
     def spec(self, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
         """The policy for these spaces. Raises `UsageError` if there is none."""
@@ -46,6 +56,16 @@ class MLP:
         object.__setattr__(self, "net", net or (64, 64))
         object.__setattr__(self, "activation", activation)
         object.__setattr__(self, "normalize_observations", normalize_observations)
+
+    @property
+    def extra_arrays(self) -> tuple[ExtraArray, ...]:
+        """None: a batch has its log-probabilities."""
+        return ()
+
+    @property
+    def is_code(self) -> bool:
+        """False: it travels as plain data."""
+        return False
 
     def spec(self, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
         """The policy for these spaces."""
@@ -137,7 +157,12 @@ class PolicyParameters:
         """The pieces of the buffers: `observation_mean` and `observation_std` if observations are normalized."""
 
     def initial(self, seed: int = 1) -> Floats:
-        """Initial parameters [P] float32: orthogonal weights with the gains of the layout, biases 0."""
+        """Initial parameters [P] float32: orthogonal weights with the gains of the layout, biases 0.
+
+        Raises `UsageError` for an `OwnPolicy`, whose initial values only you know.
+        """
+        if self.spec.own is not None:
+            raise UsageError(f"policy {self.spec.own.factory}: expected initial values of your own; publish them")
         generator = np.random.default_rng(seed)
         flat = np.zeros(self.size, np.float32)
         for piece in self.layout:

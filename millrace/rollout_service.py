@@ -16,7 +16,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -35,53 +34,40 @@ from learner.rollouts.ledger import Ledger
 from learner.run_folder.results import Evaluation
 from millrace.launch.rollouts import start
 from millrace.policies import MLP, PolicyChoice, PolicyParameters
-from protocol.arrays import Array, Bools, Floats, Ints
+from protocol.arrays import Array, Ints
 from protocol.env_spec import EnvSpec
 from protocol.errors import CheckpointError, UsageError, first_line
-from protocol.rollout import Episode, stack_rollouts
+from protocol.rollout import Batch, stack_rollouts
 from protocol.specs import PolicySpec
 
 PULSE_S = 0.005  # how often messages are answered while the user computes
 EVALUATION_COPIES = 4  # episodes that a worker plays side by side
 
 
-@dataclass(frozen=True)
-class RolloutBatch:
+class RolloutBatch(Batch, frozen=True, kw_only=True, eq=False):
     """One rollout of each lane, side by side: T steps of N env copies. All arrays are writable and yours.
 
     Row t says: in `obs[t]` we did `action[t]`, got `reward[t]` and saw `obs[t + 1]`, wherever `valid[t]`. A row that is not
     valid only resets its env copy: leave it out of every loss, return and count.
+
+    Beside the fields below it has `action` [T, N, *action] (int64 counted from 0, or float32 before clipping), `reward`
+    [T, N] float32 (raw), `terminated`, `truncated` and `valid` [T, N] bool, `state` [N, S] float32 before `obs[0]`, `lane`
+    [N] int64, `fresh` [N] bool (False where a column goes on where it ended in the batch before), `copies` of a lane, and
+    `episodes`, which have `reward` (the return), `length` and `seconds`.
     """
 
     obs: Any
     """[T+1, N, *shape]; for a Dict or Tuple observation a dict with such an array for each leaf, by its path `a/b`"""
-    action: Array
-    """[T, N, *shape] as sampled: int64 counted from 0, or float32 before clipping"""
-    log_prob: Floats
-    """[T, N] of the action, under the policy that acted"""
-    reward: Floats
-    """[T, N] raw"""
-    terminated: Bools
-    """[T, N] the task ended: do not bootstrap"""
-    truncated: Bools
-    """[T, N] a time limit ended the episode: bootstrap from obs[t + 1]"""
-    valid: Bools
-    """[T, N]"""
-    state: Floats
-    """[N, S] state of the recurrent core before obs[0]; S is 0 without a core"""
-    lane: Ints
-    """[N] the lane of each column"""
+    log_prob: Any
+    """[T, N] float32 of the action, under the policy that acted; None if it is your own and does not return it"""
+    extras: Any
+    """what your own policy returned, by name: {name: [T, N, *shape]}; empty for the built-in ones"""
     version: Ints
-    """[N] the version of the weights that acted"""
-    fresh: Bools
-    """[N] False where the column goes on where it ended in the batch before"""
-    episodes: tuple[Episode, ...] = field(repr=False)
-    """the episodes that ended: `reward` (the return), `length`, `seconds`"""
+    """[N] int64, the version of the weights that acted"""
 
-    @property
-    def env_steps(self) -> int:
-        """Number of valid transitions."""
-        return int(np.count_nonzero(self.valid))
+    def __repr__(self) -> str:
+        T, N = self.reward.shape
+        return f"RolloutBatch({T} steps of {N} env copies: {self.env_steps} env steps, {len(self.episodes)} episodes ended)"
 
 
 class RolloutService:
@@ -105,7 +91,7 @@ class RolloutService:
 
         Args:
             env: an id that `gymnasium.make` takes, or a callable that returns an environment.
-            policy: `MLP`, `CNN` or `Recurrent`; by default `MLP(64, 64)`.
+            policy: `MLP`, `CNN`, `Recurrent` or your `OwnPolicy`; by default `MLP(64, 64)`.
             rollout_steps: T, env steps of an env copy in a batch.
             restore: a file that `save` wrote; `restored` then has its arrays.
             **settings: the settings of `millrace train` for environments, workers, network and timeouts, by the same names:
@@ -287,19 +273,16 @@ class RolloutService:
         in_order = sorted((one.rollout for one in arrived), key=lambda rollout: rollout.lane)
         leaves = self.run.policy.observation
         named = {leaf.path: array for leaf, array in zip(leaves, stacked.obs, strict=True)}
+        own, extras = self.run.policy.own, zip(self.run.extras, stacked.extras, strict=True)
+        fields = {name: getattr(stacked, name) for name in Batch.__struct_fields__}
         return RolloutBatch(
-            obs=stacked.obs[0] if not leaves[0].path else named,
-            action=stacked.action,
-            log_prob=stacked.log_prob,
-            reward=stacked.reward,
-            terminated=stacked.terminated,
-            truncated=stacked.truncated,
-            valid=stacked.valid,
-            state=stacked.state,
-            lane=stacked.lane,
-            version=np.repeat(np.array([rollout.version for rollout in in_order]), stacked.copies),
-            fresh=stacked.fresh,
-            episodes=stacked.episodes,
+            **fields
+            | {
+                "obs": stacked.obs[0] if not leaves[0].path else named,
+                "log_prob": stacked.log_prob if own is None or own.has_log_prob else None,
+                "extras": {extra.name: array for extra, array in extras},
+                "version": np.repeat(np.array([rollout.version for rollout in in_order]), stacked.copies),
+            }
         )
 
     def _check_interrupt(self) -> None:

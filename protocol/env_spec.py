@@ -1,6 +1,6 @@
 """The environment of a run as plain data, how to make it, and how much code a learner may have a worker run.
 
-Only this file may unpickle, and only in `EnvSpec.make`: a factory that the *learner* sent to a worker which allows
+Only this file may unpickle, and only in `PickledCallable.load`: a callable that the *learner* sent to a worker which allows
 `AllowedCode.CALLABLES`. Nothing that a worker sends is ever unpickled.
 """
 
@@ -49,6 +49,26 @@ class PickledCallable:
     def __init__(self, data: bytes) -> None:
         self.data = data
 
+    @classmethod
+    def of(cls, made: Callable[..., object], what: str) -> PickledCallable:
+        """Pickle a callable. `what` names it in errors. Raises `UsageError` for one that cannot be sent."""
+        import cloudpickle
+
+        data = cloudpickle.dumps(made)
+        if len(data) > MAX_CALLABLE_BYTES:
+            raise UsageError(
+                f"{what}: expected its callable to pickle to at most {MAX_CALLABLE_BYTES:,} bytes, got "
+                f"{len(data):,}; let it load its data when it is called, from a file that every worker can read"
+            )
+        return cls(data)
+
+    def load(self) -> Callable[..., object]:
+        """The callable. For a worker that allows `AllowedCode.CALLABLES`."""
+        import cloudpickle
+
+        found: Callable[..., object] = cloudpickle.loads(self.data)
+        return found
+
     def __eq__(self, other: object) -> bool:
         return isinstance(other, PickledCallable) and other.data == self.data
 
@@ -77,15 +97,8 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """
         if isinstance(env, str):
             return EnvSpec(env, kwargs or {})
-        import cloudpickle
-
-        name, data = getattr(env, "__name__", type(env).__name__), cloudpickle.dumps(env)
-        if len(data) > MAX_CALLABLE_BYTES:
-            raise UsageError(
-                f"environment {name}: expected its callable to pickle to at most {MAX_CALLABLE_BYTES:,} bytes, got "
-                f"{len(data):,}; let it load its data when it is called, from a file that every worker can read"
-            )
-        return EnvSpec(name, kwargs or {}, PickledCallable(data))
+        name = getattr(env, "__name__", type(env).__name__)
+        return EnvSpec(name, kwargs or {}, PickledCallable.of(env, f"environment {name}"))
 
     def rejection_reason(self, code: AllowedCode) -> str:
         """Why a worker that allows only this code cannot make it; empty if it can."""
@@ -105,9 +118,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Make one env copy. Raises `UsageError`, with advice, if the id is unknown or a package is missing."""
         extra: dict[str, object] = {} if render_mode is None else {"render_mode": render_mode}
         if self.factory is not None:
-            import cloudpickle
-
-            env = cloudpickle.loads(self.factory.data)(**self.kwargs, **extra)
+            env = self.factory.load()(**self.kwargs, **extra)
             if not isinstance(env, gymnasium.Env):
                 raise UsageError(f"env factory {self.id}: expected it to return a gymnasium.Env, got {type(env).__name__}")
             return env

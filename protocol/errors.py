@@ -10,7 +10,8 @@
     │       ├── NoWorkers         1   no worker is left, or none ever joined
     │       ├── WorkerLost        1   a worker is gone, and env copies with it, where none may be lost
     │       ├── Stalled           1   a deadline passed; the text says what was waited for
-    │       └── EnvironmentFailed 1   the environment raised too often; the text carries the worker's own traceback
+    │       ├── PolicyFailed      1   on a worker: a policy that the user wrote raised, or returned something unusable
+    │       └── EnvironmentFailed 1   the environment, or that policy, raised too often; the text carries its traceback
     └── PeerError             counted and answered, never raised into the loop: a peer sent something wrong
         ├── BadMessage            not a valid message: shape, size, type or version
         └── BadRollout            a rollout that breaks the row format
@@ -77,6 +78,10 @@ class Stalled(RunError):
 
 class EnvironmentFailed(RunError):
     """The environment raised; `detail` is the traceback where it happened."""
+
+
+class PolicyFailed(RunError):
+    """A policy that the user wrote raised, or returned what no rollout can hold; `detail` is its traceback, if it raised."""
 
 
 class PeerError(MillraceError):

@@ -51,7 +51,7 @@ class Rollout(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unk
     action: Array
     """[T, N, *action] as sampled: int64 counted from 0, or float32 before clipping"""
     log_prob: Array
-    """[T, N] float32, under the policy that acted"""
+    """[T, N] float32, under the policy that acted; zeros if it is the user's own and does not return them"""
     reward: Array
     """[T, N] float32, raw"""
     terminated: Array
@@ -197,6 +197,8 @@ class Batch(msgspec.Struct, frozen=True):
     copies: int
     """N: each lane has this many adjacent columns, or a multiple if the batch has several of its rollouts"""
     episodes: tuple[Episode, ...]
+    extras: tuple[Array, ...] = ()
+    """one array [T, ΣN, *shape] for each of `RunSpec.extras`"""
 
     @property
     def env_steps(self) -> int:
@@ -231,4 +233,5 @@ def stack_rollouts(rollouts: Sequence[Rollout], fresh: Sequence[bool] | None = N
         fresh=np.repeat([fresh[index] for index in order], copies),
         copies=copies,
         episodes=tuple(episode for row in rows for episode in row.episodes),
+        extras=tuple(side_by_side(arrays) for arrays in zip(*(row.extras for row in rows), strict=True)),
     )

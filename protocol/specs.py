@@ -6,7 +6,7 @@ from typing import Literal
 
 import msgspec
 
-from protocol.env_spec import AllowedCode, EnvSpec
+from protocol.env_spec import AllowedCode, EnvSpec, PickledCallable, Scalar
 from protocol.wire.compression import why_no_zstd
 
 MIN_IMAGE_SIDE = 5  # pixels: a 3 x 3 convolution, then one with stride 2
@@ -84,6 +84,37 @@ class EncoderSpec(msgspec.Struct, frozen=True):
     """how many features it returns"""
 
 
+class OwnPolicySpec(msgspec.Struct, frozen=True):
+    """A policy written by the user, which acts in the workers; see `protocol/policy/own_policy.py`."""
+
+    factory: str
+    """the callable that makes it, as `my_package.policies:make`; or only the name of `code`"""
+    arrays: tuple[NamedShape, ...]
+    """its parameters, in the order of the flat vector"""
+    kwargs: dict[str, Scalar] = {}
+    """keyword arguments of the callable"""
+    state_size: int = 0
+    """S, the size of the state of one env copy"""
+    has_log_prob: bool = False
+    """whether it returns log-probabilities of its actions; without them `Rollout.log_prob` is zeros"""
+    code: PickledCallable | None = None
+    """the callable, pickled by cloudpickle"""
+
+    def rejection_reason(self, code: AllowedCode) -> str:
+        """Why a worker that allows only this code cannot make it; empty if it can."""
+        if self.code is not None and code is not AllowedCode.CALLABLES:
+            return (
+                f"policy {self.factory} is a callable, which this worker does not unpickle; it may come over ipc, inproc or "
+                "with a token (and not with --no-code), else name it as my_module:make_policy"
+            )
+        if self.code is None and code is AllowedCode.REGISTERED:
+            return (
+                f"policy {self.factory} imports a module, which this worker does not do for a learner it cannot be sure of; "
+                "give it a token (and not --no-code)"
+            )
+        return ""
+
+
 ImagesDtype = Literal["float32", "bfloat16"]
 
 
@@ -109,21 +140,25 @@ class PolicySpec(msgspec.Struct, frozen=True):
     """recurrent core between the features and the hidden layers; none: a policy without memory"""
     core_size: int = 64
     """number of units of the core"""
+    own: OwnPolicySpec | None = None
+    """a policy written by the user, in place of all that the fields after `action` describe"""
 
     @property
     def state_size(self) -> int:
         """S, the size of the recurrent state of one env copy; 0 without a core."""
+        if self.own is not None:
+            return self.own.state_size
         return 0 if self.core is None else self.core_size * (2 if self.core == "lstm" else 1)
 
     @property
     def needs_torch(self) -> bool:
         """True for policies with images (convolutions) or an encoder. Every other policy acts in numpy."""
-        return self.encoder is not None or self.convolves
+        return self.own is None and (self.encoder is not None or self.convolves)
 
     @property
     def convolves(self) -> bool:
         """True if images go through the built-in convolutions."""
-        return self.encoder is None and any(leaf.is_image for leaf in self.observation)
+        return self.own is None and self.encoder is None and any(leaf.is_image for leaf in self.observation)
 
 
 class ExtraArray(msgspec.Struct, frozen=True, array_like=True):
@@ -192,6 +227,8 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
                 f"encoder {self.policy.encoder.factory} imports a module, which this worker does not do for a learner it "
                 "cannot be sure of; give it a token (and not --no-code)"
             )
+        if self.policy.own is not None and (why := self.policy.own.rejection_reason(code)):
+            return why
         return self.env.rejection_reason(code)
 
 

@@ -24,6 +24,7 @@ from protocol.bounds import Stages
 from protocol.env_spec import AllowedCode
 from protocol.errors import BadMessage, UsageError, UserFacingError, first_line
 from protocol.messages import Order, Stepped, Weights
+from protocol.policy.own_policy import OwnPolicy
 from protocol.policy.policy import make_policy
 from protocol.specs import DescribeSpec, RunSpec, StepSpec
 from protocol.wire.codec import encode
@@ -64,7 +65,7 @@ MakeCollector = Callable[[RunSpec], tuple[Collector, Evaluator]]
 
 def make_local_collector(run: RunSpec) -> tuple[Collector, Evaluator]:
     """A collector and an evaluator that have env copies of their own and share a policy."""
-    policy = make_policy(run.policy, run.images_dtype)
+    policy = make_policy(run.policy, run.images_dtype) if run.policy.own is None else OwnPolicy(run.policy, run.extras)
     return Collector(run, policy), Evaluator(run, policy)
 
 
@@ -340,7 +341,8 @@ class Worker:
                     self._describe(run)
             self._loaded = None
         except (UserFacingError, ImportError, ValueError) as error:
-            self._do(self._session.fail(_line(error), traceback.format_exc(), None))
+            detail = error.detail if isinstance(error, UserFacingError) else ""
+            self._do(self._session.fail(_line(error), detail or traceback.format_exc(), None))
 
     def _describe(self, spec: DescribeSpec) -> None:
         """Describe the environment. A second thread sends the heartbeats while its code runs."""

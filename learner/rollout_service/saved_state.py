@@ -38,7 +38,9 @@ class ServiceState(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def digest(policy: PolicySpec) -> str:
-    """A short text that differs for different policies."""
+    """A short text that differs for different policies. Of the user's own, its name and layout count, and not its code."""
+    if policy.own is not None:
+        policy = msgspec.structs.replace(policy, own=msgspec.structs.replace(policy.own, code=None))
     return hashlib.sha256(msgspec.msgpack.encode(policy)).hexdigest()[:32]
 
 

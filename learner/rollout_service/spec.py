@@ -6,16 +6,18 @@ from learner.config.rollout_config import RolloutConfig
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
 from protocol.policy.layout import acting_size
-from protocol.specs import PolicySpec, RunSpec
+from protocol.specs import ExtraArray, PolicySpec, RunSpec
 from protocol.wire.codec import check_can_be_sent
 from protocol.wire.compression import why_no_zstd
 from protocol.wire.socket_options import MAX_FRAME_BYTES
 
 
-def rollout_spec(config: RolloutConfig, env: EnvSpec, policy: PolicySpec, rollout_steps: int) -> RunSpec:
+def rollout_spec(
+    config: RolloutConfig, env: EnvSpec, policy: PolicySpec, rollout_steps: int, extras: tuple[ExtraArray, ...] = ()
+) -> RunSpec:
     """The specification that `Welcome` carries. Raises `UsageError` if it cannot be sent, or settings and policy do not fit.
 
-    `rollout_steps`: T, the env steps of a rollout.
+    `rollout_steps`: T, the env steps of a rollout. `extras`: further arrays of each, which the user's own policy returns.
     """
     if config.compress == "zstd" and (why := why_no_zstd()):
         raise UsageError(why)
@@ -33,6 +35,7 @@ def rollout_spec(config: RolloutConfig, env: EnvSpec, policy: PolicySpec, rollou
         vector=config.chosen_vector(),
         compress=config.compress,
         images_dtype=config.images_dtype,
+        extras=extras,
         heartbeat_s=config.heartbeat_s,
     )
     _check_weights_can_be_sent(env.id, policy, config)

@@ -65,8 +65,9 @@ def start(
     else:
         keyring, token = temporary_keys(config.transport, config.keys, insecure=config.insecure)
         address = private_address(config.transport, resources)
-    if address.startswith("tcp://") and keyring is None and env.factory is not None:
-        raise UsageError("an environment factory is code: it travels over ipc or inproc only, or over tcp with keys")
+    if address.startswith("tcp://") and keyring is None and (env.factory is not None or policy.is_code):
+        what = "an environment factory" if env.factory is not None else "a policy's callable"
+        raise UsageError(f"{what} is code: it travels over ipc or inproc only, or over tcp with keys")
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     resources.callback(context.term)
     link = LearnerLink(address, context, keyring)
@@ -93,7 +94,7 @@ def start(
         spec = DescribeSpec(env, config.chosen_vector(), heartbeat_s=config.heartbeat_s)
         described = described_by_workers(link, spec, describe_settings(config), processes, check_interrupt)
         spaces = EnvSpaces.of_description(described)
-        run = rollout_spec(config, env, policy.spec(spaces.observation, spaces.action), rollout_steps)
+        run = rollout_spec(config, env, policy.spec(spaces.observation, spaces.action), rollout_steps, policy.extra_arrays)
         service = rollout_service(config, run, link, processes, check_interrupt, past=past)
         service.wait_for_workers(config.min_workers or (1 if listens else config.workers))
     return StartedService(service, run, described)

@@ -26,7 +26,7 @@ class Field(NamedTuple):
     name: str
     shape: tuple[int, ...]
     gain: float
-    """gain of the orthogonal initialization; 0: starts at zero (biases, log standard deviations), or set by the encoder"""
+    """gain of the orthogonal initialization; 0: starts at zero (biases, log standard deviations), or the user's own"""
 
 
 class Conv(NamedTuple):
@@ -57,6 +57,8 @@ def convolutions(leaf: Leaf) -> tuple[tuple[Conv, ...], tuple[int, int, int], in
 
 def parameter_layout(spec: PolicySpec) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
     """The fields that are needed to act, and then those of the critic. Linear weights are [out, in]."""
+    if spec.own is not None:
+        return tuple(Field(array.name, array.shape, 0) for array in spec.own.arrays), ()
     acting: list[Field] = []
     width = feature_size(spec)
     if spec.encoder is not None:

@@ -52,6 +52,7 @@ RECORDS: tuple[type, ...] = (
     env_spec.EnvSpec,
     specs.PolicySpec,
     specs.EncoderSpec,
+    specs.OwnPolicySpec,
     specs.NamedShape,
     specs.Leaf,
     specs.ActionSpec,

@@ -19,11 +19,12 @@ from protocol.bounds import Stages
 from protocol.envs.envpool import envpool_spec
 from protocol.envs.spaces import make_action_converter
 from protocol.envs.vectorized import make_native
-from protocol.errors import EnvironmentFailed
-from protocol.policy.distributions import distribution
+from protocol.errors import EnvironmentFailed, PolicyFailed
+from protocol.policy.own_policy import OwnPolicy
 from protocol.policy.policy import Policy
 from protocol.rollout import Rollout
 from protocol.specs import RunSpec
+from workers.collect.acting import RolloutActions, acting_of
 from workers.collect.collected_lane import CollectedLane
 from workers.collect.env_copies import EnvCopies, LoopedCopies, VectorCopies
 from workers.collect.envpool_copies import EnvpoolCopies
@@ -61,9 +62,6 @@ class _Rows(NamedTuple):
 
     obs: tuple[Array, ...]  # [L, T+1, N, *leaf] each
     state: Floats  # [L, N, S] recurrent state of the policy, updated at each step
-    noise: Floats  # [L, T, N, noise]
-    params: Floats  # [L, T, N, P]
-    action: Array  # [L, T, N, *action]
     reward: Array  # [L, T, N] float64, so that returns are summed before they are rounded
     terminated: Array  # [L, T, N] bool
     truncated: Array  # [L, T, N] bool
@@ -76,7 +74,7 @@ class Collector:
     def __init__(
         self,
         run: RunSpec,
-        policy: Policy,
+        policy: Policy | OwnPolicy,
         open_copies: OpenEnvCopies = open_env_copies,
         step_all: StepAll = no_step_for_all,
     ) -> None:
@@ -86,9 +84,8 @@ class Collector:
         self.stages: Stages = {"open": 0.0, "act": 0.0, "step": 0.0}
         """seconds spent opening lanes (making copies and their first reset), choosing actions and stepping copies"""
         self._run = run
-        self._policy = policy
+        self._acting = acting_of(run, policy)
         self._open_copies, self._step_all = open_copies, step_all
-        self._distribution = distribution(run.policy)
         self._to_env_action = make_action_converter(run.policy.action)
         self._lanes: dict[int, CollectedLane] = {}
         self._to_close: list[CollectedLane] = []  # released by a pulse, when their copies may be in the middle of a step
@@ -96,7 +93,7 @@ class Collector:
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
         """Use these weights from now on."""
-        self._policy.load(parameters, buffers)
+        self._acting.load(parameters, buffers)
 
     def collect(self, assignments: Sequence[Assignment], version: int, session: int, pulse: Pulse) -> list[Rollout]:
         """Collect one rollout for each assignment. Returns them in the order of the assignments.
@@ -110,16 +107,17 @@ class Collector:
         try:
             lanes = [self._lane_for(assignment, pulse) for assignment in assignments]
             rows = self._new_rows(lanes)
+            actions = self._acting.begin([lane.generator for lane in lanes])
             try:
-                self._act_and_step(rows, lanes, pulse)
-            except (LaneFailed, EnvironmentFailed, IndexError):
+                self._act_and_step(rows, actions, lanes, pulse)
+            except (LaneFailed, EnvironmentFailed, PolicyFailed, IndexError):
                 # An invalid observation or reward may have caused the error. Then `check_values` raises the clearer one.
                 done = len(rows.step_end_s)
                 for i, lane in enumerate(lanes):
                     lane.check_values([array[i, : done + 1] for array in rows.obs], rows.reward[i, :done])
                 raise
             return [
-                self._rollout(rows, i, lane, assignment, version, session)
+                self._rollout(rows, actions, i, lane, assignment, version, session)
                 for i, (lane, assignment) in enumerate(zip(lanes, assignments, strict=True))
             ]
         except BaseException:
@@ -157,7 +155,6 @@ class Collector:
 
     def _new_rows(self, lanes: Sequence[CollectedLane]) -> _Rows:
         L, T, N = len(lanes), self._run.rollout_steps, self._run.copies
-        action = self._run.policy.action
         obs = tuple(np.empty((L, T + 1, N, *leaf.shape), leaf.dtype) for leaf in self._run.policy.observation)
         for i, lane in enumerate(lanes):
             for array, leaf in zip(obs, lane.obs, strict=True):
@@ -165,16 +162,13 @@ class Collector:
         return _Rows(
             obs=obs,
             state=np.stack([lane.state for lane in lanes]),
-            noise=np.stack([self._distribution.noise(lane.generator, (T, N)) for lane in lanes]),
-            params=np.empty((L, T, N, self._distribution.params_size), np.float32),
-            action=np.empty((L, T, N, *action.shape), action.stored_dtype),
             reward=np.empty((L, T, N)),
             terminated=np.empty((L, T, N), bool),
             truncated=np.empty((L, T, N), bool),
             step_end_s=[],
         )
 
-    def _act_and_step(self, rows: _Rows, lanes: Sequence[CollectedLane], pulse: Pulse) -> None:
+    def _act_and_step(self, rows: _Rows, actions: RolloutActions, lanes: Sequence[CollectedLane], pulse: Pulse) -> None:
         """Step all lanes T times."""
         is_recurrent = rows.state.size > 0
         resets = np.stack([lane.ended for lane in lanes])  # [L, N] row t is not valid
@@ -188,11 +182,7 @@ class Collector:
             pulse()
             began = perf_counter()
             with np.errstate(all="ignore"):  # a NaN is reported once the rollout is complete
-                params = self._policy([leaf[:, t] for leaf in rows.obs], rows.state)
-                action = self._distribution.sample(params, rows.noise[:, t])
-                taken = self._to_env_action(action)
-            rows.params[:, t] = params
-            rows.action[:, t] = action
+                taken = self._to_env_action(actions.act(t, [leaf[:, t] for leaf in rows.obs], rows.state))
             acted = perf_counter()
             self._step_all(lane_numbers, taken, pulse)
             for i, lane, numbers, obs in views:
@@ -213,7 +203,14 @@ class Collector:
             stages["step"] += ended - acted
 
     def _rollout(
-        self, rows: _Rows, i: int, lane: CollectedLane, assignment: Assignment, version: int, session: int
+        self,
+        rows: _Rows,
+        actions: RolloutActions,
+        i: int,
+        lane: CollectedLane,
+        assignment: Assignment,
+        version: int,
+        session: int,
     ) -> Rollout:
         """The rollout of lane `i`, made of views of the rows."""
         valid, episodes = lane.finish(rows.reward[i], rows.terminated[i] | rows.truncated[i], rows.step_end_s)
@@ -221,6 +218,7 @@ class Collector:
         with np.errstate(over="ignore"):
             reward = rows.reward[i].astype(np.float32)
         lane.check_values(obs, reward)
+        acted = actions.columns(i)
         lane.obs = tuple(array[-1].copy() for array in obs)
         before, lane.state = lane.state, rows.state[i].copy()
         self.steps += int(np.count_nonzero(valid))
@@ -231,14 +229,15 @@ class Collector:
             version=version,
             sequence=assignment.sequence,
             obs=obs,
-            action=rows.action[i],
-            log_prob=self._distribution.log_prob(rows.params[i], rows.action[i]),
+            action=acted.action,
+            log_prob=acted.log_prob,
             reward=reward,
             terminated=rows.terminated[i],
             truncated=rows.truncated[i],
             valid=valid,
             state=before,
             episodes=episodes,
+            extras=acted.extras,
         )
 
 

@@ -19,11 +19,12 @@ from protocol.arrays import Array
 from protocol.envs.spaces import action_spec, make_action_converter, observation_leaves
 from protocol.errors import RunError, UsageError, first_line
 from protocol.messages import Evaluate, Evaluated
-from protocol.policy.distributions import distribution
+from protocol.policy.own_policy import OwnPolicy
 from protocol.policy.policy import Policy
 from protocol.policy.recurrent import zero_state
 from protocol.rollout import LARGEST_REWARD, Episode
 from protocol.specs import Leaf, RunSpec
+from workers.collect.acting import acting_of
 from workers.env_errors import CopyRaised
 from workers.env_loop import Pulse
 from workers.evaluate.episode_rows import RowSender, Send, as_frame
@@ -48,14 +49,16 @@ def open_looped_copies(run: RunSpec, count: int, render_mode: str | None, pulse:
 class Evaluator:
     """Plays whole episodes. It opens env copies when they are first needed."""
 
-    def __init__(self, run: RunSpec, policy: Policy, open_copies: OpenEvaluationCopies = open_looped_copies) -> None:
+    def __init__(
+        self, run: RunSpec, policy: Policy | OwnPolicy, open_copies: OpenEvaluationCopies = open_looped_copies
+    ) -> None:
         """`policy` must hold the weights to evaluate when `play` is called."""
         self.steps = 0
         """number of env steps made"""
         self.seconds = 0.0
         """seconds spent in `play`"""
-        self._run, self._policy, self._open_copies = run, policy, open_copies
-        self._distribution = distribution(run.policy)
+        self._run, self._open_copies = run, open_copies
+        self._acting = acting_of(run, policy)
         self._to_env_action = make_action_converter(run.policy.action)
         self._copies: dict[str | None, EvaluationCopies] = {}  # by render mode
 
@@ -105,11 +108,7 @@ class Evaluator:
         while running:
             pulse()
             with np.errstate(all="ignore"):
-                params = self._policy(obs, state)
-                if order.greedy:
-                    chosen = self._distribution.mode(params)[0]
-                else:
-                    chosen = self._distribution.sample(params, self._distribution.noise(generator, (1, k)))[0]
+                chosen = self._acting.choose(obs, state, generator, greedy=order.greedy)
                 actions[:k] = self._to_env_action(chosen)
             ended = False
             for n, step in zip(running, copies.step(actions, running, pulse), strict=True):

@@ -1,0 +1,118 @@
+"""A policy of the user's own: which callable makes it in the workers, and what is declared of it. Imports no torch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from protocol.env_spec import PickledCallable, Scalar
+from protocol.errors import UsageError
+from protocol.policy.own_policy import LOG_PROB
+from protocol.specs import ActionSpec, ExtraArray, Leaf, NamedShape, OwnPolicySpec, PolicySpec
+from protocol.wire.codec import DTYPES
+
+BATCH_NAMES = frozenset(
+    {"obs", "action", "reward", "terminated", "truncated", "valid", "state", "lane", "version", "fresh", "episodes"}
+)
+
+
+@dataclass(frozen=True)
+class OwnPolicy:
+    """A policy that you wrote, for `RolloutService`: any network and distribution, in any framework that the workers have.
+
+        class Policy:
+            def load(self, arrays):                     # for each version of the weights
+                self.arrays = arrays                    # {"w": float32 [4, 2]}
+
+            def act(self, obs, state, rng):             # obs [N, 4] of the N copies of a lane
+                logits = obs @ self.arrays["w"]
+                action = (logits + rng.gumbel(size=logits.shape)).argmax(-1)
+                return action, state, {"logits": logits}
+
+        service = millrace.RolloutService(
+            "CartPole-v1", millrace.OwnPolicy(Policy, {"w": (4, 2)}, extras={"logits": ("float32", (2,))})
+        )
+
+    `factory(**kwargs)` is called in each worker and returns such an object. `act` is called once for each step of a lane,
+    with exactly its copies. What an episode remembers goes into `state` [N, state_size] float32, which is zeros when an
+    episode begins; if the object keeps nothing else between its calls, results do not depend on the number of workers. An
+    action is whole numbers that count from 0, or float32, which is clipped to the space after it was stored.
+    `service.evaluate` calls `act_greedy` of the object if there is one, else `act`. docs/rollout_service.md has more.
+    """
+
+    factory: str | Callable[..., object]
+    """`module:callable`, which every worker can import; or a callable, which is sent to the workers by cloudpickle (over
+    ipc, inproc, or tcp with keys)"""
+    arrays: Mapping[str, tuple[int, ...]]
+    """shape of each of its parameters, by name: what `publish` takes and `load` gets, as float32"""
+    extras: Mapping[str, Any] = field(default_factory=dict)
+    """dtype of each further array that `act` returns, by name, as numpy.dtype takes it: `"float32"` for a number of each
+    action, `("float32", (2,))` for an array of shape [2]. `log_prob` must be float32; it is then `batch.log_prob`"""
+    state_size: int = 0
+    """S, how many numbers the state of one env copy has"""
+    kwargs: Mapping[str, Scalar] = field(default_factory=dict)
+    """keyword arguments of the factory"""
+
+    @property
+    def name(self) -> str:
+        """By which it is called in errors."""
+        return (
+            self.factory if isinstance(self.factory, str) else getattr(self.factory, "__name__", type(self.factory).__name__)
+        )
+
+    @property
+    def is_code(self) -> bool:
+        """Whether it travels as a pickled callable."""
+        return not isinstance(self.factory, str)
+
+    @property
+    def extra_arrays(self) -> tuple[ExtraArray, ...]:
+        """The declared extras but `log_prob`. Raises `UsageError`."""
+        return tuple(extra for extra in self._declared() if extra != LOG_PROB)
+
+    def spec(self, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
+        """The policy for these spaces. Raises `UsageError` for declarations that cannot be used."""
+        if isinstance(self.factory, str) and not all(self.factory.partition(":")):
+            raise UsageError(f"policy {self.factory}: expected module:factory, as in my_package.policies:make_policy")
+        if not (type(self.state_size) is int and self.state_size >= 0):
+            raise UsageError(f"policy {self.name}: state_size: expected a whole number from 0, got {self.state_size!r}")
+        own = OwnPolicySpec(
+            self.name,
+            tuple(NamedShape(name, self._shape(name, shape)) for name, shape in self.arrays.items()),
+            dict(self.kwargs),
+            self.state_size,
+            LOG_PROB in self._declared(),
+            None if isinstance(self.factory, str) else PickledCallable.of(self.factory, f"policy {self.name}"),
+        )
+        return PolicySpec(observation, action, own=own)
+
+    def _shape(self, name: str, shape: Any) -> tuple[int, ...]:
+        found = tuple(shape) if isinstance(shape, (tuple, list)) else (None,)
+        if not (all(type(side) is int and side > 0 for side in found) and math.prod(found)):
+            raise UsageError(f"policy {self.name}: array {name}: expected a shape, as (64, 4), got {shape!r}")
+        return found
+
+    def _declared(self) -> tuple[ExtraArray, ...]:
+        found = []
+        for name, dtype in self.extras.items():
+            try:
+                kind = np.dtype(dtype)
+            except (TypeError, ValueError) as error:
+                raise UsageError(f"policy {self.name}: extra {name}: {_EXPECTED}, got {dtype!r}") from error
+            extra = ExtraArray(name, kind.shape, kind.base.name)
+            if kind.base.str not in DTYPES:
+                raise UsageError(f"policy {self.name}: extra {name}: {_EXPECTED}, got {dtype!r}")
+            if name in BATCH_NAMES or (name == LOG_PROB.name and extra != LOG_PROB):
+                expected = (
+                    "float32 for each action" if name == LOG_PROB.name else "another name; a batch has an array of this one"
+                )
+                raise UsageError(f"policy {self.name}: extra {name}: expected {expected}")
+            found.append(extra)
+        return tuple(found)
+
+
+_EXPECTED = 'expected a dtype of numbers as numpy.dtype takes it, "float32" or ("float32", (2,))'

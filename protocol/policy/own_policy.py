@@ -1,0 +1,140 @@
+"""A policy that the user wrote, acting in a worker: made, called and checked here. Imports no torch.
+
+The callable `factory(**kwargs)` returns an object with
+
+    load(arrays)             {name: float32 array} as declared; called for each version of the weights
+    act(obs, state, rng)     -> action, state, extras
+
+for N env copies. All arrays are its own to change. `obs` is an array [N, *shape]; for a Dict or Tuple observation it is a
+dict of such arrays, by path. `state` [N, S] float32 is zeros when an episode begins. `rng` is the numpy `Generator` of
+these copies. `action` [N, *action] is stored as it is returned: whole numbers that count from 0, or float32 before clipping.
+`extras` has one array [N, *shape] for each name that was declared. If there is `act_greedy(obs, state, rng)`, evaluations
+call it in place of `act`.
+
+Rule: `act` is called once for each lane and step, with exactly the copies of that lane. So if it keeps nothing between its
+calls but `state`, a rollout has the same bits whatever else the worker does.
+"""
+
+from __future__ import annotations
+
+import importlib
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from protocol.arrays import Array, Floats
+from protocol.errors import PolicyFailed, first_line
+from protocol.policy.layout import named_views, parameter_layout
+from protocol.rollout import outside_of_choices
+from protocol.specs import ExtraArray, OwnPolicySpec, PolicySpec
+
+LOG_PROB = ExtraArray("log_prob", (), "float32")
+
+
+class Acted(NamedTuple):
+    """What a policy returned for the N copies of a lane, as arrays of the run."""
+
+    action: Array
+    """[N, *action]"""
+    state: Floats
+    """[N, S]"""
+    extras: tuple[Array, ...]
+    """in the order in which they were declared; last the log-probabilities, if the policy has them"""
+
+
+class OwnPolicy:
+    """The user's policy. Everything that goes wrong in it is raised as `PolicyFailed`."""
+
+    def __init__(self, spec: PolicySpec, extras: tuple[ExtraArray, ...]) -> None:
+        """Make it. `extras` are those of the run."""
+        assert spec.own is not None
+        self._spec, self._own = spec, spec.own
+        self._fields, _ = parameter_layout(spec)
+        self._paths = [leaf.path for leaf in spec.observation]
+        self._extras = (*extras, LOG_PROB) if spec.own.has_log_prob else extras
+        self._names = {extra.name for extra in self._extras}
+        self._made: Any = self._guarded("cannot be made: it", lambda: _factory(self._own)(**self._own.kwargs))
+        for name in ("load", "act"):
+            if not callable(getattr(self._made, name, None)):
+                raise self._wrong(f"expected an object with load and act, got {type(self._made).__name__} without {name}")
+
+    def load(self, parameters: Floats, buffers: Floats) -> None:
+        """Give it these weights."""
+        self._guarded("load", lambda: self._made.load(named_views(parameters.copy(), self._fields)))
+
+    def act(self, leaves: Sequence[Array], state: Floats, rng: np.random.Generator, *, greedy: bool = False) -> Acted:
+        """Act for the copies of a lane: leaves [N, *leaf], state [N, S]. `greedy`: as in an evaluation."""
+        name = "act_greedy" if greedy and hasattr(self._made, "act_greedy") else "act"
+        own = [leaf.copy() for leaf in leaves]
+        obs = dict(zip(self._paths, own, strict=True)) if self._paths[0] else own[0]
+        returned = self._guarded(name, lambda: getattr(self._made, name)(obs, state.copy(), rng))
+        if not (isinstance(returned, tuple) and len(returned) == 3):
+            raise self._wrong(f"{name}: expected action, state, extras, got {_described(returned)}")
+        action, after, extras = returned
+        copies = len(state)
+        stored = self._array(
+            action, (copies, *self._spec.action.shape), self._spec.action.stored_dtype, f"{name}: the action"
+        )
+        if why := outside_of_choices(stored, self._spec.action):
+            raise self._wrong(f"{name}: the action: {why}")
+        if self._own.state_size:
+            state = self._array(after, state.shape, "float32", f"{name}: the state")
+        given = extras or {}
+        if not isinstance(given, Mapping) or given.keys() != self._names:
+            names = ", ".join(sorted(self._names)) or "none"
+            got = ", ".join(map(str, given)) if isinstance(given, Mapping) else type(given).__name__
+            raise self._wrong(f"{name}: expected the extras {names}, got {got or 'none'}")
+        arrays = (
+            self._array(given[each.name], (copies, *each.shape), each.dtype, f"{name}: extra {each.name}")
+            for each in self._extras
+        )
+        return Acted(stored, state, tuple(arrays))
+
+    def _array(self, value: Any, shape: tuple[int, ...], dtype: str, what: str) -> Array:
+        """The value as an array of this shape and dtype. Raises `PolicyFailed` for another shape or kind of number."""
+        array: npt.NDArray[Any] = self._guarded(what, lambda: np.asarray(value))
+        if array.shape != shape or not np.can_cast(array.dtype, dtype, "same_kind"):
+            raise self._wrong(f"{what}: expected {dtype}{list(shape)}, got {array.dtype}{list(array.shape)}")
+        array = array.astype(dtype, copy=False)
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            copy = np.argwhere(~np.isfinite(array))[0][0]
+            raise self._wrong(f"{what}: expected finite numbers, got {array[copy].tolist()} for copy {copy}"[:500])
+        return array
+
+    def _guarded(self, what: str, call: Callable[[], Any]) -> Any:
+        """Call the user's code."""
+        try:
+            return call()
+        except PolicyFailed:
+            raise
+        except Exception as error:
+            line = f"{what} raised {type(error).__name__}: {first_line(error)}"
+            raise self._wrong(line, traceback.format_exc()) from error
+
+    def _wrong(self, line: str, detail: str = "") -> PolicyFailed:
+        return PolicyFailed(f"policy {self._own.factory}: {line}", detail)
+
+
+def _factory(own: OwnPolicySpec) -> Callable[..., object]:
+    """The callable that makes the policy."""
+    if own.code is not None:
+        return own.code.load()
+    module, colon, name = own.factory.partition(":")
+    if not (module and colon and name):
+        raise PolicyFailed(f"policy {own.factory}: expected module:factory, as in my_package.policies:make_policy")
+    try:
+        imported = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        says = "is it installed, or its folder on PYTHONPATH?"
+        raise PolicyFailed(f"policy {own.factory}: no module named {error.name}; {says}", traceback.format_exc()) from error
+    if not callable(found := getattr(imported, name, None)):
+        raise PolicyFailed(f"policy {own.factory}: {module} has no callable {name}")
+    factory: Callable[..., object] = found
+    return factory
+
+
+def _described(value: object) -> str:
+    return f"a tuple of {len(value)}" if isinstance(value, tuple) else type(value).__name__

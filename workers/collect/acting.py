@@ -1,0 +1,140 @@
+"""How the actions of a rollout are chosen: by a policy of ours, for all lanes in one pass, or by the user's own.
+
+Rule: the actions of a lane depend on its observations, state and random generator, and not on the other lanes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from protocol.arrays import Array, Floats
+from protocol.policy.distributions import distribution
+from protocol.policy.own_policy import OwnPolicy
+from protocol.policy.policy import Policy
+from protocol.specs import RunSpec
+
+
+class ActedRows(NamedTuple):
+    """The columns of a rollout that its policy wrote."""
+
+    action: Array
+    """[T, N, *action]"""
+    log_prob: Floats
+    """[T, N]"""
+    extras: tuple[Array, ...]
+    """[T, N, *shape] each"""
+
+
+class RolloutActions(Protocol):
+    """The actions of one rollout of each of L lanes, step by step."""
+
+    def act(self, t: int, obs: Sequence[Array], state: Floats) -> Array:
+        """Choose, and keep, the actions [L, N, *action] of step t in observations [L, N, *leaf]. Updates state [L, N, S]."""
+        ...
+
+    def columns(self, i: int) -> ActedRows:
+        """After T steps: those of lane i."""
+        ...
+
+
+class Acting(Protocol):
+    """A policy as the collector and the evaluator use it."""
+
+    def load(self, parameters: Floats, buffers: Floats) -> None:
+        """Use these weights from now on."""
+        ...
+
+    def begin(self, generators: Sequence[np.random.Generator]) -> RolloutActions:
+        """Begin a rollout of the lanes whose random generators these are."""
+        ...
+
+    def choose(self, obs: Sequence[Array], state: Floats, generator: np.random.Generator, *, greedy: bool) -> Array:
+        """Actions [k, *action] in observations [1, k, *leaf]. Updates state [1, k, S]."""
+        ...
+
+
+def acting_of(run: RunSpec, policy: Policy | OwnPolicy) -> Acting:
+    """How this policy acts in this run."""
+    return _OwnActing(run, policy) if isinstance(policy, OwnPolicy) else _BuiltInActing(run, policy)
+
+
+class _BuiltInActing:
+    """A policy of ours. The noise of a whole rollout is drawn in one call, and so are the log-probabilities computed."""
+
+    def __init__(self, run: RunSpec, policy: Policy) -> None:
+        self.run, self.policy = run, policy
+        self.distribution = distribution(run.policy)
+
+    def load(self, parameters: Floats, buffers: Floats) -> None:
+        self.policy.load(parameters, buffers)
+
+    def begin(self, generators: Sequence[np.random.Generator]) -> RolloutActions:
+        return _BuiltInActions(self, generators)
+
+    def choose(self, obs: Sequence[Array], state: Floats, generator: np.random.Generator, *, greedy: bool) -> Array:
+        params = self.policy(obs, state)
+        if greedy:
+            return self.distribution.mode(params)[0]  # type: ignore[no-any-return]
+        noise = self.distribution.noise(generator, params.shape[:2])
+        return self.distribution.sample(params, noise)[0]  # type: ignore[no-any-return]
+
+
+class _BuiltInActions:
+    def __init__(self, acting: _BuiltInActing, generators: Sequence[np.random.Generator]) -> None:
+        run, self._distribution, self._policy = acting.run, acting.distribution, acting.policy
+        L, T, N, action = len(generators), run.rollout_steps, run.copies, run.policy.action
+        self._noise = np.stack([self._distribution.noise(generator, (T, N)) for generator in generators])  # [L, T, N, noise]
+        self._params = np.empty((L, T, N, self._distribution.params_size), np.float32)
+        self._action = np.empty((L, T, N, *action.shape), action.stored_dtype)
+
+    def act(self, t: int, obs: Sequence[Array], state: Floats) -> Array:
+        params = self._policy(obs, state)
+        action = self._distribution.sample(params, self._noise[:, t])
+        self._params[:, t] = params
+        self._action[:, t] = action
+        return action
+
+    def columns(self, i: int) -> ActedRows:
+        return ActedRows(self._action[i], self._distribution.log_prob(self._params[i], self._action[i]), ())
+
+
+class _OwnActing:
+    """A policy of the user's, called once for each lane."""
+
+    def __init__(self, run: RunSpec, policy: OwnPolicy) -> None:
+        self.run, self.policy = run, policy
+
+    def load(self, parameters: Floats, buffers: Floats) -> None:
+        self.policy.load(parameters, buffers)
+
+    def begin(self, generators: Sequence[np.random.Generator]) -> RolloutActions:
+        return _OwnActions(self, generators)
+
+    def choose(self, obs: Sequence[Array], state: Floats, generator: np.random.Generator, *, greedy: bool) -> Array:
+        acted = self.policy.act([leaf[0] for leaf in obs], state[0], generator, greedy=greedy)
+        state[0] = acted.state
+        return acted.action
+
+
+class _OwnActions:
+    def __init__(self, acting: _OwnActing, generators: Sequence[np.random.Generator]) -> None:
+        run, self._policy, self._generators = acting.run, acting.policy, generators
+        lead, action = (len(generators), run.rollout_steps, run.copies), run.policy.action
+        self._action = np.empty((*lead, *action.shape), action.stored_dtype)
+        self._extras = [np.empty((*lead, *extra.shape), extra.dtype) for extra in run.extras]
+        self._log_prob = np.zeros(lead, np.float32)
+        self._written = [*self._extras, self._log_prob]  # in the order of `Acted.extras`
+
+    def act(self, t: int, obs: Sequence[Array], state: Floats) -> Array:
+        for i, generator in enumerate(self._generators):
+            acted = self._policy.act([leaf[i] for leaf in obs], state[i], generator)
+            self._action[i, t], state[i] = acted.action, acted.state
+            for array, extra in zip(self._written, acted.extras, strict=False):  # the last may be absent: log_prob
+                array[i, t] = extra
+        return np.asarray(self._action[:, t])
+
+    def columns(self, i: int) -> ActedRows:
+        return ActedRows(self._action[i], self._log_prob[i], tuple(extra[i] for extra in self._extras))
