@@ -69,7 +69,9 @@ class Trained(NamedTuple):
 def train(algo: str, max_lag: int, seed: int) -> Trained:
     """Run the training and read its results."""
     where = RESULTS / "off_policy" / f"{algo}-lag{max_lag}"
-    run = millrace.train("CartPole-v1", preset="none", algo=algo, max_lag=max_lag, seed=seed, run_dir=str(where), **SETTINGS)
+    run = millrace.train(
+        "CartPole-v1", preset="none", algo=algo, max_lag=max_lag, seed=seed, run_dir=str(where), **SETTINGS
+    ).path
     summary = RunFolder.open(run).summary()
     assert summary is not None
     assert summary.evaluation is not None

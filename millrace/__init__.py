@@ -4,13 +4,13 @@ User code imports this package only.
 
 import millrace
 run = millrace.train("CartPole-v1", seed=1)
+policy = millrace.load(run)
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from millrace.import_conflict import check_imports
@@ -36,9 +36,12 @@ if TYPE_CHECKING:
     from learner.run_folder.progress import Progress
     from learner.vector_env.env import ZmqVectorEnv
     from learner.vector_env.settings import EnvLike
+    from millrace.acting import LoadedPolicy, load
     from millrace.own_policy import OwnPolicy
+    from millrace.playing import evaluate, record
     from millrace.policies import CNN, MLP, Piece, PolicyParameters, Recurrent
     from millrace.rollout_service import RolloutBatch, RolloutService
+    from millrace.runs import Metrics, Run, train
 
 __all__ = [
     "CNN",
@@ -46,6 +49,8 @@ __all__ = [
     "Callback",
     "CheckpointError",
     "EnvironmentFailed",
+    "LoadedPolicy",
+    "Metrics",
     "MillraceError",
     "NoWorkers",
     "OwnPolicy",
@@ -55,6 +60,7 @@ __all__ = [
     "Recurrent",
     "RolloutBatch",
     "RolloutService",
+    "Run",
     "RunError",
     "Stalled",
     "UsageError",
@@ -62,7 +68,10 @@ __all__ = [
     "WorkerLost",
     "__version__",
     "algorithms",
+    "evaluate",
+    "load",
     "make_vec",
+    "record",
     "testing",
     "train",
 ]
@@ -70,59 +79,26 @@ __all__ = [
 _IMPORTED_WHEN_USED = {
     "CNN": "millrace.policies",
     "Callback": "learner.callbacks.callback",
+    "LoadedPolicy": "millrace.acting",
     "MLP": "millrace.policies",
     "OwnPolicy": "millrace.own_policy",
+    "Metrics": "millrace.runs",
     "Piece": "millrace.policies",
     "PolicyParameters": "millrace.policies",
     "Progress": "learner.run_folder.progress",
     "Recurrent": "millrace.policies",
     "RolloutBatch": "millrace.rollout_service",
     "RolloutService": "millrace.rollout_service",
+    "Run": "millrace.runs",
+    "evaluate": "millrace.playing",
+    "load": "millrace.acting",
+    "record": "millrace.playing",
+    "train": "millrace.runs",
 }
 """Public names, and the module of each. They are imported when they are used, because that takes longer than this file."""
 
 _MODULES = ("algorithms", "testing")
 """Public modules, which are imported when they are used, too"""
-
-
-def train(
-    env: str | Callable[..., object] = "",
-    *,
-    config: str | Path | None = None,
-    resume: str | Path | None = None,
-    preset: str = "auto",
-    callbacks: Sequence[object] = (),
-    watch: Callable[[Progress], object] | None = None,
-    **keywords: Any,
-) -> Path:
-    """Train a policy on this machine: the learner runs in this process, the workers in processes that it starts.
-
-    Arguments:
-        env: An id that `gymnasium.make` takes, or a callable that returns an environment.
-        config: A TOML file of settings.
-        resume: A run folder to continue from its newest checkpoint, or "auto": the newest run of this environment, algorithm
-            and seed if there is one, else a new run.
-        preset: The name of a preset (`millrace presets` lists them); "auto" takes that of `env`; "none" takes none.
-        callbacks: Objects with some of the methods of `Callback`. They are called between updates, and may end the run.
-        watch: Called with a `Progress` after each update, and several times a second during an evaluation.
-        **keywords: The flags of `millrace train`, by the same names: `learning_rate=1e-3`. `algo` may be a class of your own
-            (`millrace.algorithms`). A class that was made in a script or a notebook is given again on resume.
-
-    Returns the run folder. Raises `UserFacingError` with a message of one line. In a script, guard the call with
-    `if __name__ == "__main__":`.
-    """
-    from learner.callbacks.callbacks import Callbacks
-    from learner.config.layers import resolve
-    from learner.run_folder.resume import AUTO, newest_run
-    from millrace.launch import local_run
-
-    name = env if isinstance(env, str) else getattr(env, "__name__", type(env).__name__)
-    file, run = (None if path is None else Path(path) for path in (config, resume))
-    if run == AUTO:
-        run = newest_run(resolve(name, file=file, preset=preset, **keywords))
-        file = None if run else file
-    settings = resolve(name, file=file, resume=run, preset=preset, **keywords)
-    return local_run.train(settings, run, Callbacks(callbacks, watch), factory=None if isinstance(env, str) else env)
 
 
 def make_vec(

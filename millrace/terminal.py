@@ -1,4 +1,4 @@
-"""Shows the progress of a run: as a live block on a terminal, as a line every few seconds elsewhere, or as JSON.
+"""Shows the progress of a run: as a live block on a terminal, as one display in a notebook, as lines elsewhere, or as JSON.
 
 Rule: it never slows the run (at most five redraws a second), and the last progress is always shown. Warnings of the log are
 shown above the block. No text is read as markup or controls the terminal. That a stream which is full or closed does not end
@@ -11,8 +11,9 @@ import logging
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import Protocol
+from contextlib import contextmanager, suppress
+from html import escape
+from typing import Any, Protocol, TextIO
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -25,6 +26,7 @@ from learner.run_folder.progress import Progress
 from protocol.bounds import escaped
 
 REDRAW_EVERY_S = 0.2
+NOTEBOOK_EVERY_S = 0.5
 LINE_EVERY_S = 5.0
 
 
@@ -46,12 +48,16 @@ class ProgressView(Protocol):
 
 @contextmanager
 def progress_view(
-    log_json: bool = False, clock: Callable[[], float] = time.monotonic
+    log_json: bool = False, clock: Callable[[], float] = time.monotonic, *, may_fail: bool = True
 ) -> Iterator[Callable[[Progress], None]]:
-    """A context manager that returns a function to call with each progress. Until it ends, millrace's log is shown too."""
-    live = sys.stdout.isatty() and not log_json
-    view: ProgressView = LiveBlock(Console()) if live else JsonEvents() if log_json else PlainLines()
-    limited = RateLimitedView(view, REDRAW_EVERY_S if live else LINE_EVERY_S, clock)
+    """A context manager that returns a function to call with each progress. Until it ends, millrace's log is shown too.
+
+    `may_fail`: raise what showing raises. Otherwise it is dropped.
+    """
+    view, every_s = _view(log_json)
+    if not may_fail:
+        view = DroppingView(view)
+    limited = RateLimitedView(view, every_s, clock)
     handler = _json_log_handler() if log_json else _WarningHandler(view)
     logger = logging.getLogger("millrace")
     level = logger.level
@@ -68,24 +74,109 @@ def progress_view(
 
 
 @contextmanager
-def count_line(doing: str, clock: Callable[[], float] = time.monotonic) -> Iterator[Callable[[str], None]]:
-    """Gives a function that shows a text on stderr, after `doing`: in place on a terminal, else as a line now and then."""
-    live = sys.stderr.isatty()
-    every_s = REDRAW_EVERY_S if live else LINE_EVERY_S
+def shown_progress(
+    watch: Callable[[Progress], object] | None, *, show: bool
+) -> Iterator[Callable[[Progress], object] | None]:
+    """Gives the function to call with each progress of a run that a user's program trains, if any. It calls `watch`, too.
+
+    `show`: show the progress. An output that is closed or full does not end the run.
+    """
+    if not show:
+        yield watch
+        return
+    with progress_view(may_fail=False) as view:
+
+        def both(progress: Progress) -> object:
+            view(progress)
+            return None if watch is None else watch(progress)
+
+        yield both
+
+
+@contextmanager
+def count_line(
+    doing: str, clock: Callable[[], float] = time.monotonic, *, show: bool = True
+) -> Iterator[Callable[[str], None]]:
+    """Gives a function that shows a text, after `doing`: in place on a terminal or in a notebook, else a line now and then.
+
+    Outside a notebook it is written to stderr. `show`: whether it is shown at all.
+    """
+    notebook = NotebookCell() if show and in_notebook() else None
+    live = notebook is None and _is_terminal(sys.stderr)
+    every_s = REDRAW_EVERY_S if live or notebook else LINE_EVERY_S
     shown_s = clock() if not live else -every_s
 
-    def show(text: str) -> None:
+    def show_text(text: str) -> None:
         nonlocal shown_s
-        if clock() - shown_s >= every_s:
+        if show and clock() - shown_s >= every_s:
             shown_s = clock()
-            sys.stderr.write(f"\r\x1b[K{doing}: {text}" if live else f"{doing}: {text}\n")
-            sys.stderr.flush()
+            if notebook is not None:
+                notebook.show(f"{doing}: {text}", escape(f"{doing}: {text}"))
+            else:
+                _write_to_stderr(f"\r\x1b[K{doing}: {text}" if live else f"{doing}: {text}\n")
 
     try:
-        yield show
+        yield show_text
     finally:
-        if live:
-            sys.stderr.write("\r\x1b[K")
+        if notebook is not None:
+            notebook.clear()
+        elif live and show:
+            _write_to_stderr("\r\x1b[K")
+
+
+def in_notebook() -> bool:
+    """Whether this program is a notebook's kernel (ipykernel). IPython on a terminal is a terminal."""
+    ipython = sys.modules.get("IPython")
+    shell = ipython.get_ipython() if ipython is not None else None
+    return getattr(shell, "kernel", None) is not None
+
+
+def _is_terminal(stream: TextIO | None) -> bool:
+    """Whether a stream is a terminal. A user's program may have closed it, or replaced it with anything."""
+    try:
+        return stream is not None and stream.isatty()
+    except (AttributeError, ValueError, OSError):
+        return False
+
+
+def _write_to_stderr(text: str) -> None:
+    """Write, or drop what cannot be written."""
+    with suppress(AttributeError, ValueError, OSError):
+        sys.stderr.write(text)
+        sys.stderr.flush()
+
+
+def _view(log_json: bool) -> tuple[ProgressView, float]:
+    """The way to show progress here, and how many seconds pass between two."""
+    if log_json:
+        return JsonEvents(), LINE_EVERY_S
+    if in_notebook():
+        return NotebookBlock(NotebookCell()), NOTEBOOK_EVERY_S
+    if _is_terminal(sys.stdout):
+        return LiveBlock(Console()), REDRAW_EVERY_S
+    return PlainLines(), LINE_EVERY_S
+
+
+class DroppingView:
+    """Shows what can be shown, and drops the rest: standard output may be full, closed, or anything the user put there."""
+
+    def __init__(self, view: ProgressView) -> None:
+        self._view = view
+
+    def show(self, progress: Progress) -> None:
+        """Show this progress now."""
+        with suppress(Exception):
+            self._view.show(progress)
+
+    def print_line(self, line: str) -> None:
+        """Print a line that is not redrawn."""
+        with suppress(Exception):
+            self._view.print_line(line)
+
+    def close(self) -> None:
+        """Restore the terminal."""
+        with suppress(Exception):
+            self._view.close()
 
 
 class RateLimitedView:
@@ -131,6 +222,52 @@ class PlainLines:
 
     def close(self) -> None:
         """Nothing to do."""
+
+
+class NotebookCell:
+    """One display of a notebook's cell, which is updated in place."""
+
+    def __init__(self) -> None:
+        self._handle: Any = None
+
+    def show(self, text: str, html: str) -> None:
+        """Show this instead of what was shown before. `text` is for where no HTML can be shown."""
+        content = {"text/plain": text, "text/html": html}
+        if self._handle is None:
+            from IPython.display import display
+
+            self._handle = display(content, raw=True, display_id=True)
+        else:
+            self._handle.update(content, raw=True)
+
+    def clear(self) -> None:
+        """Show nothing."""
+        if self._handle is not None:
+            self.show("", "")
+
+
+class NotebookBlock:
+    """A block that is updated in the cell's output. Notes are printed below it."""
+
+    def __init__(self, cell: NotebookCell) -> None:
+        self._cell = cell
+
+    def show(self, progress: Progress) -> None:
+        """Update the block."""
+        figures = [f"{progress.env_steps:,} of {progress.total_steps:,} env steps", *main_figures(progress).values()]
+        cells = [(escape(name), escape(escaped(text))) for name, text in detail_rows(progress).items()]
+        left = "style='text-align:left'"
+        rows = "".join(f"<tr><td {left}>{name}</td><td {left}>{text}</td></tr>" for name, text in cells)
+        bar = f"<progress max='{max(1, progress.total_steps)}' value='{progress.env_steps}' style='width:20em'></progress>"
+        head = " &nbsp; ".join(map(escape, figures))
+        self._cell.show(" | ".join(figures), f"{bar}<div>{head}</div><table style='font-size:smaller'>{rows}</table>")
+
+    def print_line(self, line: str) -> None:
+        """Print the line."""
+        print(escaped(line), flush=True)
+
+    def close(self) -> None:
+        """Leave the block as it is."""
 
 
 class JsonEvents:

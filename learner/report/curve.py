@@ -18,6 +18,9 @@ from protocol.errors import UsageError
 
 GRID_POINTS = 400
 
+Purpose = Literal["plot", "report on"]
+"""What a run folder is read for; error messages say so."""
+
 
 class Curve(NamedTuple):
     """The learning curve of one run."""
@@ -54,7 +57,7 @@ def algorithm_label(algo: str) -> str:
     return name if own else algo.upper()
 
 
-def read_run_files(run: Path, purpose: Literal["plot", "report on"]) -> RunFiles:
+def read_run_files(run: Path, purpose: Purpose) -> RunFiles:
     """Read a run folder. Raises `UsageError`, with a one-line message that names `purpose`, if it cannot be read."""
     check_format(run)
     try:

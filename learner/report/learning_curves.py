@@ -1,7 +1,8 @@
 """Draws learning curves of run folders as a PNG. Without global state: matplotlib's pyplot is not used.
 
-There is a panel for each environment and a color for each algorithm. For several runs of the same environment and algorithm,
-each run is a thin line, their mean is a bold line, and a band reaches from the worst to the best.
+There is a panel for each environment and a color for each group of runs. As in the report, runs of a group have the same
+settings, except the seed and the folder. Of a group of several runs, each run is a thin line, their mean is a bold line, and
+a band reaches from the worst to the best. If an algorithm has several groups, the legend says in which settings they differ.
 """
 
 from __future__ import annotations
@@ -11,13 +12,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from learner.report.curve import Curve, algorithm_label, common_grid, read_run_files
+from learner.report.curve import Curve, common_grid, read_run_files
+from learner.report.runs import RunGroup, group_runs, read_run
 from learner.run_folder.atomic_write import write_atomically
 from learner.run_folder.episode_window import WINDOW_EPISODES
 from protocol.errors import RunError, UsageError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+    from learner.report.figure import PngFigure
 
 PANEL_INCHES = (6.4, 4.2)
 COLUMNS = 3
@@ -44,45 +48,61 @@ def read_curve(run: Path) -> Curve:
 
 def plot(runs: Sequence[Path], out: Path) -> Path:
     """Draw the runs into `out`. Raises `UsageError` for a folder that cannot be read, `RunError` if `out` is not written."""
-    from matplotlib.figure import Figure
+    write(curves(runs), out)
+    return out
+
+
+def write(figure: PngFigure, out: Path) -> None:
+    """Write the figure as a PNG. Raises `RunError`."""
+    try:
+        write_atomically(out, lambda file: figure.savefig(file, format="png", dpi=DPI))
+    except OSError as error:
+        raise RunError(f"{out} not written: {error.strerror}") from error
+
+
+def curves(runs: Sequence[Path]) -> PngFigure:
+    """Draw the runs. Raises `UsageError` for a folder that cannot be read, or of a run in which no episode has ended."""
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    curves = [read_curve(run) for run in runs]
-    envs, algos = sorted({curve.env for curve in curves}), sorted({curve.algo for curve in curves})
+    from learner.report.figure import PngFigure
+
+    read = [read_run(run, "plot") for run in runs]
+    for run in read:
+        if run.curve is None:
+            raise UsageError(f"run {run.path}: nothing to plot, no episode has ended yet")
+    groups = group_runs(read).groups
+    envs, names = sorted({group.env for group in groups}), sorted({group.name for group in groups})
     columns = min(len(envs), COLUMNS)
     rows = math.ceil(len(envs) / columns)
-    figure = Figure(
+    figure = PngFigure(
         figsize=(PANEL_INCHES[0] * columns, PANEL_INCHES[1] * rows), layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.1)
     )
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for panel in panels[len(envs) :]:
         panel.set_axis_off()
     for env, panel in zip(envs, panels, strict=False):
-        for algo, color in zip(algos, COLORS * math.ceil(len(algos) / len(COLORS)), strict=False):
-            if group := [curve for curve in curves if (curve.env, curve.algo) == (env, algo)]:
-                _draw(panel, group, color)
+        for group in groups:
+            if group.env == env:
+                _draw(panel, group, COLORS[names.index(group.name) % len(COLORS)])
         _style_axes(panel, env)
-    try:
-        write_atomically(out, lambda file: figure.savefig(file, format="png", dpi=DPI))
-    except OSError as error:
-        raise RunError(f"{out} not written: {error.strerror}") from error
-    return out
+    return figure
 
 
-def _draw(panel: Axes, group: Sequence[Curve], color: str) -> None:
-    algo = algorithm_label(group[0].algo)
-    if len(group) == 1:
-        (only,) = group
-        panel.plot(only.env_steps, only.returns, color=color, linewidth=1.8, label=f"{algo}, seed {only.seed}")
+def _draw(panel: Axes, group: RunGroup, color: str) -> None:
+    label = f"{group.name} ({group.differences})" if group.differences else group.name
+    lines = group.curves
+    if len(lines) == 1:
+        (only,) = lines
+        panel.plot(only.env_steps, only.returns, color=color, linewidth=1.8, label=f"{label}, seed {only.seed}")
         return
-    for curve in group:
+    for curve in lines:
         panel.plot(curve.env_steps, curve.returns, color=color, linewidth=0.6, alpha=0.35)
-    kind = "seed" if len({curve.seed for curve in group}) == len(group) else "run"
-    grid, returns = common_grid(group)
+    kind = "seed" if len({curve.seed for curve in lines}) == len(lines) else "run"
+    grid, returns = common_grid(lines)
     panel.fill_between(
-        grid, returns.min(0), returns.max(0), color=color, alpha=0.15, linewidth=0, label=f"{algo}, worst to best {kind}"
+        grid, returns.min(0), returns.max(0), color=color, alpha=0.15, linewidth=0, label=f"{label}, worst to best {kind}"
     )
-    panel.plot(grid, returns.mean(0), color=color, linewidth=2.0, label=f"{algo}, mean of {len(group)} {kind}s")
+    panel.plot(grid, returns.mean(0), color=color, linewidth=2.0, label=f"{label}, mean of {len(lines)} {kind}s")
 
 
 def _style_axes(panel: Axes, env: str) -> None:

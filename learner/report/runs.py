@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from learner.report.curve import Curve, algorithm_label, read_run_files
+from learner.report.curve import Curve, Purpose, algorithm_label, read_run_files
 from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
 from learner.run_folder.results import EVALUATION_KEY, Evaluation
 from learner.run_folder.run_folder import RunFolder
@@ -106,9 +106,9 @@ class ReportData:
         return [f"{name} ({names[:i].count(name) + 1})" if names.count(name) > 1 else name for i, name in enumerate(names)]
 
 
-def read_run(path: Path) -> Run:
-    """Read a run folder. Raises `UsageError`, with a one-line message, if it cannot be read."""
-    files = read_run_files(path, "report on")
+def read_run(path: Path, purpose: Purpose = "report on") -> Run:
+    """Read a run folder. Raises `UsageError`, with a one-line message that names `purpose`, if it cannot be read."""
+    files = read_run_files(path, purpose)
     return Run(
         path=path,
         env=files.env,

@@ -141,11 +141,17 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 
     Other rows that cannot be read are left out, and the log says how many. Raises OSError.
     """
+    rows, unreadable = read_and_count_rows(path)
+    if unreadable:
+        log.warning("%s: %d of %d rows cannot be read; they are left out", path, unreadable, len(rows) + unreadable)
+    return rows
+
+
+def read_and_count_rows(path: Path) -> tuple[list[dict[str, Any]], int]:
+    """The rows that can be read, and the number of others. A last line that was cut off does not count. Raises OSError."""
     *lines, _ = path.read_bytes().split(b"\n")
     rows = [row for line in lines if (row := _row(line)) is not None]
-    if len(rows) < len(lines):
-        log.warning("%s: %d of %d rows cannot be read; they are left out", path, len(lines) - len(rows), len(lines))
-    return rows
+    return rows, len(lines) - len(rows)
 
 
 def _row(line: bytes) -> dict[str, Any] | None:

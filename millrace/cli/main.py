@@ -20,7 +20,7 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 from learner.run_folder.last_line import last_line
 from learner.standard_streams import open_closed, unfailing
-from protocol.bounds import MAX_SEEDS, escaped, indented
+from protocol.bounds import escaped, indented
 from protocol.errors import UsageError, UserFacingError
 
 if TYPE_CHECKING:
@@ -180,35 +180,11 @@ def _evaluate(argv: list[str]) -> int:
     from millrace.cli.flags import EvaluateFlags
 
     flags = parse_flags(EvaluateFlags, argv, "evaluate")
-    episodes = flags.episodes if flags.episodes is not None else 3 if flags.video else 100
-    for name, value, least in (
-        ("episodes", episodes, 1),
-        ("seed", flags.seed, 0),
-        ("workers", flags.workers, 1),
-        ("copies", flags.copies, 1),
-        ("max_steps", flags.max_steps, 1),
-    ):
-        _at_least(name, value, least)
-    if flags.copies > MAX_SEEDS:
-        raise UsageError(f"copies: expected int <= {MAX_SEEDS}, got {flags.copies}")
-    from learner.policy_player import saved_policy, useful_workers
-    from learner.rollouts.evaluation_tickets import EvaluationPlan, evaluation_of
-    from millrace.launch.policy_workers import PlayingWorkers, policy_player
+    from millrace.playing import play
     from millrace.terminal import count_line
 
-    if flags.video:
-        from learner.recording.video import prepare_rendering, record_videos
-
-        prepare_rendering()
-    saved = saved_policy(flags.run, "best" if flags.best else "final")
-    copies = 1 if flags.video else flags.copies
-    workers = PlayingWorkers(useful_workers(flags.workers, episodes, copies), flags.transport, flags.bind)
-    with count_line("evaluating") as watch, policy_player(saved, workers, watch) as player:
-        if flags.video:
-            evaluation, videos = record_videos(player, flags.run, episodes, flags.seed)
-        else:
-            videos = []
-            evaluation = evaluation_of(player.play(EvaluationPlan.of(episodes, flags.seed, copies, flags.max_steps)))
+    with count_line("evaluating") as watch:
+        evaluation, videos = play(flags, watch)
     print("\n".join(map(str, [evaluation, *videos])))
     return 0
 
@@ -218,18 +194,11 @@ def _record(argv: list[str]) -> int:
     from millrace.cli.flags import RecordFlags
 
     flags = parse_flags(RecordFlags, argv, "record")
-    _at_least("steps", flags.steps, 1)
-    _at_least("seed", flags.seed, 0)
-    _at_least("workers", flags.workers, 1)
-    from learner.policy_player import saved_policy
-    from learner.recording.record import record
-    from millrace.launch.policy_workers import PlayingWorkers, policy_player
+    from millrace.playing import write_dataset
     from millrace.terminal import count_line
 
-    saved = saved_policy(flags.run, "best" if flags.best else "final")
-    workers = PlayingWorkers(flags.workers, flags.transport, flags.bind)
-    with count_line("recording") as watch, policy_player(saved, workers, watch) as player:
-        dataset = record(player, flags.run, flags.out, flags.steps, flags.seed, stochastic=flags.stochastic, npy=flags.npy)
+    with count_line("recording") as watch:
+        dataset = write_dataset(flags, watch)
     print(dataset)
     if flags.npy is not None:
         print(f"rows of observation and action: {flags.npy}")
@@ -355,11 +324,6 @@ def _bench(argv: list[str]) -> int:
     path = os.pathsep.join(filter(None, [str(clone), os.environ.get("PYTHONPATH")]))
     command = [sys.executable, "-P", "-m", "benchmarks.program", *(flag for flag in argv if flag != "--debug")]
     return subprocess.run(command, env={**os.environ, "PYTHONPATH": path}, check=False).returncode
-
-
-def _at_least(name: str, value: int, least: int) -> None:
-    if value < least:
-        raise UsageError(f"{name}: expected int >= {least}, got {value}")
 
 
 GROUPS = {

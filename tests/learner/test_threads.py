@@ -127,10 +127,10 @@ def test_a_run_keeps_the_number_of_threads_that_it_began_with(tmp_path: Path, mo
     used: list[int] = []
     monkeypatch.setattr(torch, "set_num_threads", used.append)
     monkeypatch.setattr(torch_setup, "usable_cores", lambda: 3)
-    folder = millrace.train("CartPole-v1", run_dir=str(tmp_path), steps=64, **settings)
+    folder = millrace.train("CartPole-v1", run_dir=str(tmp_path), steps=64, **settings).path
     assert "torch_threads = 3" in (folder / "config.toml").read_text()
     monkeypatch.setattr(torch_setup, "usable_cores", lambda: 7)
     millrace.train(resume=folder, steps=128)
-    again = millrace.train(config=folder / "config.toml", run_dir=str(tmp_path / "again"))
+    again = millrace.train(config=folder / "config.toml", run_dir=str(tmp_path / "again")).path
     assert used == [3, 3, 3]
     assert "torch_threads = 3" in (again / "config.toml").read_text()

@@ -9,7 +9,6 @@ import pytest
 
 import millrace
 from examples.own_loss import ClippedPlus
-from learner.run_folder.run_folder import RunFolder
 
 
 @pytest.mark.learning
@@ -22,7 +21,7 @@ def test_a_loss_of_one_s_own_reaches_475_on_cartpole(tmp_path: Path, seed: int) 
     more: dict[str, Any] = {"seed": seed, "run_dir": str(tmp_path), "eval_episodes": 20, "eval_every": 5000}
     run = millrace.train("CartPole-v1", algo=ClippedPlus, steps=4_000, **settings, **more)
     millrace.train(resume=run, steps=150_000, target_return=475.0)
-    summary = RunFolder(run).summary()
+    summary = run.summary
     assert summary is not None
     assert summary.evaluation is not None
     assert summary.evaluation.return_mean >= 475

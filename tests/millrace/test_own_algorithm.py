@@ -28,7 +28,7 @@ SMALL: dict[str, Any] = {
 
 
 def trained(tmp_path: Path, **settings: Any) -> Path:
-    return millrace.train("CartPole-v1", run_dir=str(tmp_path), **{**SMALL, "steps": 600, **settings})
+    return millrace.train("CartPole-v1", run_dir=str(tmp_path), **{**SMALL, "steps": 600, **settings}).path
 
 
 def policy(run: Path) -> dict[str, Any]:
@@ -60,7 +60,7 @@ def test_a_run_by_class_is_the_run_by_name_and_can_be_resumed(tmp_path: Path) ->
 
     before, copied = env_steps(by_class), tmp_path / "copy"
     shutil.copytree(by_class, copied)
-    assert millrace.train(resume=by_class, steps=1200) == by_class
+    assert millrace.train(resume=by_class, steps=1200).path == by_class
     assert env_steps(by_class) > before
     millrace.train(resume=copied, steps=1200, algo=ClippedPlus)
     assert same_policy(by_class, copied), "what is resumed twice goes on twice with the same bits"
@@ -94,7 +94,7 @@ def test_a_class_of_a_notebook_is_given_again_to_resume(tmp_path: Path) -> None:
     run = trained(tmp_path, algo=Mine)
     name = tomllib.loads((run / "config.toml").read_text())["algo"]
     assert algorithm_class(name) is Mine
-    assert millrace.train(resume=run, algo=Mine, steps=1200) == run
+    assert millrace.train(resume=run, algo=Mine, steps=1200).path == run
 
 
 def test_the_help_shows_its_settings(capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,14 +3,28 @@
 import io
 import logging
 import os
+import sys
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any, cast
 
 import pytest
+from msgspec.structs import replace
 from rich.console import Console
 
 from learner.run_folder.progress import Progress
 from learner.standard_streams import never_fails
-from millrace.terminal import LiveBlock, PlainLines, RateLimitedView, detail_rows, progress_view, render_block
+from millrace.terminal import (
+    LiveBlock,
+    PlainLines,
+    RateLimitedView,
+    count_line,
+    detail_rows,
+    in_notebook,
+    progress_view,
+    render_block,
+    shown_progress,
+)
 
 PROGRESS = Progress(
     run="runs/CartPole-v1-ppo-s1", env_steps=62_208, total_steps=100_000, updates=243, wall_s=14.8, steps_per_s=4210.3,
@@ -146,3 +160,116 @@ def test_no_text_is_read_as_markup_or_controls_the_terminal() -> None:
 def test_a_plain_line_holds_no_control_characters(capsys: pytest.CaptureFixture[str]) -> None:
     PlainLines().print_line("\x1b[7777m\ud800")
     assert capsys.readouterr().out == "\\x1b[7777m\\ud800\n"
+
+
+class Handle:
+    """A display of a notebook that remembers what it showed."""
+
+    def __init__(self, shown: list[tuple[str, dict[str, str]]]) -> None:
+        self._shown = shown
+
+    def update(self, content: dict[str, str], *, raw: bool) -> None:
+        self._shown.append(("update", content))
+
+
+@pytest.fixture
+def notebook(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, dict[str, str]]]:
+    """What is displayed, as if this were the kernel of a notebook."""
+    shown: list[tuple[str, dict[str, str]]] = []
+
+    def display(content: dict[str, str], *, raw: bool, display_id: bool) -> Handle:
+        shown.append(("display", content))
+        return Handle(shown)
+
+    ipython = SimpleNamespace(get_ipython=lambda: SimpleNamespace(kernel=object()))
+    monkeypatch.setitem(sys.modules, "IPython", cast(ModuleType, ipython))
+    monkeypatch.setitem(sys.modules, "IPython.display", cast(ModuleType, SimpleNamespace(display=display)))
+    return shown
+
+
+def test_a_notebook_is_found_by_its_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not in_notebook()
+    on_a_terminal = SimpleNamespace(get_ipython=lambda: SimpleNamespace())
+    monkeypatch.setitem(sys.modules, "IPython", cast(ModuleType, on_a_terminal))
+    assert not in_notebook()
+    imported_only = SimpleNamespace(get_ipython=lambda: None)
+    monkeypatch.setitem(sys.modules, "IPython", cast(ModuleType, imported_only))
+    assert not in_notebook()
+
+
+def test_a_notebook_gets_one_display_that_is_updated(notebook: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    now = [0.0]
+    with progress_view(clock=lambda: now[0]) as show:
+        for steps in range(100, 1_100, 100):
+            show(Progress(env_steps=steps, total_steps=1_000, run="runs/<b>"))
+            now[0] += 0.25
+    assert [how for how, _ in notebook] == ["display"] + ["update"] * 5
+    assert [content["text/plain"].partition(" ")[0] for _, content in notebook] == [
+        "100",
+        "300",
+        "500",
+        "700",
+        "900",
+        "1,000",
+    ]
+    html = notebook[-1][1]["text/html"]
+    assert "<progress max='1000' value='1000'" in html
+    assert "runs/&lt;b&gt;" in html
+    assert capsys.readouterr().out == ""
+
+
+def test_notes_and_warnings_are_printed_in_a_notebook(notebook: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    with progress_view() as show:
+        show(Progress(note="greedy return 9.0"))
+        logging.getLogger("millrace.learner").warning("a worker was lost")
+    assert capsys.readouterr().out == "greedy return 9.0\nwarning: a worker was lost\n"
+
+
+def test_a_count_in_a_notebook_is_updated_and_then_cleared(notebook: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    now = [0.0]
+    with count_line("evaluating", clock=lambda: now[0]) as show:
+        for played in range(3):
+            now[0] += 1.0
+            show(f"{played} of 3 episodes")
+    texts = [content["text/plain"] for _, content in notebook]
+    assert texts == ["evaluating: 0 of 3 episodes", "evaluating: 1 of 3 episodes", "evaluating: 2 of 3 episodes", ""]
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_program_s_run_shows_lines_and_calls_its_watch(capsys: pytest.CaptureFixture[str]) -> None:
+    seen: list[Progress] = []
+    with shown_progress(seen.append, show=True) as show:
+        assert show is not None
+        show(PROGRESS)
+    assert seen == [PROGRESS]
+    assert capsys.readouterr().out.startswith("62,208 of 100,000 env steps | ")
+    assert shown_progress(None, show=False).__enter__() is None
+    with shown_progress(seen.append, show=False) as show:
+        assert show is not None
+        show(PROGRESS)
+    assert seen == [PROGRESS] * 2
+    assert capsys.readouterr().out == ""
+
+
+def test_an_output_that_takes_nothing_does_not_end_a_program_s_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    closed = io.StringIO()
+    closed.close()
+    monkeypatch.setattr(sys, "stdout", closed)
+    seen: list[Progress] = []
+    with shown_progress(seen.append, show=True) as show:
+        assert show is not None
+        show(PROGRESS)
+        show(replace(PROGRESS, note="greedy return 9.0"))
+    assert len(seen) == 2
+
+
+def test_what_a_watch_returns_or_raises_reaches_the_run() -> None:
+    def watch(progress: Progress) -> bool:
+        if not progress.updates:
+            raise ValueError("mine")
+        return False
+
+    with pytest.raises(ValueError, match="mine"), shown_progress(watch, show=True) as show:
+        assert show is not None
+        assert show(PROGRESS) is False
+        show(Progress())

@@ -137,7 +137,7 @@ def test_packed_frame_stacks_train_the_same_policy_as_unpacked_ones(tmp_path: Pa
 
     monkeypatch.setattr(packing, "unpack_stack", unstacking)
     for number, way in enumerate(over):
-        folder = millrace.train(stacks, run_dir=str(tmp_path / f"runs{number}"), eval_episodes=1, **settings, **way)
+        folder = millrace.train(stacks, run_dir=str(tmp_path / f"runs{number}"), eval_episodes=1, **settings, **way).path
         policies.append((folder / "policy.safetensors").read_bytes())
         assert unpacked == [[61, 2, 4, 40, 40]] * 4 * number  # two updates of two lanes; none is dealt before the evaluation
     assert policies[0] == policies[1]

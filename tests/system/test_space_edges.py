@@ -54,7 +54,7 @@ def updates(folder: Path) -> int:
 
 
 def train(env: Callable[[], Any], folder: Path, **settings: Any) -> Path:
-    return millrace.train(env, run_dir=str(folder), **{**SMALL, **settings})
+    return millrace.train(env, run_dir=str(folder), **{**SMALL, **settings}).path
 
 
 def test_a_callable_of_3_mb_travels_to_the_workers(tmp_path: Path) -> None:

@@ -8,7 +8,8 @@ import pytest
 
 from learner.config.layers import resolve
 from learner.report.curve import Curve, common_grid
-from learner.report.learning_curves import plot, read_curve
+from learner.report.learning_curves import curves, plot, read_curve
+from learner.report.runs import group_runs, read_run
 from learner.run_folder.metrics_log import MetricsLog
 from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import RunFolder
@@ -17,8 +18,8 @@ from protocol.errors import RunError, UsageError
 Floats = np.ndarray[Any, Any]
 
 
-def a_run(folder: Path, env: str = "CartPole-v1", seed: int = 1, length: int = 20) -> Path:
-    run = RunFolder.create(resolve(env, run_dir=str(folder), seed=seed)).path
+def a_run(folder: Path, env: str = "CartPole-v1", seed: int = 1, length: int = 20, **settings: Any) -> Path:
+    run = RunFolder.create(resolve(env, run_dir=str(folder), seed=seed, **settings)).path
     log = MetricsLog(run)
     for i in range(1, length + 1):
         log.write(Progress(env_steps=100 * i, return_mean=None if i == 1 else 5.0 * i + seed), {})
@@ -86,3 +87,33 @@ def test_what_cannot_be_plotted_is_said_in_one_line(tmp_path: Path) -> None:
         read_curve(a_run(tmp_path, length=1))
     with pytest.raises(RunError, match="not written: No such file or directory"):
         plot([a_run(tmp_path, seed=2)], tmp_path / "nowhere" / "curves.png")
+
+
+def legend(runs: list[Path]) -> list[str]:
+    found = curves(runs).axes[0].get_legend()
+    assert found is not None
+    return sorted(text.get_text() for text in found.get_texts())
+
+
+def test_runs_that_differ_only_in_the_seed_are_one_mean(tmp_path: Path) -> None:
+    runs = [a_run(tmp_path / str(seed), seed=seed) for seed in (1, 2, 3)]
+    assert legend(runs) == ["PPO, mean of 3 seeds", "PPO, worst to best seed"]
+
+
+def test_runs_of_different_settings_are_drawn_apart_with_what_differs(tmp_path: Path) -> None:
+    runs = [a_run(tmp_path, seed=seed, gamma=gamma) for gamma in (0.9, 0.95) for seed in (1, 2)]
+    assert legend([*runs, a_run(tmp_path, algo="a2c")]) == [
+        "A2C, seed 1",
+        "PPO A (gamma 0.9), mean of 2 seeds",
+        "PPO A (gamma 0.9), worst to best seed",
+        "PPO B (gamma 0.95), mean of 2 seeds",
+        "PPO B (gamma 0.95), worst to best seed",
+    ]
+
+
+def test_the_groups_are_those_of_the_report(tmp_path: Path) -> None:
+    runs = [a_run(tmp_path, gamma=gamma) for gamma in (0.9, 0.95, 0.99)]
+    groups = group_runs([read_run(run) for run in runs]).groups
+    assert legend(runs) == [f"{group.name} ({group.differences}), seed 1" for group in groups]
+    colors = {line.get_color() for line in curves(runs).axes[0].get_lines()}
+    assert len(colors) == len(runs)

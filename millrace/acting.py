@@ -1,0 +1,179 @@
+"""A saved policy that acts: `millrace.load`. Reads the run folder; needs no environment, and torch only for images.
+
+Rule: for the same observations it chooses the same actions as the workers of `millrace evaluate`, bit for bit, if as many
+observations are passed at once as a worker plays side by side (`--copies`). In a batch of another size, the last bits of a
+matrix product may differ.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from learner.policy_player import saved_policy
+from protocol.arrays import Array, Floats
+from protocol.envs.spaces import make_action_converter
+from protocol.errors import UsageError
+from protocol.policy.distributions import distribution
+from protocol.policy.policy import make_policy
+from protocol.policy.recurrent import zero_state
+from protocol.specs import Leaf, PolicySpec
+
+Observation: TypeAlias = Any
+"""An array, a number, or a dict or tuple of observations: what the environment returns, or a vector environment."""
+
+
+class LoadedPolicy:
+    """A policy of a run folder. `millrace.load` makes it.
+
+    >>> import gymnasium, millrace
+    >>> policy = millrace.load(run)
+    >>> env = gymnasium.make("CartPole-v1")
+    >>> observation, _ = env.reset(seed=1)
+    >>> observation, reward, terminated, truncated, _ = env.step(policy(observation))
+    """
+
+    def __init__(self, run: Path, *, best: bool, deterministic: bool, seed: int) -> None:
+        self.run = run
+        """The run folder."""
+        saved = saved_policy(run, "best" if best else "final")
+        self.spec: PolicySpec = saved.spec
+        """The observations, the actions and the network, as plain data."""
+        self._name = f"{saved.env.id}, {'best' if best else 'newest'} policy"
+        self._policy = make_policy(saved.spec)
+        self._policy.load(saved.parameters, saved.buffers)
+        self._distribution = distribution(saved.spec)
+        self._to_env_action = make_action_converter(saved.spec.action)
+        self._generator = None if deterministic else np.random.default_rng(seed)
+        self._state: Floats | None = None  # [1, n, S] of a recurrent policy, once it was started
+
+    def start(self, copies: int = 1, *, seed: int | None = None) -> None:
+        """Begin new episodes in this number of env copies. A policy with a recurrent core needs it; others do not.
+
+        `seed`: restart the random numbers of a policy that samples its actions. Raises `UsageError` if `copies` is below 1.
+
+        >>> import millrace, numpy
+        >>> policy = millrace.load(run, deterministic=False)
+        >>> policy.start(2, seed=7)
+        >>> actions = policy(numpy.zeros((2, 4)))
+        """
+        if copies < 1:
+            raise UsageError(f"start: expected at least 1 env copy, got {copies}")
+        self._state = zero_state(self.spec, 1, copies)
+        if seed is not None and self._generator is not None:
+            self._generator = np.random.default_rng(seed)
+
+    def __call__(self, observation: Observation, *, first: npt.ArrayLike | None = None) -> Any:
+        """The action for one observation, as `env.step` takes it; for a batch of n observations, actions [n, *action].
+
+        Arguments:
+            observation: One of the environment's observation space, or n of them: arrays [n, *leaf]. A Dict or Tuple
+                observation is a dict or tuple of such arrays. The policy normalizes it, if it was trained so.
+            first: Of a recurrent policy: True where this observation is the first of an episode. A bool, or [n] of them.
+
+        Raises `UsageError` if the observation is not of the space, not finite, or of another number of copies than `start`.
+        """
+        leaves, is_one = self._leaves(observation)
+        n = len(leaves[0][0])
+        state = self._state_for(n, first)
+        with np.errstate(all="ignore"):
+            params = self._policy(leaves, state)
+            if self._generator is None:
+                chosen = self._distribution.mode(params)[0]
+            else:
+                chosen = self._distribution.sample(params, self._distribution.noise(self._generator, (1, n)))[0]
+            action = np.asarray(self._to_env_action(chosen)).astype(self.spec.action.dtype, copy=False)
+        return action[0] if is_one else action
+
+    def __repr__(self) -> str:
+        how = "most probable actions" if self._generator is None else "sampled actions"
+        return f"<{self._name} of {self.run}; {how}>"
+
+    def _state_for(self, n: int, first: npt.ArrayLike | None) -> Floats:
+        """The recurrent state [1, n, S], which the policy updates in place."""
+        if not self.spec.state_size:
+            return zero_state(self.spec, 1, n)
+        if self._state is None:
+            raise UsageError(f"{self!r} is recurrent: call start({n}) before the first observation of an episode")
+        if self._state.shape[1] != n:
+            raise UsageError(f"{self!r}: expected {self._state.shape[1]} observations, as in start, got {n}")
+        if first is not None:
+            self._state[0, np.broadcast_to(np.asarray(first, bool), n)] = 0
+        return self._state
+
+    def _leaves(self, observation: Observation) -> tuple[tuple[Array, ...], bool]:
+        """The arrays [1, n, *leaf] of an observation or a batch, and whether it was one observation."""
+        leaves = self.spec.observation
+        if len(leaves) == 1 and not leaves[0].path:
+            found = {"": observation}
+        else:
+            found = dict(_by_path(observation, ""))
+            missing = [leaf.path for leaf in leaves if leaf.path not in found]
+            if missing:
+                raise UsageError(f"observation: expected {missing[0]}, got {', '.join(sorted(found)) or 'nothing'}")
+        arrays = [_checked(found[leaf.path], leaf) for leaf in leaves]
+        numbers = {None if array.shape == leaf.shape else len(array) for array, leaf in zip(arrays, leaves, strict=True)}
+        if len(numbers) > 1:
+            raise UsageError("observation: expected all its arrays for the same number of env copies, got different ones")
+        (number,) = numbers
+        n = 1 if number is None else number
+        return tuple(array.reshape(1, n, *leaf.shape) for array, leaf in zip(arrays, leaves, strict=True)), number is None
+
+
+def load(run: str | os.PathLike[str], *, best: bool = False, deterministic: bool = True, seed: int = 0) -> LoadedPolicy:
+    """Load a policy of a run folder, to act with it: `policy(observation)` gives the action.
+
+    Arguments:
+        run: The run folder. Also one of a run that has not ended: its policy is saved with each checkpoint.
+        best: Take the policy with the best evaluation during the run (`eval_every`). Otherwise it is the newest one, as in
+            `millrace evaluate`: the policy with which a run that has ended was evaluated at its end.
+        deterministic: Take the most probable action, as `millrace evaluate` does. Otherwise draw it, as in training.
+        seed: Seed of the actions that are drawn.
+
+    It reads policy.safetensors and policy.json; neither the environment nor the algorithm must be installed. A policy of
+    images or with an encoder imports torch. Raises `UsageError`, with a message of one line, if there is no such policy.
+
+    >>> import millrace, numpy
+    >>> policy = millrace.load(run)
+    >>> one = policy(numpy.zeros(4))
+    >>> several = policy(numpy.zeros((8, 4)))
+    >>> several.shape
+    (8,)
+    """
+    return LoadedPolicy(Path(run), best=best, deterministic=deterministic, seed=seed)
+
+
+def _by_path(observation: Observation, path: str) -> Iterator[tuple[str, Any]]:
+    """The arrays of a Dict or Tuple observation, by the names that a policy gives them."""
+    match observation:
+        case Mapping():
+            parts = list(observation.items())
+        case tuple():
+            parts = list(enumerate(observation))
+        case _:
+            yield path, observation
+            return
+    for name, part in parts:
+        yield from _by_path(part, f"{path}/{name}" if path else str(name))
+
+
+def _checked(value: Any, leaf: Leaf) -> Array:
+    """An array [*leaf] or [n, *leaf] of the dtype of its space. Raises `UsageError`."""
+    what = f"observation {leaf.path}".strip()
+    try:
+        given = np.asarray(value)
+    except (ValueError, TypeError):  # rows of different lengths; a tensor on a GPU
+        given = np.asarray(None)
+    expected = f"{leaf.dtype}{list(leaf.shape)}, or [n, …] of them"
+    if leaf.shape not in (given.shape, given.shape[1:]) or not np.can_cast(given.dtype, leaf.dtype, "same_kind"):
+        raise UsageError(f"{what}: expected {expected}, got {given.dtype}{list(given.shape)}")
+    with np.errstate(over="ignore"):
+        array = given.astype(leaf.dtype, copy=False)
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise UsageError(f"{what}: expected finite numbers, got {array.tolist()}"[:500])
+    return array

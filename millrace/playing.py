@@ -1,0 +1,199 @@
+"""Evaluating and recording a run's policy: the commands `evaluate` and `record`, and the functions of the same names.
+
+Rule: a keyword of the function is the flag of the command, by the same name and with the same default. Worker processes play
+the episodes; the caller's process runs no environment code.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal, TypedDict, TypeVar, Unpack
+
+import msgspec
+
+from learner.config.did_you_mean import did_you_mean
+from learner.policy_player import SavedPolicy, saved_policy, useful_workers
+from learner.recording.record import RecordedDataset
+from learner.recording.record import record as record_dataset
+from learner.rollouts.evaluation_tickets import EvaluationPlan, evaluation_of
+from learner.run_folder.results import Evaluation
+from millrace.cli.flags import EvaluateFlags, RecordFlags
+from millrace.launch.policy_workers import PlayingWorkers, policy_player
+from millrace.terminal import count_line
+from protocol.bounds import MAX_SEEDS
+from protocol.env_spec import EnvSpec
+from protocol.errors import UsageError
+
+Watch = Callable[[str], None]
+"""Gets how far it is, as text."""
+Environment = Callable[..., object]
+"""Returns the environment of a run that was started with a callable, and so has no id by which a worker could find it."""
+_Flags = TypeVar("_Flags", EvaluateFlags, RecordFlags)
+
+
+class PlayKeywords(TypedDict, total=False):
+    """Keywords that `evaluate` and `record` have in common."""
+
+    seed: int
+    best: bool
+    workers: int
+    transport: Literal["inproc", "ipc", "tcp"]
+    bind: str
+
+
+class EvaluateKeywords(PlayKeywords, total=False):
+    """Keywords of `millrace.evaluate`. `EvaluateFlags` says what they mean."""
+
+    copies: int
+    max_steps: int
+    video: bool
+
+
+class RecordKeywords(PlayKeywords, total=False):
+    """Keywords of `millrace.record`. `RecordFlags` says what they mean."""
+
+    npy: Path | None
+    stochastic: bool
+
+
+class ShownKeywords(TypedDict, total=False):
+    """Keywords of the two functions that are no flags of the commands."""
+
+    env: Environment | None
+    progress: bool
+
+
+class RunEvaluateKeywords(EvaluateKeywords, ShownKeywords, total=False):
+    """Keywords of `Run.evaluate`."""
+
+
+class RunRecordKeywords(RecordKeywords, ShownKeywords, total=False):
+    """Keywords of `Run.record`."""
+
+
+def evaluate(
+    run: str | os.PathLike[str],
+    episodes: int | None = None,
+    *,
+    env: Environment | None = None,
+    progress: bool = True,
+    **keywords: Unpack[EvaluateKeywords],
+) -> Evaluation:
+    """Play greedy episodes of a run's policy with worker processes, as `millrace evaluate` does.
+
+    Arguments:
+        run: A `Run`, or a run folder.
+        episodes: Number of episodes; if not given 100, or 3 with `video`.
+        env: The callable that the run was started with, if its environment has no id. (`Run.evaluate` knows it.)
+        progress: Show how far it is.
+        **keywords: The flags of `millrace evaluate`. `seed` of the episodes; `best`, to use the policy with the best
+            evaluation during the run in place of the newest; the number of `workers`, and of the `copies` that each plays
+            side by side; `max_steps` of all episodes together; `transport` or `bind`; `video`, to film them.
+
+    Returns the `Evaluation`: `return_mean`, `return_std`, `length_mean`, `episodes` and `cut`. It does not depend on the
+    number of workers. Raises `UserFacingError` with a message of one line.
+
+    >>> import millrace
+    >>> result = millrace.evaluate(run, episodes=2, workers=1)
+    >>> result.episodes, result.cut
+    (2, 0)
+    """
+    flags = flags_of(EvaluateFlags, "evaluate", run=Path(run), episodes=episodes, **keywords)
+    with count_line("evaluating", show=progress) as watch:
+        return play(flags, watch, env)[0]
+
+
+def record(
+    run: str | os.PathLike[str],
+    out: str,
+    steps: int = 50_000,
+    *,
+    env: Environment | None = None,
+    progress: bool = True,
+    **keywords: Unpack[RecordKeywords],
+) -> RecordedDataset:
+    """Write episodes of a run's policy as a Minari dataset, as `millrace record` does. It needs the extra `record`.
+
+    Arguments:
+        run: A `Run`, or a run folder.
+        out: Id of the dataset, as `cartpole/expert-v0`. It is written to MINARI_DATASETS_PATH, or to ~/.minari/datasets.
+        steps: Number of env steps. The last episode is finished, unless that would take more than twice as many.
+        env: The callable that the run was started with, if its environment has no id. (`Run.record` knows it.)
+        progress: Show how far it is.
+        **keywords: The flags of `millrace record`: `stochastic`, to sample actions; `npy`, a file for rows of observation
+            and action; `seed`, `best`, `workers`, `transport` and `bind`.
+
+    Returns a `RecordedDataset`: `dataset_id`, `episodes`, `steps`, `return_mean`, `return_std` and `cut`. It does not depend
+    on the number of workers. Raises `UserFacingError` with a message of one line; then it leaves no files.
+
+    >>> import millrace
+    >>> millrace.record(run, "cartpole/example-v0", steps=20, workers=1).dataset_id
+    'cartpole/example-v0'
+    """
+    flags = flags_of(RecordFlags, "record", run=Path(run), out=out, steps=steps, **keywords)
+    with count_line("recording", show=progress) as watch:
+        return write_dataset(flags, watch, env)
+
+
+def flags_of(kind: type[_Flags], name: str, **keywords: Any) -> _Flags:
+    """The flags that these keyword arguments make. Raises `UsageError` that names one that is wrong."""
+    for keyword in keywords:
+        if keyword not in kind.__struct_fields__:
+            raise UsageError(f"{name}: unknown keyword {keyword}{did_you_mean(keyword, kind.__struct_fields__)}")
+    try:
+        return msgspec.convert(keywords, kind)
+    except msgspec.ValidationError as error:
+        raise UsageError(f"{name}: {error}") from error
+
+
+def play(flags: EvaluateFlags, watch: Watch, env: Environment | None = None) -> tuple[Evaluation, list[Path]]:
+    """Play greedy episodes. Returns their evaluation, and the paths of the videos if there are any.
+
+    Raises `UserFacingError`, or `KeyboardInterrupt` if the user stops it.
+    """
+    episodes = flags.episodes if flags.episodes is not None else 3 if flags.video else 100
+    for name, value, least in (
+        ("episodes", episodes, 1),
+        ("seed", flags.seed, 0),
+        ("workers", flags.workers, 1),
+        ("copies", flags.copies, 1),
+        ("max_steps", flags.max_steps, 1),
+    ):
+        _at_least(name, value, least)
+    if flags.copies > MAX_SEEDS:
+        raise UsageError(f"copies: expected int <= {MAX_SEEDS}, got {flags.copies}")
+    if flags.video:
+        from learner.recording.video import prepare_rendering, record_videos
+
+        prepare_rendering()
+    saved = _saved(flags, env)
+    copies = 1 if flags.video else flags.copies
+    workers = PlayingWorkers(useful_workers(flags.workers, episodes, copies), flags.transport, flags.bind)
+    with policy_player(saved, workers, watch) as player:
+        if flags.video:
+            return record_videos(player, flags.run, episodes, flags.seed)
+        return evaluation_of(player.play(EvaluationPlan.of(episodes, flags.seed, copies, flags.max_steps))), []
+
+
+def write_dataset(flags: RecordFlags, watch: Watch, env: Environment | None = None) -> RecordedDataset:
+    """Write a dataset. Raises `UserFacingError`, or `KeyboardInterrupt` if the user stops it; then it leaves no files."""
+    _at_least("steps", flags.steps, 1)
+    _at_least("seed", flags.seed, 0)
+    _at_least("workers", flags.workers, 1)
+    saved, workers = _saved(flags, env), PlayingWorkers(flags.workers, flags.transport, flags.bind)
+    with policy_player(saved, workers, watch) as player:
+        return record_dataset(
+            player, flags.run, flags.out, flags.steps, flags.seed, stochastic=flags.stochastic, npy=flags.npy
+        )
+
+
+def _saved(flags: EvaluateFlags | RecordFlags, env: Environment | None) -> SavedPolicy:
+    saved = saved_policy(flags.run, "best" if flags.best else "final")
+    return saved if env is None else saved._replace(env=EnvSpec.of(env, saved.env.kwargs))
+
+
+def _at_least(name: str, value: int, least: int) -> None:
+    if value < least:
+        raise UsageError(f"{name}: expected int >= {least}, got {value}")

@@ -1,0 +1,267 @@
+"""A run in Python: `millrace.train` makes it, `millrace.Run` names its folder and reads it each time it is asked.
+
+Rule: what a run folder lacks is None or empty, and what cannot be read is said in one line. Its repr never raises.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Unpack
+
+import numpy as np
+
+from learner.callbacks.callbacks import Callbacks
+from learner.config.config import Config
+from learner.config.layers import config_of_run, resolve
+from learner.recording.record import RecordedDataset
+from learner.run_folder.metrics_log import METRICS_FILE, read_and_count_rows
+from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY, Progress
+from learner.run_folder.results import Evaluation, Summary
+from learner.run_folder.resume import AUTO, newest_run
+from learner.run_folder.run_folder import RunFolder
+from millrace.playing import RunEvaluateKeywords, RunRecordKeywords, evaluate, record
+from millrace.terminal import shown_progress
+from protocol.arrays import Array
+from protocol.errors import UsageError, UserFacingError
+
+if TYPE_CHECKING:
+    from learner.report.figure import PngFigure
+
+NOT_FINISHED = "not finished"
+
+
+class Metrics(dict[str, Array]):
+    """The metrics of a run: a numpy array [updates] for each name, as `metrics["rollout/ep_rew_mean"]`.
+
+    Whole numbers are int64. Other columns are float64, with NaN where an update has no such number: most updates make no
+    evaluation. The names are those of metrics.jsonl, which are Stable-Baselines3's where it has one.
+
+    >>> import millrace
+    >>> metrics = millrace.Run(run).metrics
+    >>> int(metrics["time/total_timesteps"][-1])
+    64
+    >>> metrics.unreadable
+    0
+    """
+
+    unreadable: int
+    """Number of rows that could not be read, and are left out."""
+
+    def __init__(self, rows: list[dict[str, Any]], unreadable: int = 0) -> None:
+        names = dict.fromkeys(name for row in rows for name in row)
+        super().__init__({name: _column([row.get(name) for row in rows]) for name in names})
+        self.unreadable, self._updates = unreadable, len(rows)
+
+    def __repr__(self) -> str:
+        lost = f", {self.unreadable} more cannot be read" if self.unreadable else ""
+        return f"<metrics of {self._updates} updates{lost}: {', '.join(self)}>"
+
+
+class Run(os.PathLike[str]):
+    """A run folder: its results, and what can be done with its policy. `millrace.train` returns one.
+
+    Everything is read from the folder when it is asked for, so a `Run` of a run that still trains shows how far it is.
+    `os.fspath(run)` is its folder: a run can be passed wherever a path is expected.
+
+    Raises `UsageError`, with a message of one line, if `path` is no run folder.
+
+    >>> import millrace
+    >>> millrace.Run(run).summary.env_steps
+    64
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = RunFolder.open(Path(path)).path
+        """The run folder."""
+        self._given: dict[str, Any] = {}
+
+    @classmethod
+    def _trained(cls, path: Path, given: Mapping[str, Any]) -> Run:
+        """A run that was just trained. `given`: environment and algorithm, if they are objects of the caller's program."""
+        run = cls.__new__(cls)
+        run.path, run._given = path, dict(given)
+        return run
+
+    @property
+    def config(self) -> Config:
+        """All settings of the run. Raises `UsageError` if config.toml cannot be read.
+
+        >>> import millrace
+        >>> millrace.Run(run).config.seed
+        1
+        """
+        return config_of_run(self.path)
+
+    @property
+    def summary(self) -> Summary | None:
+        """The results of the run; None if it has not ended.
+
+        >>> import millrace
+        >>> millrace.Run(run).summary.stop_reason
+        'all env steps done'
+        """
+        return RunFolder(self.path).summary()
+
+    @property
+    def metrics(self) -> Metrics:
+        """The metrics of every update, as columns. Rows that cannot be read are left out and counted.
+
+        >>> import millrace
+        >>> millrace.Run(run).metrics["rollout/ep_rew_mean"].dtype
+        dtype('float64')
+        """
+        try:
+            return Metrics(*read_and_count_rows(self.path / METRICS_FILE))
+        except FileNotFoundError:
+            return Metrics([])
+        except OSError as error:
+            raise UsageError(f"{self.path / METRICS_FILE} cannot be read: {error.strerror}") from error
+
+    def evaluate(self, episodes: int | None = None, **keywords: Unpack[RunEvaluateKeywords]) -> Evaluation:
+        """Play greedy episodes of the newest policy: `millrace.evaluate` of this run, with the same keywords.
+
+        >>> import millrace
+        >>> result = millrace.Run(run).evaluate(episodes=2, workers=1)
+        >>> result.episodes
+        2
+        """
+        keywords.setdefault("env", self._given.get("env"))
+        return evaluate(self, episodes, **keywords)
+
+    def record(self, out: str, steps: int = 50_000, **keywords: Unpack[RunRecordKeywords]) -> RecordedDataset:
+        """Write episodes of the newest policy as a Minari dataset: `millrace.record` of this run, with the same keywords.
+
+        >>> import millrace
+        >>> millrace.Run(run).record("cartpole/of-a-run-v0", steps=20).dataset_id
+        'cartpole/of-a-run-v0'
+        """
+        keywords.setdefault("env", self._given.get("env"))
+        return record(self, out, steps, **keywords)
+
+    def resume(self, **keywords: Any) -> Run:
+        """Continue the run from its newest checkpoint: `millrace.train(resume=run)`, with the same keywords.
+
+        An environment or algorithm that was given to `train` as an object is given again. Returns the run, which has the
+        same folder. A run that has reached its `steps` ends at once, so give more of them.
+
+        >>> import millrace
+        >>> millrace.Run(run).resume(steps=96, progress=False).summary.env_steps
+        96
+        """
+        return train(resume=self, **{**self._given, **keywords})
+
+    def plot(self, out: str | os.PathLike[str] | None = None) -> PngFigure:
+        """Draw the learning curve, as `millrace plot` does. Returns a matplotlib figure, which a notebook shows.
+
+        `out`: also write it to this file, as a PNG. Raises `UsageError` if no episode has ended yet.
+
+        >>> import millrace
+        >>> figure = millrace.Run(run).plot("curve.png")
+        """
+        from learner.report.learning_curves import curves, write
+
+        figure = curves([self.path])
+        if out is not None:
+            write(figure, Path(out))
+        return figure
+
+    def __fspath__(self) -> str:
+        return os.fspath(self.path)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Run) and other.path.absolute() == self.path.absolute()
+
+    def __hash__(self) -> int:
+        return hash(self.path.absolute())
+
+    def __repr__(self) -> str:
+        facts = self._facts()
+        return f"<run {self.path}: {', '.join(facts.values())}>"
+
+    def _repr_html_(self) -> str:
+        """A small table, for notebooks."""
+        rows = {**self._facts(), "folder": str(self.path)}
+        cells = [(escape(name), escape(fact.removeprefix(f"{name} "))) for name, fact in rows.items()]
+        left = "style='text-align:left'"
+        return f"<table>{''.join(f'<tr><th {left}>{name}</th><td {left}>{fact}</td></tr>' for name, fact in cells)}</table>"
+
+    def _facts(self) -> dict[str, str]:
+        """What is most important about the run, by name. Never raises."""
+        try:
+            config, summary = self.config, self.summary
+            facts = {"environment": config.env, "algorithm": config.algo, "seed": f"seed {config.seed}"}
+            if summary is None:
+                return facts | _newest_figures(self.metrics)
+        except UserFacingError as error:
+            return {"problem": str(error)}
+        facts["env steps"] = f"{summary.env_steps:,} env steps in {summary.wall_s:,.1f} s"
+        if summary.return_mean_100 is not None:
+            facts["return"] = f"return {summary.return_mean_100:,.1f} (last 100 training episodes)"
+        if summary.evaluation is not None:
+            facts["greedy"] = f"greedy {summary.evaluation}"
+        return {**facts, "ended": summary.stop_reason}
+
+
+def train(
+    env: str | Callable[..., object] = "",
+    *,
+    config: str | os.PathLike[str] | None = None,
+    resume: str | os.PathLike[str] | None = None,
+    preset: str = "auto",
+    callbacks: Sequence[object] = (),
+    watch: Callable[[Progress], object] | None = None,
+    progress: bool = True,
+    **keywords: Any,
+) -> Run:
+    """Train a policy on this machine: the learner runs in this process, the workers in processes that it starts.
+
+    Arguments:
+        env: An id that `gymnasium.make` takes, or a callable that returns an environment.
+        config: A TOML file of settings.
+        resume: A run, or its folder, to continue from its newest checkpoint; or "auto": the newest run of this environment,
+            algorithm and seed if there is one, else a new run.
+        preset: The name of a preset (`millrace presets` lists them); "auto" takes that of `env`; "none" takes none.
+        callbacks: Objects with some of the methods of `Callback`. They are called between updates, and may end the run.
+        watch: Called with a `Progress` after each update, and several times a second during an evaluation.
+        progress: Show how far the run is: in one display in a notebook, in place on a terminal, else in a line every 5 s.
+        **keywords: The flags of `millrace train`, by the same names: `learning_rate=1e-3`. `algo` may be a class of your own
+            (`millrace.algorithms`). A class that was made in a script or a notebook is given again on resume.
+
+    Returns the `Run`. Raises `UserFacingError` with a message of one line. In a script, guard the call with
+    `if __name__ == "__main__":`.
+
+    >>> import millrace
+    >>> run = millrace.train("CartPole-v1", seed=1, steps=64, envs=2, lanes=1, rollout_steps=16, workers=1, progress=False)
+    >>> run.summary.env_steps
+    64
+    """
+    from millrace.launch import local_run
+
+    name = env if isinstance(env, str) else getattr(env, "__name__", type(env).__name__)
+    file, run = (None if path is None else Path(path) for path in (config, resume))
+    if run == AUTO:
+        run = newest_run(resolve(name, file=file, preset=preset, **keywords))
+        file = None if run else file
+    settings = resolve(name, file=file, resume=run, preset=preset, **keywords)
+    objects = {name: given for name, given in {"env": env, **keywords}.items() if callable(given)}
+    with shown_progress(watch, show=progress) as both:
+        folder = local_run.train(settings, run, Callbacks(callbacks, both), factory=None if isinstance(env, str) else env)
+    return Run._trained(folder, objects)
+
+
+def _newest_figures(metrics: Metrics) -> dict[str, str]:
+    """How far a run is that has not ended."""
+    facts = {"env steps": f"{int(metrics[ENV_STEPS_KEY][-1]):,} env steps"} if ENV_STEPS_KEY in metrics else {}
+    returns = metrics.get(RETURN_KEY)
+    if returns is not None and np.isfinite(returns[-1]):
+        facts["return"] = f"return {returns[-1]:,.1f} (last 100 training episodes)"
+    return {**facts, "ended": NOT_FINISHED}
+
+
+def _column(values: list[Any]) -> Array:
+    if all(type(value) is int for value in values):
+        return np.array(values, np.int64)
+    return np.array([np.nan if value is None else value for value in values], np.float64)

@@ -1,0 +1,207 @@
+"""`millrace.load`: a saved policy acts as the workers of an evaluation do, bit for bit, and says what it cannot take."""
+
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import millrace
+from learner.config.layers import resolve
+from learner.policy_player import saved_policy
+from learner.rollouts.evaluation_tickets import EvaluationPlan
+from learner.run_folder.run_folder import RunFolder
+from millrace.launch.policy_workers import PlayingWorkers, policy_player
+from protocol.arrays import Array
+from protocol.envs.spaces import make_action_converter, make_unflatten
+from protocol.messages import EpisodeRows
+from protocol.specs import RunSpec
+from tests.support.collectors import TOY, random_weights, run_of
+
+STEPS = 30
+
+
+def folder_of(run: RunSpec, tmp_path: Path, which: Any = "final", scale: float = 1.0) -> Path:
+    """A run folder with random weights."""
+    parameters, buffers = random_weights(run.policy)
+    folder = RunFolder.create(resolve(run.env.id, run_dir=str(tmp_path)))
+    folder.write_policy(run.policy, run.env, (parameters * np.float32(scale)).astype(np.float32), buffers, which)
+    return folder.path
+
+
+def silent(text: str) -> None:
+    """Shows nothing."""
+
+
+def played(run: Path, copies: int, *, greedy: bool = True, seed: int = 3) -> list[tuple[list[Array], Array]]:
+    """What workers of an evaluation saw and did: for each episode the leaves [L+1, *leaf], and actions [L, *action]."""
+    rows: list[list[EpisodeRows]] = [[] for _ in range(copies)]
+    plan = EvaluationPlan(tuple(seed + n for n in range(copies)), copies, STEPS, greedy=greedy, send_rows=True)
+    saved = saved_policy(run)
+    with policy_player(saved, PlayingWorkers(1, "inproc"), silent) as player:
+        player.play(plan, lambda episode, some: rows[episode].append(some))
+    to_env = make_action_converter(saved.spec.action)
+    leaves = range(len(saved.spec.observation))
+    return [
+        (
+            [np.concatenate([some.obs[i][bool(n) :] for n, some in enumerate(one)]) for i in leaves],
+            np.asarray(to_env(np.concatenate([some.action for some in one]))),
+        )
+        for one in rows
+    ]
+
+
+def observations(episodes: Sequence[tuple[list[Array], Array]], t: int, unflatten: Any) -> Any:
+    """The batch at step t. Of an episode that has ended, its last observation."""
+    count = range(len(episodes[0][0]))
+    return unflatten([np.stack([leaves[i][min(t, len(leaves[i]) - 1)] for leaves, _ in episodes]) for i in count])
+
+
+POLICIES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
+    "discrete": ("CartPole-v1", {}, {}),
+    "box, normalized": ("Pendulum-v1", {}, {"normalize_observations": True}),
+    "images": (f"{TOY}Frames-v0", {}, {}),
+    "lstm": ("CartPole-v1", {}, {"core": "lstm", "core_size": 8}),
+    "gru": ("Pendulum-v1", {}, {"core": "gru", "core_size": 8, "normalize_observations": True}),
+    "action values": ("CartPole-v1", {}, {"head": "q"}),
+    "dict": (f"{TOY}Spaces-v0", {"observation": "dict", "action": "multidiscrete"}, {}),
+    "tuple": (f"{TOY}Spaces-v0", {"observation": "tuple", "action": "multibinary"}, {}),
+    "nested": (f"{TOY}Spaces-v0", {"observation": "nested", "action": "offset"}, {}),
+    "doubles": (f"{TOY}Spaces-v0", {"observation": "unbounded", "action": "half"}, {}),
+}
+
+
+@pytest.mark.parametrize("copies", [1, 4])
+@pytest.mark.parametrize("name", POLICIES)
+def test_it_acts_as_an_evaluation_does_bit_for_bit(name: str, copies: int, tmp_path: Path) -> None:
+    env, kwargs, settings = POLICIES[name]
+    run = run_of(env, kwargs=kwargs, **settings)
+    folder = folder_of(run, tmp_path)
+    unflatten = make_unflatten(run.env.make().observation_space)
+    episodes = played(folder, copies)
+    policy = millrace.load(folder)
+    policy.start(copies)
+    compared = 0
+    for t in range(max(len(actions) for _, actions in episodes)):
+        batch = observations(episodes, t, unflatten)
+        got = policy(batch)
+        for n, (_, actions) in enumerate(episodes):
+            if t < len(actions):
+                assert got[n].tobytes() == actions[t].tobytes(), (t, n)
+                assert got[n].dtype == actions[t].dtype
+                compared += 1
+    assert compared > 2 * copies
+
+
+def test_one_observation_gives_one_action_that_the_environment_takes(tmp_path: Path) -> None:
+    run = run_of("Pendulum-v1")
+    folder = folder_of(run, tmp_path)
+    ((leaves, actions),) = played(folder, 1)
+    policy = millrace.load(folder)
+    assert [policy(obs).tobytes() for obs in leaves[0][:-1]] == [action.tobytes() for action in actions]
+    assert run.env.make().action_space.contains(policy(leaves[0][0]))
+
+
+def test_sampled_actions_are_those_of_a_recording_with_the_same_seed(tmp_path: Path) -> None:
+    folder = folder_of(run_of("CartPole-v1"), tmp_path)
+    policy = millrace.load(folder, deterministic=False, seed=0)
+    for seed in (3, 8):
+        ((leaves, actions),) = played(folder, 1, greedy=False, seed=seed)
+        policy.start(seed=seed)
+        assert [int(policy(obs)) for obs in leaves[0][:-1]] == actions.tolist()
+    greedy = millrace.load(folder)
+    assert [int(greedy(obs)) for obs in leaves[0][:-1]] != actions.tolist()
+
+
+def test_the_same_seed_samples_the_same_actions(tmp_path: Path) -> None:
+    folder, batch = folder_of(run_of("CartPole-v1"), tmp_path), np.zeros((64, 4), np.float32)
+    one, same, other = (millrace.load(folder, deterministic=False, seed=seed)(batch).tolist() for seed in (1, 1, 2))
+    assert one == same
+    assert one != other
+
+
+def test_the_best_policy_is_another_file(tmp_path: Path) -> None:
+    run = run_of("Pendulum-v1")
+    folder = folder_of(run, tmp_path)
+    with pytest.raises(millrace.UsageError, match=r"policy of run .* cannot be read: .*best\.safetensors"):
+        millrace.load(folder, best=True)
+    parameters, buffers = random_weights(run.policy)
+    RunFolder.open(folder).write_policy(run.policy, run.env, -parameters, buffers, "best")
+    obs = np.array([1.0, 0.0, 0.5], np.float32)
+    assert millrace.load(folder, best=True)(obs) != millrace.load(folder)(obs)
+
+
+def test_a_recurrent_policy_says_that_it_must_be_started_and_how(tmp_path: Path) -> None:
+    policy = millrace.load(folder_of(run_of("CartPole-v1", core="lstm", core_size=8), tmp_path))
+    with pytest.raises(millrace.UsageError, match=r"recurrent: call start\(3\) before the first observation"):
+        policy(np.zeros((3, 4)))
+    policy.start(2)
+    with pytest.raises(millrace.UsageError, match="expected 2 observations, as in start, got 3"):
+        policy(np.zeros((3, 4)))
+    with pytest.raises(millrace.UsageError, match="expected at least 1 env copy, got 0"):
+        policy.start(0)
+
+
+def test_first_begins_an_episode_in_these_copies_only(tmp_path: Path) -> None:
+    run = run_of("Pendulum-v1", core="gru", core_size=8)
+    policy, obs = millrace.load(folder_of(run, tmp_path)), np.array([[0.5, -0.5, 2.0], [1.0, 0.0, -1.0]], np.float32)
+    policy.start(2)
+    begun, later = policy(obs), policy(obs)
+    third = policy(obs, first=[True, False])
+    assert third[0] == begun[0]
+    assert third[1] != begun[1]
+    assert not np.array_equal(later, begun), "the state has an effect"
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (np.zeros(5), r"observation: expected float32\[4\], or \[n, …\] of them, got float64\[5\]"),
+        (np.zeros((2, 3, 4)), r"got float64\[2, 3, 4\]"),
+        ([[0.0] * 4, [0.0] * 3], "observation: expected"),
+        (np.full(4, np.nan), "observation: expected finite numbers, got"),
+        (np.full(4, 1e300), "observation: expected finite numbers, got"),
+        (["a"] * 4, "observation: expected"),
+        ({"x": np.zeros(4)}, "observation: expected"),
+    ],
+)
+def test_what_is_no_observation_is_refused_in_one_line(given: Any, message: str, tmp_path: Path) -> None:
+    policy = millrace.load(folder_of(run_of("CartPole-v1"), tmp_path))
+    with pytest.raises(millrace.UsageError, match=message) as caught:
+        policy(given)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_part_of_a_dict_that_is_missing_or_of_another_number_is_named(tmp_path: Path) -> None:
+    run = run_of(f"{TOY}Spaces-v0", kwargs={"observation": "dict", "action": "discrete"})
+    policy = millrace.load(folder_of(run, tmp_path))
+    whole = run.env.make().observation_space.sample()
+    assert isinstance(whole, dict)
+    assert policy(whole).shape == ()
+    assert policy({**whole, "more": 1}).shape == (), "what the policy does not use is ignored"
+    name = next(iter(whole))
+    with pytest.raises(millrace.UsageError, match=f"observation: expected {name}"):
+        policy({key: value for key, value in whole.items() if key != name})
+    with pytest.raises(millrace.UsageError, match="for the same number of env copies, got different ones"):
+        policy({**whole, name: _stacked(whole[name])})
+
+
+def _stacked(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(np.stack([part, part]) for part in value)
+    if isinstance(value, dict):
+        return {key: np.stack([part, part]) for key, part in value.items()}
+    return np.stack([value, value])
+
+
+def test_acting_imports_neither_torch_nor_an_environment_nor_an_algorithm(tmp_path: Path) -> None:
+    folder = folder_of(run_of("CartPole-v1"), tmp_path)
+    program = (
+        f"import sys, numpy, millrace; policy = millrace.load({str(folder)!r}); policy(numpy.zeros(4)); "
+        "assert not sys.modules.keys() & {'torch', 'cloudpickle', 'learner.algorithms.algorithm', "
+        "'gymnasium.envs.classic_control', 'workers.worker'}"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
