@@ -32,6 +32,7 @@ from protocol.errors import (  # noqa: E402
 if TYPE_CHECKING:
     from gymnasium.vector import AutoresetMode
 
+    from learner.algorithms.moments import Moments
     from learner.callbacks.callback import Callback
     from learner.run_folder.progress import Progress
     from learner.vector_env.env import ZmqVectorEnv
@@ -52,6 +53,7 @@ __all__ = [
     "LoadedPolicy",
     "Metrics",
     "MillraceError",
+    "Moments",
     "NoWorkers",
     "OwnPolicy",
     "Piece",
@@ -81,6 +83,7 @@ _IMPORTED_WHEN_USED = {
     "Callback": "learner.callbacks.callback",
     "LoadedPolicy": "millrace.acting",
     "MLP": "millrace.policies",
+    "Moments": "learner.algorithms.moments",
     "OwnPolicy": "millrace.own_policy",
     "Metrics": "millrace.runs",
     "Piece": "millrace.policies",

@@ -18,7 +18,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import gymnasium
 import numpy as np
@@ -39,6 +39,9 @@ from protocol.env_spec import EnvSpec
 from protocol.errors import CheckpointError, UsageError, first_line
 from protocol.rollout import Batch, stack_rollouts
 from protocol.specs import PolicySpec
+
+if TYPE_CHECKING:
+    from learner.algorithms.moments import Moments
 
 PULSE_S = 0.005  # how often messages are answered while the user computes
 EVALUATION_COPIES = 4  # episodes that a worker plays side by side
@@ -123,6 +126,7 @@ class RolloutService:
         self._over = threading.Event()
         self._owner = threading.get_ident()
         self._taken, self._published = 0, 0
+        self._moments: Moments | None = None
         self._resources = ExitStack()
         spec = EnvSpec.of(env, config.env_kwargs)
         try:
@@ -137,12 +141,14 @@ class RolloutService:
                     listens=listens,
                     past=past,
                 )
+            self._service, self.run = started.service, started.run
             if state is not None:
                 _check_restored(state, spec.id, started.run.policy, str(restore))
+                if state.moments is not None:
+                    self.moments.restore(state.moments)
         except BaseException:
             self._resources.close()
             raise
-        self._service, self.run = started.service, started.run
         self.policy = PolicyParameters(started.run.policy)
         """Names, shapes and offsets of the parameters, and initial values."""
         self.observation_space: gymnasium.Space[Any] = started.described.observation_space
@@ -161,15 +167,27 @@ class RolloutService:
         """Send new weights to all workers; they may now collect the rollouts of the next batch. Returns their version.
 
         `parameters`: the flat vector [P], or an array for each name in `policy.layout`. `buffers` likewise, for a policy
-        that normalizes observations. They are copied. Raises `UsageError` for wrong shapes, or numbers that are not finite.
+        that normalizes observations; by default those of `moments`. They are copied.
+        Raises `UsageError` for wrong shapes, or numbers that are not finite.
         """
         self._check_open()
+        if buffers is None and self._moments is not None and self.run.policy.normalize_observations:
+            buffers = self._moments.buffers()
         flat, flat_buffers = self.policy.flat(parameters), self.policy.flat_buffers(buffers)
         with self._lock:
             self._service.publish(self._version + 1, flat, flat_buffers)
         self._version += 1
         self._published += 1
         return self._version
+
+    @property
+    def moments(self) -> Moments:
+        """Running mean and standard deviation of observations and returns, as in the built-in trainer. Imports torch."""
+        if self._moments is None:
+            from learner.algorithms.moments import Moments
+
+            self._moments = Moments(self.run.policy)
+        return self._moments
 
     def gather(self) -> RolloutBatch:
         """Wait for the next batch. Raises `RunError` when no worker is left, or the environment failed too often."""
@@ -208,8 +226,8 @@ class RolloutService:
     def save(self, path: str | Path, **arrays: Any) -> None:
         """Write the service's state and your arrays into one .npz file, which is there whole or not at all.
 
-        Call it right after `publish`. `RolloutService(..., restore=path)` goes on from it: ledger, versions and lanes
-        continue, and `restored` has the arrays. Rollouts that were under way are collected anew.
+        Call it right after `publish`. `RolloutService(..., restore=path)` goes on from it: ledger, versions, lanes
+        and moments continue, and `restored` has the arrays. Rollouts that were under way are collected anew.
         """
         self._check_open()
         with self._lock:
@@ -221,6 +239,7 @@ class RolloutService:
             env_steps=self.env_steps,
             ledger=snapshot.ledger,
             incarnations=snapshot.incarnations,
+            moments=None if self._moments is None else self._moments.state(),
         )
         write(Path(path), state, arrays)
 

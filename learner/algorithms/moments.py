@@ -1,0 +1,108 @@
+"""`RolloutService.moments`: running mean and standard deviation of observations, and of the discounted return.
+
+They are those of the built-in trainer: the same classes, updated from the same rows. Imports torch, when it is first used.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+import torch
+
+from learner.algorithms.normalization import ObservationNormalizer, RewardScaler
+from protocol.arrays import Array, Floats
+from protocol.errors import UsageError
+from protocol.policy.features import box_feature_mask, features, normalize
+from protocol.rollout import Batch
+from protocol.specs import PolicySpec
+
+
+class Moments:
+    """Running moments of all batches so far. Only valid rows count.
+
+        features = service.moments.normalized(batch)           # as the policy saw them, for your loss
+        reward = service.moments.scaled_rewards(batch, gamma)
+        service.moments.update(batch)
+        service.publish(parameters)                            # sends mean and standard deviation, too
+
+    `service.save` keeps them, and a service that is restored goes on from them.
+    """
+
+    def __init__(self, policy: PolicySpec) -> None:
+        """For the observations of this policy, also if it does not normalize them itself."""
+        self._policy = msgspec.structs.replace(
+            policy, normalize_observations=True, own=None, encoder=None, head="actor_critic"
+        )
+        self._observations = ObservationNormalizer(self._policy)
+        self._size = len(box_feature_mask(self._policy))
+        self._rewards: tuple[float, RewardScaler] | None = None
+
+    @property
+    def mean(self) -> Floats:
+        """[D] float32, of each feature of the observation. Features of discrete values have 0; images have no features."""
+        return self.buffers()[: self._size]
+
+    @property
+    def std(self) -> Floats:
+        """[D] float32 standard deviation; 1 where a feature never varied or is of a discrete value."""
+        return self.buffers()[self._size :]
+
+    def buffers(self) -> Floats:
+        """`mean`, then `std`, in one array [2 D]: what `publish` takes for a policy that normalizes observations."""
+        return self._observations.buffers()
+
+    def update(self, batch: Batch) -> None:
+        """Count the observations of a batch. Call it once for each batch, after `normalized`."""
+        self._observations.update(self._features(batch)[:-1], batch.valid)
+
+    def normalized(self, batch: Batch) -> Floats:
+        """The features [T+1, N, D] float32 of a batch: (x − mean) / std, clipped to ±10.
+
+        Before `update` these are the ones that the policy saw, if it normalizes and `max_lag` is 0. Arrays of the
+        observation are flattened and side by side; discrete values are one-hot vectors, bytes are divided by 255 before.
+        """
+        return normalize(self._features(batch), self.mean, self.std)
+
+    def scaled_rewards(self, batch: Batch, gamma: float) -> Floats:
+        """Count a batch, and return its rewards [T, N] divided by the standard deviation of the discounted return.
+
+        Call it once for each batch. `gamma` is the discount, the same each time. Raises `UsageError` for another.
+        """
+        if self._rewards is None:
+            self._rewards = gamma, RewardScaler(gamma)
+        if gamma != self._rewards[0]:
+            raise UsageError(f"moments: gamma: expected {self._rewards[0]} as in the batches before, got {gamma}")
+        return self._rewards[1].scale(batch)
+
+    def _features(self, batch: Batch) -> Array:
+        obs: Any = batch.obs
+        paths = [leaf.path for leaf in self._policy.observation]
+        return features(self._policy, [obs[path] for path in paths] if paths[0] else [obs])
+
+    def state(self) -> dict[str, Any]:
+        """Plain data to go on from. The running returns are not in it: a service that is restored has new env copies."""
+        kept: dict[str, Any] = {"observations": _plain(self._observations.state_dict())}
+        if self._rewards is not None:
+            gamma, scaler = self._rewards
+            kept |= {"gamma": gamma, "rewards": _plain(scaler.state_dict()["moments"])}
+        return kept
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a `state`."""
+        self._observations.load_state_dict(_tensors(state["observations"]))
+        if "gamma" in state:
+            scaler = RewardScaler(state["gamma"])
+            scaler.load_state_dict({"moments": _tensors(state["rewards"]), "returns": {}})
+            self._rewards = state["gamma"], scaler
+
+
+def _plain(moments: dict[str, Any]) -> dict[str, Any]:
+    return {name: value.tolist() if isinstance(value, torch.Tensor) else value for name, value in moments.items()}
+
+
+def _tensors(moments: dict[str, Any]) -> dict[str, Any]:
+    return {
+        name: value if name == "count" else torch.tensor(np.asarray(value, np.float64)) for name, value in moments.items()
+    }
