@@ -8,6 +8,7 @@ are, and the learner runs no code of the environment.
 from __future__ import annotations
 
 import logging
+import socket
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
@@ -32,6 +33,7 @@ from learner.rollout_service.service import describe_settings, rollout_service
 from learner.rollouts.hub import HubObserver
 from learner.run_folder.run_folder import Interrupted, RunFolder
 from learner.run_folder.run_lock import RunLock
+from protocol.address import advertised_address
 from protocol.bounds import one_line
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
@@ -165,6 +167,8 @@ class Run:
         self.folder.write_config(config)  # nothing of a resumed run is written before everything fits
         self.recorder = RunRecorder(config, self.folder, spec, self.algorithm, self.service, state, made, episodes)
         self.folder.keep()
+        if self.folder.lock is not None and not link.address.startswith("inproc://"):
+            self.folder.lock.announce(advertised_address(link.address, config.advertise, socket.gethostname()))
 
     def train(self, workers: int) -> None:
         """Wait for this number of `workers`, then train to the end.

@@ -11,6 +11,7 @@ from enum import Enum
 import msgspec
 
 WIDTH = 512  # bytes: every rewrite has the same length, so that one of them replaces the whole
+LONGEST_ADDRESS = 200
 
 
 class Owner(msgspec.Struct, frozen=True, kw_only=True):
@@ -22,6 +23,8 @@ class Owner(msgspec.Struct, frozen=True, kw_only=True):
     """Which running kernel the process is on: processes with the same one are on one machine."""
     token: str
     """Random: two locks never have the same."""
+    address: str = ""
+    """Where its learner listens; empty if nobody can ask it, or it does not listen yet."""
     count: int = 0
     """How often the owner has rewritten the file."""
 

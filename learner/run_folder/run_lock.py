@@ -23,7 +23,8 @@ from typing import NamedTuple, Self
 
 from msgspec.structs import replace
 
-from learner.run_folder.lease import LeaseWatch, Owner, Verdict, decoded
+from learner.run_folder.lease import LONGEST_ADDRESS, LeaseWatch, Owner, Verdict, decoded
+from protocol.address import is_local
 from protocol.errors import RunError, RunTakenOver, UsageError
 
 log = logging.getLogger("millrace.learner")
@@ -85,6 +86,12 @@ class RunLock:
             if self._is_ours():
                 self._path.unlink()
         self._close()
+
+    def announce(self, address: str) -> None:
+        """Write into the lock file where the learner of this run listens, for `millrace status`."""
+        with self._writing:
+            self._owner = replace(self._owner, address=address if len(address) <= LONGEST_ADDRESS else "")
+        self._rewrite()
 
     def check(self) -> None:
         """Raise `RunTakenOver` if another process is known to have taken the run over. Costs nothing."""
@@ -233,6 +240,44 @@ class RunLock:
         if self._file >= 0:
             os.close(self._file)
             self._file = -1
+
+
+def learner_address(folder: Path) -> str:
+    """The address of the learner that trains the run in this folder now.
+
+    Raises `UsageError`, with a one-line message, if none does, or if it cannot be asked from this machine.
+    """
+    if not folder.is_dir():
+        raise UsageError(f"run {folder}: no such folder")
+    try:
+        owner = decoded((folder / LOCK_FILE).read_bytes())
+    except FileNotFoundError:
+        raise UsageError(f"run {folder}: no process trains it now") from None
+    except OSError as error:
+        raise UsageError(f"run {folder}: {LOCK_FILE} cannot be read: {error.strerror}") from error
+    if owner is None:
+        raise UsageError(f"run {folder}: {LOCK_FILE} names no process; it is being written, or damaged: try again")
+    here = owner.boot == _boot()
+    if here and not owner.address.startswith("tcp://") and not _is_alive(owner.pid):  # over tcp it may be in a container
+        raise UsageError(f"run {folder}: no process trains it now; {owner} did, and is gone")
+    if not owner.address:
+        raise UsageError(
+            f"run {folder}: {owner} trains it and cannot be asked: it has not begun yet, or has --transport inproc or "
+            "--inference learner"
+        )
+    if not here and is_local(owner.address):
+        raise UsageError(f"run {folder}: {owner} trains it, and only that machine can reach it; ask there")
+    return owner.address
+
+
+def _is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # it is another user's
+        return True
+    return True
 
 
 def _boot() -> str:

@@ -335,7 +335,7 @@ GROUPS = {
         "learner": Command(_learner, "ENV --bind ADDRESS [flags]", "start a learner alone; workers join it from elsewhere"),
         "worker": Command(_worker, "ADDRESS [--token FILE] [flags]", "start workers that join a learner"),
         "keys": Command(_keys, "new|show|allow|revoke [NAME]", "say who may join the learners of this machine"),
-        "status": Command(_status, "ADDRESS [--watch]", "show a run's workers, their speed, and what was dropped"),
+        "status": Command(_status, "ADDRESS|RUN [--watch]", "show a run's workers, their speed, and what was dropped"),
         "launch": Command(_launch, "kubernetes|slurm|ray ENV [flags]", "start a learner and workers on a cluster"),
     },
     "Look at runs": {

@@ -1,4 +1,4 @@
-"""`millrace status ADDRESS`: ask a learner for the state of its run and print it. Needs only a worker's packages.
+"""`millrace status ADDRESS|RUN`: ask a learner for the state of its run and print it. Needs only a worker's packages.
 
 Rule: everybody who may connect may ask, and asking changes nothing. If a learner does not answer within the deadline, the
 error is one line. Names that a peer has chosen cannot control the terminal.
@@ -11,10 +11,12 @@ import shutil
 import socket
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import TextIO
 
 import msgspec
 
+from learner.run_folder.run_lock import learner_address
 from millrace.cli.arguments import Arguments
 from protocol.errors import Refused, RunError
 from protocol.keys.key_folder import TOKEN_VARIABLE, read_token
@@ -51,7 +53,10 @@ def status(argv: list[str], out: TextIO) -> None:
     arguments = Arguments(
         "status", "Show the workers of a run (speed, memory, seconds since the last message), and what was dropped."
     )
-    arguments.flag("address", metavar="ADDRESS", help="where the learner listens, as in tcp://HOST:5555")
+    arguments.flag(
+        "address", metavar="ADDRESS|RUN",
+        help="where the learner listens, as in tcp://HOST:5555, or the folder of a run that is training",
+    )  # fmt: skip
     arguments.flag("--watch", action="store_true", help="ask again every second, until Ctrl-C or the end of the learner")
     arguments.flag("--json", action="store_true", help="print one line of JSON instead of a table")
     arguments.flag(
@@ -63,8 +68,9 @@ def status(argv: list[str], out: TextIO) -> None:
     )  # fmt: skip
     arguments.flag("--insecure", action="store_true", help="ask on another machine without a token, and trust the answer")
     values = arguments.parse(argv)
-    token = checked_token(values.address, read_token(values.token), insecure=values.insecure)
-    link = WorkerLink(values.address, observer_name(), token=token)
+    address = values.address if "://" in values.address else learner_address(Path(values.address))
+    token = checked_token(address, read_token(values.token), insecure=values.insecure)
+    link = WorkerLink(address, observer_name(), token=token)
     try:
         while True:
             answer = ask(link, values.timeout_s)

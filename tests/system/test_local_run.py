@@ -389,3 +389,27 @@ def test_a_worker_whose_environment_hangs_is_ended_and_replaced(
     said = [record.getMessage() for record in caplog.records]
     assert len([line for line in said if "joined" in line]) >= 2
     assert not [line for line in said if "silent" in line]
+
+
+def test_status_asks_the_learner_that_train_started_by_its_run_folder(tmp_path: Path) -> None:
+    learner = start(tmp_path, "--steps", "100000000", "--workers", "2")
+    wait_for(lambda: any(len(read_rows(path)) > 3 for path in tmp_path.glob("runs/*/metrics.jsonl")))
+    (folder,) = tmp_path.glob("runs/*")
+
+    def status(*flags: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "millrace", "status", str(folder), *flags]
+        return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+    try:
+        answer = json.loads(status("--json").stdout)
+        assert answer["env"] == "CartPole-v1"
+        assert answer["env_steps"] > 0
+        assert {worker["worker"] for worker in answer["workers"]} == {"w0", "w1"}
+        assert {worker["pid"] for worker in answer["workers"]} == {one.pid for one in psutil.Process(learner.pid).children()}
+        assert "dropped: nothing" in status().stdout
+    finally:
+        learner.send_signal(signal.SIGINT)
+        learner.communicate(timeout=30)
+    ended = status()
+    assert (ended.returncode, ended.stdout) == (2, "")
+    assert ended.stderr == f"millrace: run {folder}: no process trains it now\n"

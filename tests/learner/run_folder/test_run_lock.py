@@ -13,9 +13,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
-from learner.run_folder.lease import LeaseWatch, Owner, Verdict, decoded
-from learner.run_folder.run_lock import LOCK_FILE, Pace, RunLock
+from learner.run_folder.lease import LONGEST_ADDRESS, WIDTH, LeaseWatch, Owner, Verdict, decoded
+from learner.run_folder.run_lock import LOCK_FILE, Pace, RunLock, learner_address
 from protocol.errors import RunError, RunTakenOver, UsageError
 
 ELSEWHERE = Owner(host="far", pid=77, boot="another kernel", token="theirs")
@@ -212,3 +213,56 @@ def test_the_file_is_rewritten_again_and_again_and_made_again(tmp_path: Path) ->
         with pytest.raises(UsageError, match="is training it"):
             lock(tmp_path).__enter__()
     assert not (tmp_path / LOCK_FILE).exists()
+
+
+# ------------------------------------------------------------------------------------------- where its learner listens
+
+
+def test_the_lock_says_where_the_learner_listens_and_keeps_saying_it(tmp_path: Path) -> None:
+    with lock(tmp_path) as held:
+        with pytest.raises(
+            UsageError, match=rf"process {os.getpid()} on \S+ trains it and cannot be asked: it has not begun"
+        ):
+            learner_address(tmp_path)
+        held.announce("ipc:///tmp/here/learner")
+        assert learner_address(tmp_path) == "ipc:///tmp/here/learner"
+        held.confirm()
+        assert learner_address(tmp_path) == "ipc:///tmp/here/learner", "the next rewriting keeps it"
+        assert len((tmp_path / LOCK_FILE).read_bytes()) == WIDTH
+        held.announce("tcp://" + "h" * LONGEST_ADDRESS + ":5555")
+        assert len((tmp_path / LOCK_FILE).read_bytes()) == WIDTH
+        assert owner_of(tmp_path).address == ""
+    with pytest.raises(UsageError, match="no process trains it now"):
+        learner_address(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"rubbish", "names no process"),
+        (
+            replace(ELSEWHERE, address="ipc:///tmp/x").encoded(),
+            "process 77 on far trains it, and only that machine can reach",
+        ),
+        (replace(ELSEWHERE, address="tcp://127.0.0.1:5").encoded(), "only that machine can reach it; ask there"),
+    ],
+)
+def test_a_learner_that_cannot_be_asked_from_here_is_named(content: bytes, message: str, tmp_path: Path) -> None:
+    (tmp_path / LOCK_FILE).write_bytes(content)
+    with pytest.raises(UsageError, match=message):
+        learner_address(tmp_path)
+
+
+def test_a_learner_elsewhere_is_asked_at_its_address(tmp_path: Path) -> None:
+    (tmp_path / LOCK_FILE).write_bytes(replace(ELSEWHERE, address="tcp://far:5555").encoded())
+    assert learner_address(tmp_path) == "tcp://far:5555"
+
+
+def test_a_process_that_is_gone_trains_nothing(tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
+        pass
+    with lock(tmp_path):
+        mine = owner_of(tmp_path)
+    (tmp_path / LOCK_FILE).write_bytes(replace(mine, pid=ended.pid, address="ipc:///tmp/x").encoded())
+    with pytest.raises(UsageError, match=rf"no process trains it now; process {ended.pid} on \S+ did, and is gone"):
+        learner_address(tmp_path)
