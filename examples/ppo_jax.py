@@ -42,6 +42,7 @@ class Settings:
     value_weight: float = 0.5
     max_grad_norm: float = 0.5
     bind: str = ""
+    keys: str = ""
     save: str = ""
 
 
@@ -117,7 +118,7 @@ def update(state: dict[str, Any], batch: dict[str, jax.Array], remaining: jax.Ar
 def train(settings: Settings) -> float:
     """Train. Returns the mean return of the last 100 training episodes."""
     save = Path(settings.save) if settings.save else None
-    names = ("rollout_steps", "workers", "envs", "lanes", "seed", "bind")
+    names = ("rollout_steps", "workers", "envs", "lanes", "seed", "bind", "keys")
     collecting = {name: getattr(settings, name) for name in names}
     restore = save if save and save.exists() else None
     returns: list[float] = []
@@ -148,7 +149,7 @@ def train(settings: Settings) -> float:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="PPO in JAX over millrace's rollout service")
-    for name in ("steps", "seed", "workers", "bind", "save"):
+    for name in ("steps", "seed", "workers", "bind", "keys", "save"):
         default = getattr(Settings, name)
         parser.add_argument(f"--{name}", type=type(default), default=default)
     train(Settings(**vars(parser.parse_args())))
