@@ -49,7 +49,13 @@ class Hello(Message, frozen=True, array_like=False):  # a map, as in every versi
     """drawn at random for each process, for pids repeat in containers; a secret of the worker, its supervisor and learner"""
     software: Line
     attempt: Natural
-    """counts how often this process has started to join: a repeated Hello keeps the number, a new start raises it"""
+    """`process_nonce` + 1 when the process first joins, and one more each time that it starts to join again. A repeated
+    Hello keeps the number. So it also tells which process a Welcome answers."""
+
+    @property
+    def is_first_attempt(self) -> bool:
+        """Whether the process has joined nowhere before."""
+        return self.attempt <= self.process_nonce + 1
 
 
 class Welcome(Message, frozen=True):

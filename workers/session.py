@@ -112,7 +112,7 @@ class Identity:
     software: str
 
     def hello(self, attempt: int) -> Hello:
-        """The Hello of this attempt to join."""
+        """The Hello of this attempt to join. Attempts are counted from the nonce: no two processes have the same one."""
         return Hello(
             PROTOCOL_VERSION,
             worker=self.worker,
@@ -176,7 +176,7 @@ class Session:
         self._statistics = Statistics()
         self._join_timeout_s = join_timeout_s
         self._rejoin_timeout_s = rejoin_timeout_s
-        self._attempt = 0
+        self._attempt = identity.process_nonce
         self._last_heard_s = self._due_s = self._joining_s = now
         self._backoff_s = HELLO_FIRST_S
         self._reason = ""

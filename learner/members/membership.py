@@ -107,7 +107,7 @@ class Member:
 
     def record_heartbeat(self, heartbeat: Heartbeat) -> list[int]:
         """Keep the heartbeat. Returns the tickets that were lost on the way."""
-        if self.heartbeat is None and self.hello.attempt > 1:
+        if self.heartbeat is None and not self.hello.is_first_attempt:
             self.stages_before = heartbeat.stages
         self.heartbeat = msgspec.structs.replace(heartbeat, tickets=())  # what is kept of it is small
         steps, since_s = self.measured

@@ -90,7 +90,9 @@ MUTATIONS = {
     "a repeated Welcome starts the session again": Mutation(
         SESSION, "self.state is State.READY and message.session == self.session", "False"
     ),
-    "a worker that joins again repeats its Hello": Mutation(SESSION, "self._attempt += 1", "self._attempt = 1"),
+    "a worker that joins again repeats its Hello": Mutation(
+        SESSION, "self._attempt += 1", "self._attempt = self.identity.process_nonce + 1"
+    ),
     "finished work stays in progress": Mutation(
         SESSION,
         "self._current.in_progress = ()\n        effects: list",

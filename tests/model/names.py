@@ -18,6 +18,8 @@ from learner.rollouts.evaluation_tickets import FIRST_TICKET
 BITS = 20
 MASK = (1 << BITS) - 1
 
+ATTEMPTS = 1 << 8  # so far apart are the nonces of the processes of a worker: none starts to join so often
+
 
 class Kind(IntEnum):
     """What a name names. Kinds with a scope come after the kind of their scope."""
@@ -30,10 +32,10 @@ class Kind(IntEnum):
     """scope: the lane"""
     REPLIES = 5
     """number of heartbeat replies; 0 stays 0, because each session begins with it; scope: the session"""
-    ATTEMPT = 6
-    """keeps its value, because each process begins at 1; scope: the worker"""
-    NONCE = 7
-    """process of a worker; scope: the worker"""
+    NONCE = 6
+    """process of a worker, a multiple of `ATTEMPTS`; scope: the worker"""
+    ATTEMPT = 7
+    """counted from the nonce of the process, from which it keeps its distance; scope: the worker"""
     OLD_SESSION = 8
     OLD_TICKET = 9
     EVALUATION = 10
@@ -71,9 +73,11 @@ def name(kind: Kind, value: int, scope: int = 0) -> Name:
 
 
 def names_in(content: Any, found: set[Name]) -> set[Name]:
-    """All names in nested tuples."""
+    """All names in nested tuples. An attempt to join also names the process."""
     if isinstance(content, Name):
         found.add(content)
+        if content.kind is Kind.ATTEMPT:
+            found.add(name(Kind.NONCE, content.value - content.value % ATTEMPTS, content.scope))
     elif isinstance(content, tuple):
         for each in content:
             names_in(each, found)
@@ -104,8 +108,11 @@ def renaming(names: Iterable[int], workers: dict[int, int]) -> dict[Name, Name |
             base = kind << 2 * BITS | scope << BITS
         if kind is Kind.WORKER:
             to = base | workers[old & MASK]
-        elif kind in (Kind.ATTEMPT, Kind.EVALUATION):
+        elif kind is Kind.EVALUATION:
             to = base | old & MASK
+        elif kind is Kind.ATTEMPT:
+            attempt = (old & MASK) % ATTEMPTS
+            to = base | (new[old - attempt - (1 << 2 * BITS)] & MASK) + attempt
         elif kind in OLD:
             same = new.get(OLD[kind] << 2 * BITS | old & MASK)
             if same is None:
@@ -114,7 +121,7 @@ def renaming(names: Iterable[int], workers: dict[int, int]) -> dict[Name, Name |
             to = base | same & MASK
         else:
             to = base | following
-            following += 1
+            following += ATTEMPTS if kind is Kind.NONCE else 1
         new[old] = to
         if to != old:
             changed[Name(old)] = Name(to)

@@ -44,9 +44,7 @@ def test_two_workers_one_lane_one_fault_of_any_kind() -> None:
         Training(workers=2, lanes=1, updates=2, faults=2),
         Training(workers=2, lanes=1, updates=2, faults=1, max_lag=1),
         Training(workers=2, lanes=2, updates=1, faults=1),
-        # Not three: a Welcome does not name a process. If a copy of a Hello outlives its process, which is killed, and the
-        # Hello of the next process is lost, the next process goes on in the session before, and a rollout is rejected.
-        Training(workers=1, lanes=1, updates=2, faults=2),
+        Training(workers=1, lanes=1, updates=2, faults=3),
         Training(workers=2, lanes=1, updates=1, faults=2, only=("drop up", "drop down")),
     ],
     ids=str,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from protocol.messages import HeartbeatReply, ToLearner, ToWorker
 from tests.model.conversation import Content, Event
 from tests.model.message_content import incarnation, rollout_content, rollout_of, session, ticket, weights
-from tests.model.names import MASK, Kind, name
+from tests.model.names import ATTEMPTS, MASK, Kind, name
 from tests.model.settings import FOR_EVER_S, TIMEOUT_S, Settings
 from tests.support.fake_ends import fake_rollouts
 from workers.collect.held_rollouts import REMEMBERED_TICKETS, Assignment, HeldRollouts, _HeldLane
@@ -52,7 +52,7 @@ class Worker:
 
     def start(self, now: float) -> list[ToLearner]:
         """A new process starts under the same name."""
-        self.nonce += 1
+        self.nonce += ATTEMPTS
         self.shut_out = False
         who = Identity(f"w{self.number}", "host", 1, self.nonce, "model")
         self.session = Session(who, now, join_timeout_s=FOR_EVER_S, rejoin_timeout_s=FOR_EVER_S)

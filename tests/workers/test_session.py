@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Sequence
 from typing import TypeVar
@@ -58,6 +59,7 @@ WHO = Identity("w0", "host", 7, 77, "fake 1")
 RUN = run_spec(lanes=4)  # heartbeat_s 1, learner_timeout_s 6
 SESSION = 11
 JOIN_S, REJOIN_S = 60.0, 600.0
+FIRST = WHO.process_nonce + 1  # number of the first attempt to join
 
 
 def sent(effects: Sequence[Effect], kind: type[M]) -> list[M]:
@@ -91,7 +93,7 @@ def ready(*messages: ToWorker, version: int | None = 0) -> Session:
     """A session that was welcomed at time 0, holds weights of this version, and then heard `messages`."""
     session = joining()
     session.tick(0.0)
-    session.handle(Welcome(SESSION, 1, RUN), 0.0)
+    session.handle(Welcome(SESSION, FIRST, RUN), 0.0)
     if version is not None:
         session.handle(weights(version), 0.0)
         session.tick(0.0)  # acknowledges them
@@ -121,7 +123,7 @@ def hello_attempt(effects: Sequence[Effect]) -> int:
 
 def test_hello_has_the_identity_and_the_protocol_version() -> None:
     (hello,) = sent(joining().tick(0.0), Hello)
-    assert hello == Hello(PROTOCOL_VERSION, "w0", "host", 7, 77, "fake 1", 1)
+    assert hello == Hello(PROTOCOL_VERSION, "w0", "host", 7, 77, "fake 1", FIRST)
 
 
 def test_hello_repeats_with_backoff_and_keeps_its_attempt() -> None:
@@ -135,7 +137,7 @@ def test_hello_repeats_with_backoff_and_keeps_its_attempt() -> None:
     gaps = [after - before for before, after in itertools.pairwise(times)]
     assert gaps[:5] == [0.25, 0.5, 1.0, 2.0, 4.0]
     assert set(gaps[4:]) == {HELLO_MOST_S}
-    assert attempts == {1}
+    assert attempts == {FIRST}
 
 
 def test_next_due_s_is_the_time_of_the_next_hello() -> None:
@@ -147,35 +149,45 @@ def test_next_due_s_is_the_time_of_the_next_hello() -> None:
 
 def test_joining_again_raises_the_attempt_and_resets_the_backoff() -> None:
     session = ready()
-    assert hello_attempt(session.handle(Rejoin(SESSION), 5.0)) == 2
+    assert hello_attempt(session.handle(Rejoin(SESSION), 5.0)) == FIRST + 1
     assert session.next_due_s() == 5.0 + HELLO_FIRST_S
 
 
 def test_welcome_starts_a_session() -> None:
     session = joining()
     session.tick(0.0)
-    assert session.handle(Welcome(SESSION, 1, RUN), 0.1) == [StartSession(RUN)]
+    assert session.handle(Welcome(SESSION, FIRST, RUN), 0.1) == [StartSession(RUN)]
     assert (session.state, session.session, session.run) == (State.READY, SESSION, RUN)
 
 
 def test_welcome_for_an_older_attempt_is_ignored() -> None:
     session = ready()
     session.handle(Rejoin(SESSION), 1.0)
-    assert session.handle(Welcome(12, 1, RUN), 1.1) == []
+    assert session.handle(Welcome(12, FIRST, RUN), 1.1) == []
     assert session.state is State.JOINING
-    assert session.handle(Welcome(13, 2, RUN), 1.2) == [StartSession(RUN)]
+    assert session.handle(Welcome(13, FIRST + 1, RUN), 1.2) == [StartSession(RUN)]
+
+
+def test_welcome_for_a_process_that_has_ended_is_ignored() -> None:
+    """The learner answers its delayed Hello when another process of the same name joins."""
+    ended = dataclasses.replace(WHO, process_nonce=WHO.process_nonce - 1_000)
+    (late,) = sent(Session(ended, 0.0, join_timeout_s=JOIN_S, rejoin_timeout_s=REJOIN_S).tick(0.0), Hello)
+    session = joining()
+    session.tick(0.0)
+    assert session.handle(Welcome(12, late.attempt, RUN), 0.1) == []
+    assert session.state is State.JOINING
 
 
 def test_a_repeated_welcome_is_ignored() -> None:
     session = ready(collect((0, 0)))
-    assert session.handle(Welcome(SESSION, 1, RUN), 0.1) == []
+    assert session.handle(Welcome(SESSION, FIRST, RUN), 0.1) == []
     assert session.held_count() == 1
 
 
 def test_welcome_to_another_session_of_the_same_attempt_starts_anew() -> None:
     """The learner gave this worker up, then heard a late Hello of it."""
     session = ready(collect((0, 0)))
-    assert session.handle(Welcome(12, 1, RUN), 0.1) == [StartSession(RUN)]
+    assert session.handle(Welcome(12, FIRST, RUN), 0.1) == [StartSession(RUN)]
     assert (session.session, session.held_count()) == (12, 0)
 
 
@@ -448,7 +460,7 @@ def test_nothing_of_a_session_outlives_it() -> None:
     closed, *_ = session.handle(Rejoin(SESSION), 1.0)
     assert closed == CloseLanes((LaneIncarnation(0, 0), LaneIncarnation(1, 0)))
     assert session.held_count() == 0
-    session.handle(Welcome(12, 2, RUN), 1.1)
+    session.handle(Welcome(12, FIRST + 1, RUN), 1.1)
     assert session.held_count() == 0
     assert session.next_task() is None
     (heartbeat,) = sent(session.tick(2.2), Heartbeat)
@@ -461,7 +473,7 @@ def test_a_task_of_an_ended_session_is_abandoned_and_its_rollouts_are_not_sent()
     assert not session.abandoned(task.session)
     session.handle(Rejoin(SESSION), 1.0)
     assert session.abandoned(task.session)
-    session.handle(Welcome(12, 2, RUN), 1.1)
+    session.handle(Welcome(12, FIRST + 1, RUN), 1.1)
     assert session.abandoned(task.session)
     session.handle(msgspec.structs.replace(collect((0, 0)), session=12), 1.2)  # the same ticket number again
     assert session.finished(fake_rollouts(task)) == []
@@ -487,13 +499,13 @@ def test_rejoin_is_answered_by_hello_at_once() -> None:
     effects = session.handle(Rejoin(SESSION), 3.0)
     assert session.state is State.JOINING
     assert effects[0] == CloseLanes((LaneIncarnation(0, 0),))
-    assert hello_attempt(effects) == 2
+    assert hello_attempt(effects) == FIRST + 1
 
 
 def test_a_worker_joins_a_silent_learner_again() -> None:
     session = ready(collect((0, 0)))
     assert sent(session.tick(6.0), Heartbeat)
-    assert hello_attempt(session.tick(6.1)) == 2
+    assert hello_attempt(session.tick(6.1)) == FIRST + 1
     assert (session.state, session.held_count()) == (State.JOINING, 0)
 
 
@@ -652,7 +664,7 @@ def test_a_worker_that_has_left_sends_nothing() -> None:
 # -------------------------------------------------------------------- the table
 
 EVERY_MESSAGE: list[ToWorker] = [
-    Welcome(SESSION, 1, RUN),
+    Welcome(SESSION, FIRST, RUN),
     Refuse("no"),
     Rejoin(SESSION),
     weights(5),

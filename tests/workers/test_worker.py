@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import cast
 
 import msgspec
@@ -83,7 +84,7 @@ class Unanswered(FakeLink):
 
 
 def work(link: FakeLink) -> Leave:
-    return Worker(cast(WorkerLink, link), Session(identity("w0"), 0.0), clock=lambda: 0.0).run()
+    return Worker(cast(WorkerLink, link), Session(replace(identity("w0"), process_nonce=0), 0.0), clock=lambda: 0.0).run()
 
 
 PARAMETERS = np.random.default_rng(0).normal(0, 0.1, acting_size(RUN.policy)).astype(np.float32)

@@ -60,7 +60,7 @@ def of_three(env: DescribedEnv) -> None:
 
 
 def hello(name: bytes, nonce: int = 1, attempt: int = 1) -> Hello:
-    return Hello(PROTOCOL_VERSION, name.decode(), "host", 1, nonce, "fake", attempt)
+    return Hello(PROTOCOL_VERSION, name.decode(), "host", 1, nonce, "fake", nonce + attempt)
 
 
 def join(made: DescribeCoordinator, name: bytes, nonce: int = 1) -> int:

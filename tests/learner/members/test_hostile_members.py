@@ -66,7 +66,7 @@ class Noisy:
 
 
 def hello(name: str, nonce: int = 1, host: str = "host", attempt: int = 1) -> Hello:
-    return Hello(PROTOCOL_VERSION, name, host, 1, nonce, "fake", attempt)
+    return Hello(PROTOCOL_VERSION, name, host, 1, nonce, "fake", nonce + attempt)
 
 
 def logged(caplog: pytest.LogCaptureFixture) -> int:

@@ -82,7 +82,8 @@ class Learner:
         return self.balanced(self.coordinator.receive(peer, message, self.now))
 
     def joins(self, peer: bytes, *, pid: int = 1, attempt: int = 1, host: str = "host") -> list[Outgoing]:
-        return self.says(peer, Hello(PROTOCOL_VERSION, peer.decode(), host, pid, 1000 * len(host) + pid, "fake", attempt))
+        nonce = 1000 * len(host) + pid
+        return self.says(peer, Hello(PROTOCOL_VERSION, peer.decode(), host, pid, nonce, "fake", nonce + attempt))
 
     def session(self, peer: bytes) -> int:
         return self.coordinator.members[peer].session
@@ -164,7 +165,7 @@ def test_hello_is_answered_by_welcome_weights_and_collect_in_this_order() -> Non
     learner = Learner(lanes=2)
     outs = learner.joins(A)
     assert kinds(outs, A) == [Welcome, Weights, Collect]
-    assert of(outs, Welcome) == [Welcome(100, 1, learner.coordinator.run)]
+    assert of(outs, Welcome) == [Welcome(100, 4_002, learner.coordinator.run)]
     assert learner.coordinator.events == [WorkerJoined("a", "host", 1)]
 
 
@@ -196,7 +197,7 @@ def test_a_later_attempt_of_the_same_process_begins_a_new_session() -> None:
     learner = Learner(lanes=2)
     learner.joins(A)
     outs = learner.joins(A, attempt=2)
-    assert of(outs, Welcome) == [Welcome(101, 2, learner.coordinator.run)]
+    assert of(outs, Welcome) == [Welcome(101, 4_003, learner.coordinator.run)]
     assert learner.coordinator.ledger.lost == 2
     assert {permit.incarnation for permit in permits(outs)} == {1}
 

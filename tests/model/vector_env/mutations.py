@@ -42,6 +42,9 @@ OF_THE_LEARNER = {
 OF_THE_WORKER = {
     "a repeated order is executed again": Mutation(HELD, "order.ticket > lane.newest:", "order.ticket >= lane.newest:"),
     "an answer is not sent again": Mutation(HELD, "return lane.answer if lane.answer is not None and", "return None if"),
+    "two processes count their attempts to join alike": Mutation(
+        SESSION, "self._attempt = identity.process_nonce", "self._attempt = 0"
+    ),
     "an executed order stays": Mutation(HELD, "lane.order, lane.answer = None, answer", "lane.answer = answer"),
     "an answer is not kept": Mutation(HELD, "lane.order, lane.answer = None, answer", "lane.order = None"),
     "replies to heartbeats are not counted": Mutation(SESSION, "self._current.replies = number", "pass"),
@@ -60,6 +63,7 @@ def runs() -> list[Conversation]:
         Stepping(workers=1, lanes=1, calls=("reset", "step", "step", "step"), faults=1),
         Stepping(workers=1, lanes=2, calls=("reset", "step"), faults=1),
         Stepping(workers=2, lanes=1, calls=("reset", "step", "step"), faults=1),
+        Stepping(workers=1, lanes=1, calls=("reset", "step"), faults=2),
     ]
 
 

@@ -23,6 +23,8 @@ SMALL = [
     Stepping(workers=1, lanes=1, calls=("reset", "step", "call", "step"), faults=1),
 ]
 LARGE = [
+    Stepping(workers=1, lanes=1, calls=("reset", "step", "call", "step"), faults=2),
+    Stepping(workers=2, lanes=1, calls=("reset", "step"), faults=2),
     Stepping(workers=2, lanes=1, calls=("reset", "step", "step"), faults=1),
     Stepping(workers=1, lanes=2, calls=("reset", "step", "call", "step"), faults=1),
     Stepping(workers=2, lanes=2, calls=("reset", "step", "step"), faults=1),

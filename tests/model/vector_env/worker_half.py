@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from protocol.messages import Answer, ToLearner
 from tests.model.conversation import Content, Event
 from tests.model.message_content import incarnation, session, ticket
-from tests.model.names import MASK, Kind, name
+from tests.model.names import ATTEMPTS, MASK, Kind, name
 from tests.model.settings import FOR_EVER_S, TIMEOUT_S
 from tests.model.vector_env.order_content import (
     NEW,
@@ -63,7 +63,7 @@ class Worker:
                 assert current is not None
                 return self._turn(current.handle(message_of(message, self.number, run.run), now), now)
             case ("start",):
-                self.nonce += 1
+                self.nonce += ATTEMPTS
                 self.shut_out = False
                 who = Identity(f"w{self.number}", "host", 1, self.nonce, "model")
                 self.session = Session(who, now, join_timeout_s=FOR_EVER_S, rejoin_timeout_s=FOR_EVER_S)
