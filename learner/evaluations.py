@@ -63,7 +63,7 @@ class Evaluations:
         """Whether an evaluation is due after so many env steps."""
         return bool(self._settings.every_env_steps) and env_steps >= self.next_at
 
-    def evaluate_newest(self, version: int, env_steps: int) -> dict[str, float]:
+    def evaluate_newest(self, version: int, env_steps: int) -> dict[str, float | None]:
         """Make the evaluation that is due, of the newest policy, which is this version. Returns its metrics."""
         found = self._evaluate_version(version, env_steps)
         self._keep_if_best(found, env_steps)

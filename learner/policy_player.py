@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import math
 import os
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from learner.config.rollout_config import RolloutConfig
 from learner.members.describe import DescribeSettings, described_by_workers
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.rollouts.evaluation_tickets import EvaluationPlan, OnRows, PlayedEpisode
@@ -34,12 +36,23 @@ class SavedPolicy(NamedTuple):
     env: EnvSpec
     parameters: Floats
     buffers: Floats
+    facts: tuple[str, ...] = ()
+    """names of the numbers that the run logs of each episode"""
 
 
 def saved_policy(run: Path, which: Which = "final") -> SavedPolicy:
     """Read a policy of a run folder. Raises `UsageError`, with a one-line message, if it cannot be read."""
     card, parameters, buffers = RunFolder.open(run).read_policy(which)
-    return SavedPolicy(card.policy, EnvSpec(card.env, card.env_kwargs), parameters, buffers)
+    return SavedPolicy(card.policy, EnvSpec(card.env, card.env_kwargs), parameters, buffers, _facts(run))
+
+
+def _facts(run: Path) -> tuple[str, ...]:
+    """The `info_keys` of a run; none if its config.toml cannot be read."""
+    try:
+        keys = tomllib.loads((run / "config.toml").read_text("utf-8")).get("info_keys", "")
+        return RolloutConfig(info_keys=keys).fact_names() if isinstance(keys, str) else ()
+    except (OSError, ValueError):
+        return ()
 
 
 def load_policy(run: Path, which: Which = "final") -> tuple[Policy, PolicySpec, EnvSpec]:
@@ -98,7 +111,7 @@ class PolicyPlayer:
 
     def _published(self) -> Hub:
         policy = self.policy
-        run = RunSpec(policy.env, policy.spec, rollout_steps=1, copies=1, lanes=1, seed=0)
+        run = RunSpec(policy.env, policy.spec, rollout_steps=1, copies=1, lanes=1, seed=0, facts=policy.facts)
         coordinator = TicketCoordinator(
             run,
             rollouts_per_update=1,

@@ -71,7 +71,7 @@ class RunRecorder:
         self._requests = Requests()
         self._settings = msgspec.to_builtins(config)
         self._update: dict[str, Any] = {}  # facts of the last update: fields of `Progress`
-        self._window = EpisodeWindow.from_state(state.episodes)
+        self._window = EpisodeWindow.from_state(state.episodes, state.facts, spec.facts)
         self._metrics = MetricsLog(folder.path, state.env_steps)
         self._episode_recorder = episode_recorder
         self._stages_s = {"update": 0.0, "other": 0.0}
@@ -85,6 +85,7 @@ class RunRecorder:
         self._saved_to = ""  # path of the newest checkpoint
         self._finished = False
         self._said_s = -SAY_AGAIN_S
+        self._said_missing = False  # whether facts were looked for in the first episodes
         self._trouble = ""  # with the folder, as it was said last
         self._workers_alive = 0
         service.report(self.progress())
@@ -127,6 +128,8 @@ class RunRecorder:
         self.env_steps += batch.env_steps
         self._window.extend(batch.episodes)
         self._update = {"episodes": batch.episodes}
+        if self._spec.facts and self._window.full and not self._said_missing:
+            self._say_missing_facts()
         self._episodes_since_save += len(batch.episodes)
 
     def training_goes_on(self) -> bool:
@@ -239,6 +242,7 @@ class RunRecorder:
             steps_per_s=(self.env_steps - self._steps_before) / here_s if here_s else 0.0,
             return_mean=self._window.return_mean,
             length_mean=self._window.length_mean,
+            facts=self._window.facts,
             lag_mean=sum(lags) / len(lags),
             lag_max=max(lags),
             workers_alive=self._workers_alive,
@@ -288,6 +292,13 @@ class RunRecorder:
             if now - self._said_s >= SAY_AGAIN_S:
                 self._said_s = now
                 log.warning("%s; the run goes on, and says so at most once a minute", error)
+
+    def _say_missing_facts(self) -> None:
+        """Say once which facts no episode had: perhaps they are called otherwise."""
+        self._said_missing = True
+        if names := [name for name, fact in self._window.facts.items() if fact.mean is None]:
+            last = "none of the last 100 episodes had it in the info of its last step"
+            log.warning("info_keys %s: %s; is it called so?", ", ".join(names), last)
 
     def _save_checkpoint(self, state: dict[str, Any]) -> None:
         path = checkpoint.save(self._folder.path, state, self.env_steps, self._checkpoints.keep)
@@ -342,6 +353,7 @@ class RunRecorder:
             ledger=snapshot.ledger,
             incarnations=snapshot.incarnations,
             episodes=self._window.state(),
+            facts=list(self._spec.facts),
             best=self._evaluations.best,
             best_policy=self._evaluations.best_policy,
             newest_evaluation=self._evaluations.newest,
@@ -361,6 +373,7 @@ class RunRecorder:
             env_steps_per_s=self.env_steps / wall_s if wall_s else 0.0,
             stop_reason=reason,
             return_mean_100=self._window.return_mean,
+            facts_100=self._window.facts,
             evaluation=self._evaluations.of_version(self.version),
             best=self._confirmed,
             ledger=snapshot.ledger.counts(),

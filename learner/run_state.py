@@ -28,6 +28,8 @@ class RunState(msgspec.Struct, kw_only=True):
     """The next incarnation of each lane."""
     episodes: list[Any] = []
     """State of the `EpisodeWindow`."""
+    facts: list[str] = []
+    """Names of the facts of these episodes."""
     best: list[float] | None = None
     """Mean return and env steps of the best evaluation."""
     best_policy: Any = None

@@ -174,7 +174,8 @@ def play(flags: EvaluateFlags, watch: Watch, env: Environment | None = None) -> 
     with policy_player(saved, workers, watch) as player:
         if flags.video:
             return record_videos(player, flags.run, episodes, flags.seed)
-        return evaluation_of(player.play(EvaluationPlan.of(episodes, flags.seed, copies, flags.max_steps))), []
+        played = player.play(EvaluationPlan.of(episodes, flags.seed, copies, flags.max_steps))
+        return evaluation_of(played, saved.facts), []
 
 
 def write_dataset(flags: RecordFlags, watch: Watch, env: Environment | None = None) -> RecordedDataset:

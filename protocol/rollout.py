@@ -13,13 +13,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Annotated
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
+from msgspec import Meta
 
 from protocol.arrays import Array, Bools, Floats
-from protocol.bounds import Count, Natural, Real, Seconds
+from protocol.bounds import MAX_FACTS, Count, Natural, Real, Seconds
 from protocol.errors import BadRollout
 from protocol.specs import ActionSpec, Leaf, RunSpec
 
@@ -33,7 +35,7 @@ class Episode(msgspec.Struct, frozen=True, array_like=True):
     """the return: undiscounted sum of raw rewards"""
     length: Count
     seconds: Seconds
-    facts: tuple[float, ...] = ()
+    facts: Annotated[tuple[float, ...], Meta(max_length=MAX_FACTS)] = ()
     """one number for each name in `RunSpec.facts`, from the info of the episode's last step; NaN where it had none"""
 
 
@@ -141,8 +143,17 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
             raise BadRollout(
                 f"episode: expected a finite return of 1 to {steps_so_far} float32 rewards and a duration, got {episode}"
             )
-        if len(episode.facts) != len(run.facts):
-            raise BadRollout(f"episode: expected {len(run.facts)} facts, got {len(episode.facts)}")
+        if why := wrong_facts(episode, len(run.facts)):
+            raise BadRollout(f"episode: {why}")
+
+
+def wrong_facts(episode: Episode, count: int) -> str:
+    """What is wrong with the facts of an episode; empty if they are `count` numbers, each finite or NaN (missing)."""
+    if len(episode.facts) != count:
+        return f"expected {count} facts, got {len(episode.facts)}"
+    if any(map(math.isinf, episode.facts)):
+        return f"expected finite facts, got {episode.facts}"
+    return ""
 
 
 def outside_of_space(array: Array, leaf: Leaf) -> str:

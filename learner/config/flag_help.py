@@ -27,7 +27,7 @@ BASIC = (
     "eval_episodes", "eval_every", "target_return", "target_mean_return",
 )  # fmt: skip
 GROUPS = {
-    "evaluation": ("eval_copies", "eval_max_steps"),
+    "evaluation": ("eval_copies", "eval_max_steps", "info_keys"),
     "worker": (
         "lanes", "max_lag", "vector", "inference", "images_dtype", "torch_threads", "pin_workers", "min_workers",
     ),

@@ -132,6 +132,8 @@ def _defaults_of(algo: str, where: str = "") -> Config:
 def _coerce(record: msgspec.Struct, name: str, value: Any) -> Any:
     """1e5 becomes an integer where the field is one, and "none" becomes None where the default is None."""
     default = getattr(type(record)(), name)
+    if name == "info_keys" and isinstance(value, list | tuple):
+        return ",".join(map(str, value))
     if value == "none" and default is None:
         return None
     if isinstance(value, float) and type(default) is int and value.is_integer():

@@ -57,6 +57,10 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """Precision in which the acting policy processes images. bfloat16 halves the work on CPUs with AMX and is slower
     elsewhere. The learner always computes in float32.
     """
+    info_keys: Free[str] = ""
+    """Names of numbers that the environment reports in info at the end of an episode, separated by commas, as
+    is_success,distance. Their means are logged.
+    """
     pin_workers: Free[bool | None] = None
     """Keep each local worker process on one core (train only). none: do so if max_lag is 0 and the number of workers is a
     multiple of the number of cores.
@@ -119,6 +123,10 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """
     max_env_failures: Free[Natural] = 3
     """End the run if the environment has raised more exceptions, or ended more worker processes, than this."""
+
+    def fact_names(self) -> tuple[str, ...]:
+        """The names in `info_keys`."""
+        return tuple(name for part in self.info_keys.split(",") if (name := part.strip()))
 
     def call_timeouts(self) -> CallTimeouts:
         """How long a call of an env copy may take."""

@@ -12,6 +12,7 @@ from learner.config.config import Config
 from learner.config.hyperparameters import DQNConfig
 from learner.config.rollout_config import RolloutConfig
 from protocol.address import advertised_address, check_address
+from protocol.bounds import MAX_FACTS, MAX_NAME, one_line
 from protocol.errors import UsageError
 
 
@@ -63,6 +64,11 @@ def check_rollout_settings(config: RolloutConfig, at: str = "") -> None:
         raise UsageError(
             f"{at}{config.envs} envs cannot be shared evenly among {config.lanes} lanes; take {near}, or {divisor} lanes"
         )
+    names = config.fact_names()
+    if len(names) > MAX_FACTS or len(set(names)) < len(names):
+        raise UsageError(f"{at}info_keys: expected at most {MAX_FACTS} different names, got {len(names)}")
+    if wrong := [name for name in names if name != one_line(name, MAX_NAME)]:
+        raise UsageError(f"{at}info_keys: expected names in one line, got {one_line(repr(wrong[0]), MAX_NAME)}")
     try:
         check_address(config.bind)
     except UsageError as error:

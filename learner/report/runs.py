@@ -16,7 +16,7 @@ import numpy as np
 
 from learner.report.curve import Curve, Purpose, algorithm_label, read_run_files
 from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
-from learner.run_folder.results import EVALUATION_KEY, Evaluation
+from learner.run_folder.results import EVALUATION_KEY, Evaluation, FactMean
 from learner.run_folder.run_folder import RunFolder
 from protocol.arrays import Doubles
 
@@ -38,6 +38,8 @@ class RunResults(NamedTuple):
     """why the run stopped, or that it has not stopped"""
     ledger: dict[str, int]
     stages: dict[str, float]
+    facts: dict[str, FactMean] = {}
+    """of each name in `info_keys`: mean over the last training episodes"""
 
 
 @dataclass(frozen=True)
@@ -168,7 +170,7 @@ def _results(path: Path, rows: Sequence[dict[str, Any]]) -> RunResults:
     if summary is not None:
         return RunResults(
             summary.env_steps, summary.updates, summary.wall_s, summary.env_steps_per_s, summary.return_mean_100,
-            summary.evaluation, summary.stop_reason, summary.ledger, summary.stages,
+            summary.evaluation, summary.stop_reason, summary.ledger, summary.stages, summary.facts_100,
         )  # fmt: skip
     last = rows[-1] if rows else {}
     env_steps, wall_s = int(last.get(ENV_STEPS_KEY) or 0), float(last.get("time/time_elapsed") or 0)

@@ -6,7 +6,7 @@ Rule: text from run folders is escaped.
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from html import escape
 
 import numpy as np
@@ -16,6 +16,7 @@ from learner.report.curve import common_grid
 from learner.report.html_parts import color_dot, return_text, section, time_text
 from learner.report.runs import ReportData, RunGroup, differing_settings
 from learner.run_folder.episode_window import WINDOW_EPISODES
+from learner.run_folder.results import FactMean
 
 WIDE, NARROW = (1080, 360), (540, 320)
 MOST_VIDEO_BYTES, MOST_BYTES_OF_ALL_VIDEOS = 4 * 2**20, 24 * 2**20
@@ -71,7 +72,9 @@ def _rows_of_group(group: RunGroup) -> str:
             spread = f"± {results.evaluation.return_std:,.1f}, {results.evaluation.episodes} episodes"
             cut = f", {results.evaluation.cut} cut" if results.evaluation.cut else ""
             greedy = f"<strong>{return_text(results.evaluation.return_mean)}</strong><small>{escape(spread + cut)}</small>"
+            greedy += _facts(results.evaluation.facts)
         mean = "" if results.return_mean_100 is None else return_text(results.return_mean_100)
+        mean += _facts(results.facts)
         cells = [
             greedy,
             mean,
@@ -91,6 +94,10 @@ def _rows_of_group(group: RunGroup) -> str:
         mean, worst, best = map(return_text, (sum(returns) / len(returns), min(returns), max(returns)))
         name += f"<span>greedy {mean} on average, {worst} to {best}</span>"
     return f'<tbody><tr class="line"><th scope="rowgroup" colspan="8">{name}</th></tr>{"".join(rows)}</tbody>'
+
+
+def _facts(facts: Mapping[str, FactMean]) -> str:
+    return "".join(f"<small>{escape(f'{name} {fact}')}</small>" for name, fact in facts.items())
 
 
 def curves(report: ReportData) -> str:

@@ -62,7 +62,7 @@ class RolloutService:
         `watch` is called with the number of episodes that were played, several times a second. Raises `RunError` when the
         run cannot go on.
         """
-        return evaluation_of(self._hub.evaluate(plan, watch))
+        return evaluation_of(self._hub.evaluate(plan, watch), self._hub.coordinator.run.facts)
 
     def drain(self, reason: str, timeout_s: float = 5.0) -> None:
         """Ask every worker to leave, and wait for that at most `timeout_s`."""

@@ -36,6 +36,7 @@ def rollout_spec(
         compress=config.compress,
         images_dtype=config.images_dtype,
         extras=extras,
+        facts=config.fact_names(),
         heartbeat_s=config.heartbeat_s,
     )
     _check_weights_can_be_sent(env.id, policy, config)

@@ -14,13 +14,14 @@ import heapq
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from learner.members.membership import Member, Outgoing
 from learner.rollouts.row_checks import reason_to_reject
-from learner.run_folder.results import Evaluation
+from learner.run_folder.results import Evaluation, fact_means
 from protocol.messages import EpisodeRows, Evaluate, Evaluated, Heartbeat
-from protocol.rollout import LARGEST_REWARD, Episode
+from protocol.rollout import LARGEST_REWARD, Episode, wrong_facts
 from protocol.specs import PolicySpec
 
 FIRST_TICKET = 1 << 52
@@ -70,19 +71,22 @@ class PlayedEpisode:
     cut: bool
 
 
-def evaluation_of(played: Sequence[PlayedEpisode]) -> Evaluation:
-    """The evaluation that these episodes make."""
+def evaluation_of(played: Sequence[PlayedEpisode], facts: Sequence[str] = ()) -> Evaluation:
+    """The evaluation that these episodes make. `facts`: the names of their facts."""
     episodes = [one.episode for one in played]
     cut = sum(one.cut for one in played)
-    return Evaluation.of([episode.reward for episode in episodes], [episode.length for episode in episodes], cut)
+    evaluation = Evaluation.of([episode.reward for episode in episodes], [episode.length for episode in episodes], cut)
+    if not facts:
+        return evaluation
+    return msgspec.structs.replace(evaluation, facts=fact_means(facts, [episode.facts for episode in episodes]))
 
 
 class EvaluationTickets:
     """The tickets of the evaluation that is pending, if there is one."""
 
-    def __init__(self, policy: PolicySpec) -> None:
-        """`policy`: that of the run, which says what rows look like."""
-        self._policy = policy
+    def __init__(self, policy: PolicySpec, facts: int = 0) -> None:
+        """`policy`: that of the run, which says what rows look like. `facts`: how many numbers each episode has."""
+        self._policy, self._facts = policy, facts
         self._plan: EvaluationPlan | None = None
         self._version = -1
         self._on_rows: OnRows | None = None
@@ -224,8 +228,8 @@ class EvaluationTickets:
         if len(answer.episodes) != seeds or len(answer.cut) != seeds:
             return f"expected {seeds} episodes, got {len(answer.episodes)} and {len(answer.cut)} marks of cut ones"
         for episode in answer.episodes:
-            if episode.facts:
-                return f"expected episodes without facts, got {len(episode.facts)}"
+            if why := wrong_facts(episode, self._facts):
+                return f"episode: {why}"
             if episode.length > most:
                 return f"expected episodes of at most {most} steps, got {episode.length}"
             if not abs(episode.reward) <= episode.length * LARGEST_REWARD:  # false for NaN too

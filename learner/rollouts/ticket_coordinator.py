@@ -108,7 +108,7 @@ class TicketCoordinator:
         self._absent = list(incarnations[run.lanes :])  # incarnations of lanes that the run had, and may have again
         self.tickets: dict[int, Ticket] = {}
         self.ready: list[AcceptedRollout] = []
-        self.evaluation = EvaluationTickets(run.policy)
+        self.evaluation = EvaluationTickets(run.policy, len(run.facts))
         self._held_back = False  # whether to deal no ticket for a rollout, because an evaluation is about to begin
         self._placement, self._queue = LanePlacement(self.lanes, _by_joining), LaneQueue(self.lanes)
         self._oldest_ready = version  # no rollout that is ready is older

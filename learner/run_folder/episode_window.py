@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from learner.run_folder.results import FactMean, fact_means
 from protocol.rollout import Episode
 
 WINDOW_EPISODES = 100
@@ -17,7 +19,11 @@ WINDOW_EPISODES = 100
 class EpisodeWindow:
     """The last 100 episodes."""
 
-    def __init__(self, episodes: Sequence[Episode] = ()) -> None:
+    def __init__(self, episodes: Sequence[Episode] = (), facts: Sequence[str] = ()) -> None:
+        """`facts`: the names of the facts of episodes."""
+        self.facts: dict[str, FactMean] = fact_means(facts, ())
+        """The means of their facts, by name."""
+        self._names = facts
         self.return_mean: float | None = None
         """Mean return, or None before the first episode has ended."""
         self.length_mean: float | None = None
@@ -26,9 +32,14 @@ class EpisodeWindow:
         self.extend(episodes)
 
     @staticmethod
-    def from_state(state: list[Any]) -> EpisodeWindow:
-        """The window whose `state` this is."""
-        return EpisodeWindow(msgspec.convert(state, list[Episode]))
+    def from_state(state: list[Any], had: Sequence[str] = (), facts: Sequence[str] = ()) -> EpisodeWindow:
+        """The window whose `state` this is. `had`: the names of the facts in it; `facts`: those of new episodes."""
+        episodes = msgspec.convert(state, list[Episode])
+        if tuple(had) != tuple(facts):
+            by_name = (dict(zip(had, one.facts, strict=True)) for one in episodes)
+            renamed = (tuple(of_one.get(name, math.nan) for name in facts) for of_one in by_name)
+            episodes = [msgspec.structs.replace(one, facts=new) for one, new in zip(episodes, renamed, strict=True)]
+        return EpisodeWindow(episodes, facts)
 
     def state(self) -> list[Any]:
         """The episodes as plain data, for a checkpoint."""
@@ -42,6 +53,8 @@ class EpisodeWindow:
         self._episodes.extend(episodes)
         self.return_mean = float(np.mean([episode.reward for episode in self._episodes]))
         self.length_mean = float(np.mean([episode.length for episode in self._episodes]))
+        if self._names:
+            self.facts = fact_means(self._names, [episode.facts for episode in self._episodes])
 
     @property
     def full(self) -> bool:

@@ -11,7 +11,7 @@ from typing import Any, SupportsFloat
 import msgspec
 
 from learner.run_folder.requests import Requests
-from learner.run_folder.results import Evaluation
+from learner.run_folder.results import Evaluation, FactMean, fact_metrics
 from protocol.errors import UsageError
 from protocol.rollout import Episode, Rollout
 
@@ -50,6 +50,8 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
     """mean return of the last 100 training episodes, in raw rewards; None before the first has ended"""
     length_mean: float | None = None
     """mean length of the same episodes, in env steps"""
+    facts: dict[str, FactMean] = {}
+    """of each name in `info_keys`: what the environment reported at the ends of these episodes"""
     lag_mean: float = 0.0
     lag_max: int = 0
     workers_alive: int = 0
@@ -106,6 +108,7 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
             "lag/max": self.lag_max,
             "drop/stale": self.ledger.get("stale", 0),
         }
+        row |= fact_metrics("rollout", self.facts)
         row |= {f"ledger/{name}": count for name, count in self.ledger.items()}
         row |= {f"stage/{name}": seconds for name, seconds in self.stages.items()}
         return row | named(train)

@@ -2,12 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import zip_longest
 
 import msgspec
 import numpy as np
 
 EVALUATION_KEY = "eval/mean_reward"
+
+
+class FactMean(msgspec.Struct, frozen=True):
+    """The mean of a number that the environment reports at the ends of episodes."""
+
+    mean: float | None
+    """over the episodes that have the number; None if none has it"""
+    missing: int
+    """how many episodes do not have it"""
+
+    def __str__(self) -> str:
+        mean = "missing" if self.mean is None else f"{self.mean:.3g}"
+        return f"{mean} ({self.missing} without)" if self.missing and self.mean is not None else mean
+
+
+def fact_means(names: Sequence[str], episodes: Iterable[Sequence[float]]) -> dict[str, FactMean]:
+    """The means of the facts of these episodes, by name. NaN is a fact that is missing."""
+    columns = zip(*episodes, strict=True)
+    means = {}
+    for name, column in zip_longest(names, columns, fillvalue=()):
+        there = [number for number in column if not math.isnan(number)]
+        mean = None
+        if there:
+            mean = math.fsum(number / len(there) for number in there)  # their sum may be too large for a float
+        means[str(name)] = FactMean(mean, len(column) - len(there))
+    return means
+
+
+def fact_metrics(group: str, facts: Mapping[str, FactMean]) -> dict[str, float | None]:
+    """The facts as they are logged: eval/is_success and eval/is_success_missing."""
+    row: dict[str, float | None] = {}
+    for name, fact in facts.items():
+        row |= {f"{group}/{name}": fact.mean, f"{group}/{name}_missing": fact.missing}
+    return row
 
 
 class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
@@ -21,6 +57,8 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
     """mean length of an episode in env steps"""
     cut: int = 0
     """episodes that were stopped because they were too long; they count with the return they had by then"""
+    facts: dict[str, FactMean] = {}
+    """of each name in `info_keys`: what the environment reported at the ends of the episodes"""
 
     @staticmethod
     def of(returns: Sequence[float], lengths: Sequence[int], cut: int) -> Evaluation:
@@ -35,11 +73,13 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
 
     def __str__(self) -> str:
         cut = f", {self.cut} of them cut short" if self.cut else ""
-        return f"return {self.return_mean:.1f} ± {self.return_std:.1f} over {self.episodes} episodes{cut}"
+        facts = "".join(f", {name} {fact}" for name, fact in self.facts.items())
+        return f"return {self.return_mean:.1f} ± {self.return_std:.1f} over {self.episodes} episodes{cut}{facts}"
 
-    def metrics(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float | None]:
         """The numbers that are logged with a row of metrics."""
-        return {EVALUATION_KEY: self.return_mean, "eval/mean_ep_length": self.length_mean}
+        returns = {EVALUATION_KEY: self.return_mean, "eval/mean_ep_length": self.length_mean}
+        return returns | fact_metrics("eval", self.facts)
 
 
 class Best(msgspec.Struct, frozen=True, kw_only=True):
@@ -66,6 +106,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     stop_reason: str
     return_mean_100: float | None
     """mean return of the last 100 training episodes"""
+    facts_100: dict[str, FactMean] = {}
+    """of each name in `info_keys`: what the environment reported at the ends of these episodes"""
     evaluation: Evaluation | None
     """evaluation of the final policy"""
     best: Best | None = None

@@ -76,7 +76,8 @@ def train(
         env = started.vector_env(known.described)
         stack.callback(env.close)
         workers = config.min_workers or (1 if elsewhere else min(config.workers, config.envs))
-        lanes = SplitVectorEnv(env, config.lanes, _before_waits(env, workers, config.no_workers_timeout_s), env.step_lanes)
+        before_wait = _before_waits(env, workers, config.no_workers_timeout_s)
+        lanes = SplitVectorEnv(env, config.lanes, before_wait, env.step_lanes, config.fact_names())
         evaluation_copies = SplitEvaluationCopies(lanes, config.lanes, config.eval_copies)
 
         def collector(spec: RunSpec) -> tuple[Collector, Evaluator]:

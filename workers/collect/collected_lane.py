@@ -6,6 +6,7 @@ raises `LaneFailed` for an environment that raises, for observations that do not
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from time import perf_counter
 
@@ -18,6 +19,7 @@ from protocol.policy.recurrent import zero_state
 from protocol.rollout import Episode, describe_first_non_finite
 from protocol.specs import Leaf, RunSpec
 from workers.collect.env_copies import EnvCopies, Leaves, copy_seeds
+from workers.collect.facts import Facts
 from workers.env_errors import CopyRaised, LaneFailed, lane_failed
 from workers.env_loop import Pulse
 from workers.env_results import leaf_writers
@@ -41,6 +43,8 @@ class CollectedLane:
         self._return = [0.0] * run.copies  # of the running episodes, as are the next two
         self._length = [0] * run.copies
         self._start_s = [0.0] * run.copies  # by perf_counter
+        self._facts: dict[tuple[int, int], tuple[float, ...]] = {}  # by row and copy, of episodes that ended in this rollout
+        self._no_facts = (math.nan,) * len(run.facts)
         self._writers = leaf_writers(run.policy.observation, run.copies)
 
     def reset(self, pulse: Pulse) -> None:
@@ -66,6 +70,11 @@ class CollectedLane:
         """Write observations into row `t` of the arrays. Raises `Unusable`, an error of one copy."""
         for writer, array, values in zip(self._writers, joined, leaves, strict=True):
             writer.write(array[t], values)
+
+    def keep_facts(self, t: int, facts: Facts) -> None:
+        """Keep the facts of the episodes that ended in row `t` for `finish`."""
+        for n, of_copy in facts.items():
+            self._facts[t, n] = of_copy
 
     def check_values(self, obs: Sequence[Array], reward: Array) -> None:
         """Raise, naming step and copy, if obs [rows, N, *leaf] or rewards [rows, N] are not finite or not in their space."""
@@ -105,11 +114,13 @@ class CollectedLane:
         for t, n in np.argwhere(done).tolist():
             add(n, t + 1)
             if valid[t, n]:
-                episodes.append(Episode(self._return[n], self._length[n], step_end_s[t] - self._start_s[n]))
+                facts = self._facts.get((t, n), self._no_facts)
+                episodes.append(Episode(self._return[n], self._length[n], step_end_s[t] - self._start_s[n], facts))
             self._return[n], self._length[n], self._start_s[n] = 0.0, 0, step_end_s[t]
         for n in range(len(rewards)):
             if first[n] < len(step_end_s):
                 add(n, len(step_end_s))
+        self._facts.clear()
         return valid, tuple(episodes)
 
 

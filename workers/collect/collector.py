@@ -46,11 +46,11 @@ def open_env_copies(run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
         case "native":
             with activity().during(MAKING):
                 env = make_native(run.env, run.copies)
-            return VectorCopies(env)
+            return VectorCopies(env, run.facts)
         case "envpool":
-            return EnvpoolCopies(envpool_spec(run.env), run.copies)
+            return EnvpoolCopies(envpool_spec(run.env), run.copies, run.facts)
         case "loop":
-            return LoopedCopies([run.env.make] * run.copies, pulse)
+            return LoopedCopies([run.env.make] * run.copies, pulse, run.facts)
 
 
 def no_step_for_all(lanes: Sequence[int], actions: Array, pulse: Pulse) -> None:
@@ -192,6 +192,8 @@ class Collector:
                     lane.write_observations(obs, t + 1, row.leaves)
                 except CopyRaised as error:
                     raise lane_failed(lane.number, f"step {t}", error) from error
+                if row.facts:
+                    lane.keep_facts(t, row.facts)
                 if (lost := row.lost) is not None:
                     _truncate_lost(rows, i, lane, t, lost)
             if is_recurrent:

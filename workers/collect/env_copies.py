@@ -20,6 +20,7 @@ from protocol.arrays import Array
 from protocol.envs.spaces import make_flatten
 from protocol.envs.vectorized import check_resets_next_step
 from protocol.errors import UsageError
+from workers.collect.facts import Facts, facts_of_copies, facts_of_info, of_ended
 from workers.env_errors import CopyRaised, Unusable
 from workers.env_loop import EnvLoop, Pulse
 from workers.env_results import missing_leaf, read_leaves
@@ -38,6 +39,8 @@ class StepResult(NamedTuple):
     lost: Array | None = None
     """[N] bool, copies that were lost with their worker: their step was not made, and the next step starts an episode on
     new copies"""
+    facts: Facts = {}
+    """of the episodes that ended in this step, if the run asks for facts"""
 
 
 class EnvCopies(Protocol):
@@ -70,7 +73,11 @@ def copy_seeds(seed: int, lane: int, incarnation: int, copies: int) -> list[int]
 class LoopedCopies:
     """A loop over N environments."""
 
-    def __init__(self, makes: Iterable[Callable[[], gymnasium.Env[Any, Any]]], pulse: Pulse) -> None:
+    def __init__(
+        self, makes: Iterable[Callable[[], gymnasium.Env[Any, Any]]], pulse: Pulse, facts: Sequence[str] = ()
+    ) -> None:
+        """`facts`: names of the numbers in `info` that belong to an episode."""
+        self._facts = facts
         self._loop = EnvLoop((partial(made_without_order_check, make) for make in makes), pulse)
         self.observation_space = self._loop.envs[0].observation_space
         self.action_space = self._loop.envs[0].action_space
@@ -86,9 +93,12 @@ class LoopedCopies:
     def step(self, actions: Array, pulse: Pulse) -> StepResult:
         """Step each copy, or reset it if its episode has ended."""
         loop = self._loop
-        loop.step(actions, self._observations, pulse)
+        infos = loop.step(actions, self._observations, pulse)
         leaves = self._leaves() if self._nested else (self._observations,)
-        return StepResult(leaves, loop.reward, loop.terminated, loop.truncated)
+        if not self._facts:
+            return StepResult(leaves, loop.reward, loop.terminated, loop.truncated)
+        facts = {n: facts_of_info(self._facts, info, n) for n, info in infos if loop.terminated[n] or loop.truncated[n]}
+        return StepResult(leaves, loop.reward, loop.terminated, loop.truncated, facts=facts)
 
     def _leaves(self) -> Leaves:
         if self._nested:
@@ -120,10 +130,13 @@ def _without_order_check(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any
 class VectorCopies:
     """Any `gymnasium.vector.VectorEnv` with NextStep autoreset."""
 
-    def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
-        """Raises `UsageError` for another autoreset mode."""
+    def __init__(self, env: VectorEnv[Any, Any, Any], facts: Sequence[str] = ()) -> None:
+        """`facts`: names of the numbers in `info` that belong to an episode.
+
+        Raises `UsageError` for another autoreset mode.
+        """
         check_resets_next_step(env)
-        self._env, self._activity = env, activity()
+        self._env, self._activity, self._facts = env, activity(), facts
         self._per_copy = (env.num_envs,)
         self.observation_space = env.single_observation_space
         self.action_space = env.single_action_space
@@ -151,7 +164,7 @@ class VectorCopies:
         """Step all copies at once."""
         self._activity.begin(STEPPING)
         try:
-            observation, reward, terminated, truncated, _ = self._env.step(actions)
+            observation, reward, terminated, truncated, infos = self._env.step(actions)
         except BaseException as error:
             raise CopyRaised(None, "step") from error
         finally:
@@ -163,9 +176,16 @@ class VectorCopies:
                 )
                 raise Unusable(None, line)
         try:
-            return StepResult(self._read(observation), reward, terminated, truncated)
+            return StepResult(
+                self._read(observation), reward, terminated, truncated, facts=self._of_ended(infos, terminated | truncated)
+            )
         except (LookupError, TypeError) as error:
             raise missing_leaf(None, observation, error) from error
+
+    def _of_ended(self, infos: dict[str, Any], ended: Array) -> Facts:
+        if not self._facts or not np.any(ended):
+            return {}
+        return of_ended(facts_of_copies(self._facts, infos, self._env.num_envs), ended)
 
     def close(self) -> None:
         """Close it. What it raises is ignored."""

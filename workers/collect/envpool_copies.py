@@ -18,7 +18,8 @@ from protocol.arrays import Array
 from protocol.envs.envpool import EnvpoolSpec
 from protocol.envs.spaces import make_flatten
 from workers.collect.env_copies import Leaves, StepResult
-from workers.env_errors import CopyRaised
+from workers.collect.facts import facts_of_copies, of_ended
+from workers.env_errors import CopyRaised, Unusable
 from workers.env_loop import Pulse
 from workers.supervise.activity import CLOSING, RESETTING, STEPPING, activity
 
@@ -26,7 +27,9 @@ from workers.supervise.activity import CLOSING, RESETTING, STEPPING, activity
 class EnvpoolCopies:
     """N copies in one pool. The pool is made at the first reset, because envpool takes its seeds when it is made."""
 
-    def __init__(self, pool: EnvpoolSpec, copies: int) -> None:
+    def __init__(self, pool: EnvpoolSpec, copies: int, facts: Sequence[str] = ()) -> None:
+        """`facts`: names of the numbers in `info` that belong to an episode."""
+        self._facts = facts
         self.observation_space = pool.observation_space
         self.action_space = pool.action_space
         self._pool, self._activity = pool, activity()
@@ -48,25 +51,31 @@ class EnvpoolCopies:
         """Step all copies at once, and reset those that were truncated here."""
         self._activity.begin(STEPPING)
         try:
-            result, elapsed = self._step_and_reset(actions) if self._truncated.any() else self._step(actions)
+            result, elapsed, facts = self._step_and_reset(actions) if self._truncated.any() else self._step(actions)
+        except Unusable:
+            raise
         except BaseException as error:
             raise CopyRaised(None, "step") from error
         finally:
             self._activity.end(len(actions))
         at_limit = elapsed >= self._pool.limit
         self._truncated = at_limit & ~result.terminated & ~result.truncated
-        return result._replace(truncated=result.truncated | at_limit)
+        truncated = result.truncated | at_limit
+        return result._replace(
+            truncated=truncated, facts=of_ended(facts, result.terminated | truncated) if self._facts else {}
+        )
 
-    def _step(self, actions: Array, copies: Array | None = None) -> tuple[StepResult, Array]:
-        """Step these n copies, or all: the result, and the number of steps [n] of their episodes."""
+    def _step(self, actions: Array, copies: Array | None = None) -> tuple[StepResult, Array, Array]:
+        """Step these n copies, or all: the result, the number of steps [n] of their episodes, and their facts [n, names]."""
         observation, reward, terminated, truncated, infos = self._env.step(actions, copies)  # type: ignore[union-attr,call-arg]
-        return StepResult(self._read(observation), reward, terminated, truncated), infos["elapsed_step"]
+        facts = facts_of_copies(self._facts, infos, len(actions)) if self._facts else np.empty((len(actions), 0))
+        return StepResult(self._read(observation), reward, terminated, truncated), infos["elapsed_step"], facts
 
-    def _step_and_reset(self, actions: Array) -> tuple[StepResult, Array]:
+    def _step_and_reset(self, actions: Array) -> tuple[StepResult, Array, Array]:
         """Reset the copies that were truncated here and step the others: the result of all, as in `_step`."""
         reset, rest = np.flatnonzero(self._truncated), np.flatnonzero(~self._truncated)
         first = self._read(self._env.reset(reset)[0])  # type: ignore[union-attr,arg-type,call-arg]
-        result, elapsed = self._step(actions[rest], rest)
+        result, elapsed, facts = self._step(actions[rest], rest)
 
         def merged(of_rest: Array, of_reset: Any = 0) -> Array:
             array = np.empty((len(actions), *of_rest.shape[1:]), of_rest.dtype)
@@ -75,7 +84,7 @@ class EnvpoolCopies:
 
         leaves = [merged(stepped, started) for stepped, started in zip(result.leaves, first, strict=True)]
         flags = merged(result.terminated), merged(result.truncated)
-        return StepResult(leaves, merged(result.reward), *flags), merged(elapsed)
+        return StepResult(leaves, merged(result.reward), *flags), merged(elapsed), merged(facts)
 
     def close(self) -> None:
         """Close the pool and its threads. What it raises is ignored."""

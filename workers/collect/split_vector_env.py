@@ -17,6 +17,8 @@ from protocol.envs.spaces import make_flatten
 from protocol.errors import NoWorkers
 from protocol.specs import RunSpec
 from workers.collect.env_copies import EnvCopies, Leaves, StepResult
+from workers.collect.facts import Facts, facts_of_copies, of_ended
+from workers.env_errors import Unusable, lane_failed
 from workers.env_loop import Pulse
 
 Result = TypeVar("Result")
@@ -31,12 +33,14 @@ class SplitVectorEnv:
         lanes: int,
         before_wait: Callable[[Pulse], None] = lambda pulse: None,
         step_lanes: Callable[[Sequence[int], Array], Any] | None = None,
+        facts: Sequence[str] = (),
     ) -> None:
         """`before_wait` is called before each wait for the vector environment, with the `pulse` to call during the wait.
 
         `step_lanes` steps some lanes of the vector environment: then it may have more lanes than these, for evaluation.
+        `facts`: names of the numbers in `info` that belong to an episode.
         """
-        self.env = env
+        self.env, self.facts = env, facts
         self._lanes, self._before_wait, self._step_lanes = lanes, before_wait, step_lanes
         self._actions: Array | None = None  # [num_envs, *action]
         self._read = make_flatten(env.single_observation_space)
@@ -53,7 +57,11 @@ class SplitVectorEnv:
         if [lanes[i] for i in order] != list(range(self._lanes)):
             raise ValueError(f"lanes: expected all {self._lanes} of the vector environment at once, got {sorted(lanes)}")
         in_order = actions[order].reshape(-1, *actions.shape[2:])  # [L · N, *action]
-        self._result = self.step_some(range(self._lanes), slice(len(in_order)), in_order, pulse)
+        try:
+            self._result = self.step_some(range(self._lanes), slice(len(in_order)), in_order, pulse)
+        except Unusable as error:
+            lane, copy = divmod(error.copy or 0, len(in_order) // self._lanes)
+            raise lane_failed(lane, "step", Unusable(copy, error.line)) from error
 
     def step_some(self, lanes: Sequence[int], copies: slice, actions: Array, pulse: Pulse) -> StepResult:
         """Step these lanes, which have these copies, with their actions. The result has a row for every copy there is."""
@@ -66,14 +74,20 @@ class SplitVectorEnv:
             padded[copies] = actions
             result = self._wait(lambda: step_lanes(lanes, padded), pulse)
         observation, reward, terminated, truncated, infos = result
-        return StepResult(self._read(observation), reward, terminated, truncated, infos.get("worker_lost"))
+        facts: Facts = {}
+        if self.facts and (ended := terminated | truncated).any():
+            facts = of_ended(facts_of_copies(self.facts, infos, self.env.num_envs), ended)
+        return StepResult(self._read(observation), reward, terminated, truncated, infos.get("worker_lost"), facts)
 
     def result(self, copies: slice) -> StepResult:
         """The part of the last step's result that belongs to these copies."""
         assert self._result is not None
-        leaves, reward, terminated, truncated, lost = self._result
+        leaves, reward, terminated, truncated, lost, facts = self._result
         lost = None if lost is None else lost[copies]
-        return StepResult([leaf[copies] for leaf in leaves], reward[copies], terminated[copies], truncated[copies], lost)
+        own = {n - copies.start: facts[n] for n in range(copies.start, copies.stop) if n in facts} if facts else {}
+        return StepResult(
+            [leaf[copies] for leaf in leaves], reward[copies], terminated[copies], truncated[copies], lost, own
+        )
 
     def reset(self, copies: slice, seeds: Sequence[int], pulse: Pulse) -> Leaves:
         """Start episodes in these copies, with a seed for each."""

@@ -18,7 +18,8 @@ from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import make_flatten
 from protocol.errors import UsageError
 from workers.collect.env_copies import made_without_order_check
-from workers.env_errors import CopyRaised
+from workers.collect.facts import facts_of_info
+from workers.env_errors import CopyRaised, Unusable
 from workers.env_loop import PULSE_S, EnvLoop, Pulse
 from workers.supervise.activity import EVALUATING, activity
 
@@ -31,6 +32,8 @@ class CopyStep(NamedTuple):
     reward: Any
     terminated: Any
     truncated: Any
+    facts: tuple[float, ...] = ()
+    """numbers in `info` that belong to the episode, if the run asks for them and it ends in this step"""
 
 
 class CopiesLost(Exception):
@@ -67,9 +70,12 @@ class EvaluationCopies(Protocol):
 class LoopedEvaluationCopies:
     """A loop over environments in this process."""
 
-    def __init__(self, env: EnvSpec, count: int, render_mode: str | None, pulse: Pulse) -> None:
-        """`render_mode`: None, or `rgb_array`. Raises `UsageError` if the environment does not render so."""
-        self.count, self._activity = count, activity()
+    def __init__(self, env: EnvSpec, count: int, render_mode: str | None, pulse: Pulse, facts: Sequence[str] = ()) -> None:
+        """`render_mode`: None, or `rgb_array`. Raises `UsageError` if the environment does not render so.
+
+        `facts`: names of the numbers in `info` that belong to an episode.
+        """
+        self.count, self._activity, self._facts = count, activity(), facts
         make = partial(made_without_order_check, partial(env.make, render_mode))
         with warnings.catch_warnings():
             if render_mode is not None:
@@ -98,8 +104,11 @@ class LoopedEvaluationCopies:
         pulse_due_s = perf_counter() + PULSE_S
         for n in copies:
             try:
-                observation, reward, terminated, truncated, _ = self._loop.envs[n].step(actions[n])
-                results.append(CopyStep(self._read(observation), reward, terminated, truncated))
+                observation, reward, terminated, truncated, info = self._loop.envs[n].step(actions[n])
+                facts = facts_of_info(self._facts, info, n) if self._facts and (terminated or truncated) else ()
+                results.append(CopyStep(self._read(observation), reward, terminated, truncated, facts))
+            except Unusable as error:
+                raise Unusable(n, error.line, f"step {self._steps[n]}") from error
             except BaseException as error:
                 raise CopyRaised(n, f"step {self._steps[n]}") from error
             self._steps[n] += 1

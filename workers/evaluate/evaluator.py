@@ -7,6 +7,7 @@ opened once, and reset with a seed before each episode.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from contextlib import suppress
 from time import perf_counter
@@ -25,7 +26,7 @@ from protocol.policy.recurrent import zero_state
 from protocol.rollout import LARGEST_REWARD, Episode
 from protocol.specs import Leaf, RunSpec
 from workers.collect.acting import acting_of
-from workers.env_errors import CopyRaised
+from workers.env_errors import CopyRaised, Unusable
 from workers.env_loop import Pulse
 from workers.evaluate.episode_rows import RowSender, Send, as_frame
 from workers.evaluate.evaluation_copies import CopiesLost, EvaluationCopies, LoopedEvaluationCopies
@@ -43,7 +44,7 @@ class EvaluationFailed(RunError):
 
 def open_looped_copies(run: RunSpec, count: int, render_mode: str | None, pulse: Pulse) -> EvaluationCopies:
     """Copies in this process."""
-    return LoopedEvaluationCopies(run.env, count, render_mode, pulse)
+    return LoopedEvaluationCopies(run.env, count, render_mode, pulse, run.facts)
 
 
 class Evaluator:
@@ -78,6 +79,8 @@ class Evaluator:
             cause = error.__cause__ or error
             where = error.doing if error.copy is None else f"copy {error.copy}, {error.doing}"
             line = f"{where}: its environment raised {type(cause).__name__}: {first_line(cause, '')}"
+            if isinstance(error, Unusable):
+                raise EvaluationFailed(f"{where}: {error.line}") from error
             raise EvaluationFailed(line, "".join(format_exception(cause))) from error
         except BaseException:
             self.close()
@@ -97,6 +100,8 @@ class Evaluator:
         actions = np.zeros((copies.count, *policy.action.shape), policy.action.dtype)
         state, generator = zero_state(policy, 1, k), np.random.default_rng(order.seeds[0])
         returns, lengths, cut, seconds = [0.0] * k, [0] * k, [False] * k, [0.0] * k
+        no_facts = (math.nan,) * len(self._run.facts)
+        facts = [no_facts] * k
         senders = [RowSender(order, n, policy, send) for n in range(k)] if order.send_rows or order.send_frames else []
         began_s = perf_counter()
         for n, leaves in enumerate(copies.reset(order.seeds, pulse)):
@@ -122,12 +127,12 @@ class Evaluator:
                     self._observe(senders[n], obs, n, copies)
                     senders[n].step(chosen[n], reward, bool(step.terminated), bool(step.truncated) or cut[n])
                 if over or cut[n]:
-                    ended, seconds[n] = True, perf_counter() - began_s
+                    ended, seconds[n], facts[n] = True, perf_counter() - began_s, step.facts or no_facts
             self._check_finite(obs, lengths[running[0]] - 1)  # all that run have made equally many steps
             self.steps += len(running)
             if ended:
                 running = [n for n in running if not seconds[n]]
-        episodes = tuple(Episode(*figures) for figures in zip(returns, lengths, seconds, strict=True))
+        episodes = tuple(Episode(*figures) for figures in zip(returns, lengths, seconds, facts, strict=True))
         return Evaluated(order.session, order.ticket, episodes, tuple(cut))
 
     def _opened(self, count: int, render_mode: str | None, pulse: Pulse) -> EvaluationCopies:

@@ -42,7 +42,13 @@ class SplitEvaluationCopies:
         if result.lost is not None and np.asarray(result.lost)[own].any():
             raise CopiesLost
         return [
-            CopyStep(tuple(leaf[n] for leaf in result.leaves), result.reward[n], result.terminated[n], result.truncated[n])
+            CopyStep(
+                tuple(leaf[n] for leaf in result.leaves),
+                result.reward[n],
+                result.terminated[n],
+                result.truncated[n],
+                result.facts.get(n, ()),
+            )
             for n in own
         ]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import msgspec
@@ -83,6 +84,16 @@ def test_an_answer_holds_nothing_but_what_was_asked_for() -> None:
     played = Played()
     episode = Episode(0.0, 1, 0.0, (1.0,) * 60_000)
     played.learner.says(A, msgspec.structs.replace(played.answer(1), episodes=(episode,)))
+    assert played.strikes() == 1
+
+
+@pytest.mark.parametrize("facts", [(), (1.0, 2.0), (math.inf,)])
+def test_an_answer_with_wrong_facts_is_a_strike(facts: tuple[float, ...]) -> None:
+    played = Played()
+    played.learner.coordinator.evaluation._facts = 1
+    answer = played.answer(1)
+    episodes = tuple(msgspec.structs.replace(episode, facts=facts) for episode in answer.episodes)
+    played.learner.says(A, msgspec.structs.replace(answer, episodes=episodes))
     assert played.strikes() == 1
 
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 SAVED = {"_plan", "_version", "_first", "_seeds", "_undealt", "_held", "_played", "_rows"}
 """What of `EvaluationTickets` is saved. `_seeds` follow from the plan."""
-NOT_SAVED = {"_policy", "_on_rows"}
+NOT_SAVED = {"_policy", "_facts", "_on_rows"}
 
 
 class EvaluatingLearner(Learner):

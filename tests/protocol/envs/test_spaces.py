@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium
+import msgspec
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -13,7 +14,7 @@ from gymnasium.vector.utils import batch_space
 from protocol.arrays import Array
 from protocol.envs.spaces import action_spec, make_action_converter, make_flatten, observation_leaves
 from protocol.errors import BadRollout, UsageError
-from protocol.rollout import Episode, Rollout, validate
+from protocol.rollout import Episode, Rollout, validate, wrong_facts
 from protocol.specs import RunSpec
 from tests.support.collectors import TOY, bits, collect, random_collector, run_of, sync_vector_env_over
 from workers.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_ACTIONS, UNSUPPORTED_OBSERVATIONS
@@ -210,3 +211,12 @@ def test_values_that_are_not_of_the_space_are_refused() -> None:
     ):  # fmt: skip
         assert with_episode(impossible).startswith("episode: expected a finite return"), impossible
     assert with_episode(Episode(1.0, 1, 1.0, (1.0,))) == "episode: expected 0 facts, got 1"
+
+
+def test_facts_are_as_many_as_the_run_asks_for_and_finite_or_missing() -> None:
+    episode = Episode(1.0, 1, 1.0)
+    for facts in ((1.0, -1e308), (float("nan"), 0.0)):
+        assert wrong_facts(msgspec.structs.replace(episode, facts=facts), 2) == ""
+    assert wrong_facts(episode, 1) == "expected 1 facts, got 0"
+    for facts in ((float("inf"), 0.0), (0.0, -float("inf"))):
+        assert wrong_facts(msgspec.structs.replace(episode, facts=facts), 2).startswith("expected finite facts, got ")

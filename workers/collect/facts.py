@@ -1,0 +1,64 @@
+"""Facts of episodes: the numbers that an environment reports in `info` at an episode's last step (`RunSpec.facts`).
+
+Rule: a number that is absent, or not finite, is missing: it is NaN, not 0. Anything that is no number is an error of the
+environment, which names the key.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from protocol.arrays import Array
+from protocol.bounds import one_line
+from workers.env_errors import Unusable
+
+Facts = Mapping[int, tuple[float, ...]]
+"""By env copy: the facts of the episode that ended in this step."""
+
+
+def facts_of_info(names: Sequence[str], info: Mapping[str, Any], copy: int | None = None) -> tuple[float, ...]:
+    """A number for each name. Raises `Unusable` for what is no number."""
+    return tuple(_number(name, info.get(name, math.nan), copy) for name in names)
+
+
+def facts_of_copies(names: Sequence[str], infos: Mapping[str, Any], count: int) -> Array:
+    """[count, names] float64: of each copy of a vector environment, from its infos in gymnasium's form."""
+    table = np.full((count, len(names)), np.nan)
+    for k, name in enumerate(names):
+        if name not in infos:
+            continue
+        given = np.asarray(infos[name])
+        there = np.asarray(infos.get(f"_{name}", np.ones(count, bool)))
+        if given.shape[:1] != (count,) or there.shape != (count,):
+            raise Unusable(None, f"info {name}: expected a number for each of {count} copies, got {_shown(infos[name])}")
+        for n in np.flatnonzero(there):
+            table[n, k] = _number(name, given[n], int(n))
+    return table
+
+
+def of_ended(table: Array, ended: Array) -> Facts:
+    """The rows of a table [N, names] of the copies that ended [N]."""
+    return {int(n): tuple(table[n].tolist()) for n in np.flatnonzero(ended)}
+
+
+def _number(name: str, value: Any, copy: int | None) -> float:
+    try:
+        array = np.asarray(value)
+        if array.size == 1 and array.dtype.kind in "biuf":
+            number = float(array.reshape(()))
+            return number if math.isfinite(number) else math.nan
+    except (ValueError, OverflowError):  # rows of different lengths
+        pass
+    if value is None:
+        return math.nan
+    if type(value) is int:
+        return math.nan  # too large for a float
+    raise Unusable(copy, f"info {name}: expected a number, got {_shown(value)}; name only numbers in info_keys")
+
+
+def _shown(value: Any) -> str:
+    return one_line(f"{type(value).__name__} {value!r}", 80)
