@@ -25,6 +25,7 @@ from learner.rollout_service.service import RolloutService
 from learner.rollouts.hub import HubSnapshot
 from learner.rollouts.lanes import AcceptedRollout
 from learner.run_folder import checkpoint
+from learner.run_folder.env_attributes import EnvAttributes
 from learner.run_folder.episode_window import EpisodeWindow
 from learner.run_folder.metrics_log import MetricsLog
 from learner.run_folder.progress import Progress, Row, named
@@ -33,6 +34,7 @@ from learner.run_folder.results import Best, Summary
 from learner.run_folder.run_folder import RunFolder
 from learner.run_folder.versions import versions
 from learner.run_state import RunState
+from protocol.arrays import Array
 from protocol.bounds import one_line
 from protocol.errors import RunError, first_line
 from protocol.rollout import Batch
@@ -68,7 +70,8 @@ class RunRecorder:
         self._evaluating_since_s: float | None = None
         self._shown_s = 0.0
         self._confirmed: Best | None = None
-        self._requests = Requests()
+        refusal = "envpool's env copies have no attributes" if spec.vector == "envpool" else ""
+        self._requests = Requests(EnvAttributes(state.env_attributes, refusal))
         self._settings = msgspec.to_builtins(config)
         self._update: dict[str, Any] = {}  # facts of the last update: fields of `Progress`
         self._window = EpisodeWindow.from_state(state.episodes, state.facts, spec.facts)
@@ -80,7 +83,7 @@ class RunRecorder:
         self._episodes_since_save = 0
         self.longest_save_s = 0.0
         """How long the longest checkpoint took to write, in this process."""
-        self._saved: tuple[int, int, list[float] | None] | None = None  # what `_position` was in the newest checkpoint
+        self._saved: tuple[int, int, list[float] | None, int] | None = None  # what `_position` was in the newest checkpoint
         self._saved_env_steps: int | None = None
         self._saved_to = ""  # path of the newest checkpoint
         self._finished = False
@@ -132,6 +135,10 @@ class RunRecorder:
             self._say_missing_facts()
         self._episodes_since_save += len(batch.episodes)
 
+    def env_attributes(self) -> Array | None:
+        """The attributes of env copies that the weights of this version carry."""
+        return self._requests.attributes.table(self.version)
+
     def training_goes_on(self) -> bool:
         """Whether the next rollouts may be collected now: no evaluation is due, and the run does not end."""
         return not self._evaluations.is_due(self.env_steps) and self.stop_reason() is None
@@ -180,7 +187,11 @@ class RunRecorder:
         warn_on_error(lambda: self._folder.write_policy(policy, env, *self._algorithm.weights()))
         self._took_to_save(time.monotonic() - began_s)
         if self._saved == self._position() and self._callbacks.wants("on_checkpoint"):
-            self._callbacks.on_checkpoint(self.progress())
+            self._requests.closed = "expected it earlier than in on_checkpoint: the checkpoint would lack it"
+            try:
+                self._callbacks.on_checkpoint(self.progress())
+            finally:
+                self._requests.closed = ""
 
     def save_unless_saved(self) -> None:
         """Write a checkpoint and the policy, unless the newest checkpoint already has this state."""
@@ -219,6 +230,7 @@ class RunRecorder:
         if not self._finished:
             self._finished = True
             warn_on_error(lambda: self._folder.write_summary(self._summary(reason)))
+            self._requests.closed = "the run has ended"
             self._callbacks.on_end(msgspec.structs.replace(self.progress(), stop_reason=reason))
 
     def close(self) -> None:
@@ -305,9 +317,9 @@ class RunRecorder:
         self._saved_to = one_line(str(path))
         self._saved, self._saved_env_steps = self._position(), self.env_steps
 
-    def _position(self) -> tuple[int, int, list[float] | None]:
-        """What of the state changes when the run goes on: the version, the next evaluation, the best policy."""
-        return self.version, self._evaluations.next_at, self._evaluations.best
+    def _position(self) -> tuple[int, int, list[float] | None, int]:
+        """What of the state changes when the run goes on: version, next evaluation, best policy, set attributes."""
+        return self.version, self._evaluations.next_at, self._evaluations.best, self._requests.attributes.changes
 
     def _write_logged(self) -> None:
         """Add what callbacks logged to the row of this update."""
@@ -354,6 +366,7 @@ class RunRecorder:
             incarnations=snapshot.incarnations,
             episodes=self._window.state(),
             facts=list(self._spec.facts),
+            env_attributes=self._requests.attributes.state(self.version),
             best=self._evaluations.best,
             best_policy=self._evaluations.best_policy,
             newest_evaluation=self._evaluations.newest,

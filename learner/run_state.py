@@ -10,6 +10,7 @@ import msgspec
 from learner.algorithms import Algorithm
 from learner.rollouts.ledger import Ledger
 from learner.run_folder import checkpoint
+from learner.run_folder.env_attributes import AttributesState
 from learner.run_folder.results import Evaluation
 from learner.run_folder.run_folder import RunFolder
 from protocol.errors import CheckpointError
@@ -30,6 +31,8 @@ class RunState(msgspec.Struct, kw_only=True):
     """State of the `EpisodeWindow`."""
     facts: list[str] = []
     """Names of the facts of these episodes."""
+    env_attributes: AttributesState = msgspec.field(default_factory=AttributesState)
+    """Attributes of env copies that callbacks set."""
     best: list[float] | None = None
     """Mean return and env steps of the best evaluation."""
     best_policy: Any = None

@@ -44,11 +44,15 @@ def train(
         service.pulse()
         check_time()
 
+    def publish() -> None:
+        weights, attributes = algorithm.weights(), recorder.env_attributes()
+        service.publish(recorder.version, *weights, deal=recorder.training_goes_on(), env_attributes=attributes)
+
     recorder.save()
     try:
         service.wait_for_workers(workers)
         recorder.start()
-        service.publish(recorder.version, *algorithm.weights(), deal=recorder.training_goes_on())
+        publish()
         recorder.evaluate_if_due()
         while (reason := recorder.stop_reason()) is None:
             arrived = service.gather()
@@ -62,7 +66,7 @@ def train(
                 if not algorithm.is_finite():
                     raise RunError(f"learner: update {recorder.version}: the weights are not finite after it; {ADVICE}")
             recorder.count(batch)
-            service.publish(recorder.version, *algorithm.weights(), deal=recorder.training_goes_on())
+            publish()
             recorder.updated(metrics, time.monotonic() - began_s)
         recorder.save()
         recorder.conclude()

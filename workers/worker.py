@@ -208,6 +208,7 @@ class Worker:
         """Let the policy act under these weights."""
         if self._loaded is not weights:
             collector.load(to_float32(weights.parameters), weights.buffers)
+            collector.env_attributes = b"" if weights.env_attributes is None else weights.env_attributes.tobytes()
             self._loaded = weights
 
     def _evaluate(self, task: EvaluationTask) -> None:

@@ -19,7 +19,7 @@ from learner.rollouts.ledger import Ledger
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 from learner.run_folder.progress import Progress
 from learner.run_folder.results import Evaluation
-from protocol.arrays import Floats
+from protocol.arrays import Array, Floats
 from protocol.specs import RunSpec
 from protocol.wire.learner_link import LearnerLink
 
@@ -36,13 +36,16 @@ class RolloutService:
         """Wait until this number of `workers` have joined. Raises `NoWorkers` when they do not come in time."""
         self._hub.wait_for(count)
 
-    def publish(self, version: int, parameters: Floats, buffers: Floats, *, deal: bool = True) -> None:
+    def publish(
+        self, version: int, parameters: Floats, buffers: Floats, *, deal: bool = True, env_attributes: Array | None = None
+    ) -> None:
         """Send new weights to all workers and deal the tickets that they allow. The arrays must not change afterwards.
 
-        `deal` False: deal no ticket before the next `gather`, because these weights are evaluated first.
-        Raises `RunError` if a parameter is too large for the dtype in which weights are sent.
+        `deal` False: deal no ticket before the next `gather`, because these weights are evaluated first. `env_attributes`:
+        attributes that each env copy gets before its next rollout, packed. Raises `RunError` if a parameter is too large for
+        the dtype in which weights are sent.
         """
-        self._hub.publish(version, parameters, buffers, deal=deal)
+        self._hub.publish(version, parameters, buffers, deal=deal, env_attributes=env_attributes)
 
     def gather(self) -> list[AcceptedRollout]:
         """Wait for the rollouts of the next update. Raises `RunError` when the run cannot go on."""

@@ -141,7 +141,9 @@ class Hub:
         """Wait until this number of `workers` have joined. Raises `NoWorkers` after `no_workers_timeout_s`."""
         self._server.wait_for(workers, self.settings.no_workers_timeout_s, lambda: self._turn(POLL_S))
 
-    def publish(self, version: int, parameters: Array, buffers: Array, *, deal: bool = True) -> None:
+    def publish(
+        self, version: int, parameters: Array, buffers: Array, *, deal: bool = True, env_attributes: Array | None = None
+    ) -> None:
         """Broadcast new weights and deal the tickets that they allow. The arrays must not change afterwards.
 
         `deal` False: deal no ticket before the next `gather`, because these weights are evaluated first.
@@ -149,7 +151,7 @@ class Hub:
         """
         sent = to_wire_dtype(parameters, self.settings.weights_dtype)
         self._weight_age.published(version, self._clock())
-        self._server.send(self.coordinator.publish(version, sent, buffers, deal=deal))
+        self._server.send(self.coordinator.publish(version, sent, buffers, deal=deal, env_attributes=env_attributes))
 
     def gather(self) -> list[AcceptedRollout]:
         """The rollouts of the next update. Raises `NoWorkers`, `Stalled` or `EnvironmentFailed`."""

@@ -210,7 +210,9 @@ class TicketCoordinator:
 
     # ---------------------------------------------------------------- the learner's side
 
-    def publish(self, version: int, parameters: Array, buffers: Array, *, deal: bool = True) -> list[Outgoing]:
+    def publish(
+        self, version: int, parameters: Array, buffers: Array, *, deal: bool = True, env_attributes: Array | None = None
+    ) -> list[Outgoing]:
         """Set the newest weights. Send them to the workers that can take them now; deal the tickets that they allow.
 
         `deal` False: deal none before `deal` is called, because these weights are evaluated first.
@@ -220,7 +222,7 @@ class TicketCoordinator:
         if self._weights is None:
             self._first_version, self._used_before = version, self.ledger.used
         self.version = version
-        self._weights = Weights(version, parameters, buffers)
+        self._weights = Weights(version, parameters, buffers, env_attributes)
         out = [out for member in self.membership.active() for out in self._send_newest_weights(member)]
         return out + self._deal()
 

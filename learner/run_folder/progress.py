@@ -95,6 +95,22 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
             raise UsageError(f"log {name}: this is not the progress of a run")
         self.requests.log(name, value)
 
+    def set_env_attr(self, name: str, value: Any) -> None:
+        """Set an attribute of every env copy that trains, from the next version of the weights on: a curriculum.
+
+        `value` is plain data: numbers, text, lists, dicts, numpy arrays. Each rollout is made under the attributes of its
+        version, so the result is the same for any number of workers. Checkpoints keep them. Evaluation is on env copies as
+        they are made. Raises `UsageError` if the value cannot be sent, and in `on_checkpoint` and `on_end`.
+        """
+        if self.requests is None:
+            raise UsageError(f"set_env_attr {name}: this is not the progress of a run")
+        self.requests.set_env_attr(name, value)
+
+    @property
+    def env_attrs(self) -> dict[str, Any]:
+        """The attributes of env copies that were set so far, by name; in a resumed run also those from before."""
+        return {} if self.requests is None else self.requests.attributes.now()
+
     def row(self, train: Row) -> dict[str, float | None]:
         """One flat row of metrics. `train`: the metrics of the algorithm."""
         row: dict[str, float | None] = {

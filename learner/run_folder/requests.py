@@ -1,4 +1,4 @@
-"""What callbacks ask of a run, until the run takes it: numbers to log.
+"""What callbacks ask of a run, until the run takes it: numbers to log, and attributes of env copies.
 
 Rule: everything is checked when it is asked for, so that an error names the user's line.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from learner.run_folder.env_attributes import EnvAttributes
 from protocol.bounds import one_line
 from protocol.errors import UsageError
 
@@ -18,7 +19,11 @@ LONGEST_NAME = 200  # characters
 class Requests:
     """The requests that were not taken yet."""
 
-    def __init__(self) -> None:
+    def __init__(self, attributes: EnvAttributes | None = None) -> None:
+        self.attributes = attributes or EnvAttributes()
+        """attributes of the env copies"""
+        self.closed = ""
+        """why no attribute may be set now; empty if it may"""
         self._logged: dict[str, float | None] = {}
 
     def log(self, name: str, value: Any) -> None:
@@ -33,6 +38,12 @@ class Requests:
         if name not in self._logged and len(self._logged) >= MOST_LOGGED:
             raise UsageError(f"log {name}: expected at most {MOST_LOGGED} names in one row")
         self._logged[name] = number if math.isfinite(number) else None
+
+    def set_env_attr(self, name: str, value: Any) -> None:
+        """Set an attribute of every env copy from the next weights on. Raises `UsageError` if it cannot be sent."""
+        if self.closed:
+            raise UsageError(f"set_env_attr {one_line(str(name), 80)}: {self.closed}")
+        self.attributes.set(name, value)
 
     def take_logged(self) -> dict[str, float | None]:
         """The numbers that were logged since the last call."""

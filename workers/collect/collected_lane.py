@@ -18,6 +18,7 @@ from protocol.errors import UsageError
 from protocol.policy.recurrent import zero_state
 from protocol.rollout import Episode, describe_first_non_finite
 from protocol.specs import Leaf, RunSpec
+from protocol.wire.plain_values import pack, unpack
 from workers.collect.env_copies import EnvCopies, Leaves, copy_seeds
 from workers.collect.facts import Facts
 from workers.env_errors import CopyRaised, LaneFailed, lane_failed
@@ -43,9 +44,24 @@ class CollectedLane:
         self._return = [0.0] * run.copies  # of the running episodes, as are the next two
         self._length = [0] * run.copies
         self._start_s = [0.0] * run.copies  # by perf_counter
+        self._attributes = b""  # that were set in the copies
         self._facts: dict[tuple[int, int], tuple[float, ...]] = {}  # by row and copy, of episodes that ended in this rollout
         self._no_facts = (math.nan,) * len(run.facts)
         self._writers = leaf_writers(run.policy.observation, run.copies)
+
+    def set_attributes(self, packed: bytes, pulse: Pulse) -> None:
+        """Set these attributes in all copies, unless they are set. Raises `LaneFailed` if a copy does not have one."""
+        if packed == self._attributes:
+            return
+        before, now = (unpack(each) if each else {} for each in (self._attributes, packed))
+        for name, value in now.items():
+            if name in before and pack(before[name]) == pack(value):
+                continue
+            try:
+                self.copies.assign(name, pack(value), pulse)
+            except CopyRaised as error:
+                raise lane_failed(self.number, f"set_env_attr {name}", error) from error
+        self._attributes = packed
 
     def reset(self, pulse: Pulse) -> None:
         """Start episodes in all copies. Raises `UsageError` when their spaces are not those of the run."""

@@ -83,6 +83,8 @@ class Collector:
         """number of env steps collected; rows that are not valid do not count"""
         self.stages: Stages = {"open": 0.0, "act": 0.0, "step": 0.0}
         """seconds spent opening lanes (making copies and their first reset), choosing actions and stepping copies"""
+        self.env_attributes = b""
+        """attributes that each env copy gets before its next rollout (`Weights.env_attributes`)"""
         self._run = run
         self._acting = acting_of(run, policy)
         self._open_copies, self._step_all = open_copies, step_all
@@ -106,6 +108,8 @@ class Collector:
         self._collecting = True
         try:
             lanes = [self._lane_for(assignment, pulse) for assignment in assignments]
+            for lane in lanes:
+                lane.set_attributes(self.env_attributes, pulse)
             rows = self._new_rows(lanes)
             actions = self._acting.begin([lane.generator for lane in lanes])
             try:
@@ -149,6 +153,7 @@ class Collector:
         except CopyRaised as error:
             raise lane_failed(assignment.lane, "made", error) from error
         lane = self._lanes[assignment.lane] = CollectedLane(self._run, assignment.lane, assignment.incarnation, copies)
+        lane.set_attributes(self.env_attributes, pulse)
         lane.reset(pulse)
         self.stages["open"] += perf_counter() - began
         return lane

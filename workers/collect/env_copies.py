@@ -13,13 +13,14 @@ from typing import Any, NamedTuple, Protocol
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import VectorEnv
+from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.wrappers import OrderEnforcing
 
 from protocol.arrays import Array
 from protocol.envs.spaces import make_flatten
 from protocol.envs.vectorized import check_resets_next_step
 from protocol.errors import UsageError
+from protocol.wire.plain_values import unpack
 from workers.collect.facts import Facts, facts_of_copies, facts_of_info, of_ended
 from workers.env_errors import CopyRaised, Unusable
 from workers.env_loop import EnvLoop, Pulse
@@ -57,6 +58,10 @@ class EnvCopies(Protocol):
 
     def step(self, actions: Array, pulse: Pulse) -> StepResult:
         """Step with actions [N, *action] of the environment's dtype. A copy whose episode has ended is reset instead."""
+        ...
+
+    def assign(self, name: str, packed: bytes, pulse: Pulse) -> None:
+        """Set an attribute of every copy to a value, packed by `protocol.wire.plain_values`."""
         ...
 
     def close(self) -> None:
@@ -100,6 +105,11 @@ class LoopedCopies:
         facts = {n: facts_of_info(self._facts, info, n) for n, info in infos if loop.terminated[n] or loop.truncated[n]}
         return StepResult(leaves, loop.reward, loop.terminated, loop.truncated, facts=facts)
 
+    def assign(self, name: str, packed: bytes, pulse: Pulse) -> None:
+        """Set an attribute of every copy; of its wrappers, the outermost one that has it gets it."""
+        for n, env in enumerate(self._loop.envs):
+            set_attribute(n, env, name, unpack(packed))  # each its own value: they may change it
+
     def _leaves(self) -> Leaves:
         if self._nested:
             return read_leaves(self._read, self._observations)
@@ -125,6 +135,20 @@ def _without_order_check(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any
     if isinstance(env, gymnasium.Wrapper):
         env.env = _without_order_check(env.env)
     return env
+
+
+def set_attribute(copy: int | None, env: Any, name: str, value: Any) -> None:
+    """Set an attribute that the environment, or one of its wrappers, has. Raises `CopyRaised`."""
+    owner = env
+    while not hasattr(owner, name) and isinstance(owner, gymnasium.Wrapper | VectorWrapper):
+        owner = owner.env
+    if not hasattr(owner, name) or callable(getattr(owner, name)):
+        what = "a method" if hasattr(owner, name) else "none"
+        raise Unusable(copy, f"expected an attribute of the environment that is called {name}, got {what}")
+    try:
+        setattr(owner, name, value)
+    except BaseException as error:
+        raise CopyRaised(copy, f"set_env_attr {name}") from error
 
 
 class VectorCopies:
@@ -181,6 +205,15 @@ class VectorCopies:
             )
         except (LookupError, TypeError) as error:
             raise missing_leaf(None, observation, error) from error
+
+    def assign(self, name: str, packed: bytes, pulse: Pulse) -> None:
+        """Set an attribute of the vector environment, or of each of its copies where it has them (`SyncVectorEnv`)."""
+        copies = getattr(self._env.unwrapped, "envs", None)
+        if isinstance(copies, list | tuple):
+            for n, env in enumerate(copies):
+                set_attribute(n, env, name, unpack(packed))
+        else:
+            set_attribute(None, self._env, name, unpack(packed))
 
     def _of_ended(self, infos: dict[str, Any], ended: Array) -> Facts:
         if not self._facts or not np.any(ended):

@@ -86,6 +86,10 @@ class EnvpoolCopies:
         flags = merged(result.terminated), merged(result.truncated)
         return StepResult(leaves, merged(result.reward), *flags), merged(elapsed), merged(facts)
 
+    def assign(self, name: str, packed: bytes, pulse: Pulse) -> None:
+        """Raises `Unusable`: the copies are not Python objects."""
+        raise Unusable(None, "envpool's env copies have no attributes")
+
     def close(self) -> None:
         """Close the pool and its threads. What it raises is ignored."""
         if self._env is not None:

@@ -7,6 +7,7 @@ own, and autoreset is NextStep for the vector environment as for the loop.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -14,13 +15,15 @@ from gymnasium.vector import VectorEnv
 
 from protocol.arrays import Array
 from protocol.envs.spaces import make_flatten
-from protocol.errors import NoWorkers
+from protocol.errors import EnvironmentFailed, NoWorkers, WorkerLost
 from protocol.specs import RunSpec
+from protocol.wire.plain_values import unpack
 from workers.collect.env_copies import EnvCopies, Leaves, StepResult
 from workers.collect.facts import Facts, facts_of_copies, of_ended
-from workers.env_errors import Unusable, lane_failed
+from workers.env_errors import CopyRaised, Unusable, lane_failed
 from workers.env_loop import Pulse
 
+METHODS = ("close", "render", "reset", "step")  # of every environment
 Result = TypeVar("Result")
 
 
@@ -46,6 +49,9 @@ class SplitVectorEnv:
         self._read = make_flatten(env.single_observation_space)
         self._result: StepResult | None = None
         self._no_workers: NoWorkers | None = None
+        self._calls: Any = env  # for `call_some` and `assign_some` of a `ZmqVectorEnv`
+        self._assigned: dict[tuple[int, str], tuple[slice, bytes]] = {}  # by first copy and name: attributes that were set
+        self._lost = False  # whether copies were lost, and the copies that replace them need the attributes
 
     def open_lane(self, run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
         """The copies of this lane: `OpenEnvCopies` of a `Collector`."""
@@ -65,6 +71,8 @@ class SplitVectorEnv:
 
     def step_some(self, lanes: Sequence[int], copies: slice, actions: Array, pulse: Pulse) -> StepResult:
         """Step these lanes, which have these copies, with their actions. The result has a row for every copy there is."""
+        if self._lost:
+            self._assign_again(pulse)
         if self._step_lanes is None:
             result = self._wait(lambda: self.env.step(actions), pulse)
         else:
@@ -74,6 +82,7 @@ class SplitVectorEnv:
             padded[copies] = actions
             result = self._wait(lambda: step_lanes(lanes, padded), pulse)
         observation, reward, terminated, truncated, infos = result
+        self._lost |= bool(self._assigned) and "worker_lost" in infos
         facts: Facts = {}
         if self.facts and (ended := terminated | truncated).any():
             facts = of_ended(facts_of_copies(self.facts, infos, self.env.num_envs), ended)
@@ -98,6 +107,34 @@ class SplitVectorEnv:
         options = {"reset_mask": mask}
         observation, _ = self._wait(lambda: self.env.reset(seed=all_seeds, options=options), pulse)  # type: ignore[arg-type]
         return [leaf[copies] for leaf in self._read(observation)]
+
+    def assign(self, copies: slice, name: str, packed: bytes, pulse: Pulse) -> None:
+        """Set an attribute of these copies, also of those that replace lost ones."""
+        try:
+            self._wait(lambda: self._assign_now(copies, name, packed), pulse)
+        except WorkerLost:
+            self._lost = True
+        self._assigned[copies.start, name] = copies, packed
+
+    def _assign_now(self, copies: slice, name: str, packed: bytes) -> None:
+        chosen = range(copies.start, copies.stop)
+        try:
+            there = all(self._calls.call_some(chosen, "has_wrapper_attr", name))
+            if not there or name in METHODS:
+                what = "a method" if there else "none"
+                raise Unusable(None, f"expected an attribute of the environment that is called {name}, got {what}")
+            self._calls.assign_some(chosen, name, [unpack(packed)] * len(chosen))
+        except EnvironmentFailed as error:
+            raise CopyRaised(None, f"set_env_attr {name}") from error
+
+    def _assign_again(self, pulse: Pulse) -> None:
+        """Set the attributes of copies that replace lost ones. If a worker is lost meanwhile, the next step tries again."""
+        self._lost = False
+        for (_, name), (copies, packed) in self._assigned.items():
+            try:
+                self._wait(partial(self._assign_now, copies, name, packed), pulse)
+            except WorkerLost:
+                self._lost = True
 
     def raise_if_no_workers(self) -> None:
         """Raise `NoWorkers` once, if a wait ended because no worker was left."""
@@ -130,6 +167,10 @@ class _LaneOfVectorEnv:
     def step(self, actions: Array, pulse: Pulse) -> StepResult:
         """The result of the step that `SplitVectorEnv.step_all` made."""
         return self._split.result(self._copies)
+
+    def assign(self, name: str, packed: bytes, pulse: Pulse) -> None:
+        """Set an attribute of these copies."""
+        self._split.assign(self._copies, name, packed, pulse)
 
     def close(self) -> None:
         """Do nothing: the copies belong to the vector environment, and are reset when the lane starts anew."""

@@ -1,0 +1,81 @@
+"""Attributes of env copies that callbacks set: what the next weights carry, and what a resumed run must send. Pure.
+
+Rule: an attribute takes effect with the next version of the weights, so each rollout is made under the attributes of its
+version, whatever the number of workers. A checkpoint of version v has those of v, and those that wait for v + 1.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from protocol.arrays import Array
+from protocol.bounds import MAX_NAME, one_line
+from protocol.errors import UsageError
+from protocol.wire.plain_values import pack, unpack
+
+MOST_BYTES = 1 << 20  # of all attributes together: they travel with all weights
+
+
+class AttributesState(msgspec.Struct, kw_only=True):
+    """What a checkpoint keeps."""
+
+    sent: bytes = b""
+    """packed attributes of the version of the checkpoint; empty if there are none"""
+    waiting: bytes = b""
+    """those of the next version"""
+
+
+class EnvAttributes:
+    """The attributes of one run, by name."""
+
+    def __init__(self, state: AttributesState | None = None, refusal: str = "") -> None:
+        """`state`: that of a resumed run. `refusal`: why this run's env copies have no attributes, if so."""
+        state = state or AttributesState()
+        self._refusal = refusal
+        self._next = _unpacked(state.sent)  # what the next weights carry
+        self._after: dict[str, Any] | None = _unpacked(state.waiting)  # what the weights after those carry; None: the same
+        self._sent, self._version = state.sent, -1
+        self.changes = 0
+        """how often an attribute was set, in this process"""
+
+    def now(self) -> dict[str, Any]:
+        """The attributes as they were set last, by name."""
+        return dict(self._next if self._after is None else self._after)
+
+    def set(self, name: str, value: Any) -> None:
+        """Set an attribute from the next weights on. Raises `UsageError` if it cannot be sent."""
+        if self._refusal:
+            raise UsageError(f"set_env_attr {one_line(str(name), 80)}: {self._refusal}")
+        if not (isinstance(name, str) and name.isidentifier() and len(name) <= MAX_NAME) or name.startswith("_"):
+            raise UsageError(f"set_env_attr: expected the name of a public attribute, got {one_line(repr(name), 80)}")
+        try:
+            value = unpack(pack(value))  # a copy, which the caller cannot change any more
+            size = len(pack({**self.now(), name: value}))
+        except TypeError as error:
+            raise UsageError(f"set_env_attr {name}: {one_line(str(error))}") from None
+        if size > MOST_BYTES:
+            raise UsageError(f"set_env_attr {name}: expected at most {MOST_BYTES:,} bytes of attributes, got {size:,}")
+        self._next = {**self._next, name: value}
+        if self._after is not None:
+            self._after = {**self._after, name: value}
+        self.changes += 1
+
+    def table(self, version: int) -> Array | None:
+        """What the weights of this version carry; None if there are no attributes."""
+        self._sent, self._version = pack(self._next) if self._next else b"", version
+        if self._after is not None:
+            self._next, self._after = self._after, None
+        return np.frombuffer(self._sent, np.uint8) if self._sent else None
+
+    def state(self, version: int) -> AttributesState:
+        """What a checkpoint of this version keeps."""
+        waiting = pack(self.now()) if self.now() else b""
+        first = self._version == -1  # nothing was published in this process
+        return AttributesState(sent=self._sent if first or version == self._version else waiting, waiting=waiting)
+
+
+def _unpacked(packed: bytes) -> dict[str, Any]:
+    return unpack(packed) if packed else {}
