@@ -2,9 +2,11 @@
 
 User code imports this package only.
 
-import millrace
-run = millrace.train("CartPole-v1", seed=1)
-policy = millrace.load(run)
+    run = millrace.train("CartPole-v1", seed=1)
+    policy = millrace.load(run)
+
+>>> import millrace
+>>> installed = millrace.__version__
 """
 
 from __future__ import annotations
@@ -158,6 +160,14 @@ def make_vec(
         NoWorkers: too few workers joined in time.
         EnvironmentFailed: an environment raised; the error has the worker's traceback.
         WorkerLost: see `on_worker_loss`.
+
+    >>> import millrace
+    >>> envs = millrace.make_vec("CartPole-v1", 4, workers=2)
+    >>> observations, infos = envs.reset(seed=1)
+    >>> observations, rewards, terminated, truncated, infos = envs.step([0, 1, 0, 1])
+    >>> observations.shape
+    (4, 4)
+    >>> envs.close()
     """
     from learner.members.endpoint import BindSettings
     from learner.vector_env.settings import VectorEnvSettings

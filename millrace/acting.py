@@ -33,6 +33,8 @@ class LoadedPolicy:
 
     >>> import gymnasium, millrace
     >>> policy = millrace.load(run)
+    >>> isinstance(policy, millrace.LoadedPolicy)
+    True
     >>> env = gymnasium.make("CartPole-v1")
     >>> observation, _ = env.reset(seed=1)
     >>> observation, reward, terminated, truncated, _ = env.step(policy(observation))
@@ -77,6 +79,11 @@ class LoadedPolicy:
             first: Of a recurrent policy: True where this observation is the first of an episode. A bool, or [n] of them.
 
         Raises `UsageError` if the observation is not of the space, not finite, or of another number of copies than `start`.
+
+        >>> import millrace
+        >>> policy = millrace.load(run)
+        >>> int(policy([0.0, 0.0, 0.1, 0.0])) in (0, 1)
+        True
         """
         leaves, is_one = self._leaves(observation)
         n = len(leaves[0][0])

@@ -2,17 +2,19 @@
 
 There are two levels. On the first, an algorithm is a loss; everything else about an update is done for it:
 
-    from millrace.algorithms import ActorCritic, ActorCriticConfig
-
-    class Mine(ActorCritic):
-        class Config(ActorCriticConfig, frozen=True):
-            penalty: float = 0.1
-            "Weight of the squared log-ratio."
-
-        def loss(self, rows):
-            log_ratio = rows.log_prob_now - rows.log_prob
-            ...
-            return loss, {"penalty": log_ratio.square().mean()}
+>>> import millrace
+>>> from millrace.algorithms import ActorCritic, ActorCriticConfig
+>>> class Mine(ActorCritic):
+...     class Config(ActorCriticConfig, frozen=True):
+...         penalty: float = 0.1
+...         "Weight of the squared log-ratio."
+...
+...     def loss(self, rows):
+...         log_ratio = rows.log_prob_now - rows.log_prob
+...         penalty, value = log_ratio.square().mean(), (rows.value - rows.target).square().mean()
+...         loss = -(log_ratio.exp() * rows.advantage).mean() + self.config.penalty * penalty + 0.5 * value
+...         return loss, {"penalty": penalty}
+>>> run = millrace.train("CartPole-v1", algo=Mine, penalty=0.2, steps=500, workers=1, eval_episodes=2, progress=False)
 
 On the second, a class derives from `Algorithm` and makes the whole update. `millrace.testing.check_algorithm` tells what is
 wrong with a class of either level. A run takes it as `millrace train CartPole-v1 --algo my_module:Mine --penalty 0.2`, or as

@@ -24,18 +24,20 @@ BATCH_NAMES = frozenset(
 class OwnPolicy:
     """A policy that you wrote, for `RolloutService`: any network and distribution, in any framework that the workers have.
 
-        class Policy:
-            def load(self, arrays):                     # for each version of the weights
-                self.arrays = arrays                    # {"w": float32 [4, 2]}
-
-            def act(self, obs, state, rng):             # obs [N, 4] of the N copies of a lane
-                logits = obs @ self.arrays["w"]
-                action = (logits + rng.gumbel(size=logits.shape)).argmax(-1)
-                return action, state, {"logits": logits}
-
-        service = millrace.RolloutService(
-            "CartPole-v1", millrace.OwnPolicy(Policy, {"w": (4, 2)}, extras={"logits": ("float32", (2,))})
-        )
+    >>> import millrace, numpy
+    >>> class Policy:
+    ...     def load(self, arrays):                     # for each version of the weights
+    ...         self.arrays = arrays                    # {"w": float32 [4, 2]}
+    ...
+    ...     def act(self, obs, state, rng):             # obs [N, 4] of the N copies of a lane
+    ...         logits = obs @ self.arrays["w"]
+    ...         action = (logits + rng.gumbel(size=logits.shape)).argmax(-1)
+    ...         return action, state, {"logits": logits}
+    >>> policy = millrace.OwnPolicy(Policy, {"w": (4, 2)}, extras={"logits": ("float32", (2,))})
+    >>> with millrace.RolloutService("CartPole-v1", policy, workers=1, envs=2, lanes=1, rollout_steps=8) as service:
+    ...     _ = service.publish({"w": numpy.zeros((4, 2))})
+    ...     service.gather().extras["logits"].shape
+    (8, 2, 2)
 
     `factory(**kwargs)` is called in each worker and returns such an object. `act` is called once for each step of a lane,
     with exactly its copies. What an episode remembers goes into `state` [N, state_size] float32, which is zeros when an

@@ -44,6 +44,11 @@ class MLP:
     """Hidden layers and a linear output: `MLP(64, 64)`.
 
     If the observation has images, they go through convolutions first, as with `CNN`.
+
+    >>> import millrace
+    >>> with millrace.RolloutService("CartPole-v1", millrace.MLP(32), workers=1, envs=2, lanes=1) as service:
+    ...     [(piece.name, piece.shape) for piece in service.policy.layout if "weight" in piece.name]
+    [('actor.0.weight', (32, 4)), ('actor.out.weight', (2, 32))]
     """
 
     net: tuple[int, ...]
@@ -82,7 +87,12 @@ class MLP:
 
 @dataclass(frozen=True, init=False)
 class CNN(MLP):
-    """Convolutions for images, then hidden layers: `CNN(512)`. Large images get those of Mnih et al. (2015)."""
+    """Convolutions for images, then hidden layers: `CNN(512)`. Large images get those of Mnih et al. (2015).
+
+    >>> import millrace
+    >>> millrace.CNN(128).net
+    (128,)
+    """
 
     def __init__(self, *net: int, activation: Activation = "relu", normalize_observations: bool = False) -> None:
         super().__init__(*(net or (512,)), activation=activation, normalize_observations=normalize_observations)
@@ -101,6 +111,13 @@ class Recurrent(MLP):
     """A recurrent core, then hidden layers: `Recurrent(64, core="lstm", core_size=64)`.
 
     A batch has the core's state before its first row in `state`.
+
+    >>> import millrace
+    >>> policy = millrace.Recurrent(32, core="gru", core_size=16)
+    >>> with millrace.RolloutService("CartPole-v1", policy, workers=1, envs=2, lanes=1, rollout_steps=8) as service:
+    ...     _ = service.publish(service.policy.initial())
+    ...     service.gather().state.shape
+    (2, 16)
     """
 
     core: Literal["lstm", "gru"]
@@ -127,7 +144,13 @@ class Recurrent(MLP):
 
 
 class Piece(NamedTuple):
-    """One array of the flat parameter vector: `flat[offset : offset + size].reshape(shape)`."""
+    """One array of the flat parameter vector: `flat[offset : offset + size].reshape(shape)`.
+
+    >>> import millrace
+    >>> piece = millrace.Piece("actor.0.weight", shape=(64, 4), offset=0, gain=1.4)
+    >>> piece.size
+    256
+    """
 
     name: str
     """as `actor.0.weight`; weights are [outputs, inputs]"""
@@ -143,7 +166,13 @@ class Piece(NamedTuple):
 
 
 class PolicyParameters:
-    """The parameters of a policy: names, shapes and offsets in the flat float32 vector, and initial values."""
+    """The parameters of a policy: names, shapes and offsets in the flat float32 vector, and initial values.
+
+    >>> import millrace
+    >>> parameters = millrace.PolicyParameters(millrace.load(run).spec)
+    >>> parameters.size == sum(piece.size for piece in parameters.layout)
+    True
+    """
 
     def __init__(self, spec: PolicySpec) -> None:
         self.spec = spec
@@ -160,6 +189,11 @@ class PolicyParameters:
         """Initial parameters [P] float32: orthogonal weights with the gains of the layout, biases 0.
 
         Raises `UsageError` for an `OwnPolicy`, whose initial values only you know.
+
+        >>> import millrace
+        >>> parameters = millrace.PolicyParameters(millrace.load(run).spec)
+        >>> parameters.initial(seed=3).shape == (parameters.size,)
+        True
         """
         if self.spec.own is not None:
             raise UsageError(f"policy {self.spec.own.factory}: expected initial values of your own; publish them")
@@ -176,15 +210,34 @@ class PolicyParameters:
         return flat
 
     def named(self, flat: Floats) -> dict[str, Array]:
-        """Views of the pieces of a flat vector [P], by name."""
+        """Views of the pieces of a flat vector [P], by name.
+
+        >>> import millrace
+        >>> parameters = millrace.PolicyParameters(millrace.load(run).spec)
+        >>> parameters.named(parameters.initial())["actor.out.bias"]
+        array([0., 0.], dtype=float32)
+        """
         return named_views(flat, self._fields)
 
     def flat(self, parameters: Mapping[str, Array] | Array) -> Floats:
-        """A flat copy [P] float32 of a flat vector, or of arrays by name. Raises `UsageError`."""
+        """A flat copy [P] float32 of a flat vector, or of arrays by name. Raises `UsageError`.
+
+        >>> import millrace
+        >>> parameters = millrace.PolicyParameters(millrace.load(run).spec)
+        >>> flat = parameters.initial()
+        >>> bool((parameters.flat(parameters.named(flat)) == flat).all())
+        True
+        """
         return _flat(parameters, self._fields, "parameters")
 
     def flat_buffers(self, buffers: Mapping[str, Array] | Array | None) -> Floats:
-        """A flat float32 copy of buffers. None: mean 0 and standard deviation 1. Raises `UsageError`."""
+        """A flat float32 copy of buffers. None: mean 0 and standard deviation 1. Raises `UsageError`.
+
+        >>> import millrace
+        >>> parameters = millrace.PolicyParameters(millrace.load(run).spec)
+        >>> parameters.flat_buffers(None)
+        array([], dtype=float32)
+        """
         if buffers is None:
             buffers = {
                 field.name: np.full(field.shape, 1.0 if field.name.endswith("std") else 0.0) for field in self._buffer_fields

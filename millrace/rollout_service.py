@@ -53,6 +53,13 @@ class RolloutBatch(Batch, frozen=True, kw_only=True, eq=False):
     Row t says: in `obs[t]` we did `action[t]`, got `reward[t]` and saw `obs[t + 1]`, wherever `valid[t]`. A row that is not
     valid only resets its env copy: leave it out of every loss, return and count.
 
+    >>> import millrace
+    >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:
+    ...     _ = service.publish(service.policy.initial())
+    ...     batch = service.gather()
+    >>> isinstance(batch, millrace.RolloutBatch), batch.obs.shape, batch.action.shape
+    (True, (9, 2, 4), (8, 2))
+
     Beside the fields below it has `action` [T, N, *action] (int64 counted from 0, or float32 before clipping), `reward`
     [T, N] float32 (raw), `terminated`, `truncated` and `valid` [T, N] bool, `state` [N, S] float32 before `obs[0]`, `lane`
     [N] int64, `fresh` [N] bool (False where a column goes on where it ended in the batch before), `copies` of a lane, and
@@ -79,6 +86,16 @@ class RolloutService:
     Use it in a `with` statement and from one thread. While you compute, a thread of the service answers the workers, so a
     long computation loses none of them. Iterating gives a `RolloutBatch` for each update; it waits until one rollout of each
     lane is there. A batch can be at most `max_lag` versions old.
+
+    >>> import millrace
+    >>> with millrace.RolloutService("CartPole-v1", millrace.MLP(64), workers=1, envs=4, rollout_steps=8) as service:
+    ...     parameters = service.policy.initial(seed=1)
+    ...     service.publish(parameters)
+    ...     for batch in service:
+    ...         parameters = parameters * 0.99  # learn from the batch here
+    ...         if service.publish(parameters) == 2:
+    ...             break
+    0
     """
 
     def __init__(
@@ -160,7 +177,14 @@ class RolloutService:
 
     @property
     def version(self) -> int:
-        """The version of the newest weights; -1 before the first were published."""
+        """The version of the newest weights; -1 before the first were published.
+
+        >>> import millrace
+        >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:
+        ...     _ = service.publish(service.policy.initial())
+        ...     service.version
+        0
+        """
         return self._version
 
     def publish(self, parameters: Mapping[str, Array] | Array, buffers: Mapping[str, Array] | Array | None = None) -> int:
@@ -169,6 +193,11 @@ class RolloutService:
         `parameters`: the flat vector [P], or an array for each name in `policy.layout`. `buffers` likewise, for a policy
         that normalizes observations; by default those of `moments`. They are copied.
         Raises `UsageError` for wrong shapes, or numbers that are not finite.
+
+        >>> import millrace
+        >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:
+        ...     service.publish(service.policy.named(service.policy.initial()))
+        0
         """
         self._check_open()
         if buffers is None and self._moments is not None and self.run.policy.normalize_observations:
@@ -182,7 +211,15 @@ class RolloutService:
 
     @property
     def moments(self) -> Moments:
-        """Running mean and standard deviation of observations and returns, as in the built-in trainer. Imports torch."""
+        """Running mean and standard deviation of observations and returns, as in the built-in trainer. Imports torch.
+
+        >>> import millrace
+        >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:
+        ...     _ = service.publish(service.policy.initial())
+        ...     service.moments.update(service.gather())
+        ...     service.moments.mean.shape
+        (4,)
+        """
         if self._moments is None:
             from learner.algorithms.moments import Moments
 
@@ -190,7 +227,14 @@ class RolloutService:
         return self._moments
 
     def gather(self) -> RolloutBatch:
-        """Wait for the next batch. Raises `RunError` when no worker is left, or the environment failed too often."""
+        """Wait for the next batch. Raises `RunError` when no worker is left, or the environment failed too often.
+
+        >>> import millrace
+        >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:
+        ...     _ = service.publish(service.policy.initial())
+        ...     service.gather().reward.shape
+        (8, 2)
+        """
         self._check_open()
         if self._taken >= self._published + self.config.max_lag or not self._published:
             raise UsageError(
@@ -213,6 +257,12 @@ class RolloutService:
 
         The result does not depend on the number of workers. `max_steps`: env steps of the whole evaluation at most; each
         episode gets an equal share.
+
+        >>> import millrace
+        >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:
+        ...     _ = service.publish(service.policy.initial())
+        ...     service.evaluate(episodes=4).episodes
+        4
         """
         self._check_open()
         if not self._published:
@@ -228,6 +278,14 @@ class RolloutService:
 
         Call it right after `publish`. `RolloutService(..., restore=path)` goes on from it: ledger, versions, lanes
         and moments continue, and `restored` has the arrays. Rollouts that were under way are collected anew.
+
+        >>> import millrace
+        >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:
+        ...     _ = service.publish(service.policy.initial())
+        ...     service.save("state.npz", parameters=service.policy.initial())
+        >>> with millrace.RolloutService("CartPole-v1", restore="state.npz", workers=1, envs=2, lanes=1) as service:
+        ...     service.publish(service.restored["parameters"])
+        0
         """
         self._check_open()
         with self._lock:
@@ -244,22 +302,49 @@ class RolloutService:
         write(Path(path), state, arrays)
 
     def ledger(self) -> dict[str, int]:
-        """What became of every ticket and every transition: `used`, `stale`, `lost` and so on."""
+        """What became of every ticket and every transition: `used`, `stale`, `lost` and so on.
+
+        >>> import millrace
+        >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:
+        ...     _ = service.publish(service.policy.initial())
+        ...     _ = service.gather()
+        ...     service.ledger()["transitions_received"]
+        16
+        """
         with self._lock:
             return self._service.snapshot().ledger.counts()
 
     def lags(self) -> dict[str, int]:
-        """Number of rollouts used, by lag."""
+        """Number of rollouts used, by lag.
+
+        >>> import millrace
+        >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:
+        ...     _ = service.publish(service.policy.initial())
+        ...     _ = service.gather()
+        ...     service.lags()
+        {'0': 1}
+        """
         with self._lock:
             return self._service.lag_histogram()
 
     def workers(self) -> list[str]:
-        """The names of the workers that have joined."""
+        """The names of the workers that have joined.
+
+        >>> import millrace
+        >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:
+        ...     service.workers()
+        ['w0']
+        """
         with self._lock:
             return sorted(member.hello.worker for member in self._service.snapshot().members)
 
     def close(self, reason: str = "the learner has ended") -> None:
-        """Ask the workers to leave, and release everything. Does nothing the second time."""
+        """Ask the workers to leave, and release everything. Does nothing the second time.
+
+        >>> import millrace
+        >>> service = millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1)
+        >>> service.close()
+        """
         if self._over.is_set():
             return
         self._over.set()

@@ -1,9 +1,8 @@
 """Tests of what a user writes. `check_algorithm` is the conformance test of an algorithm; use it with pytest or by itself.
 
-from millrace.testing import check_algorithm
-
-def test_my_algorithm():
-    check_algorithm(Mine, penalty=0.2)
+>>> from millrace.algorithms import PPO
+>>> from millrace.testing import check_algorithm
+>>> check_algorithm(PPO, net=(16,), learns=False)
 """
 
 from __future__ import annotations

@@ -26,11 +26,27 @@ def first_line(error: BaseException, otherwise: str = "no message") -> str:
 
 
 class MillraceError(Exception):
-    """Base of all errors of millrace."""
+    """Base of all errors of millrace.
+
+    >>> import millrace
+    >>> try:
+    ...     millrace.Run("runs/no-such-run")
+    ... except millrace.MillraceError as error:
+    ...     print(error)
+    run runs/no-such-run: no such folder
+    """
 
 
 class UserFacingError(MillraceError):
-    """One side cannot go on. The command line prints the one line and exits with `exit_code`."""
+    """One side cannot go on. The command line prints the one line and exits with `exit_code`.
+
+    >>> import millrace
+    >>> try:
+    ...     millrace.train("CartPole-v1", steps=0)
+    ... except millrace.UserFacingError as error:
+    ...     error.exit_code
+    2
+    """
 
     exit_code = 1
 
@@ -41,7 +57,13 @@ class UserFacingError(MillraceError):
 
 
 class UsageError(UserFacingError):
-    """What the user asked for cannot be done; the text says what can."""
+    """What the user asked for cannot be done; the text says what can.
+
+    >>> import millrace
+    >>> millrace.train("CartPole-v1", learning_rat=1e-3)
+    Traceback (most recent call last):
+    protocol.errors.UsageError: keyword argument: unknown setting learning_rat; did you mean learning_rate?
+    """
 
     exit_code = 2
 
@@ -57,27 +79,85 @@ class RunTakenOver(UserFacingError):
 
 
 class RunError(UserFacingError):
-    """The run cannot go on."""
+    """The run cannot go on.
+
+    >>> import millrace
+    >>> millrace.Run(run).plot("no-such-folder/curve.png")
+    Traceback (most recent call last):
+    protocol.errors.RunError: no-such-folder/curve.png not written: No such file or directory
+    """
 
 
 class CheckpointError(RunError):
-    """A checkpoint is missing, broken or of another format."""
+    """A checkpoint is missing, broken or of another format.
+
+    >>> import millrace, pathlib
+    >>> _ = pathlib.Path("state.npz").write_bytes(b"not a saved state")
+    >>> try:
+    ...     millrace.RolloutService("CartPole-v1", restore="state.npz")
+    ... except millrace.CheckpointError as error:
+    ...     print("the state cannot be restored")
+    the state cannot be restored
+    """
 
 
 class NoWorkers(RunError):
-    """No worker is left, or none ever joined."""
+    """No worker is left, or none ever joined.
+
+    >>> import millrace
+    >>> try:
+    ...     millrace.RolloutService("CartPole-v1", bind="tcp://127.0.0.1:*", no_workers_timeout_s=0.2)
+    ... except millrace.NoWorkers as error:
+    ...     print("start a worker: millrace worker ADDRESS")
+    start a worker: millrace worker ADDRESS
+    """
 
 
 class WorkerLost(RunError):
-    """A worker was lost, and its env copies with it."""
+    """A worker was lost, and its env copies with it.
+
+    >>> import gymnasium, millrace, os
+    >>> class Dies(gymnasium.Wrapper):
+    ...     def step(self, action):
+    ...         os._exit(1)
+    >>> envs = millrace.make_vec(lambda: Dies(gymnasium.make("CartPole-v1")), 1, on_worker_loss="raise")
+    >>> _ = envs.reset()
+    >>> try:
+    ...     envs.step([0])
+    ... except millrace.WorkerLost as error:
+    ...     print("its worker is gone")
+    its worker is gone
+    >>> envs.close()
+    """
 
 
 class Stalled(RunError):
-    """A deadline passed."""
+    """A deadline passed.
+
+    >>> import gymnasium, millrace, time
+    >>> class Hangs(gymnasium.Wrapper):
+    ...     def step(self, action):
+    ...         time.sleep(600)
+    >>> try:
+    ...     millrace.train(lambda: Hangs(gymnasium.make("CartPole-v1")), workers=1, stall_timeout_s=1, progress=False)
+    ... except millrace.Stalled as error:
+    ...     print("nothing happened for a second")
+    nothing happened for a second
+    """
 
 
 class EnvironmentFailed(RunError):
-    """The environment raised; `detail` is the traceback where it happened."""
+    """The environment raised; `detail` is the traceback where it happened.
+
+    >>> import millrace
+    >>> def broken():
+    ...     raise OSError("the simulator has no licence")
+    >>> try:
+    ...     millrace.make_vec(broken, 2)
+    ... except millrace.EnvironmentFailed as error:
+    ...     print(error.detail.splitlines()[-1])
+    OSError: the simulator has no licence
+    """
 
 
 class PolicyFailed(RunError):

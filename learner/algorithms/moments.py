@@ -22,10 +22,19 @@ from protocol.specs import PolicySpec
 class Moments:
     """Running moments of all batches so far. Only valid rows count.
 
-        features = service.moments.normalized(batch)           # as the policy saw them, for your loss
-        reward = service.moments.scaled_rewards(batch, gamma)
-        service.moments.update(batch)
-        service.publish(parameters)                            # sends mean and standard deviation, too
+    >>> import millrace
+    >>> policy = millrace.MLP(normalize_observations=True)
+    >>> with millrace.RolloutService("CartPole-v1", policy, workers=1, envs=2, lanes=1, rollout_steps=8) as service:
+    ...     parameters = service.policy.initial()
+    ...     _ = service.publish(parameters)
+    ...     batch = service.gather()
+    ...     features = service.moments.normalized(batch)    # as the policy saw them, for your loss
+    ...     reward = service.moments.scaled_rewards(batch, 0.99)
+    ...     service.moments.update(batch)
+    ...     service.publish(parameters)                     # sends mean and standard deviation, too
+    1
+    >>> isinstance(service.moments, millrace.Moments)
+    True
 
     `service.save` keeps them, and a service that is restored goes on from them.
     """

@@ -16,15 +16,13 @@ class Callback:
     evaluation and a summary. If it raises, the run ends too: the state after the last whole update is saved, then the
     exception is raised. A method that returns anything else lets the run go on.
 
-    ```python
-    import millrace
-
-    class StopWhenGood(millrace.Callback):
-        def on_update(self, progress):
-            return progress.return_mean is None or progress.return_mean < 100
-
-    run = millrace.train("CartPole-v1", callbacks=[StopWhenGood()])
-    ```
+    >>> import millrace
+    >>> class StopWhenGood(millrace.Callback):
+    ...     def on_update(self, progress):
+    ...         return progress.return_mean is None or progress.return_mean < 10
+    >>> run = millrace.train("CartPole-v1", callbacks=[StopWhenGood()], workers=1, eval_episodes=2, progress=False)
+    >>> run.summary.env_steps < 5_000
+    True
     """
 
     def on_start(self, progress: Progress) -> object:

@@ -26,14 +26,13 @@ Row = Mapping[str, float | None]
 class Progress(msgspec.Struct, frozen=True, kw_only=True):
     """The progress of a run: the terminal shows it, the metrics record it after each update, and callbacks get it.
 
-    ```python
-    import millrace
-
-    def show(progress: millrace.Progress) -> None:
-        print(progress.env_steps, progress.return_mean, progress.metrics.get("train/value_loss"))
-
-    run = millrace.train("CartPole-v1", watch=show)
-    ```
+    >>> import millrace
+    >>> seen = []
+    >>> def watch(progress: millrace.Progress) -> None:
+    ...     seen.append((progress.env_steps, progress.return_mean, progress.metrics.get("train/value_loss")))
+    >>> run = millrace.train("CartPole-v1", watch=watch, steps=500, workers=1, eval_episodes=2, progress=False)
+    >>> seen[-1][0] == run.summary.env_steps
+    True
     """
 
     run: str = ""
