@@ -26,6 +26,7 @@ from benchmarks.writing import write
 from learner.config.layers import resolve
 from learner.run_folder.progress import Progress
 from millrace.launch.local_run import train
+from protocol.env_spec import EnvSpec
 
 WARM_UP = 2  # updates that are not counted: env copies are opened and torch is imported meanwhile
 MODES = ("workers", "learner")
@@ -80,7 +81,7 @@ def measure(case: str, mode: str, threads: int) -> tuple[float, float]:
             run_dir=folder,
             **settings,
         )
-        train(config, None, watch, factory)
+        train(config, None, watch, None if factory is None else EnvSpec.of(factory))
     (steps, wait_s), (last_steps, last_wait_s) = waits[WARM_UP], waits[-1]
     return (last_steps - steps) / (last_wait_s - wait_s), statistics.median(memory)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import os
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,8 +20,9 @@ from learner.rollouts.hub import Hub, HubSettings
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 from learner.run_folder.run_folder import RunFolder, Which
 from protocol.arrays import Floats
-from protocol.env_spec import EnvSpec
+from protocol.env_spec import EnvLike, EnvSpec
 from protocol.envs.description import DescribedEnv
+from protocol.envs.wrappers import WrapperLike
 from protocol.policy.policy import Policy, make_policy
 from protocol.specs import DescribeSpec, PolicySpec, RunSpec
 from protocol.wire.learner_link import LearnerLink
@@ -40,10 +41,17 @@ class SavedPolicy(NamedTuple):
     """names of the numbers that the run logs of each episode"""
 
 
-def saved_policy(run: Path, which: Which = "final") -> SavedPolicy:
-    """Read a policy of a run folder. Raises `UsageError`, with a one-line message, if it cannot be read."""
+def saved_policy(
+    run: Path, which: Which = "final", *, env: EnvLike | None = None, wrappers: Sequence[WrapperLike] | None = None
+) -> SavedPolicy:
+    """Read a policy of a run folder, and find its environment and wrappers by the names that the run remembers.
+
+    `env`, `wrappers`: take these instead. Raises `UsageError`, with a one-line message, if it cannot be read, or they cannot
+    be found.
+    """
     card, parameters, buffers = RunFolder.open(run).read_policy(which)
-    return SavedPolicy(card.policy, EnvSpec(card.env, card.env_kwargs), parameters, buffers, _facts(run))
+    spec = EnvSpec.of(card.env if env is None else env, card.env_kwargs, card.wrappers if wrappers is None else wrappers)
+    return SavedPolicy(card.policy, spec, parameters, buffers, _facts(run))
 
 
 def _facts(run: Path) -> tuple[str, ...]:

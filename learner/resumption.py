@@ -10,6 +10,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import msgspec
+
 from learner.config.config import Config
 from learner.config.hyperparameters import DQNConfig
 from learner.config.layers import config_of_run
@@ -17,6 +19,7 @@ from learner.config.on_resume import Change, OnResume, changes, refusal
 from learner.env_spaces import EnvSpaces
 from learner.run_folder.run_folder import RunFolder
 from protocol.bounds import one_line
+from protocol.envs.found_names import moved
 from protocol.errors import UsageError
 
 
@@ -46,7 +49,7 @@ def check_settings(config: Config, run: Path) -> list[str]:
     Raises `UsageError` that names the fixed settings that differ, or if this is no run folder.
     """
     RunFolder.open(run)
-    before = config_of_run(run, config.algo)
+    before = _with_present_names(config_of_run(run, config.algo), config)
     changed = [*changes(before, config)]
     if before.algo == config.algo:  # else the settings of the two algorithms cannot be compared
         changed += changes(before.algorithm, config.algorithm)
@@ -71,6 +74,16 @@ def check_spaces(run: Path, made_for: EnvSpaces, now: EnvSpaces) -> None:
             f"run {run}: the environment's {what} have changed: expected {one}, got {other}; "
             "install the version of the environment that the run was started with, or start a new run"
         )
+
+
+def _with_present_names(before: Config, now: Config) -> Config:
+    """The settings of a run, with the names that its environment and wrappers have now, if they were moved to a module."""
+    wrappers_moved = len(before.wrapper) == len(now.wrapper) and all(map(moved, before.wrapper, now.wrapper))
+    return msgspec.structs.replace(
+        before,
+        env=now.env if moved(before.env, now.env) else before.env,
+        wrapper=now.wrapper if wrappers_moved else before.wrapper,
+    )
 
 
 def _is_finished(config: Config, folder: RunFolder) -> bool:

@@ -222,7 +222,7 @@ def serve(config: Config, resume: Resumption | None, watch: Watch) -> Path:
         observer = stack.enter_context(prometheus_observer(config))
         for line in join_lines(link.address, config.advertise, keyring):
             log.warning("%s", line)
-        env, processes = EnvSpec.of(config.env, config.env_kwargs), ProcessCallbacks()
+        env, processes = EnvSpec.of(config.env, config.env_kwargs, config.wrapper), ProcessCallbacks()
         known = known_environment(config, env, resume, describe_over(link, config, processes))
         folder = folder or stack.enter_context(run_folder(config, None))
         run = Run(

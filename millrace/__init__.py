@@ -38,13 +38,14 @@ if TYPE_CHECKING:
     from learner.callbacks.callback import Callback
     from learner.run_folder.progress import Progress
     from learner.vector_env.env import ZmqVectorEnv
-    from learner.vector_env.settings import EnvLike
     from millrace.acting import LoadedPolicy, load
     from millrace.own_policy import OwnPolicy
     from millrace.playing import evaluate, record
     from millrace.policies import CNN, MLP, Piece, PolicyParameters, Recurrent
     from millrace.rollout_service import RolloutBatch, RolloutService
     from millrace.runs import Metrics, Run, train
+    from protocol.env_spec import EnvLike
+    from protocol.envs.wrappers import WrapperLike
 
 __all__ = [
     "CNN",
@@ -123,6 +124,7 @@ def make_vec(
     timeout: float = 60.0,
     copy: bool = True,
     render_mode: str | None = None,
+    wrappers: Sequence[WrapperLike] = (),
     **kwargs: bool | int | float | str,
 ) -> ZmqVectorEnv:
     """Make a `gymnasium.vector.VectorEnv` whose env copies live in worker processes.
@@ -131,7 +133,8 @@ def make_vec(
 
     Args:
         env: anything `gymnasium.make` takes, a callable that returns an environment, or a list with one of these for each
-            env copy. A callable is sent over TCP only to workers that have a key.
+            env copy. What only your script or notebook has (a callable, an id that it registers) is code: it is sent over
+            TCP only to workers that have a key.
         num_envs: number of env copies; by default 1, or the length of the list.
         workers: number of worker processes to start on this machine; by default one for each core, at most `num_envs`.
             They end with the vector environment.
@@ -149,6 +152,8 @@ def make_vec(
         timeout: seconds that a worker may take to answer; then it is given up.
         copy: return copies of the observations. Without it the next step overwrites them.
         render_mode: passed on to the environment.
+        wrappers: applied to every env copy in its worker, the first one innermost: classes, functions, or names as
+            "gymnasium.wrappers:FlattenObservation".
         kwargs: passed on to the environment.
 
     A worker elsewhere is also given up if it sends no heartbeat for 5 s while this process waits for it. A long step does
@@ -188,6 +193,7 @@ def make_vec(
             copy=copy,
             render_mode=render_mode,
             kwargs=kwargs,
+            wrappers=wrappers,
         )
     )
 

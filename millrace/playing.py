@@ -7,9 +7,9 @@ the episodes; the caller's process runs no environment code.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypedDict, TypeVar, Unpack
+from typing import Any, Literal, NamedTuple, TypedDict, TypeVar, Unpack
 
 import msgspec
 
@@ -23,14 +23,21 @@ from millrace.cli.flags import EvaluateFlags, RecordFlags
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
 from millrace.terminal import count_line
 from protocol.bounds import MAX_SEEDS
-from protocol.env_spec import EnvSpec
+from protocol.env_spec import EnvLike
+from protocol.envs.wrappers import WrapperLike
 from protocol.errors import UsageError
 
+NOT_KEYWORDS = ("wrapper",)  # in Python they are `wrappers`
 Watch = Callable[[str], None]
 """Gets how far it is, as text."""
-Environment = Callable[..., object]
-"""Returns the environment of a run that was started with a callable, and so has no id by which a worker could find it."""
 _Flags = TypeVar("_Flags", EvaluateFlags, RecordFlags)
+
+
+class Given(NamedTuple):
+    """What is taken in place of the environment and the wrappers that the run remembers by name."""
+
+    env: EnvLike | None = None
+    wrappers: Sequence[WrapperLike] | None = None
 
 
 class PlayKeywords(TypedDict, total=False):
@@ -61,7 +68,8 @@ class RecordKeywords(PlayKeywords, total=False):
 class ShownKeywords(TypedDict, total=False):
     """Keywords of the two functions that are no flags of the commands."""
 
-    env: Environment | None
+    env: EnvLike | None
+    wrappers: Sequence[WrapperLike] | None
     progress: bool
 
 
@@ -77,7 +85,8 @@ def evaluate(
     run: str | os.PathLike[str],
     episodes: int | None = None,
     *,
-    env: Environment | None = None,
+    env: EnvLike | None = None,
+    wrappers: Sequence[WrapperLike] | None = None,
     progress: bool = True,
     **keywords: Unpack[EvaluateKeywords],
 ) -> Evaluation:
@@ -86,7 +95,9 @@ def evaluate(
     Arguments:
         run: A `Run`, or a run folder.
         episodes: Number of episodes; if not given 100, or 3 with `video`.
-        env: The callable that the run was started with, if its environment has no id. (`Run.evaluate` knows it.)
+        env: The environment that the run was started with, if it is not found by its name: it was made in another script or
+            notebook. (`Run.evaluate` of the `Run` that `train` returned knows it.)
+        wrappers: Likewise the wrappers.
         progress: Show how far it is.
         **keywords: The flags of `millrace evaluate`. `seed` of the episodes; `best`, to use the policy with the best
             evaluation during the run in place of the newest; the number of `workers`, and of the `copies` that each plays
@@ -102,7 +113,7 @@ def evaluate(
     """
     flags = flags_of(EvaluateFlags, "evaluate", run=Path(run), episodes=episodes, **keywords)
     with count_line("evaluating", show=progress) as watch:
-        return play(flags, watch, env)[0]
+        return play(flags, watch, Given(env, wrappers))[0]
 
 
 def record(
@@ -110,7 +121,8 @@ def record(
     out: str,
     steps: int = 50_000,
     *,
-    env: Environment | None = None,
+    env: EnvLike | None = None,
+    wrappers: Sequence[WrapperLike] | None = None,
     progress: bool = True,
     **keywords: Unpack[RecordKeywords],
 ) -> RecordedDataset:
@@ -120,7 +132,9 @@ def record(
         run: A `Run`, or a run folder.
         out: Id of the dataset, as `cartpole/expert-v0`. It is written to MINARI_DATASETS_PATH, or to ~/.minari/datasets.
         steps: Number of env steps. The last episode is finished, unless that would take more than twice as many.
-        env: The callable that the run was started with, if its environment has no id. (`Run.record` knows it.)
+        env: The environment that the run was started with, if it is not found by its name: it was made in another script or
+            notebook. (`Run.record` of the `Run` that `train` returned knows it.)
+        wrappers: Likewise the wrappers.
         progress: Show how far it is.
         **keywords: The flags of `millrace record`: `stochastic`, to sample actions; `npy`, a file for rows of observation
             and action; `seed`, `best`, `workers`, `transport` and `bind`.
@@ -134,13 +148,13 @@ def record(
     """
     flags = flags_of(RecordFlags, "record", run=Path(run), out=out, steps=steps, **keywords)
     with count_line("recording", show=progress) as watch:
-        return write_dataset(flags, watch, env)
+        return write_dataset(flags, watch, Given(env, wrappers))
 
 
 def flags_of(kind: type[_Flags], name: str, **keywords: Any) -> _Flags:
     """The flags that these keyword arguments make. Raises `UsageError` that names one that is wrong."""
     for keyword in keywords:
-        if keyword not in kind.__struct_fields__:
+        if keyword not in kind.__struct_fields__ or keyword in NOT_KEYWORDS:
             raise UsageError(f"{name}: unknown keyword {keyword}{did_you_mean(keyword, kind.__struct_fields__)}")
     try:
         return msgspec.convert(keywords, kind)
@@ -148,7 +162,7 @@ def flags_of(kind: type[_Flags], name: str, **keywords: Any) -> _Flags:
         raise UsageError(f"{name}: {error}") from error
 
 
-def play(flags: EvaluateFlags, watch: Watch, env: Environment | None = None) -> tuple[Evaluation, list[Path]]:
+def play(flags: EvaluateFlags, watch: Watch, given: Given | None = None) -> tuple[Evaluation, list[Path]]:
     """Play greedy episodes. Returns their evaluation, and the paths of the videos if there are any.
 
     Raises `UserFacingError`, or `KeyboardInterrupt` if the user stops it.
@@ -168,7 +182,7 @@ def play(flags: EvaluateFlags, watch: Watch, env: Environment | None = None) -> 
         from learner.recording.video import prepare_rendering, record_videos
 
         prepare_rendering()
-    saved = _saved(flags, env)
+    saved = _saved(flags, given)
     copies = 1 if flags.video else flags.copies
     workers = PlayingWorkers(useful_workers(flags.workers, episodes, copies), flags.transport, flags.bind)
     with policy_player(saved, workers, watch) as player:
@@ -178,21 +192,21 @@ def play(flags: EvaluateFlags, watch: Watch, env: Environment | None = None) -> 
         return evaluation_of(played, saved.facts), []
 
 
-def write_dataset(flags: RecordFlags, watch: Watch, env: Environment | None = None) -> RecordedDataset:
+def write_dataset(flags: RecordFlags, watch: Watch, given: Given | None = None) -> RecordedDataset:
     """Write a dataset. Raises `UserFacingError`, or `KeyboardInterrupt` if the user stops it; then it leaves no files."""
     _at_least("steps", flags.steps, 1)
     _at_least("seed", flags.seed, 0)
     _at_least("workers", flags.workers, 1)
-    saved, workers = _saved(flags, env), PlayingWorkers(flags.workers, flags.transport, flags.bind)
+    saved, workers = _saved(flags, given), PlayingWorkers(flags.workers, flags.transport, flags.bind)
     with policy_player(saved, workers, watch) as player:
         return record_dataset(
             player, flags.run, flags.out, flags.steps, flags.seed, stochastic=flags.stochastic, npy=flags.npy
         )
 
 
-def _saved(flags: EvaluateFlags | RecordFlags, env: Environment | None) -> SavedPolicy:
-    saved = saved_policy(flags.run, "best" if flags.best else "final")
-    return saved if env is None else saved._replace(env=EnvSpec.of(env, saved.env.kwargs))
+def _saved(flags: EvaluateFlags | RecordFlags, given: Given | None) -> SavedPolicy:
+    env, wrappers = given or Given(flags.env or None, flags.wrapper or None)
+    return saved_policy(flags.run, "best" if flags.best else "final", env=env, wrappers=wrappers)
 
 
 def _at_least(name: str, value: int, least: int) -> None:

@@ -35,7 +35,8 @@ from learner.run_folder.results import Evaluation
 from millrace.launch.rollouts import start
 from millrace.policies import MLP, PolicyChoice, PolicyParameters
 from protocol.arrays import Array, Ints
-from protocol.env_spec import EnvSpec
+from protocol.env_spec import EnvLike, EnvSpec, remembered_name
+from protocol.envs.wrappers import WrapperLike, wrapper_name
 from protocol.errors import CheckpointError, UsageError, first_line
 from protocol.rollout import Batch, stack_rollouts
 from protocol.specs import PolicySpec
@@ -100,9 +101,10 @@ class RolloutService:
 
     def __init__(
         self,
-        env: str | Any,
+        env: EnvLike,
         policy: PolicyChoice | None = None,
         *,
+        wrappers: Sequence[WrapperLike] = (),
         rollout_steps: int = 128,
         restore: str | Path | None = None,
         **settings: Any,
@@ -110,7 +112,10 @@ class RolloutService:
         """Start the workers and wait until they have joined.
 
         Args:
-            env: an id that `gymnasium.make` takes, or a callable that returns an environment.
+            env: an id that `gymnasium.make` takes, a `gymnasium.envs.registration.EnvSpec`, or a callable that returns an
+                environment; also one that only your script or notebook has.
+            wrappers: applied to every env copy in its worker, the first one innermost: classes, functions, or names as
+                "gymnasium.wrappers:FlattenObservation".
             policy: `MLP`, `CNN`, `Recurrent` or your `OwnPolicy`; by default `MLP(64, 64)`.
             rollout_steps: T, env steps of an env copy in a batch.
             restore: a file that `save` wrote; `restored` then has its arrays.
@@ -123,7 +128,7 @@ class RolloutService:
         the environment cannot be made.
         """
         listens = bool(settings.get("bind"))
-        config = _config(env, settings)
+        config = _config(env, wrappers, settings)
         if not (type(rollout_steps) is int and rollout_steps > 0):
             raise UsageError(f"rollout_steps: expected a whole number above 0, got {rollout_steps!r}")
         self.restored: dict[str, Array] = {}
@@ -145,7 +150,7 @@ class RolloutService:
         self._taken, self._published = 0, 0
         self._moments: Moments | None = None
         self._resources = ExitStack()
-        spec = EnvSpec.of(env, config.env_kwargs)
+        spec = EnvSpec.of(env, config.env_kwargs, wrappers)
         try:
             with self._interrupts:
                 started = start(
@@ -401,13 +406,12 @@ class RolloutService:
             raise UsageError("rollout service: expected calls from the thread that made it, got one from another thread")
 
 
-def _config(env: object, settings: dict[str, Any]) -> RolloutConfig:
+def _config(env: EnvLike, wrappers: Sequence[WrapperLike], settings: dict[str, Any]) -> RolloutConfig:
     """The settings as a record, checked. Raises `UsageError`."""
     known = RolloutConfig.__struct_fields__
-    if unknown := [name for name in settings if name not in known or name == "env"]:
+    if unknown := [name for name in settings if name not in known or name in ("env", "wrapper")]:
         raise UsageError(f"rollout service: unknown setting {unknown[0]}{did_you_mean(unknown[0], known)}")
-    name = env if isinstance(env, str) else getattr(env, "__name__", type(env).__name__)
-    given = {**settings, "env": name}
+    given = {**settings, "env": remembered_name(env), "wrapper": tuple(map(wrapper_name, wrappers))}
     if not given.get("bind"):
         given.pop("bind", None)
     return convert_rollout_settings(given)

@@ -25,6 +25,8 @@ from learner.run_folder.run_folder import RunFolder
 from millrace.playing import RunEvaluateKeywords, RunRecordKeywords, evaluate, record
 from millrace.terminal import shown_progress
 from protocol.arrays import Array
+from protocol.env_spec import EnvLike, EnvSpec, remembered_name
+from protocol.envs.wrappers import WrapperLike, wrapper_name
 from protocol.errors import UsageError, UserFacingError
 
 if TYPE_CHECKING:
@@ -129,6 +131,7 @@ class Run(os.PathLike[str]):
         2
         """
         keywords.setdefault("env", self._given.get("env"))
+        keywords.setdefault("wrappers", self._given.get("wrappers"))
         return evaluate(self, episodes, **keywords)
 
     def record(self, out: str, steps: int = 50_000, **keywords: Unpack[RunRecordKeywords]) -> RecordedDataset:
@@ -139,6 +142,7 @@ class Run(os.PathLike[str]):
         'cartpole/of-a-run-v0'
         """
         keywords.setdefault("env", self._given.get("env"))
+        keywords.setdefault("wrappers", self._given.get("wrappers"))
         return record(self, out, steps, **keywords)
 
     def resume(self, **keywords: Any) -> Run:
@@ -206,8 +210,9 @@ class Run(os.PathLike[str]):
 
 
 def train(
-    env: str | Callable[..., object] = "",
+    env: EnvLike = "",
     *,
+    wrappers: Sequence[WrapperLike] | None = None,
     config: str | os.PathLike[str] | None = None,
     resume: str | os.PathLike[str] | None = None,
     preset: str = "auto",
@@ -219,7 +224,11 @@ def train(
     """Train a policy on this machine: the learner runs in this process, the workers in processes that it starts.
 
     Arguments:
-        env: An id that `gymnasium.make` takes, or a callable that returns an environment.
+        env: An id that `gymnasium.make` takes, a `gymnasium.envs.registration.EnvSpec`, or a callable that returns an
+            environment; also one that only your script or notebook has. A resumed run finds it by its name, or it is
+            given again.
+        wrappers: Applied to every env copy, also in evaluations, the first one innermost: classes, functions, or names as
+            "gymnasium.wrappers:FlattenObservation".
         config: A TOML file of settings.
         resume: A run, or its folder, to continue from its newest checkpoint; or "auto": the newest run of this environment,
             algorithm and seed if there is one, else a new run.
@@ -240,15 +249,23 @@ def train(
     """
     from millrace.launch import local_run
 
-    name = env if isinstance(env, str) else getattr(env, "__name__", type(env).__name__)
+    name = remembered_name(env)
+    if wrappers is not None:
+        keywords["wrapper"] = list(map(wrapper_name, wrappers))
     file, run = (None if path is None else Path(path) for path in (config, resume))
     if run == AUTO:
         run = newest_run(resolve(name, file=file, preset=preset, **keywords))
         file = None if run else file
     settings = resolve(name, file=file, resume=run, preset=preset, **keywords)
-    objects = {name: given for name, given in {"env": env, **keywords}.items() if callable(given)}
+    objects = {name: made for name, made in keywords.items() if callable(made)}
+    objects |= {} if isinstance(env, str) else {"env": env}
+    objects |= {} if wrappers is None else {"wrappers": wrappers}
+    given = None
+    if not isinstance(env, str) or wrappers is not None:
+        outer = settings.wrapper if wrappers is None else wrappers
+        given = EnvSpec.of(settings.env if isinstance(env, str) else env, settings.env_kwargs, outer)
     with shown_progress(watch, show=progress) as both:
-        folder = local_run.train(settings, run, Callbacks(callbacks, both), factory=None if isinstance(env, str) else env)
+        folder = local_run.train(settings, run, Callbacks(callbacks, both), given)
     return Run._trained(folder, objects)
 
 

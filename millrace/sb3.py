@@ -12,14 +12,14 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import gymnasium
+import msgspec
 import numpy as np
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 import millrace
 from learner.vector_env.env import ZmqVectorEnv
-from learner.vector_env.settings import EnvLike
 from protocol.arrays import Array
-from protocol.env_spec import EnvSpec, Scalar
+from protocol.env_spec import EnvLike, EnvSpec, Scalar
 
 Indices = int | Iterable[int] | None
 
@@ -58,7 +58,10 @@ def make_vec_env(
     envs = env_id
     if wrapper_class is not None:
         wrap = _Wrapping(wrapper_class, wrapper_kwargs or {}, monitor)
-        envs = wrap(env_id) if isinstance(env_id, str) or callable(env_id) else [wrap(each) for each in env_id]
+        if isinstance(env_id, Sequence) and not isinstance(env_id, str):
+            envs = [wrap(each) for each in env_id]
+        else:
+            envs = wrap(env_id)
     env = Sb3VecEnv(millrace.make_vec(envs, n_envs, autoreset_mode="SameStep", **keywords, **(env_kwargs or {})))
     if seed is not None:
         env.seed(seed)
@@ -161,26 +164,25 @@ class _Wrapping:
         self, wrapper_class: Callable[..., gymnasium.Env[Any, Any]], keywords: dict[str, Any], monitor: bool
     ) -> None:
         self._wrapper_class, self._keywords, self._monitor = wrapper_class, keywords, monitor
-        self._made: dict[EnvLike, Callable[..., gymnasium.Env[Any, Any]]] = {}
+        self._made: dict[object, Callable[..., gymnasium.Env[Any, Any]]] = {}
 
     def __call__(self, env: EnvLike) -> Callable[..., gymnasium.Env[Any, Any]]:
         """A factory of this environment, wrapped. The same one for the same environment, so that it is sent once."""
-        if env not in self._made:
-            self._made[env] = _wrapped(env, self._wrapper_class, self._keywords, self._monitor)
-        return self._made[env]
+        key = env if isinstance(env, str) else id(env)  # gymnasium's specs cannot be hashed
+        if key not in self._made:
+            self._made[key] = _wrapped(env, self._wrapper_class, self._keywords, self._monitor)
+        return self._made[key]
 
 
 def _wrapped(
     env: EnvLike, wrapper_class: Callable[..., gymnasium.Env[Any, Any]], keywords: dict[str, Any], monitor: bool
 ) -> Callable[..., gymnasium.Env[Any, Any]]:
     """A factory that a worker can call without this module, which needs Stable-Baselines3: it is a nested function."""
+    inner = EnvSpec.of(env)
 
     def make(render_mode: str | None = None, **kwargs: Scalar) -> gymnasium.Env[Any, Any]:
-        if isinstance(env, str):
-            made = EnvSpec(env, kwargs).make(render_mode)
-        else:
-            made = env(**kwargs, **({} if render_mode is None else {"render_mode": render_mode}))
+        made = msgspec.structs.replace(inner, kwargs=kwargs).make(render_mode)
         return wrapper_class(gymnasium.wrappers.RecordEpisodeStatistics(made) if monitor else made, **keywords)
 
-    make.__name__ = env if isinstance(env, str) else getattr(env, "__name__", type(env).__name__)
+    make.__name__ = make.__qualname__ = inner.id
     return make

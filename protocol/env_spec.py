@@ -2,22 +2,31 @@
 
 Only this file may unpickle, and only in `PickledCallable.load`: a callable that the *learner* sent to a worker which allows
 `AllowedCode.CALLABLES`. Nothing that a worker sends is ever unpickled.
+
+Rule: what other processes find by name travels by name. What only this process has (a function, a class or a registered id
+of a script or notebook) travels as a pickled callable.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
+import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from enum import Enum
 from importlib.util import find_spec
 from typing import Any, TypeVar
 
 import gymnasium
 import msgspec
+from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
 from gymnasium.envs.registration import VectorizeMode
 from gymnasium.vector import VectorEnv
 
+from protocol.envs.found_names import MAIN, attribute, found_by_others, in_main, last_part, name_of
+from protocol.envs.unknown_ids import is_registered, load_plugins, most_similar, plugin_modules, registers, what_to_write
+from protocol.envs.wrappers import WrapperLike, not_named, wrap, wrapper_name
 from protocol.errors import UsageError, first_line
 
 # By namespace: the module that registers its environments. The id is then passed to gymnasium as `module:id`, so that
@@ -25,6 +34,8 @@ from protocol.errors import UsageError, first_line
 REGISTERING_MODULES = {"millrace": "workers.envs", "ALE": "ale_py"}
 MAX_CALLABLE_BYTES = 1 << 26
 Scalar = bool | int | float | str
+EnvLike = str | GymnasiumSpec | Callable[..., object]
+"""An id that `gymnasium.make` takes or a name, gymnasium's `EnvSpec`, or a callable that returns an environment."""
 _Made = TypeVar("_Made")
 
 
@@ -54,7 +65,13 @@ class PickledCallable:
         """Pickle a callable. `what` names it in errors. Raises `UsageError` for one that cannot be sent."""
         import cloudpickle
 
-        data = cloudpickle.dumps(made)
+        try:
+            data = cloudpickle.dumps(made)
+        except Exception as error:  # what it refers to may be anything
+            raise UsageError(
+                f"{what}: its callable cannot be sent to workers: {type(error).__name__}: {first_line(error)}; let it make "
+                "what it needs when it is called"
+            ) from error
         if len(data) > MAX_CALLABLE_BYTES:
             raise UsageError(
                 f"{what}: expected its callable to pickle to at most {MAX_CALLABLE_BYTES:,} bytes, got "
@@ -80,25 +97,40 @@ class PickledCallable:
 
 
 class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The environment: a gymnasium id, or a factory that the learner pickled."""
+    """The environment: a gymnasium id, the name of a function that returns one, or a factory that the learner pickled."""
 
     id: str
-    """any id that `gymnasium.make` takes: `CartPole-v1`, `ALE/Pong-v5`, `my_package.envs:MyEnv-v0`"""
+    """any id that `gymnasium.make` takes: `CartPole-v1`, `ALE/Pong-v5`, `my_package.envs:MyEnv-v0`; or a function or class,
+    `my_package.envs:MyEnv`, that returns an environment
+    """
     kwargs: dict[str, Scalar] = {}
     """keyword arguments of `gymnasium.make`"""
     factory: PickledCallable | None = None
     """a cloudpickled callable that returns one environment; `id` is then only its name"""
+    wrappers: tuple[str, ...] = ()
+    """wrappers of every copy, the innermost first: `module:Class`, or `module:Class(key=value)` with plain values. If one of
+    them is in the factory, all are, and these are only their names.
+    """
 
     @staticmethod
-    def of(env: str | Callable[[], object], kwargs: dict[str, Scalar] | None = None) -> EnvSpec:
-        """Make a spec from an id, or from a callable that takes `kwargs` and returns a `gymnasium.Env`.
+    def of(env: EnvLike | EnvSpec, kwargs: dict[str, Scalar] | None = None, wrappers: Sequence[WrapperLike] = ()) -> EnvSpec:
+        """Make a spec from what a user gives: an id or a name, gymnasium's `EnvSpec`, or a callable that takes `kwargs`.
 
-        Raises `UsageError` for a callable that is too large to send.
+        `wrappers`: each takes an environment and returns one, or is the name of such a callable. Raises `UsageError` for
+        what cannot be found, and for a callable that is too large to send.
         """
-        if isinstance(env, str):
-            return EnvSpec(env, kwargs or {})
-        name = getattr(env, "__name__", type(env).__name__)
-        return EnvSpec(name, kwargs or {}, PickledCallable.of(env, f"environment {name}"))
+        if isinstance(env, EnvSpec):
+            return env
+        name, factory = _given(env)
+        name = env if isinstance(env, str) else name
+        names = tuple(map(wrapper_name, wrappers))
+        own = [not_named(wrapper) for wrapper in wrappers]
+        if any(wrapper is not None for wrapper in own):
+            layers = [name if wrapper is None else wrapper for name, wrapper in zip(names, own, strict=True)]
+            factory = _WrappedFactory(name, factory, tuple(layers))
+        return EnvSpec(
+            name, kwargs or {}, None if factory is None else PickledCallable.of(factory, f"environment {name}"), names
+        )
 
     def rejection_reason(self, code: AllowedCode) -> str:
         """Why a worker that allows only this code cannot make it; empty if it can."""
@@ -112,18 +144,30 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 f"environment {self.id} imports a module, which this worker does not do for a learner it cannot be sure of; "
                 "give it a token (and not --no-code)"
             )
+        if self.wrappers and code is AllowedCode.REGISTERED:
+            return (
+                f"environment {self.id}: its wrapper {self.wrappers[0]} imports a module, which this worker does not do for "
+                "a learner it cannot be sure of; give it a token (and not --no-code)"
+            )
         return ""
 
-    def make(self, render_mode: str | None = None) -> gymnasium.Env[object, object]:
-        """Make one env copy. Raises `UsageError`, with advice, if the id is unknown or a package is missing."""
-        extra: dict[str, object] = {} if render_mode is None else {"render_mode": render_mode}
+    def make(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
+        """Make one env copy, in its wrappers. Raises `UsageError`, with advice, if it or a package cannot be found.
+
+        `detail` of the error is the traceback if a constructor raised.
+        """
+        extra: dict[str, Any] = {} if render_mode is None else {"render_mode": render_mode}
         if self.factory is not None:
-            env = self.factory.load()(**self.kwargs, **extra)
-            if not isinstance(env, gymnasium.Env):
-                raise UsageError(f"env factory {self.id}: expected it to return a gymnasium.Env, got {type(env).__name__}")
-            return env
-        # Without gymnasium's checker: it costs a tenth of a CartPole step, and `protocol.rollout.validate` checks every row.
-        return self._made(lambda env_id: gymnasium.make(env_id, disable_env_checker=True, **self.kwargs, **extra))  # type: ignore[arg-type]
+            factory = self.factory.load()
+            env = _checked(self.id, factory(**self.kwargs, **extra))
+            if isinstance(factory, _WrappedFactory):
+                return env
+        else:
+            # Without gymnasium's checker: it costs a tenth of a CartPole step, and `protocol.rollout.validate` checks rows.
+            env = self._made(lambda env_id: _make(env_id, {**self.kwargs, **extra}))
+        for wrapper in self.wrappers:
+            env = wrap(env, wrapper)
+        return env
 
     def make_vectorized(self, copies: int) -> VectorEnv[Any, Any, Any]:
         """Make `copies` copies in the environment's own vectorized form; `protocol.envs.vectorized` checks it."""
@@ -144,17 +188,141 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def _made(self, make: Callable[[str], _Made]) -> _Made:
         """Call `make` with the id. Raises `UsageError`."""
         registrar = REGISTERING_MODULES.get(self.id.partition("/")[0])
+        plain = registrar is None and ":" not in self.id
+        plugins_failed = load_plugins(self.id) if plain and not is_registered(self.id) else []
         try:
             return make(f"{registrar}:{self.id}" if registrar and find_spec(registrar) else self.id)
         except (gymnasium.error.Error, ImportError, TypeError) as error:  # TypeError: keyword arguments it does not take
-            raise UsageError(_make_error(self.id, error)) from error
+            raise UsageError(_make_error(self.id, error, plugins_failed)) from error
         except Exception as error:  # its constructor raised any exception
             line = f"environment {self.id} cannot be made: {type(error).__name__}: {first_line(error)}"
             raise UsageError(line, traceback.format_exc()) from error
 
 
-def _make_error(env_id: str, error: Exception) -> str:
-    """One line for an environment that is not known, or whose package is missing."""
+def _make(env_id: str, kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
+    """Make the environment of an id, or call the function or class that a name names."""
+    module_name, colon, name = env_id.partition(":")
+    if colon and all(word.isidentifier() for word in name.split(".")):
+        function = attribute(importlib.import_module(module_name), name)
+        if callable(function) and name not in gymnasium.registry:
+            return _checked(env_id, function(**kwargs))
+    return gymnasium.make(env_id, disable_env_checker=True, **kwargs)
+
+
+def _checked(name: str, made: object) -> gymnasium.Env[Any, Any]:
+    if not isinstance(made, gymnasium.Env):
+        raise UsageError(f"env factory {name}: expected it to return a gymnasium.Env, got {type(made).__name__}")
+    return made
+
+
+# -------------------------------------------------------------------------------------------- what only this process has
+
+
+class _WrappedFactory:
+    """Makes an environment and wraps it: one of the wrappers has no name that another process finds."""
+
+    def __init__(self, name: str, env: Callable[..., object] | None, wrappers: tuple[WrapperLike, ...]) -> None:
+        """`env` returns the environment without wrappers; None: `name` is its id."""
+        self._name, self._env, self._wrappers = name, env, wrappers
+
+    def __call__(self, render_mode: str | None = None, **kwargs: Scalar) -> gymnasium.Env[Any, Any]:
+        if self._env is None:
+            env = EnvSpec(self._name, kwargs).make(render_mode)
+        else:
+            env = _checked(self._name, self._env(**kwargs, **({} if render_mode is None else {"render_mode": render_mode})))
+        for wrapper in self._wrappers:
+            env = wrap(env, wrapper)
+        return env
+
+
+class _SpecFactory:
+    """Makes the environment of gymnasium's `EnvSpec`, which is not registered where it is made."""
+
+    def __init__(self, spec: GymnasiumSpec) -> None:
+        if isinstance(spec.entry_point, str) and callable(own := in_main(spec.entry_point)):
+            spec = dataclasses.replace(spec, entry_point=own)
+        self._spec = spec
+
+    def __call__(self, **kwargs: Any) -> gymnasium.Env[Any, Any]:
+        return gymnasium.make(self._spec, disable_env_checker=True, **kwargs)
+
+
+def remembered_name(env: EnvLike | EnvSpec) -> str:
+    """The name by which a run remembers an environment that was given in Python, and finds it again if it can."""
+    return env.id if isinstance(env, EnvSpec) else _named(env)[0]
+
+
+def _given(env: EnvLike) -> tuple[str, Callable[..., object] | None]:
+    """The name of what a user gave, and what makes it if workers cannot find it by that name. Raises `UsageError`."""
+    name, factory = _named(env)
+    if factory is None and not found_by_others(name):
+        last = "my_env" if "lambda" in name else last_part(name)
+        raise UsageError(
+            f"environment {name} was made in a script, a notebook or a function, and cannot be found here; go on where it "
+            f"was made, or put it into a module and name it as my_module:{last} (train: ENV; evaluate, record: --env)"
+        )
+    return name, factory
+
+
+def _named(env: EnvLike) -> tuple[str, Callable[..., object] | None]:
+    match env:
+        case str():
+            return _registered_here(env)
+        case GymnasiumSpec():
+            return (env.id, None) if _is_of_everyone(env) else _registered_here(env.id, env)
+        case _ if callable(env):
+            return name_of(env), env
+        case _:
+            raise UsageError(
+                f"environment: expected an id, a gymnasium EnvSpec or a callable that returns one, got {env!r:.100}"
+            )
+
+
+def _registered_here(env_id: str, given: GymnasiumSpec | None = None) -> tuple[str, Callable[..., object] | None]:
+    """The name of an id, and what makes it if it is registered in this process only."""
+    module, _, plain = env_id.rpartition(":")
+    if module not in ("", MAIN):
+        return env_id, None
+    if module == MAIN and callable(own := in_main(env_id)):
+        return env_id, own
+    known = gymnasium.registry.get(plain)
+    if given is not None and given is not known:
+        return f"<{plain}>", _SpecFactory(given)
+    if known is None or _is_of_everyone(known):
+        return env_id, None
+    registrar = _registering_module(known)
+    return f"{registrar or MAIN}:{plain}", _SpecFactory(known)
+
+
+def _is_of_everyone(spec: GymnasiumSpec) -> bool:
+    """Whether a process that has just started knows this spec: it is gymnasium's, ours or a plugin's, and unchanged."""
+    known = gymnasium.registry.get(spec.id)
+    try:
+        if known is None or spec != known:
+            return False
+    except ValueError:  # arrays among the keyword arguments
+        return False
+    where = spec.entry_point if isinstance(spec.entry_point, str) else getattr(spec.entry_point, "__module__", "")
+    package = where.partition(":")[0].partition(".")[0]
+    return package == "gymnasium" or spec.namespace in REGISTERING_MODULES or package in plugin_modules()
+
+
+def _registering_module(spec: GymnasiumSpec) -> str:
+    """The module that registers it when another process imports it, as far as its source text shows; empty if none does."""
+    where = spec.entry_point if isinstance(spec.entry_point, str) else getattr(spec.entry_point, "__module__", "")
+    parts = where.partition(":")[0].split(".")
+    modules = [".".join(parts[:count]) for count in range(1, len(parts) + 1)]
+    return next((module for module in modules if module != MAIN and registers(module, spec.id)), "")
+
+
+# --------------------------------------------------------------------------------------------------------------- errors
+
+
+def _make_error(env_id: str, error: Exception, plugins_failed: Sequence[str] = ()) -> str:
+    """One line for an environment that is not known, or whose package is missing.
+
+    `plugins_failed`: lines about installed packages that could not register their environments.
+    """
     module, colon, _ = env_id.partition(":")
     says = first_line(error)
     match error:
@@ -171,6 +339,14 @@ def _make_error(env_id: str, error: Exception) -> str:
                 f"environment {env_id} has no vectorized form of its own (gymnasium's vector_entry_point); use --vector loop"
             )
         case gymnasium.error.UnregisteredEnv() if not colon:
-            return f"environment {env_id} is not registered: {says} One of your own is given as my_module:MyEnv-v0"
+            broken = f" ({'; '.join(plugins_failed)})" if plugins_failed else ""
+            return f"environment {env_id} is not registered: {what_to_write(env_id)}{broken}"
+        case gymnasium.error.UnregisteredEnv():
+            name = env_id.partition(":")[2]
+            similar = most_similar(name, vars(sys.modules.get(module, object)))
+            hint = f"; did you mean {module}:{similar}?" if similar else ""
+            return (
+                f"environment {env_id}: module {module} neither registers {name} nor has a class or function so named{hint}"
+            )
         case _:
             return f"environment {env_id} cannot be made: {says}"

@@ -8,7 +8,6 @@ then, in one line, before a worker or a run folder is made. A class that was giv
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import sys
 import traceback
 from collections.abc import Mapping
@@ -24,6 +23,7 @@ from learner.config.did_you_mean import did_you_mean
 from learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig
 from learner.config.on_resume import declared
 from protocol.bounds import one_line
+from protocol.envs.found_names import attribute, importable
 from protocol.errors import UsageError, first_line
 
 ALGORITHMS = {
@@ -79,12 +79,12 @@ def name_of(algorithm: type) -> str:
             return short
     main = sys.modules["__main__"]
     spec = getattr(main, "__spec__", None)
-    in_main = module == "__main__" and _attribute(main, qualname) is algorithm
+    in_main = module == "__main__" and attribute(main, qualname) is algorithm
     name = (
         f"{spec.name if spec is not None and in_main else module}:{qualname}"  # `python -m mine`: others import it as mine
     )
     _given.pop(name, None)
-    if module == "__main__" or _attribute(sys.modules.get(module), qualname) is not algorithm or not _importable(module):
+    if module == "__main__" or attribute(sys.modules.get(module), qualname) is not algorithm or not importable(module):
         _given[name] = algorithm
     _checked(name, algorithm)
     return name
@@ -107,7 +107,7 @@ def with_algorithm(table: dict[str, Any], algo: str | None) -> dict[str, Any]:
 def _found(name: str) -> object:
     module_name, _, qualname = name.partition(":")
     if module_name == "__main__" or "<locals>" in qualname:
-        found = _attribute(sys.modules.get(module_name), qualname)
+        found = attribute(sys.modules.get(module_name), qualname)
         if found is None:
             raise UsageError(
                 f"algo {name}: this class was made in a script, a notebook or a function; go on with it there: "
@@ -117,7 +117,7 @@ def _found(name: str) -> object:
     if not all(part.isidentifier() for text in (module_name, qualname) for part in text.split(".")):
         raise UsageError(f"algo {name}: expected module:Class, as in mine:ClippedPlus")
     module = _imported(module_name, name)
-    found = _attribute(module, qualname)
+    found = attribute(module, qualname)
     if found is None:
         classes = [key for key, value in vars(module).items() if isinstance(value, type)]
         where = getattr(module, "__file__", None) or "built-in"
@@ -141,22 +141,6 @@ def _imported(module_name: str, name: str) -> ModuleType:
 def _import_failed(name: str, module: str, error: BaseException) -> UsageError:
     why = one_line(f"{type(error).__name__}: {first_line(error)}")
     return UsageError(f"algo {name}: the import of {module} failed: {why}", "".join(traceback.format_exception(error)))
-
-
-def _attribute(module: ModuleType | None, qualname: str) -> object:
-    """What a module has under this dotted name; None if nothing."""
-    found: object = module
-    for part in qualname.split("."):
-        found = getattr(found, part, None)
-    return found
-
-
-def _importable(module: str) -> bool:
-    """Whether another process that has our search path could import this module."""
-    try:
-        return importlib.util.find_spec(module) is not None
-    except (ImportError, ValueError, AttributeError):
-        return False
 
 
 def _last(name: str) -> str:

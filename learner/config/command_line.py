@@ -68,12 +68,13 @@ def _read_layers(command: str, argv: list[str], resumed: Path | None = None) -> 
     if type(algorithm) is not type(first.algorithm):  # then the values of its own flags may have been mistaken for ENV
         first = parse(without_help, default=RunFlags(algo="", algorithm=algorithm), ignore_unknown=True)
     base = below(first.env)
-    default = RunFlags(**{**_fields(base), "env_kwargs": {}})
+    default = RunFlags(**{**_fields(base), "env_kwargs": {}, "wrapper": ()})
     if without_help != argv:
         show_help(default, command)
     flags = parse(argv, default=default)
     config = Config(**_fields(flags))
-    return validate(override(config, {"env_kwargs": base.env_kwargs | config.env_kwargs}, "")), flags.resume
+    both = {"env_kwargs": base.env_kwargs | config.env_kwargs, "wrapper": config.wrapper or base.wrapper}
+    return validate(override(config, both, "")), flags.resume
 
 
 def _none_for_tyro(argv: list[str], algorithm: AlgorithmConfig) -> list[str]:

@@ -23,8 +23,8 @@ from learner.config.flag_parser import parse_flags, plain_type
 from learner.config.hyperparameters import HYPERPARAMETERS
 
 BASIC = (
-    "env", "algo", "steps", "seed", "workers", "envs", "env_kwargs", "device", "preset", "config", "resume", "run_dir",
-    "eval_episodes", "eval_every", "target_return", "target_mean_return",
+    "env", "algo", "steps", "seed", "workers", "envs", "env_kwargs", "wrapper", "device", "preset", "config", "resume",
+    "run_dir", "eval_episodes", "eval_every", "target_return", "target_mean_return",
 )  # fmt: skip
 GROUPS = {
     "evaluation": ("eval_copies", "eval_max_steps", "info_keys"),
@@ -45,6 +45,7 @@ GROUPS = {
 METAVARS = {
     "algo": f"{{{','.join(HYPERPARAMETERS)}}}|MODULE:CLASS",
     "env_kwargs": "NAME VALUE ...",
+    "wrapper": "MODULE:CLASS",
     "net": "INT ...",
     "callback": "MODULE:FACTORY",
     "config": "PATH",

@@ -21,6 +21,7 @@ from learner.config.hyperparameters import HYPERPARAMETERS, algorithms_with
 from learner.config.presets import PRESETS, environment_presets, named_presets
 from learner.config.validation import convert, validate
 from learner.run_folder.run_format import check_format, check_whole
+from protocol.envs.found_names import moved
 from protocol.errors import UsageError
 
 
@@ -78,7 +79,7 @@ def lower_layers(
     where = str(file)
     table = {} if file is None else _read_toml(file, of_run=resume is not None)
     table = table if resume is None else with_algorithm(table, algo)
-    if resume is not None and env not in ("", table.get("env")):
+    if resume is not None and env and not moved(str(table.get("env")), env):
         raise UsageError(f"run {resume} is of {table.get('env')}, not of {env}; resume it without naming an environment")
     named = named_presets()
     whole_run = named[preset].settings if preset in named else {}

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
-from tyro.conf import Positional
+from tyro.conf import Positional, UseAppendAction
 
 from learner.config.on_resume import Adaptable, Fixed, Free
 from protocol.alive import CallTimeouts
@@ -32,6 +32,10 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """Environment id for gymnasium.make, as CartPole-v1, ALE/Pong-v5 or my_package.envs:MyEnv-v0."""
     env_kwargs: Fixed[dict[str, Scalar]] = {}
     """Keyword arguments for gymnasium.make: NAME VALUE NAME VALUE ..."""
+    wrapper: Fixed[Annotated[tuple[str, ...], UseAppendAction]] = ()
+    """Wrap every env copy, also in evaluations: gymnasium.wrappers:FlattenObservation, or with plain arguments
+    "my_module:Scale(by=0.5)". The first one given is the innermost.
+    """
     seed: Fixed[Natural] = 1
     """Seed of all random numbers of the run."""
     workers: Free[Count] = 2

@@ -13,6 +13,7 @@ from learner.config.hyperparameters import DQNConfig
 from learner.config.rollout_config import RolloutConfig
 from protocol.address import advertised_address, check_address
 from protocol.bounds import MAX_NAME, one_line
+from protocol.envs.wrappers import wrapper_name
 from protocol.errors import UsageError
 
 MAX_FACTS = 32  # names in info_keys
@@ -71,6 +72,12 @@ def check_rollout_settings(config: RolloutConfig, at: str = "") -> None:
         raise UsageError(f"{at}info_keys: expected at most {MAX_FACTS} different names, got {len(names)}")
     if wrong := [name for name in names if name != one_line(name, MAX_NAME)]:
         raise UsageError(f"{at}info_keys: expected names in one line, got {one_line(repr(wrong[0]), MAX_NAME)}")
+    if config.wrapper and config.chosen_vector() != "loop":
+        raise UsageError(
+            f"{at}vector {config.vector}: wrappers are applied to single env copies; expected loop, which is the default"
+        )
+    for wrapper in config.wrapper:
+        wrapper_name(wrapper)
     try:
         check_address(config.bind)
     except UsageError as error:

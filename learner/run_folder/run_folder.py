@@ -78,6 +78,8 @@ class PolicyDescription(msgspec.Struct, frozen=True, kw_only=True):
     arrays: tuple[ArrayPosition, ...]
     buffers: tuple[str, ...]
     """names of arrays that are not parameters: mean and standard deviation for observation normalization"""
+    wrappers: tuple[str, ...] = ()
+    """wrappers of every env copy, the innermost first"""
 
 
 class RunSettings(Protocol):
@@ -226,6 +228,7 @@ class RunFolder:
             policy=spec,
             arrays=_array_positions(acting),
             buffers=tuple(named_views(buffers, buffer_layout(spec))),
+            wrappers=env.wrappers,
         )
         contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         checksum = str(zlib.crc32(_split(save(contiguous))[1]))
@@ -320,7 +323,7 @@ def _decode_description(text: bytes) -> PolicyDescription:
 
 def as_folder_name(env: str) -> str:
     """The name of an environment or an algorithm as part of a folder's name."""
-    return re.sub(r"[^A-Za-z0-9._]+", "-", env).strip("-.") or "env"
+    return re.sub(r"[^A-Za-z0-9._]+", "-", env.removeprefix("__main__:")).strip("-.") or "env"
 
 
 def _array_positions(fields: tuple[Field, ...]) -> tuple[ArrayPosition, ...]:

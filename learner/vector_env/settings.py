@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
-import gymnasium
 from gymnasium.vector import AutoresetMode
 
 from learner.members.endpoint import BindSettings
-from protocol.env_spec import Scalar
-
-EnvLike = str | Callable[..., gymnasium.Env[Any, Any]]
-"""What `gymnasium.make` takes, or a callable that returns an environment."""
+from protocol.env_spec import EnvLike, EnvSpec, Scalar
+from protocol.envs.wrappers import WrapperLike
 
 
 @dataclass(frozen=True)
 class VectorEnvSettings:
     """The arguments of `millrace.make_vec`, with the same meanings and defaults."""
 
-    env: EnvLike | Sequence[EnvLike]
+    env: EnvLike | EnvSpec | Sequence[EnvLike]
     num_envs: int | None = None
     workers: int | None = None
     lanes: int | None = None
@@ -36,15 +33,17 @@ class VectorEnvSettings:
     render_mode: str | None = None
     kwargs: dict[str, Scalar] = field(default_factory=dict)
     """Keyword arguments of the environment."""
+    wrappers: Sequence[WrapperLike] = ()
+    """Wrappers of every env copy, the innermost first."""
     single_lanes: int = 0
     """Number of further copies, after the others: each is a lane of its own, which `ZmqVectorEnv.step_lanes` steps."""
 
     @property
-    def envs(self) -> list[EnvLike]:
+    def envs(self) -> list[EnvLike | EnvSpec]:
         """The environment of each copy: `num_envs` times the same one, or the given list."""
-        if isinstance(self.env, str) or callable(self.env):
-            return [self.env] * (1 if self.num_envs is None else self.num_envs)
-        return list(self.env)
+        if isinstance(self.env, Sequence) and not isinstance(self.env, str):
+            return list(self.env)
+        return [self.env] * (1 if self.num_envs is None else self.num_envs)
 
     @property
     def local_workers(self) -> int:

@@ -79,12 +79,17 @@ def requested_copies(settings: VectorEnvSettings, learner_timeout_s: float = mat
         raise UsageError(f"num_envs: expected at least 1 and, with a list, its length ({N}), got {settings.num_envs}")
     if not 1 <= lanes <= N:
         raise UsageError(f"lanes: expected 1 to num_envs ({N}), got {lanes}; each lane lives in one worker")
-    env_specs = {env: EnvSpec.of(env, settings.kwargs) for env in dict.fromkeys(envs)}
+    with_single = [*envs, *envs[:1] * settings.single_lanes]
+    keys = [env if isinstance(env, str) else id(env) for env in with_single]  # gymnasium's specs cannot be hashed
+    env_specs = {
+        key: EnvSpec.of(env, settings.kwargs, settings.wrappers)
+        for key, env in dict(zip(keys, with_single, strict=True)).items()
+    }
     different = list({(spec.id, spec.factory): spec for spec in env_specs.values()}.values())
     index = {(spec.id, spec.factory): n for n, spec in enumerate(different)}
     return RequestedCopies(
         envs=tuple(different),
-        copies=tuple(index[env_specs[env].id, env_specs[env].factory] for env in [*envs, *envs[:1] * settings.single_lanes]),
+        copies=tuple(index[env_specs[key].id, env_specs[key].factory] for key in keys),
         lanes=settings.lane_sizes,
         autoreset=_autoreset_mode(settings.autoreset_mode),
         render_mode=settings.render_mode,

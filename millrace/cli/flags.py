@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import msgspec
-from tyro.conf import Positional
+from tyro.conf import Positional, UseAppendAction, arg
 
 
 class EvaluateFlags(msgspec.Struct, frozen=True, kw_only=True):
@@ -21,6 +21,10 @@ class EvaluateFlags(msgspec.Struct, frozen=True, kw_only=True):
     """seed of the episodes"""
     best: bool = False
     """use the policy with the best evaluation during the run (--eval-every), instead of the newest"""
+    env: str = ""
+    """the environment, if the run does not find it by itself, as my_module:make_env or my_module:MyEnv-v0"""
+    wrapper: Annotated[tuple[str, ...], arg(metavar="MODULE:CLASS"), UseAppendAction] = ()
+    """the wrappers, innermost first, if the run does not find them by itself"""
     workers: int = 2
     """number of worker processes that play the episodes; the result does not depend on it"""
     copies: int = 4
@@ -59,6 +63,10 @@ class RecordFlags(msgspec.Struct, frozen=True, kw_only=True):
     """number of env steps; the last episode is finished, unless that would take more than twice as many"""
     best: bool = False
     """use the policy with the best evaluation during the run (--eval-every), instead of the newest"""
+    env: str = ""
+    """the environment, if the run does not find it by itself, as my_module:make_env or my_module:MyEnv-v0"""
+    wrapper: Annotated[tuple[str, ...], arg(metavar="MODULE:CLASS"), UseAppendAction] = ()
+    """the wrappers, innermost first, if the run does not find them by itself"""
     npy: Path | None = None
     """also write this .npy file: a float32 array with a row [observation, action], flattened, for each step"""
     stochastic: bool = False

@@ -137,10 +137,12 @@ def _learner(argv: list[str]) -> int:
     from learner.resumption import Resumption, unless_finished
     from learner.run import serve
     from millrace.launch import learner_inference as inference
+    from protocol.env_spec import EnvSpec
 
     def train(checked: Resumption | None, watch: Watch) -> Path:
         if config.inference == "learner":
-            return inference.train(config, checked, watch, elsewhere=True)
+            env = EnvSpec.of(config.env, config.env_kwargs, config.wrapper)
+            return inference.train(config, checked, watch, env, elsewhere=True)
         return serve(config, checked, watch)
 
     return _run(argv, lambda watch: unless_finished(config, resume, lambda checked: train(checked, watch)))

@@ -49,13 +49,13 @@ def train(
     config: Config,
     resume: Resumption | None,
     watch: Watch,
-    factory: Callable[..., object] | None = None,
+    env_spec: EnvSpec,
     *,
     elsewhere: bool = False,
 ) -> Path:
     """Train until the run is done. Returns the run folder.
 
-    `factory` makes the environment if it has no id. `elsewhere`: the workers are started elsewhere and join at
+    `elsewhere`: the workers are started elsewhere and join at
     `config.bind`. Raises `UserFacingError`, or `Interrupted` if the user stopped the run.
     """
     with ExitStack() as stack:
@@ -63,9 +63,8 @@ def train(
         stack.callback(context.term)
         link = LearnerLink(private_address("inproc", stack), context)
         stack.callback(link.close, 0.5)
-        listening = listen(_settings(config, factory, elsewhere=elsewhere), stack.enter_context(ExitStack()))
+        listening = listen(_settings(config, env_spec, elsewhere=elsewhere), stack.enter_context(ExitStack()))
         observer = stack.enter_context(prometheus_observer(config))
-        env_spec = EnvSpec.of(config.env if factory is None else factory, config.env_kwargs)
         folder = stack.enter_context(run_folder(config, resume))
         started = listening.start(worker_flags(config, folder.path), config.call_timeouts())
 
@@ -114,10 +113,10 @@ def acting_policy(spec: PolicySpec, device: str, images: ImagesDtype) -> Policy:
     return TorchPolicy(spec, device, together=True, images=images)
 
 
-def _settings(config: Config, factory: Callable[..., object] | None, *, elsewhere: bool) -> VectorEnvSettings:
+def _settings(config: Config, env: EnvSpec, *, elsewhere: bool) -> VectorEnvSettings:
     """The vector environment of a run; `elsewhere`: its workers are started elsewhere."""
     return VectorEnvSettings(
-        config.env if factory is None else factory,  # type: ignore[arg-type]  # what it returns is checked when it is made
+        env,
         config.envs,
         workers=None if elsewhere else config.workers,
         lanes=config.lanes,
@@ -125,7 +124,6 @@ def _settings(config: Config, factory: Callable[..., object] | None, *, elsewher
         transport=config.transport,
         timeout_s=_longest_order_s(config),
         copy=False,
-        kwargs=config.env_kwargs,
         single_lanes=config.eval_copies,
     )
 

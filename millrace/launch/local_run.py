@@ -27,21 +27,22 @@ from workers.supervise.worker_thread import WorkerThread
 from workers.supervisor import STOP_WITHIN_S, Running, Supervisor
 
 
-def train(config: Config, resume: Path | None, watch: Watch, factory: Callable[..., object] | None = None) -> Path:
-    """Train. Returns the run folder. `factory` returns the environment if the id does not name one.
+def train(config: Config, resume: Path | None, watch: Watch, env: EnvSpec | None = None) -> Path:
+    """Train. Returns the run folder. `env`: the environment, if the settings do not name one that workers find.
 
     Raises `UserFacingError`, or `Interrupted` if the user stopped the run.
     """
-    return unless_finished(config, resume, lambda checked: _train(config, checked, watch, factory))
+    return unless_finished(config, resume, lambda checked: _train(config, checked, watch, env))
 
 
-def _train(config: Config, resume: Resumption | None, watch: Watch, factory: Callable[..., object] | None) -> Path:
+def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec | None) -> Path:
+    env = env or EnvSpec.of(config.env, config.env_kwargs, config.wrapper)
     if config.inference == "learner":
         from millrace.launch import learner_inference as inference
 
-        return inference.train(config, resume, watch, factory)
+        return inference.train(config, resume, watch, env)
     keyring, token = temporary_keys(config.transport, config.keys, insecure=config.insecure)
-    if factory is not None and config.transport == "tcp" and keyring is None:
+    if env.factory is not None and config.transport == "tcp" and keyring is None:
         raise UsageError("an environment factory is code: it travels over ipc or inproc only, or over tcp with --keys")
     with ExitStack() as stack:
         address = private_address(config.transport, stack)
@@ -50,7 +51,6 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, factory: Cal
         link = LearnerLink(address, context, keyring)
         stack.callback(link.close, 0.5)
         observer = stack.enter_context(prometheus_observer(config))
-        env = EnvSpec.of(config.env if factory is None else factory, config.env_kwargs)
         folder = stack.enter_context(run_folder(config, resume))
         start = _starter(config, link.address, token, context, folder.path)
         supervisor = Supervisor(start, config.workers, timeouts=config.call_timeouts())

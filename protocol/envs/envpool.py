@@ -20,7 +20,7 @@ from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import VectorEnv
 
 from protocol.env_spec import EnvSpec
-from protocol.envs.vectorized import vector_alternative
+from protocol.envs.vectorized import check_unwrapped_id, vector_alternative
 from protocol.errors import UsageError
 
 MAX_EPISODE_STEPS = 2**31 - 1  # envpool counts steps in an int32
@@ -61,8 +61,7 @@ def _ignore_warnings() -> Iterator[None]:
 
 def envpool_spec(env: EnvSpec) -> EnvpoolSpec:
     """How envpool makes the environment of this id. Raises `UsageError` if it cannot."""
-    if env.factory is not None:
-        raise UsageError(f"environment {env.id}: vector envpool: expected an id that gymnasium registers, got a callable")
+    check_unwrapped_id(env, "envpool")
     try:
         import envpool
     except ImportError as error:

@@ -16,8 +16,7 @@ from protocol.errors import UsageError
 
 def make_native(env: EnvSpec, copies: int) -> VectorEnv[Any, Any, Any]:
     """Make a vector environment of `copies` env copies with the environment's own code. Raises `UsageError`."""
-    if env.factory is not None:
-        raise UsageError(f"environment {env.id}: vector native: expected an id that gymnasium registers, got a callable")
+    check_unwrapped_id(env, "native")
     made = env.make_vectorized(copies)
     try:
         check_resets_next_step(made)
@@ -25,6 +24,16 @@ def make_native(env: EnvSpec, copies: int) -> VectorEnv[Any, Any, Any]:
         made.close()
         raise
     return made
+
+
+def check_unwrapped_id(env: EnvSpec, vector: str) -> None:
+    """Raises `UsageError` for what has no vectorized form: a callable, and anything in a wrapper."""
+    if env.wrappers:
+        raise UsageError(
+            f"environment {env.id}: vector {vector}: wrappers are applied to single env copies; use --vector loop"
+        )
+    if env.factory is not None:
+        raise UsageError(f"environment {env.id}: vector {vector}: expected an id that gymnasium registers, got a callable")
 
 
 def check_resets_next_step(env: VectorEnv[Any, Any, Any]) -> None:

@@ -262,8 +262,8 @@ def test_the_python_face_takes_a_callable(asked: list[Any]) -> None:
 
     millrace.train(my_env, workers=1)
     ((config, _, factory),) = asked
-    assert (config.env, config.workers) == ("my_env", 1)
-    assert factory is my_env
+    assert (config.env, config.workers) == ("<my_env>", 1)
+    assert (factory.id, factory.wrappers) == ("<my_env>", ())
 
 
 # ------------------------------------------------------------------------------------------------ how a run can go wrong

@@ -124,7 +124,7 @@ def test_an_environment_may_be_a_callable(tmp_path: Path) -> None:
         **SMALL,
         **IN_LEARNER,
     }
-    assert summary(millrace.train(low_gravity, **settings).path)["env"] == "low_gravity"
+    assert summary(millrace.train(low_gravity, **settings).path)["env"] == "<low_gravity>"
     with pytest.raises(UsageError, match="an environment factory is code"):
         millrace.train(low_gravity, transport="tcp", **settings)
 

@@ -270,7 +270,7 @@ def test_an_environment_may_be_a_callable_and_travels_to_local_workers_only(tmp_
 
     settings: dict[str, Any] = {"steps": 1_000, "run_dir": str(tmp_path), "env_kwargs": {"gravity": 5.0}, **SMALL}
     folder = millrace.train(balance, **settings).path
-    assert summary(folder)["env"] == "balance"
+    assert summary(folder)["env"] == "<balance>"
     with pytest.raises(UsageError, match="ipc or inproc only"):
         millrace.train(balance, transport="tcp", **settings)
 

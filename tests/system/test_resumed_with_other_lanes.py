@@ -14,6 +14,7 @@ from learner.config.layers import resolve
 from learner.run_folder import checkpoint
 from learner.run_folder.metrics_log import read_rows
 from millrace.launch.local_run import train
+from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
 from tests.learner.config.test_on_resume import content
 from tests.system.test_local_run import assert_balanced, summary
@@ -139,16 +140,21 @@ class Changing(gymnasium.Env[Any, Any]):
 
 def test_an_environment_whose_spaces_have_changed_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     given: dict[str, Any] = {"transport": "inproc", "workers": 1, "eval_episodes": 1, "run_dir": str(tmp_path), "net": (8,)}
-    run = train(resolve("Changing", steps=1_024, rollout_steps=32, n_epochs=1, **given), None, silent, Changing)
+    run = train(
+        resolve(EnvSpec.of(Changing).id, steps=1_024, rollout_steps=32, n_epochs=1, **given),
+        None,
+        silent,
+        EnvSpec.of(Changing),
+    )
     before = content(run)
     monkeypatch.setattr(Changing, "size", 4)
     says = (
         rf"^run {run}: the environment's observations have changed: expected .*\(3,\).*, got .*\(4,\).*; install the version"
     )
     with pytest.raises(UsageError, match=says) as why:
-        train(resolve(resume=run, steps=2_048), run, silent, Changing)
+        train(resolve(resume=run, steps=2_048), run, silent, EnvSpec.of(Changing))
     assert "\n" not in str(why.value)
     assert content(run) == before
     monkeypatch.setattr(Changing, "size", 3)
-    train(resolve(resume=run, steps=2_048), run, silent, Changing)
+    train(resolve(resume=run, steps=2_048), run, silent, EnvSpec.of(Changing))
     assert summary(run)["env_steps"] > 1_024

@@ -21,8 +21,8 @@ from gymnasium.vector import AutoresetMode
 
 import millrace
 from learner.vector_env.env import ZmqVectorEnv
-from learner.vector_env.settings import EnvLike
 from millrace.launch import vector
+from protocol.env_spec import EnvLike
 from protocol.errors import EnvironmentFailed, NoWorkers, UserFacingError, WorkerLost
 from protocol.keys.key_folder import KeyFolder
 from tests.system.processes import START_S, Worker, free_port

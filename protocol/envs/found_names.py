@@ -1,0 +1,67 @@
+"""Names of functions and classes of the user's: whether another process finds them, and what a run remembers of them.
+
+Rule: `module:qualname` is what an import finds again, in any process. `__main__:name` is an attribute of the program's own
+script or notebook, and only that program finds it. `<name>` is found by nobody: a lambda, a function in a function,
+an object.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from types import ModuleType
+
+MAIN = "__main__"
+
+
+def name_of(made: object) -> str:
+    """The name under which `made` is found again, or one that says that it is not."""
+    module, qualname = getattr(made, "__module__", None), getattr(made, "__qualname__", None)
+    if not isinstance(module, str) or not isinstance(qualname, str):
+        return f"<{type(made).__name__}>"
+    if attribute(sys.modules.get(module), qualname) is not made:
+        return f"<{qualname.rpartition('.')[2].strip('<>')}>"
+    if module == MAIN:
+        spec = getattr(sys.modules[MAIN], "__spec__", None)
+        # `python -m mine`: others import it as mine. A script has no name that others import.
+        return f"{MAIN}:{qualname}" if spec is None or spec.name.endswith(MAIN) else f"{spec.name}:{qualname}"
+    return f"{module}:{qualname}" if importable(module) else f"<{qualname}>"
+
+
+def found_by_others(name: str) -> bool:
+    """Whether another process can find what has this name."""
+    return not name.startswith((f"{MAIN}:", "<"))
+
+
+def in_main(name: str) -> object:
+    """What this program's script or notebook has under `__main__:name`; None if nothing."""
+    module, _, qualname = name.partition(":")
+    return attribute(sys.modules.get(MAIN), qualname) if module == MAIN else None
+
+
+def moved(before: str, now: str) -> bool:
+    """Whether `now` may be what had the name `before`: it has a module where it had none, and the rest is the same."""
+    without_module = not found_by_others(before) or ":" not in before
+    return before == now or (without_module and last_part(before) == last_part(now))
+
+
+def last_part(name: str) -> str:
+    """The name without its module, and without what it stands in: `Clip` of `mine:Outer.Clip(0.5)` and of `<Clip>`."""
+    name = name.strip("<>").partition("(")[0].rpartition(":")[2]
+    return name if "/" in name else name.rpartition(".")[2]
+
+
+def attribute(module: ModuleType | None, qualname: str) -> object:
+    """What a module has under this dotted name; None if nothing."""
+    found: object = module
+    for part in qualname.split("."):
+        found = getattr(found, part, None)
+    return found
+
+
+def importable(module: str) -> bool:
+    """Whether another process that has our search path could import this module."""
+    try:
+        return importlib.util.find_spec(module) is not None
+    except (ImportError, ValueError, AttributeError):
+        return False

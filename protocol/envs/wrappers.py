@@ -1,0 +1,138 @@
+"""Wrappers of an environment by name: `module:Class`, or `module:Class(key=value)` with plain values.
+
+Rule: the arguments are literals of Python (numbers, text, lists, dicts, None), which are read and never evaluated. Names are
+imported where the environment is made, that is in a worker.
+"""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import functools
+import importlib
+import traceback
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import gymnasium
+
+from protocol.bounds import one_line
+from protocol.envs.found_names import attribute, found_by_others, in_main, last_part, name_of
+from protocol.errors import UsageError, first_line
+
+Wrapper = Callable[..., gymnasium.Env[Any, Any]]
+WrapperLike = str | Wrapper
+"""`module:Class`, with or without plain arguments, or what takes an environment and returns one."""
+MAX_WRAPPER_NAME = 1000
+
+
+class NamedWrapper(NamedTuple):
+    """A wrapper's name, read."""
+
+    module: str
+    qualname: str
+    args: tuple[Any, ...]
+    kwargs: dict[str, Any]
+
+
+def read_wrapper(text: str) -> NamedWrapper:
+    """Read `module:Class` or `module:Class(key=value)`. Raises `UsageError`."""
+    module, colon, rest = text.partition(":")
+    qualname, bracket, _ = rest.partition("(")
+    words = [*module.split("."), *qualname.split(".")]
+    if not colon or not all(word.isidentifier() for word in words) or len(text) > MAX_WRAPPER_NAME:
+        raise UsageError(
+            f"wrapper {one_line(text, 200)}: expected module:Class, or module:Class(key=value) with plain values, as in "
+            "gymnasium.wrappers:FlattenObservation"
+        )
+    if not bracket:
+        return NamedWrapper(module, qualname, (), {})
+    try:
+        match ast.parse(rest, mode="eval").body:
+            case ast.Call(func, args, keywords) if ast.unparse(func) == qualname and all(each.arg for each in keywords):
+                values = tuple(ast.literal_eval(arg) for arg in args)
+                named = {str(each.arg): ast.literal_eval(each.value) for each in keywords}
+                return NamedWrapper(module, qualname, values, named)
+    except (SyntaxError, ValueError, TypeError, MemoryError, RecursionError):
+        pass
+    raise UsageError(
+        f"wrapper {one_line(text, 200)}: expected arguments that are plain values (numbers, text, lists), as in "
+        "gymnasium.wrappers:FilterObservation(filter_keys=['image'])"
+    )
+
+
+def wrapper_name(wrapper: WrapperLike) -> str:
+    """The name of a wrapper, as a run remembers it. Raises `UsageError` for text that is no name."""
+    if isinstance(wrapper, str):
+        if found_by_others(wrapper):
+            read_wrapper(wrapper)
+        return wrapper
+    if not callable(wrapper):
+        raise UsageError(f"wrappers: expected functions, classes or module:Class, got {type(wrapper).__name__}")
+    if not isinstance(wrapper, functools.partial):
+        return name_of(wrapper)
+    name = name_of(wrapper.func)
+    arguments = [*map(repr, wrapper.args), *(f"{key}={value!r}" for key, value in wrapper.keywords.items())]
+    named = f"{name}({', '.join(arguments)})"
+    try:
+        read = read_wrapper(named)
+        plain = (read.args, read.kwargs) == (wrapper.args, wrapper.keywords)
+    except (UsageError, ValueError):  # ValueError: arrays cannot be compared
+        plain = False
+    return named if plain and found_by_others(name) else f"<{last_part(name)}>"
+
+
+def not_named(wrapper: WrapperLike) -> Wrapper | None:
+    """The wrapper itself, if other processes cannot find it by its name; else None. Raises `UsageError`."""
+    name = wrapper_name(wrapper)
+    if found_by_others(name):
+        return None
+    if not isinstance(wrapper, str):
+        return wrapper
+    found = in_main(name)
+    if not callable(found):
+        last = "my_wrapper" if "lambda" in name else last_part(name)
+        raise UsageError(
+            f"wrapper {name} was made in a script, a notebook or a function, and cannot be found here; pass it again: "
+            f"wrappers=[{last}] there, or --wrapper my_module:{last} from a module"
+        )
+    return found
+
+
+def wrap(env: gymnasium.Env[Any, Any], wrapper: WrapperLike) -> gymnasium.Env[Any, Any]:
+    """The environment in this wrapper. Raises `UsageError`; its `detail` is the traceback if the wrapper itself raised."""
+    name = wrapper_name(wrapper)
+    try:
+        made: object = _found(wrapper)(env) if isinstance(wrapper, str) else wrapper(env)
+    except UsageError:
+        raise
+    except TypeError as error:
+        line = f"wrapper {name}: {first_line(error)}"
+        if isinstance(wrapper, str) and "argument" in line:
+            module, qualname, _, _ = read_wrapper(wrapper)
+            raise UsageError(f'{line}; give its arguments, as in --wrapper "{module}:{qualname}(name=value)"') from error
+        raise UsageError(line, traceback.format_exc()) from error
+    except Exception as error:
+        raise UsageError(f"wrapper {name}: {type(error).__name__}: {first_line(error)}", traceback.format_exc()) from error
+    if not isinstance(made, gymnasium.Env):
+        raise UsageError(f"wrapper {name}: expected it to return a gymnasium.Env, got {type(made).__name__}")
+    return made
+
+
+def _found(text: str) -> Wrapper:
+    """The wrapper of this name, imported, with its arguments. Raises `UsageError`."""
+    module_name, qualname, args, kwargs = read_wrapper(text)
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        if error.name is not None and f"{module_name}.".startswith(f"{error.name}."):
+            raise UsageError(
+                f"wrapper {text}: no module named {error.name}; is it installed, or its folder on PYTHONPATH?"
+            ) from error
+        raise UsageError(f"wrapper {text}: a package it needs is missing ({first_line(error)}); pip install it") from error
+    found = attribute(module, qualname)
+    if not callable(found):
+        close = difflib.get_close_matches(qualname, vars(module), n=1)
+        hint = f"; did you mean {module_name}:{close[0]}?" if close else ""
+        raise UsageError(f"wrapper {text}: module {module_name} has no {qualname}{hint}")
+    return lambda env: found(env, *args, **kwargs)

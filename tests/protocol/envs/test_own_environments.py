@@ -1,0 +1,285 @@
+"""What a user gives as an environment or a wrapper: how it travels, and the name by which it is found again."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import cloudpickle
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
+
+from protocol.env_spec import AllowedCode, EnvSpec, remembered_name
+from protocol.envs.found_names import found_by_others, moved, name_of
+from protocol.envs.wrappers import read_wrapper, wrapper_name
+from protocol.errors import UsageError
+from workers.envs.toy import Countdown
+
+MODULE = __name__
+
+
+class Halved(gymnasium.RewardWrapper[Any, Any]):
+    def reward(self, reward: Any) -> float:
+        return float(reward) / 2
+
+
+def make_countdown(k: int = 5) -> gymnasium.Env[Any, Any]:
+    return Countdown(k)
+
+
+class Outer:
+    class Inner(Halved):
+        pass
+
+
+def not_an_env() -> object:
+    return 3
+
+
+@pytest.fixture
+def registry() -> Iterator[None]:
+    """The registry of gymnasium is as before afterwards."""
+    before = dict(gymnasium.registry)
+    yield
+    gymnasium.registry.clear()
+    gymnasium.registry.update(before)
+
+
+@pytest.fixture
+def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """Stands in for the module of a script."""
+    module = ModuleType("__main__")
+    exec("import gymnasium\nclass Mine(gymnasium.Env): pass\ndef make(): return Mine()", module.__dict__)
+    monkeypatch.setitem(sys.modules, "__main__", module)
+    return module
+
+
+def first_reward(spec: EnvSpec) -> float:
+    env = spec.make()
+    env.reset(seed=1)
+    reward = float(env.step(env.action_space.sample())[1])
+    env.close()
+    return reward
+
+
+# ------------------------------------------------------------------------------------------------------------- names
+
+
+def test_names_say_who_finds_what_they_name(script: ModuleType) -> None:
+    def inside() -> None: ...
+
+    assert name_of(Halved) == f"{MODULE}:Halved"
+    assert name_of(Outer.Inner) == f"{MODULE}:Outer.Inner"
+    assert name_of(script.make) == "__main__:make"
+    assert name_of(inside) == "<inside>"
+    assert name_of(lambda: None) == "<lambda>"
+    assert name_of(Halved(gymnasium.make("CartPole-v1"))) == "<Halved>"
+    names = [f"{MODULE}:Halved", "__main__:make", "<inside>", "CartPole-v1"]
+    assert [found_by_others(name) for name in names] == [True, False, False, True]
+
+
+def test_a_class_that_another_took_the_name_of_is_found_by_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = Halved
+    monkeypatch.setattr(sys.modules[MODULE], "Halved", Outer)
+    assert name_of(before) == "<Halved>"
+
+
+def test_a_program_that_runs_as_a_module_is_found_under_its_name(script: ModuleType) -> None:
+    script.__spec__ = type("Spec", (), {"name": "package.mine"})()
+    assert name_of(script.make) == "package.mine:make"
+    script.__spec__ = type("Spec", (), {"name": "package.__main__"})()
+    assert name_of(script.make) == "__main__:make"
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "same"),
+    [
+        ("<Clip>", "mine:Clip", True),
+        ("__main__:Clip", "mine:Clip", True),
+        ("__main__:My-v0", "mine:My-v0", True),
+        ("__main__:space/My-v0", "mine:space/My-v0", True),
+        ("Mine-v0", "mine:Mine-v0", True),  # as an id of a script was remembered before
+        ("mine:Clip", "mine:Clip", True),
+        ("<Clip>", "mine:Clap", False),
+        ("mine:Clip", "other:Clip", False),
+        ("mine:Clip", "<Clip>", False),
+        ("CartPole-v1", "CartPole-v0", False),
+    ],
+)
+def test_what_had_no_module_may_have_moved_into_one(before: str, now: str, same: bool) -> None:
+    assert moved(before, now) is same
+
+
+# ------------------------------------------------------------------------------------------------------ environments
+
+
+def test_an_id_that_everyone_knows_travels_by_name() -> None:
+    for env in ("CartPole-v1", gymnasium.spec("CartPole-v1"), gymnasium.make("CartPole-v1").spec):
+        assert env is not None
+        assert EnvSpec.of(env) == EnvSpec("CartPole-v1")
+    assert EnvSpec.of("millrace/CartDoublePendulum-v0").factory is None
+
+
+def test_a_name_of_a_function_or_a_class_makes_an_environment() -> None:
+    assert first_reward(EnvSpec.of(f"{MODULE}:make_countdown", {"k": 3})) == first_reward(EnvSpec.of(Countdown, {"k": 3}))
+    assert isinstance(EnvSpec(f"{Countdown.__module__}:Countdown").make(), Countdown)
+    with pytest.raises(UsageError, match=r"not_an_env: expected it to return a gymnasium.Env, got int$"):
+        EnvSpec(f"{MODULE}:not_an_env").make()
+    with pytest.raises(
+        UsageError, match=r"neither registers make_countdwn nor .* so named; did you mean .*:make_countdown\?$"
+    ):
+        EnvSpec(f"{MODULE}:make_countdwn").make()
+
+
+def test_a_callable_travels_pickled_and_is_remembered_by_its_name() -> None:
+    spec = EnvSpec.of(make_countdown, {"k": 3})
+    assert (spec.id, spec.factory is None) == (f"{MODULE}:make_countdown", False)
+    again = EnvSpec.of(spec.id, spec.kwargs)
+    assert again.factory is None
+    assert first_reward(again) == first_reward(spec)
+    assert EnvSpec.of(lambda: Countdown()).id == "<lambda>"
+
+
+def test_an_id_that_only_this_process_registered_travels_pickled(registry: None, script: ModuleType) -> None:
+    gymnasium.register("Own-v3", script.Mine, max_episode_steps=7)
+    gymnasium.register("ByText-v3", "__main__:Mine", max_episode_steps=8)
+    assert remembered_name("Own-v3") == remembered_name(gymnasium.spec("Own-v3")) == "__main__:Own-v3"
+    for env, limit in (("Own-v3", 7), ("__main__:Own-v3", 7), ("ByText-v3", 8), (gymnasium.spec("ByText-v3"), 8)):
+        spec = EnvSpec.of(env)
+        assert spec.factory is not None
+        registered = dict(gymnasium.registry)
+        gymnasium.registry.clear()  # as in a worker
+        made = spec.make()
+        gymnasium.registry.update(registered)
+        assert type(made.unwrapped).__name__ == "Mine"
+        assert made.spec is not None
+        assert made.spec.max_episode_steps == limit
+
+
+def test_a_spec_that_is_not_the_registered_one_has_no_name(registry: None) -> None:
+    shorter = gymnasium.make("CartPole-v1", max_episode_steps=3).spec
+    assert shorter is not None
+    spec = EnvSpec.of(shorter)
+    assert spec.id == "<CartPole-v1>"
+    made = spec.make()
+    assert made.spec is not None
+    assert made.spec.max_episode_steps == 3
+
+
+def test_an_id_that_an_imported_module_registers_is_remembered_with_it(
+    registry: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "arcade_of_mine.py").write_text(
+        "import gymnasium\nfrom workers.envs.toy import Countdown\nclass Game(Countdown): pass\n"
+        'gymnasium.register(id="Game-v0", entry_point="arcade_of_mine:Game")\n'
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    __import__("arcade_of_mine")
+    assert remembered_name("Game-v0") == "arcade_of_mine:Game-v0"
+    gymnasium.register(id="Elsewhere-v0", entry_point="arcade_of_mine:Game")
+    assert remembered_name("Elsewhere-v0") == "__main__:Elsewhere-v0", "its module does not register it"
+
+
+@pytest.mark.parametrize("name", ["__main__:nowhere", "<inside>", "<lambda>", "__main__:Nowhere-v0"])
+def test_what_cannot_be_found_again_is_one_line_that_says_what_to_pass(name: str) -> None:
+    with pytest.raises(UsageError, match=r"was made in a script, a notebook or a function.*my_module:\S+ \(train") as why:
+        EnvSpec.of(name)
+    assert "\n" not in str(why.value)
+
+
+def test_what_cannot_be_pickled_is_one_line() -> None:
+    lock = __import__("threading").Lock()
+    with pytest.raises(UsageError, match=r"<make>: its callable cannot be sent to workers: TypeError: .*; let it make"):
+
+        def make() -> object:
+            return lock
+
+        EnvSpec.of(make)
+    with pytest.raises(UsageError, match="expected an id, a gymnasium EnvSpec or a callable that returns one, got 3"):
+        EnvSpec.of(3)  # type: ignore[arg-type]
+
+
+# ---------------------------------------------------------------------------------------------------------- wrappers
+
+
+def test_wrappers_are_applied_in_their_order() -> None:
+    spec = EnvSpec.of("CartPole-v1", {}, [Halved, "gymnasium.wrappers:TimeLimit(max_episode_steps=2)"])
+    assert spec.factory is None
+    made = spec.make()
+    assert isinstance(made, TimeLimit)
+    assert isinstance(made.env, Halved)
+    assert first_reward(spec) == 0.5
+
+
+def test_a_wrapper_without_a_name_travels_pickled_with_all_others() -> None:
+    kwargs: dict[str, bool | int | float | str] = {"k": 4}
+    spec = EnvSpec.of(make_countdown, kwargs, [Halved, lambda env: TimeLimit(env, 2), RecordEpisodeStatistics])
+    assert spec.factory is not None
+    assert spec.wrappers == (f"{MODULE}:Halved", "<lambda>", "gymnasium.wrappers.common:RecordEpisodeStatistics")
+    made = spec.make()
+    kinds = []
+    while isinstance(made, gymnasium.Wrapper):
+        kinds.append(type(made).__name__)
+        made = made.env
+    assert kinds == ["RecordEpisodeStatistics", "TimeLimit", "Halved"], "each of them once"
+    assert EnvSpec.of("CartPole-v1", {"render_mode": "rgb_array"}, [lambda env: env]).make().render_mode == "rgb_array"
+    with pytest.raises(UsageError, match=r"<lambda> was made in a script.*wrappers=\[my_wrapper\] there"):
+        EnvSpec.of(spec.id, kwargs, spec.wrappers)
+
+
+def test_plain_arguments_stand_in_the_name_and_others_do_not() -> None:
+    assert (
+        wrapper_name(partial(TimeLimit, max_episode_steps=9)) == "gymnasium.wrappers.common:TimeLimit(max_episode_steps=9)"
+    )
+    given: Any = np.int64(9), np.arange(3)
+    assert wrapper_name(partial(TimeLimit, max_episode_steps=given[0])) == "<TimeLimit>"
+    assert wrapper_name(partial(Halved, given[1])) == "<Halved>"
+    read = read_wrapper("a.b:C.D([1, 2], x={'k': None}, y=-1.5)")
+    assert read == ("a.b", "C.D", ([1, 2],), {"x": {"k": None}, "y": -1.5})
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "Clip", "mine:", ":Clip", "mine:Clip(", "mine:Clip)", "mine:Clip(f())", "mine:Clip(x=y)", "mine:Clip(**{})",
+     "mine:Clip(1)(2)", "mine:Cl ip", "mine:Clip(1) + 1", "mine:" + "C" * 2000, "mi\nne:Clip", "mine:Clip(" + "[" * 300],
+)  # fmt: skip
+def test_what_is_no_name_of_a_wrapper_is_one_line(text: str) -> None:
+    with pytest.raises(UsageError, match=r"^wrapper .*: expected .*, as in gymnasium.wrappers:F") as why:
+        wrapper_name(text)
+    assert "\n" not in str(why.value)
+    assert len(str(why.value)) < 500
+
+
+@pytest.mark.parametrize(
+    ("wrapper", "says"),
+    [
+        (
+            "nowhere_to_be_found:Clip",
+            r"^wrapper nowhere_to_be_found:Clip: no module named nowhere_to_be_found; is it installed",
+        ),
+        ("gymnasium.wrappers:TimeLimt", r"has no TimeLimt; did you mean gymnasium.wrappers:TimeLimit\?$"),
+        (
+            "gymnasium.wrappers:TimeLimit",
+            r"missing 1 required .*'max_episode_steps'; give its arguments, as in --wrapper \"gymnasium.wrappers:",
+        ),
+        (lambda env: 3, r"^wrapper <lambda>: expected it to return a gymnasium.Env, got int$"),
+        (lambda env: 1 / 0, r"^wrapper <lambda>: ZeroDivisionError: division by zero$"),
+    ],
+)
+def test_what_goes_wrong_with_a_wrapper_is_one_line(wrapper: Any, says: str) -> None:
+    with pytest.raises(UsageError, match=says):
+        EnvSpec.of("CartPole-v1", {}, [wrapper]).make()
+
+
+def test_a_worker_that_does_not_know_its_learner_imports_no_wrapper() -> None:
+    named, pickled = (EnvSpec.of("CartPole-v1", {}, [wrapper]) for wrapper in (Halved, lambda env: env))
+    codes = [AllowedCode.REGISTERED, AllowedCode.MODULES, AllowedCode.CALLABLES]
+    assert [bool(named.rejection_reason(code)) for code in codes] == [True, False, False]
+    assert [bool(pickled.rejection_reason(code)) for code in codes] == [True, True, False]
+    assert cloudpickle.loads(pickled.factory.data if pickled.factory else b"").__class__.__module__ == "protocol.env_spec"
