@@ -8,6 +8,7 @@ runs only to find which of them is wrong.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any, NoReturn
@@ -136,6 +137,8 @@ def _number(name: str, n: int, value: Any) -> Any:
     if array.size == 1:
         raise Unusable(n, f"{name}: expected a number, got {one_line(repr(value), 80)}")
     advice = "; wrap the environment so that it returns one number" if name == "reward" else ""
+    if advice and "mo_gymnasium" in sys.modules:
+        advice += ", as --wrapper mo_gymnasium.wrappers:LinearReward does"
     raise Unusable(n, f"{name}: expected a number, got an array of shape {array.shape}{advice}")
 
 

@@ -14,6 +14,7 @@ from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
 
 from protocol.arrays import Array
 from protocol.bounds import LARGEST, MAX_NAME, MAX_TEXT, one_line
+from protocol.envs.space_advice import observation_advice
 from protocol.envs.space_records import describe_space, make_space
 from protocol.errors import BadMessage, UsageError, first_line
 from protocol.space_spec import EnvDescription, check_size
@@ -39,8 +40,12 @@ class DescribedEnv:
 
 def describe_env(env: gymnasium.Env[Any, Any]) -> EnvDescription:
     """The description of an env copy. Raises `UsageError` if its spaces are not supported or too large to send."""
+    try:
+        observation = describe_space(env.observation_space, "observation space")
+    except UsageError as error:
+        raise UsageError(f"{error}; {observation_advice(env)}") from error
     description = EnvDescription(
-        observation=describe_space(env.observation_space, "observation space"),
+        observation=observation,
         action=describe_space(env.action_space, "action space"),
         metadata=_metadata(env.metadata),
         spec=_spec_as_text(env.spec),

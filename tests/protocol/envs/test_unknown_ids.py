@@ -1,0 +1,203 @@
+"""Ids that gymnasium does not know: plugins of installed packages, and a line that says what to write.
+
+The packages are made here, and nothing is downloaded.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import pytest
+from gymnasium import spaces
+
+from protocol.env_spec import EnvSpec, remembered_name
+from protocol.envs.description import describe_env
+from protocol.envs.unknown_ids import installed_packages, most_similar
+from protocol.errors import UsageError
+
+GAME = """
+import gymnasium
+class Game(gymnasium.Env):
+    observation_space = action_space = gymnasium.spaces.Discrete(2)
+    def reset(self, *, seed=None, options=None): return 0, {}
+    def step(self, action): return 0, 1.0, False, False, {}
+"""
+REGISTERS_ON_IMPORT = (
+    GAME
+    + """
+gymnasium.register(id="FakeFlappy-v0", entry_point="fake_flappy:Game")
+for suffix in ("", "Dense"):
+    gymnasium.register(id=f"FakeMaze{suffix}-v3", entry_point="fake_flappy:Game")
+"""
+)
+REGISTERS_WHEN_CALLED = (
+    GAME
+    + """
+def register_all():
+    gymnasium.register("FakeHighway-v0", "fake_highway:Game", max_episode_steps=11)
+"""
+)
+
+
+class Site:
+    """A folder of installed packages."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def install(self, module: str, source: str, entry_points: str = "", needs: str = "gymnasium>=1.0") -> None:
+        (self.path / module).mkdir()
+        (self.path / module / "__init__.py").write_text(source)
+        info = self.path / f"{module}-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\nRequires-Dist: {needs}\n")
+        (info / "RECORD").write_text(f"{module}/__init__.py,,\n{module}-1.0.dist-info/METADATA,,\n")
+        if entry_points:
+            (info / "entry_points.txt").write_text(entry_points)
+
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
+    """Nothing else is installed that has environments. What is imported and registered meanwhile is forgotten."""
+    registry, modules = dict(gymnasium.registry), set(sys.modules)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield Site(tmp_path)
+    gymnasium.registry.clear()
+    gymnasium.registry.update(registry)
+    for name in set(sys.modules) - modules:
+        if name.startswith("fake_"):
+            del sys.modules[name]
+
+
+def refusal(env_id: str) -> str:
+    with pytest.raises(UsageError) as why:
+        EnvSpec(env_id).make()
+    line = str(why.value)
+    assert "\n" not in line
+    return line
+
+
+def test_the_line_names_the_installed_package_and_what_to_write(site: Site) -> None:
+    assert "fake_flappy" not in refusal("FakeFlappy-v0")
+    site.install("fake_flappy", REGISTERS_ON_IMPORT)
+    for env in ("FakeFlappy-v0", "FakeMazeDense-v3", "FakeMaze-v3"):
+        assert refusal(env) == (
+            f"environment {env} is not registered: the installed package fake_flappy registers it when it is imported; "
+            f"write fake_flappy:{env}"
+        )
+    assert "fake_flappy" not in sys.modules, "it is read, not imported"
+    assert type(EnvSpec("fake_flappy:FakeFlappy-v0").make().unwrapped).__name__ == "Game"
+
+
+def test_a_misspelled_id_is_suggested_with_its_module(site: Site) -> None:
+    site.install("fake_flappy", REGISTERS_ON_IMPORT)
+    assert refusal("FakeFlapy-v0").endswith("is not registered: did you mean fake_flappy:FakeFlappy-v0?")
+    assert refusal("CartPol-v1").endswith("did you mean CartPole-v1?")
+    says = "module fake_flappy neither registers FakeFlapy-v0 nor has a class or function so named; did you mean "
+    assert refusal("fake_flappy:FakeFlapy-v0").endswith(f"{says}fake_flappy:FakeFlappy-v0?")
+
+
+def test_an_id_that_nothing_resembles_says_which_packages_there_are(site: Site) -> None:
+    site.install("fake_flappy", REGISTERS_ON_IMPORT)
+    line = refusal("Qqqqqqqqqqq-v7")
+    assert "packages with environments are installed (" in line
+    assert line.endswith("and one of your own is given as my_module:MyEnv-v0")
+    assert most_similar("Qqqqqqqqqqq-v7") is None
+
+
+@pytest.mark.parametrize(
+    ("source", "needs"),
+    [
+        ("def register(**_): ...\nregister(id='FakeFlappy-v0')", "numpy"),
+        ("def register(**_): ...\nregister(id='FakeFlappy-v0')", "gymnasium; extra == 'rl'"),
+    ],
+)
+def test_a_package_that_does_not_need_gymnasium_is_not_read(site: Site, source: str, needs: str) -> None:
+    site.install("fake_other", source, needs=needs)
+    assert "fake_other" not in [package.module for package in installed_packages()]
+    assert "fake_other" not in refusal("FakeFlappy-v0")
+
+
+@pytest.mark.parametrize(
+    "entry_points",
+    [
+        "[gymnasium.envs]\n__root__ = fake_highway:register_all\n",
+        "[gymnasium.envs.__root__]\nfake = fake_highway:register_all\n",  # as highway-env has it
+    ],
+)
+def test_the_plugin_of_an_installed_package_registers_its_ids(site: Site, entry_points: str) -> None:
+    site.install("fake_highway", REGISTERS_WHEN_CALLED, entry_points)
+    assert "FakeHighway-v0" not in gymnasium.registry
+    made = EnvSpec.of("FakeHighway-v0").make()
+    assert made.spec is not None
+    assert made.spec.max_episode_steps == 11
+    assert remembered_name("FakeHighway-v0") == "FakeHighway-v0", "a worker finds it too"
+    assert EnvSpec.of("FakeHighway-v0").factory is None
+
+
+def test_a_plugin_may_have_a_namespace(site: Site) -> None:
+    site.install("fake_highway", REGISTERS_WHEN_CALLED, "[gymnasium.envs]\nFakeSpace = fake_highway:register_all\n")
+    assert type(EnvSpec("FakeSpace/FakeHighway-v0").make().unwrapped).__name__ == "Game"
+
+
+def test_a_plugin_that_fails_costs_no_more_than_its_ids(site: Site) -> None:
+    site.install("fake_broken", "raise OSError('no display')", "[gymnasium.envs]\n__root__ = fake_broken:register_all\n")
+    site.install("fake_highway", REGISTERS_WHEN_CALLED, "[gymnasium.envs]\n__root__ = fake_highway:register_all\n")
+    assert EnvSpec("FakeHighway-v0").make().spec is not None
+    assert refusal("FakeOther-v0").endswith("(fake_broken: OSError: no display)")
+
+
+def test_no_plugin_is_imported_for_an_id_that_is_known(site: Site) -> None:
+    site.install("fake_broken", "raise OSError('no display')", "[gymnasium.envs]\n__root__ = fake_broken:register_all\n")
+    for env in ("CartPole-v1", "workers.envs.toy:Countdown-v0", "millrace/CartDoublePendulum-v0"):
+        EnvSpec.of(env).make().close()
+    assert "fake_broken" not in sys.modules
+
+
+# ------------------------------------------------------------------------------- observations that no policy takes
+
+
+class Observes(gymnasium.Env[Any, Any]):
+    action_space = spaces.Discrete(2)
+
+    def __init__(self, space: gymnasium.Space[Any], module: str = "mine") -> None:
+        self.observation_space = space
+        self.__class__ = type("Observes", (Observes,), {"__module__": module})
+
+
+GRID = {"image": spaces.Box(0, 9, (7, 7, 3)), "direction": spaces.Discrete(4), "mission": spaces.Text(9)}
+
+
+@pytest.mark.parametrize(
+    ("env", "advice"),
+    [
+        (
+            Observes(spaces.Dict(GRID)),
+            """ "gymnasium.wrappers:FilterObservation(filter_keys=['direction', 'image'])" leaves what is supported""",
+        ),
+        (Observes(spaces.Dict(GRID), "minigrid.envs.empty"), "--wrapper minigrid.wrappers:ImgObsWrapper leaves the image"),
+        (
+            Observes(spaces.Tuple([spaces.Text(3), spaces.Discrete(2)])),
+            '--wrapper "gymnasium.wrappers:FilterObservation(filter_keys=[1])" leaves what is supported',
+        ),
+        (Observes(spaces.Text(3)), "--wrapper gymnasium.wrappers:FlattenObservation makes it an array"),
+        (Observes(spaces.Graph(spaces.Discrete(2), None)), "a gymnasium.ObservationWrapper of yours that returns arrays"),
+        (Observes(spaces.Dict({"said": spaces.Text(3)})), "a gymnasium.ObservationWrapper of yours that returns arrays"),
+    ],
+    ids=["dict", "minigrid", "tuple", "text", "graph", "only text"],
+)
+def test_the_line_about_observations_names_a_wrapper_that_helps(env: gymnasium.Env[Any, Any], advice: str) -> None:
+    with pytest.raises(UsageError) as why:
+        describe_env(env)
+    line = str(why.value)
+    assert line.endswith(advice)
+    assert "\n" not in line
+    wrapper = line.partition("--wrapper ")[2].partition(" leaves")[0].partition(" makes")[0].strip('"')
+    if wrapper.startswith("gymnasium."):
+        from protocol.envs.wrappers import wrap
+
+        describe_env(wrap(env, wrapper))
