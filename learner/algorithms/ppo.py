@@ -19,6 +19,7 @@ from learner.algorithms.kernels.loss_gradients import Numbers, OutputGradients
 from learner.algorithms.minibatches import LossInput, Observations
 from learner.algorithms.updates import scheduled
 from learner.config.hyperparameters import PPOConfig
+from protocol.errors import UsageError
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
 
@@ -42,6 +43,13 @@ class PPO(ActorCritic):
 
     def stops(self, metrics: Metrics) -> bool:
         """Whether the KL divergence from the policy that acted is more than 1.5 times `target_kl`."""
+        if math.isinf(self._kl_limit):
+            return False
+        if "approx_kl" not in metrics:
+            raise UsageError(
+                f"{type(self).__name__}.loss: target_kl needs approx_kl among the numbers that it logs, got "
+                f"{', '.join(metrics)}; log losses.approx_kl(…), or set target_kl to none"
+            )
         return metrics["approx_kl"] > self._kl_limit
 
     def loss(self, rows: LossInput) -> tuple[Tensor, Mapping[str, Tensor | float]]:
@@ -75,15 +83,23 @@ class PPO(ActorCritic):
         )
 
     def metrics(self, epochs: Sequence[Sequence[Metrics]], estimates: Sequence[Estimates]) -> Metrics:
-        """The metrics of `ActorCritic`, the loss, the KL divergence of the last epoch, the clip range and epochs so far."""
-        last = epochs[-1][-1]
-        weighted = self.config.ent_coef * last["entropy_loss"] + self.config.vf_coef * last["value_loss"]
-        return super().metrics(epochs, estimates) | {
-            "train/loss": last["policy_gradient_loss"] + weighted,
-            "train/approx_kl": float(np.mean([step["approx_kl"] for step in epochs[-1]])),
-            "train/n_updates": float(self.epochs),
-            "train/clip_range": self.clip_range,
-        }
+        """Those of `ActorCritic`, the last loss, the KL divergence of the last epoch, the clip range and the epochs so far.
+
+        A subclass with a loss of its own logs what it likes: what it does not log is not among them.
+        """
+        found = super().metrics(epochs, estimates)
+        found |= {"train/loss": self._total(epochs[-1][-1]), "train/n_updates": float(self.epochs)}
+        found |= {"train/clip_range": self.clip_range}
+        if divergences := [step["approx_kl"] for step in epochs[-1] if "approx_kl" in step]:
+            found["train/approx_kl"] = float(np.mean(divergences))
+        return found
+
+    def _total(self, step: Metrics) -> float:
+        """The loss of a gradient step. Autograd measured it; the derivation by hand measured only its parts."""
+        if "loss" in step:
+            return step["loss"]
+        weighted = self.config.ent_coef * step["entropy_loss"] + self.config.vf_coef * step["value_loss"]
+        return step["policy_gradient_loss"] + weighted
 
     def count_update(self, batch: Batch, observations: Observations, epochs: int) -> None:
         """See `ActorCritic`."""

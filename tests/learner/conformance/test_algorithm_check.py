@@ -14,6 +14,7 @@ import torch
 from learner.algorithms import ALGORITHMS, Algorithm, algorithm_class
 from learner.conformance.same_bits import first_difference
 from millrace.algorithms import (
+    PPO,
     ActorCritic,
     ActorCriticConfig,
     ActorCriticNetwork,
@@ -258,6 +259,22 @@ def test_a_sound_algorithm_passes_and_nothing_global_changes() -> None:
 @pytest.mark.parametrize("settings", [{"core": "gru"}, {"normalize_rewards": True, "normalize_observations": True}])
 def test_it_passes_with_other_settings(settings: dict[str, Any]) -> None:
     check_algorithm(Sound, learns=False, **SMALL, **settings)
+
+
+class OtherLoss(PPO):
+    """PPO with a loss that logs nothing."""
+
+    def loss(self, rows: LossInput) -> tuple[torch.Tensor, Mapping[str, torch.Tensor | float]]:
+        ratio = (rows.log_prob_now - rows.log_prob).exp()
+        return -(ratio * rows.advantage).mean() + (rows.value - rows.target).square().mean(), {}
+
+
+def test_a_subclass_of_ppo_need_not_log_what_ppo_logs() -> None:
+    check_algorithm(OtherLoss, learns=False, **SMALL)
+    with pytest.raises(AlgorithmMistakes) as caught:
+        check_algorithm(OtherLoss, learns=False, target_kl=0.01, **SMALL)
+    says = "OtherLoss.loss: target_kl needs approx_kl among the numbers that it logs, got loss, grad_norm; log "
+    assert says in str(caught.value)
 
 
 @pytest.mark.timeout(600)  # on a busy machine
