@@ -51,6 +51,11 @@ BENCHMARKS = {
     "slow": Benchmark(
         "slow", "PPO on an environment whose steps sleep 5 ms, compared with Stable-Baselines3", brief=("--rounds", "1")
     ),
+    "service": Benchmark(
+        "rollout_service",
+        "the rollout service, compared with the built-in trainer's collecting rate",
+        brief=("--rounds", "2", "--seconds", "2"),
+    ),
     "wire": Benchmark("wire", "sending rollouts, compared with raw ZeroMQ"),
     "scale": Benchmark("scale", "one learner with 10, 100 and 1,000 simulated workers"),
     "memory": Benchmark(
