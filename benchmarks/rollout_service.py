@@ -1,9 +1,9 @@
 """Env steps/s of `RolloutService` beside the built-in trainer's: `millrace bench service`.
 
 All collect CartPole-v1 with two processes, the same policy, seed and sizes, over ipc. The service's loop only publishes the
-same weights again; the trainer's algorithm does the same, so its figure is its collecting rate. The ceiling is two collectors
-without any messages. The last row is the service with the same network written as an `OwnPolicy`. Rounds are interleaved,
-and a share is the median of the shares within a round.
+same weights again; the trainer's algorithm does the same, so its figure is its collecting rate. The ceiling is two
+collectors without any messages. The last row is the service with the same network written as an `OwnPolicy`. Rounds are
+interleaved, and a share is the median of the shares within a round.
 """
 
 from __future__ import annotations

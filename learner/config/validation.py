@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Any, get_args, get_type_hints
+from typing import Any, TypeVar, get_args, get_type_hints
 
 import msgspec
 
@@ -17,6 +17,7 @@ from protocol.envs.wrappers import wrapper_name
 from protocol.errors import UsageError
 
 MAX_FACTS = 32  # names in info_keys
+Record = TypeVar("Record", bound=msgspec.Struct)
 
 
 def convert(settings: dict[str, Any], where: str) -> Config:
@@ -24,11 +25,15 @@ def convert(settings: dict[str, Any], where: str) -> Config:
 
     Raises `UsageError` that names the setting, what was expected and what was given. `where` says in which file it stands.
     """
+    kind: type[msgspec.Struct] = settings_record(settings["algo"])
+    algorithm = _converted(settings["algorithm"], kind, settings, where)
+    return msgspec.structs.replace(_converted({**settings, "algorithm": {}}, Config, settings, where), algorithm=algorithm)
+
+
+def _converted(values: Any, kind: type[Record], settings: dict[str, Any], where: str = "") -> Record:
+    """These values, which are among the settings, as a record. Raises `UsageError`."""
     try:
-        kind: type[msgspec.Struct] = settings_record(settings["algo"])
-        algorithm = msgspec.convert(settings["algorithm"], kind)
-        config = msgspec.convert({**settings, "algorithm": {}}, Config)
-        return msgspec.structs.replace(config, algorithm=algorithm)
+        return msgspec.convert(values, kind)
     except msgspec.ValidationError as error:
         raise UsageError(f"{where}: {_reworded(str(error), settings)}".removeprefix(": ")) from error
 
@@ -50,10 +55,7 @@ def validate(config: Config, where: str = "") -> Config:
 
 def convert_rollout_settings(settings: dict[str, Any]) -> RolloutConfig:
     """The record of these settings, checked. Raises `UsageError`."""
-    try:
-        config = msgspec.convert(settings, RolloutConfig)
-    except msgspec.ValidationError as error:
-        raise UsageError(_reworded(str(error), settings)) from error
+    config = _converted(settings, RolloutConfig, settings)
     check_rollout_settings(config)
     return config
 

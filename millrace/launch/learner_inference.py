@@ -13,8 +13,6 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-import zmq
-
 from learner.callbacks.callbacks import Watch
 from learner.config.config import Config
 from learner.interrupts import Interrupts
@@ -26,14 +24,14 @@ from learner.rollout_service.service import describe_settings
 from learner.run import Run, RunSetup, known_environment, prometheus_observer, run_folder
 from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.settings import VectorEnvSettings
-from millrace.launch.local_worker_options import private_address, worker_flags
+from millrace.launch.endpoint import open_endpoint
+from millrace.launch.local_worker_options import worker_flags
 from millrace.launch.vector import listen
 from protocol.alive import WorkerExit
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.policy.policy import Policy, make_policy
 from protocol.specs import DescribeSpec, ImagesDtype, PolicySpec, RunSpec
-from protocol.wire.learner_link import LearnerLink
 from workers.collect.collector import Collector
 from workers.collect.split_vector_env import SplitVectorEnv
 from workers.env_loop import Pulse
@@ -59,10 +57,8 @@ def train(
     `config.bind`. Raises `UserFacingError`, or `Interrupted` if the user stopped the run.
     """
     with ExitStack() as stack:
-        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        stack.callback(context.term)
-        link = LearnerLink(private_address("inproc", stack), context)
-        stack.callback(link.close, 0.5)
+        endpoint = open_endpoint(BindSettings(), "inproc", stack)
+        link = endpoint.link
         listening = listen(_settings(config, env_spec, elsewhere=elsewhere), stack.enter_context(ExitStack()))
         observer = stack.enter_context(prometheus_observer(config))
         folder = stack.enter_context(run_folder(config, resume))
@@ -86,7 +82,10 @@ def train(
             evaluator = Evaluator(spec, policy, lambda run, count, render_mode, pulse: evaluation_copies)
             return Collector(spec, policy, lanes.open_lane, lanes.step_all), evaluator
 
-        supervisor = Supervisor(lambda name: WorkerThread(link.address, name, context, collector), 1, prefix="inference")
+        def start(name: str) -> WorkerThread:
+            return WorkerThread(link.address, name, endpoint.context, collector)
+
+        supervisor = Supervisor(start, 1, prefix="inference")
         interrupts = Interrupts(config.grace_s)
         stack.callback(lambda: supervisor.stop(interrupts.at_most(STOP_WITHIN_S)))
         stack.callback(supervisor.ask_to_leave)  # if it is asked a second time, the worker leaves at once

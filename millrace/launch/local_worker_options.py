@@ -59,6 +59,11 @@ def temporary_keys(transport: str, keys: str, *, insecure: bool) -> tuple[Keyrin
     return generate_run_keys("local", datetime.now(UTC)) if encrypted else (None, None)
 
 
+def no_flags(name: str) -> tuple[list[str], Path | None]:
+    """Those of a worker without options of its own, which writes to this process's stderr: a `WorkerFlags`."""
+    return [], None
+
+
 def worker_flags(config: Config, run: Path) -> WorkerFlags:
     """The flags of a run's workers. Their logs are in the run folder."""
     logs = run / "workers"

@@ -5,28 +5,19 @@ Rule: whatever happens, no worker, socket file or temporary folder is left behin
 
 from __future__ import annotations
 
-import logging
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
-import zmq
-
 from learner.interrupts import Interrupts
-from learner.members.endpoint import BindSettings, join_lines, keyring_for
+from learner.members.endpoint import BindSettings
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.policy_player import PolicyPlayer, SavedPolicy
-from millrace.launch.local_worker_options import private_address
-from protocol.wire.learner_link import LearnerLink
-from workers.supervise.worker_process import WorkerCommand, WorkerProcess
-from workers.supervise.worker_thread import WorkerThread
-from workers.supervisor import Running, Supervisor
-
-log = logging.getLogger("millrace.learner")
+from millrace.launch.endpoint import open_endpoint
+from workers.supervisor import Supervisor
 
 
 @dataclass(frozen=True)
@@ -43,7 +34,6 @@ class PlayingWorkers:
 @contextmanager
 def policy_player(policy: SavedPolicy, which: PlayingWorkers, watch: Callable[[str], None]) -> Iterator[PolicyPlayer]:
     """A player with its workers. `watch` gets how far it is. Raises `UserFacingError`, or `KeyboardInterrupt`."""
-    keyring = keyring_for(BindSettings(which.bind), datetime.now(UTC).replace(microsecond=0)) if which.bind else None
     with ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts())
 
@@ -51,20 +41,16 @@ def policy_player(policy: SavedPolicy, which: PlayingWorkers, watch: Callable[[s
             if interrupts.received:
                 raise KeyboardInterrupt
 
-        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        stack.callback(context.term)
-        link = LearnerLink(which.bind or private_address(which.transport, stack), context, keyring)
-        stack.callback(link.close, 0.5)
+        endpoint = open_endpoint(BindSettings(which.bind), which.transport, stack)
         if which.bind:
             processes = ProcessCallbacks()
-            for line in join_lines(link.address, "", keyring):
-                log.warning("%s", line)
+            endpoint.announce("")
         else:
             logs = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="millrace-")))
-            supervisor = Supervisor(_starter(which, link.address, context, logs), which.workers)
+            supervisor = Supervisor(endpoint.starter(lambda name: ([], logs / f"{name}.log")), which.workers)
             stack.callback(supervisor.stop, 2.0)
             processes = ProcessCallbacks(supervisor.poll, expected=which.workers)
-        player = PolicyPlayer(policy, link, processes, check_interrupt, watch)
+        player = PolicyPlayer(policy, endpoint.link, processes, check_interrupt, watch)
         reason = "all episodes played"
         try:
             yield player
@@ -73,11 +59,3 @@ def policy_player(policy: SavedPolicy, which: PlayingWorkers, watch: Callable[[s
             raise
         finally:
             player.leave(reason)
-
-
-def _starter(
-    which: PlayingWorkers, address: str, context: zmq.Context[zmq.Socket[bytes]], logs: Path
-) -> Callable[[str], Running]:
-    if which.transport == "inproc":
-        return lambda name: WorkerThread(address, name, context)
-    return lambda name: WorkerProcess(WorkerCommand(address, name, logs / f"{name}.log"))

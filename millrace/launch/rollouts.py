@@ -5,34 +5,25 @@ Rule: whatever happens, no worker, socket file or folder of ours is left behind.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from datetime import UTC, datetime
-
-import zmq
 
 from learner.config.rollout_config import RolloutConfig
 from learner.env_spaces import EnvSpaces
 from learner.members.describe import described_by_workers
-from learner.members.endpoint import join_lines, keyring_for
+from learner.members.endpoint import BindSettings
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.rollout_service.service import RolloutService, describe_settings, rollout_service
 from learner.rollout_service.spec import rollout_spec
 from learner.rollouts.ledger import Ledger
-from millrace.launch.local_worker_options import private_address, stopped_on_error, temporary_keys, worker_cores
+from millrace.launch.endpoint import open_endpoint
+from millrace.launch.local_worker_options import stopped_on_error, worker_cores
 from millrace.policies import PolicyChoice
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
-from protocol.errors import UsageError
 from protocol.specs import DescribeSpec, RunSpec
-from protocol.wire.learner_link import LearnerLink
-from workers.supervise.worker_process import WorkerCommand, WorkerProcess
-from workers.supervise.worker_thread import WorkerThread
-from workers.supervisor import Running, Supervisor, core_flags, timeout_flags
-
-log = logging.getLogger("millrace.learner")
+from workers.supervisor import Supervisor, core_flags, timeout_flags
 
 
 @dataclass(frozen=True)
@@ -59,32 +50,17 @@ def start(
 
     `listens`: wait for workers elsewhere at `config.bind`, and start none. Raises `UserFacingError`.
     """
-    if listens:
-        keyring, token = keyring_for(config, datetime.now(UTC).replace(microsecond=0)), None
-        address = config.bind
-    else:
-        keyring, token = temporary_keys(config.transport, config.keys, insecure=config.insecure)
-        address = private_address(config.transport, resources)
-    if address.startswith("tcp://") and keyring is None and (env.factory is not None or policy.is_code):
-        what = "an environment factory" if env.factory is not None else "a policy's callable"
-        raise UsageError(f"{what} is code: it travels over ipc or inproc only, or over tcp with keys")
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    resources.callback(context.term)
-    link = LearnerLink(address, context, keyring)
-    resources.callback(link.close, 0.5)
+    code = "an environment factory" if env.factory is not None else "a policy's callable" if policy.is_code else ""
+    where = BindSettings(config.bind if listens else "", config.keys, config.insecure, config.advertise)
+    endpoint = open_endpoint(where, config.transport, resources, code)
+    link = endpoint.link
     supervisor = None
     processes = ProcessCallbacks()
     if listens:
-        for line in join_lines(link.address, config.advertise, keyring):
-            log.warning("%s", line)
+        endpoint.announce(config.advertise)
     else:
         cores, timeouts = worker_cores(config), timeout_flags(config.call_timeouts())
-
-        def start_worker(name: str) -> Running:
-            if config.transport == "inproc":
-                return WorkerThread(link.address, name, context)
-            return WorkerProcess(WorkerCommand(link.address, name, None, token, [*timeouts, *core_flags(cores, name)]))
-
+        start_worker = endpoint.starter(lambda name: ([*timeouts, *core_flags(cores, name)], None))
         supervisor = Supervisor(start_worker, config.workers, timeouts=config.call_timeouts())
         resources.callback(supervisor.stop)
         processes = ProcessCallbacks(supervisor.poll, supervisor.activities, expected=config.workers)

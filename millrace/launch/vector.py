@@ -5,40 +5,29 @@ Rule: whatever happens, no worker, socket file or folder of ours is left behind.
 
 from __future__ import annotations
 
-import logging
 import math
 import os
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
-from datetime import UTC, datetime
-
-import zmq
 
 from learner.members.describe import DescribeSettings, described_by_workers
 from learner.members.describe_coordinator import Accept, accept_any
-from learner.members.endpoint import BindSettings, join_lines, keyring_for
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.settings import VectorEnvSettings
 from learner.vector_env.spec import RequestedCopies, requested_copies
 from learner.vector_env.step_hub import SharedSteps, StepHub
-from millrace.launch.local_worker_options import LEAVE_AT_ONCE_S, WorkerFlags, private_address, temporary_keys
+from millrace.launch.endpoint import Endpoint, open_endpoint
+from millrace.launch.local_worker_options import LEAVE_AT_ONCE_S, WorkerFlags
 from protocol.address import advertised_address, check_address
 from protocol.alive import CallTimeouts
 from protocol.cpu_cores import usable_cores
 from protocol.envs.description import DescribedEnv
 from protocol.errors import EnvironmentFailed, UsageError
-from protocol.keys.key_folder import Keyring
-from protocol.keys.keys import Token
-from protocol.wire.learner_link import LearnerLink
 from protocol.wire.shared_memory import SUPPORTED, InheritedDescriptors, SharedMemory, new_memory
 from protocol.wire.wake_up import SPIN_S, WakePipe
-from workers.supervise.worker_process import WorkerCommand, WorkerProcess
-from workers.supervise.worker_thread import WorkerThread
-from workers.supervisor import Running, Supervisor, timeout_flags
-
-log = logging.getLogger("millrace.learner")
+from workers.supervisor import Supervisor, timeout_flags
 
 CLOSE_TIMEOUT_S = 5.0  # seconds for workers to leave; then local workers are killed
 JOIN_TIMEOUT_S = 60.0  # seconds for local workers to join
@@ -93,11 +82,7 @@ class ListeningVectorEnv:
 
     settings: VectorEnvSettings
     requested: RequestedCopies
-    link: LearnerLink
-    context: zmq.Context[zmq.Socket[bytes]]
-    keyring: Keyring | None
-    token: Token | None
-    """Token of local workers."""
+    endpoint: Endpoint
     inherited: InheritedByWorkers | None
     """For local workers only."""
     resources: ExitStack
@@ -105,28 +90,20 @@ class ListeningVectorEnv:
     def start(self, flags: WorkerFlags, timeouts: CallTimeouts) -> StartedVectorEnv:
         """Start the local workers with these flags. `timeouts`: of a call of the environment. Call it once."""
         count = self.settings.local_workers
-        supervisor = Supervisor(self._starter(flags), count, timeouts=timeouts) if count else None
+        start = self.endpoint.starter(flags, self._handed)
+        supervisor = Supervisor(start, count, timeouts=timeouts) if count else None
         if supervisor is not None:
             self.resources.callback(supervisor.stop, LEAVE_AT_ONCE_S)  # if there will be no hub to close
         else:
-            for line in join_lines(self.link.address, self.settings.listen.advertise, self.keyring):
-                log.warning("%s", line)
+            self.endpoint.announce(self.settings.listen.advertise)
         return StartedVectorEnv(self, supervisor)
 
-    def _starter(self, flags: WorkerFlags) -> Callable[[str], Running]:
-        """A function that starts the local worker of a name."""
-        if self.settings.transport == "inproc":
-            return lambda name: WorkerThread(self.link.address, name, self.context)
-
-        def start(name: str) -> WorkerProcess:
-            handed = None
-            if self.inherited is not None:
-                to_worker, to_learner = self.inherited.wake_pipes[name]
-                handed = InheritedDescriptors(self.inherited.memory_fd, to_worker.read_fd, to_learner.write_fd)
-            worker_flags, log_file = flags(name)
-            return WorkerProcess(WorkerCommand(self.link.address, name, log_file, self.token, worker_flags, handed))
-
-        return start
+    def _handed(self, worker: str) -> InheritedDescriptors | None:
+        """The file descriptors that this worker inherits."""
+        if self.inherited is None:
+            return None
+        to_worker, to_learner = self.inherited.wake_pipes[worker]
+        return InheritedDescriptors(self.inherited.memory_fd, to_worker.read_fd, to_learner.write_fd)
 
 
 @dataclass(frozen=True)
@@ -151,7 +128,7 @@ class StartedVectorEnv:
             processes = ProcessCallbacks(
                 self.supervisor.poll, self.supervisor.activities, expected=self.listening.settings.local_workers
             )
-        return described_by_workers(self.listening.link, spec, settings, processes, check_interrupt, accept=accept)
+        return described_by_workers(self.listening.endpoint.link, spec, settings, processes, check_interrupt, accept=accept)
 
     def vector_env(self, described: DescribedEnv) -> ZmqVectorEnv:
         """The vector environment. Call it once; it does not wait until workers have joined."""
@@ -162,7 +139,7 @@ class StartedVectorEnv:
             memory = SharedMemory(description.step, inherited.memory_fd, resize=True)
             shared = SharedSteps(memory, inherited.wake_pipes)
         hub = StepHub(
-            listening.link,
+            listening.endpoint.link,
             description.step,
             first_session=int.from_bytes(os.urandom(6), "little"),
             local_workers=self.supervisor,
@@ -191,28 +168,16 @@ def listen(settings: VectorEnvSettings, resources: ExitStack) -> ListeningVector
         raise UsageError(f"workers: expected at least 0, got {settings.workers}")
     # Local workers end with this process, and this process notices at once if one of them ends. So no timeout is needed.
     requested = requested_copies(settings, LEARNER_TIMEOUT_S if where.bind else math.inf)
-    address = where.bind or private_address(transport, resources)
-    keyring, token = _keys(where, transport)
-    if address.startswith("tcp://") and keyring is None and any(env.factory is not None for env in requested.envs):
-        raise UsageError("an environment factory is code: it travels over ipc or inproc only, or over tcp with keys")
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    resources.callback(context.term)
-    link = LearnerLink(address, context, keyring)
-    resources.callback(link.close, 0.5)
+    if where.bind:
+        check_address(advertised_address("tcp://*:1", where.advertise, "machine"))
+    code = "an environment factory" if any(env.factory is not None for env in requested.envs) else ""
+    endpoint = open_endpoint(where, transport, resources, code)
     inherited = None
     if settings.shared_memory and SUPPORTED and count and transport != "inproc":
         to_learner = WakePipe()  # one for all workers: the last worker to finish a step writes to it
         inherited = InheritedByWorkers(new_memory(), {f"w{n}": (WakePipe(), to_learner) for n in range(count)})
         resources.callback(inherited.close)
-    return ListeningVectorEnv(settings, requested, link, context, keyring, token, inherited, resources)
-
-
-def _keys(where: BindSettings, transport: str) -> tuple[Keyring | None, Token | None]:
-    """The keyring of the learner, and the token of local workers."""
-    if not where.bind:
-        return temporary_keys(transport, where.keys, insecure=where.insecure)
-    check_address(advertised_address("tcp://*:1", where.advertise, "machine"))
-    return keyring_for(where, datetime.now(UTC).replace(microsecond=0)), None
+    return ListeningVectorEnv(settings, requested, endpoint, inherited, resources)
 
 
 def _call_timeouts(timeout_s: float) -> CallTimeouts:
