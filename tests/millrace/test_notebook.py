@@ -1,6 +1,7 @@
 """The example notebook: its cells run, in a plain process and in a real kernel, and show what a user should see."""
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -21,10 +22,14 @@ def test_it_is_small_and_holds_no_outputs() -> None:
 def test_its_cells_run_as_a_program(tmp_path: Path) -> None:
     cells = [cell for cell in json.loads(NOTEBOOK.read_text())["cells"] if cell["cell_type"] == "code"]
     program = "\n".join("".join(cell["source"]) for cell in cells)
+    records = "\nprint(run.record('corridor/example-v0', steps=100))\n"
     done = subprocess.run(
-        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=240, check=False
-    )
+        [sys.executable, "-c", program + records],
+        cwd=tmp_path, env={**os.environ, "MINARI_DATASETS_PATH": str(tmp_path)},
+        capture_output=True, text=True, timeout=240, check=False,
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
+    assert "dataset corridor/example-v0: 10" in done.stdout
     assert " env steps | " in done.stdout, "without a notebook, progress is lines"
     assert_it_walks_out(done.stdout)
 
