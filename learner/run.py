@@ -189,7 +189,7 @@ class Run:
             reason = "interrupted" if isinstance(error, KeyboardInterrupt) else _why(error)
             self.service.drain(reason, timeout_s=self._interrupts.at_most(DRAIN_S))
             try:
-                self.recorder.finish(reason)
+                self.recorder.finish(reason, cut_short=True)
             except Exception as later:  # a callback may raise again, and the error of the run is what counts
                 log.warning("%s", _why(later))
             raise

@@ -225,13 +225,16 @@ class RunRecorder:
         if self._evaluations.of_version(self.version) is not before:
             self._callbacks.on_evaluation(self.progress())
 
-    def finish(self, reason: str) -> None:
-        """Write the summary, and tell the callbacks. Does nothing if that was done."""
+    def finish(self, reason: str, *, cut_short: bool = False) -> None:
+        """Write the summary, and tell the callbacks. Does nothing if that was done.
+
+        `cut_short`: an error or an interrupt ended the run.
+        """
         if not self._finished:
             self._finished = True
             warn_on_error(lambda: self._folder.write_summary(self._summary(reason)))
             self._requests.closed = "the run has ended"
-            self._callbacks.on_end(msgspec.structs.replace(self.progress(), stop_reason=reason))
+            self._callbacks.on_end(msgspec.structs.replace(self.progress(), stop_reason=reason, cut_short=cut_short))
 
     def close(self) -> None:
         """Close the metrics, and the dataset if episodes were recorded. Also for a run that was cut short."""

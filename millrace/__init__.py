@@ -74,6 +74,7 @@ __all__ = [
     "__version__",
     "algorithms",
     "evaluate",
+    "integrations",
     "load",
     "make_vec",
     "record",
@@ -103,7 +104,7 @@ _IMPORTED_WHEN_USED = {
 }
 """Public names, and the module of each. They are imported when they are used, because that takes longer than this file."""
 
-_MODULES = ("algorithms", "testing")
+_MODULES = ("algorithms", "integrations", "testing")
 """Public modules, which are imported when they are used, too"""
 
 

@@ -13,13 +13,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Annotated
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
+from msgspec import Meta
 
 from protocol.arrays import Array, Bools, Floats
-from protocol.bounds import Count, Natural, Real, Seconds
+from protocol.bounds import MAX_FACTS, Count, Natural, Real, Seconds
 from protocol.errors import BadRollout
 from protocol.specs import ActionSpec, Leaf, RunSpec
 
@@ -33,7 +35,7 @@ class Episode(msgspec.Struct, frozen=True, array_like=True):
     """the return: undiscounted sum of raw rewards"""
     length: Count
     seconds: Seconds
-    facts: tuple[float, ...] = ()
+    facts: Annotated[tuple[float, ...], Meta(max_length=MAX_FACTS)] = ()
     """one number for each name in `RunSpec.facts`, from the info of the episode's last step; NaN where it had none"""
 
 

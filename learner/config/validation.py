@@ -12,11 +12,10 @@ from learner.config.config import Config
 from learner.config.hyperparameters import DQNConfig
 from learner.config.rollout_config import RolloutConfig
 from protocol.address import advertised_address, check_address
-from protocol.bounds import MAX_NAME, one_line
+from protocol.bounds import MAX_FACTS, MAX_NAME, one_line
 from protocol.envs.wrappers import wrapper_name
 from protocol.errors import UsageError
 
-MAX_FACTS = 32  # names in info_keys
 Record = TypeVar("Record", bound=msgspec.Struct)
 
 

@@ -81,6 +81,8 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
     """in `Callback.on_rollouts`: the rollouts of the next update, in the order in which they came"""
     stop_reason: str = ""
     """in `Callback.on_end`: why the run ended"""
+    cut_short: bool = False
+    """in `Callback.on_end`: whether an error or an interrupt ended the run"""
     requests: Requests | None = None
     """what callbacks ask of the run"""
 

@@ -39,6 +39,10 @@ class Requests:
             raise UsageError(f"log {name}: expected at most {MOST_LOGGED} names in one row")
         self._logged[name] = number if math.isfinite(number) else None
 
+    def logged(self) -> dict[str, float | None]:
+        """The numbers that were logged since `take_logged` was called last."""
+        return dict(self._logged)
+
     def set_env_attr(self, name: str, value: Any) -> None:
         """Set an attribute of every env copy from the next weights on. Raises `UsageError` if it cannot be sent."""
         if self.closed:

@@ -118,6 +118,7 @@ LIMITS: Mapping[tuple[ModuleType, str], str] = {
     (bounds, "MAX_TICKETS"): "tickets in one message",
     (bounds, "MAX_WORKERS"): "workers that one supervisor speaks for",
     (bounds, "MAX_SEEDS"): "episodes of one Evaluate",
+    (bounds, "MAX_FACTS"): "facts of an episode",
     (bounds, "MOST_FRAMES"): "observations of an episode that come with a frame: the first ones",
     (space_spec, "MAX_LEAVES"): "arrays of an observation or an action",
     (space_spec, "MAX_DEPTH"): "levels of Dict and Tuple spaces",

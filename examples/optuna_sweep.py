@@ -1,0 +1,71 @@
+"""A sweep with optuna: each trial trains several seeds, and is pruned between its evaluations if others were better.
+
+    pip install 'millrace-rl[optuna]'
+    python examples/optuna_sweep.py
+
+A trial's value is the mean return over its seeds. The seeds run one after another; at each evaluation optuna sees the mean
+of those so far. A pruned run ends as if its steps were done, so its workers leave and its folder is whole.
+"""
+
+from __future__ import annotations
+
+from statistics import fmean
+from typing import Any
+
+import optuna
+
+import millrace
+
+SEEDS = (1, 2, 3)
+
+
+class Prune(millrace.Callback):
+    """Tells optuna the evaluations of one seed, and ends the run if optuna prunes the trial."""
+
+    def __init__(self, trial: optuna.Trial, finished: list[float], most_steps: int) -> None:
+        """`finished`: the returns of the seeds before. `most_steps`: more than the env steps of one seed."""
+        self.trial, self.finished, self.first_step = trial, finished, len(finished) * most_steps
+        self.pruned = False
+
+    def on_evaluation(self, progress: millrace.Progress) -> bool:
+        """Report the mean over the seeds so far. False ends the run."""
+        assert progress.evaluation is not None
+        self.trial.report(fmean([*self.finished, progress.evaluation.return_mean]), self.first_step + progress.env_steps)
+        self.pruned = self.pruned or self.trial.should_prune()
+        return not self.pruned
+
+
+def objective(trial: optuna.Trial, env: str = "CartPole-v1", **settings: Any) -> float:
+    """Train all seeds with the settings of this trial."""
+    chosen = {
+        "learning_rate": trial.suggest_float("learning_rate", 1e-4, 1e-2, log=True),
+        "gamma": trial.suggest_categorical("gamma", [0.98, 0.99]),
+    }
+    steps = settings.pop("steps", 50_000)
+    returns: list[float] = []
+    for seed in SEEDS:
+        prune = Prune(trial, returns, 2 * steps)
+        keywords = {"eval_every": steps // 5, "eval_episodes": 20, "progress": False, **settings, **chosen}
+        run = millrace.train(env, seed=seed, steps=steps, callbacks=[prune], **keywords)
+        if prune.pruned:
+            raise optuna.TrialPruned
+        assert run.summary is not None
+        assert run.summary.evaluation is not None
+        returns.append(run.summary.evaluation.return_mean)
+    return fmean(returns)
+
+
+def sweep(trials: int, **settings: Any) -> optuna.Study:
+    """Try settings. `settings` are keywords of `millrace.train` that all trials have in common."""
+    study = optuna.create_study(
+        direction="maximize",
+        sampler=optuna.samplers.TPESampler(seed=1),
+        pruner=optuna.pruners.MedianPruner(n_startup_trials=2),
+    )
+    study.optimize(lambda trial: objective(trial, **settings), n_trials=trials)
+    return study
+
+
+if __name__ == "__main__":
+    best = sweep(20).best_trial
+    print(best.value, best.params)

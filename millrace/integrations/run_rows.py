@@ -1,0 +1,68 @@
+"""What the integrations send of a run: its settings, flat, and its numbers, at most one row in `every_s` seconds. Pure.
+
+Rule: a row with an evaluation and the last row are always sent. Numbers that are missing are left out.
+"""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from learner.run_folder.progress import Progress
+from protocol.errors import UsageError
+
+
+class RowFilter:
+    """Chooses which rows are sent."""
+
+    def __init__(self, every_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._every_s, self._clock = every_s, clock
+        self._sent_s: float | None = None
+        self._sent_update = -1
+
+    def due(self, progress: Progress) -> dict[str, float] | None:
+        """The row of the last update, if it is to be sent now."""
+        now = self._clock()
+        if self._sent_s is not None and now - self._sent_s < self._every_s:
+            return None
+        self._sent_s = now
+        return self.last(progress)
+
+    def last(self, progress: Progress) -> dict[str, float] | None:
+        """The row of the last update, unless it was sent."""
+        if progress.updates == self._sent_update or not progress.metrics:
+            return None
+        self._sent_update = progress.updates
+        logged = {} if progress.requests is None else progress.requests.logged()
+        return numbers(progress.row({**progress.metrics, **logged}))
+
+
+def numbers(row: dict[str, float | None]) -> dict[str, float]:
+    """The numbers of a row that are not missing."""
+    return {name: value for name, value in row.items() if value is not None}
+
+
+def flat_settings(progress: Progress) -> dict[str, Any]:
+    """All settings of the run by name; those of a table as env_kwargs.gravity or algorithm.learning_rate."""
+    flat: dict[str, Any] = {}
+    for name, value in progress.settings.items():
+        flat |= {f"{name}.{key}": inner for key, inner in value.items()} if isinstance(value, dict) else {name: value}
+    return flat
+
+
+def run_name(progress: Progress) -> str:
+    """The name of the run folder."""
+    return Path(progress.run).name
+
+
+def tool(name: str) -> Any:
+    """The module of this tool. Raises `UsageError`, in one line, if it is not installed."""
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name != name:
+            raise
+        raise UsageError(f"{name} is not installed: pip install 'millrace-rl[{name}]'") from None

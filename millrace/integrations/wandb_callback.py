@@ -1,0 +1,61 @@
+"""Logs a run to Weights & Biases: settings, metrics, evaluations. A resumed run goes on under the same id."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from learner.callbacks.callback import Callback
+from learner.run_folder.progress import ENV_STEPS_KEY, Progress
+from millrace.integrations.run_rows import RowFilter, flat_settings, numbers, run_name, tool
+
+
+class WandbCallback(Callback):
+    """Logs a run to Weights & Biases (`pip install 'millrace-rl[wandb]'`).
+
+    ```python
+    import millrace
+    from millrace.integrations import WandbCallback
+
+    run = millrace.train("CartPole-v1", callbacks=[WandbCallback(project="cartpole", mode="offline")])
+    ```
+    """
+
+    def __init__(self, every_s: float = 1.0, **init: Any) -> None:
+        """`every_s`: least number of seconds between two rows. `init`: arguments of `wandb.init`.
+
+        Raises `UsageError` if wandb is not installed.
+        """
+        self._wandb, self._init = tool("wandb"), init
+        self._rows = RowFilter(every_s)
+        self._run: Any = None
+
+    def on_start(self, progress: Progress) -> None:
+        """Begin, or go on with, the run of this folder's name."""
+        name = run_name(progress)
+        same = {"id": re.sub(r"[^\w.-]", "-", name)[:128], "name": name, "resume": "allow"}
+        self._run = self._wandb.init(**{**same, "config": flat_settings(progress), "dir": progress.run, **self._init})
+        self._run.define_metric(ENV_STEPS_KEY)
+        self._run.define_metric("*", step_metric=ENV_STEPS_KEY)
+
+    def on_update(self, progress: Progress) -> None:
+        """Log the metrics of the update."""
+        self._log(self._rows.due(progress))
+
+    def on_evaluation(self, progress: Progress) -> None:
+        """Log the evaluation."""
+        self._log(self._rows.last(progress))
+        if progress.evaluation is not None:
+            self._log({**numbers(progress.evaluation.metrics()), ENV_STEPS_KEY: progress.env_steps})
+
+    def on_end(self, progress: Progress) -> None:
+        """Log the last row, and end the run."""
+        if self._run is None:
+            return
+        self._log(self._rows.last(progress))
+        self._run.summary["stop_reason"] = progress.stop_reason
+        self._run.finish(exit_code=int(progress.cut_short))
+
+    def _log(self, row: dict[str, float] | None) -> None:
+        if row:
+            self._run.log(row)
