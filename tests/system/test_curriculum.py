@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 import millrace
@@ -160,3 +161,29 @@ def test_no_attribute_is_set_when_it_would_be_lost(tmp_path: Path) -> None:
     run(tmp_path, Sets(), eval_episodes=1)
     assert refused[0].endswith("the checkpoint would lack it")
     assert refused[-1].endswith("the run has ended")
+
+
+def test_copies_that_replace_lost_ones_get_the_attributes(tmp_path: Path) -> None:
+    """With `--inference learner`, one of two worker processes is killed; the level is set before update 3 and stays."""
+
+    class Kills(Callback):
+        def __init__(self) -> None:
+            self.seen: list[tuple[int, float]] = []
+            self.killed = False
+
+        def on_start(self, progress: Progress) -> None:
+            progress.set_env_attr("level", 7.0)
+
+        def on_update(self, progress: Progress) -> None:
+            self.seen += [(progress.updates, episode.facts[0]) for episode in progress.episodes if episode.length]
+            if progress.updates == 3:
+                workers = [child for child in psutil.Process().children() if "workers" in " ".join(child.cmdline())]
+                workers[0].kill()
+                self.killed = True
+
+    kills = Kills()
+    run(tmp_path, kills, inference="learner", workers=2, transport="ipc", steps=3000, eval_episodes=1)
+    assert kills.killed
+    late = [level for update, level in kills.seen if update > 8]
+    assert len(late) > 50
+    assert set(late) == {7.0}
