@@ -141,15 +141,26 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             )
         if self.factory is None and ":" in self.id and code is AllowedCode.REGISTERED:
             return (
-                f"environment {self.id} imports a module, which this worker does not do for a learner it cannot be sure of; "
+                f"environment {self.id} imports a module, which this worker does not do for a learner it is not sure of; "
                 "give it a token (and not --no-code)"
             )
-        if self.wrappers and code is AllowedCode.REGISTERED:
+        if self.called_code and code is not AllowedCode.CALLABLES:
+            what = f"wrapper {self.wrappers[0]}" if self.wrappers else f"environment {self.id}"
             return (
-                f"environment {self.id}: its wrapper {self.wrappers[0]} imports a module, which this worker does not do for "
-                "a learner it cannot be sure of; give it a token (and not --no-code)"
+                f"{what} is a function or a class to call, which this worker does not do for a learner it is not sure of; "
+                "it may come over ipc, inproc or with a token (and not with --no-code)"
             )
         return ""
+
+    @property
+    def called_code(self) -> str:
+        """What a worker calls that the learner names or sends, in words: a factory, or a wrapper. Empty for an id alone.
+
+        Any function of any module can be named, with any arguments: that is as much as a pickled callable can do.
+        """
+        if self.factory is not None or _names_a_function(self.id):
+            return "an environment factory"
+        return "a wrapper" if self.wrappers else ""
 
     def make(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
         """Make one env copy, in its wrappers. Raises `UsageError`, with advice, if it or a package cannot be found.
@@ -192,6 +203,8 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         plugins_failed = load_plugins(self.id) if plain and not is_registered(self.id) else []
         try:
             return make(f"{registrar}:{self.id}" if registrar and find_spec(registrar) else self.id)
+        except UsageError:
+            raise
         except (gymnasium.error.Error, ImportError, TypeError) as error:  # TypeError: keyword arguments it does not take
             raise UsageError(_make_error(self.id, error, plugins_failed)) from error
         except Exception as error:  # its constructor raised any exception
@@ -199,10 +212,16 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise UsageError(line, traceback.format_exc()) from error
 
 
+def _names_a_function(env_id: str) -> bool:
+    """Whether a worker looks for a function or a class of this name: `module:name`, where the name has no version."""
+    _, colon, name = env_id.partition(":")
+    return bool(colon) and all(word.isidentifier() for word in name.split("."))
+
+
 def _make(env_id: str, kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
     """Make the environment of an id, or call the function or class that a name names."""
-    module_name, colon, name = env_id.partition(":")
-    if colon and all(word.isidentifier() for word in name.split(".")):
+    module_name, _, name = env_id.partition(":")
+    if _names_a_function(env_id):
         function = attribute(importlib.import_module(module_name), name)
         if callable(function) and name not in gymnasium.registry:
             return _checked(env_id, function(**kwargs))
@@ -210,9 +229,15 @@ def _make(env_id: str, kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
 
 
 def _checked(name: str, made: object) -> gymnasium.Env[Any, Any]:
-    if not isinstance(made, gymnasium.Env):
-        raise UsageError(f"env factory {name}: expected it to return a gymnasium.Env, got {type(made).__name__}")
-    return made
+    if isinstance(made, gymnasium.Env):
+        return made
+    if hasattr(made, "possible_agents"):
+        advice = "; it has several agents: return a gymnasium.Env with one action and one reward for all of them"
+    elif hasattr(made, "num_envs"):
+        advice = "; it is a vector environment: return one copy, of which millrace makes as many as it needs"
+    else:
+        advice = ""
+    raise UsageError(f"env factory {name}: expected it to return a gymnasium.Env, got {type(made).__name__}{advice}")
 
 
 # -------------------------------------------------------------------------------------------- what only this process has

@@ -35,10 +35,9 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
         from millrace.launch import learner_inference as inference
 
         return inference.train(config, resume, watch, env)
-    code = "" if env.factory is None else "an environment factory"
     with ExitStack() as stack:
         where = BindSettings(keys=config.keys, insecure=config.insecure)
-        endpoint = open_endpoint(where, config.transport, stack, code)
+        endpoint = open_endpoint(where, config.transport, stack, env.called_code)
         observer = stack.enter_context(prometheus_observer(config))
         folder = stack.enter_context(run_folder(config, resume))
         flags = no_flags if config.transport == "inproc" else worker_flags(config, folder.path)

@@ -50,7 +50,7 @@ def start(
 
     `listens`: wait for workers elsewhere at `config.bind`, and start none. Raises `UserFacingError`.
     """
-    code = "an environment factory" if env.factory is not None else "a policy's callable" if policy.is_code else ""
+    code = env.called_code or ("a policy's callable" if policy.is_code else "")
     where = BindSettings(config.bind if listens else "", config.keys, config.insecure, config.advertise)
     endpoint = open_endpoint(where, config.transport, resources, code)
     link = endpoint.link

@@ -170,7 +170,7 @@ def listen(settings: VectorEnvSettings, resources: ExitStack) -> ListeningVector
     requested = requested_copies(settings, LEARNER_TIMEOUT_S if where.bind else math.inf)
     if where.bind:
         check_address(advertised_address("tcp://*:1", where.advertise, "machine"))
-    code = "an environment factory" if any(env.factory is not None for env in requested.envs) else ""
+    code = next((env.called_code for env in requested.envs if env.called_code), "")
     endpoint = open_endpoint(where, transport, resources, code)
     inherited = None
     if settings.shared_memory and SUPPORTED and count and transport != "inproc":

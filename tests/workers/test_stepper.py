@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from functools import partial
+from types import ModuleType
 from typing import Any
 
 import gymnasium
@@ -97,4 +99,10 @@ def test_an_observation_that_does_not_fit_is_refused_at_every_step(nested: bool,
 def test_rewards_are_numbers_or_arrays_of_one_element() -> None:
     assert stepped(partial(Changes, reward=np.array([2.5])), 1)[1].reward.tolist() == [2.5, 2.5]
     with pytest.raises(LaneFailed, match=r"copy 0, step 0: reward: expected a number, got an array of shape \(2,\); wrap"):
+        stepped(partial(Changes, reward=np.zeros(2)), 1)
+
+
+def test_the_line_about_a_reward_of_several_numbers_names_mo_gymnasium_s_wrapper(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mo_gymnasium", ModuleType("mo_gymnasium"))
+    with pytest.raises(LaneFailed, match=r"one number, as --wrapper mo_gymnasium.wrappers:LinearReward does$"):
         stepped(partial(Changes, reward=np.zeros(2)), 1)

@@ -42,6 +42,16 @@ def not_an_env() -> object:
     return 3
 
 
+def many() -> object:
+    return gymnasium.vector.SyncVectorEnv([make_countdown])
+
+
+class Players:
+    """As PettingZoo's environments."""
+
+    possible_agents = ("left", "right")
+
+
 @pytest.fixture
 def registry() -> Iterator[None]:
     """The registry of gymnasium is as before afterwards."""
@@ -129,8 +139,13 @@ def test_an_id_that_everyone_knows_travels_by_name() -> None:
 def test_a_name_of_a_function_or_a_class_makes_an_environment() -> None:
     assert first_reward(EnvSpec.of(f"{MODULE}:make_countdown", {"k": 3})) == first_reward(EnvSpec.of(Countdown, {"k": 3}))
     assert isinstance(EnvSpec(f"{Countdown.__module__}:Countdown").make(), Countdown)
-    with pytest.raises(UsageError, match=r"not_an_env: expected it to return a gymnasium.Env, got int$"):
+    with pytest.raises(UsageError, match=r"not_an_env: expected it to return a gymnasium.Env, got int$") as why:
         EnvSpec(f"{MODULE}:not_an_env").make()
+    assert not why.value.detail, "nothing has raised: a traceback says nothing more"
+    with pytest.raises(UsageError, match=r"got SyncVectorEnv; it is a vector environment: return one copy"):
+        EnvSpec(f"{MODULE}:many").make()
+    with pytest.raises(UsageError, match=r"got Players; it has several agents: return a gymnasium.Env with one action"):
+        EnvSpec(f"{MODULE}:Players").make()
     with pytest.raises(
         UsageError, match=r"neither registers make_countdwn nor .* so named; did you mean .*:make_countdown\?$"
     ):
@@ -277,9 +292,14 @@ def test_what_goes_wrong_with_a_wrapper_is_one_line(wrapper: Any, says: str) -> 
         EnvSpec.of("CartPole-v1", {}, [wrapper]).make()
 
 
-def test_a_worker_that_does_not_know_its_learner_imports_no_wrapper() -> None:
+def test_only_a_worker_that_knows_its_learner_calls_what_it_names() -> None:
     named, pickled = (EnvSpec.of("CartPole-v1", {}, [wrapper]) for wrapper in (Halved, lambda env: env))
     codes = [AllowedCode.REGISTERED, AllowedCode.MODULES, AllowedCode.CALLABLES]
-    assert [bool(named.rejection_reason(code)) for code in codes] == [True, False, False]
-    assert [bool(pickled.rejection_reason(code)) for code in codes] == [True, True, False]
+    function = EnvSpec("subprocess:getoutput", {"cmd": "touch /tmp/never"})
+    for spec, what in ((named, "a wrapper"), (pickled, "an environment factory"), (function, "an environment factory")):
+        assert [bool(spec.rejection_reason(code)) for code in codes] == [True, True, False]
+        assert spec.called_code == what
+    by_id = EnvSpec("workers.envs.toy:Countdown-v0")
+    assert [bool(by_id.rejection_reason(code)) for code in codes] == [True, False, False]
+    assert by_id.called_code == ""
     assert cloudpickle.loads(pickled.factory.data if pickled.factory else b"").__class__.__module__ == "protocol.env_spec"
