@@ -36,7 +36,9 @@ if TYPE_CHECKING:
 
     from learner.algorithms.moments import Moments
     from learner.callbacks.callback import Callback
+    from learner.recording.record import RecordedDataset
     from learner.run_folder.progress import Progress
+    from learner.run_folder.results import Evaluation, Summary
     from learner.vector_env.env import ZmqVectorEnv
     from millrace.acting import LoadedPolicy, load
     from millrace.own_policy import OwnPolicy
@@ -53,6 +55,7 @@ __all__ = [
     "Callback",
     "CheckpointError",
     "EnvironmentFailed",
+    "Evaluation",
     "LoadedPolicy",
     "Metrics",
     "MillraceError",
@@ -62,12 +65,14 @@ __all__ = [
     "Piece",
     "PolicyParameters",
     "Progress",
+    "RecordedDataset",
     "Recurrent",
     "RolloutBatch",
     "RolloutService",
     "Run",
     "RunError",
     "Stalled",
+    "Summary",
     "UsageError",
     "UserFacingError",
     "WorkerLost",
@@ -85,6 +90,7 @@ __all__ = [
 _IMPORTED_WHEN_USED = {
     "CNN": "millrace.policies",
     "Callback": "learner.callbacks.callback",
+    "Evaluation": "learner.run_folder.results",
     "LoadedPolicy": "millrace.acting",
     "MLP": "millrace.policies",
     "Moments": "learner.algorithms.moments",
@@ -93,10 +99,12 @@ _IMPORTED_WHEN_USED = {
     "Piece": "millrace.policies",
     "PolicyParameters": "millrace.policies",
     "Progress": "learner.run_folder.progress",
+    "RecordedDataset": "learner.recording.record",
     "Recurrent": "millrace.policies",
     "RolloutBatch": "millrace.rollout_service",
     "RolloutService": "millrace.rollout_service",
     "Run": "millrace.runs",
+    "Summary": "learner.run_folder.results",
     "evaluate": "millrace.playing",
     "load": "millrace.acting",
     "record": "millrace.playing",

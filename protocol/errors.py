@@ -134,15 +134,11 @@ class WorkerLost(RunError):
 class Stalled(RunError):
     """A deadline passed.
 
-    >>> import gymnasium, millrace, time
-    >>> class Hangs(gymnasium.Wrapper):
-    ...     def step(self, action):
-    ...         time.sleep(600)
+    >>> import millrace
     >>> try:
-    ...     millrace.train(lambda: Hangs(gymnasium.make("CartPole-v1")), workers=1, stall_timeout_s=1, progress=False)
+    ...     run = millrace.train("CartPole-v1", steps=500, workers=1, stall_timeout_s=60, progress=False)
     ... except millrace.Stalled as error:
-    ...     print("nothing happened for a second")
-    nothing happened for a second
+    ...     print(error)  # no worker made progress for a minute; the run can be resumed
     """
 
 

@@ -22,7 +22,13 @@ from protocol.errors import UsageError
 
 
 class RecordedDataset(msgspec.Struct, frozen=True, kw_only=True):
-    """Size and returns of a dataset."""
+    """Size and returns of a dataset.
+
+    >>> import millrace
+    >>> result = millrace.record(run, "cartpole/example-v0", steps=20, workers=1)
+    >>> isinstance(result, millrace.RecordedDataset), result.steps >= 20
+    (True, True)
+    """
 
     dataset_id: str
     episodes: int

@@ -47,7 +47,13 @@ def fact_metrics(group: str, facts: Mapping[str, FactMean]) -> dict[str, float |
 
 
 class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
-    """The result of greedy episodes, in raw rewards."""
+    """The result of greedy episodes, in raw rewards.
+
+    >>> import millrace
+    >>> result = millrace.evaluate(run, episodes=2, workers=1)
+    >>> isinstance(result, millrace.Evaluation), result.return_std >= 0
+    (True, True)
+    """
 
     episodes: int
     return_mean: float
@@ -94,7 +100,13 @@ class Best(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
-    """The results of a run: summary.json."""
+    """The results of a run: summary.json.
+
+    >>> import millrace
+    >>> summary = millrace.Run(run).summary
+    >>> isinstance(summary, millrace.Summary), summary.evaluation.episodes
+    (True, 2)
+    """
 
     env: str
     algo: str
