@@ -40,7 +40,7 @@ NEEDED = (
 )  # fmt: skip
 """The methods of an algorithm, as `learner.algorithms.Algorithm` describes them"""
 
-NOT_SETTINGS = {"config", "preset", "resume", "log_json", "debug", "watch", "callbacks", "wrappers"}
+NOT_SETTINGS = {"config", "preset", "resume", "log_json", "debug", "watch", "callbacks", "wrappers", "progress"}
 """Flags and arguments of `millrace train` and `millrace.train` that are not settings"""
 
 _given: dict[str, type] = {}
