@@ -1,4 +1,12 @@
-"""Callbacks for other tools: `WandbCallback` and `MlflowCallback`. Each imports its tool when it is made."""
+"""Callbacks for other tools: `WandbCallback` and `MlflowCallback`. Each imports its tool when it is made.
+
+>>> import millrace
+>>> try:
+...     callbacks = [millrace.integrations.MlflowCallback()]
+... except millrace.UsageError:  # mlflow is not installed
+...     callbacks = []
+>>> run = millrace.train("CartPole-v1", callbacks=callbacks, steps=500, workers=1, eval_episodes=2, progress=False)
+"""
 
 from __future__ import annotations
 
