@@ -13,7 +13,12 @@ from learner.run_folder.progress import Progress, Row
 
 def test_numbers_that_are_added_to_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     events: list[Row] = []
-    monkeypatch.setattr(metrics_log, "_event", lambda row, env_steps: events.append(row) or b"")
+
+    def keep(row: Row, env_steps: int) -> bytes:
+        events.append(row)
+        return b""
+
+    monkeypatch.setattr(metrics_log, "_event", keep)
     now = [0.0]
     log = MetricsLog(tmp_path, clock=lambda: now[0])
     log.write(Progress(updates=1, env_steps=10, return_mean=2.0), {"loss": 0.5})
