@@ -306,7 +306,13 @@ def test_a_process_that_gets_sigterm_loses_nothing_and_goes_on_as_if_its_lanes_w
     command = [sys.executable, "-m", "millrace", "train"]
     flags = [ENV, "--run-dir", str(stage.runs)]
     for name, value in settings.items():
-        flags += [f"--{name.replace('_', '-')}", *(map(str, value) if isinstance(value, tuple) else [str(value)])]
+        match value:
+            case bool():
+                flags.append(f"--{'' if value else 'no-'}{name.replace('_', '-')}")
+            case tuple():
+                flags += [f"--{name.replace('_', '-')}", *map(str, value)]
+            case _:
+                flags += [f"--{name.replace('_', '-')}", str(value)]
     started = stage.start([*command, *flags], "train")
     deadline = time.monotonic() + START_S * crowding()
     while not any(len(read_rows(path)) > 10 for path in stage.runs.glob("*/metrics.jsonl")):
