@@ -203,7 +203,7 @@ def interrupted_in_an_update(
         if self.version == 3:
             if not began:
                 began.append(clock[0])
-                os.kill(os.getpid(), signal.SIGTERM)
+                signal.raise_signal(signal.SIGTERM)
             clock[0] += minibatch_s
         return gradient(self, rows)
 
@@ -244,7 +244,7 @@ def test_time_that_saving_needs_is_not_given_to_the_update(monkeypatch: pytest.M
     with Interrupts(20.0) as interrupts:
         assert interrupts.at_most(5.0) == 5
         assert not interrupts.time_is_up(1e9)
-        os.kill(os.getpid(), signal.SIGTERM)
+        signal.raise_signal(signal.SIGTERM)
         for after_s, save_s, up in (
             (9.9, 1.0, False),
             (10.1, 1.0, True),
@@ -261,15 +261,16 @@ def test_time_that_saving_needs_is_not_given_to_the_update(monkeypatch: pytest.M
 
 
 def test_a_second_sigterm_changes_nothing_and_a_second_ctrl_c_ends_at_once() -> None:
+    # `raise_signal` signals this thread, so the handler has run when it returns. `os.kill` may choose another thread.
     with Interrupts(20.0) as interrupts:
         for _ in range(3):
-            os.kill(os.getpid(), signal.SIGTERM)
+            signal.raise_signal(signal.SIGTERM)
         assert interrupts.received
         with pytest.raises(KeyboardInterrupt):
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
     before = signal.getsignal(signal.SIGTERM)
     with Interrupts() as interrupts:
-        os.kill(os.getpid(), signal.SIGTERM)
+        signal.raise_signal(signal.SIGTERM)
         assert interrupts.received
         assert signal.getsignal(signal.SIGTERM) == before, "without a grace time, the second one must be able to end it"
 

@@ -85,7 +85,7 @@ def test_a_callable_above_the_limit_is_refused_with_the_limit(
     with pytest.raises(UsageError) as caught:
         train(large, tmp_path / "runs") if use == "train" else millrace.make_vec(large, 2)
     said = str(caught.value)
-    assert said.startswith("environment large: expected its callable to pickle to at most 100,000 bytes, got 200,")
+    assert said.startswith("environment <large>: expected its callable to pickle to at most 100,000 bytes, got 200,")
     assert said.endswith("; let it load its data when it is called, from a file that every worker can read")
     assert not (tmp_path / "runs").exists()
 
@@ -107,7 +107,8 @@ def test_a_space_whose_description_is_too_large_to_send_is_refused(tmp_path: Pat
     with pytest.raises(UsageError) as caught:
         train(large, tmp_path) if use == "train" else millrace.make_vec(large, 2)
     said = str(caught.value)
-    assert said.startswith("environment large: expected spaces whose description takes at most 1,048,576 bytes, got 1,200,")
+    expected = "expected spaces whose description takes at most 1,048,576 bytes, got 1,200,"
+    assert said.startswith(f"environment <large>: {expected}")
     assert said.endswith(
         "; wrap the environment so that its spaces have fewer entries, or so that a MultiDiscrete is a Box of integers"
     )

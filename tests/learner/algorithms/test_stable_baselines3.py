@@ -223,8 +223,9 @@ def test_action_values_are_theirs(activation: str) -> None:
 
 
 def page_code() -> dict[str, Any]:
-    """What the Python of docs/policies.md defines."""
-    (code,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    """What the example of docs/policies.md for Stable-Baselines3 defines."""
+    examples = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    (code,) = (each for each in examples if "def stable_baselines3_actor" in each)
     found: dict[str, Any] = {}
     exec(compile(code, str(PAGE), "exec"), found)
     return found
