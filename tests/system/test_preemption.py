@@ -7,7 +7,6 @@ longer than the grace time.
 from __future__ import annotations
 
 import json
-import os
 import signal
 import sys
 import time
