@@ -1,8 +1,7 @@
 """PPO in JAX over `millrace.RolloutService`: `pip install jax`, then `python examples/ppo_jax.py`.
 
-millrace's workers collect under the newest parameters; the whole update is one compiled JAX function. While JAX compiles it,
-the service answers the workers. `--bind tcp://0.0.0.0:5555` takes workers from other machines; `--save FILE` goes on from
-there at the next start.
+Workers collect under the newest parameters; the whole update is one compiled JAX function. `--bind tcp://0.0.0.0:5555` takes
+workers from other machines. `--save FILE` saves the state; a later start with the same file goes on from there.
 """
 
 from __future__ import annotations
@@ -20,6 +19,8 @@ import numpy as np
 import millrace
 
 Parameters = dict[str, jax.Array]
+ROWS = ("obs", "action", "log_prob", "reward", "terminated", "truncated", "valid")
+COLLECTING = ("rollout_steps", "workers", "envs", "lanes", "seed", "bind", "keys")
 
 
 @dataclass(frozen=True)
@@ -111,21 +112,19 @@ def update(state: dict[str, Any], batch: dict[str, jax.Array], remaining: jax.Ar
         parameters = jax.tree.map(lambda p, m, v: p - rate * m / (jnp.sqrt(v) + 1e-5), state["parameters"], mean, square)
         return {"parameters": parameters, "mean": mean, "square": square, "step": step}, None
 
-    after: dict[str, Any] = jax.lax.scan(epoch, state, None, settings.epochs)[0]
-    return after
+    return jax.lax.scan(epoch, state, None, settings.epochs)[0]  # type: ignore[no-any-return]
 
 
 def train(settings: Settings) -> float:
     """Train. Returns the mean return of the last 100 training episodes."""
     save = Path(settings.save) if settings.save else None
-    names = ("rollout_steps", "workers", "envs", "lanes", "seed", "bind", "keys")
-    collecting = {name: getattr(settings, name) for name in names}
+    collecting = {name: getattr(settings, name) for name in COLLECTING}
     restore = save if save and save.exists() else None
     returns: list[float] = []
     with millrace.RolloutService(settings.env, millrace.MLP(64, 64), restore=restore, **collecting) as service:
         parameters = with_critic(service.policy.named(service.policy.initial(settings.seed)), settings.seed)
         zeros = jax.tree.map(jnp.zeros_like, parameters)
-        state: dict[str, Any] = {"parameters": parameters, "mean": zeros, "square": zeros, "step": jnp.zeros(())}
+        state = {"parameters": parameters, "mean": zeros, "square": zeros, "step": jnp.zeros(())}
         leaves, tree = jax.tree.flatten(state)
         if restore:
             state = jax.tree.unflatten(tree, [jnp.array(service.restored[f"leaf{i}"]) for i in range(len(leaves))])
@@ -133,11 +132,8 @@ def train(settings: Settings) -> float:
         for batch in service:
             returns = (returns + [episode.reward for episode in batch.episodes])[-100:]
             mean = float(np.mean(returns)) if returns else 0.0
-            arrays = {
-                name: getattr(batch, name) for name in ("obs", "action", "log_prob", "reward", "terminated", "truncated")
-            }
             remaining = jnp.array(max(0.0, 1 - service.env_steps / settings.steps))
-            state = update(state, arrays | {"valid": batch.valid}, remaining, settings)
+            state = update(state, {name: getattr(batch, name) for name in ROWS}, remaining, settings)
             service.publish(state["parameters"])
             if save and service.version % 10 == 0:
                 service.save(save, **{f"leaf{i}": leaf for i, leaf in enumerate(jax.tree.leaves(state))})
@@ -150,6 +146,5 @@ def train(settings: Settings) -> float:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="PPO in JAX over millrace's rollout service")
     for name in ("steps", "seed", "workers", "bind", "keys", "save"):
-        default = getattr(Settings, name)
-        parser.add_argument(f"--{name}", type=type(default), default=default)
+        parser.add_argument(f"--{name}", type=type(getattr(Settings, name)), default=getattr(Settings, name))
     train(Settings(**vars(parser.parse_args())))
