@@ -260,6 +260,7 @@ def test_time_that_saving_needs_is_not_given_to_the_update(monkeypatch: pytest.M
 
 
 def test_a_second_sigterm_changes_nothing_and_a_second_ctrl_c_ends_at_once() -> None:
+    inherited = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
     # `raise_signal` signals this thread, so the handler has run when it returns. `os.kill` may choose another thread.
     with Interrupts(20.0) as interrupts:
         for _ in range(3):
@@ -267,6 +268,7 @@ def test_a_second_sigterm_changes_nothing_and_a_second_ctrl_c_ends_at_once() -> 
         assert interrupts.received
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
+    signal.signal(signal.SIGINT, inherited)
     before = signal.getsignal(signal.SIGTERM)
     with Interrupts() as interrupts:
         signal.raise_signal(signal.SIGTERM)
