@@ -9,7 +9,6 @@ interleaved, and a share is the median of the shares within a round.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import statistics
 import tempfile
 import time
@@ -74,20 +73,19 @@ class Network:
         return action, state, {"log_prob": log_prob}
 
 
-class _Done(Exception):
-    """The time is over."""
-
-
 class Clock:
     """Env steps/s after a warm-up."""
 
     def __init__(self, seconds: float) -> None:
         self._seconds, self._began_s, self._since = seconds, time.perf_counter(), (0, 0.0)
         self.rate = 0.0
+        """0 until the time is over"""
 
     def over(self, env_steps: int) -> bool:
         """Whether the time is over, after so many env steps."""
         now = time.perf_counter()
+        if self.rate:
+            return True
         if now - self._began_s < WARM_UP_S or not self._since[1]:
             self._since = env_steps, now
             return False
@@ -116,16 +114,15 @@ def trainer(max_lag: int, envs: int, seconds: float) -> float:
     """The built-in training loop."""
     clock: Clock | None = None
 
-    def watch(progress: Any) -> None:
+    def watch(progress: Any) -> bool:
         nonlocal clock
         clock = clock or Clock(seconds)
-        if clock.over(progress.env_steps):
-            raise _Done
+        return not clock.over(progress.env_steps)
 
-    with tempfile.TemporaryDirectory() as folder, contextlib.suppress(_Done):
+    with tempfile.TemporaryDirectory() as folder:
         millrace.train(
             "CartPole-v1", algo=Unchanged, preset="none", workers=PROCESSES, envs=envs, lanes=LANES, max_lag=max_lag, seed=1,
-            rollout_steps=STEPS, steps=1_000_000_000, run_dir=folder, watch=watch,
+            rollout_steps=STEPS, steps=1_000_000_000, eval_episodes=1, run_dir=folder, watch=watch, progress=False,
         )  # fmt: skip
     assert clock is not None
     return clock.rate
