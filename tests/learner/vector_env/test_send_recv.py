@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from textwrap import dedent
 from typing import Any
 
 import gymnasium
@@ -158,9 +158,9 @@ def test_a_worker_wakes_the_learner_when_its_lane_is_done_although_others_are_no
 
 
 def test_the_example_of_send_runs() -> None:
-    _, _, example = (ZmqVectorEnv.send.__doc__ or "").partition("envs = ")
+    _, _, example = (inspect.getdoc(ZmqVectorEnv.send) or "").partition("envs = ")
     names: dict[str, Any] = {"millrace": millrace, "policy": lambda observation: np.zeros(len(observation), np.int64)}
-    exec(dedent("        envs = " + example), names)
+    exec("envs = " + example, names)
     assert names["envs"].outstanding
     names["envs"].close()
 
