@@ -7,12 +7,9 @@ then, in one line, before a worker or a run folder is made. A class that was giv
 
 from __future__ import annotations
 
-import importlib
 import sys
-import traceback
 from collections.abc import Mapping
 from functools import cache
-from types import ModuleType
 from typing import Any
 
 import msgspec
@@ -22,8 +19,9 @@ from learner.config.config import Config
 from learner.config.did_you_mean import did_you_mean
 from learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig
 from learner.config.on_resume import declared
+from learner.config.own_module import import_own, is_name
 from protocol.bounds import one_line
-from protocol.envs.found_names import attribute, importable
+from protocol.envs.found_names import attribute, importable, last_part
 from protocol.errors import UsageError, first_line
 
 ALGORITHMS = {
@@ -93,7 +91,7 @@ def name_of(algorithm: type) -> str:
 def moved(before: str, now: str) -> bool:
     """Whether a run of the algorithm `before` may go on as one of `now`: the same class, which an import finds now."""
     module, _, qualname = before.partition(":")
-    return (module == "__main__" or "<locals>" in qualname) and is_own(now) and _last(before) == _last(now)
+    return (module == "__main__" or "<locals>" in qualname) and is_own(now) and last_part(before) == last_part(now)
 
 
 def with_algorithm(table: dict[str, Any], algo: str | None) -> dict[str, Any]:
@@ -111,40 +109,18 @@ def _found(name: str) -> object:
         if found is None:
             raise UsageError(
                 f"algo {name}: this class was made in a script, a notebook or a function; go on with it there: "
-                f"millrace.train(resume=…, algo={_last(name)}), or put it into a module: --algo module:{_last(name)}"
+                f"millrace.train(resume=…, algo={last_part(name)}), or put it into a module: --algo module:{last_part(name)}"
             )
         return found
-    if not all(part.isidentifier() for text in (module_name, qualname) for part in text.split(".")):
+    if not is_name(name):
         raise UsageError(f"algo {name}: expected module:Class, as in mine:ClippedPlus")
-    module = _imported(module_name, name)
+    module = import_own(module_name, f"algo {name}")
     found = attribute(module, qualname)
     if found is None:
         classes = [key for key, value in vars(module).items() if isinstance(value, type)]
         where = getattr(module, "__file__", None) or "built-in"
         raise UsageError(f"algo {name}: module {module_name} ({where}) has no {qualname}{did_you_mean(qualname, classes)}")
     return found
-
-
-def _imported(module_name: str, name: str) -> ModuleType:
-    try:
-        return importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        if error.name is not None and f"{module_name}.".startswith(f"{error.name}."):
-            raise UsageError(
-                f"algo {name}: no module {error.name}; expected one in the current folder, on PYTHONPATH or installed"
-            ) from error
-        raise _import_failed(name, module_name, error) from error
-    except (Exception, SystemExit) as error:
-        raise _import_failed(name, module_name, error) from error
-
-
-def _import_failed(name: str, module: str, error: BaseException) -> UsageError:
-    why = one_line(f"{type(error).__name__}: {first_line(error)}")
-    return UsageError(f"algo {name}: the import of {module} failed: {why}", "".join(traceback.format_exception(error)))
-
-
-def _last(name: str) -> str:
-    return name.rpartition(":")[2].rpartition(".")[2]
 
 
 def _checked(name: str, found: object) -> Any:
