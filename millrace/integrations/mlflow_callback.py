@@ -8,16 +8,15 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from learner.callbacks.callback import Callback
 from learner.run_folder.progress import Progress
-from millrace.integrations.run_rows import RowFilter, flat_settings, numbers, run_name, tool
+from millrace.integrations.run_rows import RowCallback, flat_settings, run_name, tool
 
 MOST_PARAMETERS = 100  # of one request
 MOST_CHARACTERS = 500  # of the value of a parameter
 RUN_TAG = "millrace.run"
 
 
-class MlflowCallback(Callback):
+class MlflowCallback(RowCallback):
     """Logs a run to MLflow (`pip install 'millrace-rl[mlflow]'`).
 
     ```python
@@ -34,8 +33,8 @@ class MlflowCallback(Callback):
 
         Raises `UsageError` if MLflow is not installed.
         """
+        super().__init__(every_s)
         self._mlflow, self._experiment, self._uri = tool("mlflow"), experiment, tracking_uri
-        self._rows = RowFilter(every_s)
         self._client: Any = None
         self._run = ""
 
@@ -57,16 +56,6 @@ class MlflowCallback(Callback):
         for i in range(0, len(parameters), MOST_PARAMETERS):
             client.log_batch(self._run, params=parameters[i : i + MOST_PARAMETERS])
 
-    def on_update(self, progress: Progress) -> None:
-        """Log the metrics of the update."""
-        self._log(self._rows.due(progress), progress)
-
-    def on_evaluation(self, progress: Progress) -> None:
-        """Log the evaluation."""
-        self._log(self._rows.last(progress), progress)
-        if progress.evaluation is not None:
-            self._log(numbers(progress.evaluation.metrics()), progress)
-
     def on_end(self, progress: Progress) -> None:
         """Log the last row, and end the MLflow run."""
         if not self._run:
@@ -75,8 +64,7 @@ class MlflowCallback(Callback):
         self._client.set_tag(self._run, "stop_reason", progress.stop_reason)
         self._client.set_terminated(self._run, status="FAILED" if progress.cut_short else "FINISHED")
 
-    def _log(self, row: dict[str, float] | None, progress: Progress) -> None:
-        if row:
-            now_ms = int(time.time() * 1000)
-            metrics = [self._mlflow.entities.Metric(name, value, now_ms, progress.env_steps) for name, value in row.items()]
-            self._client.log_batch(self._run, metrics=metrics)
+    def _send(self, row: dict[str, float], progress: Progress) -> None:
+        now_ms = int(time.time() * 1000)
+        metrics = [self._mlflow.entities.Metric(name, value, now_ms, progress.env_steps) for name, value in row.items()]
+        self._client.log_batch(self._run, metrics=metrics)

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from learner.callbacks.callback import Callback
 from learner.run_folder.progress import Progress
 from protocol.errors import UsageError
 
@@ -38,6 +39,31 @@ class RowFilter:
         self._sent_update = progress.updates
         logged = {} if progress.requests is None else progress.requests.logged()
         return numbers(progress.row({**progress.metrics, **logged}))
+
+
+class RowCallback(Callback):
+    """Sends rows to a tool. A class of its own for each tool says how: `_send`."""
+
+    def __init__(self, every_s: float) -> None:
+        """`every_s`: least number of seconds between two rows."""
+        self._rows = RowFilter(every_s)
+
+    def on_update(self, progress: Progress) -> None:
+        """Log the metrics of the update."""
+        self._log(self._rows.due(progress), progress)
+
+    def on_evaluation(self, progress: Progress) -> None:
+        """Log the evaluation."""
+        self._log(self._rows.last(progress), progress)
+        if progress.evaluation is not None:
+            self._log(numbers(progress.evaluation.metrics()), progress)
+
+    def _log(self, row: dict[str, float] | None, progress: Progress) -> None:
+        if row:
+            self._send(row, progress)
+
+    def _send(self, row: dict[str, float], progress: Progress) -> None:
+        raise NotImplementedError
 
 
 def numbers(row: dict[str, float | None]) -> dict[str, float]:

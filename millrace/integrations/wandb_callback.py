@@ -5,12 +5,11 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from learner.callbacks.callback import Callback
 from learner.run_folder.progress import ENV_STEPS_KEY, Progress
-from millrace.integrations.run_rows import RowFilter, flat_settings, numbers, run_name, tool
+from millrace.integrations.run_rows import RowCallback, flat_settings, run_name, tool
 
 
-class WandbCallback(Callback):
+class WandbCallback(RowCallback):
     """Logs a run to Weights & Biases (`pip install 'millrace-rl[wandb]'`).
 
     ```python
@@ -26,8 +25,8 @@ class WandbCallback(Callback):
 
         Raises `UsageError` if wandb is not installed.
         """
+        super().__init__(every_s)
         self._wandb, self._init = tool("wandb"), init
-        self._rows = RowFilter(every_s)
         self._run: Any = None
 
     def on_start(self, progress: Progress) -> None:
@@ -38,24 +37,13 @@ class WandbCallback(Callback):
         self._run.define_metric(ENV_STEPS_KEY)
         self._run.define_metric("*", step_metric=ENV_STEPS_KEY)
 
-    def on_update(self, progress: Progress) -> None:
-        """Log the metrics of the update."""
-        self._log(self._rows.due(progress))
-
-    def on_evaluation(self, progress: Progress) -> None:
-        """Log the evaluation."""
-        self._log(self._rows.last(progress))
-        if progress.evaluation is not None:
-            self._log({**numbers(progress.evaluation.metrics()), ENV_STEPS_KEY: progress.env_steps})
-
     def on_end(self, progress: Progress) -> None:
         """Log the last row, and end the run."""
         if self._run is None:
             return
-        self._log(self._rows.last(progress))
+        self._log(self._rows.last(progress), progress)
         self._run.summary["stop_reason"] = progress.stop_reason
         self._run.finish(exit_code=int(progress.cut_short))
 
-    def _log(self, row: dict[str, float] | None) -> None:
-        if row:
-            self._run.log(row)
+    def _send(self, row: dict[str, float], progress: Progress) -> None:
+        self._run.log({**row, ENV_STEPS_KEY: progress.env_steps})
