@@ -148,8 +148,9 @@ class RunRecorder:
         began_s, evaluated_s = time.monotonic(), self._stages_s.get("evaluate", 0.0)
         self._workers_alive = self._service.workers_alive()
         self._stages_s["update"] += update_s
-        self._update |= {"metrics": named(metrics), "lags": tuple(self._service.snapshot().lags)}
-        progress = self.progress()
+        snapshot = self._service.snapshot()
+        self._update |= {"metrics": named(metrics), "lags": tuple(snapshot.lags)}
+        progress = self._progress(snapshot)
         self._write_row(progress, metrics)
         self._service.report(progress)
         try:
@@ -244,7 +245,11 @@ class RunRecorder:
 
     def progress(self) -> Progress:
         """The progress of the run."""
-        snapshot = self._service.snapshot()
+        return self._progress(self._service.snapshot())
+
+    # ---------------------------------------------------------------- inside
+
+    def _progress(self, snapshot: HubSnapshot) -> Progress:
         wall_s = self._wall_s()
         here_s = wall_s - self._wall_before_s
         lags = snapshot.lags or [0]
@@ -272,8 +277,6 @@ class RunRecorder:
             requests=self._requests,
             **self._update,
         )
-
-    # ---------------------------------------------------------------- inside
 
     def _took_to_save(self, seconds: float) -> None:
         """Remember the longest time, and say once if it is longer than the grace time."""
