@@ -1,4 +1,4 @@
-"""What the integrations send of a run: its settings, flat, and its numbers, at most one row in `every_s` seconds. Pure.
+"""What the integrations send of a run: its settings, flat, and its numbers, at most one row in `every_s` seconds.
 
 Rule: a row with an evaluation and the last row are always sent. Numbers that are missing are left out.
 """
