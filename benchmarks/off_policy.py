@@ -2,7 +2,7 @@
 
 Rule: two runs differ only in the algorithm, `max_lag` and the seed. With `max_lag` 0 both algorithms compute the same
 update. With 8, rollouts may be eight versions old when they are used; A2C ignores this, and V-trace corrects for it. The
-actual lag of a run is measured. These are whole runs of `millrace.train`. The figure is docs/off_policy.png.
+actual lag of a run is measured. These are whole runs of `millrace.train`. The figure is docs/images/off_policy.png.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from learner.run_folder.run_folder import RunFolder
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-PNG = Path(__file__).parents[1] / "docs" / "off_policy.png"
+PNG = Path(__file__).parents[1] / "docs" / "images" / "off_policy.png"
 ALGORITHMS = {"a2c": COLORS[1], "impala": COLORS[0]}
 LAGS = (0, 8)
 SEEDS = 5

@@ -1,6 +1,6 @@
 """Rules of the packages and folders: which file may import which, and what may be in one place only.
 
-docs/architecture.md describes them. Every import counts, also one inside a function or under TYPE_CHECKING.
+docs/explanation/architecture.md describes them. Every import counts, also one inside a function or under TYPE_CHECKING.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ class RunFlags(Config, frozen=True, kw_only=True):
     """
     resume: Path | None = None
     """Continue this run folder from its newest checkpoint. auto: continue the newest run in --run-dir with the same ENV,
-    --algo and --seed, or start a new run if there is none. Some settings cannot change then; docs/resume.md lists them.
+    --algo and --seed, or start a new run if there is none. Some settings cannot change then: see docs/how-to/resume.md.
     """
     log_json: bool = False
     """Log to stderr as JSON, one event per line, instead of text."""

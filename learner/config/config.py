@@ -77,7 +77,7 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     callback: Free[UseAppendAction[tuple[str, ...]]] = ()
     """A callback of your own, as my_module:factory: code that the learner calls between updates. Repeat the flag for more.
-    docs/callbacks.md describes them.
+    docs/how-to/callbacks.md describes them.
     """
 
     # -------------------------------------------------------------------------------------------------------------- files

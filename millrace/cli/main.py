@@ -293,7 +293,8 @@ def _launch(argv: list[str]) -> int:
         case "ray":
             return _launch_ray(rest)
         case _:
-            raise UsageError(f"launch {launcher}: expected kubernetes, slurm or ray; for containers here see docs/docker.md")
+            expected = "expected kubernetes, slurm or ray; for containers here see docs/how-to/docker.md"
+            raise UsageError(f"launch {launcher}: {expected}")
     return 0
 
 

@@ -68,7 +68,7 @@ def cluster(engine: Engine, request: pytest.FixtureRequest, tmp_path: Path) -> I
 
 def documented() -> set[str]:
     """The commands of compose that a reader is told to type."""
-    text = "\n".join((ROOT / file).read_text() for file in ("README.md", "docs/docker.md", "docker/compose.yaml"))
+    text = "\n".join((ROOT / file).read_text() for file in ("README.md", "docs/how-to/docker.md", "docker/compose.yaml"))
     commands = re.findall(r"docker compose [^`#\n]*", text)
     assert len(commands) > 10
     return {command.strip() for command in commands}

@@ -156,7 +156,7 @@ def test_kubernetes_expands_no_variable_in_our_arguments(capsys: pytest.CaptureF
 
 
 def test_the_page_shows_what_kubernetes_knows() -> None:
-    shown = re.findall(r"<<'END'\n(.*?)^END", (ROOT / "docs/kubernetes.md").read_text(), re.DOTALL | re.MULTILINE)
+    shown = re.findall(r"<<'END'\n(.*?)^END", (ROOT / "docs/how-to/kubernetes.md").read_text(), re.DOTALL | re.MULTILINE)
     assert shown
     for text in shown:
         for document in yaml.safe_load_all(text):

@@ -1,7 +1,7 @@
 """The same weights in Stable-Baselines3's policies give the same actions, values, log-probabilities and entropies.
 
 An implementation that others wrote is the judge of ours: layout, activations, distributions, and the page that tells a user
-how to take a policy there (docs/policies.md), whose code runs here as it stands.
+how to take a policy there (docs/how-to/policies.md), whose code runs here as it stands.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ ACTIONS: dict[str, spaces.Space[Any]] = {
 ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU}
 TOLERANCE = 1e-5
 ROWS = 64
-PAGE = Path(__file__).parents[3] / "docs" / "policies.md"
+PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "policies.md"
 
 
 class Trunk(BaseFeaturesExtractor):
@@ -223,7 +223,7 @@ def test_action_values_are_theirs(activation: str) -> None:
 
 
 def page_code() -> dict[str, Any]:
-    """What the example of docs/policies.md for Stable-Baselines3 defines."""
+    """What the example of docs/how-to/policies.md for Stable-Baselines3 defines."""
     examples = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
     (code,) = (each for each in examples if "def stable_baselines3_actor" in each)
     found: dict[str, Any] = {}

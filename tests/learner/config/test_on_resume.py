@@ -18,7 +18,7 @@ from learner.run_folder.run_folder import RunFolder
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import UsageError
 
-PAGE = Path(__file__).parents[3] / "docs" / "resume.md"
+PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "resume.md"
 OTHER_OPTIMIZER = {"a2c": "adam", "impala": "adam", "reinforce": "rmsprop", "dqn": "adamw"}
 RECORDS: list[type[msgspec.Struct]] = [Config, *HYPERPARAMETERS.values()]
 
@@ -199,6 +199,6 @@ def table() -> list[str]:
 
 def test_the_page_says_what_is_declared() -> None:
     text = PAGE.read_text()
-    assert "\n".join(table()) in text, "the table of docs/resume.md should be:\n" + "\n".join(table())
+    assert "\n".join(table()) in text, "the table of docs/how-to/resume.md should be:\n" + "\n".join(table())
     for how in OnResume:
         assert how.value in text
