@@ -3,7 +3,8 @@
 Rule: each name has a virtual environment of its own in `.versions/`, which `uv` fills. `3.12` is the tested versions
 (constraints.txt) on Python 3.12; `lowest` is every direct dependency as low as its bound and the others let it, on this
 Python, and what they need at its newest. A Python that is not installed, or a package that cannot be, is an error: nothing
-is left out in silence. A PyTorch with libraries for GPUs is refused: they are gigabytes, and no test needs them.
+is left out in silence. A PyTorch with libraries for GPUs is refused, because they are gigabytes and no test needs them;
+`--gpu-libraries` accepts them, where no CPU build is to be had.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ def uv() -> Path:
     return folder / "bin" / "uv"
 
 
-def make(name: str, given: list[str]) -> Path:
+def make(name: str, given: list[str], gpu_libraries: bool) -> Path:
     """Make the virtual environment anew. Returns its interpreter."""
     folder = ENVIRONMENTS / name
     asked, exact = ENVIRONMENTS / f"{name}.in", ENVIRONMENTS / f"{name}.txt"
@@ -54,10 +55,11 @@ def make(name: str, given: list[str]) -> Path:
     subprocess.run([tool, "venv", "--quiet", "--clear", "--python", python, folder], check=True)
     interpreter = folder / "bin" / "python"
     subprocess.run([tool, "pip", "compile", "--quiet", "--python", interpreter, *how, asked, "-o", exact], check=True)
-    if for_gpus := re.findall(r"^(?:nvidia|cuda|triton)[\w-]*", exact.read_text(), re.MULTILINE):
+    for_gpus = re.findall(r"^(?:nvidia|cuda|triton)[\w-]*", exact.read_text(), re.MULTILINE)
+    if for_gpus and not gpu_libraries:
         sys.exit(
             f"{name}: expected a PyTorch for CPUs, got one with {for_gpus[0]}; say where a CPU build is (UV_FIND_LINKS) "
-            "and which version it has (--with torch==...)"
+            "and which version it has (--with torch==...), or accept this one (--gpu-libraries)"
         )
     subprocess.run([tool, "pip", "install", "--quiet", "--python", interpreter, "-r", exact], check=True)
     subprocess.run([tool, "pip", "install", "--quiet", "--python", interpreter, "--no-deps", "-e", ROOT], check=True)
@@ -69,11 +71,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="+", metavar="NAME", help=f"3.12, 3.13 ..., or {LOWEST}")
     parser.add_argument("--with", action="append", default=[], dest="given", metavar="PACKAGE==VERSION", help="instead")
+    parser.add_argument("--gpu-libraries", action="store_true", help="accept a PyTorch with libraries for GPUs")
     parser.add_argument("--pytest", nargs=argparse.REMAINDER, default=[], help="arguments of pytest; default: all tests")
     flags = parser.parse_args()
     failed = []
     for name in flags.names:
-        python = make(name, flags.given)
+        python = make(name, flags.given, flags.gpu_libraries)
         said = subprocess.run([python, "-c", ASKS], cwd=ROOT, capture_output=True, text=True, check=True).stdout
         print(f"\n{name}: {said}", end="", flush=True)
         tests = [python, "-m", "pytest", *(flags.pytest or ["--numprocesses", str((os.cpu_count() or 1) + 1)])]
