@@ -124,10 +124,11 @@ def write_numbers(arrays: Numbers, row: int | slice, values: Numbers) -> None:
     except (TypeError, ValueError):
         for name, array, of_copies in zip(("reward", "terminated", "truncated"), arrays, values, strict=True):
             for n, value in enumerate(of_copies):
-                array[row][n] = _number(name, n, value)
+                array[row][n] = one_number(name, n, value)
 
 
-def _number(name: str, n: int, value: Any) -> Any:
+def one_number(name: str, n: int, value: Any) -> Any:
+    """Reward, terminated or truncated (`name`) of copy `n`, as a number. Raises `Unusable`; a vector reward gets advice."""
     try:
         array = np.asarray(value)
     except ValueError:  # rows of different lengths

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
@@ -50,7 +51,7 @@ class Echo(gymnasium.Env[Any, Any]):
         if self.steps == self.fails_at:
             raise RuntimeError("the spring broke\nin two")
         right: Any = float(action == self.number)
-        right = {"reward": float("nan"), "text": "one"}.get(self.bad, right)
+        right = {"reward": float("nan"), "text": "one", "vector": np.ones(2), "list": [right]}.get(self.bad, right)
         observation = np.zeros(2, np.int64) if self.bad == "shape" else self._next()
         return observation, right, not self.endless and self.steps == self.longest, False, {}
 
@@ -173,13 +174,29 @@ def test_an_environment_that_raises_is_named_with_its_traceback(made: list[Echo]
     ("bad", "says"),
     [
         ("reward", "copy 0, step 0: reward: expected a finite float32, got nan"),
-        ("text", "copy 0, step 0: reward: expected a number, got str"),
+        ("text", "copy 0, step 0: reward: expected a number, got 'one'"),
         ("shape", r"copy 0, step 0: observation: expected int64\[\] as its space says, got int64\[2\]"),
     ],
 )
 def test_an_unusable_value_is_named(bad: str, says: str) -> None:
     with pytest.raises(EvaluationFailed, match=says):
         play(Evaluator(echo_run(bad=bad), Repeats()), order(1))
+
+
+def test_a_vector_reward_gets_the_advice_of_training(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = "copy 0, step 0: reward: expected a number, got an array of shape (2,)"
+    line += "; wrap the environment so that it returns one number"
+    for module, advice in ((None, ""), (sys, ", as --wrapper mo_gymnasium.wrappers:LinearReward does")):
+        if module is not None:  # the package is imported
+            monkeypatch.setitem(sys.modules, "mo_gymnasium", module)
+        with pytest.raises(EvaluationFailed) as caught:
+            play(Evaluator(echo_run(bad="vector"), Repeats()), order(1))
+        assert str(caught.value) == f"while the policy was evaluated: {line}{advice}"
+
+
+def test_a_reward_of_one_element_is_a_number_as_in_training() -> None:
+    in_lists = play(Evaluator(echo_run(bad="list"), Repeats()), order(1, 2))
+    assert figures(in_lists) == figures(play(Evaluator(echo_run(), Repeats()), order(1, 2)))
 
 
 def test_an_observation_that_is_not_finite_is_named() -> None:

@@ -28,6 +28,7 @@ from protocol.specs import Leaf, RunSpec
 from workers.collect.acting import acting_of
 from workers.env_errors import CopyRaised, Unusable
 from workers.env_loop import Pulse
+from workers.env_results import one_number
 from workers.evaluate.episode_rows import RowSender, Send, as_frame
 from workers.evaluate.evaluation_copies import CopiesLost, EvaluationCopies, LoopedEvaluationCopies
 
@@ -199,9 +200,12 @@ def _converted(value: Any, leaf: Leaf, dtype: np.dtype[Any], where: str) -> Arra
 def _finite_reward(reward: Any, n: int, t: int) -> float:
     """The reward as a number. Raises `EvaluationFailed` if it is none that a rollout could hold."""
     try:
-        number = float(reward)
-    except (TypeError, ValueError) as error:
-        raise EvaluationFailed(f"copy {n}, step {t}: reward: expected a number, got {type(reward).__name__}") from error
+        try:
+            number = float(reward)
+        except (TypeError, ValueError):
+            number = float(one_number("reward", n, reward))
+    except Unusable as error:
+        raise EvaluationFailed(f"copy {n}, step {t}: {error.line}") from error
     if not abs(number) <= LARGEST_REWARD:
         raise EvaluationFailed(f"copy {n}, step {t}: reward: expected a finite float32, got {number}")
     return number
