@@ -124,8 +124,8 @@ class RolloutService:
                 `worker_timeout_s` and so on. With `bind="tcp://0.0.0.0:5555"` no worker is started here: workers elsewhere
                 join with `millrace worker`.
 
-        Raises `UsageError` if an argument is wrong, `NoWorkers` if too few workers join in time, and `EnvironmentFailed` if
-        the environment cannot be made.
+        Raises `UsageError` if an argument is wrong, `NoWorkers` if too few workers join in time, `EnvironmentFailed` if the
+        environment cannot be made, and `PolicyFailed` if your `OwnPolicy` cannot.
         """
         listens = bool(settings.get("bind"))
         config = _config(env, wrappers, settings)

@@ -10,8 +10,8 @@
     │       ├── NoWorkers         1   no worker is left, or none ever joined
     │       ├── WorkerLost        1   a worker is gone, and env copies with it, where none may be lost
     │       ├── Stalled           1   a deadline passed; the text says what was waited for
-    │       ├── PolicyFailed      1   on a worker: a policy that the user wrote raised, or returned something unusable
-    │       └── EnvironmentFailed 1   the environment, or that policy, raised too often; the text carries its traceback
+    │       ├── PolicyFailed      1   a policy that the user wrote raised in a worker, or returned something unusable
+    │       └── EnvironmentFailed 1   the environment raised too often; the text carries its traceback
     └── PeerError             counted and answered, never raised into the loop: a peer sent something wrong
         ├── BadMessage            not a valid message: shape, size, type or version
         └── BadRollout            a rollout that breaks the row format
@@ -157,7 +157,24 @@ class EnvironmentFailed(RunError):
 
 
 class PolicyFailed(RunError):
-    """A policy that the user wrote raised, or returned what no rollout can hold; `detail` is its traceback, if it raised."""
+    """A policy that the user wrote raised in a worker, or returned what no rollout can hold.
+
+    The line names the worker and the policy. `detail` is the traceback of the worker, if the policy raised.
+
+    >>> import millrace
+    >>> class Policy:
+    ...     def load(self, arrays): ...
+    ...     def act(self, obs, state, rng):
+    ...         return obs @ self.weights, state, {}
+    >>> policy = millrace.OwnPolicy(Policy, {"w": (4, 2)})
+    >>> try:
+    ...     with millrace.RolloutService("CartPole-v1", policy, workers=1, max_env_failures=0) as service:
+    ...         version = service.publish({"w": [[0, 0]] * 4})
+    ...         batch = service.gather()
+    ... except millrace.PolicyFailed as error:
+    ...     print(error.detail.splitlines()[-1])
+    AttributeError: 'Policy' object has no attribute 'weights'
+    """
 
 
 class PeerError(MillraceError):

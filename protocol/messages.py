@@ -177,12 +177,14 @@ class Goodbye(Message, frozen=True):
 
 
 class Failure(Message, frozen=True):
-    """My environment, or my own code, raised an exception; I leave."""
+    """My environment, my policy, or my own code raised an exception; I leave."""
 
     session: Natural
     error: Line
     traceback: Text
     lane: Natural | None
+    of_policy: bool = False
+    """true: a policy that the user wrote raised, or returned what no rollout can hold; no environment is to blame"""
 
 
 class Described(Message, frozen=True):

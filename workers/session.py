@@ -266,12 +266,12 @@ class Session:
         """Leave: after the work in progress, or at once when called twice."""
         return [] if self.state is State.LEFT else self._drain(StopRequested(), TOLD_TO_STOP)
 
-    def fail(self, error: str, traceback: str, lane: int | None) -> list[Effect]:
-        """The environment, or this worker, raised: report it to the learner, and leave."""
+    def fail(self, error: str, traceback: str, lane: int | None, *, of_policy: bool = False) -> list[Effect]:
+        """The environment, the user's policy (`of_policy`), or this worker raised: report it to the learner, and leave."""
         error = one_line(error)
         effects: list[Effect] = []
         if self.state in (State.READY, State.DRAINING):
-            effects.append(Send(Failure(self.session, error, last_text(traceback), lane)))
+            effects.append(Send(Failure(self.session, error, last_text(traceback), lane, of_policy)))
         return [] if self.state is State.LEFT else effects + self._leave(WorkerFailed(), 1, error)
 
     def decline(self, reason: str) -> list[Effect]:

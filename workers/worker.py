@@ -22,7 +22,7 @@ from pathlib import Path
 
 from protocol.bounds import Stages
 from protocol.env_spec import AllowedCode
-from protocol.errors import BadMessage, UsageError, UserFacingError, first_line
+from protocol.errors import BadMessage, PolicyFailed, UsageError, UserFacingError, first_line
 from protocol.messages import Order, Stepped, Weights
 from protocol.policy.own_policy import OwnPolicy
 from protocol.policy.policy import make_policy
@@ -289,11 +289,11 @@ class Worker:
             self._do([Send(answer)])
 
     def _fail(self, error: Exception) -> None:
-        """The environment's code raised, or ours on its data: report it to the learner."""
+        """The environment's code or the user's policy raised, or our code on their data: report it to the learner."""
         detail = error.detail if isinstance(error, UserFacingError) else traceback.format_exc()
         lane = error.lane if isinstance(error, LaneFailed) else None
         log.error("%s\n%s", error, detail)
-        self._do(self._session.fail(_line(error), detail, lane))
+        self._do(self._session.fail(_line(error), detail, lane, of_policy=isinstance(error, PolicyFailed)))
 
     def _update_statistics(self) -> None:
         if (source := self._collector or self._stepper) is not None:
@@ -343,7 +343,8 @@ class Worker:
             self._loaded = None
         except (UserFacingError, ImportError, ValueError) as error:
             detail = error.detail if isinstance(error, UserFacingError) else ""
-            self._do(self._session.fail(_line(error), detail or traceback.format_exc(), None))
+            of_policy = isinstance(error, PolicyFailed)
+            self._do(self._session.fail(_line(error), detail or traceback.format_exc(), None, of_policy=of_policy))
 
     def _describe(self, spec: DescribeSpec) -> None:
         """Describe the environment. A second thread sends the heartbeats while its code runs."""

@@ -126,7 +126,7 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     is under way within its timeout.
     """
     max_env_failures: Free[Natural] = 3
-    """End the run if the environment has raised more exceptions, or ended more worker processes, than this."""
+    """End the run if the environment, or an `OwnPolicy`, has raised more exceptions, or ended more processes, than this."""
 
     def fact_names(self) -> tuple[str, ...]:
         """The names in `info_keys`."""

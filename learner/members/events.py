@@ -56,6 +56,19 @@ class EnvironmentRaised:
 
 
 @dataclass(frozen=True)
+class PolicyRaised:
+    """A policy that the user wrote raised in a worker, or returned what no rollout can hold."""
+
+    json_name: ClassVar[str] = "policy_broke"
+    worker: str
+    host: str
+    error: str
+    traceback: str
+    spare: bool = False
+    """as of `EnvironmentRaised`"""
+
+
+@dataclass(frozen=True)
 class WorkerProcessFailed:
     """A worker's process ended in a way that it did not announce: its environment is to blame, as if it had raised."""
 
@@ -91,7 +104,14 @@ class RolloutDropped:
 
 
 Event = (
-    WorkerJoined | WorkerLeft | WorkerRefused | EnvironmentRaised | WorkerProcessFailed | RejoinRequested | RolloutDropped
+    WorkerJoined
+    | WorkerLeft
+    | WorkerRefused
+    | EnvironmentRaised
+    | PolicyRaised
+    | WorkerProcessFailed
+    | RejoinRequested
+    | RolloutDropped
 )
 
 
@@ -101,7 +121,7 @@ def describe(event: Event) -> str:
     """
     line = one_line(_line(event), 4 * MAX_LINE)
     match event:
-        case EnvironmentRaised(traceback=traceback) if traceback:
+        case EnvironmentRaised(traceback=traceback) | PolicyRaised(traceback=traceback) if traceback:
             return f"{line}\n{indented(traceback)}"
         case _:
             return line
@@ -118,6 +138,8 @@ def _line(event: Event) -> str:
         case EnvironmentRaised(worker, host, lane, error):
             where = "" if lane is None else f"lane {lane}: "
             return f"worker {worker} ({host}): {where}{error}"
+        case PolicyRaised(worker, host, error):
+            return f"worker {worker} ({host}): {error}"
         case WorkerProcessFailed(worker, host, reason, spare):
             counts = "" if spare else "; this counts as a failure of the environment"
             return f"worker {worker} ({host}): its process {reason}{counts}"

@@ -21,6 +21,7 @@ import msgspec
 from learner.members.events import (
     EnvironmentRaised,
     Event,
+    PolicyRaised,
     RejoinRequested,
     RolloutDropped,
     WorkerJoined,
@@ -283,7 +284,7 @@ class MemberServer:
                 case WorkerLeft(_, why, _, on_purpose) if on_purpose:
                     expected = self._membership.draining is not None
                     self._last_turned_away = self._last_turned_away if expected else why
-                case EnvironmentRaised() if not self._settings.log_tracebacks:
+                case EnvironmentRaised() | PolicyRaised() if not self._settings.log_tracebacks:
                     line, expected = line.partition("\n")[0], True
                 case _:
                     pass

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from learner.members.events import EnvironmentRaised, Event, WorkerProcessFailed
+from learner.members.events import EnvironmentRaised, Event, PolicyRaised, WorkerProcessFailed
 from learner.members.member_server import MemberServer, ServerCallbacks
 from learner.members.membership import Outgoing
 from learner.members.process_callbacks import ProcessCallbacks
@@ -29,7 +29,7 @@ from protocol.address import name_for_people
 from protocol.alive import NO_TIMEOUTS, CallTimeouts
 from protocol.arrays import Array
 from protocol.bounds import MAX_LINE, Stages, one_line
-from protocol.errors import BadRollout, EnvironmentFailed, NoWorkers, Stalled
+from protocol.errors import BadRollout, EnvironmentFailed, NoWorkers, PolicyFailed, Stalled
 from protocol.messages import Rollout, Status, ToLearner
 from protocol.rollout import rollout_bytes, validate
 from protocol.wire.learner_link import LearnerLink
@@ -129,7 +129,7 @@ class Hub:
         self._weight_age = WeightAge()
         self._progress = Progress()
         self._env_failures = 0
-        self._failure: EnvironmentFailed | None = None
+        self._failure: EnvironmentFailed | PolicyFailed | None = None
         self._no_members_since_s: float | None = None
         self._stall_watch = StallWatch(coordinator, settings.stall_timeout_s, settings.call_timeouts)
         callbacks = ServerCallbacks(self._answer, self._status, self._on_event)
@@ -154,7 +154,7 @@ class Hub:
         self._server.send(self.coordinator.publish(version, sent, buffers, deal=deal, env_attributes=env_attributes))
 
     def gather(self) -> list[AcceptedRollout]:
-        """The rollouts of the next update. Raises `NoWorkers`, `Stalled` or `EnvironmentFailed`."""
+        """The rollouts of the next update. Raises `NoWorkers`, `Stalled`, `EnvironmentFailed` or `PolicyFailed`."""
         started_s = logged_s = self._clock()
         self._stall_watch.begin(started_s)
         self._turn(0.0)
@@ -324,21 +324,23 @@ class Hub:
         return status(self.coordinator, self._progress, now)
 
     def _on_event(self, event: Event) -> None:
-        """Count failures of environments; too many end the run."""
+        """Count failures of environments and of the user's policy together; too many end the run by the kind of the last."""
         match event:
             case EnvironmentRaised(worker, host, _, error, traceback, spare) if not spare:
-                self._count_failure(f"worker {worker} ({host}): {error}", traceback)
+                self._count_failure(EnvironmentFailed, f"worker {worker} ({host}): {error}", traceback)
+            case PolicyRaised(worker, host, error, traceback, spare) if not spare:
+                self._count_failure(PolicyFailed, f"worker {worker} ({host}): {error}", traceback)
             case WorkerProcessFailed(worker, host, reason, spare) if not spare:
-                self._count_failure(f"worker {worker} ({host}): its process {reason}", "")
+                self._count_failure(EnvironmentFailed, f"worker {worker} ({host}): its process {reason}", "")
             case _:
                 pass
 
-    def _count_failure(self, line: str, traceback: str) -> None:
+    def _count_failure(self, kind: type[EnvironmentFailed | PolicyFailed], line: str, traceback: str) -> None:
         self._env_failures += 1
         allowed = self.settings.max_env_failures
         if self._env_failures > allowed:
             counted = f"failure {self._env_failures}; max_env_failures allows {allowed}"
-            self._failure = EnvironmentFailed(one_line(f"{line}; {counted}", 4 * MAX_LINE), traceback)
+            self._failure = kind(one_line(f"{line}; {counted}", 4 * MAX_LINE), traceback)
 
     def _check_members(self) -> None:
         """Raise `NoWorkers` when there was no member for too long."""

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 
 import msgspec
 
-from learner.members.events import EnvironmentRaised, Event, RolloutDropped
+from learner.members.events import EnvironmentRaised, Event, PolicyRaised, RolloutDropped
 from learner.members.lane_placement import LanePlacement, is_spare
 from learner.members.membership import Member, Membership, Outgoing
 from learner.members.states import MemberState, SentUnusable
@@ -155,9 +155,13 @@ class TicketCoordinator:
             case Goodbye(_, reason):
                 self.membership.remove(member, Goodbye, f"left: {reason}")
                 return self._deal()
-            case Failure(_, error, traceback, lane):
+            case Failure(_, error, traceback, lane, of_policy):
                 hello, spare = member.hello, is_spare(member, self.lanes)
-                self.events.append(EnvironmentRaised(hello.worker, hello.host, lane, error, escaped(traceback), spare))
+                shown = escaped(traceback)
+                if of_policy and self.run.policy.own is not None:  # no worker can blame a policy that is not the user's
+                    self.events.append(PolicyRaised(hello.worker, hello.host, error, shown, spare))
+                else:
+                    self.events.append(EnvironmentRaised(hello.worker, hello.host, lane, error, shown, spare))
                 self.membership.remove(member, Failure, f"broke: {error}")
                 return self._deal()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from pathlib import Path
 from typing import Any
 
@@ -104,20 +105,43 @@ def test_an_error_in_it_arrives_with_its_traceback() -> None:
     policy = millrace.OwnPolicy(Broken, ARRAYS, EXTRAS, state_size=1, kwargs={"wrong": "act raises"})
     with millrace.RolloutService("CartPole-v1", policy, workers=1, max_env_failures=1, **SMALL) as service:
         service.publish(WEIGHTS)
-        with pytest.raises(millrace.EnvironmentFailed) as raised:
+        with pytest.raises(millrace.PolicyFailed) as raised:
             service.gather()
-    assert "policy Broken: act raised ZeroDivisionError: of the user's" in str(raised.value)
-    assert "\n" not in str(raised.value)
+    assert re.fullmatch(
+        r"worker \S+ \(\S+\): policy Broken: act raised ZeroDivisionError: of the user's; "
+        r"failure 2; max_env_failures allows 1",
+        str(raised.value),
+    )
+    assert raised.value.exit_code == 1
     assert 'raise ZeroDivisionError("of the user\'s")' in raised.value.detail
+
+
+def test_an_environment_that_raises_beside_it_is_not_called_a_policy() -> None:
+    environment = "workers.envs.toy:Raises-v0"
+    with millrace.RolloutService(environment, QUIET_TOY, workers=1, max_env_failures=0, **SMALL) as service:
+        service.publish({"w": np.zeros(1)})
+        with pytest.raises(millrace.EnvironmentFailed, match="its environment raised"):
+            service.gather()
+
+
+class First:
+    """Always takes the first action."""
+
+    def load(self, arrays: Any) -> None:
+        """Needs no weights."""
+
+    def act(self, obs: Any, state: Any, rng: Any) -> Any:
+        return np.zeros(len(state), np.int64), None, {}
+
+
+QUIET_TOY = millrace.OwnPolicy(First, {"w": (1,)})
 
 
 def test_a_factory_that_raises_is_named() -> None:
     """The worker has joined before it makes the policy: the error comes from the start, or from the first batch."""
     policy = millrace.OwnPolicy(Broken, ARRAYS, EXTRAS, state_size=1, kwargs={"wrong": "factory raises"})
     with (
-        pytest.raises(
-            millrace.EnvironmentFailed, match="policy Broken: cannot be made: it raised ValueError: no such thing"
-        ),
+        pytest.raises(millrace.PolicyFailed, match="policy Broken: cannot be made: it raised ValueError: no such thing"),
         millrace.RolloutService("CartPole-v1", policy, workers=1, max_env_failures=0, **SMALL) as service,
     ):
         service.publish(WEIGHTS)

@@ -637,6 +637,13 @@ def test_a_failure_is_reported_with_its_traceback_and_leaves_with_exit_code_1() 
     ]
 
 
+def test_a_failure_of_the_users_policy_says_so() -> None:
+    session = ready(collect((0, 3)))
+    task_of(session)
+    sent, _ = session.fail("policy Mine: act raised KeyError", "Traceback: …", None, of_policy=True)
+    assert sent == Send(Failure(SESSION, "policy Mine: act raised KeyError", "Traceback: …", None, True))
+
+
 def test_a_failure_before_any_session_is_not_reported() -> None:
     assert joining().fail("no such environment", "", None) == [Leave(1, "no such environment")]
 

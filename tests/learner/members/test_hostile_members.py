@@ -298,6 +298,13 @@ def test_a_spare_worker_cannot_end_the_run_with_failures() -> None:
         noisy.hub._turn(0.0)
 
 
+def test_a_worker_cannot_blame_a_policy_that_is_not_the_users() -> None:
+    noisy = Noisy(max_env_failures=0)
+    noisy.hears("honest", Failure(1, "boom", "", None, of_policy=True))
+    with pytest.raises(EnvironmentFailed, match="boom; failure 1; max_env_failures allows 0"):
+        noisy.hub._turn(0.0)
+
+
 def test_a_worker_that_fails_before_lanes_are_placed_counts() -> None:
     learner = Learner(lanes=2, publish=False)
     learner.joins(b"a")

@@ -21,7 +21,7 @@ from hypothesis.extra import numpy as hnp
 
 from protocol.env_spec import PickledCallable
 from protocol.errors import BadMessage
-from protocol.messages import EpisodeRows, Hello, Inquire, Refuse, Rollout, ToLearner, ToWorker, Weights, Welcome
+from protocol.messages import EpisodeRows, Failure, Hello, Inquire, Refuse, Rollout, ToLearner, ToWorker, Weights, Welcome
 from protocol.space_spec import DictSpace, Shape, SpaceSpec, TupleSpace
 from protocol.wire.codec import DTYPES, MAX_FRAMES, MAX_HEAD_BYTES, decode_to_learner, decode_to_worker, encode
 from tests.support.fake_ends import fake_rollout, run_spec
@@ -186,7 +186,7 @@ def test_a_head_of_another_length_is_refused(message: Any, data: st.DataObject) 
 def test_a_default_stands_at_the_end_alone() -> None:
     """By position nothing else can be left out."""
     defaults = {kind: kind.__struct_defaults__ for kind in (*KINDS, Inquire) if kind.__struct_defaults__}
-    assert defaults == {Weights: (None,), EpisodeRows: (None,), Rollout: ((), None, ())}
+    assert defaults == {Weights: (None,), Failure: (False,), EpisodeRows: (None,), Rollout: ((), None, ())}
     assert Rollout.__struct_fields__[-3:] == ("episodes", "mask", "extras")
 
 
