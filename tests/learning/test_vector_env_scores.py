@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+pytest.importorskip("stable_baselines3")
+
 from millrace.sb3 import make_vec_env
 
 

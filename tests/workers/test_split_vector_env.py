@@ -73,7 +73,7 @@ def test_lanes_are_collected_in_any_order_but_only_all_together() -> None:
             collect(split, run, 1, lanes=(0, 2))
 
 
-class WithoutWorkers(SyncVectorEnv[Any, Any]):
+class WithoutWorkers(SyncVectorEnv):  # gymnasium 1.1's is not generic
     def step(self, actions: Any) -> Any:
         raise NoWorkers("waited 1 s for 1 worker")
 

@@ -17,9 +17,6 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.dqn.policies import DQNPolicy
 from torch import Tensor, nn
 
 from learner.algorithms.dqn import DQN
@@ -34,6 +31,12 @@ from protocol.policy.policy import make_policy
 from protocol.policy.torch_distributions import log_prob_and_entropy
 from protocol.specs import PolicySpec
 from tests.support.batches import batch, no_pulse
+
+pytest.importorskip("stable_baselines3")
+
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.dqn.policies import DQNPolicy
 
 OBSERVATION = spaces.Box(-np.inf, np.inf, (4,))
 ACTIONS: dict[str, spaces.Space[Any]] = {
