@@ -170,7 +170,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         extra: dict[str, Any] = {} if render_mode is None else {"render_mode": render_mode}
         if self.factory is not None:
             factory = self.factory.load()
-            env = _checked(self.id, factory(**self.kwargs, **extra))
+            env = _called(self.id, factory, {**self.kwargs, **extra})
             if isinstance(factory, _WrappedFactory):
                 return env
         else:
@@ -224,11 +224,20 @@ def _make(env_id: str, kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
     if _names_a_function(env_id):
         function = attribute(importlib.import_module(module_name), name)
         if callable(function) and name not in gymnasium.registry:
-            return _checked(env_id, function(**kwargs))
+            return _called(env_id, function, kwargs)
     return gymnasium.make(env_id, disable_env_checker=True, **kwargs)
 
 
-def _checked(name: str, made: object) -> gymnasium.Env[Any, Any]:
+def _called(name: str, factory: Callable[..., object], kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
+    """What a user's callable returns. Raises `UsageError` if that is no environment, or it asks for an unknown id."""
+    try:
+        made = factory(**kwargs)
+    except gymnasium.error.UnregisteredEnv as error:
+        raise UsageError(
+            f"environment {name}: it asks gymnasium for an id that is not registered in the worker ({first_line(error)}); "
+            "pass the id itself or gymnasium.spec(id) instead of a callable, or let it make module:id, where the module "
+            "registers it"
+        ) from error
     if isinstance(made, gymnasium.Env):
         return made
     if hasattr(made, "possible_agents"):
@@ -254,7 +263,7 @@ class _WrappedFactory:
         if self._env is None:
             env = EnvSpec(self._name, kwargs).make(render_mode)
         else:
-            env = _checked(self._name, self._env(**kwargs, **({} if render_mode is None else {"render_mode": render_mode})))
+            env = _called(self._name, self._env, kwargs | ({} if render_mode is None else {"render_mode": render_mode}))
         for wrapper in self._wrappers:
             env = wrap(env, wrapper)
         return env

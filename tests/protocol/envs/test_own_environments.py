@@ -42,6 +42,10 @@ def not_an_env() -> object:
     return 3
 
 
+def asks_for_an_unknown_id() -> gymnasium.Env[Any, Any]:
+    return gymnasium.make("OnlyInTheScript-v0")
+
+
 def many() -> object:
     return gymnasium.vector.SyncVectorEnv([make_countdown])
 
@@ -185,6 +189,26 @@ def test_a_spec_that_is_not_the_registered_one_has_no_name(registry: None) -> No
     made = spec.make()
     assert made.spec is not None
     assert made.spec.max_episode_steps == 3
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        EnvSpec.of(asks_for_an_unknown_id),
+        EnvSpec.of(asks_for_an_unknown_id, wrappers=[lambda env: env]),
+        EnvSpec(f"{MODULE}:asks_for_an_unknown_id"),
+    ],
+    ids=["pickled", "pickled with its wrapper", "by name"],
+)
+def test_a_callable_that_makes_an_id_of_the_script_alone_is_one_line_that_says_what_to_pass(spec: EnvSpec) -> None:
+    with pytest.raises(UsageError, match="asks gymnasium for an id that is not registered in the worker") as raised:
+        spec.make()
+    line = str(raised.value)
+    assert line.startswith(f"environment {MODULE}:asks_for_an_unknown_id: ")
+    assert "`OnlyInTheScript` doesn't exist" in line
+    assert "pass the id itself or gymnasium.spec(id)" in line
+    assert "module:id" in line
+    assert (raised.value.detail, "\n" in line) == ("", False)
 
 
 def test_an_id_that_an_imported_module_registers_is_remembered_with_it(
