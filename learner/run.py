@@ -12,20 +12,18 @@ import socket
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 import msgspec
-import zmq
 
 from learner.callbacks.callbacks import Callbacks, Watch
 from learner.config.config import Config
 from learner.env_spaces import EnvSpaces
 from learner.imports_ahead import ImportsAhead
 from learner.interrupts import Interrupts
+from learner.members.bound import listen
 from learner.members.describe import described_by_workers
 from learner.members.describe_coordinator import Accept
-from learner.members.endpoint import join_lines, keyring_for
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.recording.training_recorder import TrainingRecorder
 from learner.resumption import Resumption, check_spaces
@@ -211,23 +209,18 @@ def serve(config: Config, resume: Resumption | None, watch: Watch) -> Path:
     """Train with workers that are started elsewhere and join at `config.bind`. Returns the run folder."""
     if config.inference == "learner":
         raise UsageError("--inference learner does not work with python -m learner; use millrace learner")
-    keyring = keyring_for(config, datetime.now(UTC).replace(microsecond=0))
     with ExitStack() as stack:
         # The run is locked before the port is bound: of two learners of one run, the second is told so.
         folder = None if resume is None else stack.enter_context(run_folder(config, resume))
-        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        stack.callback(context.term)
-        link = LearnerLink(config.bind, context, keyring)
-        stack.callback(link.close)
+        bound = listen(config, stack)
         observer = stack.enter_context(prometheus_observer(config))
-        for line in join_lines(link.address, config.advertise, keyring):
-            log.warning("%s", line)
+        bound.announce(config.advertise)
         env, processes = EnvSpec.of(config.env, config.env_kwargs, config.wrapper), ProcessCallbacks()
-        known = known_environment(config, env, resume, describe_over(link, config, processes))
+        known = known_environment(config, env, resume, describe_over(bound.link, config, processes))
         folder = folder or stack.enter_context(run_folder(config, None))
         run = Run(
             RunSetup(config, known, folder, resume is not None, Interrupts(config.grace_s)),
-            link,
+            bound.link,
             processes,
             watch,
             observer,

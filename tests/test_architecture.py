@@ -247,6 +247,12 @@ def test_no_function_takes_too_many_parameters() -> None:
                 assert len(names) <= MOST_PARAMETERS, f"{source}:{node.lineno} {node.name}({', '.join(names)})"
 
 
+def test_the_learner_s_socket_is_opened_in_one_place() -> None:
+    """So that its keys, its context and the order in which they are closed are the same in every launcher."""
+    found = {where.partition(":")[0] for source in sources(*PACKAGES) for where in every_call(source, "LearnerLink")}
+    assert found == {"learner/members/bound.py"}
+
+
 def test_every_file_says_first_what_it_holds() -> None:
     for source in sources(*PACKAGES, "tests"):
         assert ast.get_docstring(tree(source)) or not (ROOT / source).read_text().strip(), source

@@ -1,30 +1,22 @@
-"""Opens the learner's end of the conversation: address, keys and socket, and starts local workers for it.
+"""The address, keys and socket of a learner that starts local workers, or lets workers elsewhere join.
 
-Rule: code travels only over ipc, inproc, or tcp with keys. Closing `resources` releases all that was acquired.
+Rule: whatever happens, closing `resources` releases all that was acquired.
 """
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from datetime import UTC, datetime
 
-import zmq
-
-from learner.members.endpoint import BindSettings, join_lines, keyring_for
+from learner.members.bound import Bound, bind, listen
+from learner.members.endpoint import BindSettings
 from millrace.launch.local_worker_options import WorkerFlags, private_address, temporary_keys
-from protocol.errors import UsageError
-from protocol.keys.key_folder import Keyring
 from protocol.keys.keys import Token
-from protocol.wire.learner_link import LearnerLink
 from protocol.wire.shared_memory import InheritedDescriptors
 from workers.supervise.worker_process import WorkerCommand, WorkerProcess
 from workers.supervise.worker_thread import WorkerThread
 from workers.supervisor import Running
-
-log = logging.getLogger("millrace.learner")
 
 
 def _nothing_handed(name: str) -> InheritedDescriptors | None:
@@ -32,12 +24,9 @@ def _nothing_handed(name: str) -> InheritedDescriptors | None:
 
 
 @dataclass(frozen=True)
-class Endpoint:
+class Endpoint(Bound):
     """An address that is bound, and what a worker needs to join there."""
 
-    link: LearnerLink
-    context: zmq.Context[zmq.Socket[bytes]]
-    keyring: Keyring | None
     token: Token | None
     """Token of local workers."""
 
@@ -57,27 +46,15 @@ class Endpoint:
 
         return start
 
-    def announce(self, advertise: str) -> None:
-        """Log how a worker is started elsewhere."""
-        for line in join_lines(self.link.address, advertise, self.keyring):
-            log.warning("%s", line)
-
 
 def open_endpoint(where: BindSettings, transport: str, resources: ExitStack, code: str = "") -> Endpoint:
     """Bind `where.bind`, or without one an address of this transport for local workers.
 
-    `code`: what travels to the workers as code, for the error; empty if nothing does. Raises `UsageError`.
+    `code`: as of `learner.members.bound.bind`. Raises `UsageError`.
     """
     if where.bind:
-        keyring, token = keyring_for(where, datetime.now(UTC).replace(microsecond=0)), None
-        address = where.bind
+        token, bound = None, listen(where, resources, code)
     else:
         keyring, token = temporary_keys(transport, where.keys, insecure=where.insecure)
-        address = private_address(transport, resources)
-    if code and address.startswith("tcp://") and keyring is None:
-        raise UsageError(f"{code} is code: it travels over ipc or inproc only, or over tcp with keys")
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    resources.callback(context.term)
-    link = LearnerLink(address, context, keyring)
-    resources.callback(link.close, 0.5)
-    return Endpoint(link, context, keyring, token)
+        bound = bind(private_address(transport, resources), keyring, resources, code)
+    return Endpoint(bound.link, bound.context, bound.keyring, token)

@@ -1,0 +1,58 @@
+"""Opens the learner's end of the conversation: the socket at its address, and who may connect there.
+
+Rule: code travels only over ipc, inproc, or tcp with keys. Closing `resources` releases all that was acquired, the socket
+before its context.
+"""
+
+from __future__ import annotations
+
+import logging
+from contextlib import ExitStack
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+import zmq
+
+from learner.members.endpoint import Listening, join_lines, keyring_for
+from protocol.errors import UsageError
+from protocol.keys.key_folder import Keyring
+from protocol.wire.learner_link import LearnerLink
+
+log = logging.getLogger("millrace.learner")
+
+LINGER_S, LINGER_ELSEWHERE_S = 0.5, 2.0  # for what is queued, when the socket is closed
+
+
+@dataclass(frozen=True)
+class Bound:
+    """An address that is bound, and who may connect there."""
+
+    link: LearnerLink
+    context: zmq.Context[zmq.Socket[bytes]]
+    keyring: Keyring | None
+    """None if no key is needed."""
+
+    def announce(self, advertise: str) -> None:
+        """Log how a worker is started elsewhere."""
+        for line in join_lines(self.link.address, advertise, self.keyring):
+            log.warning("%s", line)
+
+
+def listen(where: Listening, resources: ExitStack, code: str = "") -> Bound:
+    """Bind `where.bind` for workers that are started elsewhere. `code`: as of `bind`. Raises `UsageError`."""
+    keyring = keyring_for(where, datetime.now(UTC).replace(microsecond=0))
+    return bind(where.bind, keyring, resources, code, LINGER_ELSEWHERE_S)
+
+
+def bind(address: str, keyring: Keyring | None, resources: ExitStack, code: str = "", linger_s: float = LINGER_S) -> Bound:
+    """Bind this address for those whose keys are in `keyring`.
+
+    `code`: what travels to the workers as code, for the error; empty if nothing does. Raises `UsageError`.
+    """
+    if code and address.startswith("tcp://") and keyring is None:
+        raise UsageError(f"{code} is code: it travels over ipc or inproc only, or over tcp with keys")
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    resources.callback(context.term)
+    link = LearnerLink(address, context, keyring)
+    resources.callback(link.close, linger_s)
+    return Bound(link, context, keyring)
