@@ -9,7 +9,7 @@ BIN := .venv/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: train test lint type unit docs bench bench-peers test-learning test-cluster test-model test-processors test-versions \
+.PHONY: train test lint type unit docs site bench bench-peers test-learning test-cluster test-model test-processors test-versions \
 	test-kill soak clean
 
 train: .venv/installed  ## train CartPole-v1 on two worker processes until a greedy evaluation averages 475
@@ -53,6 +53,9 @@ soak: .venv/installed-dev  ## faults for ten minutes, every two seconds one; the
 docs: .venv/installed-dev  ## write the generated parts of protocol/README.md
 	$(BIN)/python -m tests.protocol.test_wire_document
 
+site: .venv/installed-docs  ## build the documentation site in site/: warnings are errors
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+
 bench: .venv/installed-dev  ## all benchmarks, ten minutes: tables here, JSON and pictures in benchmarks/results
 	$(BIN)/millrace bench
 
@@ -70,5 +73,9 @@ bench-peers: .venv/installed-dev  ## training beside seven other systems, each i
 	$(PIP_INSTALL) --editable '.[dev]'
 	touch $@
 
+.venv/installed-docs: .venv/installed-dev
+	$(PIP_INSTALL) --editable '.[docs]'
+	touch $@
+
 clean:
-	rm -rf .venv .versions .cluster benchmarks/peers/envs .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv site .versions .cluster benchmarks/peers/envs .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,0 +1,28 @@
+"""Hooks of mkdocs (mkdocs.yml names this file): pages from outside docs/, pages made from the code, and links."""
+
+from __future__ import annotations
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.exceptions import PluginError
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+
+from website.pages import FROM_ELSEWHERE, MADE, ROOT, DeadLink, for_site, written_pages
+
+
+def on_files(files: Files, /, *, config: MkDocsConfig) -> Files:
+    """Add the pages that are not in docs/."""
+    for source, page in FROM_ELSEWHERE.items():
+        files.append(File.generated(config, page, content=(ROOT / source).read_text(encoding="utf-8")))
+    for page, make in MADE.items():
+        files.append(File.generated(config, page, content=make()))
+    return files
+
+
+def on_page_markdown(markdown: str, /, *, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Rewrite the links of a page. Raises PluginError for a link to a file that does not exist."""
+    path = page.file.src_uri
+    try:
+        return for_site(path, written_pages().get(path, f"docs/{path}"), markdown)
+    except DeadLink as error:
+        raise PluginError(str(error)) from None
