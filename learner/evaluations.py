@@ -123,8 +123,8 @@ class Evaluations:
             self._write_best(*self.best_policy)
 
     def _write_best(self, parameters: Floats, buffers: Floats) -> None:
-        policy, env = self._spec.policy, self._spec.env
-        warn_on_error(lambda: self._folder.write_policy(policy, env, parameters, buffers, which="best"))
+        policy, env, facts = self._spec.policy, self._spec.env, self._spec.facts
+        warn_on_error(lambda: self._folder.write_policy(policy, env, parameters, buffers, "best", facts))
 
 
 def warn_on_error(write: Callable[[], object]) -> None:

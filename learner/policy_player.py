@@ -51,11 +51,12 @@ def saved_policy(
     """
     card, parameters, buffers = RunFolder.open(run).read_policy(which)
     spec = EnvSpec.of(card.env if env is None else env, card.env_kwargs, card.wrappers if wrappers is None else wrappers)
-    return SavedPolicy(card.policy, spec, parameters, buffers, _facts(run))
+    facts = _facts_of_older(run) if card.facts is None else card.facts
+    return SavedPolicy(card.policy, spec, parameters, buffers, facts)
 
 
-def _facts(run: Path) -> tuple[str, ...]:
-    """The `info_keys` of a run; none if its config.toml cannot be read."""
+def _facts_of_older(run: Path) -> tuple[str, ...]:
+    """The `info_keys` of a run whose policy.json does not say them; none if its config.toml cannot be read."""
     try:
         keys = tomllib.loads((run / "config.toml").read_text("utf-8")).get("info_keys", "")
         return RolloutConfig(info_keys=keys).fact_names() if isinstance(keys, str) else ()

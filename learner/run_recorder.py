@@ -184,8 +184,8 @@ class RunRecorder:
         if not self._make_folder_again():
             return
         warn_on_error(lambda: self._save_checkpoint(state))
-        policy, env = self._spec.policy, self._spec.env
-        warn_on_error(lambda: self._folder.write_policy(policy, env, *self._algorithm.weights()))
+        policy, env, facts = self._spec.policy, self._spec.env, self._spec.facts
+        warn_on_error(lambda: self._folder.write_policy(policy, env, *self._algorithm.weights(), facts=facts))
         self._took_to_save(time.monotonic() - began_s)
         if self._saved == self._position() and self._callbacks.wants("on_checkpoint"):
             self._requests.closed = "expected it earlier than in on_checkpoint: the checkpoint would lack it"

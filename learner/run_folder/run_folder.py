@@ -80,6 +80,8 @@ class PolicyDescription(msgspec.Struct, frozen=True, kw_only=True):
     """names of arrays that are not parameters: mean and standard deviation for observation normalization"""
     wrappers: tuple[str, ...] = ()
     """wrappers of every env copy, the innermost first"""
+    facts: tuple[str, ...] | None = None
+    """names of the numbers that the run logs of each episode; None: an older millrace wrote it, which did not say"""
 
 
 class RunSettings(Protocol):
@@ -211,11 +213,18 @@ class RunFolder:
         )
 
     def write_policy(
-        self, spec: PolicySpec, env: EnvSpec, parameters: Floats, buffers: Floats, which: Which = "final"
+        self,
+        spec: PolicySpec,
+        env: EnvSpec,
+        parameters: Floats,
+        buffers: Floats,
+        which: Which = "final",
+        facts: tuple[str, ...] = (),
     ) -> None:
         """Write the arrays and policy.json.
 
-        `parameters` [P] begins with the acting part; the rest (the critic) is not written.
+        `parameters` [P] begins with the acting part; the rest (the critic) is not written. `facts`: names of the numbers
+        that the run logs of each episode.
         """
         from safetensors.numpy import save
 
@@ -229,6 +238,7 @@ class RunFolder:
             arrays=_array_positions(acting),
             buffers=tuple(named_views(buffers, buffer_layout(spec))),
             wrappers=env.wrappers,
+            facts=facts,
         )
         contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         checksum = str(zlib.crc32(_split(save(contiguous))[1]))
