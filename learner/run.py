@@ -29,6 +29,7 @@ from learner.recording.training_recorder import TrainingRecorder
 from learner.resumption import Resumption, check_spaces
 from learner.rollout_service.service import describe_settings, rollout_service
 from learner.rollouts.hub import HubObserver
+from learner.run_folder.lease import Closed
 from learner.run_folder.run_folder import Interrupted, RunFolder
 from learner.run_folder.run_lock import RunLock
 from protocol.address import advertised_address
@@ -36,6 +37,8 @@ from protocol.bounds import one_line
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.errors import MillraceError, RunTakenOver, UsageError, first_line
+from protocol.keys.key_folder import Keyring
+from protocol.messages import Status
 from protocol.specs import DescribeSpec, RunSpec
 from protocol.wire.learner_link import LearnerLink
 
@@ -165,8 +168,22 @@ class Run:
         self.folder.write_config(config)  # nothing of a resumed run is written before everything fits
         self.recorder = RunRecorder(config, self.folder, spec, self.algorithm, self.service, state, made, episodes)
         self.folder.keep()
-        if self.folder.lock is not None and not link.address.startswith("inproc://"):
-            self.folder.lock.announce(advertised_address(link.address, config.advertise, socket.gethostname()))
+        self.announce(link.address, config.advertise, link.keyring)
+
+    def announce(self, address: str, advertise: str, keyring: Keyring | None) -> None:
+        """Say in the lock of the run folder that `millrace status` may ask at this address; or why it cannot."""
+        if self.folder.lock is None:
+            return
+        if address.startswith("inproc://"):
+            self.folder.lock.announce(Closed.INPROC)
+        elif keyring is not None and keyring.folder is None:
+            self.folder.lock.announce(Closed.KEYS_OF_THE_RUN)
+        else:
+            self.folder.lock.announce(advertised_address(address, advertise, socket.gethostname()))
+
+    def status(self, now: float) -> Status:
+        """The answer to `millrace status`. `now`: seconds of the monotonic clock."""
+        return self.service.status(now)
 
     def train(self, workers: int) -> None:
         """Wait for this number of `workers`, then train to the end.

@@ -20,6 +20,7 @@ from learner.rollouts.ticket_coordinator import TicketCoordinator
 from learner.run_folder.progress import Progress
 from learner.run_folder.results import Evaluation
 from protocol.arrays import Array, Floats
+from protocol.messages import Status
 from protocol.specs import RunSpec
 from protocol.wire.learner_link import LearnerLink
 
@@ -74,6 +75,10 @@ class RolloutService:
     def report(self, progress: Progress) -> None:
         """Tell how far the run is: `millrace status` and Prometheus ask for it."""
         self._hub.report_progress(progress)
+
+    def status(self, now: float) -> Status:
+        """The answer to `millrace status`. `now`: seconds of the monotonic clock."""
+        return self._hub.status(now)
 
     def snapshot(self) -> HubSnapshot:
         """A snapshot of workers, tickets and rollouts."""

@@ -132,7 +132,7 @@ class Hub:
         self._failure: EnvironmentFailed | PolicyFailed | None = None
         self._no_members_since_s: float | None = None
         self._stall_watch = StallWatch(coordinator, settings.stall_timeout_s, settings.call_timeouts)
-        callbacks = ServerCallbacks(self._answer, self._status, self._on_event)
+        callbacks = ServerCallbacks(self._answer, self.status, self._on_event)
         self._server = MemberServer(link, coordinator, callbacks, self._processes, clock=clock)
 
     # ---------------------------------------------------------------- what the loop calls
@@ -320,7 +320,8 @@ class Hub:
             self._weight_age.arrived(name_for_people(peer), message.version, now)
         return out
 
-    def _status(self, now: float) -> Status:
+    def status(self, now: float) -> Status:
+        """The answer to `millrace status`."""
         return status(self.coordinator, self._progress, now)
 
     def _on_event(self, event: Event) -> None:

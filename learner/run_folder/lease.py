@@ -14,6 +14,15 @@ WIDTH = 512  # bytes: every rewrite has the same length, so that one of them rep
 LONGEST_ADDRESS = 200
 
 
+class Closed(Enum):
+    """Why nobody can ask the learner of a run."""
+
+    INPROC = "inproc"
+    """Its workers are threads: it listens in its own process only."""
+    KEYS_OF_THE_RUN = "keys"
+    """Its keys are made for this run, and are in no file."""
+
+
 class Owner(msgspec.Struct, frozen=True, kw_only=True):
     """The content of the lock file."""
 
@@ -25,6 +34,8 @@ class Owner(msgspec.Struct, frozen=True, kw_only=True):
     """Random: two locks never have the same."""
     address: str = ""
     """Where its learner listens; empty if nobody can ask it, or it does not listen yet."""
+    closed: Closed | None = None
+    """Why nobody can ask it, where that is known."""
     count: int = 0
     """How often the owner has rewritten the file."""
 

@@ -23,7 +23,7 @@ from typing import NamedTuple, Self
 
 from msgspec.structs import replace
 
-from learner.run_folder.lease import LONGEST_ADDRESS, LeaseWatch, Owner, Verdict, decoded
+from learner.run_folder.lease import LONGEST_ADDRESS, Closed, LeaseWatch, Owner, Verdict, decoded
 from protocol.address import is_local
 from protocol.errors import RunError, RunTakenOver, UsageError
 
@@ -44,6 +44,12 @@ class Pace(NamedTuple):
 
 
 PACE = Pace()
+WHY_CLOSED = {
+    Closed.INPROC: "with --transport inproc it listens in its own process only; run it with --transport ipc",
+    Closed.KEYS_OF_THE_RUN: (
+        "with --transport tcp and --keys, the keys of its local workers are in no file; run it with --transport ipc"
+    ),
+}
 JOIN_S = 5.0  # a file system that does not answer must not keep the process
 
 
@@ -87,10 +93,14 @@ class RunLock:
                 self._path.unlink()
         self._close()
 
-    def announce(self, address: str) -> None:
-        """Write into the lock file where the learner of this run listens, for `millrace status`."""
+    def announce(self, where: str | Closed) -> None:
+        """Write into the lock file where the learner of this run listens for `millrace status`, or why nobody can ask it."""
         with self._writing:
-            self._owner = replace(self._owner, address=address if len(address) <= LONGEST_ADDRESS else "")
+            match where:
+                case Closed():
+                    self._owner = replace(self._owner, address="", closed=where)
+                case str():
+                    self._owner = replace(self._owner, address=where if len(where) <= LONGEST_ADDRESS else "", closed=None)
         self._rewrite()
 
     def check(self) -> None:
@@ -261,10 +271,8 @@ def learner_address(folder: Path) -> str:
     if here and not owner.address.startswith("tcp://") and not _is_alive(owner.pid):  # over tcp it may be in a container
         raise UsageError(f"run {folder}: no process trains it now; {owner} did, and is gone")
     if not owner.address:
-        raise UsageError(
-            f"run {folder}: {owner} trains it and cannot be asked: it has not begun yet, or has --transport inproc or "
-            "--inference learner"
-        )
+        why = "it has not begun yet; try again" if owner.closed is None else WHY_CLOSED[owner.closed]
+        raise UsageError(f"run {folder}: {owner} trains it and cannot be asked: {why}")
     if not here and is_local(owner.address):
         raise UsageError(f"run {folder}: {owner} trains it, and only that machine can reach it; ask there")
     return owner.address

@@ -31,7 +31,7 @@ from learner.vector_env.step_hub import StepHub
 from protocol.arrays import Array
 from protocol.envs.spaces import make_flatten
 from protocol.errors import BadMessage, UsageError, WorkerLost
-from protocol.messages import Answer, Stepped
+from protocol.messages import Answer, Status, Stepped
 from protocol.wire.plain_values import repr_paths
 from protocol.wire.shared_memory import SharedMemory
 
@@ -410,6 +410,10 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
     def watch(self, callback: Callable[[], None]) -> None:
         """Set what is called regularly during each wait. An exception that it raises ends the wait."""
         self._hub.call_while_waiting(callback)
+
+    def answer_for(self, run: Callable[[float], Status]) -> None:
+        """Answer `millrace status` for this run, which acts on these copies. `run` takes the time and gives its status."""
+        self._hub.answer_for(run)
 
     # ---------------------------------------------------------------- close
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from msgspec.structs import replace
+
 from learner.vector_env.order_coordinator import OrderCoordinator
 from protocol.messages import Status
 
 
 def status(coordinator: OrderCoordinator, now: float) -> Status:
-    """The status message of a vector environment. It has no weights, no target and no ledger."""
+    """The status message of a vector environment of its own. It has no weights, no target and no ledger."""
     members = coordinator.members.values()
     return Status(
         env=", ".join(dict.fromkeys(env.id for env in coordinator.spec.envs)),
@@ -21,3 +23,8 @@ def status(coordinator: OrderCoordinator, now: float) -> Status:
         workers=coordinator.membership.status(now),
         ledger={},
     )
+
+
+def status_of_run(run: Status, coordinator: OrderCoordinator, now: float) -> Status:
+    """The status message of a run that acts on the copies of a vector environment: its own figures, and these workers."""
+    return replace(run, workers=coordinator.membership.status(now))

@@ -18,10 +18,10 @@ from learner.members.events import Event, WorkerLeft
 from learner.members.member_server import MemberServer, ServerCallbacks, ServerSettings
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator
-from learner.vector_env.status import status
+from learner.vector_env.status import status, status_of_run
 from protocol.address import worker_name
 from protocol.errors import EnvironmentFailed
-from protocol.messages import Answer, Order, WorkerActivity, WorkerExit
+from protocol.messages import Answer, Order, Status, WorkerActivity, WorkerExit
 from protocol.specs import StepSpec
 from protocol.wire.learner_link import LearnerLink
 from protocol.wire.shared_memory import SharedMemory
@@ -123,6 +123,7 @@ class StepHub:
         self._newest_tickets: dict[int, int] = {}  # lane -> ticket of its newest order, if its answer is wanted
         self._patience_s = PATIENCE_S
         self._while_waiting: Callable[[], None] = lambda: None
+        self._status: Callable[[float], Status] = lambda now: status(self._coordinator, now)
         self.stepped: set[int] = set()
         """Lanes whose last step, through shared memory, is done."""
         self._under_way: dict[int, int] = {}  # lane -> number of its order through shared memory
@@ -133,7 +134,7 @@ class StepHub:
         # server's short grace: after a long suspension even its connection must be made anew.
         settings = ServerSettings(grace_s=worker_timeout_s, last_messages_wait_s=LAST_MESSAGES_WAIT_S, log_tracebacks=False)
         callbacks = ServerCallbacks(
-            self._coordinator.receive, lambda now: status(self._coordinator, now), self._on_event, self._wake_sleeping
+            self._coordinator.receive, lambda now: self._status(now), self._on_event, self._wake_sleeping
         )
         processes = ProcessCallbacks(self._local_workers.poll, self._local_workers.activities)
         self._server = MemberServer(link, self._coordinator, callbacks, processes, settings, clock)
@@ -151,6 +152,10 @@ class StepHub:
     def call_while_waiting(self, callback: Callable[[], None]) -> None:
         """Call this now and then while waiting; what it raises ends the wait."""
         self._while_waiting = callback
+
+    def answer_for(self, run: Callable[[float], Status]) -> None:
+        """From now on answer `millrace status` for the run that acts on these copies: its figures, and the workers here."""
+        self._status = lambda now: status_of_run(run(now), self._coordinator, now)
 
     # ---------------------------------------------------------------- orders
 

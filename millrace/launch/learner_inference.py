@@ -96,6 +96,8 @@ def train(
 
         processes = ProcessCallbacks(ended, supervisor.activities, lambda: env.workers, 0 if elsewhere else config.workers)
         run = Run(RunSetup(config, known, folder, resume is not None, interrupts), link, processes, watch, observer)
+        env.answer_for(run.status)  # the learner's own endpoint is inproc: `millrace status` asks where the workers join
+        run.announce(env.address, config.advertise, listening.endpoint.keyring)
         run.train(1)
         return run.folder.path
 

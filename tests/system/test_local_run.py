@@ -9,6 +9,8 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -391,25 +393,67 @@ def test_a_worker_whose_environment_hangs_is_ended_and_replaced(
     assert not [line for line in said if "silent" in line]
 
 
-def test_status_asks_the_learner_that_train_started_by_its_run_folder(tmp_path: Path) -> None:
-    learner = start(tmp_path, "--steps", "100000000", "--workers", "2")
-    wait_for(lambda: any(len(read_rows(path)) > 3 for path in tmp_path.glob("runs/*/metrics.jsonl")))
-    (folder,) = tmp_path.glob("runs/*")
+Ask = Callable[..., subprocess.CompletedProcess[str]]
 
-    def status(*flags: str) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "millrace", "status", str(folder), *flags]
-        return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
+@contextmanager
+def training(tmp_path: Path, *flags: str) -> Iterator[tuple[subprocess.Popen[bytes] | preloaded.ForkedProcess, Path, Ask]]:
+    """A learner that trains, its run folder, and a function that runs `millrace status` of it; ended afterwards."""
+    learner = start(tmp_path, "--steps", "100000000", "--workers", "2", *flags)
     try:
+        wait_for(lambda: any(len(read_rows(path)) > 3 for path in tmp_path.glob("runs/*/metrics.jsonl")))
+        (folder,) = tmp_path.glob("runs/*")
+
+        def status(*flags: str) -> subprocess.CompletedProcess[str]:
+            command = [sys.executable, "-m", "millrace", "status", str(folder), *flags]
+            return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+        yield learner, folder, status
+    finally:
+        learner.send_signal(signal.SIGINT)
+        learner.communicate(timeout=30)
+
+
+def test_status_asks_the_learner_of_a_run_that_acts_in_the_learner(tmp_path: Path) -> None:
+    """Its answer is the run's, with the processes that step the env copies."""
+    with training(tmp_path, "--inference", "learner") as (learner, _, status):
+        asked = status("--json")
+        assert asked.returncode == 0, asked.stderr
+        answer = json.loads(asked.stdout)
+        assert (answer["env"], answer["total_steps"]) == ("CartPole-v1", 100_000_000)
+        assert answer["env_steps"] > 0
+        assert answer["ledger"]["used"] > 0
+        assert {worker["pid"] for worker in answer["workers"]} == {one.pid for one in psutil.Process(learner.pid).children()}
+
+
+@pytest.mark.parametrize(
+    ("flags", "why"),
+    [
+        (("--transport", "inproc"), "with --transport inproc it listens in its own process only"),
+        (("--transport", "inproc", "--inference", "learner"), "with --transport inproc it listens in its own process only"),
+        (("--transport", "tcp", "--keys", "KEYS"), "the keys of its local workers are in no file"),
+    ],
+)
+def test_status_of_a_run_that_nobody_can_ask_is_one_line_that_says_why(
+    tmp_path: Path, flags: tuple[str, ...], why: str
+) -> None:
+    keys = str(tmp_path / "keys")
+    with training(tmp_path, *(keys if flag == "KEYS" else flag for flag in flags)) as (learner, folder, status):
+        refused = status()
+    assert (refused.returncode, refused.stdout, refused.stderr.count("\n")) == (2, "", 1)
+    assert f"run {folder}: process {learner.pid} on " in refused.stderr
+    assert why in refused.stderr
+    assert refused.stderr.endswith("run it with --transport ipc\n")
+
+
+def test_status_asks_the_learner_that_train_started_by_its_run_folder(tmp_path: Path) -> None:
+    with training(tmp_path) as (learner, folder, status):
         answer = json.loads(status("--json").stdout)
         assert answer["env"] == "CartPole-v1"
         assert answer["env_steps"] > 0
         assert {worker["worker"] for worker in answer["workers"]} == {"w0", "w1"}
         assert {worker["pid"] for worker in answer["workers"]} == {one.pid for one in psutil.Process(learner.pid).children()}
         assert "dropped: nothing" in status().stdout
-    finally:
-        learner.send_signal(signal.SIGINT)
-        learner.communicate(timeout=30)
     ended = status()
     assert (ended.returncode, ended.stdout) == (2, "")
     assert ended.stderr == f"millrace: run {folder}: no process trains it now\n"

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from learner.run_folder.lease import LONGEST_ADDRESS, WIDTH, LeaseWatch, Owner, Verdict, decoded
+from learner.run_folder.lease import LONGEST_ADDRESS, WIDTH, Closed, LeaseWatch, Owner, Verdict, decoded
 from learner.run_folder.run_lock import LOCK_FILE, Pace, RunLock, learner_address
 from protocol.errors import RunError, RunTakenOver, UsageError
 
@@ -232,6 +232,16 @@ def test_the_lock_says_where_the_learner_listens_and_keeps_saying_it(tmp_path: P
         held.announce("tcp://" + "h" * LONGEST_ADDRESS + ":5555")
         assert len((tmp_path / LOCK_FILE).read_bytes()) == WIDTH
         assert owner_of(tmp_path).address == ""
+        for why, line in (
+            (Closed.INPROC, "cannot be asked: with --transport inproc it listens in its own process only"),
+            (Closed.KEYS_OF_THE_RUN, "cannot be asked: .* the keys of its local workers are in no file; run it with"),
+        ):
+            held.announce(why)
+            with pytest.raises(UsageError, match=line):
+                learner_address(tmp_path)
+            assert len((tmp_path / LOCK_FILE).read_bytes()) == WIDTH
+        held.announce("ipc:///tmp/here/learner")
+        assert learner_address(tmp_path) == "ipc:///tmp/here/learner", "it is open again"
     with pytest.raises(UsageError, match="no process trains it now"):
         learner_address(tmp_path)
 
