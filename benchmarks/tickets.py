@@ -1,0 +1,158 @@
+"""Draws docs/images/tickets.png, who collects and who learns when: `python -m benchmarks.tickets`.
+
+It plays the real coordinator (`learner/rollouts/ticket_coordinator.py`) in simulated time: three lanes, each on a worker of
+its own, rollouts of three durations in turn, an update that takes as long as a short rollout, and messages that take no
+time. So the picture shows what the rule for tickets does, and is the same on every machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import heapq
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from benchmarks.simulated import canned, run_spec
+from learner.report.learning_curves import COLORS, DPI, GREY
+from learner.rollouts.ticket_coordinator import TicketCoordinator
+from protocol.messages import PROTOCOL_VERSION, Collect, Hello
+
+OUT = Path(__file__).parents[1] / "docs" / "images" / "tickets.png"
+LANES = 3
+ROLLOUT_S = (1.0, 1.6, 1.1, 2.0)  # of lane n: the n-th first, then the others in turn
+UPDATE_S = 1.0
+NOTHING = np.zeros(0, np.float32)
+
+
+class Span(NamedTuple):
+    """A rollout that was collected, or an update."""
+
+    row: int
+    """number of the lane; `LANES` is the learner"""
+    start_s: float
+    end_s: float
+    version: int
+    """of the weights that acted, or that the update began with"""
+
+
+class Played(NamedTuple):
+    """What happened."""
+
+    spans: list[Span]
+    lags: list[int]
+    """of each rollout that an update used"""
+
+
+def play(max_lag: int, seconds: float) -> Played:
+    """What workers and learner do with tickets under this `max_lag`."""
+    run = run_spec(LANES)
+    rollout = canned(run)
+    coordinator = TicketCoordinator(
+        run, rollouts_per_update=LANES, max_lag=max_lag, worker_timeout_s=1e9, first_session=1, version=0
+    )
+    spans: list[Span] = []
+    lags: list[int] = []
+    events: list[tuple[float, int]] = []  # when a row's rollout or update ends
+    tickets: list[list[int]] = [[] for _ in range(LANES)]
+    busy = [False] * (LANES + 1)
+    collected = [0] * LANES
+    now = 0.0
+
+    def dealt(out: list[tuple[bytes, object]]) -> None:
+        for _, message in out:
+            if isinstance(message, Collect):
+                for permit in message.permits:
+                    tickets[permit.lane].append(permit.ticket)
+
+    def begin(row: int, duration_s: float, version: int) -> None:
+        busy[row] = True
+        spans.append(Span(row, now, now + duration_s, version))
+        heapq.heappush(events, (now + duration_s, row))
+
+    peers = [f"w{n}".encode() for n in range(LANES)]
+    for n, peer in enumerate(peers):
+        coordinator.receive(peer, Hello(PROTOCOL_VERSION, peer.decode(), "host", n + 1, n, "simulated", n + 1), now)
+    dealt(list(coordinator.publish(0, NOTHING, NOTHING)))
+    while now < seconds:
+        if not busy[LANES] and (taken := coordinator.take()):
+            lags += [coordinator.version - each.rollout.version for each in taken]
+            begin(LANES, UPDATE_S, coordinator.version)
+        for lane in range(LANES):
+            if tickets[lane] and not busy[lane]:
+                begin(lane, ROLLOUT_S[(lane + collected[lane]) % len(ROLLOUT_S)], coordinator.version)
+        now, row = heapq.heappop(events)
+        busy[row] = False
+        if row == LANES:
+            dealt(list(coordinator.publish(coordinator.version + 1, NOTHING, NOTHING)))
+            continue
+        owner = coordinator.lanes[row].owner
+        assert owner is not None
+        version = next(span.version for span in reversed(spans) if span.row == row)
+        filled = msgspec.structs.replace(
+            rollout,
+            session=coordinator.members[owner].session,
+            lane=row,
+            ticket=tickets[row].pop(0),
+            version=version,
+            sequence=collected[row],
+        )
+        collected[row] += 1
+        dealt(list(coordinator.receive(owner, filled, now)))
+    return Played(spans, lags)
+
+
+def busy_share(played: Played, rows: range, seconds: float) -> float:
+    """Share of the time in which these rows collect or learn."""
+    began = [span for span in played.spans if span.row in rows and span.start_s < seconds]
+    return sum(min(span.end_s, seconds) - span.start_s for span in began) / (seconds * len(rows))
+
+
+def draw(out: Path, seconds: float = 20.0) -> None:
+    """A panel for `max_lag` 0, 1 and 2: a row for the learner and for each lane."""
+    from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    figure = Figure(figsize=(10.0, 5.6), layout=ConstrainedLayoutEngine())
+    panels = figure.subplots(3, 1, sharex=True)
+    for max_lag, panel in enumerate(panels):
+        played = play(max_lag, seconds)
+        for span in played.spans:
+            panel.broken_barh(
+                [(span.start_s, span.end_s - span.start_s)],
+                (span.row + 0.08, 0.84),
+                color=COLORS[span.version % len(COLORS)],
+                edgecolor="white",
+                linewidth=1.0,
+            )
+            if (span.start_s + span.end_s) / 2 < seconds:
+                middle = (span.start_s + span.end_s) / 2, span.row + 0.5
+                panel.text(*middle, str(span.version), ha="center", va="center", fontsize=7, color="white")
+        collects, learns = (busy_share(played, rows, seconds) for rows in (range(LANES), range(LANES, LANES + 1)))
+        panel.set_title(
+            f"max_lag {max_lag}: workers collect {collects:.0%} of the time, the learner learns {learns:.0%}; "
+            f"lags {min(played.lags)} to {max(played.lags)}",
+            fontsize=9,
+            fontweight="bold",
+            loc="left",
+        )
+        panel.set_xlim(0, seconds)
+        panel.set_ylim(LANES + 1, 0)
+        panel.set_yticks([row + 0.5 for row in range(LANES + 1)], [*(f"lane {n}" for n in range(LANES)), "update"])
+        panel.tick_params(labelsize=8, colors=GREY, length=2)
+        for side in ("top", "right", "left"):
+            panel.spines[side].set_visible(False)
+    panels[-1].set_xlabel("time; the number is the version of the weights; white: it waits", fontsize=8, color=GREY)
+    figure.savefig(out, dpi=DPI)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="draw when lanes are collected and when the learner learns")
+    parser.add_argument("--out", type=Path, default=OUT, help="PNG to write")
+    draw(parser.parse_args().out)
+
+
+if __name__ == "__main__":
+    main()
