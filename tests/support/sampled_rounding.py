@@ -29,7 +29,7 @@ SAMPLES = 16
 
 EXACT = (
     *("_to_copy", "_unsafe_view", "cat", "clone", "new_ones", "ones_like", "relu", "relu_"),
-    *("select_backward", "threshold_backward", "unsafe_split"),
+    *("select_backward", "slice_backward", "threshold_backward", "unsafe_split"),
 )
 # How large the terms are whose roundings make up the error of one element, by the arguments and the result.
 ELEMENTWISE_SIZES: dict[str, Callable[[Sequence[Any], Tensor], Tensor]] = {
