@@ -43,7 +43,7 @@ class OwnPolicy:
     with exactly its copies. What an episode remembers goes into `state` [N, state_size] float32, which is zeros when an
     episode begins; if the object keeps nothing else between its calls, results do not depend on the number of workers. An
     action is whole numbers that count from 0, or float32, which is clipped to the space after it was stored.
-    `service.evaluate` calls `act_greedy` of the object if there is one, else `act`. docs/how-to/own_learner.md has more.
+    `service.evaluate` calls `act_greedy` of the object if there is one, else `act`. docs/how-to/own_policy.md has more.
     """
 
     factory: str | Callable[..., object]
