@@ -14,6 +14,7 @@ from website.links import Link, elsewhere, resolved, with_links
 
 ROOT = Path(__file__).parent.parent
 FROM_ELSEWHERE = {
+    "README.md": "index.md",
     "protocol/README.md": "reference/wire.md",
     "CHANGELOG.md": "project/changelog.md",
     "CONTRIBUTING.md": "project/contributing.md",
