@@ -20,7 +20,7 @@ FROM_ELSEWHERE = {
     "CONTRIBUTING.md": "project/contributing.md",
 }
 """Files outside docs/ that are pages: path in the repository -> path in the site"""
-START = {"README.md": "index.md", "docs": "index.md"}
+START = {"docs": "index.md"}
 """What links to these files becomes a link to this page."""
 MADE: dict[str, Callable[[], str]] = {}
 """Pages that are made from the code: path in the site -> what makes it"""
