@@ -9,7 +9,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Any, TypeVar, Unpack
 
 import numpy as np
 
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from learner.report.figure import PngFigure
 
 NOT_FINISHED = "not finished"
+
+_Played = TypeVar("_Played", RunEvaluateKeywords, RunRecordKeywords)
 
 
 class Metrics(dict[str, Array]):
@@ -130,9 +132,7 @@ class Run(os.PathLike[str]):
         >>> result.episodes
         2
         """
-        keywords.setdefault("env", self._given.get("env"))
-        keywords.setdefault("wrappers", self._given.get("wrappers"))
-        return evaluate(self, episodes, **keywords)
+        return evaluate(self, episodes, **self._with_given(keywords))
 
     def record(self, out: str, steps: int = 50_000, **keywords: Unpack[RunRecordKeywords]) -> RecordedDataset:
         """Write episodes of the newest policy as a Minari dataset: `millrace.record` of this run, with the same keywords.
@@ -141,9 +141,7 @@ class Run(os.PathLike[str]):
         >>> millrace.Run(run).record("cartpole/of-a-run-v0", steps=20).dataset_id
         'cartpole/of-a-run-v0'
         """
-        keywords.setdefault("env", self._given.get("env"))
-        keywords.setdefault("wrappers", self._given.get("wrappers"))
-        return record(self, out, steps, **keywords)
+        return record(self, out, steps, **self._with_given(keywords))
 
     def resume(self, **keywords: Any) -> Run:
         """Continue the run from its newest checkpoint: `millrace.train(resume=run)`, with the same keywords.
@@ -191,6 +189,12 @@ class Run(os.PathLike[str]):
         cells = [(escape(name), escape(fact.removeprefix(f"{name} "))) for name, fact in rows.items()]
         left = "style='text-align:left'"
         return f"<table>{''.join(f'<tr><th {left}>{name}</th><td {left}>{fact}</td></tr>' for name, fact in cells)}</table>"
+
+    def _with_given(self, keywords: _Played) -> _Played:
+        """These keywords, and what `train` was given as objects where they do not say something else."""
+        keywords.setdefault("env", self._given.get("env"))
+        keywords.setdefault("wrappers", self._given.get("wrappers"))
+        return keywords
 
     def _facts(self) -> dict[str, str]:
         """What is most important about the run, by name. Never raises."""

@@ -19,10 +19,10 @@ from learner.config.config import Config
 from learner.config.did_you_mean import did_you_mean
 from learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig
 from learner.config.on_resume import declared
-from learner.config.own_module import import_own, is_name
 from protocol.bounds import one_line
 from protocol.envs.found_names import attribute, importable, last_part
 from protocol.errors import UsageError, first_line
+from protocol.own_module import import_own, is_name
 
 ALGORITHMS = {
     "ppo": "learner.algorithms.ppo:PPO",

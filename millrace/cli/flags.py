@@ -10,15 +10,11 @@ import msgspec
 from tyro.conf import Positional, UseAppendAction, arg
 
 
-class EvaluateFlags(msgspec.Struct, frozen=True, kw_only=True):
-    """Play greedy episodes of a run's newest policy; print mean and standard deviation of the return."""
+class PlayFlags(msgspec.Struct, frozen=True, kw_only=True):
+    """Flags of the commands whose workers play episodes of a run's policy."""
 
     run: Positional[Path]
     """run folder"""
-    episodes: int | None = None
-    """number of episodes; if not given 100, or 3 with --video"""
-    seed: int = 1_000_000
-    """seed of the episodes"""
     best: bool = False
     """use the policy with the best evaluation during the run (--eval-every), instead of the newest"""
     env: str = ""
@@ -27,14 +23,23 @@ class EvaluateFlags(msgspec.Struct, frozen=True, kw_only=True):
     """the wrappers, innermost first, if the run does not find them by itself"""
     workers: int = 2
     """number of worker processes that play the episodes; the result does not depend on it"""
-    copies: int = 4
-    """number of episodes that a worker plays side by side"""
-    max_steps: int = 1_000_000
-    """most env steps of all episodes together; each episode gets an equal share, and is cut when it reaches it"""
     transport: Literal["inproc", "ipc", "tcp"] = "ipc"
     """how local workers are connected: as threads of this process, by local sockets, or by TCP"""
     bind: str = ""
     """address at which workers join that are started elsewhere, as tcp://0.0.0.0:5555; then none are started here"""
+
+
+class EvaluateFlags(PlayFlags, frozen=True, kw_only=True):
+    """Play greedy episodes of a run's newest policy; print mean and standard deviation of the return."""
+
+    episodes: int | None = None
+    """number of episodes; if not given 100, or 3 with --video"""
+    seed: int = 1_000_000
+    """seed of the episodes"""
+    copies: int = 4
+    """number of episodes that a worker plays side by side"""
+    max_steps: int = 1_000_000
+    """most env steps of all episodes together; each episode gets an equal share, and is cut when it reaches it"""
     video: bool = False
     """film the episodes: an mp4 of each in the folder videos of the run (pip install 'millrace-rl[video]')"""
     debug: bool = False
@@ -52,33 +57,19 @@ class PlotFlags(msgspec.Struct, frozen=True, kw_only=True):
     """show the traceback of an error"""
 
 
-class RecordFlags(msgspec.Struct, frozen=True, kw_only=True):
+class RecordFlags(PlayFlags, frozen=True, kw_only=True):
     """Write a Minari dataset: episodes of a run's newest policy, with raw rewards (pip install 'millrace-rl[record]')."""
 
-    run: Positional[Path]
-    """run folder"""
     out: str
     """id of the dataset, as cartpole/expert-v0; it is written to MINARI_DATASETS_PATH, or to ~/.minari/datasets"""
     steps: int = 50_000
     """number of env steps; the last episode is finished, unless that would take more than twice as many"""
-    best: bool = False
-    """use the policy with the best evaluation during the run (--eval-every), instead of the newest"""
-    env: str = ""
-    """the environment, if the run does not find it by itself, as my_module:make_env or my_module:MyEnv-v0"""
-    wrapper: Annotated[tuple[str, ...], arg(metavar="MODULE:CLASS"), UseAppendAction] = ()
-    """the wrappers, innermost first, if the run does not find them by itself"""
     npy: Path | None = None
     """also write this .npy file: a float32 array with a row [observation, action], flattened, for each step"""
     stochastic: bool = False
     """sample actions from the policy, as in training, instead of taking the most probable ones"""
     seed: int = 2_000_000
     """seed of the episodes and of the sampled actions"""
-    workers: int = 2
-    """number of worker processes that play the episodes; the dataset does not depend on it"""
-    transport: Literal["inproc", "ipc", "tcp"] = "ipc"
-    """how local workers are connected: as threads of this process, by local sockets, or by TCP"""
-    bind: str = ""
-    """address at which workers join that are started elsewhere, as tcp://0.0.0.0:5555; then none are started here"""
     debug: bool = False
     """show the traceback of an error"""
 

@@ -7,9 +7,7 @@ imported where the environment is made, that is in a worker.
 from __future__ import annotations
 
 import ast
-import difflib
 import functools
-import importlib
 import traceback
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -17,8 +15,9 @@ from typing import Any, NamedTuple
 import gymnasium
 
 from protocol.bounds import one_line
-from protocol.envs.found_names import attribute, found_by_others, in_main, last_part, name_of
+from protocol.envs.found_names import found_by_others, in_main, last_part, name_of
 from protocol.errors import UsageError, first_line
+from protocol.own_module import own_callable
 
 Wrapper = Callable[..., gymnasium.Env[Any, Any]]
 WrapperLike = str | Wrapper
@@ -122,17 +121,5 @@ def wrap(env: gymnasium.Env[Any, Any], wrapper: WrapperLike) -> gymnasium.Env[An
 def _found(text: str) -> Wrapper:
     """The wrapper of this name, imported, with its arguments. Raises `UsageError`."""
     module_name, qualname, args, kwargs = read_wrapper(text)
-    try:
-        module = importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        if error.name is not None and f"{module_name}.".startswith(f"{error.name}."):
-            raise UsageError(
-                f"wrapper {text}: no module named {error.name}; is it installed, or its folder on PYTHONPATH?"
-            ) from error
-        raise UsageError(f"wrapper {text}: a package it needs is missing ({first_line(error)}); pip install it") from error
-    found = attribute(module, qualname)
-    if not callable(found):
-        close = difflib.get_close_matches(qualname, vars(module), n=1)
-        hint = f"; did you mean {module_name}:{close[0]}?" if close else ""
-        raise UsageError(f"wrapper {text}: module {module_name} has no {qualname}{hint}")
+    found = own_callable(f"{module_name}:{qualname}", f"wrapper {text}", "gymnasium.wrappers:FlattenObservation")
     return lambda env: found(env, *args, **kwargs)

@@ -13,12 +13,10 @@ probabilities.
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Callable, Sequence
-
 import torch
 
 from protocol.errors import UsageError, first_line
+from protocol.own_module import own_callable
 from protocol.policy.features import feature_size
 from protocol.specs import ActionSpec, EncoderSpec, Leaf, NamedShape, PolicySpec
 
@@ -58,7 +56,8 @@ def _make(factory: str, spec: PolicySpec, seed: int) -> torch.nn.Module:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         try:
-            module = _import_factory(factory)(feature_size(spec), images)
+            make = own_callable(factory, f"encoder {factory}", "my_package.networks:encoder")
+            module = make(feature_size(spec), images)
         except UsageError:
             raise
         except Exception as error:
@@ -70,20 +69,6 @@ def _make(factory: str, spec: PolicySpec, seed: int) -> torch.nn.Module:
     if strange := [name for name, parameter in module.named_parameters() if parameter.dtype != torch.float32]:
         raise UsageError(f"encoder {factory}: expected float32 parameters, got another dtype in {strange[0]}")
     return module.eval()
-
-
-def _import_factory(factory: str) -> Callable[[int, Sequence[tuple[int, ...]]], object]:
-    module, _, name = factory.partition(":")
-    if not module or not name:
-        raise UsageError(f"encoder {factory}: expected module:factory, as in my_package.networks:encoder")
-    try:
-        found: Callable[[int, Sequence[tuple[int, ...]]], object] = getattr(importlib.import_module(module), name)
-    except ModuleNotFoundError as error:
-        says = "is it installed, or its folder on PYTHONPATH?"
-        raise UsageError(f"encoder {factory}: no module named {error.name}; {says}") from error
-    except AttributeError as error:
-        raise UsageError(f"encoder {factory}: {module} has no {name}") from error
-    return found
 
 
 def _output_size(factory: str, module: torch.nn.Module, spec: PolicySpec) -> int:

@@ -17,7 +17,6 @@ calls but `state`, a rollout has the same bits whatever else the worker does.
 
 from __future__ import annotations
 
-import importlib
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -26,7 +25,8 @@ import numpy as np
 import numpy.typing as npt
 
 from protocol.arrays import Array, Floats
-from protocol.errors import PolicyFailed, first_line
+from protocol.errors import PolicyFailed, UsageError, first_line
+from protocol.own_module import own_callable
 from protocol.policy.layout import named_views, parameter_layout
 from protocol.rollout import outside_of_choices
 from protocol.specs import ExtraArray, OwnPolicySpec, PolicySpec
@@ -122,18 +122,10 @@ def _factory(own: OwnPolicySpec) -> Callable[..., object]:
     """The callable that makes the policy."""
     if own.code is not None:
         return own.code.load()
-    module, colon, name = own.factory.partition(":")
-    if not (module and colon and name):
-        raise PolicyFailed(f"policy {own.factory}: expected module:factory, as in my_package.policies:make_policy")
     try:
-        imported = importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        says = "is it installed, or its folder on PYTHONPATH?"
-        raise PolicyFailed(f"policy {own.factory}: no module named {error.name}; {says}", traceback.format_exc()) from error
-    if not callable(found := getattr(imported, name, None)):
-        raise PolicyFailed(f"policy {own.factory}: {module} has no callable {name}")
-    factory: Callable[..., object] = found
-    return factory
+        return own_callable(own.factory, f"policy {own.factory}", "my_package.policies:make_policy")
+    except UsageError as error:
+        raise PolicyFailed(str(error), error.detail) from error
 
 
 def _described(value: object) -> str:

@@ -22,6 +22,7 @@ from learner.run_folder import checkpoint
 from learner.run_folder.metrics_log import MetricsLog
 from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import Interrupted, RunFolder
+from millrace.cli.flags import EvaluateFlags, PlayFlags, RecordFlags
 from millrace.cli.main import COMMANDS, main
 from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
@@ -490,6 +491,14 @@ def test_the_overview_lists_what_there_is(capsys: Captured) -> None:
     assert all(f"millrace {name} " in out for name in COMMANDS)
     assert main([]) == 0
     assert capsys.readouterr().out == out
+
+
+def test_what_evaluate_and_record_have_in_common_is_declared_once() -> None:
+    """`seed` has another default in each, and every command has `debug`."""
+    both = set(EvaluateFlags.__struct_fields__) & set(RecordFlags.__struct_fields__)
+    assert both == {*PlayFlags.__struct_fields__, "seed", "debug"}
+    assert issubclass(EvaluateFlags, PlayFlags)
+    assert issubclass(RecordFlags, PlayFlags)
 
 
 def test_the_help_is_the_text_under_each_field_with_the_presets_defaults(capsys: Captured) -> None:

@@ -83,7 +83,7 @@ def test_what_looks_at_a_run_does_not_need_its_code(
     assert "ClippedPlus" in (run / "report.html").read_text()
     capsys.readouterr()
     assert main(["train", "--resume", str(run), "--steps", "1200"]) == 2
-    missing = "no module my_own_loss; expected one in the current folder, on PYTHONPATH or installed"
+    missing = "no module named my_own_loss; is it installed, or its folder on PYTHONPATH?"
     assert capsys.readouterr().err == f"millrace: {run / 'config.toml'}: algo my_own_loss:ClippedPlus: {missing}\n"
 
 

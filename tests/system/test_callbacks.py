@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -13,10 +12,10 @@ import pytest
 
 import millrace
 from learner.callbacks.callbacks import MOMENTS
-from learner.run_folder import checkpoint
 from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.run_folder import Interrupted
 from millrace import Callback, Progress
+from tests.system.run_folders import folder_of, saved, summary
 from tests.system.runs import accounted
 
 ENV = "workers.envs.toy:Identity-v0"
@@ -62,21 +61,6 @@ def run(tmp_path: Path, *callbacks: object, resume: Path | None = None, **settin
     return Path(millrace.train(
         "" if resume else ENV, run_dir=str(tmp_path / "runs"), resume=resume, callbacks=callbacks, **{**SMALL, **settings}
     ))  # fmt: skip
-
-
-def folder_of(tmp_path: Path) -> Path:
-    (folder,) = (tmp_path / "runs").iterdir()
-    return folder
-
-
-def summary(folder: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((folder / "summary.json").read_text())
-    return found
-
-
-def saved(folder: Path) -> int:
-    found: int = checkpoint.newest(folder)[0].state["past"]["version"]
-    return found
 
 
 def rows(folder: Path) -> list[int]:
@@ -179,7 +163,7 @@ def test_a_raise_in_each_method(tmp_path: Path, moment: str, error: BaseExceptio
     assert caught.value is error
     notes = list(error.__notes__)
     del error.__notes__
-    folder = folder_of(tmp_path)
+    folder = folder_of(tmp_path / "runs")
     at = {"on_start": 0, "on_end": UPDATES}.get(moment, 5)
     assert notes[0] == f"raised in Acts.{moment}"
     assert len(notes) == (1 if at == 0 else 2)
@@ -234,7 +218,7 @@ def test_a_raise_after_an_error_is_only_logged(tmp_path: Path, caplog: pytest.Lo
         run(tmp_path, Twice())
     said = [record.getMessage() for record in caplog.records]
     assert [line for line in said if "UsersError" in line] == ["UsersError: second", "UsersError: third"]
-    assert saved(folder_of(tmp_path)) == 1
+    assert saved(folder_of(tmp_path / "runs")) == 1
 
 
 def test_a_callback_by_its_name_is_called_again_when_the_run_is_resumed(
@@ -256,7 +240,7 @@ def test_a_callback_by_its_name_is_called_again_when_the_run_is_resumed(
     flags += [f"--run-dir={tmp_path / 'runs'}"]
     named = ["--callback", "mine_on_disk:Stop"]
     assert main(["train", ENV, *flags, *named]) == 0
-    folder = folder_of(tmp_path)
+    folder = folder_of(tmp_path / "runs")
     assert "ended by Stop.on_update" in capsys.readouterr().out
     assert summary(folder)["updates"] == 4
     assert main(["train", "--resume", str(folder), *named]) == 0
@@ -266,5 +250,5 @@ def test_a_callback_by_its_name_is_called_again_when_the_run_is_resumed(
     assert err[-1].startswith("millrace: mine_on_disk.py:7: ValueError: no; raised in Fail.on_update; ")
     assert "go on with: --resume" in err[-1]
     assert main(["train", ENV, *flags, "--callback", "mine_on_disk:Stp"]) == 2
-    assert "module mine_on_disk has no Stp; did you mean Stop?" in capsys.readouterr().err
-    assert folder_of(tmp_path) == folder, "no folder is made for a callback that does not exist"
+    assert "module mine_on_disk has no Stp; did you mean mine_on_disk:Stop?" in capsys.readouterr().err
+    assert folder_of(tmp_path / "runs") == folder, "no folder is made for a callback that does not exist"

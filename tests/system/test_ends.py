@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import shlex
@@ -21,6 +20,7 @@ from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.progress import Progress
 from millrace.launch.local_run import train
 from protocol.errors import RunError, UsageError
+from tests.system.run_folders import folder_of, saved, summary
 from tests.system.runs import accounted
 
 SMALL: dict[str, Any] = {
@@ -40,28 +40,12 @@ def run(tmp_path: Path, watch: Watch = lambda progress: None, resume: Path | Non
     )
 
 
-def folder_of(tmp_path: Path) -> Path:
-    (folder,) = (tmp_path / "runs").iterdir()
-    return folder
-
-
-def summary(folder: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((folder / "summary.json").read_text())
-    return found
-
-
 def raises_at(update: int, error: BaseException) -> Watch:
     def watch(progress: Progress) -> None:
         if progress.updates == update:
             raise error
 
     return watch
-
-
-def saved(folder: Path) -> int:
-    """The number of updates in the newest checkpoint."""
-    found: int = checkpoint.newest(folder)[0].state["past"]["version"]
-    return found
 
 
 def how_to_go_on(folder: Path) -> list[str]:
@@ -82,7 +66,7 @@ def parameters(folder: Path) -> torch.Tensor:
 def test_a_watch_that_raises(tmp_path: Path, error: BaseException, max_lag: int) -> None:
     with pytest.raises(type(error)) as caught:
         run(tmp_path, raises_at(5, error), max_lag=max_lag)
-    folder = folder_of(tmp_path)
+    folder = folder_of(tmp_path / "runs")
     assert caught.value is error
     assert error.__notes__ == how_to_go_on(folder)
     assert saved(folder) == 5
@@ -99,20 +83,20 @@ def test_a_watch_that_raises_in_an_evaluation(tmp_path: Path) -> None:
 
     with pytest.raises(UsersError):
         run(tmp_path, watch, eval_every=100, eval_episodes=200)
-    found = checkpoint.newest(folder_of(tmp_path))[0]
-    assert saved(folder_of(tmp_path)) == 4
+    found = checkpoint.newest(folder_of(tmp_path / "runs"))[0]
+    assert saved(folder_of(tmp_path / "runs")) == 4
     assert found.state["past"]["next_evaluation"] == 100 <= found.env_steps, "it must be made again"
 
 
 def test_a_watch_that_raises_at_the_very_end(tmp_path: Path) -> None:
     def watch(progress: Progress) -> None:
-        finished = (folder_of(tmp_path) / "summary.json").exists()
+        finished = (folder_of(tmp_path / "runs") / "summary.json").exists()
         if finished and not progress.doing:
             raise UsersError
 
     with pytest.raises(UsersError):
         run(tmp_path, watch)
-    assert summary(folder_of(tmp_path))["stop_reason"] == "all steps done"
+    assert summary(folder_of(tmp_path / "runs"))["stop_reason"] == "all steps done"
 
 
 def breaks(monkeypatch: pytest.MonkeyPatch, update: int, minibatch: int, how: Callable[[dict[str, float]], None]) -> None:
@@ -176,8 +160,8 @@ def test_weights_that_are_not_finite_are_never_saved(
     monkeypatch.setattr(PPO, "update", broken)
     with pytest.raises(RunError, match="update 2: the weights are not finite"):
         run(tmp_path)
-    assert saved(folder_of(tmp_path)) == 2
-    assert torch.isfinite(parameters(folder_of(tmp_path))).all()
+    assert saved(folder_of(tmp_path / "runs")) == 2
+    assert torch.isfinite(parameters(folder_of(tmp_path / "runs"))).all()
 
 
 def test_a_run_folder_that_is_deleted_is_made_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -23,7 +23,8 @@ from millrace.launch.local_run import train
 from protocol.errors import EnvironmentFailed, NoWorkers, UsageError
 from tests.support import preloaded
 from tests.system.processes import Stage, free_port, wait_for
-from tests.system.test_local_run import assert_balanced, run, start, summary, worker_processes
+from tests.system.run_folders import summary
+from tests.system.test_local_run import assert_balanced, run, start, worker_processes
 
 SMALL: dict[str, Any] = {"n_epochs": 2, "eval_episodes": 2}
 TOY = "workers.envs.toy:"

@@ -27,17 +27,13 @@ from learner.run_folder.progress import Progress
 from millrace.launch.local_run import train
 from protocol.errors import EnvironmentFailed, NoWorkers, RunError, UsageError
 from tests.support import preloaded
+from tests.system.run_folders import summary
 
 SMALL: dict[str, Any] = {"n_epochs": 2, "eval_episodes": 2}  # these tests do not need a run that learns much
 
 
 def run(tmp_path: Path, env: str, watch: Any = lambda progress: None, resume: Path | None = None, **settings: Any) -> Path:
     return train(resolve(env, run_dir=str(tmp_path / f"runs{time.monotonic_ns()}"), **settings), resume, watch)
-
-
-def summary(folder: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((folder / "summary.json").read_text())
-    return found
 
 
 def assert_balanced(ledger: dict[str, int]) -> None:

@@ -6,7 +6,6 @@ longer than the grace time.
 
 from __future__ import annotations
 
-import json
 import signal
 import sys
 import time
@@ -28,6 +27,7 @@ from learner.run_folder.progress import Progress
 from learner.run_folder.run_folder import Interrupted
 from millrace.launch.local_run import train
 from tests.system.processes import START_S, Stage, crowding
+from tests.system.run_folders import folder_of, summary
 
 ENV = "tests.system.restarting_env:Restarting-v0"
 T, LANES, ENVS = 16, 2, 4
@@ -60,11 +60,6 @@ def run(tmp_path: Path, watch: Watch = silent, resume: Path | None = None, **set
     return train(resolve(ENV, run_dir=str(tmp_path), **{**COMMON, **settings}), resume, watch)
 
 
-def folder_of(tmp_path: Path) -> Path:
-    (folder,) = tmp_path.iterdir()
-    return folder
-
-
 def restarted(tmp_path: Path, after: int, **settings: Any) -> Path:
     """A run that goes on, and whose lanes are all started anew while they collect under the version `after`."""
     rows = settings.get("rollout_steps", T)
@@ -81,11 +76,6 @@ def interrupts_at(update: int) -> Watch:
             raise KeyboardInterrupt
 
     return watch
-
-
-def summary(folder: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((folder / "summary.json").read_text())
-    return found
 
 
 def same(left: Any, right: Any) -> bool:

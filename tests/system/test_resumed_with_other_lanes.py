@@ -17,7 +17,8 @@ from millrace.launch.local_run import train
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError
 from tests.learner.config.test_on_resume import content
-from tests.system.test_local_run import assert_balanced, summary
+from tests.system.run_folders import summary
+from tests.system.test_local_run import assert_balanced
 
 GRADIENT_STEPS = 5
 SHAPES: dict[str, tuple[int, int]] = {  # lanes and envs

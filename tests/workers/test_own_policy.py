@@ -150,7 +150,7 @@ def test_what_goes_wrong_in_it_is_named(wrong: str, message: str) -> None:
     ("factory", "message"),
     [
         ("no_such_module:make", "no module named no_such_module; is it installed, or its folder on PYTHONPATH?"),
-        (HERE + "nothing", "tests.support.own_policies has no callable nothing"),
+        (HERE + "nothing", "module tests.support.own_policies has no nothing"),
         (HERE + "not_a_policy", "expected an object with load and act, got int without load"),
     ],
 )

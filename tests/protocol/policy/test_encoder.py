@@ -108,7 +108,7 @@ def test_one_that_is_different_here_is_refused() -> None:
     [
         ("nowhere", "encoder nowhere: expected module:factory, as in my_package.networks:encoder"),
         ("no.such:one", "no module named no; is it installed, or its folder on PYTHONPATH?"),
-        (f"{HERE}:one", "tests.support.custom_encoders has no one"),
+        (f"{HERE}:one", "module tests.support.custom_encoders has no one"),
         (f"{HERE}:not_a_module", "expected it to return a torch.nn.Module, got int"),
         (f"{HERE}:with_statistics", "expected parameters alone, got the buffer 1.running_mean; use LayerNorm, say"),
         (f"{HERE}:of_doubles", "expected float32 parameters, got another dtype in weight"),

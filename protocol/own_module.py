@@ -1,0 +1,68 @@
+"""Imports what a setting of the user names, as `module:name`: an algorithm, a callback, a policy, an encoder, a wrapper.
+
+Rule: whatever is wrong is one line that quotes the setting. What the user's code raised has its traceback as detail; a
+package that is missing needs none.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import traceback
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+from protocol.bounds import one_line
+from protocol.envs.found_names import attribute
+from protocol.errors import UsageError, first_line
+
+
+def is_name(text: str) -> bool:
+    """Whether this is `module:name`, with or without dots in either part."""
+    module, _, name = text.partition(":")
+    return all(part.isidentifier() for each in (module, name) for part in each.split("."))
+
+
+def own_callable(name: str, what: str, example: str) -> Callable[..., Any]:
+    """Import `module:name`, a function or class. `what` quotes the setting, as `callback mine:Stop`. Raises `UsageError`."""
+    if not is_name(name):
+        raise UsageError(f"{what}: expected module:factory, as in {example}")
+    module_name, _, qualname = name.partition(":")
+    return callable_of(import_own(module_name, what), qualname, what)
+
+
+def import_own(module: str, what: str) -> ModuleType:
+    """Import a module. `what`: as of `own_callable`. Raises `UsageError`."""
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is not None and f"{module}.".startswith(f"{error.name}."):
+            raise UsageError(
+                f"{what}: no module named {error.name}; is it installed, or its folder on PYTHONPATH?"
+            ) from error
+        raise UsageError(f"{what}: the import of {module} failed: {_why(error)}; is that package installed?") from error
+    except (Exception, SystemExit) as error:
+        raise own_code_failed(f"{what}: the import of {module}", error) from error
+
+
+def callable_of(module: ModuleType, qualname: str, what: str) -> Callable[..., Any]:
+    """The function or class that a module has under this name. `what`: as of `own_callable`. Raises `UsageError`."""
+    found = attribute(module, qualname)
+    if found is None:
+        known = [name for name, value in vars(module).items() if callable(value) and not name.startswith("_")]
+        close = difflib.get_close_matches(qualname, known, n=1)
+        hint = f"; did you mean {module.__name__}:{close[0]}?" if close else ""
+        raise UsageError(f"{what}: module {module.__name__} has no {qualname}{hint}")
+    if not callable(found):
+        raise UsageError(f"{what}: expected a function or class to call, got {type(found).__name__}")
+    return found
+
+
+def own_code_failed(what: str, error: BaseException) -> UsageError:
+    """The error for what the user's code raised."""
+    return UsageError(f"{what} failed: {_why(error)}", "".join(traceback.format_exception(error)))
+
+
+def _why(error: BaseException) -> str:
+    return one_line(f"{type(error).__name__}: {first_line(error)}")

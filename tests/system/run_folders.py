@@ -1,0 +1,27 @@
+"""Reads what a test needs of a run folder: its summary, and its newest checkpoint."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from learner.run_folder import checkpoint
+
+
+def folder_of(runs: Path) -> Path:
+    """The one run folder in this folder."""
+    (folder,) = runs.iterdir()
+    return folder
+
+
+def summary(folder: Path) -> dict[str, Any]:
+    """Its summary.json."""
+    found: dict[str, Any] = json.loads((folder / "summary.json").read_text())
+    return found
+
+
+def saved(folder: Path) -> int:
+    """The number of updates in its newest checkpoint."""
+    found: int = checkpoint.newest(folder)[0].state["past"]["version"]
+    return found
