@@ -136,7 +136,7 @@ def _line(event: Event) -> str:
         case WorkerRefused(worker, why):
             return f"worker {worker} was refused: {why}"
         case EnvironmentRaised(worker, host, lane, error):
-            where = "" if lane is None else f"lane {lane}: "
+            where = "" if lane is None or error.startswith(f"lane {lane},") else f"lane {lane}: "  # most errors name it
             return f"worker {worker} ({host}): {where}{error}"
         case PolicyRaised(worker, host, error):
             return f"worker {worker} ({host}): {error}"

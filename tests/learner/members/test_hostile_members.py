@@ -137,6 +137,13 @@ def test_no_line_of_a_traceback_looks_like_a_line_of_the_log() -> None:
     assert "\x1b" not in text
 
 
+@pytest.mark.parametrize("error", ["lane 0, copy 1, step 7: boom", "boom"])
+def test_a_failure_names_its_lane_once(error: str) -> None:
+    line = describe(EnvironmentRaised("w", "h", 0, error, ""))
+    assert line.startswith("worker w (h): lane 0")
+    assert line.count("lane 0") == 1
+
+
 def test_a_message_that_cannot_be_read_forges_no_line(caplog: pytest.LogCaptureFixture) -> None:
     noisy = Noisy()
     noisy.hears("spare", BadMessage("array expected, got one\n2026 learner: all is \x1b[31mwell"))
