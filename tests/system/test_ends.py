@@ -133,7 +133,7 @@ def test_an_update_that_fails_in_the_middle_is_taken_back(tmp_path: Path, monkey
     with pytest.raises(expected) as caught:
         run(tmp_path / "broken", seed=4)
     monkeypatch.undo()
-    whole, broken = folder_of(tmp_path / "whole"), folder_of(tmp_path / "broken")
+    whole, broken = (folder_of(tmp_path / part / "runs") for part in ("whole", "broken"))
     assert saved(broken) == saved(whole) == 3
     assert torch.equal(parameters(whole), parameters(broken)), "a half update was saved"
     assert (whole / "policy.safetensors").read_bytes() == (broken / "policy.safetensors").read_bytes()
@@ -222,7 +222,7 @@ NAMES = ["[red]x[/red]", "with space", "öäü ✓ 学", "%s{0}", "a'b\"c", "-da
 def test_run_folders_of_any_name(tmp_path: Path, name: str) -> None:
     with pytest.raises(UsersError):
         run(tmp_path / name, raises_at(2, UsersError()))
-    folder = folder_of(tmp_path / name)
+    folder = folder_of(tmp_path / name / "runs")
     assert saved(folder) == 2
     assert run(tmp_path / name, resume=folder) == folder
     assert summary(folder)["stop_reason"] == "all steps done"
