@@ -1,7 +1,8 @@
 """The learner's `/metrics` for Prometheus, by Prometheus's naming conventions.
 
 Rule: the training loop publishes a whole snapshot in one assignment now and then, and never waits. The server's threads
-read the newest snapshot and nothing else. Labels have few values, all of them ours: no names of workers, paths or keys.
+read the newest snapshot and nothing else. Labels have few values: ours, and at most `MAX_FACTS` names of `info_keys`; no
+names of workers, paths or keys.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import islice
 from wsgiref.simple_server import WSGIRequestHandler, make_server
 
 import msgspec
@@ -30,8 +32,10 @@ from prometheus_client.registry import Collector
 from learner.config.config import Config
 from learner.rollouts.hub import Hub, HubObserver
 from learner.run_folder.progress import Progress
+from learner.run_folder.results import FactMean
 from learner.run_folder.versions import versions
 from protocol.address import WILDCARDS, is_local
+from protocol.bounds import MAX_FACTS
 from protocol.errors import UsageError
 
 log = logging.getLogger("millrace.learner")
@@ -128,6 +132,7 @@ def _of_progress(now: MetricsSnapshot, updates: int) -> Iterator[Metric]:
         yield GaugeMetricFamily(
             "millrace_episode_length_mean", "Env steps, of the last 100 training episodes.", done.length_mean
         )
+    yield from _of_facts(done.facts)
     yield SummaryMetricFamily(
         "millrace_update_seconds",
         "Updates by this learner and the time they took.",
@@ -141,6 +146,25 @@ def _of_progress(now: MetricsSnapshot, updates: int) -> Iterator[Metric]:
         for name in names:
             stages.add_metric((side, name), done.stages.get(f"{side}_{name}", 0.0))
     yield stages
+
+
+def _of_facts(facts: Mapping[str, FactMean]) -> Iterator[Metric]:
+    """The numbers of `info_keys`. A name is the value of a label, which may be any text: the exposition escapes it."""
+    means = GaugeMetricFamily(
+        "millrace_episode_info_mean",
+        "Numbers in info, by name: of those of the last 100 training episodes that have it.",
+        labels=("key",),
+    )
+    missing = GaugeMetricFamily(
+        "millrace_episode_info_missing",
+        "How many of the last 100 training episodes do not have the number, by name.",
+        labels=("key",),
+    )
+    for name, fact in islice(facts.items(), MAX_FACTS):
+        if fact.mean is not None:
+            means.add_metric((name,), fact.mean)
+        missing.add_metric((name,), fact.missing)
+    yield from (means, missing) if facts else ()
 
 
 def _of_ledger(ledger: Mapping[str, int]) -> Iterator[Metric]:

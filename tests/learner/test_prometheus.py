@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 import zmq
 from prometheus_client import CollectorRegistry, generate_latest
@@ -26,7 +27,9 @@ from learner.prometheus import EVERY_S, STAGES, MetricsCollector, metrics_server
 from learner.rollouts.hub import PULSE_S, Hub, HubSettings
 from learner.run import prometheus_observer
 from learner.run_folder.progress import Progress
+from learner.run_folder.results import FactMean
 from millrace.launch import local_run
+from protocol.bounds import MAX_FACTS
 from protocol.errors import UsageError
 from protocol.messages import Drain
 from protocol.policy.policy import make_policy
@@ -131,6 +134,33 @@ def test_the_numbers_are_those_of_the_coordinator_and_the_ledger(scraped: Scrape
     assert (found["millrace_rollout_lag_versions_count", ()], found["millrace_rollout_lag_versions_sum", ()]) == (3, 3)
     learning.coordinator.drain("done")
     assert by(scraped.metrics(), "millrace_workers", "state") == {"active": 0, "spare": 0, "draining": 2}
+
+
+def test_the_numbers_of_info_keys_are_gauges_whatever_their_names_are(scraped: Scraped) -> None:
+    scraped.learner.joins(A)
+    scraped.learner.publish(0)
+    names = {"is_success", 'the "best"', "C:\\temp\\n", "Güte {a=1}", "millrace_workers"}
+    facts = {name: FactMean(mean=0.25 * number, missing=number) for number, name in enumerate(sorted(names))}
+    scraped.hub.report_progress(msgspec.structs.replace(PROGRESS, facts=facts | {"never": FactMean(None, 9)}))
+    found = scraped.metrics()
+    assert by(found, "millrace_episode_info_mean", "key") == {name: fact.mean for name, fact in facts.items()}
+    missing = {name: fact.missing for name, fact in facts.items()}
+    assert by(found, "millrace_episode_info_missing", "key") == {**missing, "never": 9}
+    assert by(found, "millrace_workers", "state").keys() == {"active", "spare", "draining"}
+
+
+def test_no_more_numbers_of_info_keys_are_shown_than_a_run_may_have(scraped: Scraped) -> None:
+    scraped.learner.joins(A)
+    scraped.learner.publish(0)
+    many = {f"key{number}": FactMean(mean=1.0, missing=0) for number in range(MAX_FACTS + 10)}
+    scraped.hub.report_progress(msgspec.structs.replace(PROGRESS, facts=many))
+    assert len(by(scraped.metrics(), "millrace_episode_info_mean", "key")) == MAX_FACTS
+
+
+def test_without_info_keys_there_is_no_such_gauge(scraped: Scraped) -> None:
+    scraped.learner.joins(A)
+    scraped.learner.publish(0)
+    assert "episode_info" not in str(scraped.metrics().keys())
 
 
 def test_a_worker_without_a_lane_is_a_spare(scraped: Scraped) -> None:
