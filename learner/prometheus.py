@@ -31,6 +31,7 @@ from prometheus_client.registry import Collector
 
 from learner.config.config import Config
 from learner.rollouts.hub import Hub, HubObserver
+from learner.rollouts.ledger import Ledger
 from learner.run_folder.progress import Progress
 from learner.run_folder.results import FactMean
 from learner.run_folder.versions import versions
@@ -72,6 +73,10 @@ class MetricsSnapshot(msgspec.Struct, frozen=True, kw_only=True):
     """Number of handshakes that failed."""
 
 
+SAMPLE = MetricsSnapshot(at_s=1.0, progress=Progress(return_mean=1.0, length_mean=1.0), ledger=Ledger().counts())
+"""A snapshot in which every metric has a value: for the list of metrics in the documentation"""
+
+
 class MetricsCollector(Collector):
     """Keeps the newest snapshot and turns it into metrics."""
 
@@ -81,6 +86,13 @@ class MetricsCollector(Collector):
         self._snapshot = MetricsSnapshot()
         self._updates_before: int | None = None  # updates of earlier learners, if the run was resumed
         self._about = {"env": config.env, "algo": config.algo, "seed": str(config.seed)}
+
+    @staticmethod
+    def of(config: Config, snapshot: MetricsSnapshot) -> MetricsCollector:
+        """A collector that has this snapshot."""
+        collector = MetricsCollector(config)
+        collector._snapshot = snapshot
+        return collector
 
     def observe(self, hub: Hub) -> None:
         """Take a new snapshot if the last one is old enough. Called whenever the hub has listened."""

@@ -10,6 +10,7 @@ import posixpath
 from collections.abc import Callable
 from pathlib import Path
 
+from website import commands_page, metrics_page, python_page, settings_page
 from website.links import Link, elsewhere, resolved, with_links
 
 ROOT = Path(__file__).parent.parent
@@ -22,7 +23,12 @@ FROM_ELSEWHERE = {
 """Files outside docs/ that are pages: path in the repository -> path in the site"""
 START = {"docs": "index.md"}
 """What links to these files becomes a link to this page."""
-MADE: dict[str, Callable[[], str]] = {}
+MADE: dict[str, Callable[[], str]] = {
+    "reference/python.md": python_page.page,
+    "reference/settings.md": settings_page.page,
+    "reference/commands.md": commands_page.page,
+    "reference/metrics.md": metrics_page.page,
+}
 """Pages that are made from the code: path in the site -> what makes it"""
 
 

@@ -1,0 +1,1 @@
+"""Tests of the documentation: links, commands, names and code blocks of README.md and docs/."""

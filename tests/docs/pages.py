@@ -1,0 +1,69 @@
+"""The pages that the tests read, and the blocks of code in them."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from typing import NamedTuple
+
+from website.links import FENCE, outside_fences
+from website.pages import MADE, ROOT
+
+WITHOUT_CHECKS_OF_COMMANDS = {"CHANGELOG.md"}
+"""Pages that also name what was there once"""
+
+
+class Block(NamedTuple):
+    """A fenced block of code."""
+
+    line: int
+    """of the page, at which its first line stands, from 1"""
+    language: str
+    text: str
+
+
+@cache
+def written() -> dict[str, str]:
+    """The text of each page that someone wrote, by its path in the repository."""
+    paths = [*ROOT.glob("docs/**/*.md"), *(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md"))]
+    paths += [ROOT / "protocol" / "README.md"]
+    return {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in sorted(paths)}
+
+
+@cache
+def made() -> dict[str, str]:
+    """The text of each page that is made from the code, by the path that it would have in the repository."""
+    return {f"docs/{page}": make() for page, make in MADE.items()}
+
+
+def manuals() -> dict[str, str]:
+    """The written pages that tell users what to do now."""
+    return {path: text for path, text in written().items() if path not in WITHOUT_CHECKS_OF_COMMANDS}
+
+
+def blocks(text: str) -> list[Block]:
+    """The fenced blocks of a page."""
+    lines = text.split("\n")
+    plain = {number for number, _ in outside_fences(text)}
+    found: list[Block] = []
+    opened: tuple[int, str] | None = None
+    for number, line in enumerate(lines, 1):
+        if number in plain:
+            continue
+        if opened is None:
+            mark = FENCE.match(line)
+            assert mark is not None, line
+            opened = number, line.strip().lstrip("`~").strip()
+        elif FENCE.match(line) and line.strip().strip("`~") == "":
+            found.append(Block(opened[0] + 1, opened[1], "\n".join(lines[opened[0] : number - 1])))
+            opened = None
+    return found
+
+
+def code_spans(text: str) -> list[tuple[int, str]]:
+    """Line and content of each piece of code between backticks."""
+    return [
+        (number, match[1].strip())
+        for number, line in outside_fences(text)
+        for match in re.finditer(r"(?<!`)`([^`\n]+)`(?!`)", line)
+    ]

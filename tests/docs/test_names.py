@@ -1,0 +1,162 @@
+"""Every command, flag, file, exit code and metric that a page names exists."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import pytest
+
+from learner.run_folder.metric_names import METRICS
+from millrace.cli.main import COMMANDS
+from tests.docs import pages
+from tests.docs.commands import all_flags, mistake, shown_in
+from website.metrics_page import prometheus
+from website.pages import ROOT
+
+FLAGS_OF_OTHERS = {
+    "--build", "--scale", "--constraint", "--editable", "--gpus", "--rm", "--network", "--no-deps", "--processes",
+    "--without-pip", "--runs", "--minutes", "--rounds", "--peers", "--seconds", "--numprocesses", "--quick", "--account",
+    "--mem-per-cpu", "--gres", "--requeue", "--save",
+}  # fmt: skip
+"""Flags of pip, Docker, Slurm, the examples and the benchmarks that pages name"""
+OWN_METRICS = {"is_success", "distance", "is_success_missing", "success", "NAME"}
+"""Names that examples choose for numbers of their own"""
+EXIT_CODES = {0, 1, 2, 130, 137, 143}
+FILE = re.compile(r"^(?:learner|workers|protocol|millrace|tests|docs|examples|benchmarks|docker|website)/[\w./-]*[\w/]$")
+ENVIRONMENT = re.compile(r"-v\d+$")
+MADE_BY_COMMANDS = {"benchmarks/results", "benchmarks/results/", "benchmarks/peers/envs"}
+MODULE = re.compile(r"^python3? -m (\w[\w.]*)")
+EXIT_CODE = re.compile(r"exit codes? (\d+)|exits? with (?:code )?(\d+)\b")
+METRIC = re.compile(r"^(rollout|eval|time|lag|drop|ledger|stage|train|replay)/\w+$")
+PROMETHEUS = re.compile(r"^millrace_[a-z_]+$")
+
+
+def wrong_commands(path: str, text: str) -> Iterator[str]:
+    """Commands in blocks that their own parser refuses."""
+    for block in pages.blocks(text):
+        for shown in shown_in(block):
+            if shown.words and (complaint := mistake(shown.words)):
+                yield f"{path}:{shown.line}: millrace {' '.join(shown.words)}: {complaint}"
+
+
+def wrong_names(path: str, text: str, flags: set[str]) -> Iterator[str]:
+    """Names between backticks that do not exist."""
+    metrics = {name for group in METRICS.values() for name in group}
+    of_prometheus = {name for name, *_ in prometheus()}
+    for line, code in pages.code_spans(text):
+        words = code.split()
+        if (
+            words[0] == "millrace"
+            and len(words) > 1
+            and words[1].isalpha()
+            and words[1].islower()
+            and words[1] not in COMMANDS
+        ):
+            yield f"{path}:{line}: {code}: no such command"
+        if words[0] == "millrace" or words[0].startswith("--"):
+            for flag in re.findall(r"(?<![\w-])--[a-z][\w-]*", code):
+                if flag not in flags | FLAGS_OF_OTHERS:
+                    yield f"{path}:{line}: {code}: no such flag: {flag}"
+        if FILE.match(code) and code not in MADE_BY_COMMANDS and not ENVIRONMENT.search(code) and not (ROOT / code).exists():
+            yield f"{path}:{line}: there is no file {code}"
+        if (module := MODULE.match(code)) and module[1].startswith(("benchmarks.", "tests.", "learner", "workers")):
+            file = ROOT / module[1].replace(".", "/")
+            if not (file.with_suffix(".py").is_file() or (file / "__main__.py").is_file()):
+                yield f"{path}:{line}: there is no module {module[1]}"
+        if METRIC.match(code) and code not in metrics and code.partition("/")[2] not in OWN_METRICS:
+            yield f"{path}:{line}: there is no metric {code}"
+        if PROMETHEUS.match(code) and not any(name.startswith(code) for name in of_prometheus):
+            yield f"{path}:{line}: there is no metric {code}"
+    for match in EXIT_CODE.finditer(text):
+        if (number := int(match[1] or match[2])) not in EXIT_CODES:
+            yield f"{path}:{text.count(chr(10), 0, match.start()) + 1}: there is no exit code {number}"
+
+
+@pytest.fixture(scope="module")
+def flags() -> set[str]:
+    return all_flags()
+
+
+@pytest.mark.parametrize("path", pages.manuals())
+def test_its_commands_parse(path: str) -> None:
+    wrong = list(wrong_commands(path, pages.manuals()[path]))
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("path", pages.manuals())
+def test_what_it_names_exists(path: str, flags: set[str]) -> None:
+    wrong = list(wrong_names(path, pages.manuals()[path], flags))
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "millrace trian CartPole-v1",
+        "millrace train CartPole-v1 --stepz 3",
+        "millrace train CartPole-v1 --steps many",
+        "millrace train CartPole-v1 --algo pp0",
+        "millrace train CartPole-v1 --algo dqn --n-epochs 3",
+        "millrace train CartPole-v1 \\\n  --stepz 3",
+        "$ millrace learner CartPole-v1 --bnd tcp://0.0.0.0:5555",
+        "(sleep 1; FOO=1 .venv/bin/millrace worker tcp://host:5555 --proceses 4) &",
+        "millrace worker",
+        "millrace keys make laptop",
+        "millrace keys new laptop --sever x",
+        "millrace status runs/x --wach",
+        "millrace launch kubernetes CartPole-v1 --worker 4",
+        "millrace launch slurm CartPole-v1 -- --stepz 3",
+        "millrace launch moon CartPole-v1",
+        "millrace evaluate runs/x --bets",
+        "millrace record runs/x",
+        "millrace plot runs/x --output y",
+        "millrace bench everything",
+        "millrace presets now",
+        "millrace --hepl",
+        "ls && millrace report runs/* --bst > x",
+    ],
+)
+def test_a_wrong_command_is_found(line: str) -> None:
+    assert len(list(wrong_commands("page.md", f"text\n\n```bash\n{line}\n```\n"))) == 1
+
+
+def test_right_commands_are_not_called_wrong() -> None:
+    text = """```bash
+millrace train CartPole-v1 --algo dqn --steps 1000 --target-return none   # a comment with --stepz
+millrace train CartPole-v1 --algo my_module:Mine --penalty 0.2 --env-kwargs a 1 --net 8 8
+millrace train --config runs/x/config.toml
+millrace learner CartPole-v1 --bind tcp://0.0.0.0:5555 --core lstm &
+millrace worker tcp://host:5555 --token laptop.token --processes 4 | tee log
+millrace keys new laptop; millrace keys show
+millrace launch kubernetes CartPole-v1 --workers 4 -- --steps 1000 > k8s.yaml
+millrace status runs/x --watch
+millrace evaluate runs/x --video && millrace plot runs/* --out c.png
+millrace train --help
+echo "it's not shell
+```
+```python
+millrace trian
+```
+"""
+    assert not list(wrong_commands("page.md", text))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "`--eval-evry 3`", "`millrace train --stepz`", "`millrace trian x`", "`learner/no_such.py`", "`docs/how-to/no.md`",
+        "`python -m benchmarks.no_such`", "`train/value_los`", "`stage/learner_sleep`", "`millrace_env_stepz`",
+        "It ends with exit code 3.", "It exits with 4.",
+    ],
+)  # fmt: skip
+def test_a_wrong_name_is_found(text: str, flags: set[str]) -> None:
+    assert len(list(wrong_names("page.md", text, flags))) == 1
+
+
+def test_right_names_are_not_called_wrong(flags: set[str]) -> None:
+    text = (
+        "`--eval-every 3`, `millrace train --steps 3`, `learner/train.py`, `tests/`, `python -m benchmarks.two_hosts`, "
+        "`train/value_loss`, `rollout/is_success`, `millrace_env_steps_total`, exit code 130"
+    )
+    assert not list(wrong_names("page.md", text, flags))

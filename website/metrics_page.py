@@ -1,0 +1,51 @@
+"""reference/metrics.md: every number of metrics.jsonl, TensorBoard and Prometheus, from the code that makes them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from prometheus_client.metrics_core import Metric
+
+from learner.config.config import Config
+from learner.prometheus import SAMPLE, MetricsCollector
+from learner.run_folder.metric_names import METRICS
+from website.tables import anchored, table
+
+HEAD = """# Metrics
+
+Look here for the meaning of a number in a log. `metrics.jsonl` in the [run folder](run_folder.md) has a row for each update;
+`millrace.Run(path).metrics` reads it. TensorBoard shows the same numbers under the same names, and so do the
+[W&B](../how-to/wandb.md) and [MLflow](../how-to/mlflow.md) callbacks. Names are those of Stable-Baselines3 where it has one.
+A number that does not exist yet is missing or null. `ledger/…` and `stage/…` count from the beginning of the run.
+
+In a name, NAME stands for a name that you chose.
+
+"""
+PROMETHEUS = """## Prometheus
+
+A learner with `--metrics-bind 127.0.0.1:9464` shows these at `http://127.0.0.1:9464/metrics`. Prometheus itself adds
+`process_…` (memory and CPU of the learner).
+
+"""
+
+
+def page() -> str:
+    """The page."""
+    parts = [HEAD]
+    for title, names in METRICS.items():
+        rows = ((anchored(name, f"`{name}`"), meaning.unit, meaning.text) for name, meaning in names.items())
+        parts.append(f"## {title}\n\n{table(('name', 'unit', 'meaning'), rows)}\n")
+    rows = ((anchored(name, f"`{name}`"), kind, labels, text) for name, kind, labels, text in prometheus())
+    return "".join([*parts, PROMETHEUS, table(("name", "type", "labels", "meaning"), rows)])
+
+
+def prometheus() -> Iterator[tuple[str, str, str, str]]:
+    """Name as Prometheus shows it, type, labels and text of each metric of a learner that trains."""
+    for metric in MetricsCollector.of(Config(env="CartPole-v1"), SAMPLE).collect():
+        labels = {label for sample in metric.samples for label in sample.labels} - {"le"}
+        shown = "" if metric.type == "info" else ", ".join(f"`{label}`" for label in sorted(labels))
+        yield _shown_name(metric), metric.type, shown or "–", metric.documentation
+
+
+def _shown_name(metric: Metric) -> str:
+    return metric.name + {"counter": "_total", "info": "_info"}.get(metric.type, "")

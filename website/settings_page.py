@@ -1,0 +1,156 @@
+"""reference/settings.md: every setting of a run, from the records that hold them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from enum import Enum
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import msgspec
+
+from learner.config.command_line import RunFlags
+from learner.config.config import Config
+from learner.config.flag_help import BASIC, GROUPS, field_texts
+from learner.config.hyperparameters import HYPERPARAMETERS
+from learner.config.on_resume import OnResume, declared
+from website.tables import anchored, table
+
+HEAD = """# Settings
+
+Look here for the name, the range and the default of a setting. Each setting of a run has one name in three places:
+
+- as a flag of `millrace train` and `millrace learner`, with dashes: `--eval-every 1000`;
+- as a key of a TOML file for `--config`, with underscores: `eval_every = 1000`;
+- as a keyword of `millrace.train`, with underscores: `eval_every=1000`.
+
+Settings of an algorithm stand in a table of the TOML file that has the algorithm's name, as `[ppo]`. Keyword arguments
+of the environment stand in the table `[env_kwargs]`. A flag wins over `--config`, and `--config` wins over a preset. The
+config.toml of a run folder has every setting of that run.
+
+A list is written as `--net 64 64` and as `net = [64, 64]`. A setting that may be none is written as `--core none` and as
+`core = "none"`. A setting that is true or false is written as `--shared-net` or `--no-shared-net`, and as
+`shared_net = true`.
+
+The column "on resume" says what happens if a [resumed run](../how-to/resume.md) gets another value:
+
+"""
+COLUMNS = ("setting", "values", "default", "on resume", "meaning")
+TITLES = {
+    "evaluation": "Evaluation",
+    "worker": "Workers",
+    "network": "Network",
+    "timeout and failure": "Timeouts and failures",
+    "file and log": "Files and logs",
+}
+"""Headings of the groups of `--help`"""
+LAYERS = ("config", "preset", "resume", "log_json", "debug")
+"""Flags that are no settings: they say where settings come from, or how errors and logs look."""
+KINDS = {bool: "true or false", int: "int", float: "float", str: "text", Path: "path"}
+
+
+def page() -> str:
+    """The page."""
+    parts = [HEAD + "".join(f"- **{one.name.lower()}**: {one.value}\n" for one in OnResume)]
+    parts.append("\n## Basics\n\n" + _table(Config, [name for name in BASIC if name not in LAYERS]))
+    parts.append(
+        "\n## Where settings come from\n\nThese flags are no settings: no TOML file and no run folder holds them.\n\n"
+        + _table(RunFlags, LAYERS)
+    )
+    for title, names in GROUPS.items():
+        parts.append(f"\n## {TITLES[title]}\n\n" + _table(Config, [name for name in names if name not in LAYERS]))
+    for algo, record in HYPERPARAMETERS.items():
+        about = " ".join((record.__doc__ or "").split())
+        parts.append(
+            f"\n## Algorithm {algo}\n\n{about} `--algo {algo}`, TOML table `[{algo}]`.\n\n"
+            + _table(record, list(field_texts(record)), f"{algo}.")
+        )
+    return "".join(parts)
+
+
+def shown_names() -> list[str]:
+    """All settings and flags that the page shows, those of algorithms as `ALGO.NAME`."""
+    names = [*BASIC, *LAYERS, *(name for group in GROUPS.values() for name in group)]
+    return sorted({*names, *(f"{algo}.{name}" for algo, record in HYPERPARAMETERS.items() for name in field_texts(record))})
+
+
+def _table(record: type[msgspec.Struct], names: Sequence[str], prefix: str = "") -> str:
+    hints, texts = get_type_hints(record, include_extras=True), field_texts(record)
+    resumed = {} if record is RunFlags else declared(record)
+    defaults = record()
+    return table(
+        COLUMNS,
+        (
+            (
+                anchored(f"{prefix}{name}", f"`{flag(name)}`"),
+                values(hints[name]),
+                default(getattr(defaults, name)),
+                resumed[name].name.lower() if name in resumed else "–",
+                texts[name],
+            )
+            for name in names
+        ),
+    )
+
+
+def flag(name: str) -> str:
+    """How a setting is written on the command line."""
+    return "ENV" if name == "env" else f"--{name.replace('_', '-')}"
+
+
+def default(value: Any) -> str:
+    """A default, as it is written on the command line."""
+    if value is None:
+        return "none"
+    if value in ("", (), {}):
+        return "–"
+    match value:
+        case bool():
+            return str(value).lower()
+        case tuple():
+            return f"`{' '.join(map(str, value))}`"
+        case _:
+            return f"`{value}`"
+
+
+def values(hint: Any) -> str:
+    """Which values a type allows, in words."""
+    kind, notes = _bare(hint)
+    if kind in KINDS:
+        return KINDS[kind] + "".join(notes)
+    arguments = get_args(kind)
+    match get_origin(kind):
+        case origin if origin is Literal:
+            return ", ".join(f"`{one}`" for one in arguments)
+        case origin if origin in (Union, UnionType):
+            some = [values(one) for one in arguments if one is not NoneType]
+            return " or ".join([*some, "none"] if NoneType in arguments else some)
+        case origin if origin is tuple:
+            return f"list of {values(arguments[0])}"
+        case origin if origin is dict:
+            return "table"
+    raise TypeError(f"settings page: expected a type that it can describe, got {hint}")
+
+
+def _bare(hint: Any) -> tuple[Any, list[str]]:
+    """A type without annotations, and its bounds in words."""
+    if get_origin(hint) is not Annotated:
+        return hint, []
+    inner, *marks = get_args(hint)
+    kind, notes = _bare(inner)
+    for mark in marks:
+        if isinstance(mark, msgspec.Meta):
+            notes += _bounds(mark)
+        elif isinstance(mark, Enum):
+            continue
+    return kind, notes
+
+
+def _bounds(meta: msgspec.Meta) -> Iterator[str]:
+    if meta.ge is not None and meta.le is not None:
+        yield f", {meta.ge:g} to {meta.le:g}"
+        return
+    for sign, bound in (("≥", meta.ge), (">", meta.gt), ("≤", meta.le), ("<", meta.lt)):
+        if bound is not None:
+            yield f" {sign} {bound:g}"
