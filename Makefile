@@ -9,7 +9,7 @@ BIN := .venv/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: train test lint type unit docs site bench bench-peers test-learning test-cluster test-model test-processors test-versions \
+.PHONY: train test lint type unit docs site dist bench bench-peers test-learning test-cluster test-model test-processors test-versions \
 	test-kill soak clean
 
 train: .venv/installed  ## train CartPole-v1 on two worker processes until a greedy evaluation averages 475
@@ -53,8 +53,12 @@ soak: .venv/installed-dev  ## faults for ten minutes, every two seconds one; the
 docs: .venv/installed-dev  ## write the generated parts of protocol/README.md
 	$(BIN)/python -m tests.protocol.test_wire_document
 
-site: .venv/installed-docs  ## build the documentation site in site/: warnings are errors
+site: .venv/installed-docs  ## build the documentation in site/: warnings are errors, links are checked, every block of code runs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	$(BIN)/python -m pytest --numprocesses $$(nproc) -m 'docs or not docs' tests/docs
+
+dist: .venv/installed-dev  ## build sdist and wheel in dist/, install each into a clean environment, and train from there
+	$(BIN)/python -m tests.distributions
 
 bench: .venv/installed-dev  ## all benchmarks, ten minutes: tables here, JSON and pictures in benchmarks/results
 	$(BIN)/millrace bench

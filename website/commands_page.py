@@ -8,6 +8,7 @@ import os
 import re
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 from learner.config.hyperparameters import HYPERPARAMETERS
@@ -50,6 +51,7 @@ def lines_of(name: str) -> list[str]:
             return [name]
 
 
+@cache
 def help_of(line: str) -> str:
     """What `millrace LINE --help` prints in a terminal of 100 columns, without colors."""
     if line == "bench":  # a process of its own, so its output cannot be redirected here

@@ -19,7 +19,7 @@ GROUPS = {
     "Policies that act in workers": ("MLP", "CNN", "Recurrent", "OwnPolicy", "PolicyParameters", "Piece"),
     "Errors": (
         "MillraceError", "UserFacingError", "UsageError", "RunError", "CheckpointError", "NoWorkers", "WorkerLost",
-        "Stalled", "EnvironmentFailed",
+        "Stalled", "EnvironmentFailed", "PolicyFailed",
     ),
 }  # fmt: skip
 """The names of `millrace.__all__`; its modules and `__version__` have sections of their own"""

@@ -28,6 +28,8 @@ SHELL = {"", "bash", "sh", "console", "shell"}
 OPERATORS = re.compile(r"^[();<>|&]+$")
 PLACEHOLDER = re.compile(r"^(…|\.\.\.|[A-Z_]+)$")
 NO_ARGUMENT = re.compile(r"^(…|\.\.\.|\[.*|[A-Za-z.…]+\])$")
+LISTED = re.compile(r"^\s*millrace/? {2,}")
+"""The folder `millrace` in a list of folders"""
 BEFORE = {"nohup", "exec", "time", "nice", "env", "srun"}
 """Words that may stand before a command"""
 LAUNCHERS = {"kubernetes": flags.KubernetesFlags, "slurm": flags.SlurmFlags, "ray": flags.RayFlags}
@@ -58,13 +60,15 @@ def shown_in(block: Block) -> Iterator[Shown]:
     text = re.sub(r"\\\n", "  ", block.text)
     number = block.line
     for line in text.split("\n"):
-        for words in _commands(line.strip().removeprefix("$ ")):
-            yield Shown(number, words)
+        if block.language or not LISTED.match(line):
+            for words in _commands(line.strip().removeprefix("$ ")):
+                yield Shown(number, words)
         number += 1
 
 
 def _commands(line: str) -> Iterator[tuple[str, ...]]:
     """What stands after `millrace` in each command of a line of shell."""
+    line = re.sub(r"(?<=\w)(\|\w+)+", "", line)  # one of several words, as in new|show
     lexer = shlex.shlex(line, posix=True, punctuation_chars=True)
     lexer.commenters = "#"
     lexer.whitespace_split = True

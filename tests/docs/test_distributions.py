@@ -1,0 +1,35 @@
+"""What `make dist` finds wrong with the files of a distribution, and that the changelog has the version."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+
+import pytest
+
+from tests.distributions import PACKAGES, ROOT, data_files, mistakes
+
+
+def test_the_packages_have_data_that_must_travel() -> None:
+    assert {*(f"{package}/py.typed" for package in PACKAGES), "learner/config/presets.toml"} <= data_files()
+
+
+@pytest.mark.parametrize("lost", ["millrace/py.typed", "learner/config/presets.toml", "workers/__init__.py"])
+def test_a_file_that_is_missing_is_named(lost: str) -> None:
+    whole = {*data_files(), *(f"{package}/__init__.py" for package in PACKAGES)}
+    assert mistakes(whole, data_files()) == []
+    assert mistakes(whole - {lost}, data_files()) == [f"{lost} is missing"]
+
+
+def test_tests_in_a_distribution_are_named() -> None:
+    whole = {*data_files(), *(f"{package}/__init__.py" for package in PACKAGES)}
+    (line,) = mistakes({*whole, "tests/conftest.py", "tests/versions.py"}, data_files())
+    assert line.startswith("tests/conftest.py: expected no tests")
+
+
+def test_the_changelog_has_this_version_below_what_is_unreleased() -> None:
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    headings = re.findall(r"^## \[(.+?)\](.*)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert headings[0] == ("Unreleased", "")
+    assert headings[1][0] == version
+    assert re.fullmatch(r" - \d{4}-\d{2}-\d{2}", headings[1][1])

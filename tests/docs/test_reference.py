@@ -1,0 +1,142 @@
+"""The reference pages are complete: every setting, public name, metric, exit code and file of a run folder is there."""
+
+from __future__ import annotations
+
+import json
+import re
+import tempfile
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+import millrace
+from learner.config.command_line import RunFlags
+from learner.config.hyperparameters import HYPERPARAMETERS
+from learner.run_folder import run_folder
+from learner.run_folder.metric_names import METRICS
+from protocol import errors
+from protocol.errors import UserFacingError
+from website import commands_page, docstring_examples, python_page, settings_page
+from website.pages import ROOT
+
+KNOWN = {name for group in METRICS.values() for name in group}
+RUNS = {
+    "ppo": {"algo": "ppo", "info_keys": "distance"},
+    "ppo, Box actions": {"env": "Pendulum-v1", "algo": "ppo"},
+    "a2c": {"algo": "a2c"},
+    "impala": {"algo": "impala"},
+    "reinforce": {"algo": "reinforce", "rollout_steps": 501, "steps": 2_100},
+    "dqn": {"algo": "dqn", "learning_starts": 0, "gradient_steps": 1},
+}
+
+
+def general(name: str) -> str:
+    """A name in which the user's own part is NAME."""
+    group, _, last = name.partition("/")
+    return f"{group}/{last.replace('distance', 'NAME').replace('own_number', 'NAME')}"
+
+
+@cache
+def logged(which: str) -> tuple[set[str], set[str]]:
+    """The names that a small run logs, and the names of the files in its folder."""
+
+    class Log(millrace.Callback):
+        def on_update(self, progress: millrace.Progress) -> None:
+            progress.log("own_number", 1)
+
+    sizes = {"envs": 2, "lanes": 1, "rollout_steps": 8, "eval_episodes": 1, "eval_every": 16, "workers": 1}
+    chosen = {"env": "CartPole-v1", "steps": 200, "preset": "none", "transport": "inproc", **sizes, **RUNS[which]}
+    with tempfile.TemporaryDirectory() as folder:
+        run = millrace.train(**chosen, run_dir=folder, progress=False, callbacks=[Log()])  # type: ignore[arg-type]
+        rows = [json.loads(line) for line in (run.path / "metrics.jsonl").read_text().splitlines()]
+        return {name for row in rows for name in row}, {path.name for path in run.path.iterdir()}
+
+
+@pytest.mark.parametrize("which", RUNS)
+def test_every_metric_of_a_run_has_a_meaning(which: str) -> None:
+    names, _ = logged(which)
+    assert {general(name) for name in names} <= KNOWN
+    assert "custom/own_number" in names
+
+
+def test_every_meaning_is_of_a_metric() -> None:
+    found = {"train/NAME"}  # of an algorithm of the user's own
+    for which in RUNS:
+        names, _ = logged(which)
+        found |= {general(name) for name in names}
+    assert found == KNOWN
+
+
+def test_every_setting_is_on_the_page() -> None:
+    expected = {field for field in RunFlags.__struct_fields__ if field != "algorithm"}
+    expected |= {f"{algo}.{field}" for algo, record in HYPERPARAMETERS.items() for field in record.__struct_fields__}
+    assert set(settings_page.shown_names()) == expected
+    page = settings_page.page()
+    assert [name for name in expected if f'<span id="{name}">' not in page] == []
+    assert "| int ≥ 1 |" in page
+    assert "| `auto`, `cpu`, `cuda` |" in page
+
+
+@pytest.mark.parametrize(
+    ("hint", "words"),
+    [
+        (Path | None, "path or none"),
+        (tuple[int, ...], "list of int"),
+        (float | None, "float or none"),
+        (dict[str, int], "table"),
+    ],
+)
+def test_a_type_is_said_in_words(hint: object, words: str) -> None:
+    assert settings_page.values(hint) == words
+
+
+def test_a_type_that_nobody_knows_is_an_error() -> None:
+    with pytest.raises(TypeError, match="expected a type that it can describe"):
+        settings_page.values(set[int])
+
+
+def test_every_public_name_is_on_the_python_page() -> None:
+    public = set(millrace.__all__) - set(python_page.MODULES) - {"__version__"}
+    assert {name for names in python_page.GROUPS.values() for name in names} == public
+    assert {name for name in millrace.__all__ if name in millrace._MODULES} <= set(python_page.MODULES)
+    page = python_page.page()
+    for module in ("algorithms", "testing", "integrations"):
+        for name in getattr(millrace, module).__all__:
+            assert f"::: millrace.{module}.{name}\n" in page
+    assert "::: millrace.sb3.make_vec_env\n" in page
+
+
+def test_every_command_is_on_its_page() -> None:
+    page = commands_page.page()
+    for name in commands_page.COMMANDS:
+        assert f"### millrace {name}\n" in page
+    for line in ("keys revoke", "launch slurm", "train --algo dqn", "bench"):
+        assert f"$ millrace {line} --help\n" in page
+    assert "--replay-size" in page
+
+
+def test_every_exit_code_of_an_error_is_on_its_page() -> None:
+    page = (ROOT / "docs/reference/exit_codes.md").read_text()
+    for name in millrace.__all__:
+        error = getattr(errors, name, None)
+        if isinstance(error, type) and issubclass(error, UserFacingError) and error is not UserFacingError:
+            (row,) = [row for row in page.splitlines() if row.startswith("|") and f"`{name}`" in row]
+            assert row.endswith(f"| {error.exit_code} |")
+
+
+def test_every_file_of_a_run_folder_is_on_its_page() -> None:
+    page = (ROOT / "docs/reference/run_folder.md").read_text()
+    listed = {name.rstrip("/") for name in re.findall(r"^\| `([\w./]+)` \|", page, re.MULTILINE)}
+    in_code = {name.rstrip("/") for name in re.findall(r"^      ([\w.]+/?) {2,}", run_folder.__doc__ or "", re.MULTILINE)}
+    _, there = logged("ppo")
+    assert there <= listed
+    assert in_code <= listed
+    assert len(in_code) >= 10
+
+
+def test_examples_in_docstrings_become_code() -> None:
+    text = "About.\n\n>>> x = 1\n>>> x\n1\n\nMore.\n\n    >>> y"
+    assert docstring_examples.with_fences(text) == (
+        "About.\n\n```pycon\n>>> x = 1\n>>> x\n1\n```\n\nMore.\n\n    ```pycon\n    >>> y\n    ```"
+    )
