@@ -69,6 +69,7 @@ def shown_in(block: Block) -> Iterator[Shown]:
 def _commands(line: str) -> Iterator[tuple[str, ...]]:
     """What stands after `millrace` in each command of a line of shell."""
     line = re.sub(r"(?<=\w)(\|\w+)+", "", line)  # one of several words, as in new|show
+    line = re.sub(r"(?<=\s)\d>", ">", re.sub(r"\$\{?\w+\}?", "1", line))  # variables; redirections of a numbered stream
     lexer = shlex.shlex(line, posix=True, punctuation_chars=True)
     lexer.commenters = "#"
     lexer.whitespace_split = True
@@ -173,7 +174,7 @@ def _refuse(message: str) -> None:
 
 def all_flags() -> set[str]:
     """Every flag of every command, from the help texts."""
-    found: set[str] = set()
+    found = {"--version"}
     for name in COMMANDS:
         for line in lines_of(name):
             found |= set(re.findall(r"(?<![\w-])--[a-z][\w-]*", help_of(line)))

@@ -7,7 +7,7 @@ from functools import cache
 from typing import NamedTuple
 
 from website.links import FENCE, outside_fences
-from website.pages import MADE, ROOT
+from website.pages import FROM_ELSEWHERE, MADE, ROOT
 
 WITHOUT_CHECKS_OF_COMMANDS = {"CHANGELOG.md"}
 """Pages that also name what was there once"""
@@ -34,6 +34,11 @@ def written() -> dict[str, str]:
 def made() -> dict[str, str]:
     """The text of each page that is made from the code, by the path that it would have in the repository."""
     return {f"docs/{page}": make() for page, make in MADE.items()}
+
+
+def in_the_site() -> dict[str, str]:
+    """The texts of files that the site has elsewhere, by the path that they would have in the repository."""
+    return {f"docs/{page}": written()[source] for source, page in FROM_ELSEWHERE.items()}
 
 
 def manuals() -> dict[str, str]:
