@@ -59,7 +59,15 @@ def install_and_train(distribution: Path, folder: Path) -> str:
     work.mkdir(parents=True)
     clean = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     subprocess.run([sys.executable, "-m", "venv", environment], check=True)
-    pip = [environment / "bin" / "python", "-m", "pip", "install", "--quiet", "--constraint", ROOT / "constraints.txt"]
+    pip: list[str | Path] = [
+        environment / "bin" / "python",
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--constraint",
+        ROOT / "constraints.txt",
+    ]
     subprocess.run([*pip, distribution], check=True, cwd=work, env=clean)
     millrace = environment / "bin" / "millrace"
     said = subprocess.run(

@@ -1,7 +1,4 @@
-"""An extension of Griffe (mkdocstrings): examples in doctest's style become blocks of code in the pages.
-
-Rule: an example begins with a line `>>>` and ends with an empty line or the end of the docstring.
-"""
+"""An extension of Griffe (mkdocstrings): examples in doctest's style become blocks of code in the pages."""
 
 from __future__ import annotations
 
@@ -9,28 +6,13 @@ from typing import Any
 
 import griffe
 
+from website.doctest_fences import with_fences
 
-class DocstringExamples(griffe.Extension):
+
+class DocstringExamples(griffe.Extension):  # type: ignore[misc]  # mypy skips griffe
     """Puts fences around examples in docstrings."""
 
     def on_object(self, *, obj: griffe.Object, **kwargs: Any) -> None:
         """See `griffe.Extension`."""
         if obj.docstring is not None:
             obj.docstring.value = with_fences(obj.docstring.value)
-
-
-def with_fences(text: str) -> str:
-    """A docstring in which each example stands in a fenced block."""
-    lines: list[str] = []
-    indent: str | None = None
-    for line in text.split("\n"):
-        if indent is None and line.lstrip().startswith(">>> "):
-            indent = line[: len(line) - len(line.lstrip())]
-            lines.append(f"{indent}```pycon")
-        elif indent is not None and not line.strip():
-            lines.append(f"{indent}```")
-            indent = None
-        lines.append(line)
-    if indent is not None:
-        lines.append(f"{indent}```")
-    return "\n".join(lines)

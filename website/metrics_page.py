@@ -35,8 +35,8 @@ def page() -> str:
     for title, names in METRICS.items():
         rows = ((anchored(name, f"`{name}`"), meaning.unit, meaning.text) for name, meaning in names.items())
         parts.append(f"## {title}\n\n{table(('name', 'unit', 'meaning'), rows)}\n")
-    rows = ((anchored(name, f"`{name}`"), kind, labels, text) for name, kind, labels, text in prometheus())
-    return "".join([*parts, PROMETHEUS, table(("name", "type", "labels", "meaning"), rows)])
+    shown = ((anchored(name, f"`{name}`"), kind, labels, text) for name, kind, labels, text in prometheus())
+    return "".join([*parts, PROMETHEUS, table(("name", "type", "labels", "meaning"), shown)])
 
 
 def prometheus() -> Iterator[tuple[str, str, str, str]]:

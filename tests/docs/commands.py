@@ -32,8 +32,12 @@ LISTED = re.compile(r"^\s*millrace/? {2,}")
 """The folder `millrace` in a list of folders"""
 BEFORE = {"nohup", "exec", "time", "nice", "env", "srun"}
 """Words that may stand before a command"""
-LAUNCHERS = {"kubernetes": flags.KubernetesFlags, "slurm": flags.SlurmFlags, "ray": flags.RayFlags}
-RECORDS = {
+LAUNCHERS: dict[str, type[flags.LaunchFlags]] = {
+    "kubernetes": flags.KubernetesFlags,
+    "slurm": flags.SlurmFlags,
+    "ray": flags.RayFlags,
+}
+RECORDS: dict[str, type[Any]] = {
     "evaluate": flags.EvaluateFlags,
     "record": flags.RecordFlags,
     "plot": flags.PlotFlags,

@@ -13,10 +13,12 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tests.docs import pages
+from website.pages import ROOT
 
 DEADLINE_S = 100
 FILE_NAME = re.compile(r"^# (\w+\.py)\b")
@@ -58,7 +60,7 @@ def run_page(path: str, text: str, folder: Path) -> str:
         "MPLBACKEND": "agg",
         "WANDB_MODE": "offline",
     }
-    python_path = os.pathsep.join([str(pages.ROOT), os.environ.get("PYTHONPATH", "")]).strip(os.pathsep)
+    python_path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]).strip(os.pathsep)
     done = subprocess.run(
         [sys.executable, "page.py"],
         cwd=folder,
@@ -75,7 +77,7 @@ def run_page(path: str, text: str, folder: Path) -> str:
     return f"{path}: exit code {done.returncode}\n{done.stderr.replace(str(folder / 'page.py'), path)}"
 
 
-def with_blocks() -> list[pytest.param]:  # type: ignore[valid-type]
+def with_blocks() -> list[Any]:
     """The pages that have blocks of Python; those that take long are marked."""
     return [
         pytest.param(path, marks=() if path in QUICK else pytest.mark.docs, id=path)

@@ -7,6 +7,7 @@ import re
 import tempfile
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -15,13 +16,15 @@ from learner.config.command_line import RunFlags
 from learner.config.hyperparameters import HYPERPARAMETERS
 from learner.run_folder import run_folder
 from learner.run_folder.metric_names import METRICS
+from millrace.cli.main import COMMANDS
 from protocol import errors
 from protocol.errors import UserFacingError
-from website import commands_page, docstring_examples, python_page, settings_page
+from website import commands_page, python_page, settings_page
+from website.doctest_fences import with_fences
 from website.pages import ROOT
 
 KNOWN = {name for group in METRICS.values() for name in group}
-RUNS = {
+RUNS: dict[str, dict[str, Any]] = {
     "ppo": {"algo": "ppo", "info_keys": "distance"},
     "ppo, Box actions": {"env": "Pendulum-v1", "algo": "ppo"},
     "a2c": {"algo": "a2c"},
@@ -46,9 +49,16 @@ def logged(which: str) -> tuple[set[str], set[str]]:
             progress.log("own_number", 1)
 
     sizes = {"envs": 2, "lanes": 1, "rollout_steps": 8, "eval_episodes": 1, "eval_every": 16, "workers": 1}
-    chosen = {"env": "CartPole-v1", "steps": 200, "preset": "none", "transport": "inproc", **sizes, **RUNS[which]}
+    chosen: dict[str, Any] = {
+        "env": "CartPole-v1",
+        "steps": 200,
+        "preset": "none",
+        "transport": "inproc",
+        **sizes,
+        **RUNS[which],
+    }
     with tempfile.TemporaryDirectory() as folder:
-        run = millrace.train(**chosen, run_dir=folder, progress=False, callbacks=[Log()])  # type: ignore[arg-type]
+        run = millrace.train(**chosen, run_dir=folder, progress=False, callbacks=[Log()])
         rows = [json.loads(line) for line in (run.path / "metrics.jsonl").read_text().splitlines()]
         return {name for row in rows for name in row}, {path.name for path in run.path.iterdir()}
 
@@ -109,7 +119,7 @@ def test_every_public_name_is_on_the_python_page() -> None:
 
 def test_every_command_is_on_its_page() -> None:
     page = commands_page.page()
-    for name in commands_page.COMMANDS:
+    for name in COMMANDS:
         assert f"### millrace {name}\n" in page
     for line in ("keys revoke", "launch slurm", "train --algo dqn", "bench"):
         assert f"$ millrace {line} --help\n" in page
@@ -137,6 +147,4 @@ def test_every_file_of_a_run_folder_is_on_its_page() -> None:
 
 def test_examples_in_docstrings_become_code() -> None:
     text = "About.\n\n>>> x = 1\n>>> x\n1\n\nMore.\n\n    >>> y"
-    assert docstring_examples.with_fences(text) == (
-        "About.\n\n```pycon\n>>> x = 1\n>>> x\n1\n```\n\nMore.\n\n    ```pycon\n    >>> y\n    ```"
-    )
+    assert with_fences(text) == ("About.\n\n```pycon\n>>> x = 1\n>>> x\n1\n```\n\nMore.\n\n    ```pycon\n    >>> y\n    ```")
