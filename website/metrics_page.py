@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from prometheus_client.metrics_core import Metric
 
 from learner.config.config import Config
+from learner.metric_names import METRICS
 from learner.prometheus import SAMPLE, MetricsCollector
-from learner.run_folder.metric_names import METRICS
 from website.tables import anchored, table
 
 HEAD = """# Metrics

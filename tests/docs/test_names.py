@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from learner.run_folder.metric_names import METRICS
+from learner.metric_names import METRICS
 from millrace.cli.main import COMMANDS
 from tests.docs import pages
 from tests.docs.commands import all_flags, mistake, shown_in

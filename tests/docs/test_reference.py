@@ -14,8 +14,8 @@ import pytest
 import millrace
 from learner.config.command_line import RunFlags
 from learner.config.hyperparameters import HYPERPARAMETERS
+from learner.metric_names import METRICS
 from learner.run_folder import run_folder
-from learner.run_folder.metric_names import METRICS
 from millrace.cli.main import COMMANDS
 from protocol import errors
 from protocol.errors import UserFacingError
