@@ -7,6 +7,11 @@ import os
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # as the command line does: bits must not depend on the number of cores
 
+import sys
+
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else hundreds of processes of tests each compile all that they import
+sys.dont_write_bytecode = False
+
 import tempfile
 import threading
 import time
@@ -18,6 +23,9 @@ import psutil
 import pytest
 
 from tests.support import preloaded
+from workers.supervise import worker_process
+
+worker_process.popen = preloaded.start_worker  # type: ignore[assignment]
 
 LEAVE_WITHIN_S = 5.0
 SOAK_TIMEOUT_S = 1200  # of a test of that mark: it takes minutes, and longer on a busy machine
@@ -35,8 +43,22 @@ def _runs(process: psutil.Process) -> bool:
     return False
 
 
+def _has_children(process: int) -> bool:
+    """Whether a process has a child that is not a preloaded parent, or such a parent has one. True if unknown."""
+    found: set[int] = set()
+    try:
+        for children in Path(f"/proc/{process}/task").glob("*/children"):
+            found.update(map(int, children.read_text().split()))
+    except OSError:
+        return True
+    parents = preloaded.parent_pids()
+    return not Path(f"/proc/{process}/task/{process}/children").exists() or any(
+        child not in parents or _has_children(child) for child in found
+    )
+
+
 def pytest_unconfigure() -> None:
-    preloaded.close_parent()
+    preloaded.close_parents()
 
 
 @pytest.fixture(autouse=True)
@@ -48,8 +70,11 @@ def nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
     threads = set(threading.enumerate())
     yield
     deadline = time.monotonic() + LEAVE_WITHIN_S
-    children = [child for child in psutil.Process().children(recursive=True) if _runs(child)]
-    children = [child for child in children if child.pid != preloaded.parent_pid()]
+    if _has_children(os.getpid()):  # psutil reads all of /proc
+        children = [child for child in psutil.Process().children(recursive=True) if _runs(child)]
+        children = [child for child in children if child.pid not in preloaded.parent_pids()]
+    else:
+        children = []
     _, alive = psutil.wait_procs(children, timeout=LEAVE_WITHIN_S)
     alive = [child for child in alive if _runs(child)]
     for child in alive:

@@ -1,12 +1,13 @@
-"""Starts `python -m learner` and `python -m millrace` as children that a preloaded parent forks: PyTorch is imported once.
+"""Starts learners and workers as children that a preloaded parent forks: imports happen once.
 
 Rule: a command is forked only if nothing that the interpreter or a library reads when it starts differs from the parent's:
-else it is executed (`may_be_forked`). With TESTS_EXEC=1, and outside a test, every command is executed. There is one
-parent for each process of pytest; it starts with the first command and ends with pytest.
+else it is executed (`may_be_forked`). With TESTS_EXEC=1, and outside a test, every command is executed. Each process of
+pytest has one parent for learners and one for workers; it starts with its first command and ends with pytest.
 """
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import select
@@ -19,12 +20,18 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any
+from typing import IO, Any, Literal
+
+import psutil
+
+from workers.supervise.worker_process import NONCE_VARIABLE
 
 PROGRAM = Path(__file__).with_name("preloaded_parent.py")
 LEARNERS = (["learner"], ["millrace", "train"], ["millrace", "learner"], ["millrace", "evaluate"], ["millrace", "record"])
 """Modules, and their first argument. Other commands do without PyTorch, and must be seen to."""
-PER_COMMAND = {"COLUMNS", "PYTEST_CURRENT_TEST", "PYTHONPATH", "PYTHONUNBUFFERED", "TMPDIR"}
+SUPERVISOR = ["workers"]
+WORKER = ["-P", "-m", "workers"]  # as a supervisor starts it
+PER_COMMAND = {"COLUMNS", "PYTEST_CURRENT_TEST", "PYTHONPATH", "PYTHONUNBUFFERED", "TMPDIR", NONCE_VARIABLE}
 """Variables that a child may have otherwise than its parent: nobody reads them before the command runs, or `become` does."""
 BY_IMPORTS = {
     "LD_LIBRARY_PATH", "OMP_WAIT_POLICY", "PYGAME_HIDE_SUPPORT_PROMPT", "SDL_VIDEODRIVER", "TORCHINDUCTOR_CACHE_DIR",
@@ -33,9 +40,14 @@ BY_IMPORTS = {
 
 ENVIRONMENT = {name: value for name, value in os.environ.items() if name not in PER_COMMAND}
 """That of the parent: of the process of pytest at its start, before a test changes it."""
+PYTHON = sys.executable
 ANSWERS_WITHIN_S = 300.0  # importing PyTorch takes seconds, and much longer on a crowded machine
 
+PR_SET_CHILD_SUBREAPER = 36  # of linux/prctl.h
+
 Stream = int | IO[Any] | None
+Imports = Literal["learner", "worker"]
+"""What a preloaded parent has imported."""
 
 
 def start(
@@ -67,11 +79,30 @@ def run(
     return subprocess.CompletedProcess(list(command), process.returncode, stdout.decode(), stderr.decode())
 
 
+def start_worker(
+    command: Sequence[str],
+    *,
+    stdin: int,
+    stdout: IO[Any] | None,
+    stderr: IO[Any] | None,
+    start_new_session: Literal[True],
+    env: Mapping[str, str],
+    pass_fds: Sequence[int],
+) -> subprocess.Popen[bytes] | ForkedWorker:
+    """Start a worker, as `subprocess.Popen` does for its supervisor: forked if it may be, or executed."""
+    if may_be_forked(command, env):
+        return ForkedWorker(command, (stdin, stdout, stderr), env, pass_fds)
+    return subprocess.Popen(
+        command, stdin=stdin, stdout=stdout, stderr=stderr, start_new_session=start_new_session, env=env, pass_fds=pass_fds
+    )
+
+
 def may_be_forked(command: Sequence[str], env: Mapping[str, str] | None = None) -> bool:
     """Whether a command is one of ours, and its environment is the parent's as far as it is read at the start."""
     if os.environ.get("TESTS_EXEC") or "PYTEST_CURRENT_TEST" not in os.environ or not hasattr(os, "pidfd_open"):
         return False  # a benchmark or the soak starts processes as a user does
-    if list(command[:2]) != [sys.executable, "-m"] or not any(list(command[2:][: len(each)]) == each for each in LEARNERS):
+    forked = [["-m", *each] for each in (*LEARNERS, SUPERVISOR)] + [WORKER]
+    if command[0] != PYTHON or not any(list(command[1:][: len(each)]) == each for each in forked):
         return False
     return _read_at_start(os.environ if env is None else env) == _read_at_start(ENVIRONMENT)
 
@@ -99,7 +130,8 @@ class ForkedProcess:
                 theirs.append(given)
             self.stdin, self.stdout, self.stderr = ours
             request = {"argv": list(command[2:]), "environment": dict(env), "folder": str(folder)}
-            self.pid = _parent().ask(request, theirs)
+            self._parent = _parent("worker" if command[2] in SUPERVISOR else "learner")
+            self.pid = self._parent.ask(request, theirs)
         finally:
             for each in made:
                 os.close(each)
@@ -163,13 +195,82 @@ class ForkedProcess:
 
     def _wait(self, timeout: float | None) -> int | None:
         if self.returncode is None and select.select([self._ended], [], [], timeout)[0]:
-            self.returncode = os.waitstatus_to_exitcode(_parent().ask({"reap": self.pid}))
+            self.returncode = os.waitstatus_to_exitcode(self._parent.ask({"reap": self.pid}))
             os.close(self._ended)
         return self.returncode
 
     def __del__(self) -> None:
         if self.returncode is None and hasattr(self, "_ended"):
             os.close(self._ended)
+
+
+class ForkedWorker:
+    """A worker that was forked for this process, and is its child. Its methods are those of `subprocess.Popen`."""
+
+    def __init__(
+        self,
+        command: Sequence[str],
+        streams: tuple[Stream, Stream, Stream],
+        env: Mapping[str, str],
+        passed: Sequence[int],
+    ) -> None:
+        self.args = list(command)
+        self.returncode: int | None = None
+        given: list[int] = []
+        made: list[int] = []
+        try:
+            for number, stream in enumerate(streams):
+                given.append(_stream(number, stream, given, made)[1])
+            request = {"argv": self.args[3:], "environment": dict(env), "folder": os.getcwd(), "passed": list(passed)}
+            self.pid = _parent("worker").ask(request, [*given, *passed])
+        finally:
+            for each in made:
+                os.close(each)
+        _commands[self.pid] = self.args
+
+    def wait(self) -> int:
+        """Wait until it has ended, and reap it. Returns the exit code, negative for a signal."""
+        if self.returncode is None:
+            self.returncode = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+        return self.returncode
+
+    def poll(self) -> int | None:
+        """The exit code, negative for a signal, or None while it runs. Reaps it."""
+        if self.returncode is None and (found := os.waitpid(self.pid, os.WNOHANG))[0]:
+            self.returncode = os.waitstatus_to_exitcode(found[1])
+        return self.returncode
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal, if it has not ended."""
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def terminate(self) -> None:
+        """Send SIGTERM."""
+        self.send_signal(signal.SIGTERM)
+
+
+_commands: dict[int, list[str]] = {}
+
+
+def command_line(process: psutil.Process) -> list[str]:
+    """The command of a process, also if it is a worker that was forked. Empty if it has ended."""
+    with suppress(psutil.NoSuchProcess, psutil.ZombieProcess):
+        found: list[str] = process.cmdline()
+        return _commands.get(process.pid, found) if str(PROGRAM) in found else found
+    return []
+
+
+def workers_of(supervisor: int) -> list[psutil.Process]:
+    """The workers of the process with this id. Each leads a session of its own; a preloaded parent does not."""
+    children = psutil.Process(supervisor).children()
+    return [child for child in children if _leads_session(child.pid)]
+
+
+def _leads_session(pid: int) -> bool:
+    with suppress(ProcessLookupError):
+        return os.getsid(pid) == pid
+    return False
 
 
 def _stream(number: int, stream: Stream, before: list[int], made: list[int]) -> tuple[IO[bytes] | None, int]:
@@ -189,51 +290,71 @@ def _stream(number: int, stream: Stream, before: list[int], made: list[int]) -> 
 
 
 class _Parent:
-    """The preloaded parent, and our end of its socket."""
+    """A preloaded parent, and our end of its socket."""
 
-    def __init__(self) -> None:
+    def __init__(self, imports: Imports, connected: socket.socket | None = None) -> None:
+        """`connected`: our end, if the parent runs already and ends with this process."""
+        self._imports = imports
         self._lock = threading.Lock()
+        self.process: subprocess.Popen[bytes] | None = None
+        if connected is not None:
+            self._socket = connected
+            return
         self._socket, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._socket.settimeout(ANSWERS_WITHIN_S)
-        command = [sys.executable, "-P", str(PROGRAM), str(other.fileno())]
+        command = [sys.executable, "-P", str(PROGRAM), str(other.fileno()), imports]
         with other:
             self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, env=ENVIRONMENT, pass_fds=[other.fileno()])
 
     def ask(self, request: dict[str, Any], descriptors: Sequence[int] = ()) -> int:
         """What it answers: the id of a new child, or the wait status of one that has ended."""
         with self._lock:
+            _adopt_orphans("passed" in request)
             try:
                 socket.send_fds(self._socket, [json.dumps(request).encode()], list(descriptors))
                 answer = self._socket.recv(64)
                 assert answer, "the preloaded parent has ended"
             except BaseException:  # a deadline of the test, say: nobody may take the late answer for one to something else
-                _started.remove(self)
+                del _started[self._imports]
                 self.close()
                 raise
+            finally:
+                _adopt_orphans(False)
         return int(answer)
 
     def close(self) -> None:
         """End it, and wait for its end."""
         self._socket.close()
-        self.process.kill()  # it has nothing to finish
-        self.process.wait()
+        if self.process is not None:
+            self.process.kill()  # it has nothing to finish
+            self.process.wait()
 
 
-_started: list[_Parent] = []
+_started: dict[Imports, _Parent] = {}
 
 
-def _parent() -> _Parent:
-    if not _started:
-        _started.append(_Parent())
-    return _started[0]
+def _adopt_orphans(adopts: bool) -> None:
+    """Make this process the parent of orphans among its descendants, or of no orphans."""
+    assert ctypes.CDLL(None, use_errno=True).prctl(PR_SET_CHILD_SUBREAPER, int(adopts), 0, 0, 0) == 0, ctypes.get_errno()
 
 
-def parent_pid() -> int | None:
-    """The process id of the preloaded parent, or None if it was not started. It is not left behind by a test."""
-    return _started[0].process.pid if _started else None
+def _parent(imports: Imports) -> _Parent:
+    if imports not in _started:
+        _started[imports] = _Parent(imports)
+    return _started[imports]
 
 
-def close_parent() -> None:
-    """End the preloaded parent, if it was started."""
+def use_parent(connected: socket.socket) -> None:
+    """Let the preloaded parent at the other end fork the workers of this process."""
+    _started["worker"] = _Parent("worker", connected)
+
+
+def parent_pids() -> set[int]:
+    """The process ids of the preloaded parents that were started. They are not left behind by a test."""
+    return {parent.process.pid for parent in _started.values() if parent.process is not None}
+
+
+def close_parents() -> None:
+    """End the preloaded parents that were started."""
     while _started:
-        _started.pop().close()
+        _started.popitem()[1].close()

@@ -26,7 +26,7 @@ import psutil
 from learner.run_folder.metrics_log import read_rows
 from protocol.keys.key_folder import KeyFolder
 from tests.model.traces.recorder import FOLDER
-from tests.support.preloaded import start
+from tests.support.preloaded import start, workers_of
 
 ROOT = Path(__file__).parents[2]
 T = TypeVar("T")
@@ -155,8 +155,7 @@ class Worker(Running):
 
     def processes(self) -> list[psutil.Process]:
         """The supervisor and its children."""
-        supervisor = psutil.Process(self.pid)
-        return [supervisor, *supervisor.children()]
+        return [psutil.Process(self.pid), *workers_of(self.pid)]
 
     def kill(self) -> None:
         """Send SIGKILL to both and wait until the supervisor is dead."""

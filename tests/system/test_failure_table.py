@@ -15,9 +15,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import psutil
 import pytest
 
+from tests.support.preloaded import workers_of
 from tests.system.processes import EXECUTED, START_S, TOY, WORKER_TIMEOUT_S, Learner, Stage, free_port, wait_for
 from tests.system.runs import IN_ROLLOUT, LANES, NOTICED_S, accounted, dealt_again, finish, play, within
 
@@ -43,11 +43,11 @@ def test_a_killed_worker_of_a_local_run_is_restarted(stage: Stage) -> None:
     learner = Learner([*command, "--run-dir", str(stage.runs)], said, stage.runs)
     stage.started.append(learner)
     learner.trains(2)
-    victim = psutil.Process(learner.pid).children()[0]
+    victim = workers_of(learner.pid)[0]
     victim.kill()
     within("worker killed -9, on the learner's machine", dealt_again(learner), 1.0)
     learner.trains()
-    wait_for(lambda: len(psutil.Process(learner.pid).children()) == 2, START_S, "the worker's return")
+    wait_for(lambda: len(workers_of(learner.pid)) == 2, START_S, "the worker's return")
     finish(learner, [])
 
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-import psutil
 import pytest
 
 import millrace
@@ -245,7 +244,7 @@ def test_the_run_fails_if_no_worker_joins(tmp_path: Path, monkeypatch: pytest.Mo
 def test_ctrl_c_while_an_environment_hangs_drains_saves_and_ends_all_workers(tmp_path: Path) -> None:
     learner = start(tmp_path, "--inference", "learner")
     wait_for(lambda: any(len(read_rows(path)) > 10 for path in tmp_path.glob("runs/*/metrics.jsonl")))
-    workers = psutil.Process(learner.pid).children()
+    workers = preloaded.workers_of(learner.pid)
     assert len(workers) == 2
     for worker in workers:
         worker.suspend()  # no step is answered from now on

@@ -45,7 +45,7 @@ def assert_balanced(ledger: dict[str, int]) -> None:
 
 def worker_processes() -> list[psutil.Process]:
     children = psutil.Process().children(recursive=True)
-    return [child for child in children if child.status() != psutil.STATUS_ZOMBIE and "workers" in child.cmdline()]
+    return [child for child in children if "workers" in preloaded.command_line(child)]
 
 
 @pytest.mark.parametrize(
@@ -335,7 +335,7 @@ def checkpoints(tmp_path: Path) -> list[Path]:
 def test_ctrl_c_drains_saves_and_says_how_to_resume(tmp_path: Path) -> None:
     learner = start(tmp_path)
     wait_for(lambda: any(len(read_rows(path)) > 10 for path in tmp_path.glob("runs/*/metrics.jsonl")))
-    workers = psutil.Process(learner.pid).children()
+    workers = preloaded.workers_of(learner.pid)
     assert len(workers) == 2
     learner.send_signal(signal.SIGINT)
     _, stderr = learner.communicate(timeout=30)
@@ -352,7 +352,7 @@ def test_ctrl_c_drains_saves_and_says_how_to_resume(tmp_path: Path) -> None:
 def test_a_learner_that_was_killed_goes_on_from_its_newest_checkpoint(tmp_path: Path) -> None:
     learner = start(tmp_path, "--checkpoint-every-s", "0.2", "--steps", "40000")
     wait_for(lambda: len(checkpoints(tmp_path)) >= 3)
-    workers = psutil.Process(learner.pid).children()
+    workers = preloaded.workers_of(learner.pid)
     os.kill(learner.pid, signal.SIGKILL)
     learner.communicate(timeout=10)
     _, alive = psutil.wait_procs(workers, timeout=10)
@@ -448,7 +448,7 @@ def test_status_asks_the_learner_that_train_started_by_its_run_folder(tmp_path: 
         assert answer["env"] == "CartPole-v1"
         assert answer["env_steps"] > 0
         assert {worker["worker"] for worker in answer["workers"]} == {"w0", "w1"}
-        assert {worker["pid"] for worker in answer["workers"]} == {one.pid for one in psutil.Process(learner.pid).children()}
+        assert {worker["pid"] for worker in answer["workers"]} == {one.pid for one in preloaded.workers_of(learner.pid)}
         assert "dropped: nothing" in status().stdout
     ended = status()
     assert (ended.returncode, ended.stdout) == (2, "")

@@ -10,10 +10,20 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
-from tests.support.preloaded import ENVIRONMENT, ForkedProcess, may_be_forked
-from tests.system.processes import ROOT, wait_for
+from tests.support.preloaded import (
+    ENVIRONMENT,
+    ForkedProcess,
+    ForkedWorker,
+    command_line,
+    may_be_forked,
+    start_worker,
+    workers_of,
+)
+from tests.system.processes import ROOT, Stage, wait_for
+from workers.supervise import worker_process
 
 WITHIN_S = 60.0
 PIPES = (subprocess.DEVNULL, subprocess.PIPE, subprocess.PIPE)
@@ -121,16 +131,77 @@ def test_one_that_nobody_waits_for_is_no_process_any_more(probe: dict[str, str])
         stream.close()
 
 
+def test_a_worker_can_tell_no_difference_and_is_a_child_of_its_supervisor(probe: dict[str, str], tmp_path: Path) -> None:
+    command = [sys.executable, "-P", "-m", "probe", "one", "--two"]
+    found: list[dict[str, Any]] = []
+    for forks in (True, False):
+        reads, writes = os.pipe()
+        with (tmp_path / "said").open("wb") as said:
+            if forks:
+                process: ForkedWorker | subprocess.Popen[bytes] = ForkedWorker(
+                    command, (subprocess.DEVNULL, said, said), probe, [writes]
+                )
+            else:
+                process = subprocess.Popen(
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=said,
+                    stderr=said,
+                    start_new_session=True,
+                    env=probe,
+                    pass_fds=[writes],
+                )
+        os.close(writes)
+        assert os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT) is not None, "it is not a child of this process"
+        assert process.wait() == process.poll() == 0
+        assert os.read(reads, 1) == b"", "somebody else holds what was passed"
+        os.close(reads)
+        found.append(json.loads((tmp_path / "said").read_text()))
+        assert found[-1].pop("group") == found[-1].pop("session") == process.pid
+        assert found[-1]["files"] == [0, 1, 2, writes]
+    assert found[0] == found[1]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL, signal.SIGHUP])
+def test_a_signal_ends_a_worker(probe: dict[str, str], tmp_path: Path, number: int) -> None:
+    said = tmp_path / "said"
+    with said.open("wb") as file:
+        worker = ForkedWorker([sys.executable, "-P", "-m", "probe", "wait"], (subprocess.DEVNULL, file, file), probe, [])
+    wait_for(lambda: said.read_bytes() == b"waits\n", WITHIN_S, "its start")
+    assert worker.poll() is None
+    worker.send_signal(number)
+    assert worker.wait() == worker.poll() == -number
+    worker.terminate()  # nobody
+
+
+def test_workers_of_a_forked_supervisor_are_its_children_and_end_with_it(stage: Stage) -> None:
+    """It has a preloaded parent of its own, which is none of its workers and ends with it too."""
+    supervisor = stage.worker(f"ipc://{stage.tmp_path}/nobody", "some", "--processes", "2")
+    workers = wait_for(lambda: len(found := workers_of(supervisor.pid)) == 2 and found, WITHIN_S, "two workers")
+    assert workers
+    assert not any("workers" in command_line(worker) for worker in workers), "they were executed"
+    family = psutil.Process(supervisor.pid).children(recursive=True)
+    assert len(family) == 3
+    supervisor.process.kill()
+    _, alive = psutil.wait_procs(family, timeout=WITHIN_S)
+    assert not alive
+
+
+def test_workers_of_this_process_are_forked() -> None:
+    assert worker_process.popen is start_worker
+
+
 def test_only_learners_whose_environment_is_the_parents_are_forked(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("TESTS_EXEC", raising=False)
     learner = [sys.executable, "-m", "learner", "CartPole-v1"]
     changed = {name for name in {*os.environ, *ENVIRONMENT} if os.environ.get(name) != ENVIRONMENT.get(name)}
     assert may_be_forked(learner), changed
+    assert may_be_forked([sys.executable, "-m", "workers", "x"])
+    assert may_be_forked([sys.executable, "-P", "-m", "workers", "x"])
     assert may_be_forked([sys.executable, "-m", "millrace", "train"], {**os.environ, "PYTHONPATH": "x", "TMPDIR": "/x"})
     for other in (
         [sys.executable, "-P", *learner[1:]],
         ["ip", "netns", "exec", "x", *learner],
-        [sys.executable, "-m", "workers", "x"],
         [sys.executable, "-m", "millrace", "worker", "x"],
         [sys.executable, "-m", "millrace", "status", "x"],
         [sys.executable, "-m", "millrace"],

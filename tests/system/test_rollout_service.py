@@ -7,7 +7,6 @@ import os
 import signal
 import threading
 import time
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ import psutil
 import pytest
 
 import millrace
+from tests.support.preloaded import command_line
 from tests.system.processes import Stage, free_port, wait_for
 
 SMALL: dict[str, Any] = {"envs": 4, "lanes": 2, "rollout_steps": 16}
@@ -23,14 +23,7 @@ SMALL: dict[str, Any] = {"envs": 4, "lanes": 2, "rollout_steps": 16}
 
 def children() -> list[psutil.Process]:
     """The worker processes of this process that run."""
-    return [child for child in psutil.Process().children() if "workers" in _command(child)]
-
-
-def _command(process: psutil.Process) -> list[str]:
-    with suppress(psutil.NoSuchProcess, psutil.ZombieProcess):
-        found: list[str] = process.cmdline()
-        return found
-    return []
+    return [child for child in psutil.Process().children() if "workers" in command_line(child)]
 
 
 def test_a_long_computation_loses_no_worker() -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from tests.support.preloaded import workers_of
 from tests.system.processes import ROOT, START_S, Learner, Running, Stage, free_port, wait_for
 from tests.system.runs import within
 
@@ -166,7 +167,7 @@ def test_what_an_environment_leaves_behind_is_gone_after_the_run(stage: Stage, k
 def test_a_worker_that_is_told_to_leave_during_a_long_step_is_gone_in_ten_seconds(stage: Stage) -> None:
     learner, supervisor = served(stage, "Slow-v0", {"env-kwargs": "step_s 600.0"})
     learner.hears("worker w0 .* joined", START_S)
-    (worker,) = wait_for(lambda: psutil.Process(supervisor.pid).children(), 5, "the worker")
+    (worker,) = wait_for(lambda: workers_of(supervisor.pid), 5, "the worker")
     time.sleep(1)
     supervisor.signal(15)
     began_s = time.monotonic()
@@ -178,7 +179,7 @@ def test_a_worker_that_is_told_to_leave_during_a_long_step_is_gone_in_ten_second
 def test_a_worker_that_is_stopped_is_given_up_although_its_supervisor_lives(stage: Stage) -> None:
     learner, supervisor = served(stage, "Slow-v0", {"env-kwargs": "step_s 0.2", "rollout-steps": 50, "batch-size": 100})
     learner.hears("worker w0 .* joined", START_S)
-    (worker,) = psutil.Process(supervisor.pid).children()
+    (worker,) = workers_of(supervisor.pid)
     time.sleep(1)
     worker.suspend()
     began_s = time.monotonic()

@@ -25,6 +25,7 @@ from millrace.launch import vector
 from protocol.env_spec import EnvLike
 from protocol.errors import EnvironmentFailed, NoWorkers, UserFacingError, WorkerLost
 from protocol.keys.key_folder import KeyFolder
+from tests.support.preloaded import command_line
 from tests.system.processes import START_S, Worker, free_port
 
 SHARED_MEMORY = {"shared": True, "messages": False}
@@ -43,7 +44,7 @@ def make(env: EnvLike = "CartPole-v1", **keywords: Any) -> ZmqVectorEnv:
 
 def local_workers() -> list[psutil.Process]:
     """Worker processes that are children of this process, in the order of their names."""
-    found = [(child.cmdline(), child) for child in psutil.Process().children() if child.status() != psutil.STATUS_ZOMBIE]
+    found = [(command_line(child), child) for child in psutil.Process().children() if child.status() != psutil.STATUS_ZOMBIE]
     named = [(line[line.index("--name") + 1], child) for line, child in found if "--name" in line]
     return [child for _, child in sorted(named, key=lambda pair: pair[0])]
 

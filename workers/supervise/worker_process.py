@@ -26,6 +26,8 @@ from workers.supervise.activity import STACK_SIGNAL, ActivityReader
 from workers.supervise.ending import Ending
 from workers.watchdog import deepest_frame, where_it_hung
 
+popen = subprocess.Popen  # a name of its own: a test may start workers in another way
+
 NONCE_VARIABLE = "MILLRACE_WORKER_NONCE"
 WRITE_STACKS_S = 0.3  # from the signal until the worker is killed
 CLOSE_WITHIN_S = 5.0  # a worker that leaves must have closed its environments and ended within this time
@@ -78,7 +80,7 @@ class WorkerProcess:
         if start.token is not None:
             secret[TOKEN_VARIABLE] = start.token.to_text()
         with _opened(start.log) as stderr:
-            self._process = subprocess.Popen(
+            self._process = popen(
                 command,
                 stdin=subprocess.DEVNULL,
                 stdout=stderr if start.log else None,
