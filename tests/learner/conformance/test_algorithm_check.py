@@ -34,7 +34,7 @@ from protocol.errors import MillraceError, RunError
 
 Pulse = Callable[[], None]
 Metrics = dict[str, float]
-SMALL: dict[str, Any] = {"net": (16,), "n_epochs": 2, "rollout_steps": 32, "learning_rate": 3e-3}
+SMALL: dict[str, Any] = {"net": (16,), "n_epochs": 2, "batch_size": 128, "rollout_steps": 32, "learning_rate": 3e-3}
 
 
 class Sound(ActorCritic):

@@ -289,8 +289,21 @@ def learned(name: str, core: Core | None, updates: int) -> float:
     return min(greedy, float(np.mean([episode.reward for rollout in rollouts for episode in rollout.episodes])))
 
 
-@pytest.mark.parametrize("core", CORES)
-@pytest.mark.parametrize("name", list(SETTINGS))
+IN_MAKE_TEST = (
+    ("ppo", "gru"),
+    ("a2c", "lstm"),
+    ("impala", "gru"),
+)  # each algorithm and each core; `make soak` runs the others
+
+
+@pytest.mark.parametrize(
+    ("name", "core"),
+    [
+        pytest.param(name, core, marks=() if (name, core) in IN_MAKE_TEST else pytest.mark.soak)
+        for name in SETTINGS
+        for core in CORES
+    ],
+)
 def test_what_was_shown_is_remembered(name: str, core: Core) -> None:
     assert learned(name, core, 60) > 0.9
 
