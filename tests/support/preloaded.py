@@ -339,8 +339,10 @@ def _adopt_orphans(adopts: bool) -> None:
 
 
 def _parent(imports: Imports) -> _Parent:
-    if imports not in _started:
-        _started[imports] = _Parent(imports)
+    """The parent with these imports. That of workers starts with that of learners: a learner gives workers little time."""
+    for each in (imports, *(("worker",) if imports == "learner" else ())):
+        if each not in _started:
+            _started[each] = _Parent(each)
     return _started[imports]
 
 

@@ -34,8 +34,6 @@ LOOK_EVERY_S = 0.02
 START_S = 90.0  # importing torch takes seconds, and longer on a busy machine
 TOY = "workers.envs.toy:Slow-v0"
 WORKER_TIMEOUT_S = 1.5
-EXECUTED = ("env",)
-"""Words before a command that must not be forked, because it must start as slowly as a process does."""
 SMALL: dict[str, object] = {
     "env-kwargs": "seconds 0.001",
     "rollout-steps": 16,

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.preloaded import workers_of
-from tests.system.processes import EXECUTED, START_S, TOY, WORKER_TIMEOUT_S, Learner, Stage, free_port, wait_for
+from tests.system.processes import START_S, TOY, WORKER_TIMEOUT_S, Learner, Stage, free_port, wait_for
 from tests.system.runs import IN_ROLLOUT, LANES, NOTICED_S, accounted, dealt_again, finish, play, within
 
 # ---------------------------------------------------------------- workers
@@ -69,7 +69,7 @@ def test_a_stopped_worker_joins_again_when_it_continues(stage: Stage) -> None:
 
 
 def test_a_run_without_workers_saves_a_checkpoint_and_fails(stage: Stage) -> None:
-    learner, workers = play(stage, {"no-workers-timeout-s": 1, **IN_ROLLOUT}, before=EXECUTED)  # workers start meanwhile
+    learner, workers = play(stage, {"no-workers-timeout-s": 1, **IN_ROLLOUT})
     for worker in workers:
         worker.kill()
     began_s = time.monotonic()
