@@ -419,7 +419,7 @@ def test_status_asks_the_learner_of_a_run_that_acts_in_the_learner(tmp_path: Pat
         assert (answer["env"], answer["total_steps"]) == ("CartPole-v1", 100_000_000)
         assert answer["env_steps"] > 0
         assert answer["ledger"]["used"] > 0
-        assert {worker["pid"] for worker in answer["workers"]} == {one.pid for one in psutil.Process(learner.pid).children()}
+        assert {worker["pid"] for worker in answer["workers"]} == {one.pid for one in preloaded.workers_of(learner.pid)}
 
 
 @pytest.mark.parametrize(
