@@ -52,6 +52,18 @@ def validate(config: Config, where: str = "") -> Config:
     return config
 
 
+def idle_workers(config: Config) -> str:
+    """A line for the user if some workers of a run on this machine will have no lane, or nothing."""
+    idle = config.workers - config.lanes
+    if idle <= 0:
+        return ""
+    envs = -(-config.envs // config.workers) * config.workers
+    return (
+        f"{idle} of {config.workers} workers have nothing to collect, because there are {config.lanes} lanes; to use them all, "
+        f"take --lanes {config.workers}" + (f" --envs {envs}" if envs != config.envs else "")
+    )
+
+
 def convert_rollout_settings(settings: dict[str, Any]) -> RolloutConfig:
     """The record of these settings, checked. Raises `UsageError`."""
     config = _converted(settings, RolloutConfig, settings)

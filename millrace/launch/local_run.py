@@ -5,11 +5,13 @@ Rule: whatever happens, no worker, socket file or temporary folder is left behin
 
 from __future__ import annotations
 
+import logging
 from contextlib import ExitStack
 from pathlib import Path
 
 from learner.callbacks.callbacks import Watch
 from learner.config.config import Config
+from learner.config.validation import idle_workers
 from learner.interrupts import Interrupts
 from learner.members.endpoint import BindSettings
 from learner.members.process_callbacks import ProcessCallbacks
@@ -19,6 +21,8 @@ from millrace.launch.endpoint import open_endpoint
 from millrace.launch.local_worker_options import no_flags, stopped_on_error, worker_flags
 from protocol.env_spec import EnvSpec
 from workers.supervisor import STOP_WITHIN_S, Supervisor
+
+log = logging.getLogger("millrace.learner")
 
 
 def train(config: Config, resume: Path | None, watch: Watch, env: EnvSpec | None = None) -> Path:
@@ -35,6 +39,8 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
         from millrace.launch import learner_inference as inference
 
         return inference.train(config, resume, watch, env)
+    if line := idle_workers(config):
+        log.warning("%s", line)
     with ExitStack() as stack:
         where = BindSettings(keys=config.keys, insecure=config.insecure)
         endpoint = open_endpoint(where, config.transport, stack, env.called_code)

@@ -12,6 +12,7 @@ from learner.config.config import Config
 from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
 from learner.config.layers import config_from_toml, lower_layers, resolve
 from learner.config.presets import PRESETS, named_presets
+from learner.config.validation import idle_workers
 from protocol.errors import UsageError
 
 
@@ -92,6 +93,21 @@ def test_a_whole_number_may_be_written_in_powers_of_ten(tmp_path: Path) -> None:
     assert resolve("CartPole-v1", steps=1e6).steps == 1_000_000
     assert resolve("CartPole-v1", file=written(tmp_path, "steps = 3e5")).steps == 300_000
     assert "steps: expected int" in refusal(steps=1.5)
+
+
+@pytest.mark.parametrize(
+    ("workers", "says"),
+    [
+        (4, ""),
+        (6, "2 of 6 workers have nothing to collect, because there are 4 lanes; to use them all, take --lanes 6 --envs 12"),
+        (8, "4 of 8 workers have nothing to collect, because there are 4 lanes; to use them all, take --lanes 8"),
+    ],
+)
+def test_workers_without_a_lane_are_named_with_settings_that_use_them(workers: int, says: str) -> None:
+    config = resolve("CartPole-v1", workers=workers, envs=8, lanes=4)
+    assert idle_workers(config) == says
+    taken = dict(zip(("lanes", "envs"), map(int, re.findall(r"--\w+ (\d+)", says)), strict=False))
+    assert not idle_workers(resolve("CartPole-v1", **{"workers": workers, "envs": 8, "lanes": 4, **taken}))
 
 
 @pytest.mark.parametrize(
