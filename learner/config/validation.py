@@ -59,7 +59,7 @@ def idle_workers(config: Config) -> str:
         return ""
     envs = -(-config.envs // config.workers) * config.workers
     return (
-        f"{idle} of {config.workers} workers have nothing to collect, because there are {config.lanes} lanes; to use them all, "
+        f"{idle} of {config.workers} workers have nothing to collect, because there are {config.lanes} lanes; to use all, "
         f"take --lanes {config.workers}" + (f" --envs {envs}" if envs != config.envs else "")
     )
 

@@ -99,8 +99,8 @@ def test_a_whole_number_may_be_written_in_powers_of_ten(tmp_path: Path) -> None:
     ("workers", "says"),
     [
         (4, ""),
-        (6, "2 of 6 workers have nothing to collect, because there are 4 lanes; to use them all, take --lanes 6 --envs 12"),
-        (8, "4 of 8 workers have nothing to collect, because there are 4 lanes; to use them all, take --lanes 8"),
+        (6, "2 of 6 workers have nothing to collect, because there are 4 lanes; to use all, take --lanes 6 --envs 12"),
+        (8, "4 of 8 workers have nothing to collect, because there are 4 lanes; to use all, take --lanes 8"),
     ],
 )
 def test_workers_without_a_lane_are_named_with_settings_that_use_them(workers: int, says: str) -> None:
