@@ -106,8 +106,8 @@ def test_a_whole_number_may_be_written_in_powers_of_ten(tmp_path: Path) -> None:
 def test_workers_without_a_lane_are_named_with_settings_that_use_them(workers: int, says: str) -> None:
     config = resolve("CartPole-v1", workers=workers, envs=8, lanes=4)
     assert idle_workers(config) == says
-    taken = dict(zip(("lanes", "envs"), map(int, re.findall(r"--\w+ (\d+)", says)), strict=False))
-    assert not idle_workers(resolve("CartPole-v1", **{"workers": workers, "envs": 8, "lanes": 4, **taken}))
+    taken: dict[str, Any] = dict(zip(("lanes", "envs"), map(int, re.findall(r"--\w+ (\d+)", says)), strict=False))
+    assert not idle_workers(resolve("CartPole-v1", workers=workers, **({"envs": 8, "lanes": 4} | taken)))
 
 
 @pytest.mark.parametrize(
