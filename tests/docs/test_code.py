@@ -30,7 +30,10 @@ EXTRAS = {
 MISSING = re.compile(
     r"^ModuleNotFoundError: No module named '(\w+)|^protocol\.errors\.UsageError: .*pip install (\S+)", re.MULTILINE
 )
-QUICK: set[str] = set()
+QUICK = {
+    "docs/explanation/rows.md", "docs/how-to/mlflow.md", "docs/how-to/own_policy.md", "docs/how-to/vector_env_async.md",
+    "docs/how-to/wandb.md", "docs/tutorial/your_environment.md",
+}  # fmt: skip
 """Pages that take a second or two. They run in `make test`, too."""
 
 
