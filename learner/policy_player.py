@@ -49,7 +49,7 @@ def saved_policy(
     `env`, `wrappers`: take these instead. Raises `UsageError`, with a one-line message, if it cannot be read, or they cannot
     be found.
     """
-    card, parameters, buffers = RunFolder.open(run).read_policy(which)
+    card, parameters, buffers = RunFolder.open_policy(run).read_policy(which)
     spec = EnvSpec.of(card.env if env is None else env, card.env_kwargs, card.wrappers if wrappers is None else wrappers)
     facts = _facts_of_older(run) if card.facts is None else card.facts
     return SavedPolicy(card.policy, spec, parameters, buffers, facts)

@@ -160,6 +160,17 @@ class RunFolder:
             raise UsageError(f"run {path}: expected a run folder, got one without config.toml")
         return RunFolder(path)
 
+    @staticmethod
+    def open_policy(path: Path) -> RunFolder:
+        """Open an existing folder to read its policy. A copy of policy.json and policy.safetensors is enough.
+
+        Raises `UsageError`, as `open` does.
+        """
+        if not (path / POLICY_JSON).is_file():
+            return RunFolder.open(path)
+        check_format(path)
+        return RunFolder(path)
+
     def remove(self) -> None:
         """Remove the folder, and the parent folders made for it that nothing else is in.
 

@@ -1,5 +1,6 @@
 """`millrace.load`: a saved policy acts as the workers of an evaluation do, bit for bit, and says what it cannot take."""
 
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -205,3 +206,16 @@ def test_acting_imports_neither_torch_nor_an_environment_nor_an_algorithm(tmp_pa
         "'gymnasium.envs.classic_control', 'workers.worker'}"
     )
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
+
+
+def test_a_copy_of_the_two_files_is_enough(tmp_path: Path) -> None:
+    run = folder_of(run_of("CartPole-v1"), tmp_path)
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    for name in ("policy.json", "policy.safetensors"):
+        shutil.copy(run / name, copy)
+    batch = np.random.default_rng(0).normal(size=(16, 4)).astype(np.float32)
+    np.testing.assert_array_equal(millrace.load(copy)(batch), millrace.load(run)(batch))
+    (copy / "policy.json").unlink()
+    with pytest.raises(millrace.UsageError, match=r"expected a run folder, got one without config\.toml"):
+        millrace.load(copy)
