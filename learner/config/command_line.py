@@ -22,8 +22,8 @@ class RunFlags(Config, frozen=True, kw_only=True):
     config: Path | None = None
     """TOML file of settings. The config.toml of a run folder repeats that run."""
     preset: str = "auto"
-    """The name of a whole run (`millrace presets` lists them), the environment whose preset to take, auto (the preset of
-    ENV, if there is one) or none.
+    """Preset to use: the name of a whole run (`millrace presets` lists them), or an environment, for the preset of that
+    environment. auto: the preset of ENV, if there is one. none: no preset.
     """
     resume: Path | None = None
     """Continue this run folder from its newest checkpoint. auto: continue the newest run in --run-dir with the same ENV,

@@ -46,12 +46,12 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     eval_every: Free[Natural] = 0
     """Env steps between evaluations during training. 0: evaluate only at the end."""
     eval_copies: Free[Annotated[int, Meta(ge=1, le=MAX_SEEDS)]] = 4
-    """Number of evaluation episodes that a worker plays side by side, on env copies of their own. The last bits of results
-    may depend on it. They do not depend on the number of workers.
+    """Number of evaluation episodes that a worker plays at the same time, on env copies of their own. The last bits of
+    results may depend on this number. Results do not depend on the number of workers.
     """
     eval_max_steps: Free[Count] = 1_000_000
-    """Most env steps of one evaluation. Each episode gets an equal share: with 100 episodes, one that reaches 10000 steps is
-    cut. It counts with the return it has by then, and the result says how many were cut.
+    """Largest number of env steps of one evaluation. Each episode gets an equal share: with 100 episodes, an episode that
+    reaches 10000 steps is cut. It counts with its return up to that step, and the result says how many were cut.
     """
     target_return: Free[float | None] = None
     """Stop as soon as the mean return of an evaluation is at least this. Needs eval_every."""
@@ -65,19 +65,20 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     workers then only step the environments.
     """
     torch_threads: Free[Count | None] = None
-    """Number of PyTorch threads in the learner. none: chosen when the run starts, and kept in its config.toml: 1;
-    or with images, an encoder or a layer of 512 x 512 weights all cores. If max_lag is above 0, one core is left to each
-    local worker, unless half of the cores or less would remain. Another number changes the last bits of results.
+    """Number of PyTorch threads in the learner. none: chosen when the run starts, and kept in its config.toml. The
+    choice is 1; with images, an encoder or a layer of 512 x 512 weights it is all cores. If max_lag is above 0, one core is
+    then left to each local worker, unless this would leave half of the cores or less to the learner. Another number
+    changes the last bits of results.
     """
 
     grace_s: Free[SecondsOrNever] = 30.0
     """Seconds from SIGTERM, SIGHUP or Ctrl-C to the end of the process. The current update gets at most half of them; then
-    it is given up, and the state before it is saved. 0: as long as the update takes.
+    it is undone, and the state before it is saved. 0: wait until the update has ended.
     """
 
     callback: Free[UseAppendAction[tuple[str, ...]]] = ()
-    """A callback of your own, as my_module:factory: code that the learner calls between updates. Repeat the flag for more.
-    docs/how-to/callbacks.md describes them.
+    """A callback of your own, as my_module:factory: code that the learner calls between updates. Repeat the flag to
+    add more callbacks. docs/how-to/callbacks.md describes them.
     """
 
     # -------------------------------------------------------------------------------------------------------------- files

@@ -19,7 +19,7 @@ class OnResume(Enum):
     """How a resumed run takes another value of a setting. The value of a member is its meaning, for the documentation."""
 
     FREE = "Another value takes effect at once."
-    ADAPTABLE = "Another value takes effect at once, and what belongs to single lanes and env copies starts afresh."
+    ADAPTABLE = "Another value takes effect at once. The state of each lane and env copy starts again from the beginning."
     FIXED = "Another value is refused: the weights or the state of the run would mean something else."
 
 

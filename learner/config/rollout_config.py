@@ -93,12 +93,12 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     insecure: Free[bool] = False
     """Accept workers of other machines without keys. Whoever reaches the port can then read, disturb and stop the run."""
     compress: Free[Literal["none", "zstd"]] = "none"
-    """Compression of rollouts. zstd reduces the size of images, which pays on almost any network
+    """Compression of rollouts. zstd reduces the size of images, which helps on almost any network
     (pip install 'millrace-rl[compress]' for the learner and every worker).
     """
     weights_dtype: Free[WeightsDtype] = "float32"
     """Precision of the weights that are sent to workers. bfloat16 and float16 halve the bytes. Workers act with the rounded
-    weights; the learner's stay float32.
+    weights; the learner keeps its own weights in float32.
     """
     metrics_bind: Free[str] = ""
     """HOST:PORT at which Prometheus can read the metrics, as 127.0.0.1:9464. With 0.0.0.0:9464 everybody in the network can
@@ -110,8 +110,8 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     heartbeat_s: Free[Seconds] = 1.0
     """Seconds between two heartbeats of a worker."""
     worker_timeout_s: Free[Seconds] = 5.0
-    """A worker that has been silent for this many seconds is given up, and other workers take over its lanes. A worker is
-    not silent while its supervisor says that its environment is busy, however long that takes.
+    """A worker that has been silent for this many seconds counts as lost, and other workers take over its lanes. A worker
+    is not silent while its supervisor says that its environment is busy, however long that takes.
     """
     no_workers_timeout_s: Free[Seconds] = 60.0
     """Write a checkpoint and end the run if there has been no worker for this many seconds."""
@@ -122,11 +122,13 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     step_timeout_s: Free[SecondsOrNever] = 600.0
     """A local worker process is restarted if one step of an env copy takes longer than this many seconds. 0: never."""
     stall_timeout_s: Free[Seconds] = 600.0
-    """Write a checkpoint and end the run if no env step, reset or construction has ended for this many seconds, and none
-    is under way within its timeout.
+    """Write a checkpoint and end the run if, for this many seconds, no env step, reset or construction has ended. This does
+    not apply while such a call is in progress and within its timeout.
     """
     max_env_failures: Free[Natural] = 3
-    """End the run if the environment, or an `OwnPolicy`, has raised more exceptions, or ended more processes, than this."""
+    """End the run after more failures than this. A failure is an exception or an unusable result of the environment or of an
+    `OwnPolicy`, or the end of a worker process that one of them caused.
+    """
 
     def fact_names(self) -> tuple[str, ...]:
         """The names in `info_keys`."""

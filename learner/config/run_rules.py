@@ -60,8 +60,8 @@ class EvaluationSettings(msgspec.Struct, frozen=True, kw_only=True):
     every_env_steps: int
     """env steps between evaluations during training; 0: evaluate only at the end"""
     copies: int
-    """episodes that a worker plays side by side"""
+    """episodes that a worker plays at the same time"""
     max_steps: int
-    """most env steps of one evaluation"""
+    """largest number of env steps of one evaluation"""
     seed: int
     """the run's seed: it decides which episodes are played"""

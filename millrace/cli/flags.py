@@ -26,7 +26,7 @@ class PlayFlags(msgspec.Struct, frozen=True, kw_only=True):
     transport: Literal["inproc", "ipc", "tcp"] = "ipc"
     """how local workers are connected: as threads of this process, by local sockets, or by TCP"""
     bind: str = ""
-    """address at which workers join that are started elsewhere, as tcp://0.0.0.0:5555; then none are started here"""
+    """address at which workers from elsewhere can join, as tcp://0.0.0.0:5555; then no workers are started here"""
 
 
 class EvaluateFlags(PlayFlags, frozen=True, kw_only=True):
@@ -37,9 +37,9 @@ class EvaluateFlags(PlayFlags, frozen=True, kw_only=True):
     seed: int = 1_000_000
     """seed of the episodes"""
     copies: int = 4
-    """number of episodes that a worker plays side by side"""
+    """number of episodes that a worker plays at the same time"""
     max_steps: int = 1_000_000
-    """most env steps of all episodes together; each episode gets an equal share, and is cut when it reaches it"""
+    """largest number of env steps of all episodes together; each episode gets an equal share, and is cut at that step"""
     video: bool = False
     """film the episodes: an mp4 of each in the folder videos of the run (pip install 'millrace-rl[video]')"""
     debug: bool = False
@@ -86,7 +86,7 @@ class ReportFlags(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class LaunchFlags(msgspec.Struct, frozen=True, kw_only=True):
-    """Flags of every launcher. Flags of `millrace learner` follow `--`: millrace launch … -- --steps 1000000."""
+    """Flags of every launcher. Put flags of `millrace learner` after `--`: millrace launch … -- --steps 1000000."""
 
     env: Positional[str]
     """anything gymnasium.make takes"""

@@ -40,7 +40,7 @@ def _help() -> list[str]:
     return [
         f"usage: millrace keys {'|'.join(SUBCOMMANDS)} …",
         "",
-        "Who may join the learners of this machine from other machines.",
+        "Choose which workers of other machines may join the learners of this machine.",
         "",
         *(f"  millrace keys {each.usage:18} {each.about}" for each in SUBCOMMANDS.values()),
         "",
@@ -122,5 +122,5 @@ SUBCOMMANDS = {
     "new": Subcommand(_new, "new NAME", "make a key for workers, allow it here, and write its join token to a file"),
     "show": Subcommand(_show, "show", "list the learner's public key and the clients: names, public keys, dates, states"),
     "allow": Subcommand(_allow, "allow PUBLIC NAME", "allow a client whose key was made on another machine"),
-    "revoke": Subcommand(_revoke, "revoke NAME", "shut a client out; running learners cut off its workers in seconds"),
+    "revoke": Subcommand(_revoke, "revoke NAME", "block a client; running learners disconnect its workers within seconds"),
 }

@@ -270,7 +270,7 @@ def _launch(argv: list[str]) -> int:
             "",
             *launchers,
             "",
-            "Flags of `millrace learner` follow `--`. millrace launch NAME --help lists the flags of each.",
+            "Put flags of `millrace learner` after `--`. millrace launch NAME --help lists the flags of each.",
         )
         return 0
     from millrace.launch.launcher_flags import SET_BY_LAUNCHER, read_flags
@@ -355,7 +355,7 @@ COMMANDS = {name: command for group in GROUPS.values() for name, command in grou
 LAUNCHERS = {
     "kubernetes": "print a manifest: a Job for the learner, a Deployment for the workers",
     "slurm": "print the script of one Slurm job",
-    "ray": "train: the learner here, each worker an actor of a Ray cluster",
+    "ray": "train; the learner runs here, and each worker is an actor of a Ray cluster",
 }
 
 
