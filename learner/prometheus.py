@@ -73,7 +73,11 @@ class MetricsSnapshot(msgspec.Struct, frozen=True, kw_only=True):
     """Number of handshakes that failed."""
 
 
-SAMPLE = MetricsSnapshot(at_s=1.0, progress=Progress(return_mean=1.0, length_mean=1.0), ledger=Ledger().counts())
+SAMPLE = MetricsSnapshot(
+    at_s=1.0,
+    progress=Progress(return_mean=1.0, length_mean=1.0, facts={"NAME": FactMean(mean=1.0, missing=0)}),
+    ledger=Ledger().counts(),
+)
 """A snapshot in which every metric has a value: for the list of metrics in the documentation"""
 
 
