@@ -22,8 +22,8 @@ ENVIRONMENTS = ROOT / ".versions"
 LOWEST = "lowest"
 NEED_NEWER = re.compile(r"(ale-py|stable-baselines3)\b")
 """Packages of `dev` that need newer versions than ours of what we also need. Their tests are skipped without them."""
-SYMPY_NEEDS = "mpmath<1.4"
-"""sympy, which older versions of torch import, uses names that are deprecated since."""
+NEED_OLDER = ("mpmath<1.4", "pyparsing<3.3")
+"""The lowest torch (by sympy) and matplotlib use names of these packages that are deprecated since."""
 ASKS = """
 import platform, numpy, torch
 print("Python", platform.python_version(), "torch", torch.__version__, "numpy", numpy.__version__)
@@ -35,7 +35,7 @@ def requirements(name: str, given: list[str]) -> list[str]:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     asked = [*project["dependencies"], *project["optional-dependencies"]["dev"]]
     if name == LOWEST:
-        asked = [*(each for each in asked if not NEED_NEWER.match(each)), SYMPY_NEEDS]
+        asked = [*(each for each in asked if not NEED_NEWER.match(each)), *NEED_OLDER]
     return [*asked, *given]
 
 

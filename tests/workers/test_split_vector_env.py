@@ -73,7 +73,7 @@ def test_lanes_are_collected_in_any_order_but_only_all_together() -> None:
             collect(split, run, 1, lanes=(0, 2))
 
 
-class WithoutWorkers(SyncVectorEnv):  # gymnasium 1.1's is not generic
+class WithoutWorkers(SyncVectorEnv):
     def step(self, actions: Any) -> Any:
         raise NoWorkers("waited 1 s for 1 worker")
 
@@ -91,7 +91,7 @@ def test_that_no_worker_is_left_is_raised_once_to_whoever_asks() -> None:
     env.close()
 
 
-class LosesTwoCopies(SyncVectorEnv[Any, Any]):
+class LosesTwoCopies(SyncVectorEnv):
     """Loses the first two copies in its step number `at`, as a vector environment over worker processes would."""
 
     def __init__(self, makes: Any, at: int) -> None:
