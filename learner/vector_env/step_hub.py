@@ -123,7 +123,7 @@ class StepHub:
         self._newest_tickets: dict[int, int] = {}  # lane -> ticket of its newest order, if its answer is wanted
         self._patience_s = PATIENCE_S
         self._while_waiting: Callable[[], None] = lambda: None
-        self._status: Callable[[float], Status] = lambda now: status(self._coordinator, now)
+        self._status_of_run: Callable[[float], Status] | None = None
         self.stepped: set[int] = set()
         """Lanes whose last step, through shared memory, is done."""
         self._under_way: dict[int, int] = {}  # lane -> number of its order through shared memory
@@ -133,9 +133,7 @@ class StepHub:
         # To lose a worker costs the user's episodes. So a worker has its whole timeout to be heard again, not only the
         # server's short grace: after a long suspension even its connection must be made anew.
         settings = ServerSettings(grace_s=worker_timeout_s, last_messages_wait_s=LAST_MESSAGES_WAIT_S, log_tracebacks=False)
-        callbacks = ServerCallbacks(
-            self._coordinator.receive, lambda now: self._status(now), self._on_event, self._wake_sleeping
-        )
+        callbacks = ServerCallbacks(self._coordinator.receive, self._status, self._on_event, self._wake_sleeping)
         processes = ProcessCallbacks(self._local_workers.poll, self._local_workers.activities)
         self._server = MemberServer(link, self._coordinator, callbacks, processes, settings, clock)
 
@@ -155,7 +153,12 @@ class StepHub:
 
     def answer_for(self, run: Callable[[float], Status]) -> None:
         """From now on answer `millrace status` for the run that acts on these copies: its figures, and the workers here."""
-        self._status = lambda now: status_of_run(run(now), self._coordinator, now)
+        self._status_of_run = run
+
+    def _status(self, now: float) -> Status:
+        if self._status_of_run is None:
+            return status(self._coordinator, now)
+        return status_of_run(self._status_of_run(now), self._coordinator, now)
 
     # ---------------------------------------------------------------- orders
 

@@ -237,13 +237,14 @@ def test_a_loop_by_recv_does_not_wait_for_a_copy_that_hangs(tmp_path: Path, shar
                timeout=60.0, shared_memory=shared_memory)  # fmt: skip
     env.async_reset(seed=1)
     rows = dict.fromkeys(range(4), 0)
-    while sum(rows.values()) < 400:
+    deadline = time.monotonic() + 60.0
+    while min(rows[n] for n in (0, 2, 3)) < 100 and time.monotonic() < deadline:
         ids = env.recv()[4]["env_id"]
         for n in ids.tolist():
             rows[n] += 1
         env.send(np.zeros(len(ids), np.int64), ids)
     assert rows[1] == 2, "its reset and its first step"
-    assert all(rows[n] > 50 for n in (0, 2, 3))
+    assert min(rows[n] for n in (0, 2, 3)) >= 100, rows
     close_and_check(env)
 
 
