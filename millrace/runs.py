@@ -158,7 +158,7 @@ class Run(os.PathLike[str]):
     def plot(self, out: str | os.PathLike[str] | None = None) -> PngFigure:
         """Draw the learning curve, as `millrace plot` does. Returns a matplotlib figure, which a notebook shows.
 
-        `out`: also write it to this file, as a PNG. Raises `UsageError` if no episode has ended yet.
+        `out`: also write it to this file, as a PNG. Raises `UsageError` if no episode has ended.
 
         >>> import millrace
         >>> figure = millrace.Run(run).plot("curve.png")

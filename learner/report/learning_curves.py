@@ -7,6 +7,7 @@ a band reaches from the worst to the best. If an algorithm has several groups, t
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -37,12 +38,14 @@ COLORS = (
 )  # Okabe and Ito: distinguishable for color-blind readers
 GREY = "#555555"
 
+log = logging.getLogger("millrace.learner")
+
 
 def read_curve(run: Path) -> Curve:
     """The learning curve of a run folder. Raises `UsageError`, with a one-line message, if the folder has none."""
     curve = read_run_files(run, "plot").curve()
     if curve is None:
-        raise UsageError(f"run {run}: nothing to plot, no episode has ended yet")
+        raise UsageError(f"run {run}: nothing to plot, no episode has ended")
     return curve
 
 
@@ -61,15 +64,21 @@ def write(figure: PngFigure, out: Path) -> None:
 
 
 def curves(runs: Sequence[Path]) -> PngFigure:
-    """Draw the runs. Raises `UsageError` for a folder that cannot be read, or of a run in which no episode has ended."""
+    """Draw the runs, without those in which no episode has ended: a warning names each.
+
+    Raises `UsageError` for a folder that cannot be read, and if there is nothing to draw.
+    """
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     from learner.report.figure import PngFigure
 
-    read = [read_run(run, "plot") for run in runs]
-    for run in read:
-        if run.curve is None:
-            raise UsageError(f"run {run.path}: nothing to plot, no episode has ended yet")
+    found = [read_run(run, "plot") for run in runs]
+    read = [run for run in found if run.curve is not None]
+    empty = [f"run {run.path}: nothing to plot, no episode has ended" for run in found if run.curve is None]
+    if not read:
+        raise UsageError(empty[0])
+    for line in empty:
+        log.warning("%s; it is left out", line)
     groups = group_runs(read).groups
     envs, names = sorted({group.env for group in groups}), sorted({group.name for group in groups})
     columns = min(len(envs), COLUMNS)

@@ -83,10 +83,18 @@ def test_what_cannot_be_plotted_is_said_in_one_line(tmp_path: Path) -> None:
         read_curve(tmp_path / "nowhere")
     with pytest.raises(UsageError, match=r"expected a run folder to plot, got no config\.toml"):
         read_curve(tmp_path)
-    with pytest.raises(UsageError, match="nothing to plot, no episode has ended yet"):
+    with pytest.raises(UsageError, match="nothing to plot, no episode has ended"):
         read_curve(a_run(tmp_path, length=1))
     with pytest.raises(RunError, match="not written: No such file or directory"):
         plot([a_run(tmp_path, seed=2)], tmp_path / "nowhere" / "curves.png")
+
+
+def test_a_run_without_episodes_is_left_out_beside_others_and_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    whole, empty = a_run(tmp_path / "whole", seed=1), a_run(tmp_path / "empty", seed=1, length=1)
+    assert legend([whole, empty]) == legend([whole])
+    assert [str(empty) in line for line in caplog.messages] == [True]
 
 
 def legend(runs: list[Path]) -> list[str]:
