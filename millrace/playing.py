@@ -13,7 +13,6 @@ from typing import Any, Literal, NamedTuple, TypedDict, TypeVar, Unpack
 
 import msgspec
 
-from learner.config.did_you_mean import did_you_mean
 from learner.policy_player import SavedPolicy, saved_policy, useful_workers
 from learner.recording.record import RecordedDataset
 from learner.recording.record import record as record_dataset
@@ -23,6 +22,7 @@ from millrace.cli.flags import EvaluateFlags, RecordFlags
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
 from millrace.terminal import count_line
 from protocol.bounds import MAX_SEEDS
+from protocol.did_you_mean import did_you_mean
 from protocol.env_spec import EnvLike
 from protocol.envs.wrappers import WrapperLike
 from protocol.errors import UsageError

@@ -23,7 +23,6 @@ from typing import TYPE_CHECKING, Any, Self
 import gymnasium
 import numpy as np
 
-from learner.config.did_you_mean import did_you_mean
 from learner.config.rollout_config import RolloutConfig
 from learner.config.validation import convert_rollout_settings
 from learner.interrupts import Interrupts
@@ -35,6 +34,7 @@ from learner.run_folder.results import Evaluation
 from millrace.launch.rollouts import start
 from millrace.policies import MLP, PolicyChoice, PolicyParameters
 from protocol.arrays import Array, Ints
+from protocol.did_you_mean import did_you_mean
 from protocol.env_spec import EnvLike, EnvSpec, remembered_name
 from protocol.envs.wrappers import WrapperLike, wrapper_name
 from protocol.errors import CheckpointError, UsageError, first_line

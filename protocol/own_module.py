@@ -6,7 +6,6 @@ package that is missing needs none.
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import traceback
 from collections.abc import Callable
@@ -14,6 +13,7 @@ from types import ModuleType
 from typing import Any
 
 from protocol.bounds import one_line
+from protocol.did_you_mean import did_you_mean
 from protocol.envs.found_names import attribute
 from protocol.errors import UsageError, first_line
 
@@ -51,8 +51,7 @@ def callable_of(module: ModuleType, qualname: str, what: str) -> Callable[..., A
     found = attribute(module, qualname)
     if found is None:
         known = [name for name, value in vars(module).items() if callable(value) and not name.startswith("_")]
-        close = difflib.get_close_matches(qualname, known, n=1)
-        hint = f"; did you mean {module.__name__}:{close[0]}?" if close else ""
+        hint = did_you_mean(qualname, known, f"{module.__name__}:")
         raise UsageError(f"{what}: module {module.__name__} has no {qualname}{hint}")
     if not callable(found):
         raise UsageError(f"{what}: expected a function or class to call, got {type(found).__name__}")

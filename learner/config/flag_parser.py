@@ -13,7 +13,7 @@ import msgspec
 import tyro
 from tyro.conf import OmitArgPrefixes, PositionalMetavarFromFieldName
 
-from learner.config.did_you_mean import did_you_mean
+from protocol.did_you_mean import did_you_mean
 from protocol.errors import UsageError
 
 REWORDINGS = {

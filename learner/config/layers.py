@@ -16,11 +16,11 @@ import msgspec
 
 from learner.config.algorithm_names import is_own, name_of, settings_record, with_algorithm
 from learner.config.config import Config
-from learner.config.did_you_mean import did_you_mean
 from learner.config.hyperparameters import HYPERPARAMETERS, algorithms_with
 from learner.config.presets import PRESETS, environment_presets, named_presets
 from learner.config.validation import convert, validate
 from learner.run_folder.run_format import check_format, check_whole
+from protocol.did_you_mean import did_you_mean
 from protocol.envs.found_names import moved
 from protocol.errors import UsageError
 

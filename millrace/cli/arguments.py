@@ -9,7 +9,7 @@ import argparse
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from learner.config.did_you_mean import did_you_mean
+from protocol.did_you_mean import did_you_mean
 from protocol.errors import UsageError
 
 

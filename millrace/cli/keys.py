@@ -10,8 +10,8 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import NamedTuple
 
-from learner.config.did_you_mean import did_you_mean
 from millrace.cli.arguments import Arguments
+from protocol.did_you_mean import did_you_mean
 from protocol.errors import UsageError
 from protocol.keys.key_folder import DEFAULT_FOLDER, FOLDER_VARIABLE, KeyFolder, chosen_key_folder
 from protocol.keys.keys import public_key
