@@ -3,7 +3,8 @@ PYTHON ?= python3
 MINUTES ?= 10
 VERSIONS ?= 3.12 3.13 lowest
 RUNS ?= 200
-# One more than there are cores, because tests of processes wait for most of their time.
+# One more than there are cores, because tests of processes wait for most of their time. They begin at different places of the
+# list of tests, and who has finished takes some of another's: so tests that wait run beside tests that compute.
 TEST_PROCESSES ?= $(shell expr $$(nproc) + 1)
 BIN := .venv/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
@@ -25,7 +26,7 @@ type: .venv/installed-dev
 	$(BIN)/mypy
 
 unit: .venv/installed-dev
-	$(BIN)/python -m pytest --numprocesses $(TEST_PROCESSES)
+	$(BIN)/python -m pytest --numprocesses $(TEST_PROCESSES) --dist worksteal
 
 test-learning: .venv/installed-dev  ## published scores, three seeds each; ten minutes
 	$(BIN)/python -m pytest -m learning --timeout 3600 tests/learning

@@ -31,7 +31,9 @@ LEARNERS = (["learner"], ["millrace", "train"], ["millrace", "learner"], ["millr
 """Modules, and their first argument. Other commands do without PyTorch, and must be seen to."""
 SUPERVISOR = ["workers"]
 WORKER = ["-P", "-m", "workers"]  # as a supervisor starts it
-PER_COMMAND = {"COLUMNS", "PYTEST_CURRENT_TEST", "PYTHONPATH", "PYTHONUNBUFFERED", "TMPDIR", NONCE_VARIABLE}
+PER_COMMAND = {
+    "COLUMNS", "MINARI_DATASETS_PATH", "PYTEST_CURRENT_TEST", "PYTHONPATH", "PYTHONUNBUFFERED", "TMPDIR", NONCE_VARIABLE,
+}  # fmt: skip
 """Variables that a child may have otherwise than its parent: nobody reads them before the command runs, or `become` does."""
 BY_IMPORTS = {
     "LD_LIBRARY_PATH", "OMP_WAIT_POLICY", "PYGAME_HIDE_SUPPORT_PROMPT", "SDL_VIDEODRIVER", "TORCHINDUCTOR_CACHE_DIR",

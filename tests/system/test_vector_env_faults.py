@@ -265,6 +265,8 @@ def test_recv_reports_a_worker_that_is_killed_or_hangs_and_goes_on(tmp_path: Pat
             for n in ids[infos["worker_lost"]]:
                 lost[n] += 1
         after_losses += lost[1] > 0
+        if not lost[1]:
+            time.sleep(0.01)  # ten seconds of steps at full speed would take the core from other tests
         env.send(np.zeros(len(ids), np.int64), ids)
     assert after_losses == 200
     assert (lost[0], lost[1], lost[2]) == (0, 1, 0)
