@@ -125,7 +125,7 @@ def main() -> int:
         if off := [f"{each.variable}={each.value}" for each in PROCESSORS[name] if not said.intersection(each.says)]:
             print(f"{name}: not in force here: {', '.join(off)}")
             failed.append(name)
-        command = [sys.executable, "-m", "pytest", "--numprocesses", str(flags.processes), *numeric_tests()]
+        command = [sys.executable, "-m", "pytest", "-n", str(flags.processes), "--dist=worksteal", *numeric_tests()]
         if subprocess.run(command, cwd=ROOT, env={**os.environ, **variables}, check=False).returncode:
             failed.append(name)
     if failed:

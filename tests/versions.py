@@ -83,7 +83,7 @@ def main() -> int:
         python = make(name, flags.given, flags.gpu_libraries)
         said = subprocess.run([python, "-c", ASKS], cwd=ROOT, capture_output=True, text=True, check=True).stdout
         print(f"\n{name}: {said}", end="", flush=True)
-        tests = [python, "-m", "pytest", *(flags.pytest or ["--numprocesses", str((os.cpu_count() or 1) + 1)])]
+        tests = [python, "-m", "pytest", *(flags.pytest or ["-n", str((os.cpu_count() or 1) + 1), "--dist=worksteal"])]
         if subprocess.run(tests, cwd=ROOT, check=False).returncode:
             failed.append(name)
     if failed:
