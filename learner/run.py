@@ -29,10 +29,10 @@ from learner.recording.training_recorder import TrainingRecorder
 from learner.resumption import Resumption, check_spaces
 from learner.rollout_service.service import describe_settings, rollout_service
 from learner.rollouts.hub import HubObserver
-from learner.run_folder.lease import Closed
+from learner.run_folder.lease import Closed, Listens
 from learner.run_folder.run_folder import Interrupted, RunFolder
 from learner.run_folder.run_lock import RunLock
-from protocol.address import advertised_address
+from protocol.address import advertised_address, own_address
 from protocol.bounds import one_line
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
@@ -179,7 +179,9 @@ class Run:
         elif keyring is not None and keyring.folder is None:
             self.folder.lock.announce(Closed.KEYS_OF_THE_RUN)
         else:
-            self.folder.lock.announce(advertised_address(address, advertise, socket.gethostname()))
+            keys = "" if keyring is None or keyring.folder is None else str(keyring.folder.path.absolute())
+            others = advertised_address(address, advertise, socket.gethostname())
+            self.folder.lock.announce(Listens(others, own_address(address), keys))
 
     def status(self, now: float) -> Status:
         """The answer to `millrace status`. `now`: seconds of the monotonic clock."""

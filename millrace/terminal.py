@@ -24,6 +24,7 @@ from rich.text import Text
 from learner.run_folder.json_log import JsonLines, progress_line
 from learner.run_folder.progress import Progress
 from protocol.bounds import escaped
+from protocol.logs.notices import is_notice
 
 REDRAW_EVERY_S = 0.2
 NOTEBOOK_EVERY_S = 0.5
@@ -383,7 +384,7 @@ def _styled(name: str, text: str, progress: Progress) -> Text:
 
 
 class _WarningHandler(logging.Handler):
-    """Prints warnings and errors of the log in the view."""
+    """Prints warnings, errors and notices of the log in the view."""
 
     def __init__(self, view: ProgressView) -> None:
         super().__init__(logging.WARNING)
@@ -391,4 +392,5 @@ class _WarningHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print one record."""
-        self._view.print_line(f"{record.levelname.lower()}: {record.getMessage()}")
+        level = "" if is_notice(record) else f"{record.levelname.lower()}: "
+        self._view.print_line(f"{level}{record.getMessage()}")

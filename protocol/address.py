@@ -86,6 +86,14 @@ def advertised_address(bound: str, advertise: str, machine: str) -> str:
     return f"tcp://{f'[{named}]' if ':' in named and not named.startswith('[') else named}:{port}"
 
 
+def own_address(bound: str) -> str:
+    """The address at which processes on the same machine reach a learner that listens at `bound`."""
+    host = host_of(bound)
+    if host not in WILDCARDS:
+        return bound
+    return f"tcp://{'[::1]' if host == '[::]' else '127.0.0.1'}:{bound.rpartition(':')[2]}"
+
+
 def worker_name(peer: bytes) -> bytes:
     """The worker's name: its routing id up to the first zero byte. With keys, a zero byte and more follow the name."""
     return peer.partition(b"\0")[0]

@@ -19,6 +19,10 @@
 A message is one line: who, what, expected, got, what to do next.
 """
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+
 
 def first_line(error: BaseException, otherwise: str = "no message") -> str:
     """The first line of an exception's message; `otherwise` if it has none."""
@@ -187,3 +191,10 @@ class BadMessage(PeerError):
 
 class BadRollout(PeerError):
     """A rollout that breaks the row format or does not fit the run."""
+
+
+def unexpected_arguments(words: Sequence[str], *, one_run: bool) -> str:
+    """What is wrong with a command that got these words, too many. `one_run`: it takes one run, and has got that."""
+    if one_run:
+        return f"expected one run, got {1 + len(words)}; name one of them"
+    return f"unexpected argument {words[0]}"

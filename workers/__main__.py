@@ -22,7 +22,7 @@ from protocol.alive import CallTimeouts
 from protocol.errors import UsageError, UserFacingError
 from protocol.keys.key_folder import TOKEN_VARIABLE, read_token
 from protocol.keys.keys import Token
-from workers.connection_rules import checked_token
+from workers.connection_rules import REJOIN_TIMEOUT_S, checked_token
 from workers.supervise.learner_notice import AliveSender
 from workers.supervise.worker_process import WorkerCommand, WorkerProcess
 from workers.supervisor import Supervisor, core_flags, timeout_flags
@@ -92,7 +92,8 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         type=float,
         default=60.0,
         metavar="S",
-        help="leave when no learner has answered for S seconds (default: %(default)g)",
+        help="before a learner has accepted this worker: leave when none has answered for S seconds (default: %(default)g); "
+        f"a worker that had joined waits {REJOIN_TIMEOUT_S:g} s for its learner to come back",
     )
     for call, what in (("construct", "making one env copy"), ("reset", "a reset"), ("step", "a step")):
         faults.add_argument(

@@ -1,4 +1,4 @@
-"""To which learner a worker connects, and with which token. Pure, and without imports of numpy or gymnasium.
+"""To which learner a worker connects, with which token, and how long it waits. Pure; imports no numpy or gymnasium.
 
 Rule: over TCP to another machine, a worker connects without a token only with --insecure.
 """
@@ -9,6 +9,9 @@ from protocol.address import check_address, is_local
 from protocol.errors import UsageError
 from protocol.keys.key_folder import TOKEN_VARIABLE
 from protocol.keys.keys import Token
+
+REJOIN_TIMEOUT_S = 600.0
+"""How long a worker that had joined waits for its learner to come back."""
 
 
 def checked_token(address: str, token: Token | None, *, insecure: bool) -> Token | None:

@@ -43,6 +43,7 @@ from protocol.messages import (
 from protocol.space_spec import EnvDescription
 from protocol.specs import DescribeSpec, RunSpec, StepSpec
 from workers.collect.held_rollouts import Assignment, HeldRollouts
+from workers.connection_rules import REJOIN_TIMEOUT_S
 from workers.evaluate.held_evaluations import HeldEvaluations
 from workers.states import TABLE, LearnerSilent, State, StopRequested, WorkerFailed, WorkFinished
 from workers.step.held_orders import HeldOrders
@@ -167,7 +168,7 @@ class Session:
     """State machine of one worker, from its first Hello until it leaves."""
 
     def __init__(
-        self, identity: Identity, now: float, *, join_timeout_s: float = 60.0, rejoin_timeout_s: float = 600.0
+        self, identity: Identity, now: float, *, join_timeout_s: float = 60.0, rejoin_timeout_s: float = REJOIN_TIMEOUT_S
     ) -> None:
         self.identity = identity
         self.state = State.JOINING

@@ -14,7 +14,7 @@ import tyro
 from tyro.conf import OmitArgPrefixes, PositionalMetavarFromFieldName
 
 from protocol.did_you_mean import did_you_mean
-from protocol.errors import UsageError
+from protocol.errors import UsageError, unexpected_arguments
 
 REWORDINGS = {
     r"invalid literal for int\(\) with base 10: ": "expected a whole number, got ",
@@ -63,7 +63,8 @@ def parse_flags(
     if unknown and not ignore_unknown:
         flag = next((word for word in unknown if word.startswith("-")), None)
         if flag is None:
-            raise UsageError(f"{command}: unexpected argument {unknown[0]}")
+            one_run = any(field.name == "run" for field in msgspec.structs.fields(kind))
+            raise UsageError(f"{command}: {unexpected_arguments(unknown, one_run=one_run)}")
         name = flag.lstrip("-")
         similar = hint(name.replace("-", "_")) or did_you_mean(name, _flag_names(kind, default), "--")
         raise UsageError(f"{command}: unknown flag {flag}{similar}")

@@ -16,6 +16,7 @@ import zmq
 from learner.members.endpoint import Listening, join_lines, keyring_for
 from protocol.errors import UsageError
 from protocol.keys.key_folder import Keyring
+from protocol.logs.notices import log_notice
 from protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")
@@ -35,7 +36,7 @@ class Bound:
     def announce(self, advertise: str) -> None:
         """Log how a worker is started elsewhere."""
         for line in join_lines(self.link.address, advertise, self.keyring):
-            log.warning("%s", line)
+            log_notice(log, line)
 
 
 def listen(where: Listening, resources: ExitStack, code: str = "") -> Bound:

@@ -83,9 +83,7 @@ def join_lines(address: str, advertise: str, keyring: Keyring | None) -> list[st
     if keyring is None:
         insecure = "" if is_local(reach) else " --insecure"
         return [f"waiting for workers; start one with: millrace worker {reach}{insecure}"]
-    folder = keyring.folder
-    tokens = [] if folder is None else [folder.token_path(name) for name in keyring.allowed.names()]
-    token = next((path for path in tokens if path.is_file()), None)
+    token = None if keyring.folder is None else keyring.folder.first_token(keyring.allowed)
     if token is None:
         return [f"waiting for workers at {reach}; no token is here: `millrace keys new NAME` makes one"]
     if is_local(reach):

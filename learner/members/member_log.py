@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from learner.members.events import Event, RejoinRequested, RolloutDropped
 from protocol.bounds import MAX_TEXT, one_line
-from protocol.log_rate_limiter import Allowance, LogBudget, LogRateLimiter, suppressed_note
+from protocol.logs.log_rate_limiter import Allowance, LogBudget, LogRateLimiter, suppressed_note
 from protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")

@@ -15,6 +15,7 @@ from typing import Any
 import msgspec
 
 from learner.run_folder.progress import NOT_SHOWN, Progress
+from protocol.logs.notices import is_notice
 
 
 class JsonLines(logging.Formatter):
@@ -25,7 +26,8 @@ class JsonLines(logging.Formatter):
         event = getattr(record, "event", None)
         fields: dict[str, Any] = {} if event is None else dataclasses.asdict(event)
         kind = "said" if event is None else event.json_name
-        return _line(record.created, record.levelname.lower(), kind, record.getMessage(), fields)
+        level = "info" if is_notice(record) else record.levelname.lower()
+        return _line(record.created, level, kind, record.getMessage(), fields)
 
 
 def progress_line(progress: Progress, now: float) -> str:

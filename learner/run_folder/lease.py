@@ -7,11 +7,13 @@ its own how long the content stays the same.
 from __future__ import annotations
 
 from enum import Enum
+from typing import NamedTuple
 
 import msgspec
+from msgspec.structs import replace
 
-WIDTH = 512  # bytes: every rewrite has the same length, so that one of them replaces the whole
-LONGEST_ADDRESS = 200
+WIDTH = 1024  # bytes: every rewrite has the same length, so that one of them replaces the whole
+HIGHEST_COUNT = 10**12
 
 
 class Closed(Enum):
@@ -23,6 +25,17 @@ class Closed(Enum):
     """Its keys are made for this run, and are in no file."""
 
 
+class Listens(NamedTuple):
+    """Where the learner of a run listens for `millrace status`."""
+
+    address: str
+    """As other machines reach it."""
+    here: str
+    """As processes on its own machine reach it."""
+    keys: str = ""
+    """Its key folder; empty if it needs no key."""
+
+
 class Owner(msgspec.Struct, frozen=True, kw_only=True):
     """The content of the lock file."""
 
@@ -32,8 +45,14 @@ class Owner(msgspec.Struct, frozen=True, kw_only=True):
     """Which running kernel the process is on: processes with the same one are on one machine."""
     token: str
     """Random: two locks never have the same."""
+    network: str = ""
+    """Which network it is in: a container on the same machine may be in another one."""
     address: str = ""
-    """Where its learner listens; empty if nobody can ask it, or it does not listen yet."""
+    """Where its learner listens, for other machines; empty if nobody can ask it, or it does not listen yet."""
+    here: str = ""
+    """The same for processes on its machine and in its network."""
+    keys: str = ""
+    """The key folder of its learner; empty if it needs no key."""
     closed: Closed | None = None
     """Why nobody can ask it, where that is known."""
     count: int = 0
@@ -41,6 +60,14 @@ class Owner(msgspec.Struct, frozen=True, kw_only=True):
 
     def __str__(self) -> str:
         return f"process {self.pid} on {self.host}"
+
+    def listening(self, where: Listens | Closed) -> Owner:
+        """The owner with the place where its learner listens; without it, if that is too long for the file."""
+        if isinstance(where, Closed):
+            return replace(self, address="", here="", keys="", closed=where)
+        found = replace(self, address=where.address, here=where.here, keys=where.keys, closed=None)
+        fits = len(replace(found, count=HIGHEST_COUNT).encoded()) == WIDTH
+        return found if fits else replace(self, address="", here="", keys="", closed=None)
 
     def encoded(self) -> bytes:
         """The content of the lock file."""

@@ -23,7 +23,7 @@ from typing import NamedTuple, Self
 
 from msgspec.structs import replace
 
-from learner.run_folder.lease import LONGEST_ADDRESS, Closed, LeaseWatch, Owner, Verdict, decoded
+from learner.run_folder.lease import Closed, LeaseWatch, Listens, Owner, Verdict, decoded
 from protocol.address import is_local
 from protocol.errors import RunError, RunTakenOver, UsageError
 
@@ -31,6 +31,7 @@ log = logging.getLogger("millrace.learner")
 
 LOCK_FILE = "run.lock"
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+NETWORK = Path("/proc/self/ns/net")
 
 
 class Pace(NamedTuple):
@@ -65,7 +66,9 @@ class RunLock:
     ) -> None:
         self._folder, self._path = folder, folder / LOCK_FILE
         self._pace, self._clock, self._sleep = pace, clock, sleep
-        self._owner = Owner(host=socket.gethostname(), pid=os.getpid(), boot=_boot(), token=secrets.token_hex(8))
+        self._owner = Owner(
+            host=socket.gethostname(), pid=os.getpid(), boot=_boot(), token=secrets.token_hex(8), network=_network()
+        )
         self._file = -1
         self._other: Owner | None = None
         self._stop = threading.Event()
@@ -93,14 +96,10 @@ class RunLock:
                 self._path.unlink()
         self._close()
 
-    def announce(self, where: str | Closed) -> None:
+    def announce(self, where: Listens | Closed) -> None:
         """Write into the lock file where the learner of this run listens for `millrace status`, or why nobody can ask it."""
         with self._writing:
-            match where:
-                case Closed():
-                    self._owner = replace(self._owner, address="", closed=where)
-                case str():
-                    self._owner = replace(self._owner, address=where if len(where) <= LONGEST_ADDRESS else "", closed=None)
+            self._owner = self._owner.listening(where)
         self._rewrite()
 
     def check(self) -> None:
@@ -252,8 +251,18 @@ class RunLock:
             self._file = -1
 
 
-def learner_address(folder: Path) -> str:
-    """The address of the learner that trains the run in this folder now.
+class LearnerOfRun(NamedTuple):
+    """Where to ask the learner of a run, from this machine."""
+
+    address: str
+    keys: Path | None
+    """Its key folder, which may be on another machine; None if it needs no key."""
+    is_here: bool
+    """Whether it is on this machine and in this network, and `address` is its own."""
+
+
+def learner_of_run(folder: Path) -> LearnerOfRun:
+    """Where the learner listens that trains the run in this folder now.
 
     Raises `UsageError`, with a one-line message, if none does, or if it cannot be asked from this machine.
     """
@@ -273,9 +282,11 @@ def learner_address(folder: Path) -> str:
     if not owner.address:
         why = "it has not begun yet; try again" if owner.closed is None else WHY_CLOSED[owner.closed]
         raise UsageError(f"run {folder}: {owner} trains it and cannot be asked: {why}")
+    if owner.address.startswith("tcp://"):
+        here = here and owner.network == _network()
     if not here and is_local(owner.address):
         raise UsageError(f"run {folder}: {owner} trains it, and only that machine can reach it; ask there")
-    return owner.address
+    return LearnerOfRun(owner.here if here else owner.address, Path(owner.keys) if owner.keys else None, here)
 
 
 def _is_alive(pid: int) -> bool:
@@ -294,3 +305,11 @@ def _boot() -> str:
         return BOOT_ID.read_text().strip()
     except OSError:
         return f"host {socket.gethostname()}"
+
+
+def _network() -> str:
+    """Which network of this machine this process is in; empty where that is not known."""
+    try:
+        return os.readlink(NETWORK)
+    except OSError:
+        return ""

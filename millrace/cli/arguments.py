@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from protocol.did_you_mean import did_you_mean
-from protocol.errors import UsageError
+from protocol.errors import UsageError, unexpected_arguments
 
 
 class Arguments(argparse.ArgumentParser):
@@ -20,11 +20,13 @@ class Arguments(argparse.ArgumentParser):
         super().__init__(prog=f"millrace {command}", description=about, allow_abbrev=False)
         self._command = command
         self._names: list[str] = []
+        self._takes_run = False
         self.flag("--debug", action="store_true", help="show the traceback of an error")
 
     def flag(self, name: str, **settings: Any) -> None:
         """Add an argument, as `add_argument` does."""
         self._names.append(name)
+        self._takes_run |= "RUN" in settings.get("metavar", "")
         self.add_argument(name, **settings)
 
     def parse(self, argv: Sequence[str]) -> argparse.Namespace:
@@ -33,7 +35,7 @@ class Arguments(argparse.ArgumentParser):
         if flag := next((word for word in unknown if word.startswith("-")), None):
             raise UsageError(f"{self._command}: unknown flag {flag}{did_you_mean(flag, self._names)}")
         if unknown:
-            raise UsageError(f"{self._command}: unexpected argument {unknown[0]}")
+            raise UsageError(f"{self._command}: {unexpected_arguments(unknown, one_run=self._takes_run)}")
         return values
 
     def error(self, message: str) -> NoReturn:

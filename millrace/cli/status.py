@@ -16,10 +16,11 @@ from typing import TextIO
 
 import msgspec
 
-from learner.run_folder.run_lock import learner_address
+from learner.run_folder.run_lock import learner_of_run
 from millrace.cli.arguments import Arguments
-from protocol.errors import Refused, RunError
-from protocol.keys.key_folder import TOKEN_VARIABLE, read_token
+from protocol.errors import Refused, RunError, UsageError
+from protocol.keys.key_folder import TOKEN_VARIABLE, KeyFolder, read_token
+from protocol.keys.keys import Token
 from protocol.messages import Inquire, Status, WorkerStatus
 from protocol.wire.codec import encode
 from protocol.wire.worker_link import WorkerLink
@@ -64,12 +65,11 @@ def status(argv: list[str], out: TextIO) -> None:
     )
     arguments.flag(
         "--token", default="", metavar="FILE",
-        help=f"file of a join token, if workers need one; if not given, {TOKEN_VARIABLE}",
+        help=f"file of a join token, if workers need one; if not given, {TOKEN_VARIABLE}, or the key folder of RUN",
     )  # fmt: skip
     arguments.flag("--insecure", action="store_true", help="ask on another machine without a token, and trust the answer")
     values = arguments.parse(argv)
-    address = values.address if "://" in values.address else learner_address(Path(values.address))
-    token = checked_token(address, read_token(values.token), insecure=values.insecure)
+    address, token = whom_to_ask(values.address, read_token(values.token), insecure=values.insecure)
     link = WorkerLink(address, observer_name(), token=token)
     try:
         while True:
@@ -86,6 +86,40 @@ def status(argv: list[str], out: TextIO) -> None:
             time.sleep(WATCH_EVERY_S)
     finally:
         link.close(linger_s=0)
+
+
+def whom_to_ask(where: str, token: Token | None, *, insecure: bool) -> tuple[str, Token | None]:
+    """The address of a learner, and the token with which to connect. `where`: its address, or the folder of its run.
+
+    A run folder names the learner's key folder, whose token is used if `token` is None. Raises `UsageError`.
+    """
+    if "://" in where:
+        return where, checked_token(where, token, insecure=insecure)
+    learner = learner_of_run(Path(where))
+    if token is None and learner.keys is not None and not insecure:
+        token = token_of_learner(where, learner.keys)
+    if learner.is_here:
+        return learner.address, None if learner.keys is None else token
+    return learner.address, checked_token(learner.address, token, insecure=insecure)
+
+
+def token_of_learner(run: str, folder: Path) -> Token:
+    """A token from the learner's key folder. Raises `UsageError` if there is none on this machine."""
+    keys = KeyFolder(folder)
+    try:
+        path = keys.first_token(keys.allowed())
+    except OSError as error:
+        raise UsageError(
+            f"run {run}: key folder {folder} cannot be read: {error.strerror}; expected --token FILE"
+        ) from error
+    if path is None:
+        raise UsageError(
+            f"run {run}: its learner needs a key, and no token is in {folder} here: expected --token FILE (or "
+            f"{TOKEN_VARIABLE}); on the learner's machine, `millrace keys new NAME --keys {folder}` makes one"
+        )
+    token = read_token(str(path))
+    assert token is not None, "the path is not empty"
+    return token
 
 
 def observer_name() -> str:

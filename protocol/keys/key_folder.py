@@ -51,6 +51,10 @@ class KeyFolder:
         """Path of the token of the client of this name."""
         return self.path / f"{check_name(name)}.token"
 
+    def first_token(self, allowed: ClientList) -> Path | None:
+        """The path of the first token of these clients that is in this folder; None if there is none."""
+        return next((path for path in map(self.token_path, allowed.names()) if path.is_file()), None)
+
     def server(self) -> Key:
         """The learner's key, created if there is none. Learners that start at the same time get the same key."""
         self._ensure_folder()

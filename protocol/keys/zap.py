@@ -28,7 +28,7 @@ from protocol.errors import UsageError
 from protocol.keys.handshake import LEARNER_EVENTS, PendingHandshakes
 from protocol.keys.key_folder import Keyring
 from protocol.keys.keys import KEY_BYTES, Key, Token
-from protocol.log_rate_limiter import LogRateLimiter, suppressed_note
+from protocol.logs.log_rate_limiter import LogRateLimiter, suppressed_note
 
 log = logging.getLogger("millrace.authenticator")
 

@@ -21,7 +21,7 @@ from protocol.address import check_address, name_for_people
 from protocol.errors import BadMessage, RunError, UsageError
 from protocol.keys.key_folder import Keyring
 from protocol.keys.zap import AuthenticatorThread
-from protocol.log_rate_limiter import LogRateLimiter, suppressed_note
+from protocol.logs.log_rate_limiter import LogRateLimiter, suppressed_note
 from protocol.messages import Inquire, Refuse, ToLearner
 from protocol.wire.codec import Buffer, decode_to_learner, encode
 from protocol.wire.socket_options import LINGER_MS, set_options

@@ -18,7 +18,7 @@ from protocol.errors import BadMessage, UsageError
 from protocol.keys.handshake import WORKER_EVENTS, ConnectionProblem, connection_problem
 from protocol.keys.keys import Token
 from protocol.keys.zap import connect_with
-from protocol.log_rate_limiter import LogRateLimiter, suppressed_note
+from protocol.logs.log_rate_limiter import LogRateLimiter, suppressed_note
 from protocol.messages import ToObserver, ToWorker
 from protocol.wire.codec import Buffer, decode_to_observer, decode_to_worker
 from protocol.wire.compression import Packing

@@ -25,6 +25,7 @@ from millrace.terminal import (
     render_block,
     shown_progress,
 )
+from protocol.logs.notices import log_notice
 
 PROGRESS = Progress(
     run="runs/CartPole-v1-ppo-s1", env_steps=62_208, total_steps=100_000, updates=243, wall_s=14.8, steps_per_s=4210.3,
@@ -120,8 +121,10 @@ def test_warnings_of_the_log_are_shown_meanwhile(capsys: pytest.CaptureFixture[s
     with progress_view() as watch:
         watch(Progress(total_steps=5))
         logger.warning("worker w1 is gone")
+        log_notice(logger, "waiting for workers")
         logger.info("not so important")
     out = capsys.readouterr().out
+    assert "waiting for workers" in out.splitlines(), "a notice is shown, and is no warning"
     assert "0 of 5 env steps" in out
     assert "warning: worker w1 is gone" in out
     assert "not so important" not in out

@@ -96,6 +96,25 @@ def test_a_worker_without_a_token_says_why_it_cannot_join(stage: Stage) -> None:
     assert "no learner answered for 3 s: " in worker.said().splitlines()[-1]
 
 
+@pytest.mark.parametrize("bind", ["tcp://0.0.0.0:*", "tcp://[::]:*"])
+def test_status_of_a_run_on_this_machine_needs_nothing_but_its_folder(stage: Stage, bind: str) -> None:
+    """The learner listens for other machines, with keys in the folder that it has by default."""
+    home = ["env", f"HOME={stage.tmp_path}"]
+    keys = stage.tmp_path / ".config" / "millrace" / "keys"
+    learner = stage.learner(bind, {**CARTPOLE, "advertise": "no.such.host.invalid"}, env="CartPole-v1", before=home)
+    port = join_address(learner).rpartition(":")[2]
+    worker = stage.worker(f"tcp://127.0.0.1:{port}", "w", "--token", str(keys / "default.token"))
+    if "[" in bind:
+        worker.process.kill()
+        worker = stage.worker(f"tcp://[::1]:{port}", "w6", "--token", str(keys / "default.token"))
+    learner.trains()
+    command = [sys.executable, "-m", "millrace", "status", str(learner.folder)]
+    asked = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (asked.returncode, asked.stderr) == (0, "")
+    assert asked.stdout.startswith("CartPole-v1: ")
+    assert worker.alive()
+
+
 def test_an_insecure_learner_warns_and_a_worker_of_it_runs_no_code(stage: Stage) -> None:
     settings = {"env-kwargs": "", "insecure": " ", "advertise": "127.0.0.1"}
     learner = stage.learner("tcp://0.0.0.0:*", settings, env="workers.envs.toy:Spaces-v0")

@@ -11,7 +11,7 @@ import pytest
 
 from learner.config.config import Config
 from learner.members.endpoint import generate_run_keys, join_lines, keyring_for
-from protocol.address import advertised_address, check_address, is_local, needs_ipv6, resolves
+from protocol.address import advertised_address, check_address, is_local, needs_ipv6, own_address, resolves
 from protocol.env_spec import AllowedCode, EnvSpec, PickledCallable
 from protocol.errors import UsageError
 from protocol.keys.key_folder import KeyFolder
@@ -222,3 +222,17 @@ def test_ipv6_is_used_for_addresses_and_not_for_names_that_have_another() -> Non
 )
 def test_what_others_type_to_reach_it(bound: str, advertise: str, typed: str) -> None:
     assert advertised_address(bound, advertise, "box") == typed
+
+
+@pytest.mark.parametrize(
+    ("bound", "own"),
+    [
+        ("tcp://0.0.0.0:5555", "tcp://127.0.0.1:5555"),
+        ("tcp://[::ffff:0.0.0.0]:5555", "tcp://127.0.0.1:5555"),
+        ("tcp://[::]:5555", "tcp://[::1]:5555"),
+        ("tcp://192.168.0.1:5555", "tcp://192.168.0.1:5555"),
+        ("ipc:///tmp/x", "ipc:///tmp/x"),
+    ],
+)
+def test_what_its_own_machine_types_to_reach_it(bound: str, own: str) -> None:
+    assert own_address(bound) == own

@@ -219,6 +219,8 @@ def test_any_other_line_and_the_progress_are_lines_of_json_too() -> None:
     assert json.loads(JsonLines().format(record)) | {"time": ""} == {
         "time": "", "level": "info", "event": "said", "message": "two\nlines 3",
     }  # fmt: skip
+    record.levelno, record.levelname, record.notice = logging.WARNING, "WARNING", True
+    assert json.loads(JsonLines().format(record))["level"] == "info", "a notice is no warning"
     found = json.loads(progress_line(PROGRESS, 0.0))
     assert (found["event"], found["time"], found["env_steps"]) == ("progress", "1970-01-01T00:00:00.000+00:00", 1_000)
 

@@ -15,11 +15,12 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from learner.run_folder.lease import LONGEST_ADDRESS, WIDTH, Closed, LeaseWatch, Owner, Verdict, decoded
-from learner.run_folder.run_lock import LOCK_FILE, Pace, RunLock, learner_address
+from learner.run_folder.lease import WIDTH, Closed, LeaseWatch, Listens, Owner, Verdict, decoded
+from learner.run_folder.run_lock import LOCK_FILE, LearnerOfRun, Pace, RunLock, learner_of_run
 from protocol.errors import RunError, RunTakenOver, UsageError
 
 ELSEWHERE = Owner(host="far", pid=77, boot="another kernel", token="theirs")
+SOCKET = Listens("ipc:///tmp/here/learner", "ipc:///tmp/here/learner")
 NEVER = Pace(rewrite_every=1e6, dead_after=30.0, look_every=1.0, confirm_after=1.0)
 OWNS = """
 import sys
@@ -223,27 +224,31 @@ def test_the_lock_says_where_the_learner_listens_and_keeps_saying_it(tmp_path: P
         with pytest.raises(
             UsageError, match=rf"process {os.getpid()} on \S+ trains it and cannot be asked: it has not begun"
         ):
-            learner_address(tmp_path)
-        held.announce("ipc:///tmp/here/learner")
-        assert learner_address(tmp_path) == "ipc:///tmp/here/learner"
+            learner_of_run(tmp_path)
+        held.announce(SOCKET)
+        assert learner_of_run(tmp_path) == LearnerOfRun(SOCKET.here, None, is_here=True)
         held.confirm()
-        assert learner_address(tmp_path) == "ipc:///tmp/here/learner", "the next rewriting keeps it"
+        assert learner_of_run(tmp_path).address == SOCKET.here, "the next rewriting keeps it"
         assert len((tmp_path / LOCK_FILE).read_bytes()) == WIDTH
-        held.announce("tcp://" + "h" * LONGEST_ADDRESS + ":5555")
-        assert len((tmp_path / LOCK_FILE).read_bytes()) == WIDTH
-        assert owner_of(tmp_path).address == ""
+        for long in (
+            SOCKET._replace(address="tcp://" + "h" * WIDTH + ":5555"),
+            SOCKET._replace(keys="/" + "\N{LATIN SMALL LETTER E WITH ACUTE}" * (WIDTH // 2)),
+        ):
+            held.announce(long)
+            assert len((tmp_path / LOCK_FILE).read_bytes()) == WIDTH
+            assert owner_of(tmp_path).address == ""
         for why, line in (
             (Closed.INPROC, "cannot be asked: with --transport inproc it listens in its own process only"),
             (Closed.KEYS_OF_THE_RUN, "cannot be asked: .* the keys of its local workers are in no file; run it with"),
         ):
             held.announce(why)
             with pytest.raises(UsageError, match=line):
-                learner_address(tmp_path)
+                learner_of_run(tmp_path)
             assert len((tmp_path / LOCK_FILE).read_bytes()) == WIDTH
-        held.announce("ipc:///tmp/here/learner")
-        assert learner_address(tmp_path) == "ipc:///tmp/here/learner", "it is open again"
+        held.announce(SOCKET)
+        assert learner_of_run(tmp_path).address == SOCKET.here, "it is open again"
     with pytest.raises(UsageError, match="no process trains it now"):
-        learner_address(tmp_path)
+        learner_of_run(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -260,12 +265,24 @@ def test_the_lock_says_where_the_learner_listens_and_keeps_saying_it(tmp_path: P
 def test_a_learner_that_cannot_be_asked_from_here_is_named(content: bytes, message: str, tmp_path: Path) -> None:
     (tmp_path / LOCK_FILE).write_bytes(content)
     with pytest.raises(UsageError, match=message):
-        learner_address(tmp_path)
+        learner_of_run(tmp_path)
 
 
 def test_a_learner_elsewhere_is_asked_at_its_address(tmp_path: Path) -> None:
     (tmp_path / LOCK_FILE).write_bytes(replace(ELSEWHERE, address="tcp://far:5555").encoded())
-    assert learner_address(tmp_path) == "tcp://far:5555"
+    assert learner_of_run(tmp_path) == LearnerOfRun("tcp://far:5555", None, is_here=False)
+
+
+def test_a_learner_of_this_machine_is_asked_at_its_own_address(tmp_path: Path) -> None:
+    with lock(tmp_path) as held:
+        held.announce(Listens("tcp://box:5555", "tcp://127.0.0.1:5555", "/home/me/keys"))
+        assert learner_of_run(tmp_path) == LearnerOfRun("tcp://127.0.0.1:5555", Path("/home/me/keys"), is_here=True)
+        in_a_container = replace(owner_of(tmp_path), network="net:[1]")
+    (tmp_path / LOCK_FILE).write_bytes(in_a_container.encoded())
+    assert learner_of_run(tmp_path) == LearnerOfRun("tcp://box:5555", Path("/home/me/keys"), is_here=False)
+    (tmp_path / LOCK_FILE).write_bytes(replace(in_a_container, address="tcp://127.0.0.1:5555").encoded())
+    with pytest.raises(UsageError, match="only that machine can reach it"):
+        learner_of_run(tmp_path)
 
 
 def test_a_process_that_is_gone_trains_nothing(tmp_path: Path) -> None:
@@ -275,4 +292,4 @@ def test_a_process_that_is_gone_trains_nothing(tmp_path: Path) -> None:
         mine = owner_of(tmp_path)
     (tmp_path / LOCK_FILE).write_bytes(replace(mine, pid=ended.pid, address="ipc:///tmp/x").encoded())
     with pytest.raises(UsageError, match=rf"no process trains it now; process {ended.pid} on \S+ did, and is gone"):
-        learner_address(tmp_path)
+        learner_of_run(tmp_path)

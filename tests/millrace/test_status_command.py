@@ -1,0 +1,101 @@
+"""`millrace status RUN`: whom it asks, and with which token. The learner's answer is tested elsewhere."""
+
+from __future__ import annotations
+
+import os
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from learner.run_folder.lease import Listens, Owner, decoded
+from learner.run_folder.run_lock import LOCK_FILE, RunLock
+from millrace.cli.status import whom_to_ask
+from protocol.errors import UsageError
+from protocol.keys.key_folder import KeyFolder, read_token
+from protocol.keys.keys import Key, Token
+
+NOW = datetime(2026, 11, 21, 10, tzinfo=UTC)
+WIDE, HERE = "tcp://box:5555", "tcp://127.0.0.1:5555"
+
+
+@pytest.fixture
+def keys(tmp_path: Path) -> KeyFolder:
+    folder = KeyFolder(tmp_path / "keys")
+    folder.new("default", NOW)
+    return folder
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    path = tmp_path / "run"
+    path.mkdir()
+    return path
+
+
+def write_lock(run: Path, keys: str, boot: str = "", host: str = "box") -> None:
+    """The lock of a learner that lives, on this machine unless `boot` names another one."""
+    with RunLock(run) as lock:
+        lock.announce(Listens(WIDE, HERE, keys))
+        owner = decoded((run / LOCK_FILE).read_bytes())
+    assert owner is not None
+    (run / LOCK_FILE).write_bytes(_elsewhere(owner, boot, host).encoded())
+
+
+def _elsewhere(owner: Owner, boot: str, host: str) -> Owner:
+    return replace(owner, boot=boot, host=host) if boot else owner
+
+
+def test_a_learner_here_is_asked_with_the_token_of_its_key_folder(run: Path, keys: KeyFolder) -> None:
+    write_lock(run, str(keys.path))
+    assert whom_to_ask(str(run), None, insecure=False) == (HERE, read_token(str(keys.token_path("default"))))
+
+
+def test_a_token_that_was_given_comes_first(run: Path, keys: KeyFolder) -> None:
+    write_lock(run, str(keys.path))
+    given = Token(Key.new().public, Key.new())
+    assert whom_to_ask(str(run), given, insecure=False) == (HERE, given)
+
+
+def test_a_learner_here_without_keys_is_asked_without_a_token(run: Path) -> None:
+    write_lock(run, "")
+    of_another_learner = Token(Key.new().public, Key.new())
+    for token in (None, of_another_learner):
+        assert whom_to_ask(str(run), token, insecure=False) == (HERE, None)
+
+
+def test_a_learner_elsewhere_is_asked_with_a_token_if_its_key_folder_is_shared(run: Path, keys: KeyFolder) -> None:
+    write_lock(run, str(keys.path), boot="another kernel")
+    assert whom_to_ask(str(run), None, insecure=False) == (WIDE, read_token(str(keys.token_path("default"))))
+    write_lock(run, "", boot="another kernel")
+    with pytest.raises(UsageError, match="--insecure connects without"):
+        whom_to_ask(str(run), None, insecure=False)
+
+
+@pytest.mark.parametrize("boot", ["", "another kernel"])
+def test_a_folder_without_a_token_is_one_line_that_does_not_suggest_to_go_without(
+    run: Path, keys: KeyFolder, boot: str
+) -> None:
+    keys.revoke("default", NOW)
+    write_lock(run, str(keys.path), boot)
+    with pytest.raises(
+        UsageError, match=rf"no token is in {keys.path} here: expected --token FILE .*keys new NAME"
+    ) as raised:
+        whom_to_ask(str(run), None, insecure=False)
+    assert "insecure" not in str(raised.value)
+    assert "\n" not in str(raised.value)
+    write_lock(run, str(run / "not-here"), boot)
+    with pytest.raises(UsageError, match="no token is in"):
+        whom_to_ask(str(run), None, insecure=False)
+
+
+@pytest.mark.skipif(os.getuid() == 0, reason="root may read every folder")
+def test_a_folder_of_another_user_is_one_line(run: Path, keys: KeyFolder) -> None:
+    write_lock(run, str(keys.path))
+    keys.path.chmod(0)
+    try:
+        with pytest.raises(UsageError, match="cannot be read: Permission denied; expected --token FILE"):
+            whom_to_ask(str(run), None, insecure=False)
+    finally:
+        keys.path.chmod(0o700)
