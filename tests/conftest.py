@@ -7,10 +7,13 @@ import os
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # as the command line does: bits must not depend on the number of cores
 
+import signal
 import sys
 
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else hundreds of processes of tests each compile all that they import
 sys.dont_write_bytecode = False
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a background job does, and all that it starts
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import tempfile
 import threading
