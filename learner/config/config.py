@@ -29,7 +29,9 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     # ------------------------------------------------------------------------------------------------------------ basics
 
     algo: Fixed[str] = "ppo"
-    """Learning algorithm: one of ours, or one of your own as my_module:MyClass. `--algo NAME --help` shows its settings."""
+    """Learning algorithm: a built-in one, or your own, such as my_module:MyClass. `--algo NAME --help` shows its
+    settings.
+    """
     algorithm: Fixed[AlgorithmConfig] = PPOConfig()
     """Settings of the algorithm."""
     steps: Free[Count] = 100_000
@@ -77,8 +79,8 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """
 
     callback: Free[UseAppendAction[tuple[str, ...]]] = ()
-    """A callback of your own, as my_module:factory: code that the learner calls between updates. Repeat the flag to
-    add more callbacks. docs/how-to/callbacks.md describes them.
+    """A callback of your own, such as my_module:factory. The learner calls it between updates. Repeat the flag to add more
+    callbacks. docs/how-to/callbacks.md describes them.
     """
 
     # -------------------------------------------------------------------------------------------------------------- files
@@ -86,13 +88,13 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     checkpoint_every_s: Free[Seconds] = 60.0
     """Seconds between checkpoints."""
     checkpoint_every_episodes: Free[Natural] = 0
-    """Also write a checkpoint after this many training episodes. 0: do not."""
+    """Number of training episodes between two additional checkpoints. 0: no additional checkpoints."""
     checkpoint_every_updates: Free[Natural] = 0
-    """Also write a checkpoint after this many updates. 0: do not."""
+    """Number of updates between two additional checkpoints. 0: no additional checkpoints."""
     keep_checkpoints: Free[Count] = 3
     """Number of checkpoints to keep, the newest ones."""
     record: Free[str] = ""
-    """Write all whole training episodes into the Minari dataset of this id, as cartpole/ppo-v0
+    """Write all whole training episodes to the Minari dataset with this id, such as cartpole/ppo-v0
     (pip install 'millrace-rl[record]').
     """
 

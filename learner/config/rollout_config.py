@@ -29,12 +29,12 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     # ------------------------------------------------------------------------------------------------------------ basics
 
     env: Fixed[Positional[str]] = ""
-    """Environment id for gymnasium.make, as CartPole-v1, ALE/Pong-v5 or my_package.envs:MyEnv-v0."""
+    """Environment id for gymnasium.make, such as CartPole-v1, ALE/Pong-v5 or my_package.envs:MyEnv-v0."""
     env_kwargs: Fixed[dict[str, Scalar]] = {}
     """Keyword arguments for gymnasium.make: NAME VALUE NAME VALUE ..."""
     wrapper: Fixed[Annotated[tuple[str, ...], UseAppendAction]] = ()
-    """Wrap every env copy, also in evaluations: gymnasium.wrappers:FlattenObservation, or with plain arguments
-    "my_module:Scale(by=0.5)". The first one given is the innermost.
+    """Wrapper of every env copy, also in evaluations, such as gymnasium.wrappers:FlattenObservation. Arguments must be
+    literals: "my_module:Scale(by=0.5)". Repeat the flag to add more wrappers. The first one is the innermost.
     """
     seed: Fixed[Natural] = 1
     """Seed of all random numbers of the run."""
@@ -55,22 +55,25 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """
     vector: Free[Literal["auto", "loop", "native", "envpool"]] = "auto"
     """How the env copies of a lane are stepped. loop: one after another. native: by the environment's own vector version.
-    envpool: by envpool (pip install 'millrace-rl[envpool]'). auto: loop. The others use other random numbers.
+    envpool: by envpool (pip install 'millrace-rl[envpool]'). auto: loop. native and envpool use other random numbers than
+    loop.
     """
     images_dtype: Free[ImagesDtype] = "float32"
     """Precision in which the acting policy processes images. bfloat16 halves the work on CPUs with AMX and is slower
     elsewhere. The learner always computes in float32.
     """
     info_keys: Free[str] = ""
-    """Names of numbers that the environment reports in info at the end of an episode, separated by commas, as
-    is_success,distance. Their means are logged.
+    """Names of numbers that the environment reports in info at the end of an episode, separated by commas,
+    such as is_success,distance. Their means are logged.
     """
     pin_workers: Free[bool | None] = None
     """Keep each local worker process on one core (train only). none: do so if max_lag is 0 and the number of workers is a
     multiple of the number of cores.
     """
     min_workers: Free[Natural] = 0
-    """Start training when this many workers have joined. 0: wait for all local workers (train), for one worker (learner)."""
+    """Start training when this many workers have joined. 0: wait for all local workers (train) or one worker
+    (learner).
+    """
 
     # ----------------------------------------------------------------------------------------------------------- network
 
@@ -101,8 +104,8 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     weights; the learner keeps its own weights in float32.
     """
     metrics_bind: Free[str] = ""
-    """HOST:PORT at which Prometheus can read the metrics, as 127.0.0.1:9464. With 0.0.0.0:9464 everybody in the network can
-    read them. Default: nowhere.
+    """HOST:PORT at which Prometheus can read the metrics, such as 127.0.0.1:9464. With 0.0.0.0:9464 everybody in the network
+    can read them. Default: no metrics are served.
     """
 
     # --------------------------------------------------------------------------------------------- timeouts and failures

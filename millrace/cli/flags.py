@@ -18,7 +18,7 @@ class PlayFlags(msgspec.Struct, frozen=True, kw_only=True):
     best: bool = False
     """use the policy with the best evaluation during the run (--eval-every), instead of the newest"""
     env: str = ""
-    """the environment, if the run does not find it by itself, as my_module:make_env or my_module:MyEnv-v0"""
+    """the environment, if the run does not find it by itself, such as my_module:make_env or my_module:MyEnv-v0"""
     wrapper: Annotated[tuple[str, ...], arg(metavar="MODULE:CLASS"), UseAppendAction] = ()
     """the wrappers, innermost first, if the run does not find them by itself"""
     workers: int = 2
@@ -26,14 +26,14 @@ class PlayFlags(msgspec.Struct, frozen=True, kw_only=True):
     transport: Literal["inproc", "ipc", "tcp"] = "ipc"
     """how local workers are connected: as threads of this process, by local sockets, or by TCP"""
     bind: str = ""
-    """address at which workers from elsewhere can join, as tcp://0.0.0.0:5555; then no workers are started here"""
+    """address at which workers from elsewhere can join, such as tcp://0.0.0.0:5555; no workers are then started here"""
 
 
 class EvaluateFlags(PlayFlags, frozen=True, kw_only=True):
     """Play greedy episodes of a run's newest policy; print mean and standard deviation of the return."""
 
     episodes: int | None = None
-    """number of episodes; if not given 100, or 3 with --video"""
+    """number of episodes; if not given: 100, or 3 with --video"""
     seed: int = 1_000_000
     """seed of the episodes"""
     copies: int = 4
@@ -61,7 +61,7 @@ class RecordFlags(PlayFlags, frozen=True, kw_only=True):
     """Write a Minari dataset: episodes of a run's newest policy, with raw rewards (pip install 'millrace-rl[record]')."""
 
     out: str
-    """id of the dataset, as cartpole/expert-v0; it is written to MINARI_DATASETS_PATH, or to ~/.minari/datasets"""
+    """id of the dataset, such as cartpole/expert-v0; it is written to MINARI_DATASETS_PATH, or to ~/.minari/datasets"""
     steps: int = 50_000
     """number of env steps; the last episode is finished, unless that would take more than twice as many"""
     npy: Path | None = None
@@ -89,7 +89,7 @@ class LaunchFlags(msgspec.Struct, frozen=True, kw_only=True):
     """Flags of every launcher. Put flags of `millrace learner` after `--`: millrace launch … -- --steps 1000000."""
 
     env: Positional[str]
-    """anything gymnasium.make takes"""
+    """environment id for gymnasium.make, such as CartPole-v1 or my_package.envs:MyEnv-v0"""
     workers: int = 4
     """number of worker processes; with Ray, of actors"""
     name: str = "millrace"

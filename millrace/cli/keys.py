@@ -50,7 +50,7 @@ def _help() -> list[str]:
 
 def _new(argv: list[str]) -> list[str]:
     arguments = _arguments("new")
-    arguments.flag("name", metavar="NAME", help="name of the client: `millrace keys revoke NAME` shuts out all who use it")
+    arguments.flag("name", metavar="NAME", help="name of the client; `millrace keys revoke NAME` blocks its workers")
     arguments.flag(
         "--server", default="", metavar="PUBLIC",
         help="public key of a learner elsewhere: the token is for that learner, which must allow the key that is printed",
@@ -87,7 +87,7 @@ def _show(argv: list[str]) -> list[str]:
 def _allow(argv: list[str]) -> list[str]:
     arguments = _arguments("allow")
     arguments.flag("public", metavar="PUBLIC", help="public key of the client: 64 hexadecimal digits")
-    arguments.flag("name", metavar="NAME", help="name for the client")
+    arguments.flag("name", metavar="NAME", help="name that you give to the client, for use in `millrace keys revoke NAME`")
     values = arguments.parse(argv)
     _folder(values).allow(values.name, public_key(values.public, "keys allow"), _now())
     return [f"{values.name} may connect"]
