@@ -165,7 +165,8 @@ class Run:
         self.service = rollout_service(config, spec, link, processes, self._check_interrupt, observer, past)
         episodes = _training_recorder(config, self.folder, setup.known, spec)
         self.folder.remove_temporary()
-        self.folder.write_config(config)  # nothing of a resumed run is written before everything fits
+        # Nothing of a resumed run is written before everything fits.
+        self.folder.write_config(config, workers_elsewhere=not processes.expected)
         self.recorder = RunRecorder(config, self.folder, spec, self.algorithm, self.service, state, made, episodes)
         self.folder.keep()
         self.announce(link.address, config.advertise, link.keyring)

@@ -233,7 +233,7 @@ class RunRecorder:
         """
         if not self._finished:
             self._finished = True
-            warn_on_error(lambda: self._folder.write_summary(self._summary(reason)))
+            warn_on_error(lambda: self._folder.write_summary(self._summary(reason, cut_short)))
             self._requests.closed = "the run has ended"
             self._callbacks.on_end(msgspec.structs.replace(self.progress(), stop_reason=reason, cut_short=cut_short))
 
@@ -380,7 +380,7 @@ class RunRecorder:
             next_evaluation=self._evaluations.next_at,
         )
 
-    def _summary(self, reason: str) -> Summary:
+    def _summary(self, reason: str, cut_short: bool) -> Summary:
         wall_s, snapshot = self._wall_s(), self._service.snapshot()
         return Summary(
             env=self._config.env,
@@ -391,6 +391,7 @@ class RunRecorder:
             wall_s=wall_s,
             env_steps_per_s=self.env_steps / wall_s if wall_s else 0.0,
             stop_reason=reason,
+            cut_short=cut_short,
             return_mean_100=self._window.return_mean,
             facts_100=self._window.facts,
             evaluation=self._evaluations.of_version(self.version),

@@ -39,6 +39,8 @@ class RunFiles(NamedTuple):
     algo: str
     seed: int
     config: dict[str, Any]
+    workers_elsewhere: bool
+    """Whether its workers were started elsewhere: then the setting `workers` means nothing."""
     rows: list[dict[str, Any]]
 
     def points(self, key: str) -> list[tuple[float, float]]:
@@ -59,13 +61,13 @@ def algorithm_label(algo: str) -> str:
 
 def read_run_files(run: Path, purpose: Purpose) -> RunFiles:
     """Read a run folder. Raises `UsageError`, with a one-line message that names `purpose`, if it cannot be read."""
-    check_format(run)
+    elsewhere = check_format(run).workers_elsewhere
     try:
         text = (run / "config.toml").read_text("utf-8")
         check_whole(text, str(run / "config.toml"))
         config = tomllib.loads(text)
         env, algo, seed = str(config["env"]), str(config["algo"]), int(config["seed"])
-        return RunFiles(env, algo, seed, config, read_rows(run / METRICS_FILE))
+        return RunFiles(env, algo, seed, config, elsewhere, read_rows(run / METRICS_FILE))
     except FileNotFoundError as error:
         missing = f"no {Path(error.filename).name}" if run.is_dir() else "no such folder"
         raise UsageError(f"run {run}: expected a run folder to {purpose}, got {missing}") from error

@@ -2,7 +2,8 @@
 
 There is a panel for each environment and a color for each group of runs. As in the report, runs of a group have the same
 settings, except the seed and the folder. Of a group of several runs, each run is a thin line, their mean is a bold line, and
-a band reaches from the worst to the best. If an algorithm has several groups, the legend says in which settings they differ.
+a band reaches from the worst to the best. A run that an error or an interrupt ended is a thin line and in no mean; the
+legend says so. If an algorithm has several groups, the legend says in which settings they differ.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ import logging
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from textwrap import fill
+from typing import TYPE_CHECKING, Any
 
 from learner.report.curve import Curve, common_grid, read_run_files
 from learner.report.runs import RunGroup, group_runs, read_run
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
 
 PANEL_INCHES = (6.4, 4.2)
 COLUMNS = 3
+LABEL_WIDTH, LINE_INCHES = 80, 0.2  # of a legend below a panel: characters in a line, and its height
 DPI = 150
 COLORS = (
     "#0072b2",
@@ -45,8 +48,13 @@ def read_curve(run: Path) -> Curve:
     """The learning curve of a run folder. Raises `UsageError`, with a one-line message, if the folder has none."""
     curve = read_run_files(run, "plot").curve()
     if curve is None:
-        raise UsageError(f"run {run}: nothing to plot, no episode has ended")
+        raise UsageError(nothing_to_plot(run))
     return curve
+
+
+def nothing_to_plot(run: Path) -> str:
+    """The line about a run folder in whose metrics no episode has ended."""
+    return f"run {run}: nothing to plot, no episode has ended"
 
 
 def plot(runs: Sequence[Path], out: Path) -> Path:
@@ -74,7 +82,7 @@ def curves(runs: Sequence[Path]) -> PngFigure:
 
     found = [read_run(run, "plot") for run in runs]
     read = [run for run in found if run.curve is not None]
-    empty = [f"run {run.path}: nothing to plot, no episode has ended" for run in found if run.curve is None]
+    empty = [nothing_to_plot(run.path) for run in found if run.curve is None]
     if not read:
         raise UsageError(empty[0])
     for line in empty:
@@ -83,9 +91,9 @@ def curves(runs: Sequence[Path]) -> PngFigure:
     envs, names = sorted({group.env for group in groups}), sorted({group.name for group in groups})
     columns = min(len(envs), COLUMNS)
     rows = math.ceil(len(envs) / columns)
-    figure = PngFigure(
-        figsize=(PANEL_INCHES[0] * columns, PANEL_INCHES[1] * rows), layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.1)
-    )
+    lines = max(_legend_lines([group for group in groups if group.env == env]) for env in envs)
+    size = PANEL_INCHES[0] * columns, (PANEL_INCHES[1] + LINE_INCHES * lines) * rows
+    figure = PngFigure(figsize=size, layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.1))
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for panel in panels[len(envs) :]:
         panel.set_axis_off()
@@ -93,28 +101,26 @@ def curves(runs: Sequence[Path]) -> PngFigure:
         for group in groups:
             if group.env == env:
                 _draw(panel, group, COLORS[names.index(group.name) % len(COLORS)])
-        _style_axes(panel, env)
+        _style_axes(panel, env, below=lines > 0)
     return figure
 
 
 def _draw(panel: Axes, group: RunGroup, color: str) -> None:
-    label = f"{group.name} ({group.differences})" if group.differences else group.name
-    lines = group.curves
-    if len(lines) == 1:
-        (only,) = lines
-        panel.plot(only.env_steps, only.returns, color=color, linewidth=1.8, label=f"{label}, seed {only.seed}")
-        return
-    for curve in lines:
-        panel.plot(curve.env_steps, curve.returns, color=color, linewidth=0.6, alpha=0.35)
-    kind = "seed" if len({curve.seed for curve in lines}) == len(lines) else "run"
-    grid, returns = common_grid(lines)
-    panel.fill_between(
-        grid, returns.min(0), returns.max(0), color=color, alpha=0.15, linewidth=0, label=f"{label}, worst to best {kind}"
-    )
-    panel.plot(grid, returns.mean(0), color=color, linewidth=2.0, label=f"{label}, mean of {len(lines)} {kind}s")
+    lines, averaged = group.curves, group.averaged
+    for number, curve in enumerate(lines):
+        width, alpha = (0.6, 0.35) if averaged else (1.8, 1.0)
+        label = "" if averaged or number else group.legend()
+        panel.plot(curve.env_steps, curve.returns, color=color, linewidth=width, alpha=alpha, label=label)
+    if averaged:
+        kind = "seed" if len({curve.seed for curve in averaged}) == len(averaged) else "run"
+        band = f"{group.label}, worst to best {kind}"
+        grid, returns = common_grid(averaged)
+        panel.fill_between(grid, returns.min(0), returns.max(0), color=color, alpha=0.15, linewidth=0, label=band)
+        panel.plot(grid, returns.mean(0), color=color, linewidth=2.0, label=group.legend())
 
 
-def _style_axes(panel: Axes, env: str) -> None:
+def _style_axes(panel: Axes, env: str, *, below: bool) -> None:
+    """`below`: the legend is below the panel, in lines of at most LABEL_WIDTH characters."""
     from matplotlib.ticker import EngFormatter, MaxNLocator
 
     panel.set_title(env, fontsize=12, fontweight="bold", loc="left")
@@ -131,4 +137,17 @@ def _style_axes(panel: Axes, env: str) -> None:
         spine.set_visible(side in ("left", "bottom"))
         spine.set_color("#bbbbbb")
     handles, labels = panel.get_legend_handles_labels()
-    panel.legend(handles[::-1], labels[::-1], loc="best", fontsize=9, frameon=False, labelcolor="#333333")
+    look: dict[str, Any] = {"fontsize": 9, "frameon": False, "labelcolor": "#333333", "loc": "best"}
+    if below:
+        labels = [fill(label, LABEL_WIDTH) for label in labels]
+        look |= {"loc": "upper left", "bbox_to_anchor": (-0.1, -0.16)}
+    panel.legend(handles[::-1], labels[::-1], **look)
+
+
+def _legend_lines(groups: Sequence[RunGroup]) -> int:
+    """How many lines the legend of a panel has below it; 0 if its texts are short: then it is in the panel."""
+    legends = [group.legend() for group in groups]
+    if max(map(len, legends)) <= LABEL_WIDTH // 2:
+        return 0
+    bands = [f"{group.label}, worst to best seed" for group in groups if group.averaged]
+    return sum(len(fill(label, LABEL_WIDTH).split("\n")) for label in (*legends, *bands))

@@ -1,7 +1,7 @@
 """The data of the page: the runs, read from their folders, and the groups of runs.
 
 Rule: of a run that has not finished, the page shows what its metrics contain. Runs form a group if all their settings except
-the seed and the folder are the same.
+the seed and the folder are the same. A run that an error or an interrupt ended is in its group, and in no mean.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ from learner.run_folder.run_folder import RunFolder
 from protocol.arrays import Doubles
 
 MAY_DIFFER_IN_A_GROUP = ("seed", "run_dir")
-MOST_DIFFERENCES = 3  # settings that are listed after the name of a group
+MOST_DIFFERENCES = 3  # settings that are listed after the name of a group, if no more are needed to tell groups apart
+ELSEWHERE = "started elsewhere"
+"""What is shown as the number of workers if the learner started none."""
 
 
 class RunResults(NamedTuple):
@@ -36,6 +38,8 @@ class RunResults(NamedTuple):
     evaluation: Evaluation | None
     stop_reason: str
     """why the run stopped, or that it has not stopped"""
+    cut_short: bool
+    """whether an error or an interrupt ended it"""
     ledger: dict[str, int]
     stages: dict[str, float]
     facts: dict[str, FactMean] = {}
@@ -79,6 +83,32 @@ class RunGroup:
         """The curves of the runs in which an episode has ended."""
         return [run.curve for run in self.runs if run.curve is not None]
 
+    @property
+    def averaged(self) -> list[Curve]:
+        """The curves of which mean and band are drawn; empty if there is no mean. Runs that were cut short are left out."""
+        whole = [run.curve for run in self.runs if run.curve is not None and not run.results.cut_short]
+        return whole if len(whole) > 1 else []
+
+    @property
+    def label(self) -> str:
+        """Its name and its differences."""
+        return f"{self.name} ({self.differences})" if self.differences else self.name
+
+    def legend(self) -> str:
+        """Which runs a color of the learning curves stands for."""
+        label, curves = self.label, self.curves
+        if not curves:
+            return f"{label}: no episode has ended yet"
+        one_each = len({curve.seed for curve in curves}) == len(curves)
+        ended = [run.seed for run in self.runs if run.curve is not None and run.results.cut_short]
+        early = f"seed {', '.join(map(str, ended))} ended early" if one_each else f"{len(ended)} of them ended early"
+        if mean := self.averaged:
+            kind = "seeds" if one_each else "runs"
+            return f"{label}, mean of {len(mean)} {kind}" + (f"; {early}, not in the mean" if ended else "")
+        if len(curves) == 1:
+            return f"{label}, seed {curves[0].seed}" + (", ended early" if ended else "")
+        return f"{label}, {len(curves)} {'seeds' if one_each else 'runs'}" + (f"; {early}" if ended else "")
+
 
 @dataclass(frozen=True)
 class ReportData:
@@ -116,7 +146,7 @@ def read_run(path: Path, purpose: Purpose = "report on") -> Run:
         env=files.env,
         algo=files.algo,
         seed=files.seed,
-        settings=_flatten(files.config, files.algo),
+        settings=_flatten(files.config, files.algo) | ({"workers": ELSEWHERE} if files.workers_elsewhere else {}),
         algorithm_settings=frozenset(files.config.get(files.algo) or ()),
         results=_results(path, files.rows),
         curve=files.curve(),
@@ -152,11 +182,25 @@ def _name(run: Run, firsts: Sequence[Run]) -> tuple[str, str]:
     if len(firsts) == 1:
         return algorithm_label(run.algo), ""
     differing = differing_settings(firsts, MAY_DIFFER_IN_A_GROUP)
-    names = [name for name in differing if all(name in first.settings for first in firsts)]
-    names.sort(key=lambda name: name not in run.algorithm_settings)  # settings of the algorithm first, because they say most
-    more = [f"{len(names) - MOST_DIFFERENCES} more"] if len(names) > MOST_DIFFERENCES else []
-    differences = ", ".join([*(f"{name} {run.settings[name]}" for name in names[:MOST_DIFFERENCES]), *more])
-    return f"{algorithm_label(run.algo)} {_letters(firsts.index(run))}", differences
+    differing.sort(key=lambda name: name not in run.algorithm_settings)  # the algorithm's first, because they say most
+    needed = _distinguishing(firsts, differing)
+    names = [*needed, *(name for name in differing if name not in needed)]
+    shown = names[: max(len(needed), MOST_DIFFERENCES)]
+    texts = [f"{name} {run.settings[name]}" if name in run.settings else f"no {name}" for name in shown]
+    texts += [f"{len(names) - len(shown)} more"] if len(names) > len(shown) else []
+    return f"{algorithm_label(run.algo)} {_letters(firsts.index(run))}", ", ".join(texts)
+
+
+def _distinguishing(runs: Sequence[Run], names: Sequence[str]) -> list[str]:
+    """A few of these settings, the earliest that will do, whose values together differ between any two of the runs."""
+    chosen: list[str] = []
+
+    def kinds(more: str) -> int:
+        return len({tuple(run.settings.get(name) for name in (*chosen, more)) for run in runs})
+
+    while names and (not chosen or kinds(chosen[-1]) < len(runs)):
+        chosen.append(max(names, key=kinds))
+    return chosen
 
 
 def _letters(i: int) -> str:
@@ -170,7 +214,7 @@ def _results(path: Path, rows: Sequence[dict[str, Any]]) -> RunResults:
     if summary is not None:
         return RunResults(
             summary.env_steps, summary.updates, summary.wall_s, summary.env_steps_per_s, summary.return_mean_100,
-            summary.evaluation, summary.stop_reason, summary.ledger, summary.stages, summary.facts_100,
+            summary.evaluation, summary.stop_reason, summary.cut_short, summary.ledger, summary.stages, summary.facts_100,
         )  # fmt: skip
     last = rows[-1] if rows else {}
     env_steps, wall_s = int(last.get(ENV_STEPS_KEY) or 0), float(last.get("time/time_elapsed") or 0)
@@ -182,6 +226,7 @@ def _results(path: Path, rows: Sequence[dict[str, Any]]) -> RunResults:
         return_mean_100=last.get(RETURN_KEY),
         evaluation=None,
         stop_reason="not finished",
+        cut_short=False,
         ledger={name.removeprefix("ledger/"): int(last[name]) for name in last if name.startswith("ledger/")},
         stages={name.removeprefix("stage/"): float(last[name]) for name in last if name.startswith("stage/")},
     )

@@ -92,7 +92,8 @@ def _rows_of_group(group: RunGroup) -> str:
     returns = [run.results.evaluation.return_mean for run in group.runs if run.results.evaluation is not None]
     if len(returns) > 1:
         mean, worst, best = map(return_text, (sum(returns) / len(returns), min(returns), max(returns)))
-        name += f"<span>greedy {mean} on average, {worst} to {best}</span>"
+        which = f" of {len(returns)} of {len(group.runs)} runs" if len(returns) < len(group.runs) else ""
+        name += f"<span>greedy {mean} on average{which}, {worst} to {best}</span>"
     return f'<tbody><tr class="line"><th scope="rowgroup" colspan="8">{name}</th></tr>{"".join(rows)}</tbody>'
 
 
@@ -107,44 +108,34 @@ def curves(report: ReportData) -> str:
     for env in report.envs:
         groups = [group for group in report.groups if group.env == env]
         all_series = [series for group in groups for series in _series(group)]
-        legend = "".join(f"<li>{color_dot(group)}{escape(_legend(group))}</li>" for group in groups)
+        legend = "".join(f"<li>{color_dot(group)}{escape(group.legend())}</li>" for group in groups)
         if any(series.kind == "dots" for series in all_series):
             legend += '<li><i class="ring"></i>greedy evaluations</li>'
         drawn = chart(all_series, *size, "env steps", f"Learning curves of {env}") if all_series else ""
         panels.append(f'<figure><h3>{escape(env)}</h3><ul class="legend">{legend}</ul>{drawn}</figure>')
     about = f"Return, mean of the last {WINDOW_EPISODES} training episodes."
-    if any(len(group.curves) > 1 for group in report.groups):
-        about += " Bold: the mean over seeds. Band: from the worst to the best. Thin: each seed."
+    if any(group.averaged for group in report.groups):
+        about += " Bold: the mean over seeds, as far as the shortest of them goes. Band: from the worst to the best."
+        about += " Thin: each seed."
     return section("Learning curves", about, f'<div class="panels n{min(len(report.envs), 2)}">{"".join(panels)}</div>')
 
 
-def _legend(group: RunGroup) -> str:
-    name = f"{group.name} ({group.differences})" if group.differences else group.name
-    curves = group.curves
-    if not curves:
-        return f"{name}: no episode has ended yet"
-    if len(curves) == 1:
-        return f"{name}, seed {curves[0].seed}"
-    kind = "seeds" if len({curve.seed for curve in curves}) == len(curves) else "runs"
-    return f"{name}, {len(curves)} {kind}"
-
-
 def _series(group: RunGroup) -> Iterable[Series]:
-    curves = group.curves
-    for curve in curves:
+    averaged = group.averaged
+    for curve in group.curves:
         last = f"{return_text(float(curve.returns[-1]))} at {curve.env_steps[-1]:,.0f} env steps"
         tooltip = f"{group.name}, seed {curve.seed}: {last}"
-        yield Series("thin" if len(curves) > 1 else "line", group.color, curve.env_steps, curve.returns, tooltip)
+        yield Series("thin" if averaged else "line", group.color, curve.env_steps, curve.returns, tooltip)
     for run in group.runs:
         if len(run.evaluations):
             steps, returns = run.evaluations.T
             yield Series("dots", group.color, steps, returns, f"{group.name}, seed {run.seed}: greedy evaluations")
-    if len(curves) > 1:
-        grid, returns = common_grid(curves)
+    if averaged:
+        grid, returns = common_grid(averaged)
         if grid.size:
             band = np.column_stack([returns.min(0), returns.max(0)])
             yield Series("band", group.color, grid, band)
-            yield Series("line", group.color, grid, returns.mean(0), f"{group.name}: mean of {len(curves)}")
+            yield Series("line", group.color, grid, returns.mean(0), f"{group.name}: mean of {len(averaged)}")
 
 
 def videos(report: ReportData) -> str:

@@ -116,6 +116,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     wall_s: float
     env_steps_per_s: float
     stop_reason: str
+    cut_short: bool = False
+    """an error or an interrupt ended the run"""
     return_mean_100: float | None
     """mean return of the last 100 training episodes"""
     facts_100: dict[str, FactMean] = {}

@@ -212,10 +212,10 @@ class RunFolder:
         self.write_config(config)
         return line
 
-    def write_config(self, config: RunSettings) -> None:
+    def write_config(self, config: RunSettings, *, workers_elsewhere: bool = False) -> None:
         """Write config.toml and run.json: at the start, and again when a run is resumed, perhaps with other settings."""
         try:
-            write_format(self.path)
+            write_format(self.path, workers_elsewhere=workers_elsewhere)
         except OSError as error:
             raise RunError(f"{self.path / RUN_FILE} not written: {error.strerror}") from error
         self._write(

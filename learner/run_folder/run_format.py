@@ -27,11 +27,14 @@ class RunFormat(msgspec.Struct, frozen=True, kw_only=True):
     format: int
     millrace: str
     """the version of millrace that wrote it"""
+    workers_elsewhere: bool = False
+    """Whether the run's workers were started elsewhere. Its setting `workers` then means nothing."""
 
 
-def write_format(folder: Path) -> None:
+def write_format(folder: Path, *, workers_elsewhere: bool = False) -> None:
     """Write run.json with the current format. Raises OSError."""
-    content = msgspec.json.encode(RunFormat(format=RUN_FORMAT, millrace=versions().get("millrace", "")))
+    version = versions().get("millrace", "")
+    content = msgspec.json.encode(RunFormat(format=RUN_FORMAT, millrace=version, workers_elsewhere=workers_elsewhere))
     write_atomically(folder / RUN_FILE, lambda file: file.write(content + b"\n"))
 
 
@@ -41,12 +44,12 @@ def check_whole(text: str, where: str) -> None:
         raise UsageError(f"{where} is cut off: expected {END.strip()!r} as its last line; restore it, or start a new run")
 
 
-def check_format(folder: Path) -> int:
-    """The format of a run folder. Raises `UsageError`, with a one-line message, if this millrace cannot read it."""
+def check_format(folder: Path) -> RunFormat:
+    """The run.json of a run folder. Raises `UsageError`, with a one-line message, if this millrace cannot read it."""
     try:
         found = msgspec.json.decode((folder / RUN_FILE).read_bytes(), type=RunFormat)
     except (FileNotFoundError, NotADirectoryError):
-        return 1
+        return RunFormat(format=1, millrace="")
     except (OSError, msgspec.MsgspecError, UnicodeError, RecursionError) as error:
         raise UsageError(
             f"run {folder}: {RUN_FILE} cannot be read: {error}; if this millrace wrote the run, delete that file"
@@ -56,4 +59,4 @@ def check_format(folder: Path) -> int:
             f"run {folder}: its format is {found.format}, and this millrace reads formats up to {RUN_FORMAT}; "
             f"install the millrace that wrote it ({found.millrace or 'unknown version'}) or a newer one"
         )
-    return found.format
+    return found

@@ -16,6 +16,7 @@ from gymnasium.wrappers import FrameStackObservation, TransformObservation
 
 import millrace
 from learner.config.layers import resolve
+from learner.run_folder.run_format import check_format
 from millrace.launch.local_run import train
 from protocol.wire import compression as packing
 from tests.system.processes import START_S, Learner, Stage, crowding
@@ -112,6 +113,7 @@ def test_status_of_a_run_on_this_machine_needs_nothing_but_its_folder(stage: Sta
     asked = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (asked.returncode, asked.stderr) == (0, "")
     assert asked.stdout.startswith("CartPole-v1: ")
+    assert check_format(learner.folder).workers_elsewhere
     assert worker.alive()
 
 

@@ -24,6 +24,7 @@ from learner.config.layers import config_from_toml, resolve
 from learner.policy_player import load_policy
 from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.progress import Progress
+from learner.run_folder.run_format import check_format
 from millrace.launch.local_run import train
 from protocol.errors import EnvironmentFailed, NoWorkers, RunError, UsageError
 from tests.support import preloaded
@@ -447,6 +448,7 @@ def test_status_asks_the_learner_that_train_started_by_its_run_folder(tmp_path: 
         answer = json.loads(status("--json").stdout)
         assert answer["env"] == "CartPole-v1"
         assert answer["env_steps"] > 0
+        assert not check_format(folder).workers_elsewhere
         assert {worker["worker"] for worker in answer["workers"]} == {"w0", "w1"}
         assert {worker["pid"] for worker in answer["workers"]} == {one.pid for one in preloaded.workers_of(learner.pid)}
         assert "dropped: nothing" in status().stdout

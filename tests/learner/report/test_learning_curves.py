@@ -12,6 +12,7 @@ from learner.report.learning_curves import curves, plot, read_curve
 from learner.report.runs import group_runs, read_run
 from learner.run_folder.metrics_log import MetricsLog
 from learner.run_folder.progress import Progress
+from learner.run_folder.results import Summary
 from learner.run_folder.run_folder import RunFolder
 from protocol.errors import RunError, UsageError
 
@@ -106,6 +107,33 @@ def legend(runs: list[Path]) -> list[str]:
 def test_runs_that_differ_only_in_the_seed_are_one_mean(tmp_path: Path) -> None:
     runs = [a_run(tmp_path / str(seed), seed=seed) for seed in (1, 2, 3)]
     assert legend(runs) == ["PPO, mean of 3 seeds", "PPO, worst to best seed"]
+
+
+def test_a_long_legend_is_below_the_curves_and_takes_none_of_their_room(tmp_path: Path) -> None:
+    many: dict[str, Any] = {"gamma": 0.5, "n_epochs": 3, "clip_range": 0.3, "learning_rate": 0.5}
+    figure = curves([a_run(tmp_path, seed=seed, **settings) for settings in ({}, many) for seed in (1, 2)])
+    (panel,) = figure.axes
+    figure.draw_without_rendering()
+    box, legend = panel.get_window_extent(), panel.get_legend()
+    assert legend is not None
+    below = legend.get_window_extent()
+    whole = figure.bbox
+    assert box.width > 0.8 * whole.width
+    assert box.height > 300
+    assert below.y1 < box.y0
+    assert below.x0 >= whole.x0
+    assert below.x1 <= whole.x1
+    assert below.y0 >= whole.y0
+
+
+def test_a_run_that_an_error_ended_is_in_no_mean(tmp_path: Path) -> None:
+    runs = [a_run(tmp_path / str(seed), seed=seed, length=5 if seed == 3 else 20) for seed in (1, 2, 3)]
+    summary: dict[str, Any] = {"env": "CartPole-v1", "algo": "ppo", "seed": 3, "env_steps": 500, "updates": 5, "wall_s": 1.0,
+               "env_steps_per_s": 500.0, "return_mean_100": 28.0, "evaluation": None}  # fmt: skip
+    RunFolder.open(runs[2]).write_summary(Summary(**summary, stop_reason="ValueError: x", cut_short=True))
+    assert legend(runs) == ["PPO, mean of 2 seeds; seed 3 ended early, not in the mean", "PPO, worst to best seed"]
+    widest = max(curves(runs).axes[0].get_lines(), key=lambda line: line.get_linewidth())
+    assert np.max(widest.get_xdata()) == 2000
 
 
 def test_runs_of_different_settings_are_drawn_apart_with_what_differs(tmp_path: Path) -> None:

@@ -35,8 +35,12 @@ STAGES = {"learner_wait": 1.0, "learner_update": 3.0, "worker_step": 2.0, "worke
 def a_run(
     folder: Path, env: str = "CartPole-v1", seed: int = 1, finished: bool = True, length: int = 20, **settings: Any
 ) -> Path:
-    """A run folder; `ledger` among the keywords is what the metrics and the summary tell of it, others are settings."""
-    ledger = settings.pop("ledger", LEDGER)
+    """A run folder.
+
+    `ledger` among the keywords is what the metrics and the summary tell of it; `failure` is the error that ended it. The
+    others are settings.
+    """
+    ledger, failure = settings.pop("ledger", LEDGER), settings.pop("failure", "")
     run = RunFolder.create(resolve(env, run_dir=str(folder), seed=seed, **settings))
     log = MetricsLog(run.path)
     for i in range(1, length + 1):
@@ -47,11 +51,14 @@ def a_run(
         )
     log.close()
     if finished:
-        evaluation = Evaluation(episodes=100, return_mean=-1234.56 + seed, return_std=7.5, length_mean=9.0)
+        evaluation = None
+        if not failure:
+            evaluation = Evaluation(episodes=100, return_mean=-1234.56 + seed, return_std=7.5, length_mean=9.0)
         run.write_summary(
             Summary(
                 env=env, algo="ppo", seed=seed, env_steps=123_456, updates=789, wall_s=61.0, env_steps_per_s=4321.0,
-                stop_reason="all steps done", return_mean_100=99.5, evaluation=evaluation, ledger=ledger, stages=STAGES,
+                stop_reason=failure or "all steps done", cut_short=bool(failure),
+                return_mean_100=99.5, evaluation=evaluation, ledger=ledger, stages=STAGES,
             )
         )  # fmt: skip
     return run.path
@@ -204,10 +211,57 @@ def test_runs_that_differ_in_their_seeds_alone_are_one_line(tmp_path: Path) -> N
 def test_curves_are_a_line_each_with_a_mean_and_a_band_and_dots_for_evaluations(tmp_path: Path) -> None:
     drawn = sections.curves(report_data(*[a_run(tmp_path, seed=seed) for seed in (1, 2, 3)]))
     assert [drawn.count(f'class="{kind} c0"') for kind in ("thin", "line", "band", "dots")] == [3, 1, 1, 3]
-    assert "PPO, 3 seeds" in drawn
+    assert "PPO, mean of 3 seeds" in drawn
     assert "PPO, seed 2: 102.0 at 2,000 env steps" in drawn
     alone = sections.curves(report_data(a_run(tmp_path, seed=4)))
     assert [alone.count(f'class="{kind} c0"') for kind in ("thin", "line", "band")] == [0, 1, 0]
+
+
+def test_a_failed_run_is_in_its_group_and_in_no_mean(tmp_path: Path) -> None:
+    good = [a_run(tmp_path, seed=seed) for seed in (1, 2)]
+    failed = a_run(tmp_path, seed=3, length=5, failure="ValueError: no such room")
+    drawn = sections.curves(report_data(*good, failed))
+    assert "PPO, mean of 2 seeds; seed 3 ended early, not in the mean" in drawn
+    assert [drawn.count(f'class="{kind} c0"') for kind in ("thin", "line", "band")] == [3, 1, 1]
+    (mean,) = re.findall(r'<path class="line c0" d="M([^"]*)"', drawn)
+    assert mean.split("L")[-1].split()[0] == "1066.0", "the mean goes on where the failed run ended"
+    said = text_of(sections.results(report_data(*good, failed)))
+    assert "greedy −1,233.1 on average of 2 of 3 runs" in said
+    assert "seed 3 – not evaluated" in said
+    one_good = sections.curves(report_data(good[0], failed))
+    assert "PPO, 2 seeds; seed 3 ended early<" in one_good
+    assert "mean over seeds" not in one_good
+    assert "PPO, seed 3, ended early<" in sections.curves(report_data(failed))
+
+
+def test_groups_are_told_apart_however_late_the_setting_comes_that_differs(tmp_path: Path) -> None:
+    many: dict[str, Any] = {"gamma": 0.5, "n_epochs": 3, "clip_range": 0.3, "learning_rate": 0.5}
+    found = report_data(
+        a_run(tmp_path),
+        a_run(tmp_path, **many),
+        a_run(tmp_path, **many, workers=1),
+        a_run(tmp_path, **many, env_kwargs={"g": 1.5}),
+    )
+    labels = [group.differences for group in found.groups]
+    assert len(set(labels)) == 4, labels
+    assert ["workers 1" in label for label in labels] == [False, False, True, False]
+    assert ["env_kwargs.g 1.5" in label for label in labels] == [False, False, False, True]
+    assert "no env_kwargs.g" in labels[1]
+
+
+def test_workers_that_came_from_elsewhere_are_not_a_number(tmp_path: Path) -> None:
+    here, elsewhere = a_run(tmp_path), a_run(tmp_path, seed=2)
+    RunFolder.open(elsewhere).write_config(resolve("CartPole-v1", run_dir=str(tmp_path), seed=2), workers_elsewhere=True)
+    assert "<dt>workers</dt><dd>2</dd>" in sections.settings(report_data(here))
+    assert "<dt>workers</dt><dd>started elsewhere</dd>" in sections.settings(report_data(elsewhere))
+    assert [group.differences for group in report_data(here, elsewhere).groups] == ["workers 2", "workers started elsewhere"]
+
+
+def test_long_text_in_a_table_is_wrapped() -> None:
+    style = (ROOT / "learner" / "report" / "style.css").read_text()
+    for selector in (".runs td.text", ".runs .line th", ".settings td"):
+        (rule,) = re.findall(rf"^{re.escape(selector)} {{([^}}]*white-space[^}}]*)}}", style, re.MULTILINE)
+        assert "white-space: normal; overflow-wrap: anywhere;" in rule
 
 
 def test_a_curve_is_drawn_where_it_was_measured() -> None:

@@ -49,14 +49,14 @@ READERS: list[Callable[[Path], object]] = [
 
 def test_a_new_folder_carries_the_format_and_the_version_that_wrote_it(run: Path) -> None:
     written = json.loads((run / RUN_FILE).read_text())
-    assert written["format"] == RUN_FORMAT == check_format(run)
-    assert written.keys() == {"format", "millrace"}
+    assert written["format"] == RUN_FORMAT == check_format(run).format
+    assert written.keys() == {"format", "millrace", "workers_elsewhere"}
 
 
 @pytest.mark.parametrize("read", READERS)
 def test_a_folder_without_a_format_is_of_the_first_and_is_read(run: Path, read: Callable[[Path], object]) -> None:
     (run / RUN_FILE).unlink()
-    assert check_format(run) == 1
+    assert check_format(run).format == 1
     read(run)
 
 
@@ -83,4 +83,4 @@ def test_a_resumed_folder_gets_the_current_format(run: Path) -> None:
     (run / RUN_FILE).unlink()
     folder = RunFolder.open(run)
     folder.write_config(config_of_run(run))
-    assert check_format(run) == RUN_FORMAT
+    assert check_format(run).format == RUN_FORMAT
