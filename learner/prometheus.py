@@ -31,7 +31,6 @@ from prometheus_client.registry import Collector
 
 from learner.config.config import Config
 from learner.rollouts.hub import Hub, HubObserver
-from learner.rollouts.ledger import Ledger
 from learner.run_folder.progress import Progress
 from learner.run_folder.results import FactMean
 from learner.run_folder.versions import versions
@@ -73,30 +72,20 @@ class MetricsSnapshot(msgspec.Struct, frozen=True, kw_only=True):
     """Number of handshakes that failed."""
 
 
-SAMPLE = MetricsSnapshot(
-    at_s=1.0,
-    progress=Progress(return_mean=1.0, length_mean=1.0, facts={"NAME": FactMean(mean=1.0, missing=0)}),
-    ledger=Ledger().counts(),
-)
-"""A snapshot in which every metric has a value: for the list of metrics in the documentation"""
+BEFORE_IT_BEGAN = MetricsSnapshot()
 
 
 class MetricsCollector(Collector):
     """Keeps the newest snapshot and turns it into metrics."""
 
-    def __init__(self, config: Config, clock: Callable[[], float] = time.time) -> None:
-        """`clock` tells seconds since 1970."""
+    def __init__(
+        self, config: Config, clock: Callable[[], float] = time.time, snapshot: MetricsSnapshot = BEFORE_IT_BEGAN
+    ) -> None:
+        """`clock` tells seconds since 1970. `snapshot` is what there is to show until the first is taken."""
         self._clock = clock
-        self._snapshot = MetricsSnapshot()
+        self._snapshot = snapshot
         self._updates_before: int | None = None  # updates of earlier learners, if the run was resumed
         self._about = {"env": config.env, "algo": config.algo, "seed": str(config.seed)}
-
-    @staticmethod
-    def of(config: Config, snapshot: MetricsSnapshot) -> MetricsCollector:
-        """A collector that has this snapshot."""
-        collector = MetricsCollector(config)
-        collector._snapshot = snapshot
-        return collector
 
     def observe(self, hub: Hub) -> None:
         """Take a new snapshot if the last one is old enough. Called whenever the hub has listened."""

@@ -181,6 +181,7 @@ class Failure(Message, frozen=True):
 
     session: Natural
     error: Line
+    """one line, which names the lane if there is one"""
     traceback: Text
     lane: Natural | None
     of_policy: bool = False

@@ -8,7 +8,10 @@ from prometheus_client.metrics_core import Metric
 
 from learner.config.config import Config
 from learner.metric_names import METRICS
-from learner.prometheus import SAMPLE, MetricsCollector
+from learner.prometheus import MetricsCollector, MetricsSnapshot
+from learner.rollouts.ledger import Ledger
+from learner.run_folder.progress import Progress
+from learner.run_folder.results import FactMean
 from website.tables import anchored, table
 
 HEAD = """# Metrics
@@ -21,6 +24,12 @@ A number that does not exist yet is missing or null. `ledger/…` and `stage/…
 In a name, NAME stands for a name that you chose.
 
 """
+SAMPLE = MetricsSnapshot(
+    at_s=1.0,
+    progress=Progress(return_mean=1.0, length_mean=1.0, facts={"NAME": FactMean(mean=1.0, missing=0)}),
+    ledger=Ledger().counts(),
+)
+"""A snapshot in which every metric has a value."""
 PROMETHEUS = """## Prometheus
 
 A learner with `--metrics-bind 127.0.0.1:9464` shows these at `http://127.0.0.1:9464/metrics`. Prometheus itself adds
@@ -41,7 +50,7 @@ def page() -> str:
 
 def prometheus() -> Iterator[tuple[str, str, str, str]]:
     """Name as Prometheus shows it, type, labels and text of each metric of a learner that trains."""
-    for metric in MetricsCollector.of(Config(env="CartPole-v1"), SAMPLE).collect():
+    for metric in MetricsCollector(Config(env="CartPole-v1"), snapshot=SAMPLE).collect():
         labels = {label for sample in metric.samples for label in sample.labels} - {"le"}
         shown = "" if metric.type == "info" else ", ".join(f"`{label}`" for label in sorted(labels))
         yield _shown_name(metric), metric.type, shown or "–", metric.documentation

@@ -1,4 +1,7 @@
-"""Errors of an environment, as a worker names them: the copy that raised, then the lane of that copy. Pure."""
+"""Errors of an environment, as a worker names them: the copy that raised, then the lane of that copy. Pure.
+
+Rule: the line of an error of a lane names the lane, once, at its beginning. Whoever shows the line adds nothing to it.
+"""
 
 from __future__ import annotations
 

@@ -50,6 +50,7 @@ class EnvironmentRaised:
     host: str
     lane: int | None
     error: str
+    """One line. The worker names the lane in it, if there is one."""
     traceback: str
     spare: bool = False
     """Whether it held no lane and no ticket while every lane had a worker. Such a failure does not count against the run."""
@@ -135,10 +136,7 @@ def _line(event: Event) -> str:
             return f"worker {worker} {why}" + (f"; {tickets} of its tickets are dealt again" if tickets else "")
         case WorkerRefused(worker, why):
             return f"worker {worker} was refused: {why}"
-        case EnvironmentRaised(worker, host, lane, error):
-            where = "" if lane is None or error.startswith(f"lane {lane},") else f"lane {lane}: "  # most errors name it
-            return f"worker {worker} ({host}): {where}{error}"
-        case PolicyRaised(worker, host, error):
+        case EnvironmentRaised(worker, host, _, error) | PolicyRaised(worker, host, error):
             return f"worker {worker} ({host}): {error}"
         case WorkerProcessFailed(worker, host, reason, spare):
             counts = "" if spare else "; this counts as a failure of the environment"

@@ -38,6 +38,7 @@ from protocol.wire.learner_link import LearnerLink
 from tests.learner.rollouts.test_ticket_coordinator import Learner
 from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollout, run_spec
 from tests.support.fake_link import FakeLink
+from workers.env_errors import CopyRaised, LaneFailed, Unusable, lane_failed
 
 
 class Noisy:
@@ -137,11 +138,14 @@ def test_no_line_of_a_traceback_looks_like_a_line_of_the_log() -> None:
     assert "\x1b" not in text
 
 
-@pytest.mark.parametrize("error", ["lane 0, copy 1, step 7: boom", "boom"])
-def test_a_failure_names_its_lane_once(error: str) -> None:
-    line = describe(EnvironmentRaised("w", "h", 0, error, ""))
-    assert line.startswith("worker w (h): lane 0")
-    assert line.count("lane 0") == 1
+def test_a_failure_names_its_lane_once() -> None:
+    error = CopyRaised(1, "step")
+    error.__cause__ = ValueError("boom")
+    for failed in (lane_failed(0, "step 7", error), lane_failed(0, "step 7", Unusable(1, "boom")), LaneFailed(0, "boom")):
+        line = describe(EnvironmentRaised("w", "h", failed.lane, str(failed), ""))
+        assert line.startswith("worker w (h): lane 0, ")
+        assert line.count("lane 0") == 1
+    assert describe(EnvironmentRaised("w", "h", 0, "lane 0: boom", "")).count("lane 0") == 1, "it is shown as it came"
 
 
 def test_a_message_that_cannot_be_read_forges_no_line(caplog: pytest.LogCaptureFixture) -> None:
