@@ -18,18 +18,12 @@ from typing import Any
 import pytest
 
 from tests.docs import pages
+from tests.docs.surroundings import missing_extra, variables
 from website.pages import ROOT
 
 DEADLINE_S = 100
 FILE_NAME = re.compile(r"^# (\w+\.py)\b")
 FRAGMENT = "# fragment"
-EXTRAS = {
-    "wandb", "mlflow", "optuna", "jax", "ray", "envpool", "ale_py", "minari", "moviepy", "stable_baselines3", "mujoco",
-    "Box2D", "zstandard",
-}  # fmt: skip
-MISSING = re.compile(
-    r"^ModuleNotFoundError: No module named '(\w+)|^protocol\.errors\.UsageError: .*pip install (\S+)", re.MULTILINE
-)
 QUICK = {
     "docs/explanation/rows.md", "docs/how-to/mlflow.md", "docs/how-to/own_policy.md", "docs/how-to/vector_env_async.md",
     "docs/how-to/wandb.md", "docs/tutorial/your_environment.md",
@@ -57,17 +51,11 @@ def run_page(path: str, text: str, folder: Path) -> str:
     for block in python_blocks(text):
         if name := FILE_NAME.match(block.text):
             (folder / name[1]).write_text(block.text + "\n", encoding="utf-8")
-    home = {
-        "HOME": str(folder),
-        "MINARI_DATASETS_PATH": str(folder / "datasets"),
-        "MPLBACKEND": "agg",
-        "WANDB_MODE": "offline",
-    }
     python_path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]).strip(os.pathsep)
     done = subprocess.run(
         [sys.executable, "page.py"],
         cwd=folder,
-        env={**os.environ, **home, "PYTHONPATH": python_path},
+        env={**os.environ, **variables(folder), "PYTHONPATH": python_path},
         capture_output=True,
         text=True,
         timeout=DEADLINE_S,
@@ -75,8 +63,8 @@ def run_page(path: str, text: str, folder: Path) -> str:
     )
     if done.returncode == 0:
         return ""
-    if (missing := MISSING.search(done.stderr)) and (missing[2] or missing[1] in EXTRAS):
-        return f"needs {missing[1] or missing[2]}"
+    if extra := missing_extra(done.stderr):
+        return f"needs {extra}"
     return f"{path}: exit code {done.returncode}\n{done.stderr.replace(str(folder / 'page.py'), path)}"
 
 
@@ -121,4 +109,6 @@ def test_blocks_share_names_and_files(tmp_path: Path) -> None:
 
 def test_an_extra_that_is_not_installed_skips_the_page(tmp_path: Path) -> None:
     assert run_page("page.md", "```python\nimport mujoco.no_such_part\n```\n", tmp_path) == "needs mujoco"
+    assert missing_extra("    ModuleNotFoundError: No module named 'optuna'\n") == "optuna", "as doctest shows it"
+    assert missing_extra("    ValueError: No module named 'optuna'\n") == ""
     assert "no_such_module" in run_page("page.md", "```python\nimport no_such_module\n```\n", tmp_path)
