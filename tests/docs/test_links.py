@@ -35,6 +35,7 @@ def anchors_of(path: str, text: str) -> set[str]:
 
 
 def test_every_link_leads_somewhere() -> None:
+    pytest.importorskip("stable_baselines3", reason="the page of the Python names has those of millrace.sb3")
     own = {**pages.written(), **pages.made()}
     every = {**own, **pages.in_the_site()}
     wrong = [line for path, text in own.items() for line in dead_links(path, text, every)]
@@ -55,6 +56,8 @@ def test_every_link_leads_somewhere() -> None:
     ],
 )
 def test_a_dead_link_is_found(text: str, complaint: str) -> None:
+    if "python.md" in text:
+        pytest.importorskip("stable_baselines3", reason="the page of the Python names has those of millrace.sb3")
     every = {"docs/page.md": text, "docs/other.md": "# Other\n\n## A part", "docs/reference/python.md": ""}
     (line,) = dead_links("docs/page.md", text, every)
     assert complaint in line

@@ -107,6 +107,7 @@ def test_a_type_that_nobody_knows_is_an_error() -> None:
 
 
 def test_every_public_name_is_on_the_python_page() -> None:
+    pytest.importorskip("stable_baselines3", reason="the page of the Python names has those of millrace.sb3")
     public = set(millrace.__all__) - set(python_page.MODULES) - {"__version__"}
     assert {name for names in python_page.GROUPS.values() for name in names} == public
     assert {name for name in millrace.__all__ if name in millrace._MODULES} <= set(python_page.MODULES)

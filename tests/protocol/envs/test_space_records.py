@@ -199,7 +199,8 @@ def test_sizes_are_refused_at_decoding_before_anything_is_allocated() -> None:
 
 def test_an_environment_is_read_as_it_was_described() -> None:
     env = gymnasium.make("CartPole-v1", render_mode="rgb_array")
-    env.unwrapped.metadata = {**env.metadata, "odd": object(), "text": "é", "nested": {"fps": (1, 2)}}
+    modes = {"render_modes": ["human", "rgb_array"], "render_fps": 50}
+    env.unwrapped.metadata = {**modes, "odd": object(), "text": "é", "nested": {"fps": (1, 2)}}
     found = read_description(describe_env(env))
     assert (found.observation_space, found.action_space) == (env.observation_space, env.action_space)
     assert found.metadata == {name: value for name, value in env.metadata.items() if name != "odd"}
