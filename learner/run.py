@@ -16,7 +16,9 @@ from pathlib import Path
 
 import msgspec
 
+from learner.algorithms import Algorithm
 from learner.callbacks.callbacks import Callbacks, Watch
+from learner.config.algorithm_names import FOR_PRIOR
 from learner.config.config import Config
 from learner.env_spaces import EnvSpaces
 from learner.imports_ahead import ImportsAhead
@@ -39,7 +41,7 @@ from protocol.envs.description import DescribedEnv
 from protocol.errors import MillraceError, RunTakenOver, UsageError, first_line
 from protocol.keys.key_folder import Keyring
 from protocol.messages import Status
-from protocol.specs import DescribeSpec, RunSpec
+from protocol.specs import DescribeSpec, PolicySpec, RunSpec
 from protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")
@@ -157,10 +159,13 @@ class Run:
         self.algorithm = algorithm_class(config.algo)(
             config.algorithm, spec.policy, total_steps=config.steps, seed=config.seed, device=torch_device(config)
         )
+        if config.prior:
+            _add_prior(self.algorithm, config.prior, spec.policy)
         state = RunState()
         if setup.resumed:
             state = restore(self.folder, self.algorithm)
         self._interrupts = setup.interrupts
+        self._learns_from_prior = bool(config.prior)
         past = (state.ledger, state.incarnations)
         self.service = rollout_service(config, spec, link, processes, self._check_interrupt, observer, past)
         episodes = _training_recorder(config, self.folder, setup.known, spec)
@@ -197,6 +202,8 @@ class Run:
 
         try:
             with self._interrupts:
+                if self._learns_from_prior and self.recorder.version == 0:
+                    self.algorithm.learn_from_prior(self.service.pulse)
                 train(self.algorithm, self.service, self.recorder, workers, self._check_time)
         except RunTakenOver as error:
             self.service.drain(str(error), timeout_s=DRAIN_S)
@@ -253,6 +260,16 @@ def _why(error: BaseException) -> str:
     """One line that says why the run ended. The error may come from a user's code, and say anything."""
     text = first_line(error, type(error).__name__)
     return one_line(text if isinstance(error, MillraceError) else f"{type(error).__name__}: {text}")
+
+
+def _add_prior(algorithm: Algorithm, dataset_id: str, policy: PolicySpec) -> None:
+    from learner.recording.prior_dataset import PriorDataset
+
+    if missing := [name for name in FOR_PRIOR if not hasattr(algorithm, name)]:
+        raise UsageError(f"prior {dataset_id}: {type(algorithm).__name__} lacks {', '.join(missing)}")
+    dataset = PriorDataset(dataset_id, policy)
+    algorithm.add_prior(dataset.batches(), dataset.rows + dataset.episodes)
+    log.info("prior %s: %d transitions of %d episodes", dataset_id, dataset.rows, dataset.episodes)
 
 
 def _training_recorder(config: Config, folder: RunFolder, known: KnownEnvironment, spec: RunSpec) -> TrainingRecorder | None:

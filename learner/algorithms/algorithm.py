@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, ClassVar
 
 import numpy as np
 
 from learner.config.hyperparameters import AlgorithmConfig
 from protocol.arrays import Floats
+from protocol.errors import UsageError
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
@@ -73,6 +74,20 @@ class Algorithm(ABC):
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`: the next update is the one that would have followed it, bit for bit."""
+
+    def add_prior(self, batches: Iterable[Batch], observations: int) -> None:
+        """Take the rows of a dataset (`--prior`): batches of one column each, with this number of observations in all.
+
+        Called once, before the first update and before `load_state_dict`. By default raises `UsageError`.
+        """
+        raise UsageError(f"prior: {type(self).__name__} does not learn from prior data: it has no method add_prior")
+
+    def learn_from_prior(self, pulse: Callable[[], None]) -> None:
+        """Make those gradient steps on prior data that come before the first rollouts and are not made yet. Default: none.
+
+        Calls `pulse` between gradient steps, and raises `RunError`, as `update` does.
+        """
+        return
 
     def remember(self) -> None:
         """Remember this state, for `roll_back`. Called before each update, so it must be quick."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import msgspec
@@ -22,7 +22,8 @@ from learner.algorithms.kernels import loss_gradients
 from learner.algorithms.kernels.action_values import action_values
 from learner.algorithms.kernels.optimizer_step import avoid_compiler_import, state_of, take_step
 from learner.algorithms.normalization import ObservationNormalizer
-from learner.algorithms.replay import ReplayBuffer, Sample
+from learner.algorithms.replay.mixed_replay import MixedReplay
+from learner.algorithms.replay.replay_buffer import Sample
 from learner.algorithms.updates import check_finite, scheduled
 from learner.config.hyperparameters import DQNConfig
 from protocol.arrays import Array, Floats
@@ -75,13 +76,14 @@ class DQN(Algorithm):
     def __init__(self, config: DQNConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
         self.config = config
         self.policy = policy
-        self.replay = ReplayBuffer(
+        self.replay = MixedReplay(
             policy.observation,
             size=config.replay_size,
             n_step=config.n_step,
             gamma=config.gamma,
             seed=seed,
             alpha=config.priority_alpha if config.replay == "prioritized" else None,
+            prior_share=config.prior_share,
         )
         self.net = QNetwork(policy, device, seed=seed)
         self.target = QNetwork(policy, device, seed=seed)
@@ -132,6 +134,23 @@ class DQN(Algorithm):
             metrics |= {f"train/{name}": number for name, number in mean._asdict().items()}
             metrics["replay/env_steps_per_gradient_step"] = batch.env_steps / len(measured)
         return metrics
+
+    def add_prior(self, batches: Iterable[Batch], observations: int) -> None:
+        """Store the rows of a dataset beside the replay buffer. They count for the observation statistics."""
+
+        def counted() -> Iterator[Batch]:
+            for batch in batches:
+                self._normalizer.update(features(self.policy, batch.obs)[:-1], batch.valid)
+                yield batch
+
+        self.replay.add_prior(counted(), observations)
+        self._statistics = self._normalizer.buffers()
+
+    def learn_from_prior(self, pulse: Callable[[], None]) -> None:
+        """Make `prior_steps` gradient steps on prior data alone, less those that were made."""
+        for _ in range(self.config.prior_steps - self.gradient_steps):
+            self.step(self.replay.sample(self.config.batch_size))
+            pulse()
 
     @np.errstate(all="ignore")  # `check_finite` finds and names what is not finite
     def step(self, sample: Sample) -> StepMetrics:

@@ -38,6 +38,9 @@ NEEDED = (
 )  # fmt: skip
 """The methods of an algorithm, as `learner.algorithms.Algorithm` describes them"""
 
+FOR_PRIOR = ("add_prior", "learn_from_prior")
+"""The methods that an algorithm needs besides, in a run with prior data"""
+
 NOT_SETTINGS = {"config", "preset", "resume", "log_json", "debug", "watch", "callbacks", "wrappers", "progress"}
 """Flags and arguments of `millrace train` and `millrace.train` that are not settings"""
 

@@ -98,6 +98,11 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     (pip install 'millrace-rl[record]').
     """
 
+    prior: Fixed[str] = ""
+    """Id of a Minari dataset to learn from too, such as cartpole/ppo-v0. Each minibatch has a share of its transitions,
+    which prior_share sets. Only for algorithms with a replay buffer (pip install 'millrace-rl[record]').
+    """
+
     def stop_rule(self) -> StopRule:
         """When training ends."""
         return StopRule(steps=self.steps, target_return=self.target_return, target_mean_return=self.target_mean_return)

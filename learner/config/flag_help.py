@@ -37,7 +37,7 @@ GROUPS = {
         "step_timeout_s", "stall_timeout_s", "grace_s", "max_env_failures",
     ),
     "file and log": (
-        "checkpoint_every_s", "checkpoint_every_episodes", "checkpoint_every_updates", "keep_checkpoints", "record",
+        "checkpoint_every_s", "checkpoint_every_episodes", "checkpoint_every_updates", "keep_checkpoints", "record", "prior",
         "callback", "metrics_bind", "log_json", "debug",
     ),
 }  # fmt: skip

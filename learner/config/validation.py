@@ -9,7 +9,7 @@ import msgspec
 
 from learner.config.algorithm_names import settings_record
 from learner.config.config import Config
-from learner.config.hyperparameters import DQNConfig
+from learner.config.hyperparameters import HYPERPARAMETERS, DQNConfig
 from learner.config.rollout_config import RolloutConfig
 from protocol.address import advertised_address, check_address
 from protocol.bounds import MAX_FACTS, MAX_NAME, one_line
@@ -49,6 +49,7 @@ def validate(config: Config, where: str = "") -> Config:
             raise UsageError(f"{at}replay_size {size}: a rollout takes up to {most}; take --replay-size {most} or more")
     if config.inference == "learner":
         _check_learner_inference(config, at)
+    _check_prior(config, at)
     return config
 
 
@@ -119,6 +120,17 @@ def _check_learner_inference(config: Config, at: str) -> None:
     else:
         return
     raise UsageError(f"{at}inference learner: {wrong}")
+
+
+def _check_prior(config: Config, at: str) -> None:
+    takes_prior = [name for name, record in HYPERPARAMETERS.items() if "prior_share" in record.__struct_fields__]
+    if config.prior and config.algo in HYPERPARAMETERS and config.algo not in takes_prior:
+        raise UsageError(
+            f"{at}prior {config.prior}: {config.algo} has no replay buffer; {', '.join(takes_prior)} learn from prior data"
+        )
+    steps: int | None = getattr(config.algorithm, "prior_steps", None)
+    if steps and not config.prior:
+        raise UsageError(f"{at}prior_steps: expected 0 without prior data, got {steps}; name it by --prior")
 
 
 def _reworded(message: str, settings: dict[str, Any]) -> str:

@@ -131,3 +131,11 @@ def make_action_converter(spec: ActionSpec) -> Callable[[Array], Array]:
     if not start.any():
         return lambda action: action.astype(dtype, copy=False)
     return lambda action: (action + start).astype(dtype, copy=False)
+
+
+def make_action_reader(spec: ActionSpec) -> Callable[[Array], Array]:
+    """The inverse of `make_action_converter`: a function from actions of the environment to stored actions."""
+    if spec.kind == "box":
+        return lambda action: action.astype(spec.stored_dtype)
+    start = np.reshape(np.asarray(spec.start or 0), spec.shape if spec.start else ())
+    return lambda action: (action - start).astype(spec.stored_dtype)

@@ -13,9 +13,9 @@ import pytest
 import torch
 
 from learner.algorithms import Algorithm, algorithm_class
-from learner.algorithms import replay as replay_module
 from learner.algorithms.dqn import DQN, LOSSES, exploration_rate
-from learner.algorithms.replay import Sample
+from learner.algorithms.replay import replay_buffer as replay_module
+from learner.algorithms.replay.replay_buffer import Sample
 from learner.config.hyperparameters import DQNConfig
 from protocol.arrays import Array, Floats, Ints
 from protocol.errors import RunError, UsageError

@@ -18,7 +18,7 @@ from learner.algorithms.kernels import fused
 from learner.algorithms.kernels import mlp as layers
 from learner.algorithms.kernels.action_values import AutogradActionValues, FusedActionValues, action_values
 from learner.algorithms.kernels.fused import FusedQNetwork
-from learner.algorithms.replay import Sample
+from learner.algorithms.replay.replay_buffer import Sample
 from learner.config.hyperparameters import DQNConfig
 from protocol.arrays import Array
 from protocol.policy.layout import hidden_names, parameter_layout, total_size

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from learner.algorithms.normalization import RewardScaler, RunningMoments
-from learner.algorithms.replay import ReplayBuffer
+from learner.algorithms.replay.replay_buffer import ReplayBuffer
 from learner.rollouts.lanes import TicketedLane
 from protocol.policy.policy import make_policy
 from protocol.rollout import Batch, Rollout, stack_rollouts

@@ -16,11 +16,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from learner.algorithms import available_memory as memory
-from learner.algorithms import replay as module
-from learner.algorithms.available_memory import GIB, available_bytes
-from learner.algorithms.replay import ReplayBuffer, Sample, memory_bytes
-from learner.algorithms.sum_tree import SumTree
+from learner.algorithms.replay import available_memory as memory
+from learner.algorithms.replay import replay_buffer as module
+from learner.algorithms.replay.available_memory import GIB, available_bytes
+from learner.algorithms.replay.replay_buffer import ReplayBuffer, Sample, memory_bytes
+from learner.algorithms.replay.sum_tree import SumTree
 from protocol.errors import UsageError
 from protocol.rollout import Batch
 from protocol.specs import Leaf

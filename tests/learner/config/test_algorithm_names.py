@@ -14,7 +14,7 @@ import msgspec
 import pytest
 
 from learner.algorithms import ALGORITHMS, Algorithm, algorithm_class
-from learner.config.algorithm_names import NEEDED, NOT_SETTINGS, name_of, settings_record
+from learner.config.algorithm_names import FOR_PRIOR, NEEDED, NOT_SETTINGS, name_of, settings_record
 from learner.config.command_line import RunFlags, read_config
 from learner.config.config import Config
 from learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig
@@ -122,7 +122,7 @@ def refusal(call: Callable[[], object]) -> str:
 
 def test_the_needed_methods_are_those_of_the_interface() -> None:
     own = {name for name, value in vars(Algorithm).items() if isinstance(value, FunctionType | staticmethod)}
-    assert own == set(NEEDED)
+    assert own == {*NEEDED, *FOR_PRIOR}
 
 
 def test_flags_that_are_no_settings_are_known() -> None:

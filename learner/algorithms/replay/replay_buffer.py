@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from learner.algorithms.available_memory import GIB, available_bytes
-from learner.algorithms.sum_tree import SumTree
+from learner.algorithms.replay.available_memory import GIB, available_bytes
+from learner.algorithms.replay.sum_tree import SumTree
 from protocol.arrays import Array, Bools, Doubles, Floats, Ints
 from protocol.errors import UsageError
 from protocol.rollout import Batch
@@ -102,7 +102,7 @@ class ReplayBuffer:
         self.size = size  # slots
         self.bytes = memory_bytes(observation, size, alpha is not None)
         self._n_step, self._gamma, self._alpha = n_step, gamma, alpha
-        self._generator = np.random.default_rng(seed)
+        self.generator = np.random.default_rng(seed)  # decides what is drawn
         self._obs = tuple(np.zeros((size, *leaf.shape), leaf.dtype) for leaf in observation)
         self._row = np.zeros(size, ROW)
         self._action: Ints = self._row["action"]  # this and the next four: views of `_row`
@@ -202,14 +202,14 @@ class ReplayBuffer:
 
     def _uniform(self, count: int) -> tuple[Ints, Floats]:
         used = min(self._written, self.size)
-        slots = self._generator.integers(0, used, count)
+        slots = self.generator.integers(0, used, count)
         while not (found := self._is_row[slots]).all():  # at least half of the slots have a row; usually nearly all
-            slots[~found] = self._generator.integers(0, used, np.count_nonzero(~found))
+            slots[~found] = self.generator.integers(0, used, np.count_nonzero(~found))
         return slots, np.ones(count, np.float32)
 
     def _by_priority(self, tree: SumTree, count: int, beta: float) -> tuple[Ints, Floats]:
         """P(i) = pᵢ^α / Σ p^α;  wᵢ = (rows · P(i))^−β, divided by the greatest of them (Schaul et al. 2016, section 3.4)."""
-        slots = tree.draw(self._generator, count)
+        slots = tree.draw(self.generator, count)
         chance = tree.weights[slots] / tree.total
         weight = (self._rows * chance) ** -beta
         return slots, (weight / weight.max()).astype(np.float32)
@@ -240,14 +240,14 @@ class ReplayBuffer:
         """Remember this state, for `roll_back`: from now on, what a slot held is kept before it is written."""
         self._overwritten.clear()
         self._remembered = Remembered(
-            self._written, self._rows, self._highest, dict(self._newest), self._generator.bit_generator.state
+            self._written, self._rows, self._highest, dict(self._newest), self.generator.bit_generator.state
         )
 
     def roll_back(self) -> None:
         """Return to the state that was remembered last."""
         assert self._remembered is not None, "nothing was remembered"
         self._written, self._rows, self._highest, newest, generator = self._remembered
-        self._newest, self._generator.bit_generator.state = dict(newest), generator
+        self._newest, self.generator.bit_generator.state = dict(newest), generator
         for old in reversed(self._overwritten):
             self._row[old.slots] = old.rows
             for leaf, before in zip(self._obs, old.leaves, strict=False):
@@ -279,7 +279,7 @@ class ReplayBuffer:
             "newest": {lane: torch.tensor(written) for lane, written in self._newest.items()},
             "written": self._written,
             "highest": self._highest,
-            "generator": self._generator.bit_generator.state,
+            "generator": self.generator.bit_generator.state,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -297,4 +297,4 @@ class ReplayBuffer:
             self._tree.set(np.arange(used), state["arrays"]["weight"].numpy())
         self._rows = int(np.count_nonzero(self._is_row))
         self._newest = {int(lane): written.numpy().copy() for lane, written in state["newest"].items()}
-        self._generator.bit_generator.state = state["generator"]
+        self.generator.bit_generator.state = state["generator"]

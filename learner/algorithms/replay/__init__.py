@@ -1,0 +1,1 @@
+"""The replay buffer: where off-policy algorithms keep transitions, and how they draw them."""

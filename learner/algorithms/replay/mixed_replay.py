@@ -1,0 +1,115 @@
+"""A replay buffer with prior data: a fixed share of each draw is transitions of a dataset (RLPD, Ball et al. 2023).
+
+Rule: only own transitions are added, overwritten and taken back, and only they have priorities. Prior transitions stay as
+they are and are drawn uniformly. They are no part of a saved state: whoever loads it has added the same dataset before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from learner.algorithms.replay.replay_buffer import ReplayBuffer, Sample
+from protocol.arrays import Floats, Ints
+from protocol.rollout import Batch
+from protocol.specs import Leaf
+
+PRIOR_SLOT = -1  # `Sample.slots` of a prior transition
+
+
+class MixedReplay(ReplayBuffer):
+    """Own transitions, and prior ones if there are any. A draw has its prior transitions at its end."""
+
+    def __init__(
+        self,
+        observation: tuple[Leaf, ...],
+        *,
+        size: int,
+        n_step: int,
+        gamma: float,
+        seed: int,
+        alpha: float | None = None,
+        prior_share: float = 0.0,
+    ) -> None:
+        """`prior_share`: the share of each draw that is prior, once `add_prior` was called. Else as `ReplayBuffer`."""
+        super().__init__(observation, size=size, n_step=n_step, gamma=gamma, seed=seed, alpha=alpha)
+        self.prior: ReplayBuffer | None = None
+        self._observation, self._seed, self._share = observation, seed, prior_share
+        self._remembered_prior: Any = None
+
+    def add_prior(self, batches: Iterable[Batch], slots: int) -> None:
+        """Store prior transitions. `slots`: how many observations they have. Raises `UsageError` if memory is too small."""
+        prior = ReplayBuffer(
+            self._observation, size=slots, n_step=self._n_step, gamma=self._gamma, seed=_other_seed(self._seed)
+        )
+        for batch in batches:
+            prior.add(batch)
+        self.prior = prior
+
+    def sample(self, count: int, beta: float = 1.0) -> Sample:
+        """Draw transitions with replacement: all prior ones while there are no others. `beta`: as in `ReplayBuffer`."""
+        if self.prior is None:
+            return super().sample(count, beta)
+        prior = round(self._share * count) if len(self) else count
+        parts = [] if prior == count else [super().sample(count - prior, beta)]
+        if prior:
+            drawn = self.prior.sample(prior)
+            parts.append(drawn._replace(slots=np.full(prior, PRIOR_SLOT)))
+        return parts[0] if len(parts) == 1 else _joined(*parts)
+
+    def update_priorities(self, slots: Ints, error: Floats) -> None:
+        """Set the priorities of the own transitions among these slots [B] from their errors [B]."""
+        own = slots != PRIOR_SLOT
+        if own.any():
+            super().update_priorities(slots[own], error[own])
+
+    def remember(self) -> None:
+        """Remember this state, for `roll_back`."""
+        super().remember()
+        self._remembered_prior = _generator_state(self.prior)
+
+    def roll_back(self) -> None:
+        """Return to the state that was remembered last."""
+        super().roll_back()
+        if self.prior is not None and self._remembered_prior is not None:
+            self.prior.generator.bit_generator.state = self._remembered_prior
+
+    def state_dict(self) -> dict[str, Any]:
+        """A copy of the own slots in use, and of what decides which prior transition is drawn next."""
+        state = super().state_dict()
+        return (
+            state
+            if self.prior is None
+            else state | {"prior": {"rows": len(self.prior), "next": _generator_state(self.prior)}}
+        )
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a `state_dict`, bit for bit. Raises ValueError if it has another size, or other prior data."""
+        had, has = state.get("prior", {}).get("rows", 0), 0 if self.prior is None else len(self.prior)
+        if had != has:
+            raise ValueError(f"prior: expected the dataset of the run with {had} transitions, got {has}")
+        super().load_state_dict(state)
+        if self.prior is not None:
+            self.prior.generator.bit_generator.state = state["prior"]["next"]
+
+
+def _joined(own: Sample, prior: Sample) -> Sample:
+    """One draw of two."""
+
+    def joined(one: Any, other: Any) -> Any:
+        if isinstance(one, tuple):
+            return tuple(map(joined, one, other))
+        return np.concatenate([one, other])
+
+    return Sample(*map(joined, own, prior))
+
+
+def _generator_state(buffer: ReplayBuffer | None) -> Any:
+    return None if buffer is None else buffer.generator.bit_generator.state
+
+
+def _other_seed(seed: int) -> int:
+    """A seed for the draws of prior data, which are independent of those of own data."""
+    return int(np.random.SeedSequence(seed, spawn_key=(1,)).generate_state(1, np.uint64)[0])

@@ -1,0 +1,131 @@
+"""Whole runs that learn from a dataset too: for any number of workers, after a resume, and with data that does not fit."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+from learner.config.layers import resolve
+from learner.run_folder.metrics_log import read_rows
+from millrace.cli.main import main
+from millrace.launch.local_run import train
+from protocol.errors import UsageError
+
+minari = pytest.importorskip("minari")
+DATASET = "cartpole/random-v0"
+SMALL: dict[str, Any] = {
+    "algo": "dqn",
+    "preset": "none",
+    "transport": "inproc",
+    "seed": 3,
+    "rollout_steps": 16,
+    "learning_starts": 300,
+    "gradient_steps": 16,
+    "eval_episodes": 1,
+    "steps": 1_500,
+    "prior": DATASET,
+}
+
+
+def write(dataset_id: str, env_id: str, episodes: int) -> None:
+    """A dataset of random episodes."""
+    from minari.data_collector import EpisodeBuffer
+
+    env, generator = gymnasium.make(env_id), np.random.default_rng(1)
+    buffers = []
+    for number in range(episodes):
+        seen, _ = env.reset(seed=number)
+        rows: list[Any] = [seen]
+        actions: list[int] = []
+        rewards: list[float] = []
+        ends: list[tuple[bool, bool]] = []
+        while not ends or not any(ends[-1]):
+            actions.append(int(generator.integers(env.action_space.n)))  # type: ignore[attr-defined]
+            seen, reward, terminated, truncated, _ = env.step(actions[-1])
+            rows.append(seen)
+            rewards.append(float(reward))
+            ends.append((terminated, truncated))
+        terminations, truncations = np.array(ends).T
+        buffers.append(
+            EpisodeBuffer(
+                id=number,
+                observations=np.array(rows),
+                actions=np.array(actions),
+                rewards=rewards,
+                terminations=terminations,
+                truncations=truncations,
+                infos={},
+            )
+        )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        spaces = {"observation_space": env.observation_space, "action_space": env.action_space}
+        minari.create_dataset_from_buffers(dataset_id, buffer=buffers, data_format="hdf5", **spaces)
+    env.close()
+
+
+@pytest.fixture(autouse=True)
+def dataset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
+    write(DATASET, "CartPole-v1", episodes=20)
+
+
+def run(tmp_path: Path, name: str, resume: Path | None = None, **settings: Any) -> Path:
+    keywords = SMALL | settings
+    config = resolve("" if resume else "CartPole-v1", run_dir=str(tmp_path / name), resume=resume, **keywords)
+    return train(config, resume, lambda _: None)
+
+
+def policy(folder: Path) -> bytes:
+    return (folder / "policy.safetensors").read_bytes()
+
+
+def test_prior_data_changes_what_is_learned_and_the_number_of_workers_does_not(tmp_path: Path) -> None:
+    one, two = (policy(run(tmp_path, f"{workers}", workers=workers, prior_steps=50)) for workers in (1, 2))
+    assert one == two
+    assert policy(run(tmp_path, "none", workers=1, prior="")) != one
+    less = policy(run(tmp_path, "less", workers=1, prior_steps=50, prior_share=0.25))
+    assert less != one
+
+
+def test_gradient_steps_before_the_first_rollouts_are_those_that_were_asked_for(tmp_path: Path) -> None:
+    folder = run(tmp_path, "steps", workers=1, prior_steps=50)
+    first = read_rows(folder / "metrics.jsonl")[0]
+    assert first["train/n_updates"] == 50, "no gradient step on own rows before learning_starts"
+    without = run(tmp_path, "without", workers=1)
+    assert read_rows(without / "metrics.jsonl")[0]["train/n_updates"] == 0
+
+
+def test_a_resumed_run_keeps_its_dataset_and_refuses_another(tmp_path: Path) -> None:
+    folder = run(tmp_path, "first", workers=1, steps=800, prior_steps=10)
+    resumed = run(tmp_path, "first", resume=folder, workers=1, steps=1_500)
+    assert read_rows(resumed / "metrics.jsonl")[-1]["train/n_updates"] > 10
+    with pytest.raises(UsageError, match=r"prior: expected cartpole/random-v0 as in its config.toml, got ;"):
+        run(tmp_path, "first", resume=folder, workers=1, steps=2_000, prior="", prior_steps=0)
+
+
+@pytest.mark.parametrize(
+    ("flags", "says"),
+    [
+        (["--prior", "acrobot/random-v0"], "prior acrobot/random-v0: observations: expected "),
+        (["--prior", "cartpole/rondom-v0"], "no such dataset here; there are: acrobot/random-v0, cartpole/random-v0"),
+        (["--algo", "ppo", "--prior", DATASET], "prior cartpole/random-v0: ppo has no replay buffer; dqn"),
+        (["--prior-steps", "5"], "prior_steps: expected 0 without prior data, got 5; name it by --prior"),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_one_line_and_leaves_no_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: list[str], says: str
+) -> None:
+    write("acrobot/random-v0", "Acrobot-v1", episodes=1)
+    algo = [] if "--algo" in flags else ["--algo", "dqn"]
+    command = ["train", "CartPole-v1", *algo, *flags, "--workers", "1", "--run-dir", str(tmp_path / "runs")]
+    assert main(command) == 2
+    _, err = capsys.readouterr()
+    assert says in err
+    assert err.count("\n") == 1
+    assert not list((tmp_path / "runs").glob("*"))
