@@ -126,9 +126,15 @@ def test_the_learners_stages_sum_to_its_time(tmp_path: Path, max_lag: int) -> No
 
 
 def test_the_best_policy_of_the_evaluations_is_kept_and_evaluated_again(tmp_path: Path) -> None:
-    """The greedy return of CartPole rises and falls. The policy with the highest return is kept, not the last one."""
+    """The greedy return of CartPole rises and falls. The policy with the highest return is kept, not the last one.
+
+    With some seeds the last one is the best: which seeds these are depends on the processor's last bits.
+    """
     settings: dict[str, Any] = {"steps": 12_000, "eval_every": 1_000, "eval_episodes": 20, "learning_rate": 0.01}
-    folder = run(tmp_path, "CartPole-v1", seed=3, **settings)
+    for seed in range(3, 8):
+        folder = run(tmp_path, "CartPole-v1", seed=seed, **settings)
+        if summary(folder)["best"]["env_steps"] < summary(folder)["env_steps"]:
+            break
     evaluations = {
         row["time/total_timesteps"]: row["eval/mean_reward"]
         for row in read_rows(folder / "metrics.jsonl")
