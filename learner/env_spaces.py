@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
+from protocol.envs.action_masks import has_mask, without_mask
 from protocol.envs.description import DescribedEnv
 from protocol.envs.spaces import action_spec, observation_leaves
+from protocol.errors import UsageError
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
@@ -16,11 +18,21 @@ class EnvSpaces(NamedTuple):
     action: ActionSpec
     max_episode_steps: int | None
     """Time limit of an episode in env steps; None if there is none, or it is not known."""
+    masked: bool = False
+    """Whether the run uses action masks. A mask in an observation is not one of `observation`."""
 
     @staticmethod
-    def of_description(env: DescribedEnv) -> EnvSpaces:
+    def of_description(env: DescribedEnv, action_masks: Literal["auto", "info", "none"] = "auto") -> EnvSpaces:
         """Those that a worker described. Raises `UsageError` if a policy cannot use them."""
-        return EnvSpaces(observation_leaves(env.observation_space), action_spec(env.action_space), env.max_episode_steps)
+        observation, action = env.observation_space, action_spec(env.action_space)
+        if action_masks == "info" and action.kind not in ("discrete", "multidiscrete"):
+            raise UsageError(
+                f"action_masks info: expected an action space Discrete or MultiDiscrete, got {env.action_space}"
+            )
+        masked = action_masks == "info" or (action_masks == "auto" and has_mask(observation, env.action_space))
+        if masked:
+            observation = without_mask(observation, env.action_space)
+        return EnvSpaces(observation_leaves(observation), action, env.max_episode_steps, masked)
 
     @staticmethod
     def of_policy(policy: PolicySpec) -> EnvSpaces:

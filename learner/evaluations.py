@@ -124,7 +124,7 @@ class Evaluations:
 
     def _write_best(self, parameters: Floats, buffers: Floats) -> None:
         policy, env, facts = self._spec.policy, self._spec.env, self._spec.facts
-        warn_on_error(lambda: self._folder.write_policy(policy, env, parameters, buffers, "best", facts))
+        warn_on_error(lambda: self._folder.write_policy(policy, env, parameters, buffers, "best", facts, self._spec.masked))
 
 
 def warn_on_error(write: Callable[[], object]) -> None:

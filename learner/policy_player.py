@@ -39,6 +39,8 @@ class SavedPolicy(NamedTuple):
     buffers: Floats
     facts: tuple[str, ...] = ()
     """names of the numbers that the run logs of each episode"""
+    masked: bool = False
+    """whether the environment says which actions are allowed"""
 
 
 def saved_policy(
@@ -52,7 +54,7 @@ def saved_policy(
     card, parameters, buffers = RunFolder.open_policy(run).read_policy(which)
     spec = EnvSpec.of(card.env if env is None else env, card.env_kwargs, card.wrappers if wrappers is None else wrappers)
     facts = _facts_of_older(run) if card.facts is None else card.facts
-    return SavedPolicy(card.policy, spec, parameters, buffers, facts)
+    return SavedPolicy(card.policy, spec, parameters, buffers, facts, card.masked)
 
 
 def _facts_of_older(run: Path) -> tuple[str, ...]:
@@ -120,7 +122,9 @@ class PolicyPlayer:
 
     def _published(self) -> Hub:
         policy = self.policy
-        run = RunSpec(policy.env, policy.spec, rollout_steps=1, copies=1, lanes=1, seed=0, facts=policy.facts)
+        run = RunSpec(
+            policy.env, policy.spec, rollout_steps=1, copies=1, lanes=1, seed=0, facts=policy.facts, masked=policy.masked
+        )
         coordinator = TicketCoordinator(
             run,
             rollouts_per_update=1,

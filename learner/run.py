@@ -109,13 +109,16 @@ def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, d
 
         def accept(found: DescribedEnv) -> None:
             if resume is not None and policy is not None:
-                check_spaces(resume.run, EnvSpaces.of_policy(policy), EnvSpaces.of_description(found))
+                check_spaces(resume.run, EnvSpaces.of_policy(policy), EnvSpaces.of_description(found, config.action_masks))
 
         described = describe(
             DescribeSpec(env, config.chosen_vector(), heartbeat_s=config.heartbeat_s), check_interrupt, accept
         )
         imports.wait(check_interrupt)
-    return KnownEnvironment(env, EnvSpaces.of_description(described), described)
+    spaces = EnvSpaces.of_description(described, config.action_masks)
+    if spaces.masked:
+        log.info("actions are masked: the environment says which are allowed (--action-masks %s)", config.action_masks)
+    return KnownEnvironment(env, spaces, described)
 
 
 def describe_over(link: LearnerLink, config: Config, processes: ProcessCallbacks) -> Describe:
@@ -276,7 +279,7 @@ def _training_recorder(config: Config, folder: RunFolder, known: KnownEnvironmen
     if not config.record:
         return None
     about = f"All whole training episodes of millrace run {folder.path.resolve().name}, as acted."
-    return TrainingRecorder(config.record, known.described, spec.policy, about)
+    return TrainingRecorder(config.record, known.described, spec, about)
 
 
 def prometheus_observer(config: Config) -> AbstractContextManager[HubObserver]:

@@ -185,7 +185,9 @@ class RunRecorder:
             return
         warn_on_error(lambda: self._save_checkpoint(state))
         policy, env, facts = self._spec.policy, self._spec.env, self._spec.facts
-        warn_on_error(lambda: self._folder.write_policy(policy, env, *self._algorithm.weights(), facts=facts))
+        warn_on_error(
+            lambda: self._folder.write_policy(policy, env, *self._algorithm.weights(), facts=facts, masked=self._spec.masked)
+        )
         self._took_to_save(time.monotonic() - began_s)
         if self._saved == self._position() and self._callbacks.wants("on_checkpoint"):
             self._requests.closed = "expected it earlier than in on_checkpoint: the checkpoint would lack it"

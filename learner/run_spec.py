@@ -22,7 +22,7 @@ def run_spec(config: Config, env: EnvSpec, spaces: EnvSpaces) -> RunSpec:
     policy = _policy_spec(config, spaces)
     if algorithm_class(config.algo).whole_episodes:
         _check_room_for_whole_episodes(config, spaces.max_episode_steps)
-    return rollout_spec(config, env, policy, config.algorithm.rollout_steps)
+    return rollout_spec(config, env, policy, config.algorithm.rollout_steps, masked=spaces.masked)
 
 
 def _policy_spec(config: Config, spaces: EnvSpaces) -> PolicySpec:

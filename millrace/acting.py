@@ -16,10 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from learner.policy_player import saved_policy
-from protocol.arrays import Array, Floats
+from protocol.arrays import Array, Bools, Floats
 from protocol.envs.spaces import make_action_converter
 from protocol.errors import UsageError
 from protocol.policy.distributions import distribution
+from protocol.policy.masks import MASK, choices, forbid, masked_distribution, no_choice
 from protocol.policy.policy import make_policy
 from protocol.policy.recurrent import zero_state
 from protocol.specs import Leaf, PolicySpec
@@ -50,6 +51,8 @@ class LoadedPolicy:
         self._policy = make_policy(saved.spec)
         self._policy.load(saved.parameters, saved.buffers)
         self._distribution = distribution(saved.spec)
+        self._masked_distribution = masked_distribution(saved.spec)
+        self._is_masked = saved.masked
         self._to_env_action = make_action_converter(saved.spec.action)
         self._generator = None if deterministic else np.random.default_rng(seed)
         self._state: Floats | None = None  # [1, n, S] of a recurrent policy, once it was started
@@ -70,13 +73,17 @@ class LoadedPolicy:
         if seed is not None and self._generator is not None:
             self._generator = np.random.default_rng(seed)
 
-    def __call__(self, observation: Observation, *, first: npt.ArrayLike | None = None) -> Any:
+    def __call__(
+        self, observation: Observation, *, first: npt.ArrayLike | None = None, mask: npt.ArrayLike | None = None
+    ) -> Any:
         """The action for one observation, as `env.step` takes it; for a batch of n observations, actions [n, *action].
 
         Arguments:
             observation: One of the environment's observation space, or n of them: arrays [n, *leaf]. A Dict or Tuple
                 observation is a dict or tuple of such arrays. The policy normalizes it, if it was trained so.
             first: Of a recurrent policy: True where this observation is the first of an episode. A bool, or [n] of them.
+            mask: Which actions are allowed: [choices] bool or int8, as `info["action_mask"]` has it, or [n, choices]. If the
+                policy was trained with masks in its Dict observations, they are read there. None: all are allowed.
 
         Raises `UsageError` if the observation is not of the space, not finite, or of another number of copies than `start`.
 
@@ -87,13 +94,18 @@ class LoadedPolicy:
         """
         leaves, is_one = self._leaves(observation)
         n = len(leaves[0][0])
+        if mask is None and self._is_masked and isinstance(observation, Mapping):
+            mask = observation.get(MASK)
+        allowed = None if mask is None else self._checked_mask(mask, n)
         state = self._state_for(n, first)
         with np.errstate(all="ignore"):
-            params = self._policy(leaves, state)
+            params, chance = self._policy(leaves, state), self._distribution
+            if allowed is not None:
+                params, chance = forbid(params, allowed), self._masked_distribution
             if self._generator is None:
-                chosen = self._distribution.mode(params)[0]
+                chosen = chance.mode(params)[0]
             else:
-                chosen = self._distribution.sample(params, self._distribution.noise(self._generator, (1, n)))[0]
+                chosen = chance.sample(params, chance.noise(self._generator, (1, n)))[0]
             action = np.asarray(self._to_env_action(chosen)).astype(self.spec.action.dtype, copy=False)
         return action[0] if is_one else action
 
@@ -112,6 +124,21 @@ class LoadedPolicy:
         if first is not None:
             self._state[0, np.broadcast_to(np.asarray(first, bool), n)] = 0
         return self._state
+
+    def _checked_mask(self, mask: npt.ArrayLike, n: int) -> Bools:
+        """A mask as an array [1, n, choices]. Raises `UsageError`."""
+        action, size = self.spec.action, choices(self.spec.action)
+        try:
+            given = np.asarray(mask)
+        except (ValueError, TypeError):  # rows of different lengths
+            given = np.asarray(None)
+        if not size or given.dtype.kind not in "biu" or given.shape not in ((size,), (n, size)):
+            expected = f"{size} zeros and ones of int8 or bool, or [{n}, {size}]" if size else "none for this action space"
+            raise UsageError(f"mask: expected {expected}, got {given.dtype}{list(given.shape)}")
+        allowed: Bools = np.broadcast_to(given.astype(bool), (1, n, size))
+        if no_choice(allowed, action).any():
+            raise UsageError("mask: expected an allowed choice for each entry of the action, got none")
+        return allowed
 
     def _leaves(self, observation: Observation) -> tuple[tuple[Array, ...], bool]:
         """The arrays [1, n, *leaf] of an observation or a batch, and whether it was one observation."""

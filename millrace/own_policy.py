@@ -16,7 +16,7 @@ from protocol.specs import ActionSpec, ExtraArray, Leaf, NamedShape, OwnPolicySp
 from protocol.wire.codec import DTYPES
 
 BATCH_NAMES = frozenset(
-    {"obs", "action", "reward", "terminated", "truncated", "valid", "state", "lane", "version", "fresh", "episodes"}
+    {"obs", "action", "reward", "terminated", "truncated", "valid", "state", "lane", "version", "fresh", "episodes", "mask"}
 )
 
 
@@ -42,7 +42,8 @@ class OwnPolicy:
     `factory(**kwargs)` is called in each worker and returns such an object. `act` is called once for each step of a lane,
     with exactly its copies. What an episode remembers goes into `state` [N, state_size] float32, which is zeros when an
     episode begins; if the object keeps nothing else between its calls, results do not depend on the number of workers. An
-    action is whole numbers that count from 0, or float32, which is clipped to the space after it was stored.
+    action is whole numbers that count from 0, or float32, which is clipped to the space after it was stored. If the
+    environment has action masks, `act` also gets `mask=` [N, choices] bool, and must choose what it allows.
     `service.evaluate` calls `act_greedy` of the object if there is one, else `act`. docs/how-to/own_policy.md has more.
     """
 

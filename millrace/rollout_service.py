@@ -63,8 +63,9 @@ class RolloutBatch(Batch, frozen=True, kw_only=True, eq=False):
 
     Beside the fields below it has `action` [T, N, *action] (int64 counted from 0, or float32 before clipping), `reward`
     [T, N] float32 (raw), `terminated`, `truncated` and `valid` [T, N] bool, `state` [N, S] float32 before `obs[0]`, `lane`
-    [N] int64, `fresh` [N] bool (False where a column goes on where it ended in the batch before), `copies` of a lane, and
-    `episodes`, which have `reward` (the return), `length` and `seconds`.
+    [N] int64, `fresh` [N] bool (False where a column goes on where it ended in the batch before), `copies` of a lane,
+    `mask` [T+1, N, choices] bool of the actions that were allowed (None without action masks), and `episodes`, which have
+    `reward` (the return), `length` and `seconds`.
     """
 
     obs: Any

@@ -23,6 +23,7 @@ from msgspec import Meta
 from protocol.arrays import Array, Bools, Floats
 from protocol.bounds import MAX_FACTS, Count, Natural, Real, Seconds
 from protocol.errors import BadRollout
+from protocol.policy.masks import no_choice, not_allowed
 from protocol.specs import ActionSpec, Leaf, RunSpec
 
 LARGEST_REWARD = float(np.finfo(np.float32).max)
@@ -130,6 +131,8 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
             raise BadRollout(f"{_named(leaf)}: {why}")
     if why := outside_of_choices(rollout.action, action):
         raise BadRollout(f"action: {why}")
+    if rollout.mask is not None:
+        _check_mask(rollout.mask, rollout, action)
     ended = rollout.terminated | rollout.truncated
     if np.count_nonzero(rollout.valid[1:] == ended[:-1]):
         t, n = np.argwhere(rollout.valid[1:] == ended[:-1])[0]
@@ -145,6 +148,17 @@ def validate(rollout: Rollout, run: RunSpec) -> None:
             )
         if why := wrong_facts(episode, len(run.facts)):
             raise BadRollout(f"episode: {why}")
+
+
+def _check_mask(mask: Array, rollout: Rollout, action: ActionSpec) -> None:
+    """Raise `BadRollout` if a mask allows no choice, or forbids what was done."""
+    if (empty := no_choice(mask, action)).any():
+        t, n = np.argwhere(empty)[0]
+        raise BadRollout(f"mask: expected an allowed choice at step {t}, copy {n}, got none")
+    if (wrong := rollout.valid & not_allowed(rollout.action, mask[:-1], action)).any():
+        t, n = np.argwhere(wrong)[0]
+        got = rollout.action[t, n].tolist()
+        raise BadRollout(f"action: expected one that the mask allows at step {t}, copy {n}, got {got}")
 
 
 def wrong_facts(episode: Episode, count: int) -> str:
@@ -210,6 +224,8 @@ class Batch(msgspec.Struct, frozen=True):
     episodes: tuple[Episode, ...]
     extras: tuple[Array, ...] = ()
     """one array [T, ΣN, *shape] for each of `RunSpec.extras`"""
+    mask: Bools | None = None
+    """[T+1, ΣN, choices] which actions were allowed in `obs`; None unless the run uses action masks"""
 
     @property
     def env_steps(self) -> int:
@@ -245,4 +261,5 @@ def stack_rollouts(rollouts: Sequence[Rollout], fresh: Sequence[bool] | None = N
         copies=copies,
         episodes=tuple(episode for row in rows for episode in row.episodes),
         extras=tuple(side_by_side(arrays) for arrays in zip(*(row.extras for row in rows), strict=True)),
+        mask=None if rows[0].mask is None else side_by_side([row.mask for row in rows if row.mask is not None]),
     )

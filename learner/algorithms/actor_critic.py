@@ -31,6 +31,7 @@ from learner.algorithms.updates import check_finite, scheduled
 from learner.config.hyperparameters import ActorCriticConfig, AlgorithmConfig, PolicyGradientConfig, RecurrentConfig
 from protocol.arrays import Array, Bools, Floats
 from protocol.policy.features import features, normalize
+from protocol.policy.masks import FORBIDDEN
 from protocol.policy.networks import ActorCriticNetwork, RecurrentInput
 from protocol.policy.torch_distributions import log_prob_and_entropy
 from protocol.rollout import Batch
@@ -221,9 +222,10 @@ class ActorCritic(Algorithm):
         """The rows of a minibatch with the network's outputs: arrays of the same library as the minibatch's."""
         if isinstance(minibatch.features, np.ndarray):
             assert self._fused is not None
-            outputs: tuple[Any, Any, Any] = self._fused.forward(minibatch.features, minibatch.action)
+            outputs: tuple[Any, Any, Any] = self._fused.forward(minibatch.features, minibatch.action, minibatch.mask)
         else:
             params, value = self.net.forward(minibatch.features, minibatch.images, minibatch.recurrent)
+            params = _forbid(params, minibatch.mask)
             outputs = *log_prob_and_entropy(self.policy.action, params, minibatch.action), value
         raw = minibatch.advantage
         advantage = losses.standardized(raw) if self.standardizes_advantages() else raw
@@ -318,9 +320,11 @@ class ActorCritic(Algorithm):
     def log_probs(self, observations: Observations, batch: Batch, pulse: Pulse) -> Floats:
         """Log π(action) [T, ΣN] under the present weights."""
         action = self._flat_tensor(batch.action)
+        mask = self._allowed(batch)
 
         def log_prob(inputs: NetworkInput, rows: Index) -> Tensor:
-            return log_prob_and_entropy(self.policy.action, self.net.params(*inputs), action[rows])[0]
+            params = _forbid(self.net.params(*inputs), None if mask is None else mask[rows])
+            return log_prob_and_entropy(self.policy.action, params, action[rows])[0]
 
         return self._evaluate_in_chunks(observations, len(batch.valid), log_prob, pulse)
 
@@ -370,7 +374,12 @@ class ActorCritic(Algorithm):
             self._flat_tensor(estimates.advantage),
             self._flat_tensor(estimates.target),
             inputs.recurrent,
+            self._allowed(batch),
         )
+
+    def _allowed(self, batch: Batch) -> Tensor | None:
+        """The masks [T · ΣN, choices] of a batch, if it has them."""
+        return None if batch.mask is None else self._flat_tensor(batch.mask[:-1])
 
     def _epochs(self, rows: Minibatch, mask: Bools) -> Iterator[Iterable[Minibatch]]:
         """The minibatches of each epoch, without end. A single minibatch is made once, with its rows in order."""
@@ -458,6 +467,11 @@ class ActorCritic(Algorithm):
     def roll_back(self) -> None:
         """Return to the state that was remembered last."""
         self.load_state_dict(self._remembered)
+
+
+def _forbid(params: Tensor, mask: Tensor | None) -> Tensor:
+    """Logits [B, P] without the choices that a mask forbids: their probabilities and gradients are exactly 0."""
+    return params if mask is None else params.masked_fill(~mask, FORBIDDEN)
 
 
 def make_optimizer(kind: Literal["adam", "rmsprop"], net: ActorCriticNetwork, learning_rate: float) -> torch.optim.Optimizer:

@@ -172,14 +172,15 @@ class DQN(Algorithm):
     def targets(self, sample: Sample) -> Any:
         """The targets [B] of the action values:  Σ γⁱ r + γᵏ Q′(s′, a′). γᵏ is 0 if the task has terminated.
 
-        a′ = argmax Q′(s′, ·), or argmax Q(s′, ·) if double (van Hasselt et al. 2016). Q′ is the target network.
+        a′ = argmax Q′(s′, ·), or argmax Q(s′, ·) if double (van Hasselt et al. 2016). Q′ is the target network. With action
+        masks, a′ is the best of the actions that are allowed in s′.
         """
-        inputs, values = self._inputs(sample.next_leaves), self._target_values
+        inputs, values, mask = self._inputs(sample.next_leaves), self._target_values, sample.next_mask
         if self.config.double:
             with torch.no_grad():
-                value = values.chosen(*inputs, self._values.best_actions(*inputs))
+                value = values.chosen(*inputs, self._values.best_actions(*inputs, mask))
         else:
-            value = values.best_values(*inputs)
+            value = values.best_values(*inputs, mask)
         return values.to_array(sample.reward) + values.to_array(sample.discount) * value
 
     def _inputs(self, leaves: Sequence[Array]) -> tuple[Array, list[Array]]:

@@ -51,11 +51,13 @@ class Minibatch(NamedTuple):
     advantage: Any  # [B] float32, not standardized
     target: Any  # [B] float32, what the value is fitted to
     recurrent: RecurrentInput | None = None  # with a core, features and images are [T · C, …], and it selects B of them
+    mask: Any = None  # [B, choices] bool, which actions are allowed; None unless the run uses action masks
 
     def in_numpy(self) -> Minibatch:
         """The same memory as numpy arrays. Only for policies without images and without a core."""
-        features, _, action, log_prob, advantage, target, _ = self
-        return Minibatch(features.numpy(), (), action.numpy(), log_prob.numpy(), advantage.numpy(), target.numpy())
+        features, _, action, log_prob, advantage, target, _, mask = self
+        arrays = (features.numpy(), (), action.numpy(), log_prob.numpy(), advantage.numpy(), target.numpy())
+        return Minibatch(*arrays, mask=None if mask is None else mask.numpy())
 
     def select(self, rows: Any, input_rows: Tensor | None = None, recurrent: RecurrentInput | None = None) -> Minibatch:
         """A copy of some rows. `input_rows`: the rows of the network's input, if a core needs more rows than these."""
@@ -68,6 +70,7 @@ class Minibatch(NamedTuple):
             self.advantage[rows],
             self.target[rows],
             recurrent,
+            None if self.mask is None else self.mask[rows],
         )
 
     def select_columns(self, columns: Tensor, mask: Tensor) -> Minibatch:

@@ -29,7 +29,8 @@ BASIC = (
 GROUPS = {
     "evaluation": ("eval_copies", "eval_max_steps", "info_keys"),
     "worker": (
-        "lanes", "max_lag", "vector", "inference", "images_dtype", "torch_threads", "pin_workers", "min_workers",
+        "lanes", "max_lag", "vector", "action_masks", "inference", "images_dtype", "torch_threads", "pin_workers",
+        "min_workers",
     ),
     "network": ("transport", "bind", "advertise", "keys", "insecure", "compress", "weights_dtype"),
     "timeout and failure": (

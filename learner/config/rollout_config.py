@@ -66,6 +66,11 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """Names of numbers that the environment reports in info at the end of an episode, separated by commas,
     such as is_success,distance. Their means are logged.
     """
+    action_masks: Fixed[Literal["auto", "info", "none"]] = "auto"
+    """Which actions are allowed, as the environment says it for a Discrete or MultiDiscrete action. auto: by the key
+    action_mask of a Dict observation, if it has one with a bit for each choice. info: by info["action_mask"] of each reset
+    and step; the key of a Dict observation comes first. none: all actions are allowed, and the key is an observation.
+    """
     pin_workers: Free[bool | None] = None
     """Keep each local worker process on one core (train only). none: do so if max_lag is 0 and the number of workers is a
     multiple of the number of cores.

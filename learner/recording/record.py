@@ -61,7 +61,7 @@ def record(
     """
     if npy is not None and not npy.parent.is_dir():
         raise UsageError(f"{npy} cannot be written: no such folder {npy.parent}")
-    env = EnvironmentOfDataset(player.describe())
+    env = EnvironmentOfDataset(player.describe(), masked=player.policy.masked)
     how = "drawn from" if stochastic else "the most probable of"
     about = f"Actions {how} the policy of millrace run {run.resolve().name}; seed {seed}."
     returns: list[float] = []

@@ -10,9 +10,10 @@ import gymnasium
 from learner.recording.episodes import EpisodeAssembler
 from learner.recording.minari import MinariDataset
 from learner.rollouts.lanes import AcceptedRollout
+from protocol.envs.action_masks import without_mask
 from protocol.envs.description import DescribedEnv
 from protocol.envs.spaces import make_action_converter
-from protocol.specs import PolicySpec
+from protocol.specs import RunSpec
 
 
 class TrainingRecorder:
@@ -21,15 +22,15 @@ class TrainingRecorder:
     Steps of episodes that cannot be whole are counted instead.
     """
 
-    def __init__(self, dataset_id: str, env: DescribedEnv, spec: PolicySpec, about: str) -> None:
+    def __init__(self, dataset_id: str, env: DescribedEnv, run: RunSpec, about: str) -> None:
         """`env`: the environment as a worker described it. `about`: the description of the dataset.
 
         Raises `UsageError`, with a one-line message, if the dataset cannot be made.
         """
-        self._assembler = EpisodeAssembler(make_action_converter(spec.action))
+        self._assembler = EpisodeAssembler(make_action_converter(run.policy.action))
         self._id = dataset_id
         self._episodes = 0
-        self._dataset = MinariDataset(dataset_id, EnvironmentOfDataset(env), about)
+        self._dataset = MinariDataset(dataset_id, EnvironmentOfDataset(env, masked=run.masked), about)
 
     def add(self, rollouts: Sequence[AcceptedRollout]) -> None:
         """Add the rollouts of an update."""
@@ -51,7 +52,9 @@ class TrainingRecorder:
 class EnvironmentOfDataset(gymnasium.Env[Any, Any]):
     """What Minari reads of an environment: its spaces and its spec. Nobody steps it."""
 
-    def __init__(self, env: DescribedEnv) -> None:
-        """`env`: the environment as a worker described it."""
+    def __init__(self, env: DescribedEnv, *, masked: bool = False) -> None:
+        """`env`: the environment as a worker described it. `masked`: a mask in its observations is not recorded."""
         self.observation_space, self.action_space = env.observation_space, env.action_space
+        if masked:
+            self.observation_space = without_mask(env.observation_space, env.action_space)
         self.metadata, self.spec = env.metadata, env.spec

@@ -13,12 +13,23 @@ from protocol.wire.socket_options import MAX_FRAME_BYTES
 
 
 def rollout_spec(
-    config: RolloutConfig, env: EnvSpec, policy: PolicySpec, rollout_steps: int, extras: tuple[ExtraArray, ...] = ()
+    config: RolloutConfig,
+    env: EnvSpec,
+    policy: PolicySpec,
+    rollout_steps: int,
+    extras: tuple[ExtraArray, ...] = (),
+    *,
+    masked: bool = False,
 ) -> RunSpec:
     """The specification that `Welcome` carries. Raises `UsageError` if it cannot be sent, or settings and policy do not fit.
 
     `rollout_steps`: T, the env steps of a rollout. `extras`: further arrays of each, which the user's own policy returns.
+    `masked`: whether workers read masks of the allowed actions.
     """
+    if masked and config.chosen_vector() == "envpool":
+        raise UsageError(
+            "vector envpool: its environments report no action masks; use --vector loop, or --action-masks none"
+        )
     if config.compress == "zstd" and (why := why_no_zstd()):
         raise UsageError(why)
     if config.images_dtype != "float32" and not policy.convolves:
@@ -35,6 +46,7 @@ def rollout_spec(
         vector=config.chosen_vector(),
         compress=config.compress,
         images_dtype=config.images_dtype,
+        masked=masked,
         extras=extras,
         facts=config.fact_names(),
         heartbeat_s=config.heartbeat_s,

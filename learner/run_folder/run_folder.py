@@ -82,6 +82,8 @@ class PolicyDescription(msgspec.Struct, frozen=True, kw_only=True):
     """wrappers of every env copy, the innermost first"""
     facts: tuple[str, ...] | None = None
     """names of the numbers that the run logs of each episode; None: an older millrace wrote it, which did not say"""
+    masked: bool = False
+    """whether the environment says which actions are allowed"""
 
 
 class RunSettings(Protocol):
@@ -231,11 +233,12 @@ class RunFolder:
         buffers: Floats,
         which: Which = "final",
         facts: tuple[str, ...] = (),
+        masked: bool = False,
     ) -> None:
         """Write the arrays and policy.json.
 
         `parameters` [P] begins with the acting part; the rest (the critic) is not written. `facts`: names of the numbers
-        that the run logs of each episode.
+        that the run logs of each episode. `masked`: whether the run uses action masks.
         """
         from safetensors.numpy import save
 
@@ -250,6 +253,7 @@ class RunFolder:
             buffers=tuple(named_views(buffers, buffer_layout(spec))),
             wrappers=env.wrappers,
             facts=facts,
+            masked=masked,
         )
         contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         checksum = str(zlib.crc32(_split(save(contiguous))[1]))

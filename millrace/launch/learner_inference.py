@@ -72,7 +72,9 @@ def train(
         stack.callback(env.close)
         workers = config.min_workers or (1 if elsewhere else min(config.workers, config.envs))
         before_wait = _before_waits(env, workers, config.no_workers_timeout_s)
-        lanes = SplitVectorEnv(env, config.lanes, before_wait, env.step_lanes, config.fact_names())
+        lanes = SplitVectorEnv(
+            env, config.lanes, before_wait, env.step_lanes, config.fact_names(), masked=known.spaces.masked
+        )
         evaluation_copies = SplitEvaluationCopies(lanes, config.lanes, config.eval_copies)
 
         def collector(spec: RunSpec) -> tuple[Collector, Evaluator]:

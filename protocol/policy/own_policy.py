@@ -9,7 +9,8 @@ for N env copies. All arrays are its own to change. `obs` is an array [N, *shape
 dict of such arrays, by path. `state` [N, S] float32 is zeros when an episode begins. `rng` is the numpy `Generator` of
 these copies. `action` [N, *action] is stored as it is returned: whole numbers that count from 0, or float32 before clipping.
 `extras` has one array [N, *shape] for each name that was declared. If there is `act_greedy(obs, state, rng)`, evaluations
-call it in place of `act`.
+call it in place of `act`. In a run with action masks, both are called with `mask=` [N, choices] bool: which actions are
+allowed.
 
 Rule: `act` is called once for each lane and step, with exactly the copies of that lane. So if it keeps nothing between its
 calls but `state`, a rollout has the same bits whatever else the worker does.
@@ -24,10 +25,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from protocol.arrays import Array, Floats
+from protocol.arrays import Array, Bools, Floats
 from protocol.errors import PolicyFailed, UsageError, first_line
 from protocol.own_module import own_callable
 from protocol.policy.layout import named_views, parameter_layout
+from protocol.policy.masks import not_allowed
 from protocol.rollout import outside_of_choices
 from protocol.specs import ExtraArray, OwnPolicySpec, PolicySpec
 
@@ -65,12 +67,24 @@ class OwnPolicy:
         """Give it these weights."""
         self._guarded("load", lambda: self._made.load(named_views(parameters.copy(), self._fields)))
 
-    def act(self, leaves: Sequence[Array], state: Floats, rng: np.random.Generator, *, greedy: bool = False) -> Acted:
-        """Act for the copies of a lane: leaves [N, *leaf], state [N, S]. `greedy`: as in an evaluation."""
+    def act(
+        self,
+        leaves: Sequence[Array],
+        state: Floats,
+        rng: np.random.Generator,
+        *,
+        mask: Bools | None = None,
+        greedy: bool = False,
+    ) -> Acted:
+        """Act for the copies of a lane: leaves [N, *leaf], state [N, S]. `greedy`: as in an evaluation.
+
+        `mask`: [N, choices] which actions are allowed, in a masked run.
+        """
         name = "act_greedy" if greedy and hasattr(self._made, "act_greedy") else "act"
         own = [leaf.copy() for leaf in leaves]
         obs = dict(zip(self._paths, own, strict=True)) if self._paths[0] else own[0]
-        returned = self._guarded(name, lambda: getattr(self._made, name)(obs, state.copy(), rng))
+        keywords = {} if mask is None else {"mask": mask.copy()}
+        returned = self._guarded(name, lambda: getattr(self._made, name)(obs, state.copy(), rng, **keywords))
         if not (isinstance(returned, tuple) and len(returned) == 3):
             raise self._wrong(f"{name}: expected action, state, extras, got {_described(returned)}")
         action, after, extras = returned
@@ -80,6 +94,11 @@ class OwnPolicy:
         )
         if why := outside_of_choices(stored, self._spec.action):
             raise self._wrong(f"{name}: the action: {why}")
+        if mask is not None and (wrong := not_allowed(stored, mask, self._spec.action)).any():
+            n = int(np.flatnonzero(wrong)[0])
+            raise self._wrong(
+                f"{name}: the action: expected one that the mask allows, got {stored[n].tolist()} for copy {n}"
+            )
         if self._own.state_size:
             state = self._array(after, state.shape, "float32", f"{name}: the state")
         given = extras or {}

@@ -1,6 +1,7 @@
 """How the actions of a rollout are chosen: by a policy of ours, for all lanes in one pass, or by the user's own.
 
 Rule: the actions of a lane depend on its observations, state and random generator, and not on the other lanes.
+In a masked run, the last array of an observation is the mask of the allowed actions (`protocol.policy.masks`).
 """
 
 from __future__ import annotations
@@ -10,8 +11,9 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from protocol.arrays import Array, Floats
+from protocol.arrays import Array, Bools, Floats
 from protocol.policy.distributions import distribution
+from protocol.policy.masks import forbid, masked_distribution
 from protocol.policy.own_policy import OwnPolicy
 from protocol.policy.policy import Policy
 from protocol.specs import RunSpec
@@ -66,16 +68,23 @@ class _BuiltInActing:
 
     def __init__(self, run: RunSpec, policy: Policy) -> None:
         self.run, self.policy = run, policy
-        self.distribution = distribution(run.policy)
+        self.distribution = masked_distribution(run.policy) if run.masked else distribution(run.policy)
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
         self.policy.load(parameters, buffers)
+
+    def params(self, obs: Sequence[Array], state: Floats) -> Floats:
+        """The distribution parameters [L, N, P]. Updates state."""
+        if not self.run.masked:
+            return self.policy(obs, state)
+        *leaves, mask = obs
+        return forbid(self.policy(leaves, state), mask)
 
     def begin(self, generators: Sequence[np.random.Generator]) -> RolloutActions:
         return _BuiltInActions(self, generators)
 
     def choose(self, obs: Sequence[Array], state: Floats, generator: np.random.Generator, *, greedy: bool) -> Array:
-        params = self.policy(obs, state)
+        params = self.params(obs, state)
         if greedy:
             return self.distribution.mode(params)[0]  # type: ignore[no-any-return]
         noise = self.distribution.noise(generator, params.shape[:2])
@@ -84,14 +93,14 @@ class _BuiltInActing:
 
 class _BuiltInActions:
     def __init__(self, acting: _BuiltInActing, generators: Sequence[np.random.Generator]) -> None:
-        run, self._distribution, self._policy = acting.run, acting.distribution, acting.policy
+        run, self._distribution, self._params_of = acting.run, acting.distribution, acting.params
         L, T, N, action = len(generators), run.rollout_steps, run.copies, run.policy.action
         self._noise = np.stack([self._distribution.noise(generator, (T, N)) for generator in generators])  # [L, T, N, noise]
         self._params = np.empty((L, T, N, self._distribution.params_size), np.float32)
         self._action = np.empty((L, T, N, *action.shape), action.stored_dtype)
 
     def act(self, t: int, obs: Sequence[Array], state: Floats) -> Array:
-        params = self._policy(obs, state)
+        params = self._params_of(obs, state)
         action = self._distribution.sample(params, self._noise[:, t])
         self._params[:, t] = params
         self._action[:, t] = action
@@ -114,7 +123,8 @@ class _OwnActing:
         return _OwnActions(self, generators)
 
     def choose(self, obs: Sequence[Array], state: Floats, generator: np.random.Generator, *, greedy: bool) -> Array:
-        acted = self.policy.act([leaf[0] for leaf in obs], state[0], generator, greedy=greedy)
+        leaves, mask = _split([leaf[0] for leaf in obs], self.run.masked)
+        acted = self.policy.act(leaves, state[0], generator, mask=mask, greedy=greedy)
         state[0] = acted.state
         return acted.action
 
@@ -122,6 +132,7 @@ class _OwnActing:
 class _OwnActions:
     def __init__(self, acting: _OwnActing, generators: Sequence[np.random.Generator]) -> None:
         run, self._policy, self._generators = acting.run, acting.policy, generators
+        self._masked = run.masked
         lead, action = (len(generators), run.rollout_steps, run.copies), run.policy.action
         self._action = np.empty((*lead, *action.shape), action.stored_dtype)
         self._extras = [np.empty((*lead, *extra.shape), extra.dtype) for extra in run.extras]
@@ -130,7 +141,8 @@ class _OwnActions:
 
     def act(self, t: int, obs: Sequence[Array], state: Floats) -> Array:
         for i, generator in enumerate(self._generators):
-            acted = self._policy.act([leaf[i] for leaf in obs], state[i], generator)
+            leaves, mask = _split([leaf[i] for leaf in obs], self._masked)
+            acted = self._policy.act(leaves, state[i], generator, mask=mask)
             self._action[i, t], state[i] = acted.action, acted.state
             for array, extra in zip(self._written, acted.extras, strict=False):  # the last may be absent: log_prob
                 array[i, t] = extra
@@ -138,3 +150,8 @@ class _OwnActions:
 
     def columns(self, i: int) -> ActedRows:
         return ActedRows(self._action[i], self._log_prob[i], tuple(extra[i] for extra in self._extras))
+
+
+def _split(obs: list[Array], masked: bool) -> tuple[list[Array], Bools | None]:
+    """The arrays of an observation, and its mask."""
+    return (obs[:-1], obs[-1]) if masked else (obs, None)

@@ -15,6 +15,7 @@ import numpy as np
 from protocol.arrays import Array, Bools
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import UsageError
+from protocol.policy.masks import stored_leaves
 from protocol.policy.recurrent import zero_state
 from protocol.rollout import Episode, describe_first_non_finite
 from protocol.specs import Leaf, RunSpec
@@ -34,9 +35,7 @@ class CollectedLane:
         self.incarnation = incarnation
         self.copies = copies
         self.generator = np.random.default_rng(np.random.SeedSequence([run.seed, number, incarnation], spawn_key=(0,)))
-        self.obs = tuple(
-            np.empty((run.copies, *leaf.shape), leaf.dtype) for leaf in run.policy.observation
-        )  # [N, *leaf] each
+        self.obs = tuple(np.empty((run.copies, *leaf.shape), leaf.dtype) for leaf in stored_leaves(run))  # [N, *leaf] each
         self.state = zero_state(run.policy, run.copies)  # [N, S] recurrent state of the policy
         self.ended = np.zeros(run.copies, bool)  # [N] the next step only resets this copy
         self._run = run
@@ -47,7 +46,8 @@ class CollectedLane:
         self._attributes = b""  # that were set in the copies
         self._facts: dict[tuple[int, int], tuple[float, ...]] = {}  # by row and copy, of episodes that ended in this rollout
         self._no_facts = (math.nan,) * len(run.facts)
-        self._writers = leaf_writers(run.policy.observation, run.copies)
+        self._stored = stored_leaves(run)
+        self._writers = leaf_writers(self._stored, run.copies)
 
     def set_attributes(self, packed: bytes, pulse: Pulse) -> None:
         """Set these attributes in all copies, unless they are set. Raises `LaneFailed` if a copy does not have one."""
@@ -94,7 +94,7 @@ class CollectedLane:
 
     def check_values(self, obs: Sequence[Array], reward: Array) -> None:
         """Raise, naming step and copy, if obs [rows, N, *leaf] or rewards [rows, N] are not finite or not in their space."""
-        for leaf, array in zip(self._run.policy.observation, obs, strict=True):
+        for leaf, array in zip(self._stored, obs, strict=True):
             if array.dtype.kind == "f" and not np.isfinite(array).all():
                 raise LaneFailed(self.number, f"{_name(leaf)}: {describe_first_non_finite(array)}")
             if leaf.sizes:

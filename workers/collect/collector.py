@@ -20,6 +20,7 @@ from protocol.envs.envpool import envpool_spec
 from protocol.envs.spaces import make_action_converter
 from protocol.envs.vectorized import make_native
 from protocol.errors import EnvironmentFailed, PolicyFailed
+from protocol.policy.masks import stored_leaves
 from protocol.policy.own_policy import OwnPolicy
 from protocol.policy.policy import Policy
 from protocol.rollout import Rollout
@@ -46,11 +47,11 @@ def open_env_copies(run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
         case "native":
             with activity().during(MAKING):
                 env = make_native(run.env, run.copies)
-            return VectorCopies(env, run.facts)
+            return VectorCopies(env, run.facts, masked=run.masked)
         case "envpool":
             return EnvpoolCopies(envpool_spec(run.env), run.copies, run.facts)
         case "loop":
-            return LoopedCopies([run.env.make] * run.copies, pulse, run.facts)
+            return LoopedCopies([run.env.make] * run.copies, pulse, run.facts, masked=run.masked)
 
 
 def no_step_for_all(lanes: Sequence[int], actions: Array, pulse: Pulse) -> None:
@@ -60,7 +61,7 @@ def no_step_for_all(lanes: Sequence[int], actions: Array, pulse: Pulse) -> None:
 class _Rows(NamedTuple):
     """Arrays of the rollouts of L lanes while they are collected."""
 
-    obs: tuple[Array, ...]  # [L, T+1, N, *leaf] each
+    obs: tuple[Array, ...]  # [L, T+1, N, *leaf] each; in a masked run the last one is the mask
     state: Floats  # [L, N, S] recurrent state of the policy, updated at each step
     reward: Array  # [L, T, N] float64, so that returns are summed before they are rounded
     terminated: Array  # [L, T, N] bool
@@ -160,7 +161,7 @@ class Collector:
 
     def _new_rows(self, lanes: Sequence[CollectedLane]) -> _Rows:
         L, T, N = len(lanes), self._run.rollout_steps, self._run.copies
-        obs = tuple(np.empty((L, T + 1, N, *leaf.shape), leaf.dtype) for leaf in self._run.policy.observation)
+        obs = tuple(np.empty((L, T + 1, N, *leaf.shape), leaf.dtype) for leaf in stored_leaves(self._run))
         for i, lane in enumerate(lanes):
             for array, leaf in zip(obs, lane.obs, strict=True):
                 array[i, 0] = leaf
@@ -235,7 +236,7 @@ class Collector:
             ticket=assignment.ticket,
             version=version,
             sequence=assignment.sequence,
-            obs=obs,
+            obs=obs[:-1] if self._run.masked else obs,
             action=acted.action,
             log_prob=acted.log_prob,
             reward=reward,
@@ -244,6 +245,7 @@ class Collector:
             valid=valid,
             state=before,
             episodes=episodes,
+            mask=obs[-1] if self._run.masked else None,
             extras=acted.extras,
         )
 

@@ -17,17 +17,20 @@ from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.wrappers import OrderEnforcing
 
 from protocol.arrays import Array
+from protocol.envs.action_masks import without_mask
 from protocol.envs.spaces import make_flatten
 from protocol.envs.vectorized import check_resets_next_step
 from protocol.errors import UsageError
 from protocol.wire.plain_values import unpack
 from workers.collect.facts import Facts, facts_of_copies, facts_of_info, of_ended
+from workers.collect.mask_reader import MaskReader
 from workers.env_errors import CopyRaised, Unusable
-from workers.env_loop import EnvLoop, Pulse
+from workers.env_loop import EnvLoop, Infos, Pulse
 from workers.env_results import missing_leaf, read_leaves
 from workers.supervise.activity import CLOSING, RESETTING, STEPPING, activity
 
-Leaves = Sequence[Any]  # for each leaf of the observation: an array [N, *leaf], or a sequence of N observations
+# For each leaf of the observation: an array [N, *leaf], or a sequence of N observations. In a masked run the masks follow.
+Leaves = Sequence[Any]
 
 
 class StepResult(NamedTuple):
@@ -79,27 +82,38 @@ class LoopedCopies:
     """A loop over N environments."""
 
     def __init__(
-        self, makes: Iterable[Callable[[], gymnasium.Env[Any, Any]]], pulse: Pulse, facts: Sequence[str] = ()
+        self,
+        makes: Iterable[Callable[[], gymnasium.Env[Any, Any]]],
+        pulse: Pulse,
+        facts: Sequence[str] = (),
+        *,
+        masked: bool = False,
     ) -> None:
-        """`facts`: names of the numbers in `info` that belong to an episode."""
+        """`facts`: names of the numbers in `info` that belong to an episode. `masked`: read masks of the allowed actions."""
         self._facts = facts
         self._loop = EnvLoop((partial(made_without_order_check, make) for make in makes), pulse)
         self.observation_space = self._loop.envs[0].observation_space
         self.action_space = self._loop.envs[0].action_space
+        self._masks = MaskReader(self.observation_space, self.action_space) if masked else None
+        if masked:
+            self.observation_space = without_mask(self.observation_space, self.action_space)
         self._nested = isinstance(self.observation_space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple)
         self._read = make_flatten(self.observation_space)
         self._observations: list[Any] = [None] * len(self._loop.envs)
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:
         """Start episodes in all copies, with a seed for each."""
-        self._loop.reset(range(len(self._observations)), seeds, self._observations, pulse)
-        return self._leaves()
+        infos = self._loop.reset(range(len(self._observations)), seeds, self._observations, pulse)
+        leaves = self._leaves()
+        return leaves if self._masks is None else (*leaves, self._read_masks(self._masks, infos))
 
     def step(self, actions: Array, pulse: Pulse) -> StepResult:
         """Step each copy, or reset it if its episode has ended."""
         loop = self._loop
         infos = loop.step(actions, self._observations, pulse)
         leaves = self._leaves() if self._nested else (self._observations,)
+        if self._masks is not None:
+            leaves = (*leaves, self._read_masks(self._masks, infos))
         if not self._facts:
             return StepResult(leaves, loop.reward, loop.terminated, loop.truncated)
         facts = {n: facts_of_info(self._facts, info, n) for n, info in infos if loop.terminated[n] or loop.truncated[n]}
@@ -109,6 +123,9 @@ class LoopedCopies:
         """Set an attribute of every copy; of its wrappers, the outermost one that has it gets it."""
         for n, env in enumerate(self._loop.envs):
             set_attribute(n, env, name, unpack(packed))  # each its own value: they may change it
+
+    def _read_masks(self, masks: MaskReader, infos: Infos) -> Leaves:
+        return masks.read_loop(self._observations, infos, self._loop.terminated, self._loop.truncated)
 
     def _leaves(self) -> Leaves:
         if self._nested:
@@ -154,8 +171,8 @@ def set_attribute(copy: int | None, env: Any, name: str, value: Any) -> None:
 class VectorCopies:
     """Any `gymnasium.vector.VectorEnv` with NextStep autoreset."""
 
-    def __init__(self, env: VectorEnv[Any, Any, Any], facts: Sequence[str] = ()) -> None:
-        """`facts`: names of the numbers in `info` that belong to an episode.
+    def __init__(self, env: VectorEnv[Any, Any, Any], facts: Sequence[str] = (), *, masked: bool = False) -> None:
+        """`facts`: names of the numbers in `info` that belong to an episode. `masked`: read masks of the allowed actions.
 
         Raises `UsageError` for another autoreset mode.
         """
@@ -164,6 +181,9 @@ class VectorCopies:
         self._per_copy = (env.num_envs,)
         self.observation_space = env.single_observation_space
         self.action_space = env.single_action_space
+        self._masks = MaskReader(self.observation_space, self.action_space) if masked else None
+        if masked:
+            self.observation_space = without_mask(self.observation_space, self.action_space)
         self._read = make_flatten(self.observation_space)
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:
@@ -173,16 +193,23 @@ class VectorCopies:
             raise UsageError(f"vector environment {self._env}: expected {len(seeds)} copies, got {self._env.num_envs}")
         try:
             with activity().during(RESETTING):
-                return self._read(self._first(seeds))
+                observation, infos = self._first(seeds)
+                leaves = self._read(observation)
+            if self._masks is None:
+                return leaves
+            no_end = np.zeros(self._per_copy, bool)
+            return [*leaves, self._masks.read_all(observation, infos, no_end, no_end)]
+        except Unusable:
+            raise
         except BaseException as error:
             raise CopyRaised(None, "reset") from error
 
     def _first(self, seeds: Sequence[int]) -> Any:
-        """First observations. Most environments take a list of seeds, Atari takes an array, some take one number."""
+        """First observations, and infos. Most environments take a list of seeds, Atari an array, some one number."""
         for seed in (list(seeds), np.array(seeds)):
             with suppress(gymnasium.error.Error, TypeError):
-                return self._env.reset(seed=seed)[0]  # type: ignore[arg-type]
-        return self._env.reset(seed=seeds[0])[0]
+                return self._env.reset(seed=seed)  # type: ignore[arg-type]
+        return self._env.reset(seed=seeds[0])
 
     def step(self, actions: Array, pulse: Pulse) -> StepResult:
         """Step all copies at once."""
@@ -200,9 +227,10 @@ class VectorCopies:
                 )
                 raise Unusable(None, line)
         try:
-            return StepResult(
-                self._read(observation), reward, terminated, truncated, facts=self._of_ended(infos, terminated | truncated)
-            )
+            leaves: Leaves = self._read(observation)
+            if self._masks is not None:
+                leaves = [*leaves, self._masks.read_all(observation, infos, terminated, truncated)]
+            return StepResult(leaves, reward, terminated, truncated, facts=self._of_ended(infos, terminated | truncated))
         except (LookupError, TypeError) as error:
             raise missing_leaf(None, observation, error) from error
 

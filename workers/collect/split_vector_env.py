@@ -14,12 +14,14 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 
 from protocol.arrays import Array
+from protocol.envs.action_masks import without_mask
 from protocol.envs.spaces import make_flatten
 from protocol.errors import EnvironmentFailed, NoWorkers, WorkerLost
 from protocol.specs import RunSpec
 from protocol.wire.plain_values import unpack
 from workers.collect.env_copies import EnvCopies, Leaves, StepResult
 from workers.collect.facts import Facts, facts_of_copies, of_ended
+from workers.collect.mask_reader import MaskReader
 from workers.env_errors import CopyRaised, Unusable, lane_failed
 from workers.env_loop import Pulse
 
@@ -37,16 +39,22 @@ class SplitVectorEnv:
         before_wait: Callable[[Pulse], None] = lambda pulse: None,
         step_lanes: Callable[[Sequence[int], Array], Any] | None = None,
         facts: Sequence[str] = (),
+        *,
+        masked: bool = False,
     ) -> None:
         """`before_wait` is called before each wait for the vector environment, with the `pulse` to call during the wait.
 
         `step_lanes` steps some lanes of the vector environment: then it may have more lanes than these, for evaluation.
-        `facts`: names of the numbers in `info` that belong to an episode.
+        `facts`: names of the numbers in `info` that belong to an episode. `masked`: read masks of the allowed actions.
         """
         self.env, self.facts = env, facts
+        observation, action = env.single_observation_space, env.single_action_space
+        self._masks = MaskReader(observation, action) if masked else None
+        self.observation_space = without_mask(observation, action) if masked else observation
+        """of one copy"""
         self._lanes, self._before_wait, self._step_lanes = lanes, before_wait, step_lanes
         self._actions: Array | None = None  # [num_envs, *action]
-        self._read = make_flatten(env.single_observation_space)
+        self._read = make_flatten(self.observation_space)
         self._result: StepResult | None = None
         self._no_workers: NoWorkers | None = None
         self._calls: Any = env  # for `call_some` and `assign_some` of a `ZmqVectorEnv`
@@ -86,7 +94,15 @@ class SplitVectorEnv:
         facts: Facts = {}
         if self.facts and (ended := terminated | truncated).any():
             facts = of_ended(facts_of_copies(self.facts, infos, self.env.num_envs), ended)
-        return StepResult(self._read(observation), reward, terminated, truncated, infos.get("worker_lost"), facts)
+        leaves: Leaves = self._read(observation)
+        if self._masks is not None:
+            waits = np.ones(self.env.num_envs, bool)  # copies that were not stepped have no new mask
+            if lanes[0] < self._lanes:
+                waits[copies] = False
+            else:  # lanes for evaluation have one copy each
+                waits[[copies.start + lane - self._lanes for lane in lanes]] = False
+            leaves = [*leaves, self._masks.read_all(observation, infos, terminated | waits, truncated)]
+        return StepResult(leaves, reward, terminated, truncated, infos.get("worker_lost"), facts)
 
     def result(self, copies: slice) -> StepResult:
         """The part of the last step's result that belongs to these copies."""
@@ -105,8 +121,11 @@ class SplitVectorEnv:
         all_seeds: list[Any] = [None] * self.env.num_envs
         all_seeds[copies] = seeds
         options = {"reset_mask": mask}
-        observation, _ = self._wait(lambda: self.env.reset(seed=all_seeds, options=options), pulse)  # type: ignore[arg-type]
-        return [leaf[copies] for leaf in self._read(observation)]
+        observation, infos = self._wait(lambda: self.env.reset(seed=all_seeds, options=options), pulse)  # type: ignore[arg-type]
+        leaves: Leaves = self._read(observation)
+        if self._masks is not None:
+            leaves = [*leaves, self._masks.read_all(observation, infos, ~mask, np.zeros_like(mask))]
+        return [leaf[copies] for leaf in leaves]
 
     def assign(self, copies: slice, name: str, packed: bytes, pulse: Pulse) -> None:
         """Set an attribute of these copies, also of those that replace lost ones."""
@@ -157,7 +176,7 @@ class _LaneOfVectorEnv:
 
     def __init__(self, split: SplitVectorEnv, copies: slice) -> None:
         self._split, self._copies = split, copies
-        self.observation_space = split.env.single_observation_space
+        self.observation_space = split.observation_space
         self.action_space = split.env.single_action_space
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:

@@ -15,10 +15,12 @@ import gymnasium
 
 from protocol.arrays import Array
 from protocol.env_spec import EnvSpec
+from protocol.envs.action_masks import without_mask
 from protocol.envs.spaces import make_flatten
 from protocol.errors import UsageError
 from workers.collect.env_copies import made_without_order_check
 from workers.collect.facts import facts_of_info
+from workers.collect.mask_reader import MaskReader
 from workers.env_errors import CopyRaised, Unusable
 from workers.env_loop import PULSE_S, EnvLoop, Pulse
 from workers.supervise.activity import EVALUATING, activity
@@ -28,7 +30,7 @@ class CopyStep(NamedTuple):
     """Result of one step of one copy."""
 
     leaves: tuple[Any, ...]
-    """the arrays of the observation"""
+    """the arrays of the observation; in a masked run the mask follows"""
     reward: Any
     terminated: Any
     truncated: Any
@@ -70,10 +72,19 @@ class EvaluationCopies(Protocol):
 class LoopedEvaluationCopies:
     """A loop over environments in this process."""
 
-    def __init__(self, env: EnvSpec, count: int, render_mode: str | None, pulse: Pulse, facts: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        env: EnvSpec,
+        count: int,
+        render_mode: str | None,
+        pulse: Pulse,
+        facts: Sequence[str] = (),
+        *,
+        masked: bool = False,
+    ) -> None:
         """`render_mode`: None, or `rgb_array`. Raises `UsageError` if the environment does not render so.
 
-        `facts`: names of the numbers in `info` that belong to an episode.
+        `facts`: names of the numbers in `info` that belong to an episode. `masked`: read masks of the allowed actions.
         """
         self.count, self._activity, self._facts = count, activity(), facts
         make = partial(made_without_order_check, partial(env.make, render_mode))
@@ -84,6 +95,9 @@ class LoopedEvaluationCopies:
         self._steps = [0] * count
         first = self._loop.envs[0]
         self.observation_space, self.action_space = first.observation_space, first.action_space
+        self._masks = MaskReader(self.observation_space, self.action_space) if masked else None
+        if masked:
+            self.observation_space = without_mask(self.observation_space, self.action_space)
         self._read = make_flatten(self.observation_space)
         modes = first.metadata.get("render_modes", [])
         if render_mode is not None and (first.render_mode != render_mode or render_mode not in modes):
@@ -93,9 +107,14 @@ class LoopedEvaluationCopies:
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> list[tuple[Any, ...]]:
         """Start episodes in the first copies, with a seed for each. Returns the arrays of each observation."""
         observations: list[Any] = [None] * len(seeds)
-        self._loop.reset(range(len(seeds)), seeds, observations, pulse)
+        infos = dict(self._loop.reset(range(len(seeds)), seeds, observations, pulse))
         self._steps[: len(seeds)] = [0] * len(seeds)
-        return [self._read(observation) for observation in observations]
+        if (masks := self._masks) is None:
+            return [self._read(observation) for observation in observations]
+        return [
+            (*self._read(observation), masks.read(n, observation, infos.get(n, {}), False, False))
+            for n, observation in enumerate(observations)
+        ]
 
     def step(self, actions: Array, copies: Sequence[int], pulse: Pulse) -> list[CopyStep]:
         """Step these copies one after another, with actions [count, *action] of which only theirs are used."""
@@ -106,7 +125,10 @@ class LoopedEvaluationCopies:
             try:
                 observation, reward, terminated, truncated, info = self._loop.envs[n].step(actions[n])
                 facts = facts_of_info(self._facts, info, n) if self._facts and (terminated or truncated) else ()
-                results.append(CopyStep(self._read(observation), reward, terminated, truncated, facts))
+                leaves = self._read(observation)
+                if self._masks is not None:
+                    leaves = (*leaves, self._masks.read(n, observation, info, terminated, truncated))
+                results.append(CopyStep(leaves, reward, terminated, truncated, facts))
             except Unusable as error:
                 raise Unusable(n, error.line, f"step {self._steps[n]}") from error
             except BaseException as error:

@@ -20,6 +20,7 @@ from protocol.arrays import Array
 from protocol.envs.spaces import action_spec, make_action_converter, observation_leaves
 from protocol.errors import RunError, UsageError, first_line
 from protocol.messages import Evaluate, Evaluated
+from protocol.policy.masks import stored_leaves
 from protocol.policy.own_policy import OwnPolicy
 from protocol.policy.policy import Policy
 from protocol.policy.recurrent import zero_state
@@ -45,7 +46,7 @@ class EvaluationFailed(RunError):
 
 def open_looped_copies(run: RunSpec, count: int, render_mode: str | None, pulse: Pulse) -> EvaluationCopies:
     """Copies in this process."""
-    return LoopedEvaluationCopies(run.env, count, render_mode, pulse, run.facts)
+    return LoopedEvaluationCopies(run.env, count, render_mode, pulse, run.facts, masked=run.masked)
 
 
 class Evaluator:
@@ -61,6 +62,7 @@ class Evaluator:
         """seconds spent in `play`"""
         self._run, self._open_copies = run, open_copies
         self._acting = acting_of(run, policy)
+        self._stored = stored_leaves(run)
         self._to_env_action = make_action_converter(run.policy.action)
         self._copies: dict[str | None, EvaluationCopies] = {}  # by render mode
 
@@ -97,7 +99,7 @@ class Evaluator:
     def _play(self, order: Evaluate, send: Send, pulse: Pulse) -> Evaluated:
         k, policy = len(order.seeds), self._run.policy
         copies = self._opened(k, "rgb_array" if order.send_frames else None, pulse)
-        obs = tuple(np.empty((1, k, *leaf.shape), leaf.dtype) for leaf in policy.observation)
+        obs = tuple(np.empty((1, k, *leaf.shape), leaf.dtype) for leaf in self._stored)
         actions = np.zeros((copies.count, *policy.action.shape), policy.action.dtype)
         state, generator = zero_state(policy, 1, k), np.random.default_rng(order.seeds[0])
         returns, lengths, cut, seconds = [0.0] * k, [0] * k, [False] * k, [0.0] * k
@@ -157,14 +159,14 @@ class Evaluator:
 
         `when` is a text, or the number of the step.
         """
-        for array, leaf, value in zip(obs, self._run.policy.observation, leaves, strict=True):
+        for array, leaf, value in zip(obs, self._stored, leaves, strict=True):
             if type(value) is not np.ndarray or value.dtype != array.dtype or value.shape != leaf.shape:
                 value = _converted(value, leaf, array.dtype, f"copy {n}, {_moment(when)}")
             array[0, n] = value
 
     def _check_finite(self, obs: tuple[Array, ...], when: str | int) -> None:
         """Raise if an observation of the batch is not finite."""
-        for array, leaf in zip(obs, self._run.policy.observation, strict=True):
+        for array, leaf in zip(obs, self._stored, strict=True):
             if array.dtype.kind == "f" and not np.isfinite(array).all():
                 n = next(n for n in range(array.shape[1]) if not np.isfinite(array[0, n]).all())
                 where = f"copy {n}, {_moment(when)}: observation {leaf.path}".strip()
@@ -175,7 +177,8 @@ class Evaluator:
             frame = as_frame(copies.render(n)) if sender.wants_frame else None
         except ValueError as error:
             raise EvaluationFailed(f"copy {n}, {error}") from error
-        sender.observe([leaf[0, n] for leaf in obs], frame)
+        shown = obs[: len(self._run.policy.observation)]  # without the mask
+        sender.observe([leaf[0, n] for leaf in shown], frame)
 
 
 def _moment(when: str | int) -> str:

@@ -24,7 +24,7 @@ class SplitEvaluationCopies:
         self.count = count
         self._split, self._first_lane = split, first_lane
         self._first_copy = split.env.num_envs - count
-        self.observation_space = split.env.single_observation_space
+        self.observation_space = split.observation_space
         self.action_space = split.env.single_action_space
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> list[tuple[Any, ...]]:

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from learner.algorithms.kernels import fused
-from protocol.arrays import Array
+from protocol.arrays import Array, Bools
+from protocol.policy.masks import FORBIDDEN
 from protocol.policy.networks import QNetwork
 
 
@@ -26,16 +27,16 @@ class ActionValues(Protocol):
         """Convert a numpy array [B] to the kind of array that this class uses."""
         ...
 
-    def best_actions(self, x: Array, images: Sequence[Array]) -> Any:
-        """The best actions [B]."""
+    def best_actions(self, x: Array, images: Sequence[Array], mask: Bools | None = None) -> Any:
+        """The best actions [B], among those that `mask` [B, n] allows."""
         ...
 
     def chosen(self, x: Array, images: Sequence[Array], action: Any) -> Any:
         """The values [B] of these actions [B]. `backward` belongs to the last call."""
         ...
 
-    def best_values(self, x: Array, images: Sequence[Array]) -> Any:
-        """The values [B] of the best actions."""
+    def best_values(self, x: Array, images: Sequence[Array], mask: Bools | None = None) -> Any:
+        """The values [B] of the best actions, among those that `mask` [B, n] allows."""
         ...
 
     def backward(self, gradient: Any) -> None:
@@ -60,20 +61,24 @@ class AutogradActionValues:
     def _values(self, x: Array, images: Sequence[Array]) -> Tensor:
         return self._net.params(self.to_array(x), [self.to_array(image) for image in images])
 
-    def best_actions(self, x: Array, images: Sequence[Array]) -> Tensor:
+    def best_actions(self, x: Array, images: Sequence[Array], mask: Bools | None = None) -> Tensor:
         """See `ActionValues`."""
         with torch.no_grad():
-            return self._values(x, images).argmax(1)
+            return self._allowed_values(x, images, mask).argmax(1)
+
+    def _allowed_values(self, x: Array, images: Sequence[Array], mask: Bools | None) -> Tensor:
+        values = self._values(x, images)
+        return values if mask is None else values.masked_fill(~self.to_array(mask), FORBIDDEN)
 
     def chosen(self, x: Array, images: Sequence[Array], action: Tensor) -> Tensor:
         """See `ActionValues`."""
         self._chosen = self._values(x, images).gather(1, action[:, None])[:, 0]
         return self._chosen.detach()
 
-    def best_values(self, x: Array, images: Sequence[Array]) -> Tensor:
+    def best_values(self, x: Array, images: Sequence[Array], mask: Bools | None = None) -> Tensor:
         """See `ActionValues`."""
         with torch.no_grad():
-            return self._values(x, images).amax(1)
+            return self._allowed_values(x, images, mask).amax(1)
 
     def backward(self, gradient: Tensor) -> None:
         """See `ActionValues`."""
@@ -97,9 +102,15 @@ class FusedActionValues:
         """See `ActionValues`."""
         return array
 
-    def best_actions(self, x: Array, images: Sequence[Array]) -> Array:
+    def best_actions(self, x: Array, images: Sequence[Array], mask: Bools | None = None) -> Array:
         """See `ActionValues`."""
-        return np.asarray(self._net.forward(x).argmax(0))
+        return np.asarray(self._allowed_values(x, mask).argmax(0))
+
+    def _allowed_values(self, x: Array, mask: Bools | None) -> Array:
+        values = self._net.forward(x)  # [n, B]
+        if mask is not None:
+            np.copyto(values, np.float32(FORBIDDEN), where=~mask.T)
+        return values
 
     def chosen(self, x: Array, images: Sequence[Array], action: Array) -> Array:
         """See `ActionValues`."""
@@ -107,9 +118,9 @@ class FusedActionValues:
         self._shape, self._where = values.shape, action * len(x) + np.arange(len(x))
         return values.take(self._where)
 
-    def best_values(self, x: Array, images: Sequence[Array]) -> Array:
+    def best_values(self, x: Array, images: Sequence[Array], mask: Bools | None = None) -> Array:
         """See `ActionValues`."""
-        return np.asarray(np.maximum.reduce(self._net.forward(x), 0))
+        return np.asarray(np.maximum.reduce(self._allowed_values(x, mask), 0))
 
     def backward(self, gradient: Array) -> None:
         """See `ActionValues`."""

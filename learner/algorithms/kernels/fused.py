@@ -18,6 +18,7 @@ from learner.algorithms.kernels.mlp import FusedMLP, Head, Linear
 from protocol.arrays import Array
 from protocol.policy.features import feature_size
 from protocol.policy.layout import hidden_names, named_views, parameter_layout, total_size
+from protocol.policy.masks import FORBIDDEN
 from protocol.specs import PolicySpec
 
 MAX_ROWS = 16_384  # rows of a minibatch: the arrays of a forward pass take memory
@@ -48,9 +49,15 @@ class FusedActorCritic:
             spec.action, values.get("actor.log_std"), grads.get("actor.log_std")
         )
 
-    def forward(self, x: Array, action: Array) -> tuple[Array, Array, Array]:
-        """Features [B, D] and actions [B, *action] -> log π(action), the entropy of π, V: [B] each."""
+    def forward(self, x: Array, action: Array, mask: Array | None = None) -> tuple[Array, Array, Array]:
+        """Features [B, D] and actions [B, *action] -> log π(action), the entropy of π, V: [B] each.
+
+        `mask` [B, choices]: which actions are allowed. A logit that it forbids has probability 0, so the factor p makes its
+        gradient 0 in `ActionGradients.backward`.
+        """
         params, value = self._mlp.forward(x)
+        if mask is not None:
+            np.copyto(params, np.float32(FORBIDDEN), where=~mask.T)
         log_prob, entropy = self._actions.forward(params, action.reshape(len(x), -1))
         return log_prob, entropy, value[0]
 

@@ -41,6 +41,7 @@ class Sample(NamedTuple):
     discount: Floats  # [B] γᵏ; 0 where the task ended
     next_leaves: tuple[Array, ...]  # [B, *leaf] each, k steps later
     weight: Floats  # [B] importance-sampling weight of the loss, at most 1
+    next_mask: Bools | None = None  # [B, choices] actions allowed in the next observation; None without action masks
 
 
 def memory_bytes(observation: Sequence[Leaf], size: int, prioritized: bool) -> int:
@@ -104,6 +105,9 @@ class ReplayBuffer:
         self._n_step, self._gamma, self._alpha = n_step, gamma, alpha
         self.generator = np.random.default_rng(seed)  # decides what is drawn
         self._obs = tuple(np.zeros((size, *leaf.shape), leaf.dtype) for leaf in observation)
+        self._mask: Bools | None = (
+            None  # [size, choices], made when the first masks come; as `_obs`, one for each observation
+        )
         self._row = np.zeros(size, ROW)
         self._action: Ints = self._row["action"]  # this and the next four: views of `_row`
         self._reward: Floats = self._row["reward"]
@@ -146,10 +150,13 @@ class ReplayBuffer:
         written[0][continues] = newest[continues]
         self._written += int(np.count_nonzero(needed))
         slot = written % self.size
-        self._keep(slot[needed], self._obs)
+        if batch.mask is not None:
+            obs.append(batch.mask[:, columns])
+            self._make_mask(batch.mask.shape[-1])
+        self._keep(slot[needed], self._per_observation())
         self._keep(slot[0][continues], ())
         self._clear(slot[needed])
-        for kept, leaf in zip(self._obs, obs, strict=True):
+        for kept, leaf in zip(self._per_observation(), obs, strict=True):
             kept[slot[needed]] = leaf[needed]
         rows = slot[:-1][valid]
         self._action[rows] = batch.action[:, columns][valid]
@@ -162,6 +169,14 @@ class ReplayBuffer:
             self._tree.set(rows, self._highest**self._alpha)
         ended = terminated[-1] | batch.truncated[-1, columns] | ~valid[-1]
         self._newest[lane] = np.where(ended, NO_SLOT, written[-1])
+
+    def _make_mask(self, choices: int) -> None:
+        if self._mask is None:
+            self._mask = np.ones((self.size, choices), bool)
+
+    def _per_observation(self) -> tuple[Array, ...]:
+        """The arrays with one entry for each stored observation: its leaves, and its mask if there are masks."""
+        return self._obs if self._mask is None else (*self._obs, self._mask)
 
     def _continues(self, first: Sequence[Array], newest: Ints | None, room: int) -> tuple[Bools, Ints]:
         """[N] whether a copy's rollout begins with the newest observation that is stored for it; [N] where that was written.
@@ -198,6 +213,7 @@ class ReplayBuffer:
             discount=discount.astype(np.float32),
             next_leaves=tuple(leaf[last] for leaf in self._obs),
             weight=weight,
+            next_mask=None if self._mask is None else self._mask[last],
         )
 
     def _uniform(self, count: int) -> tuple[Ints, Floats]:
@@ -250,7 +266,7 @@ class ReplayBuffer:
         self._newest, self.generator.bit_generator.state = dict(newest), generator
         for old in reversed(self._overwritten):
             self._row[old.slots] = old.rows
-            for leaf, before in zip(self._obs, old.leaves, strict=False):
+            for leaf, before in zip(self._per_observation(), old.leaves, strict=False):
                 leaf[old.slots] = before
             if self._tree is not None and old.weights is not None:
                 self._tree.set(old.slots, old.weights)
@@ -268,7 +284,8 @@ class ReplayBuffer:
         """All arrays with one entry for each slot, by name."""
         own = {name: getattr(self, f"_{name}") for name in ("action", "reward", "terminated", "follows", "is_row")}
         tree = {} if self._tree is None else {"weight": self._tree.weights}
-        return {f"obs{i}": leaf for i, leaf in enumerate(self._obs)} | own | tree
+        masks = {} if self._mask is None else {"mask": self._mask}
+        return {f"obs{i}": leaf for i, leaf in enumerate(self._obs)} | masks | own | tree
 
     def state_dict(self) -> dict[str, Any]:
         """A copy of the slots in use, as tensors and plain data."""
@@ -289,6 +306,8 @@ class ReplayBuffer:
         self._written, self._highest = state["written"], state["highest"]
         used = min(self._written, self.size)
         self._is_row[used:] = False
+        if "mask" in state["arrays"]:
+            self._make_mask(state["arrays"]["mask"].shape[1])
         for name, array in self._arrays().items():
             if name != "weight":
                 array[:used] = state["arrays"][name].numpy()

@@ -1,0 +1,47 @@
+"""Where an environment's action masks are: under the key `action_mask` of a Dict observation, or of `info`.
+
+Rule: in a masked run, the key of an observation is a mask and no feature. The learner and the workers both decide it here,
+by the spaces alone.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import gymnasium
+from gymnasium import spaces
+
+from protocol.envs.spaces import action_spec, observation_leaves
+from protocol.errors import UsageError
+from protocol.policy.masks import MASK, choices
+from protocol.specs import Leaf
+
+
+def has_mask(observation: gymnasium.Space[Any], action: gymnasium.Space[Any]) -> bool:
+    """Whether an observation carries a mask of the allowed actions: at the key, with a bit for each choice."""
+    if not (isinstance(observation, spaces.Dict) and MASK in observation.spaces and len(observation.spaces) > 1):
+        return False
+    try:
+        leaves, wanted = observation_leaves(observation.spaces[MASK]), choices(action_spec(action))
+    except UsageError:
+        return False
+    return 0 < wanted == sum(math.prod(leaf.shape) for leaf in leaves) and all(map(_has_bits, leaves))
+
+
+def _has_bits(leaf: Leaf) -> bool:
+    match leaf.kind:
+        case "multibinary":
+            return True
+        case "box":
+            return leaf.dtype in ("bool", "int8", "uint8")
+        case _:
+            return set(leaf.sizes) == {2} and set(leaf.start) == {0}
+
+
+def without_mask(observation: gymnasium.Space[Any], action: gymnasium.Space[Any]) -> gymnasium.Space[Any]:
+    """The observation space without the mask, if it has one."""
+    if not has_mask(observation, action):
+        return observation
+    assert isinstance(observation, spaces.Dict)
+    return spaces.Dict([(key, space) for key, space in observation.spaces.items() if key != MASK])

@@ -1,0 +1,118 @@
+"""Reads the masks of allowed actions that env copies report, in their observations or in `info`.
+
+Rule: where an action will be chosen, a mask is there, has a bit for each choice, and allows at least one choice of each
+entry of the action; else the environment is wrong (`Unusable`). After an episode's end no action is chosen. If the episode
+was truncated, the mask is kept, because the value of the last observation counts; if there is none, all actions are allowed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from protocol.arrays import Array, Bools
+from protocol.bounds import one_line
+from protocol.envs.action_masks import has_mask
+from protocol.envs.spaces import action_spec
+from protocol.policy.masks import MASK, choices, no_choice
+from workers.env_errors import Unusable
+
+DTYPES = ("bool", "int8", "uint8", "int64", "int32")
+_NONE: Mapping[str, Any] = {}
+
+
+class MaskReader:
+    """Reads the masks of env copies with these spaces."""
+
+    def __init__(self, observation: gymnasium.Space[Any], action: gymnasium.Space[Any]) -> None:
+        self._action = action_spec(action)
+        self._choices = choices(self._action)
+        self._in_observation = has_mask(observation, action)
+        self._all = np.ones(self._choices, bool)
+        self._where = "its observation" if self._in_observation else "info"
+
+    def read(self, n: int, observation: Any, info: Mapping[str, Any], terminated: Any, truncated: Any) -> Bools:
+        """The mask [choices] of copy `n` after a step or a reset. Raises `Unusable`."""
+        if terminated:
+            return self._all
+        source = observation if self._in_observation else info
+        value = source.get(MASK) if isinstance(source, Mapping) else None
+        return self._mask(n, value, bool(truncated))
+
+    def read_all(self, observation: Any, infos: Mapping[str, Any], terminated: Bools, truncated: Bools) -> Bools:
+        """The masks [N, choices] of all copies of a vector environment. Raises `Unusable`.
+
+        A copy that gets no action needs none: `terminated` says so.
+        """
+        count = len(terminated)
+        given = (observation if self._in_observation else infos).get(MASK)
+        there = np.ones(count, bool) if self._in_observation else np.asarray(infos.get(f"_{MASK}", np.ones(count, bool)))
+        rows = _rows(given, count)
+        found = np.ones((count, self._choices), bool)
+        for n in np.flatnonzero(~np.asarray(terminated, bool)).tolist():
+            found[n] = self._mask(n, rows[n] if there[n] else None, bool(truncated[n]))
+        return found
+
+    def read_loop(
+        self,
+        observations: Sequence[Any],
+        infos: Sequence[tuple[int, Mapping[str, Any]]],
+        terminated: Sequence[Any],
+        truncated: Sequence[Any],
+    ) -> list[Bools]:
+        """The masks of all copies of a loop."""
+        by_copy = dict(infos)
+        return [
+            self.read(n, observation, by_copy.get(n, _NONE), terminated[n], truncated[n])
+            for n, observation in enumerate(observations)
+        ]
+
+    def _mask(self, n: int, value: Any, ended: bool) -> Bools:
+        if value is None:
+            if ended:
+                return self._all
+            raise self._wrong(n, "none")
+        array = _as_array(value)
+        if array is None or array.size != self._choices or array.dtype.name not in DTYPES:
+            raise self._wrong(n, _shown(value, array))
+        mask: Bools = array.reshape(-1).astype(bool)
+        if array.dtype.kind != "b" and (array.reshape(-1) != mask).any():
+            raise self._wrong(n, f"the value {array.max() if array.max() > 1 else array.min()}")
+        if no_choice(mask, self._action):
+            if ended:
+                return self._all
+            raise self._wrong(n, f"one without a choice, {one_line(str(mask.astype(int).tolist()), 100)}")
+        return mask
+
+    def _wrong(self, n: int, got: str) -> Unusable:
+        parts = "" if len(self._action.sizes) < 2 else f" ({' + '.join(map(str, self._action.sizes))})"
+        expected = f"expected {self._choices}{parts} zeros and ones of int8 or bool in {self._where}, at least one allowed"
+        return Unusable(n, f"{MASK}: {expected}, got {got}; fix the environment, or set action_masks to none")
+
+
+def _as_array(value: Any) -> Array | None:
+    """A mask as one array: those of several entries are joined."""
+    try:
+        if isinstance(value, tuple | list) and value and np.ndim(value[0]):
+            return np.concatenate([np.asarray(part).reshape(-1) for part in value])
+        return np.asarray(value)
+    except (ValueError, TypeError):  # rows of different lengths
+        return None
+
+
+def _rows(given: Any, count: int) -> Sequence[Any]:
+    """The value of each copy of a vector environment's array; a Tuple space gives a tuple of arrays [N, …]."""
+    if isinstance(given, tuple) and all(len(part) == count for part in given):
+        return list(zip(*given, strict=True))
+    if isinstance(given, np.ndarray | list) and len(given) == count:
+        return list(given)
+    return [given] * count  # none, or what `_mask` refuses
+
+
+def _shown(value: Any, array: Array | None) -> str:
+    if array is None or array.dtype.kind not in "biuf":
+        return one_line(f"{type(value).__name__} {value!r}", 80)
+    return f"{array.dtype}{list(array.shape)}"
