@@ -163,6 +163,10 @@ class Run:
             config.algorithm, spec.policy, total_steps=config.steps, seed=config.seed, device=torch_device(config)
         )
         if config.prior:
+            if spec.masked:
+                raise UsageError(
+                    f"prior {config.prior}: a dataset has no action masks, and this run uses them; take --action-masks none"
+                )
             _add_prior(self.algorithm, config.prior, spec.policy)
         state = RunState()
         if setup.resumed:

@@ -20,7 +20,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 ENVIRONMENTS = ROOT / ".versions"
 LOWEST = "lowest"
-NEED_NEWER = re.compile(r"(ale-py|stable-baselines3)\b")
+NEED_NEWER = re.compile(r"(ale-py|sb3-contrib|stable-baselines3)\b")
 """Packages of `dev` that need newer versions than ours of what we also need. Their tests are skipped without them."""
 NEED_OLDER = ("mpmath<1.4", "pyparsing<3.3")
 """The lowest torch (by sympy) and matplotlib use names of these packages that are deprecated since."""

@@ -101,7 +101,7 @@ def _joined(own: Sample, prior: Sample) -> Sample:
     def joined(one: Any, other: Any) -> Any:
         if isinstance(one, tuple):
             return tuple(map(joined, one, other))
-        return np.concatenate([one, other])
+        return None if one is None else np.concatenate([one, other])  # None: a draw without action masks
 
     return Sample(*map(joined, own, prior))
 
