@@ -40,6 +40,7 @@ from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.errors import MillraceError, RunTakenOver, UsageError, first_line
 from protocol.keys.key_folder import Keyring
+from protocol.logs.notices import log_notice
 from protocol.messages import Status
 from protocol.specs import DescribeSpec, PolicySpec, RunSpec
 from protocol.wire.learner_link import LearnerLink
@@ -117,7 +118,10 @@ def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, d
         imports.wait(check_interrupt)
     spaces = EnvSpaces.of_description(described, config.action_masks)
     if spaces.masked:
-        log.info("actions are masked: the environment says which are allowed (--action-masks %s)", config.action_masks)
+        log_notice(
+            log,
+            f"the environment says which actions are allowed, and others are never taken (action_masks {config.action_masks})",
+        )
     return KnownEnvironment(env, spaces, described)
 
 
