@@ -118,10 +118,7 @@ def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, d
         imports.wait(check_interrupt)
     spaces = EnvSpaces.of_description(described, config.action_masks)
     if spaces.masked:
-        log_notice(
-            log,
-            f"the environment says which actions are allowed, and others are never taken (action_masks {config.action_masks})",
-        )
+        log_notice(log, f"only actions that the environment allows are taken (action_masks {config.action_masks})")
     return KnownEnvironment(env, spaces, described)
 
 
