@@ -79,7 +79,7 @@ METRICS: dict[str, dict[str, Meaning]] = {
     },
     "Updates: all algorithms": {
         "train/learning_rate": Meaning(NONE, "Learning rate of this update."),
-        "train/n_updates": Meaning("–", "PPO: epochs so far. DQN: gradient steps so far. Others: updates so far."),
+        "train/n_updates": Meaning("–", "PPO: epochs so far. DQN, SAC, TD3: gradient steps so far. Others: updates so far."),
         "train/grad_norm": Meaning(NONE, "Norm of the gradient before it is clipped, mean over the update."),
     },
     "Updates: actor-critic algorithms": {
@@ -98,8 +98,13 @@ METRICS: dict[str, dict[str, Meaning]] = {
         "train/rows_used": Meaning("rows", "REINFORCE: rows of whole episodes, from which the update learned."),
         "train/rows_dropped": Meaning("rows", "REINFORCE: rows of unfinished episodes. They were dropped."),
     },
-    "Updates: DQN": {
+    "Updates: DQN, SAC, TD3": {
         "train/q_mean": Meaning(NONE, "Mean value of the actions that were taken."),
+        "train/critic_loss": Meaning(NONE, "SAC, TD3: mean loss of both critics."),
+        "train/actor_loss": Meaning(NONE, "SAC, TD3: mean loss of the actor."),
+        "train/ent_coef": Meaning(NONE, "SAC: mean temperature α, the weight of the entropy."),
+        "train/ent_coef_loss": Meaning(NONE, "SAC: mean loss of a learned temperature."),
+        "train/entropy": Meaning("nats", "SAC: mean entropy of the actions in [-1, 1], estimated from samples."),
         "replay/size": Meaning("transitions", "Transitions in the replay buffer."),
         "replay/bytes": Meaning("bytes", "Memory of the replay buffer."),
         "replay/env_steps_per_gradient_step": Meaning(STEPS, "New env steps for each gradient step of this update."),

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from learner.policy_player import saved_policy
 from protocol.arrays import Array, Bools, Floats
-from protocol.envs.spaces import make_action_converter
+from protocol.envs.spaces import action_converter_of
 from protocol.errors import UsageError
 from protocol.policy.distributions import distribution
 from protocol.policy.masks import MASK, choices, forbid, masked_distribution, no_choice
@@ -53,7 +53,7 @@ class LoadedPolicy:
         self._distribution = distribution(saved.spec)
         self._masked_distribution = masked_distribution(saved.spec)
         self._is_masked = saved.masked
-        self._to_env_action = make_action_converter(saved.spec.action)
+        self._to_env_action = action_converter_of(saved.spec)
         self._generator = None if deterministic else np.random.default_rng(seed)
         self._state: Floats | None = None  # [1, n, S] of a recurrent policy, once it was started
 

@@ -22,10 +22,12 @@ wrong with a class of either level. A run takes it as `millrace train CartPole-v
 
 The algorithm itself:
 
-- `Algorithm`, the base of all; `ActorCritic`, the base of those with an actor and a critic. `PPO`, `A2C`, `Impala`,
-  `REINFORCE` and `DQN` stand on the same two.
-- `AlgorithmConfig` and `ActorCriticConfig`, the bases of `Config`; `PPOConfig` and so on. Every setting has a default value
-  and a type, perhaps with bounds: `Annotated[float, msgspec.Meta(gt=0)]`. The text under it is its help.
+- `Algorithm`, the base of all; `ActorCritic`, the base of those with an actor and a critic, of which are `PPO`, `A2C`,
+  `Impala` and `REINFORCE`; `OffPolicy`, the base of those with a replay buffer, of which are `DQN`, `SAC` and `TD3`. The
+  last two share `Continuous`: actions in a bounded Box, an exact replay ratio.
+- `AlgorithmConfig`, `ActorCriticConfig`, `OffPolicyConfig` and `ContinuousConfig`, the bases of `Config`; `PPOConfig` and so
+  on. Every setting has a default value and a type, perhaps with bounds: `Annotated[float, msgspec.Meta(gt=0)]`. The text
+  under it is its help.
 - `Free`, `Adaptable` and `Fixed` say what becomes of another value in a resumed run: `n_steps: Free[int] = 3`. Without one,
   a float is free and anything else is fixed.
 
@@ -38,8 +40,12 @@ What it learns from:
 Tools:
 
 - `gae`, `vtrace` and `EpisodeEnds`: advantages and targets of arrays [T, N].
-- `ActorCriticNetwork` and `QNetwork`: the networks that workers act with, and `log_prob_and_entropy` of their outputs.
+- `ActorCriticNetwork`, `QNetwork` and `ActorAndCritics`: the networks that workers act with, and `log_prob_and_entropy` or
+  `squashed_sample` of their outputs.
+- `ReplayBuffer`, which gives a `Sample` of transitions, and `Transitions`, the tensors of one. `ObservationNormalizer`: the
+  running statistics of observations.
 - `features` and `normalize`: observations as these networks take them.
+- `UsageError`: raise it, in one line, for settings or spaces that cannot be used.
 - `check_finite` and `scheduled`: the check before a gradient step, and settings that fall over the run.
 """
 
@@ -48,26 +54,37 @@ from __future__ import annotations
 from learner.algorithms.a2c import A2C
 from learner.algorithms.actor_critic import ActorCritic, Estimates
 from learner.algorithms.algorithm import Algorithm
+from learner.algorithms.continuous import Continuous, Transitions
 from learner.algorithms.dqn import DQN
 from learner.algorithms.impala import Impala
 from learner.algorithms.minibatches import LossInput, Observations
+from learner.algorithms.normalization import ObservationNormalizer
+from learner.algorithms.off_policy import OffPolicy
 from learner.algorithms.ppo import PPO
 from learner.algorithms.reinforce import REINFORCE
+from learner.algorithms.replay.replay_buffer import ReplayBuffer, Sample
 from learner.algorithms.returns import EpisodeEnds, gae, vtrace
+from learner.algorithms.sac import SAC
+from learner.algorithms.td3 import TD3
 from learner.algorithms.updates import check_finite, scheduled
 from learner.config.hyperparameters import (
     A2CConfig,
     ActorCriticConfig,
     AlgorithmConfig,
+    ContinuousConfig,
     DQNConfig,
     ImpalaConfig,
+    OffPolicyConfig,
     PPOConfig,
     REINFORCEConfig,
+    SACConfig,
+    TD3Config,
 )
 from learner.config.on_resume import Adaptable, Fixed, Free
+from protocol.errors import UsageError
 from protocol.policy.features import features, normalize
-from protocol.policy.networks import ActorCriticNetwork, QNetwork
-from protocol.policy.torch_distributions import log_prob_and_entropy
+from protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork
+from protocol.policy.torch_distributions import log_prob_and_entropy, squashed_sample
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
@@ -76,8 +93,11 @@ __all__ = [
     "DQN",
     "PPO",
     "REINFORCE",
+    "SAC",
+    "TD3",
     "A2CConfig",
     "ActionSpec",
+    "ActorAndCritics",
     "ActorCritic",
     "ActorCriticConfig",
     "ActorCriticNetwork",
@@ -85,6 +105,8 @@ __all__ = [
     "Algorithm",
     "AlgorithmConfig",
     "Batch",
+    "Continuous",
+    "ContinuousConfig",
     "DQNConfig",
     "EpisodeEnds",
     "Estimates",
@@ -94,16 +116,26 @@ __all__ = [
     "ImpalaConfig",
     "Leaf",
     "LossInput",
+    "ObservationNormalizer",
     "Observations",
+    "OffPolicy",
+    "OffPolicyConfig",
     "PPOConfig",
     "PolicySpec",
     "QNetwork",
     "REINFORCEConfig",
+    "ReplayBuffer",
+    "SACConfig",
+    "Sample",
+    "TD3Config",
+    "Transitions",
+    "UsageError",
     "check_finite",
     "features",
     "gae",
     "log_prob_and_entropy",
     "normalize",
     "scheduled",
+    "squashed_sample",
     "vtrace",
 ]

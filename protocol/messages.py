@@ -86,7 +86,8 @@ class Weights(Message, frozen=True):
     parameters: Array
     """[P] the parameters needed to act: float32, or rounded to float16 or bfloat16 (which is sent as uint16)"""
     buffers: Array
-    """[B] float32, observation mean and standard deviation if observations are normalized, and ε for action values"""
+    """[B] float32, observation mean and standard deviation if observations are normalized; then ε for action values, or the
+    scale of the noise (deterministic actions); last, for actions in [-1, 1], 1 while they are drawn uniformly, else 0"""
     env_attributes: Array | None = None
     """[bytes] uint8, `protocol.wire.plain_values`: attributes that every env copy gets when its next rollout starts, by
     name

@@ -52,7 +52,7 @@ class Rollout(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unk
     obs: tuple[Array, ...]
     """one array [T+1, N, *leaf] for each leaf of the observation"""
     action: Array
-    """[T, N, *action] as sampled: int64 counted from 0, or float32 before clipping"""
+    """[T, N, *action] as sampled: int64 counted from 0, or float32, before clipping or in [-1, 1] (`PolicySpec.head`)"""
     log_prob: Array
     """[T, N] float32, under the policy that acted; zeros if it is the user's own and does not return them"""
     reward: Array

@@ -48,7 +48,7 @@ class ActionSpec(msgspec.Struct, frozen=True):
     kind: Literal["discrete", "multidiscrete", "multibinary", "box"]
     shape: tuple[int, ...]
     dtype: str
-    """dtype that the environment takes; a Box action is stored as float32, unclipped"""
+    """dtype that the environment takes; a Box action is stored as float32, unclipped or in [-1, 1] (`PolicySpec.head`)"""
     sizes: tuple[int, ...] = ()
     """how many choices each entry has (discrete, multidiscrete)"""
     start: tuple[int, ...] = ()
@@ -128,8 +128,10 @@ class PolicySpec(msgspec.Struct, frozen=True):
     activation: Literal["tanh", "relu"] = "tanh"
     normalize_observations: bool = False
     """subtract the running mean, divide by the running standard deviation, clip to ±10 (not images)"""
-    head: Literal["actor_critic", "q"] = "actor_critic"
-    """a distribution over actions and a state value, or the value of every discrete action, for epsilon-greedy acting"""
+    head: Literal["actor_critic", "q", "squashed", "deterministic"] = "actor_critic"
+    """a distribution over actions and a state value; or the value of every discrete action, for epsilon-greedy acting; or an
+    actor with two critics, for a bounded Box: a squashed Gaussian (tanh), or a deterministic action (tanh) plus noise. The
+    actions of these two are stored in [-1, 1] and scaled to low … high for the environment"""
     shared_net: bool = False
     """actor and critic share their hidden layers"""
     dueling: bool = False
@@ -149,6 +151,11 @@ class PolicySpec(msgspec.Struct, frozen=True):
         if self.own is not None:
             return self.own.state_size
         return 0 if self.core is None else self.core_size * (2 if self.core == "lstm" else 1)
+
+    @property
+    def stores_scaled_actions(self) -> bool:
+        """True if stored actions are in [-1, 1], and -1 and 1 stand for the bounds of the Box."""
+        return self.own is None and self.head in ("squashed", "deterministic")
 
     @property
     def needs_torch(self) -> bool:

@@ -30,6 +30,8 @@ ALGORITHMS = {
     "dqn": "learner.algorithms.dqn:DQN",
     "impala": "learner.algorithms.impala:Impala",
     "reinforce": "learner.algorithms.reinforce:REINFORCE",
+    "sac": "learner.algorithms.sac:SAC",
+    "td3": "learner.algorithms.td3:TD3",
 }
 """`module:Class` of each algorithm of ours, imported when it is used"""
 

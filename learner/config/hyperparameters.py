@@ -160,8 +160,8 @@ class REINFORCEConfig(PolicyGradientConfig, frozen=True):
     """Normalize the returns of each batch (less the baseline) to mean 0 and standard deviation 1."""
 
 
-class DQNConfig(AlgorithmConfig, frozen=True):
-    """Deep Q-learning (Mnih et al. 2015), with the usual extensions."""
+class OffPolicyConfig(AlgorithmConfig, frozen=True):
+    """Settings of every algorithm that learns from a replay buffer."""
 
     rollout_steps: Free[Count] = 32
     """T, the steps of each env copy in a rollout."""
@@ -171,16 +171,8 @@ class DQNConfig(AlgorithmConfig, frozen=True):
     """Learning rate of the optimizer."""
     learning_rate_schedule: Free[Schedule] = "constant"
     """linear: the learning rate falls to zero over the run."""
-    optimizer: Fixed[Literal["adam", "adamw"]] = "adam"
-    """Optimizer. adamw: Adam with a decoupled weight decay of 0.01."""
-    amsgrad: Fixed[bool] = False
-    """Use the AMSGrad variant of the optimizer."""
     batch_size: Free[Count] = 64
     """Number of transitions in a gradient step."""
-    gradient_steps: Free[Count] = 64
-    """Number of gradient steps in an update. There is one update for every envs x rollout_steps env steps, so this sets the
-    replay ratio.
-    """
     learning_starts: Free[Annotated[int, msgspec.Meta(ge=0)]] = 1000
     """Number of env steps before the first gradient step."""
     replay_size: Fixed[Count] = 100_000
@@ -193,20 +185,33 @@ class DQNConfig(AlgorithmConfig, frozen=True):
     """α of prioritized replay. 0: uniform. 1: in proportion to the TD error."""
     priority_beta: Free[Fraction] = 0.4
     """Initial β of prioritized replay: how far importance weights correct the bias. It grows to 1 (fully) over the run."""
+    n_step: Free[Count] = 1
+    """Number of rewards in a target before it bootstraps."""
+    tau: Free[Annotated[float, msgspec.Meta(gt=0, le=1)]] = 0.005
+    """τ of the polyak update: the fraction by which the target network moves in each gradient step."""
+
+
+class DQNConfig(OffPolicyConfig, frozen=True):
+    """Deep Q-learning (Mnih et al. 2015), with the usual extensions."""
+
+    optimizer: Fixed[Literal["adam", "adamw"]] = "adam"
+    """Optimizer. adamw: Adam with a decoupled weight decay of 0.01."""
+    amsgrad: Fixed[bool] = False
+    """Use the AMSGrad variant of the optimizer."""
+    gradient_steps: Free[Count] = 64
+    """Number of gradient steps in an update. There is one update for every envs x rollout_steps env steps, so this sets the
+    replay ratio.
+    """
     prior_share: Free[Fraction] = 0.5
     """Share of each minibatch that is prior data, in a run with --prior (Ball et al. 2023 use 0.5)."""
     prior_steps: Free[Annotated[int, msgspec.Meta(ge=0)]] = 0
     """Number of gradient steps on prior data alone, before the first rollouts are collected. Needs --prior."""
-    n_step: Free[Count] = 1
-    """Number of rewards in a target before it bootstraps."""
     double: Free[bool] = True
     """Double Q-learning: the network chooses the next action, and the target network values it."""
     dueling: Fixed[bool] = False
     """Dueling network: an action value is the state's value plus the action's advantage over the mean."""
     target: Free[Literal["polyak", "hard"]] = "hard"
     """How the target network is updated. polyak: a little in each gradient step. hard: a copy every target_every steps."""
-    tau: Free[Annotated[float, msgspec.Meta(gt=0, le=1)]] = 0.005
-    """τ of the polyak update: the fraction by which the target network moves in each gradient step."""
     target_every: Free[Count] = 250
     """Number of gradient steps between two hard updates of the target network."""
     epsilon_start: Free[Fraction] = 1.0
@@ -227,12 +232,57 @@ class DQNConfig(AlgorithmConfig, frozen=True):
     """Clip each entry of the gradient to ± this, before its norm is clipped. none: no clipping."""
 
 
+class ContinuousConfig(OffPolicyConfig, frozen=True):
+    """Settings of SAC and TD3: the defaults of Stable-Baselines3."""
+
+    rollout_steps: Free[Count] = 8
+    """T, the steps of each env copy in a rollout."""
+    net: Fixed[tuple[Count, ...]] = (256, 256)
+    """Sizes of the hidden layers: of the actor and of each critic."""
+    batch_size: Free[Count] = 256
+    """Number of transitions in a gradient step."""
+    learning_starts: Free[Annotated[int, msgspec.Meta(ge=0)]] = 100
+    """Number of env steps before the first gradient step. Until then, actions are drawn uniformly."""
+    replay_size: Fixed[Count] = 1_000_000
+    """Capacity of the replay buffer in transitions; the newest are kept. The final observation of a truncated episode takes
+    the place of one.
+    """
+    updates_per_step: Free[Positive] = 1.0
+    """Replay ratio: gradient steps for each env step after learning_starts. It is exact, whatever the rollouts are."""
+
+
+class SACConfig(ContinuousConfig, frozen=True):
+    """Soft actor-critic (Haarnoja et al. 2018) with two critics and an automatic temperature."""
+
+    ent_coef: Fixed[Positive | None] = None
+    """Temperature α: the weight of the entropy. none: learned, so that the entropy stays near target_entropy."""
+    target_entropy: Free[float | None] = None
+    """The entropy that a learned temperature aims at. none: minus the number of the action's elements."""
+
+
+class TD3Config(ContinuousConfig, frozen=True):
+    """Twin delayed deep deterministic policy gradient (Fujimoto et al. 2018)."""
+
+    learning_rate: Free[Positive] = 1e-3
+    """Learning rate of the optimizers."""
+    exploration_noise: Free[NotNegative] = 0.1
+    """Standard deviation of the noise that workers add to actions, which are in [-1, 1]."""
+    policy_delay: Free[Count] = 2
+    """Number of gradient steps of the critics for each one of the actor and of the target networks."""
+    target_noise: Free[NotNegative] = 0.2
+    """Standard deviation of the noise that is added to the actions of targets."""
+    target_noise_clip: Free[NotNegative] = 0.5
+    """Clip the noise of targets to ± this."""
+
+
 HYPERPARAMETERS: dict[str, type[AlgorithmConfig]] = {
     "ppo": PPOConfig,
     "a2c": A2CConfig,
     "dqn": DQNConfig,
     "impala": ImpalaConfig,
     "reinforce": REINFORCEConfig,
+    "sac": SACConfig,
+    "td3": TD3Config,
 }
 
 

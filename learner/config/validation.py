@@ -9,7 +9,7 @@ import msgspec
 
 from learner.config.algorithm_names import settings_record
 from learner.config.config import Config
-from learner.config.hyperparameters import HYPERPARAMETERS, DQNConfig
+from learner.config.hyperparameters import HYPERPARAMETERS, OffPolicyConfig
 from learner.config.rollout_config import RolloutConfig
 from protocol.address import advertised_address, check_address
 from protocol.bounds import MAX_FACTS, MAX_NAME, one_line
@@ -45,7 +45,9 @@ def validate(config: Config, where: str = "") -> Config:
         raise UsageError(f"{at}which environment? expected one that gymnasium.make takes, as in: millrace train CartPole-v1")
     check_rollout_settings(config, at)
     match config.algorithm:
-        case DQNConfig(replay_size=size, rollout_steps=steps) if size < (most := (steps + 1) * config.envs // config.lanes):
+        case OffPolicyConfig(replay_size=size, rollout_steps=steps) if size < (
+            most := (steps + 1) * config.envs // config.lanes
+        ):
             raise UsageError(f"{at}replay_size {size}: a rollout takes up to {most}; take --replay-size {most} or more")
     if config.inference == "learner":
         _check_learner_inference(config, at)
@@ -126,7 +128,7 @@ def _check_prior(config: Config, at: str) -> None:
     takes_prior = [name for name, record in HYPERPARAMETERS.items() if "prior_share" in record.__struct_fields__]
     if config.prior and config.algo in HYPERPARAMETERS and config.algo not in takes_prior:
         raise UsageError(
-            f"{at}prior {config.prior}: {config.algo} has no replay buffer; {', '.join(takes_prior)} learn from prior data"
+            f"{at}prior {config.prior}: {config.algo} takes no prior data; {', '.join(takes_prior)} learn from prior data"
         )
     steps: int | None = getattr(config.algorithm, "prior_steps", None)
     if steps and not config.prior:

@@ -109,11 +109,12 @@ def _batch(acting: Acting, generator: np.random.Generator, obs: Array, rows: _Ro
         params.append(policy([observed[None]], state)[0])
         state[0, ~valid] = 0
     stacked = np.stack(params)
-    action = over.sample(stacked, over.noise(generator, (steps, columns)))
+    noise = over.noise(generator, (steps, columns))
+    action = over.sample(stacked, noise)
     return Batch(
         obs=(obs,),
         action=action,
-        log_prob=over.log_prob(stacked, action),
+        log_prob=over.log_prob(stacked, action, noise),
         reward=rows.reward,
         terminated=rows.terminated,
         truncated=rows.truncated,

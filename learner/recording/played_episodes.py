@@ -11,7 +11,7 @@ from learner.policy_player import PolicyPlayer
 from learner.recording.episodes import RecordedEpisode
 from learner.rollouts.evaluation_tickets import EvaluationPlan
 from protocol.arrays import Array
-from protocol.envs.spaces import make_action_converter
+from protocol.envs.spaces import action_converter_of
 from protocol.messages import EpisodeRows
 
 FIRST_EPISODES = 2  # played before their size is known
@@ -42,7 +42,7 @@ class PlayedEpisodes:
     def __init__(self, player: PolicyPlayer, seed: int, *, stochastic: bool = False) -> None:
         """`stochastic`: draw actions from the policy; otherwise take the most probable ones."""
         self._player, self._seeds, self._stochastic = player, recording_seeds(seed), stochastic
-        self._to_env_action = make_action_converter(player.policy.spec.action)
+        self._to_env_action = action_converter_of(player.policy.spec)
         self._episodes = self._steps = self._bytes = 0  # played so far
 
     def until(self, steps: int) -> Iterator[tuple[RecordedEpisode, bool]]:

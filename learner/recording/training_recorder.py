@@ -12,7 +12,7 @@ from learner.recording.minari import MinariDataset
 from learner.rollouts.lanes import AcceptedRollout
 from protocol.envs.action_masks import without_mask
 from protocol.envs.description import DescribedEnv
-from protocol.envs.spaces import make_action_converter
+from protocol.envs.spaces import action_converter_of
 from protocol.specs import RunSpec
 
 
@@ -27,7 +27,7 @@ class TrainingRecorder:
 
         Raises `UsageError`, with a one-line message, if the dataset cannot be made.
         """
-        self._assembler = EpisodeAssembler(make_action_converter(run.policy.action))
+        self._assembler = EpisodeAssembler(action_converter_of(run.policy))
         self._id = dataset_id
         self._episodes = 0
         self._dataset = MinariDataset(dataset_id, EnvironmentOfDataset(env, masked=run.masked), about)

@@ -16,7 +16,7 @@ from gymnasium import spaces
 
 from protocol.arrays import Array
 from protocol.errors import UsageError
-from protocol.specs import ActionSpec, Leaf
+from protocol.specs import ActionSpec, Leaf, PolicySpec
 
 OBSERVATIONS = "Box, Discrete, MultiBinary, MultiDiscrete, and Dict and Tuple of these"
 ACTIONS = "Discrete, MultiDiscrete, MultiBinary and Box"
@@ -115,6 +115,19 @@ def make_flatten(space: gymnasium.Space[Any]) -> Callable[[Any], tuple[Any, ...]
         return tuple(leaves)
 
     return read
+
+
+def action_converter_of(policy: PolicySpec) -> Callable[[Array], Array]:
+    """A function from the stored actions [N, *action] of this policy to actions of the environment.
+
+    Actions in [-1, 1] are scaled to the bounds of the Box, in float64, and then converted as all others.
+    """
+    convert, spec = make_action_converter(policy.action), policy.action
+    if not policy.stores_scaled_actions:
+        return convert
+    low, high = (np.reshape(bound, spec.shape) for bound in (spec.low, spec.high))
+    middle, half = (low + high) / 2, (high - low) / 2
+    return lambda action: convert(middle + half * action.astype(np.float64))
 
 
 def make_action_converter(spec: ActionSpec) -> Callable[[Array], Array]:

@@ -8,8 +8,10 @@ positions. The parameters of the networks in `protocol.policy.networks` are view
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
+
+import numpy as np
 
 from protocol.arrays import Array
 from protocol.policy.distributions import distribution
@@ -37,6 +39,8 @@ class Conv(NamedTuple):
     stride: int
 
 
+CRITICS = ("critic0", "critic1")  # of a squashed or deterministic head; each takes the features and the action
+LOG_STD_BOUNDS = (-20.0, 2.0)  # of a squashed Gaussian (Haarnoja et al. 2018)
 NATURE = (Conv(32, 8, 4), Conv(64, 4, 2), Conv(64, 3, 1))  # Mnih et al. 2015
 SMALL = (Conv(16, 3, 1), Conv(32, 3, 2))
 
@@ -88,7 +92,17 @@ def parameter_layout(spec: PolicySpec) -> tuple[tuple[Field, ...], tuple[Field, 
         if spec.dueling:
             acting += _linear("q.value", last, 1, 1.0)
         return tuple(acting + _linear("q.out", last, action.sizes[0], 1.0)), ()
-    outputs = math.prod(action.shape) if action.kind == "box" else distribution(spec).params_size
+    size = math.prod(action.shape)
+    if spec.stores_scaled_actions:
+        acting += _linear("actor.out", last, 2 * size if spec.head == "squashed" else size, 0.01)
+        critics = [
+            field
+            for name in CRITICS
+            for hidden, last in [_hidden(name, width + size, spec.net)]
+            for field in (*hidden, *_linear(f"{name}.out", last, 1, 1.0))
+        ]
+        return tuple(acting), tuple(critics)
+    outputs = size if action.kind == "box" else distribution(spec).params_size
     acting += _linear("actor.out", last, outputs, 0.01)
     if action.kind == "box":
         acting.append(Field("actor.log_std", (outputs,), 0))
@@ -140,13 +154,30 @@ def named_views(flat: Array, fields: Sequence[Field]) -> dict[str, Array]:
 
 
 def buffer_layout(spec: PolicySpec) -> tuple[Field, ...]:
-    """The fields of `Weights.buffers`: observation mean and standard deviation if they are normalized; ε for Q-values."""
+    """The fields of `Weights.buffers`: the statistics of observations if they are normalized, and what exploration needs.
+
+    For Q-values that is ε. For actions in [-1, 1] it is the scale of the noise (deterministic), and then 1 while actions are
+    uniform (warm-up), else 0.
+    """
     fields: list[Field] = []
     if spec.normalize_observations:
         fields += [Field(name, (feature_size(spec),), 0) for name in ("observation_mean", "observation_std")]
     if spec.head == "q":
         fields.append(Field("epsilon", (1,), 0))
+    if spec.head == "deterministic":
+        fields.append(Field("noise_scale", (1,), 0))
+    if spec.stores_scaled_actions:
+        fields.append(Field("warm_up", (1,), 0))
     return tuple(fields)
+
+
+EXPLORATION = ("epsilon", "noise_scale", "warm_up")
+
+
+def appended_params(spec: PolicySpec, buffers: Mapping[str, Array]) -> Array | None:
+    """The numbers [K] that stand behind a network's output in the distribution params; None if there are none."""
+    found = [buffers[field.name] for field in buffer_layout(spec) if field.name in EXPLORATION]
+    return np.concatenate(found) if found else None
 
 
 def buffer_size(spec: PolicySpec) -> int:

@@ -55,7 +55,7 @@ class MaskedEpsilonGreedy(EpsilonGreedy):
         uniform = (allowed.cumsum(-1) > number[..., None]).argmax(-1)
         return np.where(noise[..., 0] < params[..., -1], uniform, self.mode(params))
 
-    def log_prob(self, params: Floats, action: Array) -> Floats:
+    def log_prob(self, params: Floats, action: Array, noise: Floats | None = None) -> Floats:
         """log(ε / m + (1 − ε) [action is the best]) [...] with m allowed actions, at least −69."""
         epsilon, count = params[..., -1], _allowed(params).sum(-1).astype(np.float32)
         chance = epsilon / count + (1 - epsilon) * (action == self.mode(params))

@@ -17,6 +17,8 @@ from torch.nn import functional as F
 
 from protocol.policy.encoder import make_encoder
 from protocol.policy.layout import (
+    CRITICS,
+    LOG_STD_BOUNDS,
     Field,
     convolutions,
     hidden_names,
@@ -69,6 +71,41 @@ class MLP(torch.autograd.Function):
             else:
                 g = torch.ops.aten.tanh_backward(g, inputs[i])
         found += [g.sum(0), g.t() @ inputs[0], None, g @ weights[0] if ctx.needs_input_grad[0] else None]
+        return tuple(reversed(found))
+
+
+class StackedMLP(torch.autograd.Function):
+    """K networks of one form on the same input, as one node: `MLP` with batched matrix products, [B, D] -> [K, B, O]."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, relu: bool, *layers: Tensor) -> Tensor:
+        """`layers` alternates weight [K, out, in] and bias [K, out]; the last pair is the head."""
+        x = x.expand(len(layers[0]), *x.shape)
+        inputs = [x]
+        *hidden, weight, bias = layers
+        for w, b in zip(hidden[::2], hidden[1::2], strict=True):
+            x = torch.baddbmm(b.unsqueeze(1), x, w.mT)
+            inputs.append(x.relu_() if relu else x.tanh_())
+        ctx.relu, ctx.trains = relu, weight.requires_grad
+        ctx.save_for_backward(*inputs, *layers[::2])
+        return torch.baddbmm(bias.unsqueeze(1), x, weight.mT)
+
+    @staticmethod
+    def backward(ctx: Any, *outputs: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradients of x (if wanted), and of each layer's weight and bias unless they are constants."""
+        (g,) = outputs
+        half = len(ctx.saved_tensors) // 2
+        inputs, weights = ctx.saved_tensors[:half], ctx.saved_tensors[half:]
+        found: list[Tensor | None] = []
+        for i in range(half - 1, -1, -1):
+            found += [g.sum(1), g.mT @ inputs[i]] if ctx.trains else [None, None]
+            if i:
+                g = g @ weights[i]
+                if ctx.relu:
+                    g = torch.ops.aten.threshold_backward(g, inputs[i], 0)
+                else:
+                    g = torch.ops.aten.tanh_backward(g, inputs[i])
+        found += [None, (g @ weights[0]).sum(0) if ctx.needs_input_grad[0] else None]
         return tuple(reversed(found))
 
 
@@ -258,6 +295,82 @@ class QNetwork(FlatNetwork):
         h = self.hidden(h, self._hidden)
         advantage, value = self.mlp(h, self.layers(["q.out"])), self.mlp(h, self.layers(["q.value"]))
         return value + advantage - advantage.mean(-1, keepdim=True)
+
+
+class ActorAndCritics(FlatNetwork):
+    """An actor of actions in [-1, 1] and two critics, which value an observation with an action. Each has its own MLP.
+
+    `actor` and `critics` are the two parts of the flat tensor, with their parts of the gradients: one for each optimizer.
+    """
+
+    def __init__(self, spec: PolicySpec, device: str | torch.device = "cpu", *, seed: int = 0) -> None:
+        super().__init__(spec, device, seed=seed)
+        ends = slice(None, self.acting_size), slice(self.acting_size, None)
+        self.actor, self.critics = (self.flat[end] for end in ends)
+        """[A] and [C] float32, which share memory with `flat`"""
+        self.actor.grad, self.critics.grad = (self.flat_grad[end] for end in ends)
+        self._actor = self.layers([*hidden_names(spec), "actor.out"])
+        self._critics = [layer.detach().requires_grad_() for layer in self._stacked_views(self.flat)]
+        self._constant_critics = [layer.detach() for layer in self._critics]
+        self._critic_gradients = self._stacked_views(self.flat_grad)
+
+    def _stacked_views(self, flat: Tensor) -> list[Tensor]:
+        """Weight [2, out, in] and bias [2, out] of each layer of both critics, as views of a tensor like `flat`."""
+        both = flat[self.acting_size :].view(len(CRITICS), -1)
+        views, at = [], 0
+        for field in self.fields:
+            if field.name.startswith(f"{CRITICS[0]}."):
+                end = at + math.prod(field.shape)
+                views.append(both[:, at:end].view(len(both), *field.shape))
+                at = end
+        return views
+
+    def differentiate_critics(self, loss: Tensor) -> None:
+        """Write the gradient of a loss into `critics.grad`, in place of what it held."""
+        _write_gradient(loss, self._critics, self._critic_gradients)
+
+    def differentiate_actor(self, loss: Tensor) -> None:
+        """Write the gradient of a loss into `actor.grad`, in place of what it held."""
+        _write_gradient(loss, self._actor, [layer.grad for layer in self._actor])
+
+    def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
+        """The actor's output for features [B, D] float32, before the tangent: [B, D′] (deterministic) or [B, 2 D′].
+
+        Of a squashed Gaussian, the second half is the logarithm of the standard deviations, clipped to [-20, 2].
+        """
+        out = self.mlp(self.inputs(x, images), self._actor)
+        if self.spec.head == "deterministic":
+            return out
+        mean, log_std = out.chunk(2, -1)
+        return torch.cat((mean, log_std.clamp(*LOG_STD_BOUNDS)), -1)
+
+    def values(self, x: Tensor, action: Tensor, *, constant: bool = False) -> Tensor:
+        """The values [2, B] of both critics for features [B, D] and actions [B, D′] in [-1, 1].
+
+        `constant`: the critics get no gradient; the actions do. Use it for the loss of the actor.
+        """
+        layers = self._constant_critics if constant else self._critics
+        out: Tensor = StackedMLP.apply(torch.cat((x, action), -1), self._relu, *layers)  # type: ignore[no-untyped-call]
+        return out[..., 0]
+
+
+def _write_gradient(loss: Tensor, layers: Sequence[Tensor], gradients: Sequence[Tensor | None]) -> None:
+    for found, gradient in zip(torch.autograd.grad(loss, layers), gradients, strict=True):
+        assert gradient is not None
+        gradient.copy_(found)
+
+
+def network_of(
+    spec: PolicySpec, device: str | torch.device = "cpu", *, seed: int = 0
+) -> ActorCriticNetwork | QNetwork | ActorAndCritics:
+    """The network of this policy."""
+    match spec.head:
+        case "actor_critic":
+            return ActorCriticNetwork(spec, device, seed=seed)
+        case "q":
+            return QNetwork(spec, device, seed=seed)
+        case "squashed" | "deterministic":
+            return ActorAndCritics(spec, device, seed=seed)
 
 
 def _initial(fields: Sequence[Field], seed: int) -> Tensor:

@@ -12,7 +12,16 @@ import numpy as np
 
 from protocol.arrays import Array, Floats
 from protocol.policy.features import features, normalize
-from protocol.policy.layout import buffer_layout, buffer_size, hidden_names, named_views, parameter_layout, total_size
+from protocol.policy.layout import (
+    LOG_STD_BOUNDS,
+    appended_params,
+    buffer_layout,
+    buffer_size,
+    hidden_names,
+    named_views,
+    parameter_layout,
+    total_size,
+)
 from protocol.policy.recurrent import advance, zero_state
 from protocol.specs import PolicySpec
 
@@ -40,7 +49,7 @@ class NumpyPolicy:
         self._buffers = named_views(buffers, buffer_layout(self.spec))
         self._hidden = [self._linear(name) for name in hidden_names(self.spec)]
         self._out = self._linear("q.out" if self.spec.head == "q" else "actor.out")
-        self._appended_params = self._parameters.get("actor.log_std", self._buffers.get("epsilon"))
+        self._appended_params = self._parameters.get("actor.log_std", appended_params(self.spec, self._buffers))
 
     def _linear(self, name: str) -> tuple[Floats, Floats]:
         return self._parameters[f"{name}.weight"].T, self._parameters[f"{name}.bias"]
@@ -66,6 +75,9 @@ class NumpyPolicy:
         weight, bias = self._out
         out = np.asarray(np.matmul(x, weight))
         out += bias
+        if self.spec.head == "squashed":
+            half = out.shape[-1] // 2
+            np.clip(out[..., half:], *LOG_STD_BOUNDS, out=out[..., half:])
         if self.spec.dueling:
             weight, bias = self._linear("q.value")
             out += np.matmul(x, weight) + bias - out.mean(-1, keepdims=True)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from protocol.policy.distributions import LOG_SQRT_2PI
 from protocol.specs import ActionSpec
+
+LOG_2 = math.log(2)
 
 
 def log_prob_and_entropy(spec: ActionSpec, params: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
@@ -27,6 +31,17 @@ def log_prob_and_entropy(spec: ActionSpec, params: Tensor, action: Tensor) -> tu
             mean, log_std = params.chunk(2, -1)
             z = (action.reshape(mean.shape) - mean) * torch.exp(-log_std)
             return (-0.5 * z * z - log_std - LOG_SQRT_2PI).sum(-1), (log_std + (0.5 + LOG_SQRT_2PI)).sum(-1)
+
+
+def squashed_sample(params: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Actions [B, D] = tanh(mean + std · noise) and their log-densities [B], for params [B, 2 D] and normal noise [B, D].
+
+    The log-density is computed from the noise (`distributions.Squashed`), so that it is exact also near ±1.
+    """
+    mean, log_std = params.chunk(2, -1)
+    latent = mean + log_std.exp() * noise
+    slope = 2 * (LOG_2 - latent - F.softplus(-2 * latent))  # log(1 − tanh²)
+    return torch.tanh(latent), (-0.5 * noise * noise - log_std - LOG_SQRT_2PI - slope).sum(-1)
 
 
 def _categorical(logits: Tensor, choice: Tensor) -> tuple[Tensor, Tensor]:

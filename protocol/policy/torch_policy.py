@@ -9,8 +9,8 @@ import torch
 
 from protocol.arrays import Array, Floats
 from protocol.policy.features import features, normalize
-from protocol.policy.layout import buffer_layout, buffer_size, named_views
-from protocol.policy.networks import ActorCriticNetwork, QNetwork
+from protocol.policy.layout import appended_params, buffer_layout, buffer_size, named_views
+from protocol.policy.networks import ActorCriticNetwork, network_of
 from protocol.policy.recurrent import zero_state
 from protocol.specs import ImagesDtype, PolicySpec
 
@@ -25,7 +25,7 @@ class TorchPolicy:
         self.spec = spec
         self._images_dtype = images
         self._device, self._together = device, together
-        self._net = QNetwork(spec, device) if spec.head == "q" else ActorCriticNetwork(spec, device)
+        self._net = network_of(spec, device)
         self._buffers: dict[str, Floats] = {}
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
@@ -55,15 +55,16 @@ class TorchPolicy:
             out, state[...] = flat.reshape(L, N, -1), flat_state.reshape(state.shape)
         else:
             out = np.stack([self._lane(x[lane], [image[lane] for image in images], state[lane]) for lane in range(len(x))])
-        if self.spec.head != "q":
+        appended = appended_params(self.spec, self._buffers)
+        if appended is None:
             return out
-        return np.concatenate([out, np.broadcast_to(self._buffers["epsilon"], (*out.shape[:-1], 1))], -1)
+        return np.concatenate([out, np.broadcast_to(appended, (*out.shape[:-1], len(appended)))], -1)
 
     def _lane(self, x: Floats, images: Sequence[Array], state: Floats) -> Floats:
         """Distribution parameters [N, P] of one lane, for x [N, D], images [N, *leaf] and state [N, S], updated in place."""
         inputs = torch.tensor(x, device=self._device), [torch.tensor(image, device=self._device) for image in images]
         with torch.no_grad():
-            if isinstance(self._net, QNetwork):
+            if not isinstance(self._net, ActorCriticNetwork):
                 return np.asarray(self._net.params(*inputs).cpu().numpy())
             params, after = self._net.act(*inputs, torch.tensor(state, device=self._device))
         state[:] = after.cpu().numpy()

@@ -114,7 +114,7 @@ def test_a_resumed_run_keeps_its_dataset_and_refuses_another(tmp_path: Path) -> 
     [
         (["--prior", "acrobot/random-v0"], "prior acrobot/random-v0: observations: expected "),
         (["--prior", "cartpole/rondom-v0"], "no such dataset here; there are: acrobot/random-v0, cartpole/random-v0"),
-        (["--algo", "ppo", "--prior", DATASET], "prior cartpole/random-v0: ppo has no replay buffer; dqn"),
+        (["--algo", "ppo", "--prior", DATASET], "prior cartpole/random-v0: ppo takes no prior data; dqn"),
         (["--prior-steps", "5"], "prior_steps: expected 0 without prior data, got 5; name it by --prior"),
     ],
 )

@@ -107,7 +107,8 @@ class _BuiltInActions:
         return action
 
     def columns(self, i: int) -> ActedRows:
-        return ActedRows(self._action[i], self._distribution.log_prob(self._params[i], self._action[i]), ())
+        log_prob = self._distribution.log_prob(self._params[i], self._action[i], self._noise[i])
+        return ActedRows(self._action[i], log_prob, ())
 
 
 class _OwnActing:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from protocol.arrays import Array, Floats
 from protocol.bounds import Stages
 from protocol.envs.envpool import envpool_spec
-from protocol.envs.spaces import make_action_converter
+from protocol.envs.spaces import action_converter_of
 from protocol.envs.vectorized import make_native
 from protocol.errors import EnvironmentFailed, PolicyFailed
 from protocol.policy.masks import stored_leaves
@@ -89,7 +89,7 @@ class Collector:
         self._run = run
         self._acting = acting_of(run, policy)
         self._open_copies, self._step_all = open_copies, step_all
-        self._to_env_action = make_action_converter(run.policy.action)
+        self._to_env_action = action_converter_of(run.policy)
         self._lanes: dict[int, CollectedLane] = {}
         self._to_close: list[CollectedLane] = []  # released by a pulse, when their copies may be in the middle of a step
         self._collecting = False

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from protocol.arrays import Array
-from protocol.envs.spaces import action_spec, make_action_converter, observation_leaves
+from protocol.envs.spaces import action_converter_of, action_spec, observation_leaves
 from protocol.errors import RunError, UsageError, first_line
 from protocol.messages import Evaluate, Evaluated
 from protocol.policy.masks import stored_leaves
@@ -63,7 +63,7 @@ class Evaluator:
         self._run, self._open_copies = run, open_copies
         self._acting = acting_of(run, policy)
         self._stored = stored_leaves(run)
-        self._to_env_action = make_action_converter(run.policy.action)
+        self._to_env_action = action_converter_of(run.policy)
         self._copies: dict[str | None, EvaluationCopies] = {}  # by render mode
 
     def play(self, order: Evaluate, send: Send, pulse: Pulse) -> Evaluated:

@@ -22,13 +22,17 @@ from learner.algorithms.replay.sum_tree import SumTree
 from protocol.arrays import Array, Bools, Doubles, Floats, Ints
 from protocol.errors import UsageError
 from protocol.rollout import Batch
-from protocol.specs import Leaf
+from protocol.specs import ActionSpec, Leaf
 
 PRIORITY_OFFSET = 1e-6  # added to errors, so that every transition can be drawn again
 NO_SLOT = -1
-ROW = np.dtype(  # one record, so that drawing a row is one copy
-    [("action", "i8"), ("follows", "i8"), ("reward", "f4"), ("terminated", "?"), ("is_row", "?")], align=True
-)
+DISCRETE = ActionSpec("discrete", (), "int64")
+
+
+def row_dtype(action: ActionSpec) -> np.dtype[Any]:
+    """The record of a row: one record, so that drawing a row is one copy."""
+    fields = [("follows", "i8"), ("reward", "f4"), ("terminated", "?"), ("is_row", "?")]
+    return np.dtype([("action", action.stored_dtype, action.shape), *fields], align=True)
 
 
 class Sample(NamedTuple):
@@ -36,7 +40,7 @@ class Sample(NamedTuple):
 
     slots: Ints  # [B] of their first rows
     leaves: tuple[Array, ...]  # [B, *leaf] each
-    action: Ints  # [B]
+    action: Array  # [B, *action] int64 or float32, as rows store them
     reward: Floats  # [B] Σ γⁱ r over its k steps
     discount: Floats  # [B] γᵏ; 0 where the task ended
     next_leaves: tuple[Array, ...]  # [B, *leaf] each, k steps later
@@ -44,18 +48,18 @@ class Sample(NamedTuple):
     next_mask: Bools | None = None  # [B, choices] actions allowed in the next observation; None without action masks
 
 
-def memory_bytes(observation: Sequence[Leaf], size: int, prioritized: bool) -> int:
+def memory_bytes(observation: Sequence[Leaf], size: int, prioritized: bool, action: ActionSpec = DISCRETE) -> int:
     """Memory of a replay buffer with `size` slots, in bytes."""
     row = sum(int(np.prod(leaf.shape)) * np.dtype(leaf.dtype).itemsize for leaf in observation)
-    return size * (row + ROW.itemsize) + (SumTree.memory_bytes(size) if prioritized else 0)
+    return size * (row + row_dtype(action).itemsize) + (SumTree.memory_bytes(size) if prioritized else 0)
 
 
-def check_fits_memory(observation: Sequence[Leaf], size: int, prioritized: bool) -> None:
+def check_fits_memory(observation: Sequence[Leaf], size: int, prioritized: bool, action: ActionSpec = DISCRETE) -> None:
     """Raise `UsageError`, which names a size that fits, if the memory is too small for the buffer and a copy of it.
 
     A checkpoint makes such a copy.
     """
-    needed, free = 2 * memory_bytes(observation, size, prioritized), available_bytes()
+    needed, free = 2 * memory_bytes(observation, size, prioritized, action), available_bytes()
     if free is None or needed <= free:
         return
     fits = size * free // needed
@@ -70,7 +74,7 @@ class Overwritten(NamedTuple):
     """What some slots held before they were written."""
 
     slots: Ints  # [K]
-    rows: Array  # [K] of ROW
+    rows: Array  # [K] of `row_dtype`
     weights: Doubles | None  # [K] of the sum tree
     leaves: tuple[Array, ...]  # [K, *leaf] each; none where only rows or priorities are written
 
@@ -97,19 +101,23 @@ class ReplayBuffer:
         gamma: float,
         seed: int,
         alpha: float | None = None,
+        action: ActionSpec = DISCRETE,
     ) -> None:
-        """`alpha`: draw in proportion to |error|^alpha, or uniformly if None. Raises `UsageError` if memory is too small."""
-        check_fits_memory(observation, size, alpha is not None)
+        """`action`: the action space. `alpha`: draw in proportion to |error|^alpha, or uniformly if None.
+
+        Raises `UsageError` if memory is too small.
+        """
+        check_fits_memory(observation, size, alpha is not None, action)
         self.size = size  # slots
-        self.bytes = memory_bytes(observation, size, alpha is not None)
+        self.bytes = memory_bytes(observation, size, alpha is not None, action)
         self._n_step, self._gamma, self._alpha = n_step, gamma, alpha
         self.generator = np.random.default_rng(seed)  # decides what is drawn
         self._obs = tuple(np.zeros((size, *leaf.shape), leaf.dtype) for leaf in observation)
         self._mask: Bools | None = (
             None  # [size, choices], made when the first masks come; as `_obs`, one for each observation
         )
-        self._row = np.zeros(size, ROW)
-        self._action: Ints = self._row["action"]  # this and the next four: views of `_row`
+        self._row = np.zeros(size, row_dtype(action))
+        self._action: Array = self._row["action"]  # this and the next four: views of `_row`
         self._reward: Floats = self._row["reward"]
         self._terminated: Bools = self._row["terminated"]
         self._follows: Ints = self._row["follows"]  # slot of the next observation; itself if terminated

@@ -214,12 +214,12 @@ def error_variance(made: DQN, drawn: Sample) -> Array:
     for network, leaves in ((made.net, drawn.leaves), (made.target, drawn.next_leaves)):
         for top in tops:
             layers = network_layers(network.parameters, [*hidden_names(spec), top])
-            found = forward_pass(layers, made._inputs(leaves)[0], spec.activation == "relu")
+            found = forward_pass(layers, made.inputs(leaves)[0], spec.activation == "relu")
             # the largest value of a row, and its mean, is as far off as the worst of them at most
             own = found.out_variance.max(1) + (ELEMENTWISE * UNIT * np.abs(found.out).max(1)) ** 2
             variance += own * (4 if spec.dueling and top == "q.out" else 1)
     if made.config.double:
-        x, trunk, relu = made._inputs(drawn.next_leaves)[0], hidden_names(spec), spec.activation == "relu"
+        x, trunk, relu = made.inputs(drawn.next_leaves)[0], hidden_names(spec), spec.activation == "relu"
         ours, others = (
             forward_pass(network_layers(network.parameters, [*trunk, "q.out"]), x, relu)
             for network in (made.net, made.target)
@@ -237,7 +237,7 @@ def gradient_tolerance(made: DQN, drawn: Sample, error: Array) -> Array:
     slope = drawn.weight / rows * (1 if huber else 2)
     by_value[chosen] = slope * (np.clip(error, -1, 1) if huber else error)
     by_value_variance[chosen] = slope**2 * error_variance(made, drawn)
-    x = made._inputs(drawn.leaves)[0]
+    x = made.inputs(drawn.leaves)[0]
     return q_gradient_tolerance(made.policy, made.net.flat.numpy(), x, by_value, by_value_variance)
 
 
@@ -407,7 +407,7 @@ def test_what_is_published_acts_as_the_network_and_explores_by_epsilon() -> None
     assert made.weights()[1][:4] == pytest.approx([2] * 4, abs=1)
     assert made.weights()[1][4:8] == pytest.approx([3] * 4, abs=1)
     with torch.no_grad():
-        values = made.net.params(torch.from_numpy(made._inputs([obs[0]])[0])).numpy()
+        values = made.net.params(torch.from_numpy(made.inputs([obs[0]])[0])).numpy()
     np.testing.assert_allclose(params[0, :, :-1], values, atol=1e-5)
     assert (distribution(made.policy).mode(params) == values.argmax(-1)).all()  # greedy: ε plays no part
 

@@ -160,7 +160,7 @@ def test_updates_are_the_same_either_way(options: dict[str, Any], monkeypatch: p
     def both(sample: Sample) -> StepMetrics:
         nonlocal steps
         other.load_state_dict(one.state_dict())
-        values = one.net.params(torch.from_numpy(one._inputs(sample.leaves)[0])).detach().numpy()
+        values = one.net.params(torch.from_numpy(one.inputs(sample.leaves)[0])).detach().numpy()
         error = values[np.arange(len(values)), sample.action] - one.targets(sample)
         tolerance, of_error = gradient_tolerance(one, sample, error), tolerance_of(error_variance(one, sample))
         found, expected = step(sample), other.step(sample)

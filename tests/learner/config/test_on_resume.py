@@ -42,6 +42,8 @@ def another_value(algo: str, name: str, value: Any) -> Any:
             return "prioritized"
         case "core", _:
             return "gru"
+        case "ent_coef", None:
+            return 0.2
         case "encoder", _:
             return "my_package:factory"
         case _, bool():

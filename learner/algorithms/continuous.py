@@ -1,0 +1,149 @@
+"""What SAC and TD3 share: an actor with two critics, uniform actions at first, and an exact replay ratio.
+
+Rule: after each update, the gradient steps made are ⌊updates_per_step × (env steps used − learning_starts)⌋, whatever the
+size of the rollouts and the number and speed of the workers. Where these settings change, the count goes on from there.
+"""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from learner.algorithms.kernels.optimizer_step import avoid_compiler_import
+from learner.algorithms.off_policy import OffPolicy
+from learner.algorithms.replay.replay_buffer import ReplayBuffer, Sample
+from learner.config.hyperparameters import ContinuousConfig
+from protocol.errors import UsageError
+from protocol.policy.networks import ActorAndCritics
+from protocol.specs import ActionSpec, Leaf, PolicySpec
+
+
+class Transitions:
+    """The tensors of B transitions, on the device of the weights. Their actions are in [-1, 1]."""
+
+    def __init__(self, algorithm: Continuous, sample: Sample) -> None:
+        flat = algorithm.net.flat
+
+        def tensor(array: npt.NDArray[Any]) -> Tensor:
+            return torch.from_numpy(np.ascontiguousarray(array, np.float32)).to(flat)
+
+        self.x, self.next_x = (tensor(algorithm.inputs(leaves)[0]) for leaves in (sample.leaves, sample.next_leaves))
+        """[B, D] features of the observations, and of those k steps later"""
+        self.action = tensor(sample.action.reshape(len(sample.action), -1))
+        """[B, D′]"""
+        self.reward, self.discount, self.weight = map(tensor, (sample.reward, sample.discount, sample.weight))
+        """[B] each: Σ γⁱ r; γᵏ, or 0 if the task has terminated; weight of the loss"""
+
+
+class Continuous(OffPolicy):
+    """An off-policy algorithm for a bounded Box: the networks, their targets, their optimizers and the source of noise."""
+
+    Config = ContinuousConfig
+    config: Any
+
+    @classmethod
+    def bounded_policy_spec(
+        cls, config: ContinuousConfig, observation: tuple[Leaf, ...], action: ActionSpec, **head: Any
+    ) -> PolicySpec:
+        """The policy of these spaces. `head`: fields of `PolicySpec`.
+
+        Raises `UsageError`, with a one-line message, unless the action is a Box with finite bounds and no image is observed.
+        """
+        name = cls.__name__.lower()
+        if action.kind != "box":
+            shape = list(action.shape)
+            raise UsageError(
+                f"{name}: expected an action space Box, got {action.kind}{shape}; take --algo ppo or dqn for it"
+            )
+        for low, high in zip(action.low, action.high, strict=True):
+            if not (math.isfinite(low) and math.isfinite(high)):
+                raise UsageError(f"{name}: expected an action Box with finite bounds, got {low} to {high}; take --algo ppo")
+        if images := [leaf for leaf in observation if leaf.is_image]:
+            where = f" at {images[0].path}" if images[0].path else ""
+            raise UsageError(f"{name}: expected no images, got {list(images[0].shape)}{where}; take --algo ppo for them")
+        if config.encoder is not None:
+            raise UsageError(f"{name}: expected no encoder, got {config.encoder}; take --algo ppo for it")
+        return PolicySpec(
+            observation,
+            action,
+            net=config.net,
+            activation=config.activation,
+            normalize_observations=config.normalize_observations,
+            **head,
+        )
+
+    def __init__(
+        self, config: ContinuousConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu"
+    ) -> None:
+        self.replay = ReplayBuffer(
+            policy.observation,
+            size=config.replay_size,
+            n_step=config.n_step,
+            gamma=config.gamma,
+            seed=seed,
+            alpha=config.priority_alpha if config.replay == "prioritized" else None,
+            action=policy.action,
+        )
+        super().__init__(config, policy, total_steps=total_steps, seed=seed, device=device)
+        self.net = ActorAndCritics(policy, device, seed=seed)
+        self.target = ActorAndCritics(policy, device, seed=seed)
+        self._generator = torch.Generator().manual_seed(seed)
+        self._counted = {"updates_per_step": config.updates_per_step, "env_steps": config.learning_starts, "made": 0}
+        self._learning_starts = config.learning_starts
+        self.tensors = {"parameters": self.net.flat, "target": self.target.flat}
+        self.optimizers = {name: adam(part, config) for name, part in self.parts().items()}
+
+    def parts(self) -> dict[str, Tensor]:
+        """The flat tensors that an optimizer each changes, by the optimizer's name."""
+        return {"actor_optimizer": self.net.actor, "critic_optimizer": self.net.critics}
+
+    def steps_due(self) -> int:
+        """The gradient steps that the replay ratio demands now."""
+        ratio = Fraction(repr(self.config.updates_per_step))  # as it is written: 0.29 × 100 is 29
+        steps = math.floor(ratio * max(0, self.env_steps - self._counted["env_steps"]))
+        return max(0, int(self._counted["made"]) + steps - self.gradient_steps)
+
+    def noise(self, *shape: int) -> Tensor:
+        """Normal noise [*shape], on the device of the weights."""
+        return torch.randn(*shape, generator=self._generator).to(self.net.flat)
+
+    def weights(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+        """Copies of the actor's parameters [P], and of the buffers: observation statistics, and what exploration needs."""
+        warm_up = float(self.env_steps < self.config.learning_starts)
+        exploration = np.array([*self.exploration(), warm_up], np.float32)
+        return self.net.actor.cpu().numpy().copy(), np.concatenate((self.statistics, exploration))
+
+    def exploration(self) -> list[float]:
+        """What the buffers of the policy hold between the statistics and the number that says whether it warms up."""
+        return []
+
+    def numbers(self) -> dict[str, Any]:
+        """See `OffPolicy.numbers`."""
+        counted = self._counted | {"learning_starts": self._learning_starts}
+        return super().numbers() | {"counted": counted, "noise": self._generator.get_state()}
+
+    def load_numbers(self, state: dict[str, Any]) -> None:
+        """See `OffPolicy.load_numbers`."""
+        super().load_numbers(state)
+        self._generator.set_state(state["noise"].clone())
+        counted, config = dict(state["counted"]), self.config
+        self._learning_starts = counted.pop("learning_starts")
+        self._counted = counted
+        if (counted["updates_per_step"], self._learning_starts) != (config.updates_per_step, config.learning_starts):
+            start = max(self.env_steps, config.learning_starts)
+            self._learning_starts = config.learning_starts
+            self._counted = {
+                "updates_per_step": config.updates_per_step, "env_steps": start, "made": self.gradient_steps
+            }  # fmt: skip
+
+
+def adam(flat: Tensor, config: Any) -> torch.optim.Adam:
+    """Adam for one flat tensor that has a gradient."""
+    avoid_compiler_import()
+    return torch.optim.Adam([flat], lr=config.learning_rate, fused=True)

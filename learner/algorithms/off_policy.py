@@ -1,0 +1,172 @@
+"""The base of algorithms that learn from a replay buffer: what an update does besides its gradient steps, and the state.
+
+No sockets, no files, no clock; seeded. The buffer holds raw observations. They are normalized when they are drawn, with the
+current statistics. With one torch thread on a CPU the same batches give the same bits, also after `load_state_dict`.
+"""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
+
+import msgspec
+import numpy as np
+from torch import Tensor
+from torch.optim import Optimizer
+
+from learner.algorithms.algorithm import Algorithm
+from learner.algorithms.kernels.optimizer_step import state_of
+from learner.algorithms.normalization import ObservationNormalizer
+from learner.algorithms.replay.replay_buffer import Sample
+from learner.algorithms.updates import scheduled
+from learner.config.hyperparameters import AlgorithmConfig, OffPolicyConfig
+from protocol.arrays import Array, Floats
+from protocol.policy.features import features, normalize
+from protocol.rollout import Batch
+from protocol.specs import PolicySpec
+
+
+class OffPolicy(Algorithm):
+    """An algorithm with a replay buffer. An update adds a batch to the buffer and makes the gradient steps that are due.
+
+    A subclass writes `__init__`, `steps_due`, `step` and `weights`, and puts everything that a gradient step changes into
+    `tensors`, `optimizers` and `numbers`.
+    """
+
+    Config: ClassVar[type[AlgorithmConfig]] = OffPolicyConfig
+    config: Any
+    replay: Any
+    """A `ReplayBuffer`, or what has its methods. A subclass makes it before it calls `__init__`."""
+    tensors: dict[str, Tensor]
+    """The tensors that gradient steps change in place, by their names in the saved state."""
+    optimizers: dict[str, Optimizer]
+    """The optimizers, each of one flat tensor, by their names in the saved state."""
+
+    def __init__(
+        self, config: OffPolicyConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu"
+    ) -> None:
+        self.config = config
+        self.policy = policy
+        self.env_steps = 0  # valid rows used so far; schedules depend on it
+        self.version = 0  # updates made
+        self.gradient_steps = 0  # what Stable-Baselines3 calls n_updates
+        self._total_steps = total_steps
+        # The buffers of the policy also hold what exploration needs: so the normalizer gets the policy with another head.
+        self.normalizer = ObservationNormalizer(msgspec.structs.replace(policy, head="actor_critic"))
+        self.statistics: Floats = self.normalizer.buffers()
+        self._remembered: dict[str, Any] = {}
+
+    @abstractmethod
+    def steps_due(self) -> int:
+        """The number of gradient steps of this update, whose batch is in the buffer and counted in `env_steps`."""
+
+    @abstractmethod
+    def step(self, sample: Sample) -> Sequence[float]:
+        """One gradient step on a minibatch. Adds 1 to `gradient_steps`, and updates the priorities.
+
+        Returns a NamedTuple of metrics, with NaN for what this step did not measure. Raises `RunError` when a loss or a
+        gradient is not finite, before it reaches the weights.
+        """
+
+    def update(self, batch: Batch, pulse: Callable[[], None]) -> dict[str, float]:
+        """Add a batch to the replay buffer and learn from it, calling `pulse` between gradient steps. Returns metrics.
+
+        Raises `RunError` when a loss or a gradient is not finite, before it reaches the weights.
+        """
+        config = self.config
+        done = min(
+            1.0, self.env_steps / self._total_steps
+        )  # fraction of the run: 0 in the first update, below 1 in the last
+        learning_rate = scheduled(config.learning_rate, config.learning_rate_schedule, 1 - done)
+        for optimizer in self.optimizers.values():
+            optimizer.param_groups[0]["lr"] = learning_rate
+        beta = config.priority_beta + (1 - config.priority_beta) * done
+        self.replay.add(batch)
+        self.normalizer.update(features(self.policy, batch.obs)[:-1], batch.valid)
+        self.statistics = self.normalizer.buffers()
+        self.env_steps += batch.env_steps
+        self.version += 1
+        measured: list[Any] = []
+        for _ in range(self.steps_due() if len(self.replay) else 0):
+            measured.append(self.step(self.replay.sample(config.batch_size, beta)))
+            pulse()
+        metrics = {
+            "train/learning_rate": learning_rate,
+            "train/n_updates": float(self.gradient_steps),
+            "replay/size": float(len(self.replay)),
+            "replay/bytes": float(self.replay.bytes),
+        }
+        if measured:
+            metrics |= {f"train/{name}": number for name, number in _means(measured).items()}
+            metrics["replay/env_steps_per_gradient_step"] = batch.env_steps / len(measured)
+        return metrics
+
+    def inputs(self, leaves: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Features [B, D], normalized with the current statistics, and images [B, *leaf] uint8, of leaves [B, *leaf]."""
+        x = features(self.policy, leaves)
+        if self.policy.normalize_observations:
+            x = normalize(x, *np.split(self.statistics, 2))
+        return x, [array for leaf, array in zip(self.policy.observation, leaves, strict=True) if leaf.is_image]
+
+    def is_finite(self) -> bool:
+        """Whether all weights are finite, also those that do not act, and the observation statistics."""
+        return bool(all(tensor.isfinite().all() for tensor in self.tensors.values()) and np.isfinite(self.statistics).all())
+
+    # ---------------------------------------------------------------- the state
+
+    def numbers(self) -> dict[str, Any]:
+        """What the next update depends on besides tensors, optimizers, statistics and the buffer: plain data, copied."""
+        return {"env_steps": self.env_steps, "version": self.version, "gradient_steps": self.gradient_steps}
+
+    def load_numbers(self, state: dict[str, Any]) -> None:
+        """Continue from `numbers`."""
+        self.env_steps, self.version = state["env_steps"], state["version"]
+        self.gradient_steps = state["gradient_steps"]
+
+    def state_dict(self) -> dict[str, Any]:
+        """A copy of everything that the next update depends on: tensors and plain data (`torch.load(weights_only=True)`)."""
+        return self._small_state() | {"replay": self.replay.state_dict()}
+
+    def _small_state(self) -> dict[str, Any]:
+        """The state without the replay buffer."""
+        return (
+            {name: tensor.clone() for name, tensor in self.tensors.items()}
+            | {name: state_of(optimizer) for name, optimizer in self.optimizers.items()}
+            | {"observations": self.normalizer.state_dict()}
+            | self.numbers()
+        )
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a `state_dict`: the next update is the one that would have followed it, bit for bit."""
+        self._load_small_state(state)
+        self.replay.load_state_dict(state["replay"])
+
+    def remember(self) -> None:
+        """Remember this state, for `roll_back`. Of the replay buffer, only what changes from now on is copied."""
+        self._remembered = self._small_state()
+        self.replay.remember()
+
+    def roll_back(self) -> None:
+        """Return to the state that was remembered last."""
+        self._load_small_state(self._remembered)
+        self.replay.roll_back()
+
+    def _load_small_state(self, state: dict[str, Any]) -> None:
+        for name, tensor in self.tensors.items():
+            tensor.copy_(state[name])
+        for name, optimizer in self.optimizers.items():
+            optimizer.load_state_dict(copy.deepcopy(state[name]))
+        self.normalizer.load_state_dict(state["observations"])
+        self.statistics = self.normalizer.buffers()
+        self.load_numbers(state)
+
+
+def _means(measured: Sequence[Any]) -> dict[str, float]:
+    """The mean of each metric over the steps that measured it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # no step measured it
+        means = np.nanmean(np.array(measured), 0).tolist()
+    return {name: mean for name, mean in zip(measured[0]._fields, means, strict=True) if mean == mean}
