@@ -59,9 +59,9 @@ from learner.algorithms.dqn import DQN
 from learner.algorithms.impala import Impala
 from learner.algorithms.minibatches import LossInput, Observations
 from learner.algorithms.normalization import ObservationNormalizer
-from learner.algorithms.off_policy import OffPolicy
 from learner.algorithms.ppo import PPO
 from learner.algorithms.reinforce import REINFORCE
+from learner.algorithms.replay.off_policy import OffPolicy
 from learner.algorithms.replay.replay_buffer import ReplayBuffer, Sample
 from learner.algorithms.returns import EpisodeEnds, gae, vtrace
 from learner.algorithms.sac import SAC

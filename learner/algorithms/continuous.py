@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from learner.algorithms.kernels.optimizer_step import avoid_compiler_import
-from learner.algorithms.off_policy import OffPolicy
+from learner.algorithms.replay.off_policy import OffPolicy
 from learner.algorithms.replay.replay_buffer import ReplayBuffer, Sample
 from learner.config.hyperparameters import ContinuousConfig
 from protocol.errors import UsageError

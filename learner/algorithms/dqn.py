@@ -16,8 +16,8 @@ import torch
 from learner.algorithms.kernels import loss_gradients
 from learner.algorithms.kernels.action_values import action_values
 from learner.algorithms.kernels.optimizer_step import avoid_compiler_import, take_step
-from learner.algorithms.off_policy import OffPolicy
 from learner.algorithms.replay.mixed_replay import MixedReplay
+from learner.algorithms.replay.off_policy import OffPolicy
 from learner.algorithms.replay.replay_buffer import Sample
 from learner.algorithms.updates import check_finite
 from learner.config.hyperparameters import DQNConfig

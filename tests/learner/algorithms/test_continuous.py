@@ -298,7 +298,7 @@ def test_losses_that_are_not_finite_stop_the_update(algo: str) -> None:
     assert torch.equal(algorithm.net.flat, before)
 
 
-@pytest.mark.parametrize("name", ["sac", "td3", "continuous", "off_policy"])
+@pytest.mark.parametrize("name", ["sac", "td3", "continuous", "replay/off_policy"])
 def test_they_import_nothing_that_a_user_could_not(name: str) -> None:
     """Every name of ours that these files import, kernels aside, is the object that `millrace.algorithms` exports."""
     path = Path(learner.algorithms.__file__).parent / f"{name}.py"
