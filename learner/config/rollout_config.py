@@ -121,7 +121,7 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """A worker that has been silent for this many seconds counts as lost, and other workers take over its lanes. A worker
     is not silent while its supervisor says that its environment is busy, however long that takes.
     """
-    no_workers_timeout_s: Free[Seconds] = 60.0
+    no_workers_timeout_s: Free[Seconds] = 600.0
     """Write a checkpoint and end the run if there has been no worker for this many seconds."""
     construct_timeout_s: Free[SecondsOrNever] = 600.0
     """A local worker process is restarted if making one env copy takes longer than this many seconds. 0: never."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import logging
 import math
+import socket
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -35,7 +36,7 @@ from learner.members.member_log import MemberLog
 from learner.members.membership import Membership, Outgoing
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.members.states import SentUnusable
-from protocol.address import name_for_people
+from protocol.address import advertised_address, name_for_people
 from protocol.bounds import one_line
 from protocol.errors import BadMessage, NoWorkers
 from protocol.messages import Hello, Inquire, Refuse, Status, ToLearner, ToWorker, Weights, WorkerExit
@@ -202,7 +203,8 @@ class MemberServer:
     def no_workers(self, workers: int, timeout_s: float) -> NoWorkers:
         """The error when fewer than `workers` have joined within `timeout_s`: it says how to start one."""
         address = self._link.address
-        start = f"python -m workers {address}{'' if self._link.keyring is None else ' --token FILE'}"
+        reached_at = advertised_address(address, "", socket.gethostname())
+        start = f"millrace worker {reached_at}{'' if self._link.keyring is None else ' --token FILE'}"
         joined = f"{len(self._membership.members)} joined{self.missing_reason()}"
         awaited = "1 worker" if workers == 1 else f"{workers} workers"
         return NoWorkers(f"waited {timeout_s:g} s for {awaited} at {address}, {joined}; start one: {start}")

@@ -12,6 +12,7 @@ from learner.run_folder.run_folder import RunSettings, as_folder_name
 from learner.run_folder.run_format import check_whole
 from protocol.bounds import one_line
 from protocol.errors import UsageError
+from protocol.logs.notices import log_notice
 
 log = logging.getLogger("millrace.learner")
 
@@ -28,7 +29,10 @@ def newest_run(config: RunSettings) -> Path | None:
     root = Path(config.run_dir)
     named = [(found, path) for path in (root.iterdir() if root.is_dir() else ()) if (found := pattern.fullmatch(path.name))]
     matching = [(found[1], int(found[2] or 1), path) for found, path in named if _can_be_resumed(path, config)]
-    return max(matching)[2] if matching else None
+    if not matching:
+        log_notice(log, f"no run to resume in {config.run_dir}: a new one begins")
+        return None
+    return max(matching)[2]
 
 
 def _can_be_resumed(path: Path, config: RunSettings) -> bool:

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from learner.callbacks.callbacks import Watch
 
 ABOUT = "Worker processes step copies of a gymnasium environment; one learner trains a policy in PyTorch."
-RESUME = "millrace train"
 HELP_FLAGS = ("-h", "--help")
 NOT_IN_WORKERS = {"matplotlib", "prometheus_client", "rich", "safetensors", "tensorboard", "tomli_w", "torch", "tyro"}
 """Packages that the learner needs and a worker does not. An installation only for workers lacks them."""
@@ -58,12 +57,12 @@ def _exit_code(argv: list[str]) -> int:
         sys.stdout.flush()
         return exit_code
     except UserFacingError as error:
-        _print_error(last_line("millrace", error, RESUME))
+        _print_error(last_line("millrace", error, _resumes(argv)))
         if error.detail:
             _print_error(indented(error.detail))
         return _failed(argv, error.exit_code)
     except KeyboardInterrupt as interrupt:
-        _print_error(last_line("millrace", interrupt, RESUME))
+        _print_error(last_line("millrace", interrupt, _resumes(argv)))
         return _failed(argv, 130)
     except BrokenPipeError:  # nobody reads our output any more (`| head`), so a message is useless
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -366,8 +365,13 @@ def _print_error(line: str) -> None:
     print(escaped(line), file=sys.stderr)  # it may quote what a worker said
 
 
+def _resumes(argv: list[str]) -> str:
+    """The command that resumes a run of this command line: a learner without workers stays one."""
+    return "millrace learner" if argv[:1] == ["learner"] else "millrace train"
+
+
 def _internal_error(argv: list[str], error: Exception) -> int:
-    _print_error(last_line("millrace", error, RESUME, [] if "--debug" in argv else ["--debug shows the traceback"]))
+    _print_error(last_line("millrace", error, _resumes(argv), [] if "--debug" in argv else ["--debug shows the traceback"]))
     return _failed(argv, 1)
 
 

@@ -279,6 +279,7 @@ def failing(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
         raise error
 
     monkeypatch.setattr("millrace.launch.local_run.train", train)
+    monkeypatch.setattr("learner.run.serve", train)
 
 
 def test_errors_of_ours_are_one_line_with_their_exit_code(capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -306,6 +307,8 @@ def test_an_interrupted_run_says_how_to_go_on(capsys: Captured, monkeypatch: pyt
     failing(monkeypatch, Interrupted(Path("runs/mine")))
     line = refusal(capsys, "train", "CartPole-v1", exit_code=130)
     assert line == "interrupted; go on with: millrace train --resume runs/mine"
+    line = refusal(capsys, "learner", "CartPole-v1", exit_code=130)
+    assert line == "interrupted; go on with: millrace learner --resume runs/mine", "`train` would start workers of its own"
     failing(monkeypatch, KeyboardInterrupt())
     assert refusal(capsys, "train", "CartPole-v1", exit_code=130) == "interrupted"
 

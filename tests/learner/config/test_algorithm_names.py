@@ -347,7 +347,7 @@ def test_a_resumed_run_takes_free_settings_and_refuses_fixed_ones(tmp_path: Path
     assert newest_run(config) is None, "it has no checkpoint"
 
 
-def test_resume_auto_does_not_take_a_run_of_another_algorithm(tmp_path: Path) -> None:
+def test_resume_auto_does_not_take_a_run_of_another_algorithm(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     run = a_run(tmp_path, algo="own_module:Mine")
     assert "own_module-Mine" in run.name
     (run / "checkpoints").mkdir()
@@ -355,8 +355,10 @@ def test_resume_auto_does_not_take_a_run_of_another_algorithm(tmp_path: Path) ->
     config = resolve(resume=run)
     assert newest_run(config) == run
     text = (run / "config.toml").read_text()
+    assert not caplog.messages
     (run / "config.toml").write_text(text.replace('"own_module:Mine"', '"own_module.Mine"', 1))
     assert newest_run(config) is None
+    assert caplog.messages == [f"no run to resume in {config.run_dir}: a new one begins"]
 
 
 def test_a_run_of_a_notebook_goes_on_where_the_class_is_given_or_has_been_moved(tmp_path: Path) -> None:
