@@ -42,7 +42,8 @@ Tools:
 - `gae`, `vtrace` and `EpisodeEnds`: advantages and targets of arrays [T, N].
 - `ActorCriticNetwork`, `QNetwork` and `ActorAndCritics`: the networks that workers act with, and `log_prob_and_entropy` or
   `squashed_sample` of their outputs.
-- `ReplayBuffer`, which gives a `Sample` of transitions, and `Transitions`, the tensors of one. `ObservationNormalizer`: the
+- `ReplayBuffer`, which gives a `Sample` of transitions, `MixedReplay`, which also draws prior data, and `Transitions`, the
+  tensors of a sample. `ObservationNormalizer`: the
   running statistics of observations.
 - `features` and `normalize`: observations as these networks take them.
 - `UsageError`: raise it, in one line, for settings or spaces that cannot be used.
@@ -61,6 +62,7 @@ from learner.algorithms.minibatches import LossInput, Observations
 from learner.algorithms.normalization import ObservationNormalizer
 from learner.algorithms.ppo import PPO
 from learner.algorithms.reinforce import REINFORCE
+from learner.algorithms.replay.mixed_replay import MixedReplay
 from learner.algorithms.replay.off_policy import OffPolicy
 from learner.algorithms.replay.replay_buffer import ReplayBuffer, Sample
 from learner.algorithms.returns import EpisodeEnds, gae, vtrace
@@ -116,6 +118,7 @@ __all__ = [
     "ImpalaConfig",
     "Leaf",
     "LossInput",
+    "MixedReplay",
     "ObservationNormalizer",
     "Observations",
     "OffPolicy",

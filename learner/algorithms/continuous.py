@@ -17,7 +17,7 @@ from torch import Tensor
 
 from learner.algorithms.kernels.optimizer_step import avoid_compiler_import
 from learner.algorithms.replay.off_policy import OffPolicy
-from learner.algorithms.replay.replay_buffer import ReplayBuffer, Sample
+from learner.algorithms.replay.replay_buffer import Sample
 from learner.config.hyperparameters import ContinuousConfig
 from protocol.errors import UsageError
 from protocol.policy.networks import ActorAndCritics
@@ -81,15 +81,6 @@ class Continuous(OffPolicy):
     def __init__(
         self, config: ContinuousConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu"
     ) -> None:
-        self.replay = ReplayBuffer(
-            policy.observation,
-            size=config.replay_size,
-            n_step=config.n_step,
-            gamma=config.gamma,
-            seed=seed,
-            alpha=config.priority_alpha if config.replay == "prioritized" else None,
-            action=policy.action,
-        )
         super().__init__(config, policy, total_steps=total_steps, seed=seed, device=device)
         self.net = ActorAndCritics(policy, device, seed=seed)
         self.target = ActorAndCritics(policy, device, seed=seed)
@@ -107,7 +98,7 @@ class Continuous(OffPolicy):
         """The gradient steps that the replay ratio demands now."""
         ratio = Fraction(repr(self.config.updates_per_step))  # as it is written: 0.29 × 100 is 29
         steps = math.floor(ratio * max(0, self.env_steps - self._counted["env_steps"]))
-        return max(0, int(self._counted["made"]) + steps - self.gradient_steps)
+        return max(0, int(self._counted["made"]) + steps - (self.gradient_steps - self.prior_gradient_steps))
 
     def noise(self, *shape: int) -> Tensor:
         """Normal noise [*shape], on the device of the weights."""
@@ -139,7 +130,8 @@ class Continuous(OffPolicy):
             start = max(self.env_steps, config.learning_starts)
             self._learning_starts = config.learning_starts
             self._counted = {
-                "updates_per_step": config.updates_per_step, "env_steps": start, "made": self.gradient_steps
+                "updates_per_step": config.updates_per_step, "env_steps": start,
+                "made": self.gradient_steps - self.prior_gradient_steps,
             }  # fmt: skip
 
 

@@ -7,7 +7,7 @@ a setting and does not depend on speed. ε falls with the number of env steps us
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +23,6 @@ from learner.algorithms.updates import check_finite
 from learner.config.hyperparameters import DQNConfig
 from protocol.arrays import Floats
 from protocol.errors import UsageError
-from protocol.policy.features import features
 from protocol.policy.networks import QNetwork
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
@@ -71,15 +70,6 @@ class DQN(OffPolicy):
         )
 
     def __init__(self, config: DQNConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
-        self.replay = MixedReplay(
-            policy.observation,
-            size=config.replay_size,
-            n_step=config.n_step,
-            gamma=config.gamma,
-            seed=seed,
-            alpha=config.priority_alpha if config.replay == "prioritized" else None,
-            prior_share=config.prior_share,
-        )
         super().__init__(config, policy, total_steps=total_steps, seed=seed, device=device)
         self.net = QNetwork(policy, device, seed=seed)
         self.target = QNetwork(policy, device, seed=seed)
@@ -98,23 +88,6 @@ class DQN(OffPolicy):
         """See `OffPolicy.update`; the metrics also have ε."""
         metrics = super().update(batch, pulse)
         return {"rollout/exploration_rate": exploration_rate(self.config, self.env_steps)} | metrics
-
-    def add_prior(self, batches: Iterable[Batch], observations: int) -> None:
-        """Store the rows of a dataset beside the replay buffer. They count for the observation statistics."""
-
-        def counted() -> Iterator[Batch]:
-            for batch in batches:
-                self.normalizer.update(features(self.policy, batch.obs)[:-1], batch.valid)
-                yield batch
-
-        self.replay.add_prior(counted(), observations)
-        self.statistics = self.normalizer.buffers()
-
-    def learn_from_prior(self, pulse: Callable[[], None]) -> None:
-        """Make `prior_steps` gradient steps on prior data alone, less those that were made."""
-        for _ in range(self.config.prior_steps - self.gradient_steps):
-            self.step(self.replay.sample(self.config.batch_size))
-            pulse()
 
     @np.errstate(all="ignore")  # `check_finite` finds and names what is not finite
     def step(self, sample: Sample) -> StepMetrics:

@@ -185,6 +185,10 @@ class OffPolicyConfig(AlgorithmConfig, frozen=True):
     """α of prioritized replay. 0: uniform. 1: in proportion to the TD error."""
     priority_beta: Free[Fraction] = 0.4
     """Initial β of prioritized replay: how far importance weights correct the bias. It grows to 1 (fully) over the run."""
+    prior_share: Free[Fraction] = 0.5
+    """Share of each minibatch that is prior data, in a run with --prior (Ball et al. 2023 use 0.5)."""
+    prior_steps: Free[Annotated[int, msgspec.Meta(ge=0)]] = 0
+    """Number of gradient steps on prior data alone, before the first rollouts are collected. Needs --prior."""
     n_step: Free[Count] = 1
     """Number of rewards in a target before it bootstraps."""
     tau: Free[Annotated[float, msgspec.Meta(gt=0, le=1)]] = 0.005
@@ -202,10 +206,6 @@ class DQNConfig(OffPolicyConfig, frozen=True):
     """Number of gradient steps in an update. There is one update for every envs x rollout_steps env steps, so this sets the
     replay ratio.
     """
-    prior_share: Free[Fraction] = 0.5
-    """Share of each minibatch that is prior data, in a run with --prior (Ball et al. 2023 use 0.5)."""
-    prior_steps: Free[Annotated[int, msgspec.Meta(ge=0)]] = 0
-    """Number of gradient steps on prior data alone, before the first rollouts are collected. Needs --prior."""
     double: Free[bool] = True
     """Double Q-learning: the network chooses the next action, and the target network values it."""
     dueling: Fixed[bool] = False

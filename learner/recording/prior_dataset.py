@@ -13,7 +13,7 @@ import numpy as np
 
 from protocol.arrays import Array
 from protocol.bounds import one_line
-from protocol.envs.spaces import action_spec, make_action_reader, make_flatten, observation_leaves
+from protocol.envs.spaces import action_spec, make_flatten, observation_leaves, stored_actions_of
 from protocol.errors import UsageError, first_line
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
@@ -36,7 +36,7 @@ class PriorDataset:
     def batches(self) -> Iterator[Batch]:
         """One batch for each episode, in the order of the dataset. Raises `UsageError` if an episode cannot be used."""
         flatten = make_flatten(self._dataset.observation_space)
-        to_stored = make_action_reader(self._policy.action)
+        to_stored = stored_actions_of(self._policy)
         for episode in self._dataset.iterate_episodes():
             leaves = zip(flatten(episode.observations), self._policy.observation, strict=True)
             yield self._batch(

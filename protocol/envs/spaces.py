@@ -146,9 +146,17 @@ def make_action_converter(spec: ActionSpec) -> Callable[[Array], Array]:
     return lambda action: (action + start).astype(dtype, copy=False)
 
 
-def make_action_reader(spec: ActionSpec) -> Callable[[Array], Array]:
-    """The inverse of `make_action_converter`: a function from actions of the environment to stored actions."""
-    if spec.kind == "box":
+def stored_actions_of(policy: PolicySpec) -> Callable[[Array], Array]:
+    """The inverse of `action_converter_of`: a function from actions of the environment to stored actions.
+
+    An action outside of a Box that is scaled becomes one at its bounds.
+    """
+    spec = policy.action
+    if spec.kind != "box":
+        start = np.reshape(np.asarray(spec.start or 0), spec.shape if spec.start else ())
+        return lambda action: (action - start).astype(spec.stored_dtype)
+    if not policy.stores_scaled_actions:
         return lambda action: action.astype(spec.stored_dtype)
-    start = np.reshape(np.asarray(spec.start or 0), spec.shape if spec.start else ())
-    return lambda action: (action - start).astype(spec.stored_dtype)
+    low, high = (np.reshape(bound, spec.shape) for bound in (spec.low, spec.high))
+    middle, half = (low + high) / 2, (high - low) / 2
+    return lambda action: np.clip((action - middle) / half, -1, 1).astype(spec.stored_dtype)

@@ -31,6 +31,8 @@ RUNS: dict[str, dict[str, Any]] = {
     "impala": {"algo": "impala"},
     "reinforce": {"algo": "reinforce", "rollout_steps": 501, "steps": 2_100},
     "dqn": {"algo": "dqn", "learning_starts": 0, "gradient_steps": 1},
+    "sac": {"env": "Pendulum-v1", "algo": "sac", "learning_starts": 0, "batch_size": 8, "net": (8,)},
+    "td3": {"env": "Pendulum-v1", "algo": "td3", "learning_starts": 0, "batch_size": 8, "net": (8,)},
 }
 
 

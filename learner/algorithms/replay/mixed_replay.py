@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from learner.algorithms.replay.replay_buffer import ReplayBuffer, Sample
+from learner.algorithms.replay.replay_buffer import DISCRETE, ReplayBuffer, Sample
 from protocol.arrays import Floats, Ints
 from protocol.rollout import Batch
-from protocol.specs import Leaf
+from protocol.specs import ActionSpec, Leaf
 
 PRIOR_SLOT = -1  # `Sample.slots` of a prior transition
 
@@ -31,18 +31,24 @@ class MixedReplay(ReplayBuffer):
         gamma: float,
         seed: int,
         alpha: float | None = None,
+        action: ActionSpec = DISCRETE,
         prior_share: float = 0.0,
     ) -> None:
         """`prior_share`: the share of each draw that is prior, once `add_prior` was called. Else as `ReplayBuffer`."""
-        super().__init__(observation, size=size, n_step=n_step, gamma=gamma, seed=seed, alpha=alpha)
+        super().__init__(observation, size=size, n_step=n_step, gamma=gamma, seed=seed, alpha=alpha, action=action)
         self.prior: ReplayBuffer | None = None
-        self._observation, self._seed, self._share = observation, seed, prior_share
+        self._observation, self._stored, self._seed, self._share = observation, action, seed, prior_share
         self._remembered_prior: Any = None
 
     def add_prior(self, batches: Iterable[Batch], slots: int) -> None:
         """Store prior transitions. `slots`: how many observations they have. Raises `UsageError` if memory is too small."""
         prior = ReplayBuffer(
-            self._observation, size=slots, n_step=self._n_step, gamma=self._gamma, seed=_other_seed(self._seed)
+            self._observation,
+            size=slots,
+            n_step=self._n_step,
+            gamma=self._gamma,
+            seed=_other_seed(self._seed),
+            action=self._stored,
         )
         for batch in batches:
             prior.add(batch)

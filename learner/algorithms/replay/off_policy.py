@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import warnings
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, ClassVar
 
 import msgspec
@@ -20,6 +20,7 @@ from torch.optim import Optimizer
 from learner.algorithms.algorithm import Algorithm
 from learner.algorithms.kernels.optimizer_step import state_of
 from learner.algorithms.normalization import ObservationNormalizer
+from learner.algorithms.replay.mixed_replay import MixedReplay
 from learner.algorithms.replay.replay_buffer import Sample
 from learner.algorithms.updates import scheduled
 from learner.config.hyperparameters import AlgorithmConfig, OffPolicyConfig
@@ -38,8 +39,6 @@ class OffPolicy(Algorithm):
 
     Config: ClassVar[type[AlgorithmConfig]] = OffPolicyConfig
     config: Any
-    replay: Any
-    """A `ReplayBuffer`, or what has its methods. A subclass makes it before it calls `__init__`."""
     tensors: dict[str, Tensor]
     """The tensors that gradient steps change in place, by their names in the saved state."""
     optimizers: dict[str, Optimizer]
@@ -50,9 +49,20 @@ class OffPolicy(Algorithm):
     ) -> None:
         self.config = config
         self.policy = policy
+        self.replay = MixedReplay(
+            policy.observation,
+            size=config.replay_size,
+            n_step=config.n_step,
+            gamma=config.gamma,
+            seed=seed,
+            alpha=config.priority_alpha if config.replay == "prioritized" else None,
+            action=policy.action,
+            prior_share=config.prior_share,
+        )
         self.env_steps = 0  # valid rows used so far; schedules depend on it
         self.version = 0  # updates made
         self.gradient_steps = 0  # what Stable-Baselines3 calls n_updates
+        self.prior_gradient_steps = 0  # of these, the ones before the first rollouts
         self._total_steps = total_steps
         # The buffers of the policy also hold what exploration needs: so the normalizer gets the policy with another head.
         self.normalizer = ObservationNormalizer(msgspec.structs.replace(policy, head="actor_critic"))
@@ -104,6 +114,24 @@ class OffPolicy(Algorithm):
             metrics["replay/env_steps_per_gradient_step"] = batch.env_steps / len(measured)
         return metrics
 
+    def add_prior(self, batches: Iterable[Batch], observations: int) -> None:
+        """Store the rows of a dataset beside the replay buffer. They count for the observation statistics."""
+
+        def counted() -> Iterator[Batch]:
+            for batch in batches:
+                self.normalizer.update(features(self.policy, batch.obs)[:-1], batch.valid)
+                yield batch
+
+        self.replay.add_prior(counted(), observations)
+        self.statistics = self.normalizer.buffers()
+
+    def learn_from_prior(self, pulse: Callable[[], None]) -> None:
+        """Make `prior_steps` gradient steps on prior data alone, less those that were made."""
+        while self.prior_gradient_steps < self.config.prior_steps:
+            self.step(self.replay.sample(self.config.batch_size))
+            self.prior_gradient_steps += 1
+            pulse()
+
     def inputs(self, leaves: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Features [B, D], normalized with the current statistics, and images [B, *leaf] uint8, of leaves [B, *leaf]."""
         x = features(self.policy, leaves)
@@ -119,12 +147,14 @@ class OffPolicy(Algorithm):
 
     def numbers(self) -> dict[str, Any]:
         """What the next update depends on besides tensors, optimizers, statistics and the buffer: plain data, copied."""
-        return {"env_steps": self.env_steps, "version": self.version, "gradient_steps": self.gradient_steps}
+        names = ("env_steps", "version", "gradient_steps", "prior_gradient_steps")
+        return {name: getattr(self, name) for name in names}
 
     def load_numbers(self, state: dict[str, Any]) -> None:
         """Continue from `numbers`."""
         self.env_steps, self.version = state["env_steps"], state["version"]
         self.gradient_steps = state["gradient_steps"]
+        self.prior_gradient_steps = state.get("prior_gradient_steps", 0)  # a state of an earlier millrace has none
 
     def state_dict(self) -> dict[str, Any]:
         """A copy of everything that the next update depends on: tensors and plain data (`torch.load(weights_only=True)`)."""
