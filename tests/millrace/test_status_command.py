@@ -36,6 +36,7 @@ def run(tmp_path: Path) -> Path:
 
 def write_lock(run: Path, keys: str, boot: str = "", host: str = "box") -> None:
     """The lock of a learner that lives, on this machine unless `boot` names another one."""
+    (run / LOCK_FILE).unlink(missing_ok=True)  # a lock of another machine would be watched for half a minute
     with RunLock(run) as lock:
         lock.announce(Listens(WIDE, HERE, keys))
         owner = decoded((run / LOCK_FILE).read_bytes())

@@ -113,9 +113,7 @@ class ReplayBuffer:
         self._n_step, self._gamma, self._alpha = n_step, gamma, alpha
         self.generator = np.random.default_rng(seed)  # decides what is drawn
         self._obs = tuple(np.zeros((size, *leaf.shape), leaf.dtype) for leaf in observation)
-        self._mask: Bools | None = (
-            None  # [size, choices], made when the first masks come; as `_obs`, one for each observation
-        )
+        self._mask: Bools | None = None  # [size, choices], as `_obs`; made when the first masks come
         self._row = np.zeros(size, row_dtype(action))
         self._action: Array = self._row["action"]  # this and the next four: views of `_row`
         self._reward: Floats = self._row["reward"]

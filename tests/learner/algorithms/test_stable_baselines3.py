@@ -254,6 +254,7 @@ def test_the_page_takes_a_run_to_stable_baselines3(tmp_path: Path, env: str, act
     ours, over, write = make_policy(spec), distribution(spec), make_action_converter(spec.action)
     ours.load(net.flat.numpy()[: net.acting_size], buffers)
     obs, _ = made.reset(seed=1)
+    made.action_space.seed(1)
     seen = set()
     for _ in range(200):
         (expected,) = write(over.mode(ours([np.asarray(obs, np.float32)[None, None]])[0]))
