@@ -33,7 +33,8 @@ def contests(console: Console) -> list[Contest]:
         return found
     from benchmarks import update_stable_baselines3 as peer
 
-    return [*found, peer.dqn(64, 0.35), peer.dqn(256, 0.35), peer.a2c(5, 0.35), peer.a2c(16, 0.35)]
+    found += [peer.dqn(64, 0.35), peer.dqn(256, 0.35), peer.a2c(5, 0.35), peer.a2c(16, 0.35)]
+    return [*found, *(peer.continuous(name, width, None) for name in ("SAC", "TD3") for width in (64, 256))]
 
 
 def main() -> None:

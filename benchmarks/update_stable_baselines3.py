@@ -1,8 +1,8 @@
-"""A gradient step of DQN, and an update of A2C, against Stable-Baselines3's, with the same settings and shapes.
+"""A gradient step of DQN, SAC and TD3, and an update of A2C, against Stable-Baselines3's, with the same settings and shapes.
 
 DQN: draw 64 transitions, targets by the target network, Huber loss, gradient clipped by its norm, Adam. A2C: 8 env copies;
 theirs is given the values that it keeps from acting, ours computes them anew, and both compute advantages, losses, one
-step of RMSProp and what they log.
+step of RMSProp and what they log. SAC and TD3: the shapes of Pendulum, 256 transitions.
 """
 
 from __future__ import annotations
@@ -11,19 +11,26 @@ from collections.abc import Callable
 from typing import Any
 
 import gymnasium
+import msgspec
 import numpy as np
 import torch
 from stable_baselines3 import A2C as TheirA2C
 from stable_baselines3 import DQN as TheirDQN
+from stable_baselines3 import SAC as TheirSAC
+from stable_baselines3 import TD3 as TheirTD3
 from stable_baselines3.common.env_util import make_vec_env
 
 from benchmarks.contest import Contest, repeated
 from learner.algorithms.a2c import A2C
 from learner.algorithms.dqn import DQN
 from learner.algorithms.kernels.action_values import AutogradActionValues
-from learner.config.hyperparameters import A2CConfig, DQNConfig
+from learner.algorithms.sac import SAC
+from learner.algorithms.td3 import TD3
+from learner.config.hyperparameters import A2CConfig, DQNConfig, SACConfig, TD3Config
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf
+
+OFF_POLICY = {"SAC": (SAC, SACConfig, TheirSAC), "TD3": (TD3, TD3Config, TheirTD3)}
 
 OBSERVATION = (Leaf("", "box", (4,), "float32"),)
 ACTION = ActionSpec("discrete", (), "int64", (2,), (0,))
@@ -86,6 +93,36 @@ def dqn(width: int, target: float) -> Contest:
         "ours": ours(False),
     }
     return Contest(f"DQN, {width} units", rows, "SB3", target, runs)
+
+
+def continuous(name: str, width: int, target: float | None) -> Contest:
+    """A gradient step of SAC or TD3 on 256 transitions."""
+    algorithm, settings, peer = OFF_POLICY[name]
+    rows, size = 256, 10_000
+    config = settings(net=(width, width), batch_size=rows, replay_size=size)
+    observation, action = (Leaf("", "box", (3,), "float32"),), ActionSpec("box", (1,), "float32", low=(-2.0,), high=(2.0,))
+    made = algorithm(config, algorithm.policy_spec(config, observation, action), total_steps=NEVER, seed=0)
+    generator = np.random.default_rng(0)
+    for seed in range(20):
+        batch = some_batch(32, seed)
+        actions = generator.uniform(-1, 1, (*batch.reward.shape, 1)).astype(np.float32)
+        made.replay.add(msgspec.structs.replace(batch, obs=(batch.obs[0][..., :3],), action=actions))
+    theirs = peer(
+        "MlpPolicy",
+        gymnasium.make("Pendulum-v1"),
+        batch_size=rows,
+        buffer_size=size,
+        learning_starts=0,
+        policy_kwargs={"net_arch": [width, width]},
+        device="cpu",
+    )
+    theirs.learn(500)
+
+    def ours() -> float:
+        return repeated(lambda: made.step(made.replay.sample(rows)), STEPS)
+
+    runs = {"peer": lambda: repeated(lambda: theirs.train(STEPS, rows), 1) / STEPS, "graph": ours, "ours": ours}
+    return Contest(f"{name}, {width} units", rows, "SB3", target, runs)
 
 
 def a2c(steps: int, target: float) -> Contest:
