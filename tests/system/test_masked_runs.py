@@ -14,7 +14,12 @@ import numpy as np
 import pytest
 
 import millrace
+from learner.config.layers import resolve
+from learner.rollout_service.spec import rollout_spec
+from protocol.env_spec import EnvSpec
+from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import MillraceError, UsageError
+from protocol.specs import PolicySpec
 from tests.support.mask_envs import CHOICES, InInfo, InObservation, Parts
 
 NAMED = "tests.support.mask_envs:{}-v0"
@@ -59,6 +64,22 @@ def test_without_masks_the_key_is_an_observation(tmp_path: Path) -> None:
 def test_masks_for_a_box_action_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="action_masks info: expected an action space Discrete or MultiDiscrete, got Box"):
         millrace.train("Pendulum-v1", run_dir=str(tmp_path), action_masks="info", **SMALL)
+
+
+def test_prior_data_has_no_masks_and_is_refused(tmp_path: Path) -> None:
+    says = "prior toy/none-v0: a dataset has no action masks, and this run uses them; take --action-masks none"
+    with pytest.raises(UsageError, match=says):
+        train("InInfo", tmp_path / "runs", algo="dqn", prior="toy/none-v0")
+    assert not list((tmp_path / "runs").glob("*"))
+
+
+def test_envpool_has_no_masks_and_is_refused() -> None:
+    env = InInfo()
+    policy = PolicySpec(observation_leaves(env.observation_space), action_spec(env.action_space))
+    config = resolve("Any-v0", preset="none", vector="envpool")
+    with pytest.raises(UsageError, match="vector envpool: its environments report no action masks; use --vector loop"):
+        rollout_spec(config, EnvSpec("Any-v0"), policy, 8, masked=True)
+    assert rollout_spec(config, EnvSpec("Any-v0"), policy, 8).vector == "envpool"
 
 
 @pytest.mark.parametrize(("kind", "deterministic"), [(InInfo, True), (InInfo, False), (InObservation, True), (Parts, False)])
