@@ -15,6 +15,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from learner.algorithms.kernels.actor_and_critics import passes_of
 from learner.algorithms.kernels.optimizer_step import avoid_compiler_import
 from learner.algorithms.replay.off_policy import OffPolicy
 from learner.algorithms.replay.replay_buffer import Sample
@@ -25,19 +26,15 @@ from protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
 class Transitions:
-    """The tensors of B transitions, on the device of the weights. Their actions are in [-1, 1]."""
+    """The arrays of B transitions, of the kind that the passes of the algorithm's networks use. Actions are in [-1, 1]."""
 
     def __init__(self, algorithm: Continuous, sample: Sample) -> None:
-        flat = algorithm.net.flat
-
-        def tensor(array: npt.NDArray[Any]) -> Tensor:
-            return torch.from_numpy(np.ascontiguousarray(array, np.float32)).to(flat)
-
-        self.x, self.next_x = (tensor(algorithm.inputs(leaves)[0]) for leaves in (sample.leaves, sample.next_leaves))
+        array = algorithm.passes.to_array
+        self.x, self.next_x = (array(algorithm.inputs(leaves)[0]) for leaves in (sample.leaves, sample.next_leaves))
         """[B, D] features of the observations, and of those k steps later"""
-        self.action = tensor(sample.action.reshape(len(sample.action), -1))
+        self.action = array(sample.action.reshape(len(sample.action), -1))
         """[B, D′]"""
-        self.reward, self.discount, self.weight = map(tensor, (sample.reward, sample.discount, sample.weight))
+        self.reward, self.discount, self.weight = map(array, (sample.reward, sample.discount, sample.weight))
         """[B] each: Σ γⁱ r; γᵏ, or 0 if the task has terminated; weight of the loss"""
 
 
@@ -84,6 +81,7 @@ class Continuous(OffPolicy):
         super().__init__(config, policy, total_steps=total_steps, seed=seed, device=device)
         self.net = ActorAndCritics(policy, device, seed=seed)
         self.target = ActorAndCritics(policy, device, seed=seed)
+        self.passes, self.target_passes = (passes_of(net, config.batch_size) for net in (self.net, self.target))
         self._generator = torch.Generator().manual_seed(seed)
         self._counted = {"updates_per_step": config.updates_per_step, "env_steps": config.learning_starts, "made": 0}
         self._learning_starts = config.learning_starts
@@ -100,9 +98,9 @@ class Continuous(OffPolicy):
         steps = math.floor(ratio * max(0, self.env_steps - self._counted["env_steps"]))
         return max(0, int(self._counted["made"]) + steps - (self.gradient_steps - self.prior_gradient_steps))
 
-    def noise(self, *shape: int) -> Tensor:
-        """Normal noise [*shape], on the device of the weights."""
-        return torch.randn(*shape, generator=self._generator).to(self.net.flat)
+    def noise(self, *shape: int) -> Any:
+        """Normal noise [*shape], of the kind of array that the passes use."""
+        return self.passes.to_array(torch.randn(*shape, generator=self._generator).numpy())
 
     def weights(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
         """Copies of the actor's parameters [P], and of the buffers: observation statistics, and what exploration needs."""

@@ -9,18 +9,18 @@ temperature    −log α · mean (log π(ã|s) + target entropy)
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from learner.algorithms.continuous import Continuous, Transitions
+from learner.algorithms.kernels.bounded_actions import SquashedSample, smaller_value
 from learner.algorithms.kernels.optimizer_step import take_step
 from learner.algorithms.replay.replay_buffer import Sample
 from learner.algorithms.updates import check_finite
 from learner.config.hyperparameters import SACConfig
-from protocol.policy.torch_distributions import squashed_sample
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
 ADVICE = "a lower learning_rate, or normalize_observations"
@@ -59,48 +59,48 @@ class SAC(Continuous):
         temperature = {"temperature_optimizer": self.log_temperature} if self.config.ent_coef is None else {}
         return super().parts() | temperature
 
+    @np.errstate(all="ignore")  # `check_finite` finds and names what is not finite
     def step(self, sample: Sample) -> StepMetrics:
         """One gradient step of the critics, the actor and the temperature; then the target critics move."""
-        net, rows = self.net, Transitions(self, sample)
-        alpha = self.log_temperature.exp()
+        rows, count = Transitions(self, sample), len(sample.slots)
+        alpha = math.exp(self.log_temperature.item())
         next_noise, noise = self.noise(2, *rows.action.shape)
 
-        values = net.values(rows.x, rows.action)
+        values = self.passes.values(rows.x, rows.action)
         error = values - self.targets(rows, next_noise, alpha)
-        critic_loss = 0.5 * (rows.weight * error.square()).mean(1).sum()
-        net.differentiate_critics(critic_loss)
-        found = {"critic_loss": critic_loss.item(), "critic_grad_norm": net.critics.grad.norm().item()}  # type: ignore[union-attr]
+        weighted = rows.weight * error
+        self.passes.critics_backward(weighted / count)
+        critic_loss, q_mean = 0.5 * float((weighted * error).sum()) / count, float(values.sum()) / (2 * count)
+        found = {"critic_loss": critic_loss, "critic_grad_norm": self.net.critics.grad.norm().item()}  # type: ignore[union-attr]
         check_finite(found, self.version, ADVICE)
         take_step(self.optimizers["critic_optimizer"])
 
-        action, log_prob = squashed_sample(net.params(rows.x), noise)
-        actor_loss = (alpha * log_prob - net.values(rows.x, action, constant=True).amin(0)).mean()
-        net.differentiate_actor(actor_loss)
-        found = {"actor_loss": actor_loss.item(), "actor_grad_norm": net.actor.grad.norm().item()}  # type: ignore[union-attr]
+        sampled = SquashedSample(self.passes.params(rows.x), noise)
+        value, by_values = smaller_value(self.passes.values(rows.x, sampled.action, constant=True))
+        by_action = self.passes.action_gradient(by_values / -count)
+        self.passes.actor_backward(sampled.backward(by_action, alpha / count))
+        log_prob = float(sampled.log_prob.sum()) / count
+        actor_loss = alpha * log_prob - float(value.sum()) / count
+        found = {"actor_loss": actor_loss, "actor_grad_norm": self.net.actor.grad.norm().item()}  # type: ignore[union-attr]
         check_finite(found, self.version, ADVICE)
         take_step(self.optimizers["actor_optimizer"])
 
-        by_log_temperature = -(log_prob.detach().mean() + self.target_entropy)
-        ent_coef_loss = (self.log_temperature * by_log_temperature).item()
+        by_log_temperature = -(log_prob + self.target_entropy)
+        ent_coef_loss = self.log_temperature.item() * by_log_temperature
         if self.config.ent_coef is None:
-            self.log_temperature.grad.copy_(by_log_temperature)  # type: ignore[union-attr]
+            self.log_temperature.grad.fill_(by_log_temperature)  # type: ignore[union-attr]
             take_step(self.optimizers["temperature_optimizer"])
+        else:
+            ent_coef_loss = np.nan
 
-        self.target.critics.lerp_(net.critics, self.config.tau)
+        self.target.critics.lerp_(self.net.critics, self.config.tau)
         self.gradient_steps += 1
-        self.replay.update_priorities(sample.slots, error.detach().abs().mean(0).cpu().numpy())
-        return StepMetrics(
-            critic_loss.item(),
-            found["actor_loss"],
-            alpha.item(),
-            ent_coef_loss if self.config.ent_coef is None else np.nan,
-            values.detach().mean().item(),
-            -log_prob.detach().mean().item(),
-        )
+        self.replay.update_priorities(sample.slots, self.passes.to_numpy(abs(error).mean(0)))
+        return StepMetrics(critic_loss, actor_loss, alpha, ent_coef_loss, q_mean, -log_prob)
 
-    def targets(self, rows: Transitions, noise: Tensor, alpha: Tensor) -> Tensor:
+    def targets(self, rows: Transitions, noise: Any, alpha: float) -> Any:
         """The targets [B] of both critics; `noise` [B, D′] samples the next action."""
         with torch.no_grad():
-            action, log_prob = squashed_sample(self.net.params(rows.next_x), noise)
-            value = self.target.values(rows.next_x, action).amin(0) - alpha * log_prob
-            return rows.reward + rows.discount * value
+            sampled = SquashedSample(self.passes.params(rows.next_x), noise)
+            value, _ = smaller_value(self.target_passes.values(rows.next_x, sampled.action))
+            return rows.reward + rows.discount * (value - alpha * sampled.log_prob)

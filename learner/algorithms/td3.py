@@ -7,13 +7,13 @@ actor      −mean Q₀(s, μ(s)),  once for every `policy_delay` steps of the c
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from learner.algorithms.continuous import Continuous, Transitions
+from learner.algorithms.kernels.bounded_actions import DeterministicAction, smaller_value
 from learner.algorithms.kernels.optimizer_step import take_step
 from learner.algorithms.replay.replay_buffer import Sample
 from learner.algorithms.updates import check_finite
@@ -45,36 +45,42 @@ class TD3(Continuous):
         """The scale of the noise that workers add."""
         return [self.config.exploration_noise]
 
+    @np.errstate(all="ignore")  # `check_finite` finds and names what is not finite
     def step(self, sample: Sample) -> StepMetrics:
         """One gradient step of the critics, and perhaps one of the actor and the targets."""
-        net, rows = self.net, Transitions(self, sample)
-        values = net.values(rows.x, rows.action)
+        rows, count = Transitions(self, sample), len(sample.slots)
+        values = self.passes.values(rows.x, rows.action)
         error = values - self.targets(rows, self.noise(*rows.action.shape))
-        critic_loss = (rows.weight * error.square()).mean(1).sum()
-        net.differentiate_critics(critic_loss)
-        found = {"critic_loss": critic_loss.item(), "critic_grad_norm": net.critics.grad.norm().item()}  # type: ignore[union-attr]
+        weighted = rows.weight * error
+        self.passes.critics_backward(weighted * (2 / count))
+        critic_loss, q_mean = float((weighted * error).sum()) / count, float(values.sum()) / (2 * count)
+        found = {"critic_loss": critic_loss, "critic_grad_norm": self.net.critics.grad.norm().item()}  # type: ignore[union-attr]
         check_finite(found, self.version, ADVICE)
         take_step(self.optimizers["critic_optimizer"])
         self.gradient_steps += 1
         actor_loss = self._step_of_actor(rows) if self.gradient_steps % self.config.policy_delay == 0 else np.nan
-        self.replay.update_priorities(sample.slots, error.detach().abs().mean(0).cpu().numpy())
-        return StepMetrics(found["critic_loss"], actor_loss, values.detach().mean().item())
+        self.replay.update_priorities(sample.slots, self.passes.to_numpy(abs(error).mean(0)))
+        return StepMetrics(critic_loss, actor_loss, q_mean)
 
     def _step_of_actor(self, rows: Transitions) -> float:
         """A gradient step of the actor; then both targets move. Returns the loss."""
-        net = self.net
-        loss = -net.values(rows.x, torch.tanh(net.params(rows.x)), constant=True)[0].mean()
-        net.differentiate_actor(loss)
-        found: dict[str, float] = {"actor_loss": loss.item(), "actor_grad_norm": net.actor.grad.norm().item()}  # type: ignore[union-attr]
+        chosen = DeterministicAction(self.passes.params(rows.x))
+        values = self.passes.values(rows.x, chosen.action, constant=True)
+        by_values = 0 * values
+        by_values[0] = -1 / len(chosen.action)
+        self.passes.actor_backward(chosen.backward(self.passes.action_gradient(by_values)))
+        loss = float(-values[0].mean())
+        found = {"actor_loss": loss, "actor_grad_norm": self.net.actor.grad.norm().item()}  # type: ignore[union-attr]
         check_finite(found, self.version, ADVICE)
         take_step(self.optimizers["actor_optimizer"])
-        self.target.flat.lerp_(net.flat, self.config.tau)
-        return found["actor_loss"]
+        self.target.flat.lerp_(self.net.flat, self.config.tau)
+        return loss
 
-    def targets(self, rows: Transitions, noise: Tensor) -> Tensor:
+    def targets(self, rows: Transitions, noise: Any) -> Any:
         """The targets [B] of both critics; `noise` [B, D′] is normal."""
         config = self.config
         with torch.no_grad():
-            smooth = (noise * config.target_noise).clamp(-config.target_noise_clip, config.target_noise_clip)
-            action = (torch.tanh(self.target.params(rows.next_x)) + smooth).clamp(-1, 1)
-            return rows.reward + rows.discount * self.target.values(rows.next_x, action).amin(0)
+            smooth = (noise * config.target_noise).clip(-config.target_noise_clip, config.target_noise_clip)
+            action = (DeterministicAction(self.target_passes.params(rows.next_x)).action + smooth).clip(-1, 1)
+            value, _ = smaller_value(self.target_passes.values(rows.next_x, action))
+            return rows.reward + rows.discount * value

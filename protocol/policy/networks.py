@@ -325,13 +325,16 @@ class ActorAndCritics(FlatNetwork):
                 at = end
         return views
 
-    def differentiate_critics(self, loss: Tensor) -> None:
-        """Write the gradient of a loss into `critics.grad`, in place of what it held."""
-        _write_gradient(loss, self._critics, self._critic_gradients)
+    def differentiate_critics(self, output: Tensor, by_output: Tensor | None = None) -> None:
+        """Write the gradient of a loss into `critics.grad`, in place of what it held.
 
-    def differentiate_actor(self, loss: Tensor) -> None:
-        """Write the gradient of a loss into `actor.grad`, in place of what it held."""
-        _write_gradient(loss, self._actor, [layer.grad for layer in self._actor])
+        `output` is the loss, or what the loss depends on; then `by_output` is the loss's gradient by it.
+        """
+        _write_gradient(output, by_output, self._critics, self._critic_gradients)
+
+    def differentiate_actor(self, output: Tensor, by_output: Tensor | None = None) -> None:
+        """Write the gradient of a loss into `actor.grad`; see `differentiate_critics`."""
+        _write_gradient(output, by_output, self._actor, [layer.grad for layer in self._actor])
 
     def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
         """The actor's output for features [B, D] float32, before the tangent: [B, D′] (deterministic) or [B, 2 D′].
@@ -354,8 +357,10 @@ class ActorAndCritics(FlatNetwork):
         return out[..., 0]
 
 
-def _write_gradient(loss: Tensor, layers: Sequence[Tensor], gradients: Sequence[Tensor | None]) -> None:
-    for found, gradient in zip(torch.autograd.grad(loss, layers), gradients, strict=True):
+def _write_gradient(
+    output: Tensor, by_output: Tensor | None, layers: Sequence[Tensor], gradients: Sequence[Tensor | None]
+) -> None:
+    for found, gradient in zip(torch.autograd.grad(output, layers, by_output), gradients, strict=True):
         assert gradient is not None
         gradient.copy_(found)
 

@@ -367,6 +367,8 @@ def test_a_learner_that_was_killed_goes_on_from_its_newest_checkpoint(tmp_path: 
     assert not list((tmp_path / "tmp").glob("millrace-*")), "nobody tidied up after the learner"
     (folder,) = tmp_path.glob("runs/*")
     saved = int(checkpoints(tmp_path)[-1].stem)
+    rows = read_rows(folder / "metrics.jsonl")
+    (clock,) = (row["time/time_elapsed"] for row in rows if row["time/total_timesteps"] == saved)
     first: list[Progress] = []
 
     def watch(progress: Progress) -> None:
@@ -375,7 +377,7 @@ def test_a_learner_that_was_killed_goes_on_from_its_newest_checkpoint(tmp_path: 
     config = config_from_toml((folder / "config.toml").read_text())
     train(config, folder, watch)
     assert saved < first[0].env_steps <= saved + 256, "it did not go on from the newest checkpoint"
-    assert first[0].wall_s > 0.5, "the clock began again"
+    assert first[0].wall_s > clock, "the clock began again"
     found = summary(folder)
     assert 40_000 - 256 < found["env_steps"] <= 40_000
     assert_balanced(found["ledger"])

@@ -1,4 +1,4 @@
-"""Actor-critics and Q-networks in numpy: forward pass and gradient by hand, without autograd, on the flat parameters.
+"""The networks of the learner in numpy: forward pass and gradient by hand, without autograd, on the flat parameters.
 
 Rule: outputs and gradients are those of `protocol.policy.networks` and autograd, except for rounding, for every kind of
 action. With a small network, torch spends most of the time of a minibatch on its graph, its dispatcher and its allocator,
@@ -17,7 +17,7 @@ from learner.algorithms.kernels.action_gradients import ActionGradients, action_
 from learner.algorithms.kernels.mlp import FusedMLP, Head, Linear
 from protocol.arrays import Array
 from protocol.policy.features import feature_size
-from protocol.policy.layout import hidden_names, named_views, parameter_layout, total_size
+from protocol.policy.layout import CRITICS, LOG_STD_BOUNDS, hidden_names, named_views, parameter_layout, total_size
 from protocol.policy.masks import FORBIDDEN
 from protocol.specs import PolicySpec
 
@@ -103,6 +103,52 @@ class FusedQNetwork:
             self._mlp.backward((gradient - _mean(gradient), np.add.reduce(gradient, 0, keepdims=True)))
         else:
             self._mlp.backward((gradient,))
+
+
+class FusedActorAndCritics:
+    """Computes in numpy what `ActorAndCritics` computes in torch, on the same flat parameters and gradients."""
+
+    def __init__(self, spec: PolicySpec, flat: Array, flat_grad: Array) -> None:
+        """`flat`, `flat_grad`: [P], see `protocol.policy.layout`; the layers before the last ones must not be none."""
+        values, grads = _views(spec, flat), _views(spec, flat_grad)
+        relu = spec.activation == "relu"
+        names = hidden_names(spec)
+        self._clips = spec.head == "squashed"
+        actor = [Linear.stacked([name], values, grads) for name in names]
+        self._actor = FusedMLP(actor, [Head(Linear.stacked(["actor.out"], values, grads), 0)], relu)
+        trunks = [hidden_names(spec, critic) for critic in CRITICS]
+        critics = [Linear.stacked(layers, values, grads) for layers in zip(*trunks, strict=True)]
+        heads = [Head(Linear.stacked([f"{critic}.out"], values, grads), i) for i, critic in enumerate(CRITICS)]
+        self._critics = FusedMLP(critics, heads, relu)
+        self._features = feature_size(spec)
+
+    def params(self, x: Array) -> Array:
+        """Features [B, D] -> the actor's output [P, B], as `ActorAndCritics.params`. The next call overwrites it."""
+        (params,) = self._actor.forward(x)
+        if self._clips:
+            log_std = params[len(params) // 2 :]
+            low, high = LOG_STD_BOUNDS
+            self._inside = (log_std >= low) & (log_std <= high)
+            np.clip(log_std, low, high, out=log_std)
+        return params
+
+    def actor_backward(self, by_params: Array) -> None:
+        """Write the gradient of the actor. `by_params` [P, B]: the loss's gradient by the last `params`; it is changed."""
+        if self._clips:
+            by_params[len(by_params) // 2 :] *= self._inside
+        self._actor.backward((by_params,))
+
+    def values(self, x: Array, action: Array) -> Array:
+        """Features [B, D] and actions [B, D′] -> the values [2, B] of both critics."""
+        return np.concatenate(self._critics.forward(np.concatenate((x, action), 1)))
+
+    def critics_backward(self, by_values: Array) -> None:
+        """Write the gradient of both critics. `by_values` [2, B]: the loss's gradient by the last `values`."""
+        self._critics.backward((by_values[:1], by_values[1:]))
+
+    def action_gradient(self, by_values: Array) -> Array:
+        """The loss's gradient [D′, B] by the actions of the last `values`, from that by the values [2, B]."""
+        return self._critics.input_gradient((by_values[:1], by_values[1:]))[self._features :]
 
 
 def _mean(array: Array) -> Array:

@@ -18,6 +18,7 @@ import learner.algorithms
 import millrace.algorithms
 from learner.algorithms import algorithm_class
 from learner.algorithms.continuous import Continuous, Transitions
+from learner.algorithms.kernels.actor_and_critics import AutogradPasses, FusedPasses
 from learner.algorithms.replay.replay_buffer import Sample
 from learner.config.hyperparameters import HYPERPARAMETERS
 from millrace.testing import check_algorithm
@@ -230,17 +231,19 @@ def as_table(algorithm: Continuous) -> None:
 
 @pytest.mark.parametrize(("terminated", "truncated"), [(False, False), (True, False), (False, True), (True, True)])
 def test_targets_bootstrap_unless_the_task_has_terminated(terminated: bool, truncated: bool) -> None:
-    noise = torch.full((1, 2), 0.5)
+    noise = np.full((1, 2), 0.5)
     sac, td3 = (made(algo, net=(), gamma=0.5) for algo in ("sac", "td3"))
     for algorithm in (sac, td3):
         as_table(algorithm)
-    found = sac.targets(rows_of(sac, terminated, truncated), noise, torch.tensor(0.2))
+    found = sac.targets(rows_of(sac, terminated, truncated), sac.passes.to_array(noise), 0.2)
     latent = np.array([1.5, -0.5])
     log_prob = (-0.125 - 0.5 * math.log(2 * math.pi) - np.log(1 - np.tanh(latent) ** 2)).sum()
     value = 5 + math.tanh(1.5) - 0.2 * log_prob
     np.testing.assert_allclose(found, 3 + (0 if terminated else 0.5 * value), rtol=1e-5)
 
-    found = td3.targets(rows_of(td3, terminated, truncated), 10 * noise)  # 10 · 0.5 · 0.2 is clipped to 0.5
+    found = td3.targets(
+        rows_of(td3, terminated, truncated), td3.passes.to_array(10 * noise)
+    )  # 10 · 0.5 · 0.2 is clipped to 0.5
     value = 5 + min(1, math.tanh(1) + 0.5)
     np.testing.assert_allclose(found, 3 + (0 if terminated else 0.5 * value), rtol=1e-5)
 
@@ -379,11 +382,13 @@ def their_model(algo: str, algorithm: Any) -> Any:
 
 
 @BOTH
+@pytest.mark.parametrize("kind", [FusedPasses, AutogradPasses])
 @pytest.mark.usefixtures("_float64")
-def test_updates_are_those_of_stable_baselines3(algo: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_updates_are_those_of_stable_baselines3(algo: str, kind: type, monkeypatch: pytest.MonkeyPatch) -> None:
     """Six gradient steps: losses, both networks, their targets and the temperature, for the same batches and noise."""
     algorithm = made(algo, learning_rate=1e-3)
     assert algorithm.net.flat.dtype == torch.float64
+    algorithm.passes, algorithm.target_passes = kind(algorithm.net), kind(algorithm.target)
     model = their_model(algo, algorithm)
     from stable_baselines3.common import policies
     from stable_baselines3.common.distributions import DiagGaussianDistribution
@@ -395,7 +400,8 @@ def test_updates_are_those_of_stable_baselines3(algo: str, monkeypatch: pytest.M
         sample = sample_of(generator, 32)
         noise = torch.from_numpy(generator.normal(0, 1, (2, 32, 2)))
         current = [noise[1], noise[0]]  # theirs draws the action of the current state first
-        algorithm.noise = lambda *shape, noise=noise: noise if shape == (2, 32, 2) else noise[0]
+        ours = algorithm.passes.to_array(noise.numpy())
+        algorithm.noise = lambda *shape, ours=ours: ours if shape == (2, 32, 2) else ours[0]
 
         def sampled(self: Any, current: list[torch.Tensor] = current) -> torch.Tensor:
             mean, std = self.distribution.mean, self.distribution.stddev
@@ -415,14 +421,14 @@ def test_updates_are_those_of_stable_baselines3(algo: str, monkeypatch: pytest.M
         theirs = ReplayBufferSamples(**fields)
         monkeypatch.setattr(model.replay_buffer, "sample", lambda *a, theirs=theirs, **k: theirs)
         model.train(gradient_steps=1, batch_size=32)
-        ours = algorithm.step(sample)
+        metrics = algorithm.step(sample)
         logged = model.logger.name_to_value
-        losses.append(ours.critic_loss)
-        assert ours.critic_loss == pytest.approx(logged["train/critic_loss"], rel=1e-9)
-        if not math.isnan(ours.actor_loss):
-            assert ours.actor_loss == pytest.approx(logged["train/actor_loss"], rel=1e-9)
+        losses.append(metrics.critic_loss)
+        assert metrics.critic_loss == pytest.approx(logged["train/critic_loss"], rel=1e-9)
+        if not math.isnan(metrics.actor_loss):
+            assert metrics.actor_loss == pytest.approx(logged["train/actor_loss"], rel=1e-9)
         if algo == "sac":
-            assert ours.ent_coef == pytest.approx(logged["train/ent_coef"], rel=1e-9)
+            assert metrics.ent_coef == pytest.approx(logged["train/ent_coef"], rel=1e-9)
     assert len(set(losses)) == 6
     their_weights_match(algo, model, algorithm)
 
