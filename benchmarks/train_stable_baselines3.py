@@ -1,5 +1,6 @@
-"""PPO, A2C and DQN of Stable-Baselines3 as a program, with our names for their settings. `benchmarks/train.py` runs it.
+"""PPO, A2C, DQN, SAC and TD3 of Stable-Baselines3 as a program, with our names for their settings.
 
+`benchmarks/train.py` and `benchmarks/continuous.py` run it.
 It uses one torch thread, which is fastest here. For each update it prints a line of JSON: env steps, and the time by the
 monotonic clock. Two settings differ: our DQN counts the age of a hard target in gradient steps, and may have several env
 copies.
@@ -13,7 +14,7 @@ import time
 from typing import Any
 
 import torch
-from stable_baselines3 import A2C, DQN, PPO
+from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, StopTrainingOnRewardThreshold
 from stable_baselines3.common.env_util import make_vec_env
@@ -52,6 +53,19 @@ def make(s: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
                 policy_kwargs={"net_arch": s["net"]},
                 **seed,
             )
+        case "sac" | "td3":
+            replay = {name: s[name] for name in ("learning_starts", "batch_size", "tau")}
+            kind: Any = {"sac": SAC, "td3": TD3}[s["algo"]]
+            made: BaseAlgorithm = kind(
+                "MlpPolicy",
+                env,
+                learning_rate=rate,
+                buffer_size=s["replay_size"],
+                policy_kwargs={"net_arch": s["net"]},
+                **seed,
+                **replay,
+            )
+            return made
         case "a2c":
             names = ("gae_lambda", "ent_coef", "vf_coef", "max_grad_norm")
             return A2C(
@@ -88,7 +102,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     s: dict[str, Any] = arguments.settings
-    copies = 1 if s["algo"] == "dqn" else s["envs"]
+    copies = 1 if s["algo"] in ("dqn", "sac", "td3") else s["envs"]
     env = make_vec_env(s["env"], copies, s["seed"], vec_env_cls=SubprocVecEnv if arguments.how == "subproc" else DummyVecEnv)
     evaluate: EvalCallback | None = None
     if arguments.target is not None:

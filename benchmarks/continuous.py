@@ -1,0 +1,113 @@
+"""SAC and TD3 on Pendulum-v1 with Stable-Baselines3's hyperparameters: `python -m benchmarks.continuous`.
+
+Rule: the same networks, batch, buffer, learning rates, replay ratio (1) and one env copy for both. Stable-Baselines3 makes a
+gradient step after each env step. millrace makes 8 after each 8 env steps, in the learner; one worker process collects.
+
+Env steps/s are measured after `learning_starts`. The time to -200 is from the command (with imports, start and evaluations)
+until the mean return of a greedy evaluation is -200; there is an evaluation of 10 episodes every 1,000 env steps. The share
+of the arithmetic is the time that the matrix products of a gradient step alone take, divided by the time of an env step.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")  # before numpy
+
+import argparse
+import math
+import statistics
+import time
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.programs import Contender, run
+from benchmarks.writing import write
+
+OURS, OVERLAPPED, THEIRS = "millrace", "millrace, --max-lag 1", "SB3"
+CONTENDERS = {
+    OURS: Contender("millrace", flags=("--workers", "1", "--lanes", "1")),
+    OVERLAPPED: Contender("millrace", flags=("--workers", "1", "--lanes", "1", "--max-lag", "1")),
+    THEIRS: Contender("benchmarks.train_stable_baselines3", "one"),
+}
+COMMON: dict[str, Any] = {
+    "env": "Pendulum-v1", "envs": 1, "rollout_steps": 8, "batch_size": 256, "gamma": 0.99, "tau": 0.005,
+    "learning_rate": 1e-3, "learning_starts": 100, "replay_size": 50_000, "eval_every": 1000, "eval_episodes": 10,
+}  # fmt: skip
+ROWS, OBSERVATION, ACTION = 256, 3, 1
+WARM_UP_STEPS = 600  # env steps
+SOLVED, LONGEST = -200.0, 20_000
+
+
+def products_s(algo: str, width: int, repeats: int = 200) -> float:
+    """Seconds of the matrix products of one gradient step alone, with two hidden layers of this width."""
+
+    def seconds(n: int, k: int, m: int) -> float:
+        a, b, out = torch.randn(n, k), torch.randn(k, m), torch.empty(n, m)
+        found = []
+        for _ in range(repeats):
+            began_s = time.perf_counter()
+            torch.mm(a, b, out=out)
+            found.append(time.perf_counter() - began_s)
+        return statistics.median(found)
+
+    hidden = seconds(width, width, ROWS)
+    first = seconds(width, OBSERVATION + ACTION, ROWS)
+    # In passes through one network: targets 1 actor and 2 critics; critics 2 forward, 2 backward by weights and 2 by inputs;
+    # SAC's actor 1 forward, 2 critics forward and 2 backward by inputs, the actor's backward by both. TD3 changes its actor
+    # every second step, by one critic.
+    passes = 3 + 2 + 4 + (1 + 2 + 2 + 2 if algo == "sac" else (1 + 1 + 1 + 2) / 2)
+    return passes * (hidden + first)
+
+
+def rate(name: str, settings: dict[str, Any], steps: int, seed: int) -> float:
+    """Env steps/s after the warm-up."""
+    updates = run(name, settings | {"steps": steps, "seed": seed}, contender=CONTENDERS[name]).updates
+    first = next(update for update in updates if update[0] >= WARM_UP_STEPS)
+    return (updates[-1][0] - first[0]) / (updates[-1][1] - first[1])
+
+
+def seconds_to_solve(name: str, settings: dict[str, Any], seed: int) -> float:
+    """Seconds from the command to a greedy evaluation of -200; NaN if the run has not come there."""
+    return run(name, settings | {"steps": LONGEST, "seed": seed}, SOLVED, contender=CONTENDERS[name]).solved_s
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="compare SAC and TD3 on Pendulum-v1 with Stable-Baselines3")
+    parser.add_argument("--rounds", type=int, default=3, help="number of turns, each with another seed")
+    parser.add_argument("--steps", type=int, default=3000, help="env steps of a run whose rate is measured")
+    parser.add_argument("--algo", nargs="+", default=["sac", "td3"], choices=["sac", "td3"])
+    parser.add_argument("--no-solve", action="store_true", help="leave out the time to -200")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    kinds = [(algo, width) for algo in arguments.algo for width in (64, 256)]
+    found: dict[tuple[str, str], list[float]] = {}
+    for seed in range(1, arguments.rounds + 1):
+        for name in CONTENDERS if seed % 2 else reversed(CONTENDERS):
+            for algo, width in kinds:
+                settings = COMMON | {"algo": algo, "net": [width, width]}
+                found.setdefault((f"{algo} {width}", name), []).append(rate(name, settings, arguments.steps, seed))
+                if width == 256 and algo == "sac" and not arguments.no_solve:
+                    found.setdefault(("seconds to -200", name), []).append(seconds_to_solve(name, settings, seed))
+    table = Table("", "contender", "median", "all turns", "ratio to SB3", "share of the arithmetic")
+    rows = []
+    for (what, name), numbers in sorted(found.items()):
+        ratio = statistics.median(our / its for our, its in zip(numbers, found[what, THEIRS], strict=True))
+        median = statistics.median(math.inf if math.isnan(number) else number for number in numbers)
+        algo, _, size = what.partition(" ")
+        share = products_s(algo, int(size)) * median if algo in arguments.algo else math.nan
+        rows.append({"what": what, "contender": name, "median": median, "turns": numbers, "ratio": ratio, "share": share})
+        places = 0 if median > 100 else 1
+        turns = ", ".join(f"{number:,.{places}f}" for number in numbers)
+        table.add_row(
+            what, name, f"{median:,.{places}f}", turns, f"{ratio:.2f}", "" if math.isnan(share) else f"{share:.2f}"
+        )
+    Console(width=120).print(table)
+    write("continuous", {"settings": COMMON, "rows": [{k: v for k, v in row.items() if v == v} for row in rows]})
+
+
+if __name__ == "__main__":
+    main()
