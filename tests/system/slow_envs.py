@@ -16,7 +16,7 @@ from collections import Counter
 from typing import Any
 
 import gymnasium
-from gymnasium.envs.classic_control import CartPoleEnv
+from gymnasium.envs.classic_control import CartPoleEnv, PendulumEnv
 
 from protocol.arrays import Floats
 from workers.envs.toy import Countdown, Info
@@ -89,6 +89,26 @@ class SometimesSlow(CartPoleEnv):
         return super().step(action)  # type: ignore[no-untyped-call]
 
 
+class UnevenPendulum(PendulumEnv):
+    """Pendulum, whose steps take so many seconds; ten times as many in the process that was the first to make a file."""
+
+    def __init__(self, step_s: float = 0.002, slow_file: str = "") -> None:
+        super().__init__()
+        self._step_s = step_s
+        if IN_WORKER:
+            try:
+                os.close(os.open(slow_file, os.O_CREAT | os.O_EXCL))
+                self._step_s *= 10
+            except FileExistsError:
+                pass
+
+    def step(self, action: Any) -> Any:
+        """As Pendulum's, but later."""
+        if IN_WORKER:
+            time.sleep(self._step_s)
+        return super().step(action)  # type: ignore[no-untyped-call]
+
+
 class Ends(Countdown):
     """Ends its process, in the way of `how`, at step `after` of a process, counted over all copies, and at no later one."""
 
@@ -136,5 +156,6 @@ class LeavesThings(Countdown):
 
 
 gymnasium.register("SometimesSlow-v0", f"{__name__}:SometimesSlow", max_episode_steps=500)
+gymnasium.register("UnevenPendulum-v0", f"{__name__}:UnevenPendulum", max_episode_steps=200)
 for _kind in (Slow, Ends, LeavesThings):
     gymnasium.register(f"{_kind.__name__}-v0", f"{__name__}:{_kind.__name__}")

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import signal
+import sys
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import gymnasium
@@ -13,6 +16,8 @@ import millrace
 from learner.config.layers import resolve
 from learner.run_folder.metrics_log import read_rows
 from millrace.launch.local_run import train
+from tests.support.preloaded import workers_of
+from tests.system.processes import START_S, Learner, Stage
 
 SMALL: dict[str, Any] = {
     "preset": "none",
@@ -60,6 +65,31 @@ def test_the_replay_ratio_holds_with_lag_and_after_a_resume(tmp_path: Path, algo
     last = read_rows(resumed / "metrics.jsonl")[-1]
     assert last["time/total_timesteps"] > 500
     assert last["train/n_updates"] == int(0.3 * (last["time/total_timesteps"] - 90) + 1e-9)
+
+
+@pytest.mark.soak
+def test_the_replay_ratio_is_exact_for_eight_uneven_workers_of_which_one_is_killed_now_and_then(
+    stage: Stage, tmp_path: Path
+) -> None:
+    command = f"""--algo sac --preset none --workers 8 --envs 8 --lanes 8 --rollout-steps 5 --max-lag 1 --learning-starts 90
+        --updates-per-step 0.3 --batch-size 16 --net 16 --eval-episodes 1 --steps 20000 --max-env-failures 9
+        --run-dir {stage.runs} --env-kwargs slow_file {tmp_path / "slow"}"""
+    words = [sys.executable, "-m", "millrace", "train", "tests.system.slow_envs:UnevenPendulum-v0", *command.split()]
+    learner = Learner(words, tmp_path / "train.log", stage.runs)
+    stage.started.append(learner)
+    random = Random(0)
+    for killed in range(1, 5):
+        learner.trains(8)
+        random.choice(workers_of(learner.pid)).kill()
+        learner.hears(r"worker w\d was killed by SIGKILL", START_S, killed)
+    learner.trains(8)
+    learner.signal(signal.SIGINT)
+    assert learner.ends() == 130
+    rows = learner.rows()
+    assert rows[-1]["train/n_updates"] > 200
+    for row in rows:
+        own = max(0, row["time/total_timesteps"] - 90)
+        assert row["train/n_updates"] == int(0.3 * own + 1e-9), "the gradient steps that the ratio demands, no more"
 
 
 @ALGORITHMS
