@@ -10,7 +10,7 @@ BIN := .venv/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: train test lint type unit docs site dist bench bench-peers test-learning test-cluster test-model test-processors test-versions \
+.PHONY: train test lint type unit docs site dist bench bench-peers test-learning test-cluster test-clients test-model test-processors test-versions \
 	test-kill soak clean
 
 train: .venv/installed  ## train CartPole-v1 on two worker processes until a greedy evaluation averages 475
@@ -36,6 +36,9 @@ test-model: .venv/installed-dev  ## every interleaving of messages, faults and t
 
 test-cluster: .venv/installed-dev  ## Docker, Prometheus, Slurm and Ray, for real. Needs root, Debian's packages, the extra `ray`; says which
 	$(BIN)/python -m pytest -m cluster -rs -o log_cli=true -o log_cli_level=INFO tests/cluster
+
+test-clients: .venv/installed-dev  ## the clients in C++ and other languages, built and run. Needs Debian's packages; says which
+	$(BIN)/python -m pytest -m clients -rs tests/clients
 
 test-processors: .venv/installed-dev  ## the tests that compare floats, with the code that PyTorch and numpy run on other processors
 	$(BIN)/python -m tests.processors

@@ -1,0 +1,40 @@
+"""Fixtures of the tests of clients: a stage for processes, and the C++ client, built once."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.system.processes import ROOT, Stage
+
+CPP = ROOT / "clients" / "cpp"
+PROBE = "#include <zmq.h>\n#include <sodium.h>\n"
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Iterator[Stage]:
+    """A stage whose processes end with the test."""
+    made = Stage(tmp_path / "stage")
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="session")
+def cpp(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder with the programs of `clients/cpp`, built with its tests. Skips, naming the package, without a compiler."""
+    for program, package in (("g++", "g++"), ("cmake", "cmake")):
+        if shutil.which(program) is None:
+            pytest.skip(f"{program} is missing: apt-get install {package}")
+    headers = subprocess.run(["g++", "-fsyntax-only", "-xc++", "-"], input=PROBE.encode(), capture_output=True, timeout=60)
+    if headers.returncode:
+        pytest.skip("zmq.h or sodium.h is missing: apt-get install libzmq3-dev libsodium-dev")
+    build = tmp_path_factory.mktemp("cpp")
+    for command in (["cmake", "-S", str(CPP), "-B", str(build), "-DTESTS=ON"], ["cmake", "--build", str(build), "-j2"]):
+        done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert "warning:" not in done.stderr, done.stderr
+    return build
