@@ -85,7 +85,7 @@ def test_cartpole_gives_gymnasiums_bits(cpp: Path) -> None:
 
 
 def test_the_learner_acts_and_the_client_steps(stage: Stage, cpp: Path) -> None:
-    """The client describes the environment, steps all lanes, is evaluated, and leaves with exit code 0 when the run is over."""
+    """The client describes the environment, steps all lanes, is evaluated, and leaves with exit code 0 at the end."""
     address = f"tcp://127.0.0.1:{free_port()}"
     runs = learner(stage, address, "--inference", "learner")
     client = stage.start([str(cpp / "cartpole"), address, "--name", "cpp0"], "cpp0")
