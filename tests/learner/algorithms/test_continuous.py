@@ -248,6 +248,47 @@ def test_targets_bootstrap_unless_the_task_has_terminated(terminated: bool, trun
     np.testing.assert_allclose(found, 3 + (0 if terminated else 0.5 * value), rtol=1e-5)
 
 
+def ring(terminated: bool, truncated: bool) -> Batch:
+    """0 → 1 → 2 → 0 with rewards 1, 3 and -2 and random actions, 30 times; each third step ends as asked."""
+    episodes, generator = 30, np.random.default_rng(0)
+    last = np.tile([False, False, True], (episodes, 1)).T
+    return msgspec.structs.replace(
+        batch(0, 3, episodes),
+        obs=(np.repeat(np.eye(3, dtype=np.float32)[[0, 1, 2, 0], None], episodes, 1),),
+        action=generator.uniform(-1, 1, (3, episodes, 2)).astype(np.float32),
+        reward=np.repeat(np.array([[1], [3], [-2]], np.float32), episodes, 1),
+        terminated=last & terminated,
+        truncated=last & truncated,
+        valid=np.ones((3, episodes), bool),
+    )
+
+
+@BOTH
+@pytest.mark.parametrize(("terminated", "truncated", "n_step"), [(True, False, 1), (False, True, 2), (True, True, 2)])
+def test_values_of_a_chain_are_learned(algo: str, terminated: bool, truncated: bool, n_step: int) -> None:
+    """V(2) = -2 if the task ends there, else -2 + γ V(0); V(1) = 3 + γ V(2); V(0) = 1 + γ V(1)."""
+    fixed = {"ent_coef": 1e-9} if algo == "sac" else {}
+    settings: dict[str, Any] = {
+        "net": (),
+        "gamma": 0.5,
+        "tau": 0.2,
+        "learning_rate": 0.02,
+        "n_step": n_step,
+        "batch_size": 64,
+    }
+    algorithm = made(algo, **settings, **fixed)
+    algorithm.replay.add(ring(terminated, truncated))
+    for left in range(200, 0, -1):
+        for optimizer in algorithm.optimizers.values():
+            optimizer.param_groups[0]["lr"] = 0.1 * left / 200
+        algorithm.step(algorithm.replay.sample(32))
+    around = np.array([[0, 0.5, 0], [0, 0, 0.5], [0 if terminated else 0.5, 0, 0]])
+    expected = np.linalg.solve(np.eye(3) - around, [1, 3, -2])
+    states, still = algorithm.passes.to_array(np.eye(3, dtype=np.float32)), np.zeros((3, 2), np.float32)
+    found = algorithm.passes.to_numpy(algorithm.passes.values(states, algorithm.passes.to_array(still)))
+    np.testing.assert_allclose(found, [expected, expected], atol=0.1)  # the values of the two kinds of end differ by 0.28
+
+
 # -------------------------------------------------------------------- the replay ratio
 
 
