@@ -101,6 +101,16 @@ class RewardScaler:
 
     def scale(self, batch: Batch) -> Floats:
         """Count the batch, then return its scaled rewards [T, ΣN]."""
+        self.count(batch)
+        return (batch.reward / self.std).astype(np.float32)
+
+    @property
+    def std(self) -> float:
+        """The standard deviation of the discounted return; 1 before any reward is counted."""
+        return float(self._moments.std)
+
+    def count(self, batch: Batch) -> None:
+        """Count the rewards of a batch."""
         ends = EpisodeEnds.of(batch)
         for at in range(0, len(batch.lane), batch.copies):  # rollouts of a lane are in the order of collection
             columns = slice(at, at + batch.copies)
@@ -112,7 +122,6 @@ class RewardScaler:
                 batch.reward[:, columns], ends.columns(columns), self._gamma, start
             )
             self._moments.update(found[ends.valid[:, columns]])
-        return (batch.reward / self._moments.std).astype(np.float32)
 
     def state_dict(self) -> dict[str, Any]:
         """Tensors and numbers, copied."""

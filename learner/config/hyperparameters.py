@@ -193,6 +193,8 @@ class OffPolicyConfig(AlgorithmConfig, frozen=True):
     """Number of rewards in a target before it bootstraps."""
     tau: Free[Annotated[float, msgspec.Meta(gt=0, le=1)]] = 0.005
     """τ of the polyak update: the fraction by which the target network moves in each gradient step."""
+    normalize_rewards: Fixed[bool] = False
+    """Divide rewards by the running standard deviation of the discounted return, when they are drawn from the buffer."""
 
 
 class DQNConfig(OffPolicyConfig, frozen=True):

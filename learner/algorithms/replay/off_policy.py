@@ -1,7 +1,8 @@
 """The base of algorithms that learn from a replay buffer: what an update does besides its gradient steps, and the state.
 
-No sockets, no files, no clock; seeded. The buffer holds raw observations. They are normalized when they are drawn, with the
-current statistics. With one torch thread on a CPU the same batches give the same bits, also after `load_state_dict`.
+No sockets, no files, no clock; seeded. The buffer holds raw observations and rewards. They are normalized when they are
+drawn, with the current statistics. With one torch thread on a CPU the same batches give the same bits, also after
+`load_state_dict`.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from torch.optim import Optimizer
 
 from learner.algorithms.algorithm import Algorithm
 from learner.algorithms.kernels.optimizer_step import state_of
-from learner.algorithms.normalization import ObservationNormalizer
+from learner.algorithms.normalization import ObservationNormalizer, RewardScaler
 from learner.algorithms.replay.mixed_replay import MixedReplay
 from learner.algorithms.replay.replay_buffer import Sample
 from learner.algorithms.updates import scheduled
@@ -67,6 +68,7 @@ class OffPolicy(Algorithm):
         # The buffers of the policy also hold what exploration needs: so the normalizer gets the policy with another head.
         self.normalizer = ObservationNormalizer(msgspec.structs.replace(policy, head="actor_critic"))
         self.statistics: Floats = self.normalizer.buffers()
+        self.rewards = RewardScaler(config.gamma)  # counts own rewards, not those of prior data
         self._remembered: dict[str, Any] = {}
 
     @abstractmethod
@@ -95,13 +97,15 @@ class OffPolicy(Algorithm):
             optimizer.param_groups[0]["lr"] = learning_rate
         beta = config.priority_beta + (1 - config.priority_beta) * done
         self.replay.add(batch)
+        if config.normalize_rewards:
+            self.rewards.count(batch)
         self.normalizer.update(features(self.policy, batch.obs)[:-1], batch.valid)
         self.statistics = self.normalizer.buffers()
         self.env_steps += batch.env_steps
         self.version += 1
         measured: list[Any] = []
         for _ in range(self.steps_due() if len(self.replay) else 0):
-            measured.append(self.step(self.replay.sample(config.batch_size, beta)))
+            measured.append(self.step(self.sample(beta)))
             pulse()
         metrics = {
             "train/learning_rate": learning_rate,
@@ -128,9 +132,16 @@ class OffPolicy(Algorithm):
     def learn_from_prior(self, pulse: Callable[[], None]) -> None:
         """Make `prior_steps` gradient steps on prior data alone, less those that were made."""
         while self.prior_gradient_steps < self.config.prior_steps:
-            self.step(self.replay.sample(self.config.batch_size))
+            self.step(self.sample())
             self.prior_gradient_steps += 1
             pulse()
+
+    def sample(self, beta: float = 1.0) -> Sample:
+        """A minibatch from the replay buffer and from prior data. `beta`: see `ReplayBuffer.sample`."""
+        drawn = self.replay.sample(self.config.batch_size, beta)
+        if self.config.normalize_rewards:
+            drawn = drawn._replace(reward=(drawn.reward / self.rewards.std).astype(np.float32))
+        return drawn
 
     def inputs(self, leaves: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Features [B, D], normalized with the current statistics, and images [B, *leaf] uint8, of leaves [B, *leaf]."""
@@ -166,6 +177,7 @@ class OffPolicy(Algorithm):
             {name: tensor.clone() for name, tensor in self.tensors.items()}
             | {name: state_of(optimizer) for name, optimizer in self.optimizers.items()}
             | {"observations": self.normalizer.state_dict()}
+            | ({"rewards": self.rewards.state_dict()} if self.config.normalize_rewards else {})
             | self.numbers()
         )
 
@@ -191,6 +203,8 @@ class OffPolicy(Algorithm):
             optimizer.load_state_dict(copy.deepcopy(state[name]))
         self.normalizer.load_state_dict(state["observations"])
         self.statistics = self.normalizer.buffers()
+        if self.config.normalize_rewards:
+            self.rewards.load_state_dict(state["rewards"])
         self.load_numbers(state)
 
 

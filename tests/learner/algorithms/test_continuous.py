@@ -267,7 +267,7 @@ def ring(terminated: bool, truncated: bool) -> Batch:
 @pytest.mark.parametrize(("terminated", "truncated", "n_step"), [(True, False, 1), (False, True, 2), (True, True, 2)])
 def test_values_of_a_chain_are_learned(algo: str, terminated: bool, truncated: bool, n_step: int) -> None:
     """V(2) = -2 if the task ends there, else -2 + γ V(0); V(1) = 3 + γ V(2); V(0) = 1 + γ V(1)."""
-    fixed = {"ent_coef": 1e-9} if algo == "sac" else {}
+    fixed: dict[str, Any] = {"ent_coef": 1e-9} if algo == "sac" else {}
     settings: dict[str, Any] = {
         "net": (),
         "gamma": 0.5,
@@ -315,6 +315,28 @@ def test_the_ratio_counts_on_from_where_it_is_changed() -> None:
         assert after.gradient_steps == made_so_far + (after.env_steps - env_steps) // 2
 
 
+# -------------------------------------------------------------------- reward normalization
+
+
+@pytest.mark.parametrize("algo", ["sac", "td3", "dqn"])
+def test_with_normalized_rewards_their_scale_does_not_matter(algo: str) -> None:
+    """A power of two scales float32 numbers exactly."""
+    action = action_spec(gymnasium.spaces.Discrete(3)) if algo == "dqn" else ACTION
+    settings: dict[str, Any] = {"gradient_steps": 5} if algo == "dqn" else {"updates_per_step": 0.2}
+    weights = []
+    for scale, normalize in ((1, True), (1024, True), (1024, False)):
+        algorithm = made(algo, action, normalize_rewards=normalize, batch_size=16, n_step=2, **settings)
+        for seed in range(3):
+            noise = batch(seed)
+            taken = np.arange(24).reshape(8, 3) % 3 if algo == "dqn" else noise.action
+            algorithm.update(msgspec.structs.replace(noise, action=taken, reward=noise.reward * np.float32(scale)), no_pulse)
+        weights.append(algorithm.weights()[0])
+        std = algorithm.rewards.std
+        assert std == 1 if not normalize else 2 * scale < std < 20 * scale, "the rewards have mean 1 and deviation 2"
+    np.testing.assert_array_equal(weights[0], weights[1])
+    assert not np.array_equal(weights[1], weights[2])
+
+
 # -------------------------------------------------------------------- the rules of all algorithms
 
 
@@ -326,6 +348,7 @@ def test_they_keep_the_rules_of_an_algorithm(algo: str) -> None:
         "replay": "prioritized",
         "n_step": 3,
         "normalize_observations": True,
+        "normalize_rewards": True,
         "learning_rate_schedule": "linear",
     }
     check_algorithm(algorithm_class(algo), learns=False, **plain, **more)
