@@ -43,8 +43,7 @@ Tools:
 - `ActorCriticNetwork`, `QNetwork` and `ActorAndCritics`: the networks that workers act with, and `log_prob_and_entropy` or
   `squashed_sample` of their outputs.
 - `ReplayBuffer`, which gives a `Sample` of transitions, `MixedReplay`, which also draws prior data, and `Transitions`, the
-  tensors of a sample. `ObservationNormalizer`: the
-  running statistics of observations.
+  arrays of a sample. `ObservationNormalizer` and `RewardScaler`: running statistics of observations and of returns.
 - `features` and `normalize`: observations as these networks take them.
 - `UsageError`: raise it, in one line, for settings or spaces that cannot be used.
 - `check_finite` and `scheduled`: the check before a gradient step, and settings that fall over the run.
@@ -59,7 +58,7 @@ from learner.algorithms.continuous import Continuous, Transitions
 from learner.algorithms.dqn import DQN
 from learner.algorithms.impala import Impala
 from learner.algorithms.minibatches import LossInput, Observations
-from learner.algorithms.normalization import ObservationNormalizer
+from learner.algorithms.normalization import ObservationNormalizer, RewardScaler
 from learner.algorithms.ppo import PPO
 from learner.algorithms.reinforce import REINFORCE
 from learner.algorithms.replay.mixed_replay import MixedReplay
@@ -128,6 +127,7 @@ __all__ = [
     "QNetwork",
     "REINFORCEConfig",
     "ReplayBuffer",
+    "RewardScaler",
     "SACConfig",
     "Sample",
     "TD3Config",
