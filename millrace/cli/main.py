@@ -261,6 +261,12 @@ def _keys(argv: list[str]) -> int:
     return 0
 
 
+def _conform(argv: list[str]) -> int:
+    from millrace.cli.conform import run
+
+    return run(argv, lambda line: print(line, flush=True))
+
+
 def _launch(argv: list[str]) -> int:
     if argv and argv[0] in HELP_FLAGS:
         launchers = [f"  millrace launch {name:10}  {about}" for name, about in LAUNCHERS.items()]
@@ -345,6 +351,9 @@ GROUPS = {
         "record": Command(_record, "RUN --out DATASET [flags]", "write its episodes as a Minari dataset"),
         "plot": Command(_plot, "RUN [RUN ...] [--out FILE]", "draw learning curves as a PNG"),
         "report": Command(_report, "RUN [RUN ...] [--out FILE]", "compare runs on one HTML page"),
+    },
+    "Write a client in another language": {
+        "conform": Command(_conform, "[flags] -- COMMAND …", "check a client against the wire document, rule by rule"),
     },
     "Measure millrace itself": {
         "bench": Command(_bench, "[NAME [flags]]", "run the benchmarks (in a clone of the repository)"),

@@ -16,7 +16,7 @@ from benchmarks.program import BENCHMARKS
 from learner.config.command_line import RunFlags, _none_for_tyro
 from learner.config.flag_parser import parse_flags
 from learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig
-from millrace.cli import flags, keys, status
+from millrace.cli import conform, flags, keys, status
 from millrace.cli.arguments import Arguments
 from millrace.cli.main import COMMANDS
 from protocol.errors import UsageError
@@ -129,6 +129,9 @@ def _parse(name: str, argv: list[str]) -> None:
         case "keys" | "status":
             with mock.patch.object(Arguments, "parse", _parse_only):
                 (keys.keys if name == "keys" else _status)(argv)
+        case "conform":
+            with mock.patch.object(Arguments, "parse", _parse_only):
+                conform.run(argv, lambda line: None)
         case "launch":
             launcher, *rest = argv or [""]
             if launcher not in LAUNCHERS:

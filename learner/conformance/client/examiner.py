@@ -1,0 +1,143 @@
+"""Runs the checks, one after the other, against one client. Pure: events and `now` in, effects and results out.
+
+Rule: it never waits without a deadline. A check that fails ends the client, so the next one begins with a new process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from learner.conformance.client import rules
+from learner.conformance.client.learner import Learner, Settings
+from learner.conformance.client.rules import Rule
+from learner.conformance.client.script import Broken, Effect, Event, Script, Skipped, Wait
+
+CHECK_S = 40.0  # longest time that one check may take
+
+
+@dataclass(frozen=True)
+class Check:
+    """A check: its name and what it does."""
+
+    name: str
+    script: Callable[[Learner], Script[None]]
+
+
+@dataclass(frozen=True)
+class Result:
+    """How a check ended."""
+
+    name: str
+    outcome: Literal["passed", "failed", "skipped"]
+    seconds: float
+    rule: Rule | None = None
+    expected: str = ""
+    got: str = ""
+    note: str = ""
+    """why it was skipped"""
+
+
+class Examiner:
+    """The state of the whole test."""
+
+    def __init__(self, checks: Sequence[Check], settings: Settings, now: float, limit_s: float) -> None:
+        """`limit_s`: the whole test ends after so long; what was not checked by then has failed."""
+        self.learner = Learner(settings)
+        self.results: list[Result] = []
+        self._checks = list(checks)
+        self._deadline_s = now + limit_s
+        self._script: Script[None] | None = None
+        self._wait = Wait(0.0)
+        self._due_s = self._began_s = now
+
+    @property
+    def done(self) -> bool:
+        """Whether every check has a result."""
+        return len(self.results) == len(self._checks)
+
+    def handle(self, event: Event, now: float) -> list[Effect]:
+        """Handle an event."""
+        self.learner.now = now
+        if self._script is not None:
+            try:
+                if self.learner.take(event, self._wait.wanted):
+                    self._resume(event)
+            except Broken as broken:
+                self._failed(broken)
+        return self._taken()
+
+    def tick(self, now: float) -> list[Effect]:
+        """Do what is due: begin the next check, or end a wait."""
+        learner = self.learner
+        learner.now = now
+        if self.done:
+            return []
+        if now > self._deadline_s:
+            self._out_of_time()
+        elif self._script is None:
+            self._begin()
+        elif now - self._began_s > CHECK_S:
+            self._failed(Broken(rules.PATIENCE, f"the check to end within {CHECK_S:g} s", "none of that"))
+        else:
+            try:
+                if learner.watch is not None and learner.runs and not learner.watch.said_goodbye and learner.hears:
+                    learner.watch.late(now)
+                if now >= self._due_s:
+                    self._resume(None)
+            except Broken as broken:
+                self._failed(broken)
+        return self._taken()
+
+    def next_due_s(self) -> float:
+        """Time at which `tick` must be called at the latest."""
+        return self._due_s
+
+    def _begin(self) -> None:
+        check = self._checks[len(self.results)]
+        self._began_s = self.learner.now
+        self._script = check.script(self.learner)
+        self._resume(None)
+
+    def _resume(self, event: Event | None) -> None:
+        """Let the check go on until it waits again or ends."""
+        assert self._script is not None
+        try:
+            self._wait = self._script.send(event)
+            self._due_s = self.learner.now + self._wait.for_s
+        except StopIteration:
+            self._record("passed")
+        except Skipped as skipped:
+            self._record("skipped", note=str(skipped))
+        except Broken as broken:
+            self._failed(broken)
+
+    def _failed(self, broken: Broken) -> None:
+        self._record("failed", rule=broken.rule, expected=broken.expected, got=broken.got)
+        if self.learner.runs:
+            self.learner.end()
+
+    def _record(
+        self,
+        outcome: Literal["passed", "failed", "skipped"],
+        *,
+        rule: Rule | None = None,
+        expected: str = "",
+        got: str = "",
+        note: str = "",
+    ) -> None:
+        name = self._checks[len(self.results)].name
+        self.results.append(Result(name, outcome, self.learner.now - self._began_s, rule, expected, got, note))
+        self._script, self._due_s = None, self.learner.now
+        if self.done and self.learner.runs:
+            self.learner.end()
+
+    def _out_of_time(self) -> None:
+        while not self.done:
+            self._began_s = self.learner.now
+            self._record("failed", rule=rules.PATIENCE, expected="the whole test within --limit-s", got="no time left")
+
+    def _taken(self) -> list[Effect]:
+        effects, self.learner.effects = self.learner.effects, []
+        return effects

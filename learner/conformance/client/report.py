@@ -1,0 +1,78 @@
+"""The report of a client's test, as lines for people and as plain data for programs. Pure.
+
+Rule: a reader who has never seen the code understands a failure: the rule in the document's words, where it stands, what was
+expected, what was got, what to do next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from textwrap import wrap
+from typing import Any
+
+from learner.conformance.client.examiner import Result
+from learner.conformance.client.rules import DOCUMENT
+
+WIDTH = 110
+MARKS = {"passed": "ok     ", "failed": "FAILED ", "skipped": "skipped"}
+
+
+def line_of(result: Result) -> str:
+    """One line about a check."""
+    note = f"  ({result.note})" if result.note else ""
+    return f"{MARKS[result.outcome]}  {result.name}{note}"
+
+
+def explanation(result: Result, earlier: Sequence[Result] = ()) -> list[str]:
+    """What a failure means, indented. If an earlier check failed by the same rule for the same reason, only its name."""
+    if result.rule is None:
+        return []
+    same = next(
+        (each for each in earlier if (each.rule, each.expected, each.got) == (result.rule, result.expected, result.got)),
+        None,
+    )
+    if same is not None:
+        return [f"           as in: {same.name}"]
+    parts = {
+        "rule": f"{result.rule.text}. ({DOCUMENT}, “{result.rule.section}”)",
+        "expected": result.expected,
+        "got": result.got,
+        "next": result.rule.mend,
+    }
+    return [
+        f"           {label if not at else '':9} {line}"
+        for label, text in parts.items()
+        for at, line in enumerate(wrap(text, WIDTH - 21) or [""])
+    ]
+
+
+def summary(results: Sequence[Result]) -> str:
+    """The last line."""
+    counts = {outcome: sum(each.outcome == outcome for each in results) for outcome in MARKS}
+    seconds = sum(each.seconds for each in results)
+    skipped = f", {counts['skipped']} skipped" if counts["skipped"] else ""
+    verdict = "the client does not conform" if counts["failed"] else "the client conforms"
+    return f"{counts['passed']} checks passed, {counts['failed']} failed{skipped}, {seconds:.0f} s: {verdict}"
+
+
+def as_data(results: Sequence[Result], profile: str, command: Sequence[str]) -> dict[str, Any]:
+    """The report as plain data, for a program."""
+    return {
+        "profile": profile,
+        "command": list(command),
+        "conforms": all(each.outcome != "failed" for each in results),
+        "checks": [
+            {
+                "name": each.name,
+                "outcome": each.outcome,
+                "seconds": round(each.seconds, 3),
+                "section": each.rule.section if each.rule else "",
+                "rule": each.rule.text if each.rule else "",
+                "expected": each.expected,
+                "got": each.got,
+                "next": each.rule.mend if each.rule else "",
+                "note": each.note,
+            }
+            for each in results
+        ],
+    }

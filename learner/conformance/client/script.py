@@ -1,0 +1,132 @@
+"""How a check is written: a generator that sends messages and waits for events. Pure: no socket, process or clock.
+
+A check yields a `Wait` and gets the event that it waited for, or None when the time is over. It raises `Broken` if a rule is
+broken, and `Skipped` if this client gives it nothing to look at. `Learner` is the learner that it plays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from learner.conformance.client.rules import Rule
+from protocol.errors import BadMessage
+from protocol.messages import Inquire, ToLearner
+from protocol.wire.codec import Buffer
+
+T = TypeVar("T")
+
+
+class Broken(Exception):
+    """The client broke a rule."""
+
+    def __init__(self, rule: Rule, expected: str, got: str) -> None:
+        super().__init__(f"{rule.text}: expected {expected}, got {got}")
+        self.rule, self.expected, self.got = rule, expected, got
+
+
+class Skipped(Exception):
+    """The check found nothing to look at. The text says why."""
+
+
+# ------------------------------------------------------------------------------------------------------------- effects
+
+
+@dataclass(frozen=True)
+class Send:
+    """Effect: send these frames to this peer."""
+
+    peer: bytes
+    frames: Sequence[Buffer]
+
+
+@dataclass(frozen=True)
+class StartClient:
+    """Effect: start the client's process."""
+
+
+@dataclass(frozen=True)
+class AskToStop:
+    """Effect: send SIGTERM to the client."""
+
+
+@dataclass(frozen=True)
+class EndClient:
+    """Effect: end the client, whatever it does."""
+
+
+@dataclass(frozen=True)
+class CutConnection:
+    """Effect: close the socket; with it every connection, and what is queued."""
+
+
+@dataclass(frozen=True)
+class Listen:
+    """Effect: open the socket again, at the same address."""
+
+
+Effect = Send | StartClient | AskToStop | EndClient | CutConnection | Listen
+
+# -------------------------------------------------------------------------------------------------------------- events
+
+
+@dataclass(frozen=True)
+class Heard:
+    """Event: a message arrived, or one that cannot be read."""
+
+    peer: bytes
+    message: ToLearner | Inquire | BadMessage
+
+
+@dataclass(frozen=True)
+class Ended:
+    """Event: the client's process has ended."""
+
+    code: int
+    """exit code; below 0: the number of the signal"""
+    last_line: str
+    """the last line that it printed"""
+
+
+Event = Heard | Ended
+
+
+def nothing(event: Event) -> bool:
+    """Wait for no event, only for the time."""
+    return False
+
+
+@dataclass(frozen=True)
+class Wait:
+    """Wait until `wanted` says yes to an event, at most `for_s`."""
+
+    for_s: float
+    wanted: Callable[[Event], bool] = nothing
+
+
+Script = Generator[Wait, Event | None, T]
+"""What a part of a check is: it yields waits and returns a value."""
+
+
+def brief(message: Any) -> str:
+    """A message in a few words: its type and its numbers."""
+    if isinstance(message, BadMessage):
+        return f"an unreadable message ({message})"
+    shown = [
+        f"{name} {value!r}"
+        for name in (
+            "session",
+            "attempt",
+            "ticket",
+            "lane",
+            "incarnation",
+            "version",
+            "sequence",
+            "replies",
+            "reason",
+            "error",
+        )
+        if (value := getattr(message, name, None)) is not None and value != ""
+    ]
+    return f"{type(message).__name__}({', '.join(shown)})"

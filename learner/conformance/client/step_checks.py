@@ -1,0 +1,468 @@
+"""The checks of the environment profile: the learner acts, and the client resets and steps on order.
+
+Each function is one check (`script.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from learner.conformance.client import rules
+from learner.conformance.client.join_checks import described
+from learner.conformance.client.learner import Learner
+from learner.conformance.client.script import Broken, Heard, Script, Skipped, Wait, brief
+from protocol.arrays import Array
+from protocol.envs.spaces import leaves_with_own_dtype, make_flatten
+from protocol.messages import (
+    Call,
+    Drain,
+    Goodbye,
+    Heartbeat,
+    LaneIncarnation,
+    Release,
+    Reset,
+    Returned,
+    Step,
+    Stepped,
+    Weights,
+    Welcome,
+)
+from protocol.specs import StepSpec
+from protocol.wire.codec import encode
+from protocol.wire.plain_values import pack, unpack
+
+WALK_STEPS = 300  # steps of the walk that looks for ends of episodes
+LIMIT_STEPS = 2000  # most steps of the walk to a time limit
+LANES = 2
+
+
+def step_spec(learner: Learner, lanes: int = LANES) -> Script[StepSpec]:
+    """A session in which the client steps its copies on order."""
+    env = yield from described(learner)
+    N = learner.settings.copies
+    return StepSpec(
+        envs=(learner.settings.env,),
+        copies=(0,) * (N * lanes),
+        lanes=(N,) * lanes,
+        observation=leaves_with_own_dtype(env.observation_space),
+        action=leaves_with_own_dtype(env.action_space),
+        heartbeat_s=learner.settings.heartbeat_s,
+        learner_timeout_s=30.0,
+    )
+
+
+class Stepping:
+    """A session of the environment profile, with the orders that checks need."""
+
+    def __init__(self, learner: Learner, spec: StepSpec, env: Any) -> None:
+        self.learner, self.spec, self.env = learner, spec, env
+        self.space = env.action_space
+        self.space.seed(1)
+        self.flatten = make_flatten(env.action_space)
+
+    def reset(self, lane: int = 0, incarnation: int = 0, copies: Sequence[int] | None = None, seed: int | None = 7) -> Reset:
+        """A Reset of these copies (or all), seeded by `seed` and the copy's number."""
+        copies = range(self.spec.lanes[lane]) if copies is None else copies
+        seeds = tuple(None if seed is None else seed + copy for copy in copies)
+        options = np.frombuffer(pack(None), np.uint8)
+        return Reset(self.learner.session, self.learner.ticket(), lane, incarnation, tuple(copies), seeds, options)
+
+    def step(self, lane: int = 0, incarnation: int = 0, actions: tuple[Array, ...] | None = None) -> Step:
+        """A Step with these actions, or random ones."""
+        chosen = self.random_actions(self.spec.lanes[lane]) if actions is None else actions
+        return Step(self.learner.session, self.learner.ticket(), lane, incarnation, chosen)
+
+    def random_actions(self, N: int) -> tuple[Array, ...]:
+        """Random actions of N copies."""
+        each = [self.flatten(self.space.sample()) for _ in range(N)]
+        return tuple(
+            np.stack([np.asarray(values, leaf.dtype) for values in of_leaf])
+            for leaf, of_leaf in zip(self.spec.action, zip(*each, strict=True), strict=True)
+        )
+
+    def do(self, order: Reset | Step) -> Script[Stepped]:
+        """Send an order and wait for its answer."""
+        self.learner.send(order)
+        return (yield from self.answer(order))
+
+    def walk(self, actions: Sequence[tuple[Array, ...]]) -> Script[list[Stepped]]:
+        """The answers to steps of lane 0 with these actions."""
+        rows: list[Stepped] = []
+        for each in actions:
+            row = yield from self.do(self.step(actions=each))
+            rows.append(row)
+        return rows
+
+    def answer(self, order: Reset | Step) -> Script[Stepped]:
+        """The answer to an order that was sent."""
+        text = f"Stepped for the {type(order).__name__} with ticket {order.ticket} of lane {order.lane}"
+        return (yield from self.learner.expect(Stepped, rules.ORDER_ANSWERED, text, ticket=order.ticket))
+
+
+def stepping(learner: Learner) -> Script[Stepping]:
+    """A new session of the environment profile."""
+    spec = yield from step_spec(learner)
+    env = yield from described(learner)
+    yield from learner.joining()
+    learner.welcome(spec)
+    return Stepping(learner, spec, env)
+
+
+def answers_reset_and_step(learner: Learner) -> Script[None]:
+    """The first orders of a lane."""
+    steps = yield from stepping(learner)
+    first = yield from steps.do(steps.reset())
+    if first.reward.any() or first.terminated.any() or first.truncated.any():
+        raise Broken(rules.AFTER_RESET, "reward 0 and neither flag in the answer to a Reset of all copies", brief(first))
+    for _ in range(5):
+        yield from steps.do(steps.step())
+
+
+def says_nothing_without_an_order(learner: Learner) -> Script[None]:
+    """No Stepped before the first Reset."""
+    yield from stepping(learner)
+    yield from learner.quiet(Stepped, 1.0, rules.ORDER_ONLY, "nothing before the first order of the session")
+
+
+def ends_episodes(learner: Learner) -> Script[None]:
+    """A walk with random actions: ends of episodes, and the resets that follow them."""
+    steps = yield from stepping(learner)
+    longest = steps.env.max_episode_steps
+    before = yield from steps.do(steps.reset())
+    length = np.zeros(steps.spec.lanes[0], int)
+    ends = 0
+    for _ in range(WALK_STEPS):
+        row = yield from steps.do(steps.step())
+        ended = before.terminated | before.truncated
+        for n in np.flatnonzero(ended):
+            if row.reward[n] or row.terminated[n] or row.truncated[n]:
+                raise Broken(
+                    rules.NEXT_STEP,
+                    f"reward 0 and neither flag in copy {n}, in the step after the end of its episode",
+                    f"reward {row.reward[n]:g}, terminated {row.terminated[n]}, truncated {row.truncated[n]}",
+                )
+        length = np.where(ended, 0, length + 1)
+        _within(longest, length, row)
+        ends += int((row.terminated | row.truncated).sum())
+        before = row
+        if ends >= 6:
+            return
+    if not ends:
+        raise Skipped(f"no episode ended in {WALK_STEPS} steps")
+
+
+def _within(longest: int | None, length: Array, row: Stepped) -> None:
+    """An episode at the time limit has an end."""
+    if longest is None:
+        return
+    at_limit = (length >= longest) & ~(row.terminated | row.truncated)
+    if at_limit.any():
+        n = int(np.argmax(at_limit))
+        raise Broken(
+            rules.TRUNCATED,
+            f"the end of the episode of copy {n} at {longest} steps, the longest_episode that the client described",
+            f"no end after {int(length[n])} steps",
+        )
+
+
+def truncates_at_the_limit(learner: Learner) -> Script[None]:
+    """A walk to the time limit."""
+    steps = yield from stepping(learner)
+    longest = steps.env.max_episode_steps
+    if longest is None or longest > LIMIT_STEPS:
+        raise Skipped("the environment has no time limit" if longest is None else f"its time limit is {longest} steps")
+    act = controller(steps)
+    row = yield from steps.do(steps.reset())
+    length = np.zeros(steps.spec.lanes[0], int)
+    for _ in range(3 * longest):
+        before, row = row, (yield from steps.do(steps.step(actions=act(row))))
+        length = np.where(before.terminated | before.truncated, 0, length + 1)
+        _within(longest, length, row)
+        early = row.truncated & ~row.terminated & (length < longest) & (length > 0)
+        if early.any():
+            n = int(np.argmax(early))
+            raise Broken(rules.TRUNCATED, f"truncated at {longest} steps, or terminated", f"truncated at {int(length[n])}")
+        at = (length == longest) & row.truncated
+        if at.any():
+            return
+    raise Skipped("no episode reached the time limit")
+
+
+def controller(steps: Stepping) -> Callable[[Stepped], tuple[Array, ...]]:
+    """What chooses actions for long episodes: for a cart with a pole (Box(4), Discrete(2)) it balances the pole."""
+    (observation, *more), (action, *others) = steps.spec.observation, steps.spec.action
+    is_pole = not more and not others and observation.shape == (4,) and action.kind == "discrete" and action.sizes == (2,)
+    if not is_pole:
+        return lambda row: steps.random_actions(len(row.reward))
+    gains = np.array([0.1, 0.2, 1.0, 0.6])
+    return lambda row: ((row.obs[0] @ gains > 0).astype(action.dtype) + np.asarray(action.start or 0, action.dtype),)
+
+
+def begins_the_same_episode_for_a_seed(learner: Learner) -> Script[None]:
+    """The same seeds twice."""
+    steps = yield from stepping(learner)
+    one = yield from steps.do(steps.reset(seed=11))
+    yield from steps.do(steps.step())
+    two = yield from steps.do(steps.reset(seed=11))
+    if not _same(one, two):
+        raise Broken(rules.SEEDED, "the same first observations for the same seeds", "others")
+
+
+def _same(one: Stepped, other: Stepped) -> bool:
+    return all(a.tobytes() == b.tobytes() for a, b in zip(one.obs, other.obs, strict=True))
+
+
+def executes_an_order_once(learner: Learner) -> Script[None]:
+    """Orders are repeated, because their answers were lost."""
+    steps = yield from stepping(learner)
+    actions = [steps.random_actions(steps.spec.lanes[0]) for _ in range(3)]
+    yield from steps.do(steps.reset(seed=3))
+    plain = yield from steps.walk(actions)
+    order = steps.reset(seed=3)
+    yield from steps.do(order)
+    learner.send(order)
+    yield from steps.answer(order)
+    for each, expected in zip(actions, plain, strict=True):
+        again = steps.step(actions=each)
+        found = yield from steps.do(again)
+        if not _same(found, expected):
+            raise Broken(
+                rules.ORDER_ONCE,
+                "the same observations, for the same seed and actions, as without repeated orders",
+                "others",
+            )
+        for _ in range(2):
+            learner.send(again)
+            yield from learner.expect(
+                Stepped, rules.ORDER_ONCE, f"the answer to ticket {again.ticket} again", ticket=again.ticket
+            )
+
+
+def ignores_an_old_order(learner: Learner) -> Script[None]:
+    """A late copy of an order that others followed."""
+    steps = yield from stepping(learner)
+    first = steps.reset()
+    yield from steps.do(first)
+    yield from steps.do(steps.step())
+    learner.send(first)
+    yield from learner.quiet(Stepped, 0.7, rules.ORDER_OLD, f"no answer to ticket {first.ticket} after a newer one")
+    yield from steps.do(steps.step())
+
+
+def ignores_another_session(learner: Learner) -> Script[None]:
+    """Orders of the session before."""
+    old = yield from stepping(learner)
+    reset, later = old.reset(), old.reset()
+    yield from old.do(reset)
+    steps = yield from stepping(learner)
+    yield from steps.do(steps.reset())
+    learner.send(later)
+    yield from learner.quiet(Stepped, 0.7, rules.OTHER_SESSION, "no answer to an order of the session before")
+    yield from steps.do(steps.step())
+
+
+def serves_two_lanes(learner: Learner) -> Script[None]:
+    """Orders of two lanes on their way at the same time."""
+    steps = yield from stepping(learner)
+    for orders in (
+        [steps.reset(0), steps.reset(1)],
+        [steps.step(0), steps.step(1)],
+        [steps.step(1), steps.step(0)],
+    ):
+        waiting = {order.ticket for order in orders}
+        for order in orders:
+            learner.send(order)
+        while waiting:
+            found = yield from learner.expect(Stepped, rules.ORDER_ANSWERED, f"Stepped for tickets {sorted(waiting)}")
+            waiting.discard(found.ticket)
+
+
+def starts_a_lane_again(learner: Learner) -> Script[None]:
+    """A higher incarnation, then an order of the lower one."""
+    steps = yield from stepping(learner)
+    yield from steps.do(steps.reset())
+    yield from steps.do(steps.step())
+    yield from steps.do(steps.reset(incarnation=2))
+    yield from steps.do(steps.step(incarnation=2))
+    learner.send(steps.step(incarnation=1))
+    yield from learner.quiet(Stepped, 0.7, rules.INCARNATION, "no answer to an order of incarnation 1 after one of 2")
+    yield from steps.do(steps.step(incarnation=2))
+
+
+def resets_some_copies(learner: Learner) -> Script[None]:
+    """A Reset that lists one copy."""
+    steps = yield from stepping(learner)
+    if steps.spec.lanes[0] < 2:
+        raise Skipped("the lanes have one copy each (--copies)")
+    yield from steps.do(steps.reset(seed=5))
+    before = yield from steps.do(steps.step())
+    after = yield from steps.do(steps.reset(copies=(0,), seed=5))
+    for one, other in zip(before.obs, after.obs, strict=True):
+        if one[1:].tobytes() != other[1:].tobytes():
+            raise Broken(rules.RESET_SOME, "the observations of copies that the Reset does not list as they were", "others")
+    if after.reward[0] or after.terminated[0] or after.truncated[0]:
+        raise Broken(rules.AFTER_RESET, "reward 0 and neither flag in copy 0", f"reward {after.reward[0]:g}")
+
+
+def answers_calls(learner: Learner) -> Script[None]:
+    """A Call of an attribute that every gymnasium environment has, and of one that none has."""
+    steps = yield from stepping(learner)
+    yield from steps.do(steps.reset())
+    for name in ("render_mode", "no_such_attribute_anywhere"):
+        given = np.frombuffer(pack(((), {})), np.uint8)
+        call = Call(learner.session, learner.ticket(), 0, 0, (0,), name, False, given)
+        learner.send(call)
+        found = yield from learner.expect(Returned, rules.RETURNED, f"Returned for ticket {call.ticket}", ticket=call.ticket)
+        if found.error:
+            continue
+        results = unpack(found.results.tobytes())
+        if name == "no_such_attribute_anywhere" or not isinstance(results, list) or len(results) != 1:
+            raise Broken(rules.RETURNED, "one result for the one copy, or an error", f"{results!r}"[:100])
+    yield from steps.do(steps.step())
+
+
+def beats_while_it_steps(learner: Learner) -> Script[None]:
+    """Orders follow each other without a pause; the watch counts heartbeats meanwhile."""
+    steps = yield from stepping(learner)
+    yield from steps.do(steps.reset())
+    until_s = learner.now + 2 * 1.5 + 8 * learner.settings.heartbeat_s
+    while learner.now < until_s:
+        yield from steps.do(steps.step())
+
+
+def lists_its_tickets(learner: Learner) -> Script[None]:
+    """Heartbeats after answers: nothing is held any more."""
+    steps = yield from stepping(learner)
+    yield from steps.do(steps.reset())
+    for _ in range(3):
+        found = yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
+    if found.tickets:
+        raise Broken(rules.HEARTBEAT_TICKETS, "no tickets while no order is open", f"{list(found.tickets)}")
+
+
+def releases_a_lane(learner: Learner) -> Script[None]:
+    """A lane goes to another worker, and comes back later."""
+    steps = yield from stepping(learner)
+    yield from steps.do(steps.reset(0))
+    yield from steps.do(steps.reset(1))
+    learner.send(steps.step(0))  # it may be answered or not
+    learner.send(Release(learner.session, (LaneIncarnation(0, 0),)))
+    learner.release(0)
+    yield from learner.sleep(0.3)
+    for _ in range(3):
+        found = yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
+    if found.tickets:
+        raise Broken(rules.RELEASE, "no tickets of the released lane", f"{list(found.tickets)}")
+    yield from steps.do(steps.step(1))
+    yield from steps.do(steps.reset(0, incarnation=1))
+    yield from steps.do(steps.step(0, incarnation=1))
+
+
+def forgets_unlisted_lanes(learner: Learner) -> Script[None]:
+    """A Release was lost; the next HeartbeatReply does not list the lane."""
+    steps = yield from stepping(learner)
+    yield from steps.do(steps.reset(0))
+    yield from steps.do(steps.reset(1))
+    learner.unlisted.add(0)
+    for _ in range(3):
+        yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
+    learner.unlisted.clear()
+    yield from steps.do(steps.step(1))
+    yield from steps.do(steps.reset(0, incarnation=1))
+
+
+def answers_after_a_reset_connection(learner: Learner) -> Script[None]:
+    """The connection is cut while an order is open."""
+    steps = yield from stepping(learner)
+    yield from steps.do(steps.reset())
+    order = steps.step()
+    learner.send(order)
+    learner.cut()
+    heard = yield Wait(10, lambda event: isinstance(event, Heard) and isinstance(event.message, Heartbeat | Stepped))
+    if heard is None:
+        raise Broken(rules.CONNECTION, "the client over a new connection, in the same session", "nothing within 10 s")
+    if not (isinstance(heard, Heard) and isinstance(heard.message, Stepped)):
+        learner.send(order)
+        yield from steps.answer(order)
+    yield from steps.do(steps.step())
+
+
+def ignores_what_it_cannot_read(learner: Learner) -> Script[None]:
+    """An unknown type, an extra field, a missing frame, bytes that are no msgpack."""
+    steps = yield from stepping(learner)
+    yield from steps.do(steps.reset())
+    order = steps.step()
+    head = msgpack.unpackb(bytes(encode(order)[0]))
+    arrays = list(encode(order)[1:])
+    learner.send_frames([msgpack.packb([*head, "one field too many"]), *arrays])
+    learner.send_frames([msgpack.packb(head[:-1])])
+    learner.send_frames([msgpack.packb(head)])
+    learner.send_frames([msgpack.packb(head), *arrays, b"one frame too many"])
+    learner.send_frames([msgpack.packb(["NoSuchMessage", learner.session])])
+    learner.send_frames([msgpack.packb({"type": "Refuse"})])
+    learner.send_frames([b"\xc1"])
+    learner.send_frames([b""])
+    found = yield Wait(0.7, lambda event: isinstance(event, Heard) and isinstance(event.message, Stepped))
+    if found is not None:
+        raise Broken(
+            rules.IGNORE_UNREADABLE, "no answer to a Step with a field or a frame too many or too few",
+            brief(found.message) if isinstance(found, Heard) else "",
+        )  # fmt: skip
+    yield from steps.do(steps.step())
+
+
+def reads_long_messages(learner: Learner) -> Script[None]:
+    """A Release with as many lanes as a head holds, and a frame of 8 MiB."""
+    steps = yield from stepping(learner)
+    yield from steps.do(steps.reset())
+    learner.send(Release(learner.session, tuple(LaneIncarnation(1000 + lane, 0) for lane in range(60_000))))
+    learner.send(Weights(1, np.zeros(1 << 21, np.float32), np.zeros(0, np.float32)))
+    yield from steps.do(steps.step())
+
+
+def takes_a_late_welcome(learner: Learner) -> Script[None]:
+    """A copy of the Welcome arrives while the lane has an episode."""
+    steps = yield from stepping(learner)
+    yield from steps.do(steps.reset(seed=9))
+    expected = [steps.random_actions(steps.spec.lanes[0]) for _ in range(2)]
+    rows = yield from steps.walk(expected)
+    yield from steps.do(steps.reset(seed=9))
+    yield from steps.do(steps.step(actions=expected[0]))
+    assert learner.hello is not None
+    learner.send(Welcome(learner.session, learner.hello.attempt, steps.spec))
+    found = yield from steps.do(steps.step(actions=expected[1]))
+    if not _same(found, rows[1]):
+        raise Broken(rules.REPEATED_WELCOME, "the episode to go on after a repeated Welcome", "another observation")
+
+
+def drains_while_it_steps(learner: Learner) -> Script[None]:
+    """Drain follows an order at once."""
+    steps = yield from stepping(learner)
+    yield from steps.do(steps.reset())
+    order = steps.step()
+    learner.send(order)
+    learner.send(Drain("the run is over"))
+    answered = False
+    while True:
+        found = yield Wait(
+            learner.settings.patience_s,
+            lambda event: isinstance(event, Heard) and isinstance(event.message, Stepped | Goodbye),
+        )
+        if found is None:
+            raise Broken(rules.DRAIN, "Goodbye after Drain", f"none within {learner.settings.patience_s:g} s")
+        assert isinstance(found, Heard)
+        if isinstance(found.message, Goodbye):
+            break
+        answered = True
+    listed = order.ticket in found.message.tickets
+    if listed == answered:
+        raise Broken(
+            rules.DRAIN,
+            f"ticket {order.ticket} either answered before Goodbye or listed in it",
+            "both" if listed else "neither",
+        )
+    yield from learner.left(rules.DRAIN, 0, "Drain and Goodbye")

@@ -1,0 +1,294 @@
+"""Rules that hold for every message of a session, whatever the check is about. Pure: messages and `now` in, `Broken` out.
+
+The watch knows what the learner has sent in this session. It sees each message of the client before the check does.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from learner.conformance.client import rules
+from learner.conformance.client.lane_rows import LaneRows
+from learner.conformance.client.script import Broken, brief
+from protocol.arrays import Array
+from protocol.errors import BadRollout
+from protocol.messages import (
+    Call,
+    Collect,
+    Described,
+    EpisodeRows,
+    Evaluate,
+    Evaluated,
+    Goodbye,
+    Heartbeat,
+    HeartbeatReply,
+    Permit,
+    Reset,
+    Returned,
+    Rollout,
+    Step,
+    Stepped,
+    ToLearner,
+    ToWorker,
+    Weights,
+)
+from protocol.rollout import validate
+from protocol.specs import DescribeSpec, Leaf, RunSpec, StepSpec
+
+HEARTBEATS_LATE = 2.0  # of these may be missing,
+LATE_S = 1.5  # and a busy machine may add so many seconds
+
+
+class Dealt(NamedTuple):
+    """A permit, and the version that it asks for."""
+
+    permit: Permit
+    version: int
+
+
+class Watch:
+    """One session, as the learner sees it."""
+
+    def __init__(self, session: int, run: DescribeSpec | RunSpec | StepSpec, now: float) -> None:
+        self.session, self.run = session, run
+        self.heard_heartbeat_s = now
+        self.heartbeat: Heartbeat | None = None
+        """the newest"""
+        self.replies = 0
+        """number of the last HeartbeatReply sent"""
+        self.versions: dict[int, Weights] = {}
+        """the weights sent, by version"""
+        self.orders: dict[int, Reset | Step | Call | Evaluate] = {}
+        """by ticket"""
+        self.permits: dict[int, Dealt] = {}
+        """by ticket"""
+        self.answers: dict[int, Stepped | Returned] = {}
+        """the first answer to each order, by ticket"""
+        self.rollouts: dict[int, Rollout] = {}
+        """the first rollout of each ticket"""
+        self.said_goodbye = False
+        self._asked, self._answered = Counter[int](), Counter[int]()
+        self._next_sequence: dict[tuple[int, int], int] = {}
+        self._rows: dict[tuple[int, int], LaneRows] = {}
+        self._steps = -1
+
+    # ------------------------------------------------------------------------------------------ what the learner said
+
+    def sent(self, message: ToWorker) -> None:
+        """The learner has sent this message."""
+        match message:
+            case Weights(version):
+                self.versions[version] = message
+            case Reset() | Step() | Call() | Evaluate():
+                if message.session == self.session:
+                    self.orders[message.ticket] = message
+                    self._asked[message.ticket] += 1
+            case Collect(session, version, permits) if session == self.session:
+                for permit in permits:
+                    self.permits[permit.ticket] = Dealt(permit, version)
+                    self._asked[permit.ticket] += 1
+            case HeartbeatReply(session, number) if session == self.session:
+                self.replies = max(self.replies, number)
+
+    def restarted(self, lane: int, incarnation: int) -> None:
+        """The lane was closed and may begin again in this incarnation."""
+        self._next_sequence.pop((lane, incarnation), None)
+        self._rows.pop((lane, incarnation), None)
+
+    # --------------------------------------------------------------------------------------------- what the client says
+
+    def late(self, now: float) -> None:
+        """Raise `Broken` if a Heartbeat is overdue."""
+        silent_s = now - self.heard_heartbeat_s
+        if silent_s > HEARTBEATS_LATE * self.run.heartbeat_s + LATE_S:
+            raise Broken(
+                rules.HEARTBEAT,
+                f"a Heartbeat every {self.run.heartbeat_s:g} s (heartbeat_s of this session)",
+                f"none for {silent_s:.1f} s",
+            )
+
+    def see(self, message: ToLearner, now: float) -> None:
+        """Check one message of this session. Raises `Broken`."""
+        if self.said_goodbye:
+            raise Broken(rules.AFTER_GOODBYE, "nothing after Goodbye", brief(message))
+        match message:
+            case Heartbeat():
+                self._see_heartbeat(message, now)
+            case Described() if not isinstance(self.run, DescribeSpec):
+                raise Broken(
+                    rules.DESCRIBE, f"Described only with a DescribeSpec, not a {type(self.run).__name__}", brief(message)
+                )
+            case Stepped() | Returned():
+                self._see_answer(message)
+            case Rollout():
+                self._see_rollout(message)
+            case Evaluated() | EpisodeRows():
+                if not isinstance(self.orders.get(message.ticket), Evaluate):
+                    raise Broken(rules.EVALUATE, "the ticket of an Evaluate of this session", brief(message))
+            case Goodbye():
+                self._see_tickets(message.tickets)
+                self.said_goodbye = True
+            case _:
+                pass
+
+    def _see_heartbeat(self, message: Heartbeat, now: float) -> None:
+        self.heard_heartbeat_s = now
+        before, self.heartbeat = self.heartbeat, message
+        if message.replies > self.replies:
+            raise Broken(
+                rules.HEARTBEAT_REPLIES, f"at most {self.replies}, the last reply of this session", f"{message.replies}"
+            )
+        if before is not None and message.replies < before.replies:
+            raise Broken(rules.HEARTBEAT_REPLIES, f"{before.replies} or more, as before", f"{message.replies}")
+        if message.steps < self._steps:
+            raise Broken(rules.HEARTBEAT_STEPS, f"{self._steps} or more, as before", f"{message.steps}")
+        self._steps = message.steps
+        if message.version != -1 and message.version not in self.versions:
+            expected = (
+                f"-1 or one of {sorted(self.versions)}" if self.versions else "-1: no weights were sent in this session"
+            )
+            raise Broken(rules.HEARTBEAT_VERSION, expected, f"{message.version}")
+        if before is not None and message.version < before.version:
+            raise Broken(rules.HEARTBEAT_VERSION, f"{before.version} or newer, as before", f"{message.version}")
+        self._see_tickets(message.tickets)
+
+    def _see_tickets(self, tickets: Sequence[int]) -> None:
+        known = self.orders.keys() | self.permits.keys()
+        if strange := [ticket for ticket in tickets if ticket not in known]:
+            raise Broken(
+                rules.HEARTBEAT_TICKETS,
+                f"tickets of this session{f', among {sorted(known)[-5:]}' if known else ', which has none yet'}",
+                f"ticket {strange[0]}",
+            )
+        if finished := [ticket for ticket in tickets if ticket in self.answers or ticket in self.rollouts]:
+            raise Broken(
+                rules.HEARTBEAT_TICKETS, "only tickets that are not finished", f"ticket {finished[0]}, which was answered"
+            )
+
+    def _see_answer(self, message: Stepped | Returned) -> None:
+        order = self.orders.get(message.ticket)
+        if order is None or isinstance(order, Evaluate):
+            last = f"ticket {max(self.orders)} was the last order" if self.orders else "no order was sent in this session"
+            raise Broken(rules.ORDER_ONLY, f"no answer without an order ({last})", brief(message))
+        if isinstance(order, Call) != isinstance(message, Returned):
+            raise Broken(rules.ORDER_ANSWERED, f"the answer to a {type(order).__name__}", brief(message))
+        if message.lane != order.lane:
+            raise Broken(
+                rules.LANES, f"lane {order.lane}, as in the order with ticket {order.ticket}", f"lane {message.lane}"
+            )
+        if message.incarnation != order.incarnation:
+            raise Broken(
+                rules.INCARNATION, f"incarnation {order.incarnation}, as in the order", f"incarnation {message.incarnation}"
+            )
+        self._answered[message.ticket] += 1
+        if self._answered[message.ticket] > self._asked[message.ticket]:
+            raise Broken(
+                rules.ORDER_ONLY,
+                f"{self._asked[message.ticket]} answer to ticket {message.ticket}, which was sent as often",
+                f"{self._answered[message.ticket]} answers",
+            )
+        if isinstance(message, Stepped):
+            assert isinstance(self.run, StepSpec)
+            check_stepped(message, self.run)
+        first = self.answers.setdefault(message.ticket, message)
+        if first is not message and isinstance(first, Stepped) and isinstance(message, Stepped):
+            for name in ("reward", "terminated", "truncated"):
+                if getattr(first, name).tobytes() != getattr(message, name).tobytes():
+                    raise Broken(
+                        rules.ORDER_ONCE,
+                        f"the {name} of the first answer to ticket {message.ticket}, {getattr(first, name).tolist()}",
+                        f"{getattr(message, name).tolist()}",
+                    )
+            if any(one.tobytes() != other.tobytes() for one, other in zip(first.obs, message.obs, strict=True)):
+                raise Broken(
+                    rules.ORDER_ONCE, f"the same observations as in the first answer to ticket {message.ticket}", "others"
+                )
+
+    def _see_rollout(self, message: Rollout) -> None:
+        if not isinstance(self.run, RunSpec):
+            raise Broken(rules.TICKETS, "no rollout in a session whose copies are stepped on order", brief(message))
+        dealt = self.permits.get(message.ticket)
+        if dealt is None:
+            raise Broken(rules.TICKETS, f"a ticket that was dealt: {sorted(self.permits) or 'none yet'}", brief(message))
+        permit, version = dealt
+        if message.lane != permit.lane:
+            raise Broken(
+                rules.LANES, f"lane {permit.lane}, as in the permit with ticket {permit.ticket}", f"lane {message.lane}"
+            )
+        if message.version not in self.versions or message.version < version:
+            raise Broken(
+                rules.WEIGHTS_NEW_ENOUGH, f"version {version} or newer, of those sent", f"version {message.version}"
+            )
+        self._answered[message.ticket] += 1
+        first = self.rollouts.setdefault(message.ticket, message)
+        if first is not message:
+            if self._answered[message.ticket] > self._asked[message.ticket]:
+                raise Broken(
+                    rules.ROLLOUT_ONCE,
+                    f"{self._asked[message.ticket]} rollout of ticket {message.ticket}, which was dealt as often",
+                    f"{self._answered[message.ticket]} rollouts",
+                )
+            if first.sequence != message.sequence or not same_arrays(first, message):
+                raise Broken(rules.ROLLOUT_ONCE, f"the same rollout of ticket {message.ticket} again", "another")
+            return
+        place = (message.lane, permit.incarnation)
+        expected = self._next_sequence.get(place, 0)
+        if message.sequence != expected:
+            raise Broken(
+                rules.SEQUENCE,
+                f"sequence {expected} of lane {place[0]}, incarnation {place[1]}",
+                f"sequence {message.sequence}",
+            )
+        self._next_sequence[place] = expected + 1
+        try:
+            validate(message, self.run)
+        except BadRollout as error:
+            raise Broken(rules.ROWS, "a rollout that keeps the row format", str(error)) from None
+        rows = self._rows.setdefault(place, LaneRows(self.run))
+        rows.see(message, self.versions[message.version])
+
+
+def same_arrays(one: Rollout, other: Rollout) -> bool:
+    """Whether two rollouts have the same bits."""
+    arrays = [(*each.obs, each.action, each.log_prob, each.reward, each.terminated, each.truncated) for each in (one, other)]
+    return all(a.tobytes() == b.tobytes() for a, b in zip(*arrays, strict=True)) and one.episodes == other.episodes
+
+
+def check_stepped(message: Stepped, spec: StepSpec) -> None:
+    """Raise `Broken` if the arrays are not those of the lane."""
+    N = spec.lanes[message.lane]
+    if len(message.obs) != len(spec.observation):
+        raise Broken(rules.STEPPED_ARRAYS, f"{len(spec.observation)} arrays in obs", f"{len(message.obs)}")
+    expected: list[tuple[str, Array, tuple[int, ...], str]] = [
+        ("reward", message.reward, (N,), "float64"),
+        ("terminated", message.terminated, (N,), "bool"),
+        ("truncated", message.truncated, (N,), "bool"),
+    ]
+    expected += [
+        (f"obs {leaf.path}".strip(), array, (N, *leaf.shape), leaf.dtype)
+        for leaf, array in zip(spec.observation, message.obs, strict=True)
+    ]
+    for name, array, shape, dtype in expected:
+        if array.shape != shape or array.dtype != np.dtype(dtype):
+            raise Broken(rules.STEPPED_ARRAYS, f"{name} {dtype}{list(shape)}", f"{name} {array.dtype}{list(array.shape)}")
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise Broken(rules.IN_SPACE, f"finite values in {name}", f"{array[~np.isfinite(array)][0]}")
+    if message.infos.dtype != np.uint8 or message.infos.ndim != 1:
+        raise Broken(rules.STEPPED_ARRAYS, "infos uint8[bytes]", f"infos {message.infos.dtype}{list(message.infos.shape)}")
+    for leaf, array in zip(spec.observation, message.obs, strict=True):
+        if why := outside(array, leaf):
+            raise Broken(rules.IN_SPACE, f"values of its space in obs {leaf.path}".strip(), why)
+
+
+def outside(array: Array, leaf: Leaf) -> str:
+    """What is wrong with the values of a leaf that counts; empty if nothing is."""
+    if not leaf.sizes:
+        return ""
+    counts = array - np.reshape(leaf.start, leaf.shape)
+    if (counts < 0).any() or (counts >= np.reshape(leaf.sizes, leaf.shape)).any():
+        return f"{array.min()} to {array.max()}"
+    return ""

@@ -1,0 +1,100 @@
+"""`millrace conform`: the flags of the check of a client, and its report."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from learner.conformance.client.examiner import Check, Result
+from learner.conformance.client.learner import Settings
+from learner.conformance.client.profiles import PROFILES
+from learner.conformance.client.report import as_data, explanation, line_of, summary
+from millrace.cli.arguments import Arguments
+from millrace.conform import ADDRESS_VARIABLE, Client, conform
+from protocol.env_spec import EnvSpec
+from protocol.errors import UsageError
+from protocol.keys.key_folder import TOKEN_VARIABLE
+
+ABOUT = (
+    "Check a client, which is a worker in any language. Plays the learner on a port of this machine, starts COMMAND, and "
+    "walks it through the messages, states and faults of the wire document. In COMMAND, {address} is where to connect and "
+    f"{{token}} a file with the join token; the environment has them as {ADDRESS_VARIABLE} and {TOKEN_VARIABLE}. Exit code "
+    "0: the client conforms; 1: it does not."
+)
+
+
+def run(argv: list[str], write: Callable[[str], None]) -> int:
+    """Check the client. `write` takes the lines of the report. Returns the exit code."""
+    flags, command = _split(argv)
+    arguments = Arguments("conform", ABOUT)
+    arguments.usage = "millrace conform [flags] -- COMMAND …"
+    arguments.flag(
+        "--profile", choices=sorted(PROFILES), default="environment",
+        help="environment: the learner acts, the client resets and steps its copies; collector: the client acts, by the "
+        "weights that it is sent (default: environment)",
+    )  # fmt: skip
+    arguments.flag(
+        "--env",
+        default="CartPole-v1",
+        metavar="ID",
+        help="the environment that the client is asked for (default: CartPole-v1)",
+    )
+    arguments.flag("--copies", type=int, default=2, metavar="N", help="env copies in a lane (default: 2)")
+    arguments.flag("--only", default="", metavar="TEXT", help="run only the checks whose name contains TEXT")
+    arguments.flag("--json", default="", metavar="FILE", help="also write the report to FILE, as JSON")
+    arguments.flag("--with-keys", action="store_true", help="encrypt the connection; {token} in COMMAND does so too")
+    arguments.flag(
+        "--patience-s",
+        type=float,
+        default=5.0,
+        metavar="S",
+        help="seconds that an answer of the client may take (default: 5)",
+    )
+    arguments.flag(
+        "--start-s", type=float, default=20.0, metavar="S", help="seconds that the client may take to start (default: 20)"
+    )
+    arguments.flag(
+        "--limit-s", type=float, default=300.0, metavar="S", help="seconds that the whole test may take (default: 300)"
+    )
+    values = arguments.parse(flags)
+    if not command:
+        raise UsageError(
+            "conform: which client? expected its command after --, as in: millrace conform -- ./client {address}"
+        )
+    if not (values.copies >= 1 and min(values.patience_s, values.start_s, values.limit_s) > 0):
+        raise UsageError("conform: expected --copies of 1 or more, and seconds above 0")
+    checks = _chosen(PROFILES[values.profile], values.only)
+    settings = Settings(EnvSpec(values.env), copies=values.copies, patience_s=values.patience_s, start_s=values.start_s)
+    results: list[Result] = []
+
+    def watch(result: Result) -> None:
+        write("\n".join([line_of(result), *explanation(result, results)]))
+        results.append(result)
+
+    about = f"profile {values.profile}, {values.env}, {values.copies} copies in a lane, {len(checks)} checks"
+    write(f"{about}: {' '.join(command)}")
+    conform(Client(tuple(command), values.with_keys), checks, settings, values.limit_s, watch)
+    write(summary(results))
+    if values.json:
+        report = json.dumps(as_data(results, values.profile, command), indent=2, ensure_ascii=False)
+        try:
+            Path(values.json).write_text(report + "\n")
+        except OSError as error:
+            raise UsageError(f"conform: report {values.json} not written: {error.strerror}") from error
+    return int(any(result.outcome == "failed" for result in results))
+
+
+def _split(argv: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The flags, and the client's command behind `--`."""
+    if "--" not in argv:
+        return list(argv), []
+    at = list(argv).index("--")
+    return list(argv[:at]), list(argv[at + 1 :])
+
+
+def _chosen(checks: Sequence[Check], only: str) -> list[Check]:
+    chosen = [check for check in checks if only in check.name]
+    if not chosen:
+        raise UsageError(f"conform: --only {only}: expected a part of the name of a check, as in: {checks[0].name}")
+    return chosen

@@ -1,0 +1,250 @@
+"""Checks a client, a worker in any language: opens the learner's port, starts the client, and lets the examiner decide.
+
+Rule: this file decides nothing about the conversation (`learner/conformance/client`). It only sends, receives, starts and
+ends processes, each with a deadline. No process that it started outlives it.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import tempfile
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import zmq
+
+from learner.conformance.client.examiner import Check, Examiner, Result
+from learner.conformance.client.learner import Settings
+from learner.conformance.client.script import (
+    AskToStop,
+    CutConnection,
+    Effect,
+    EndClient,
+    Ended,
+    Heard,
+    Listen,
+    Send,
+    StartClient,
+)
+from learner.members.bound import bind
+from protocol.bounds import escaped
+from protocol.errors import UsageError
+from protocol.keys.key_folder import TOKEN_VARIABLE, KeyFolder, Keyring
+from protocol.wire.learner_link import LearnerLink
+
+ADDRESS_VARIABLE = "MILLRACE_ADDRESS"
+ADDRESS_WORD, TOKEN_WORD = "{address}", "{token}"
+POLL_S = 0.05
+STOP_WITHIN_S = 4.0  # after SIGTERM, before SIGKILL
+LISTEN_WITHIN_S = 3.0  # the port of a socket that was closed may be taken for a moment
+KEPT_LINES = 40  # of the client's output
+MOST_PACKED_BYTES = 1 << 26  # of one message
+
+
+@dataclass(frozen=True)
+class Client:
+    """The client's command."""
+
+    command: tuple[str, ...]
+    """words; `{address}` and `{token}` in them are replaced"""
+    with_keys: bool = False
+    """whether the connection is encrypted, and the client needs its token"""
+
+
+def conform(
+    client: Client, checks: Sequence[Check], settings: Settings, limit_s: float, watch: Callable[[Result], None]
+) -> list[Result]:
+    """Run the checks. `watch` is called with each result. Raises `UsageError` if the command cannot be started."""
+    with ExitStack() as resources:
+        port = resources.enter_context(_Port(client.with_keys or any(TOKEN_WORD in word for word in client.command)))
+        process = resources.enter_context(_Process(client.command, port.address, port.token))
+        examiner = Examiner(checks, settings, time.monotonic(), limit_s)
+        told = 0
+
+        def perform(effects: list[Effect]) -> None:
+            for effect in effects:
+                match effect:
+                    case Send(peer, frames):
+                        port.send(peer, frames)
+                    case StartClient():
+                        process.start()
+                    case AskToStop():
+                        process.ask_to_stop()
+                    case EndClient():
+                        process.end()
+                        port.discard()
+                    case CutConnection():
+                        port.cut()
+                    case Listen():
+                        port.listen()
+
+        while not examiner.done:
+            perform(examiner.tick(time.monotonic()))
+            for event in port.heard(min(POLL_S, examiner.next_due_s() - time.monotonic())):
+                perform(examiner.handle(event, time.monotonic()))
+            if (ended := process.ended()) is not None:
+                for event in port.heard(POLL_S):  # its last words
+                    perform(examiner.handle(event, time.monotonic()))
+                perform(examiner.handle(ended, time.monotonic()))
+            for result in examiner.results[told:]:
+                watch(result)
+            told = len(examiner.results)
+        return examiner.results
+
+
+class _Port:
+    """The learner's socket, which can be closed and opened again at the same address."""
+
+    def __init__(self, with_keys: bool) -> None:
+        self._resources, self._socket = ExitStack(), ExitStack()
+        self.token: Path | None = None
+        self._keyring: Keyring | None = None
+        if with_keys:
+            folder = KeyFolder(Path(self._resources.enter_context(tempfile.TemporaryDirectory(prefix="millrace-conform-"))))
+            now = datetime.now(UTC).replace(microsecond=0)
+            self.token = folder.new("client", now)
+            self._keyring = Keyring(folder.server(), folder.allowed())
+        self.address = "tcp://127.0.0.1:*"
+        self._link: LearnerLink | None = None
+        self.listen()
+
+    def __enter__(self) -> _Port:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.cut()
+        self._resources.close()
+
+    def listen(self) -> None:
+        """Open the socket."""
+        until_s = time.monotonic() + LISTEN_WITHIN_S
+        while self._link is None:
+            try:
+                self._link = bind(self.address, self._keyring, self._socket, linger_s=0.0).link
+            except UsageError:
+                if time.monotonic() > until_s:
+                    raise
+                time.sleep(POLL_S)
+        self._link.packed_bytes_limit = MOST_PACKED_BYTES
+        self.address = self._link.address
+
+    def cut(self) -> None:
+        """Close the socket, and all its connections."""
+        self._socket.close()
+        self._link = None
+
+    def send(self, peer: bytes, frames: Sequence[bytes | memoryview]) -> None:
+        """Send, if the peer is there."""
+        if self._link is not None:
+            with suppress(zmq.ZMQError):
+                self._link.send(peer, frames)
+
+    def heard(self, timeout_s: float) -> list[Heard]:
+        """What has arrived, after a wait of at most `timeout_s`."""
+        if self._link is None:
+            time.sleep(max(0.0, timeout_s))
+            return []
+        if not self._link.poll(max(0.0, timeout_s)):
+            return []
+        return [Heard(peer, message) for peer, message in self._link.receive()]
+
+    def discard(self) -> None:
+        """Drop what has arrived: its sender was ended."""
+        self.heard(0.0)
+
+
+class _Process:
+    """The client's process, in a session of its own, so that all that it starts can be ended with it."""
+
+    def __init__(self, command: Sequence[str], address: str, token: Path | None) -> None:
+        words = {ADDRESS_WORD: address, TOKEN_WORD: "" if token is None else str(token)}
+        self._command = [_replaced(word, words) for word in command]
+        self._environment = {**os.environ, ADDRESS_VARIABLE: address}
+        self._environment.pop(TOKEN_VARIABLE, None)
+        if token is not None:
+            self._environment[TOKEN_VARIABLE] = str(token)
+        self._running: subprocess.Popen[bytes] | None = None
+        self._lines: deque[str] = deque(maxlen=KEPT_LINES)
+        self._reader: threading.Thread | None = None
+
+    def __enter__(self) -> _Process:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.end()
+
+    def start(self) -> None:
+        """Start the client. Raises `UsageError` if there is no such command."""
+        self._lines.clear()
+        try:
+            self._running = subprocess.Popen(
+                self._command,
+                env=self._environment,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise UsageError(
+                f"conform: {self._command[0]}: {error.strerror}; expected a command that starts the client after --"
+            ) from error
+        self._reader = threading.Thread(target=self._read, args=(self._running,), daemon=True)
+        self._reader.start()
+
+    def _read(self, running: subprocess.Popen[bytes]) -> None:
+        assert running.stdout is not None
+        with suppress(ValueError, OSError):
+            for line in running.stdout:
+                if text := escaped(line.decode(errors="replace")).strip():
+                    self._lines.append(text[:300])
+
+    def ask_to_stop(self) -> None:
+        """Send SIGTERM."""
+        if self._running is not None:
+            self._running.send_signal(signal.SIGTERM)
+
+    def ended(self) -> Ended | None:
+        """How it has ended; None while it runs, and before it is started."""
+        if self._running is None or (code := self._running.poll()) is None:
+            return None
+        self._close()
+        return Ended(code, self._lines[-1] if self._lines else "")
+
+    def end(self) -> None:
+        """End it and all that it started: SIGTERM, then SIGKILL."""
+        if self._running is None:
+            return
+        self._running.terminate()
+        try:
+            self._running.wait(STOP_WITHIN_S)
+        except subprocess.TimeoutExpired:
+            self._running.kill()
+            self._running.wait(STOP_WITHIN_S)
+        self._close()
+
+    def _close(self) -> None:
+        """What is left of its process group is killed, so its pipe ends."""
+        assert self._running is not None
+        assert self._reader is not None
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(self._running.pid, signal.SIGKILL)
+        self._reader.join(STOP_WITHIN_S)
+        assert self._running.stdout is not None
+        if not self._reader.is_alive():
+            self._running.stdout.close()
+        self._running = self._reader = None
+
+
+def _replaced(word: str, words: dict[str, str]) -> str:
+    for placeholder, value in words.items():
+        word = word.replace(placeholder, value)
+    return word
