@@ -48,18 +48,22 @@ class Sample(NamedTuple):
     next_mask: Bools | None = None  # [B, choices] actions allowed in the next observation; None without action masks
 
 
-def memory_bytes(observation: Sequence[Leaf], size: int, prioritized: bool, action: ActionSpec = DISCRETE) -> int:
-    """Memory of a replay buffer with `size` slots, in bytes."""
-    row = sum(int(np.prod(leaf.shape)) * np.dtype(leaf.dtype).itemsize for leaf in observation)
+def memory_bytes(
+    observation: Sequence[Leaf], size: int, prioritized: bool, action: ActionSpec = DISCRETE, choices: int = 0
+) -> int:
+    """Memory of a replay buffer with `size` slots, in bytes. `choices`: those of an action mask; 0 without masks."""
+    row = sum(int(np.prod(leaf.shape)) * np.dtype(leaf.dtype).itemsize for leaf in observation) + choices
     return size * (row + row_dtype(action).itemsize) + (SumTree.memory_bytes(size) if prioritized else 0)
 
 
-def check_fits_memory(observation: Sequence[Leaf], size: int, prioritized: bool, action: ActionSpec = DISCRETE) -> None:
+def check_fits_memory(
+    observation: Sequence[Leaf], size: int, prioritized: bool, action: ActionSpec = DISCRETE, choices: int = 0
+) -> None:
     """Raise `UsageError`, which names a size that fits, if the memory is too small for the buffer and a copy of it.
 
-    A checkpoint makes such a copy.
+    A checkpoint makes such a copy. Arguments: see `memory_bytes`.
     """
-    needed, free = 2 * memory_bytes(observation, size, prioritized, action), available_bytes()
+    needed, free = 2 * memory_bytes(observation, size, prioritized, action, choices), available_bytes()
     if free is None or needed <= free:
         return
     fits = size * free // needed
@@ -107,9 +111,10 @@ class ReplayBuffer:
 
         Raises `UsageError` if memory is too small.
         """
-        check_fits_memory(observation, size, alpha is not None, action)
+        self._content = observation, size, alpha is not None, action
+        check_fits_memory(*self._content)
         self.size = size  # slots
-        self.bytes = memory_bytes(observation, size, alpha is not None, action)
+        self.bytes = memory_bytes(*self._content)
         self._n_step, self._gamma, self._alpha = n_step, gamma, alpha
         self.generator = np.random.default_rng(seed)  # decides what is drawn
         self._obs = tuple(np.zeros((size, *leaf.shape), leaf.dtype) for leaf in observation)
@@ -135,7 +140,9 @@ class ReplayBuffer:
     # ---------------------------------------------------------------- writing
 
     def add(self, batch: Batch) -> None:
-        """Store the valid rows. Raises `UsageError` when a single rollout does not fit."""
+        """Store the valid rows. Raises `UsageError` when a single rollout does not fit, or the first masks do not."""
+        if batch.mask is not None:
+            self._make_mask(batch.mask.shape[-1])
         for at in range(0, len(batch.lane), batch.copies):  # rollouts of a lane are in the order of collection
             self._add(batch, slice(at, at + batch.copies), int(batch.lane[at]))
 
@@ -158,7 +165,6 @@ class ReplayBuffer:
         slot = written % self.size
         if batch.mask is not None:
             obs.append(batch.mask[:, columns])
-            self._make_mask(batch.mask.shape[-1])
         self._keep(slot[needed], self._per_observation())
         self._keep(slot[0][continues], ())
         self._clear(slot[needed])
@@ -178,6 +184,8 @@ class ReplayBuffer:
 
     def _make_mask(self, choices: int) -> None:
         if self._mask is None:
+            check_fits_memory(*self._content, choices)
+            self.bytes = memory_bytes(*self._content, choices)
             self._mask = np.ones((self.size, choices), bool)
 
     def _per_observation(self) -> tuple[Array, ...]:

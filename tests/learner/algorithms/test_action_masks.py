@@ -19,9 +19,11 @@ from learner.algorithms.dqn import DQN
 from learner.algorithms.impala import Impala
 from learner.algorithms.minibatches import Minibatch
 from learner.algorithms.ppo import PPO
+from learner.algorithms.replay import replay_buffer
 from learner.config.hyperparameters import DQNConfig, ImpalaConfig, PPOConfig
 from protocol.arrays import Array, Bools
 from protocol.envs.spaces import action_spec, observation_leaves
+from protocol.errors import UsageError
 from protocol.policy.distributions import distribution
 from protocol.policy.masks import FORBIDDEN, forbid, masked_distribution, no_choice, not_allowed
 from protocol.policy.numpy_policy import NumpyPolicy
@@ -329,6 +331,19 @@ def test_masks_are_saved_taken_back_and_overwritten_with_their_slots() -> None:
     assert one.next_mask is not None
     assert two.next_mask is not None
     assert np.array_equal(one.next_mask, two.next_mask)
+
+
+def test_masks_count_for_the_memory_and_are_refused_if_they_do_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    algorithm = dqn()
+    replay, before = algorithm.replay, algorithm.replay.bytes
+    masked = true_masks(masked_batch(algorithm, 0))
+    monkeypatch.setattr(replay_buffer, "available_bytes", lambda: 2 * before)
+    with pytest.raises(UsageError, match=r"^replay_size \d+: .*take --replay-size \d+ or less$"):
+        replay.add(masked)
+    assert len(replay) == 0
+    monkeypatch.setattr(replay_buffer, "available_bytes", lambda: None)
+    replay.add(masked)
+    assert replay.bytes == before + kept(algorithm).nbytes
 
 
 def test_without_masks_nothing_is_stored() -> None:
