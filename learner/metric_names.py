@@ -65,6 +65,7 @@ METRICS: dict[str, dict[str, Meaning]] = {
             TRANSITIONS, "Env steps of rollouts that broke the row format or did not fit the run. They were dropped."
         ),
         "ledger/messages_bad": Meaning("messages", "Messages that could not be read."),
+        "ledger/late_actions": Meaning("actions", "Actions that came too late for a program that owns its loop."),
     },
     "Where the time goes (worker stages: all workers together)": {
         "stage/learner_wait": Meaning(SECONDS, "Time for which the learner waited for rollouts."),

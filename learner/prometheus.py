@@ -205,6 +205,8 @@ def _of_link(now: MetricsSnapshot) -> Iterator[Metric]:
         yield CounterMetricFamily(f"millrace_{name}_bytes", f"Bytes of the messages {name}.", size)
     refused = {"unreadable": now.ledger["messages_bad"], "key": now.refused_messages}
     yield _by_reason("millrace_refused_messages", "Messages that were not used, by reason.", refused)
+    late = "Actions that came too late for a program that owns its loop."
+    yield CounterMetricFamily("millrace_late_actions", late, now.ledger["late_actions"])
     yield CounterMetricFamily("millrace_refused_handshakes", "Connections that were not let in.", now.refused_handshakes)
 
 

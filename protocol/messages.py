@@ -153,6 +153,8 @@ class Heartbeat(Message, frozen=True):
     """seconds spent in each stage since the worker started"""
     resident_bytes: Natural
     """resident memory of the worker's process; 0 if it is not known"""
+    late_actions: Natural = 0
+    """how often since the worker started a program that owns its loop took an action of its own, because none had come"""
 
 
 class HeartbeatReply(Message, frozen=True):
@@ -359,6 +361,8 @@ class WorkerStatus(msgspec.Struct, frozen=True):
     """what it does, as its supervisor says; empty if it has none"""
     doing_s: float = 0.0
     """for how many seconds it has done that"""
+    late_actions: int = 0
+    """actions that came too late for a program that owns its loop, since the worker started"""
 
 
 class Status(Message, frozen=True):

@@ -116,6 +116,14 @@ class Member:
             self.measured = heartbeat.steps, self.heard_s
         return self.lost_on_the_way(heartbeat, self.tickets)
 
+    def new_late_actions(self, heartbeat: Heartbeat) -> int:
+        """The late actions since the last heartbeat. Those before this session belong to an earlier one."""
+        if self.heartbeat is not None:
+            before = self.heartbeat.late_actions
+        else:
+            before = 0 if self.hello.is_first_attempt else heartbeat.late_actions
+        return max(0, heartbeat.late_actions - before)
+
     def lost_on_the_way(self, heartbeat: Heartbeat, sent: Mapping[int, int]) -> list[int]:
         """Those of the tickets in `sent` that were lost; for each, it has the value of `replies` when it was last sent.
 
@@ -152,6 +160,7 @@ class Member:
             strikes=0,
             doing=activity.doing if activity else "",
             doing_s=activity.for_s + max(0.0, said_s) if activity else 0.0,
+            late_actions=heartbeat.late_actions if heartbeat else 0,
         )
 
 

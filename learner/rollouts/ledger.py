@@ -34,6 +34,8 @@ class Ledger(msgspec.Struct, kw_only=True):
 
     messages_bad: int = 0
     """messages that could not be read"""
+    late_actions: int = 0
+    """actions that came too late for a program that owns its loop, which then took one of its own"""
 
     @property
     def outstanding(self) -> int:

@@ -332,6 +332,7 @@ class TicketCoordinator:
 
     def _heartbeat(self, member: CollectingMember, heartbeat: Heartbeat) -> list[Outgoing]:
         """Answer a heartbeat. If it shows that messages were lost on the way, send them again."""
+        self.ledger.late_actions += member.new_late_actions(heartbeat)
         lost = member.record_heartbeat(heartbeat)
         peer = member.peer
         if member.state is MemberState.DRAINING:

@@ -149,12 +149,13 @@ def in_json(status: Status) -> str:
 
 def as_table(status: Status) -> str:
     """A line about the run, a table of its workers, and what was dropped, by reason."""
+    late = any(worker.late_actions for worker in status.workers)
     dropped = [f"{status.ledger[name]:,} {what}" for name, what in DROPS.items() if status.ledger.get(name)]
     return "\n".join(
         [
             _run_line(status),
             "",
-            *_table([_cells(worker, status.version) for worker in status.workers]),
+            *_table([_cells(worker, status.version, late) for worker in status.workers]),
             "",
             f"dropped: {', '.join(dropped) or 'nothing'}",
         ]
@@ -179,8 +180,8 @@ def _run_line(status: Status) -> str:
     return f"{env}: {done}, {status.steps_per_s:,.0f} steps/s, return {score}, update {max(status.version, 0)}, {lag}"
 
 
-def _cells(worker: WorkerStatus, version: int) -> dict[str, str]:
-    """A row of the table, by column."""
+def _cells(worker: WorkerStatus, version: int, late: bool) -> dict[str, str]:
+    """A row of the table, by column. `late`: with the column of late actions."""
     behind = version - worker.version
     return {
         "worker": _printable(worker.worker) + (f" ({worker.strikes} strikes)" if worker.strikes else ""),
@@ -193,7 +194,7 @@ def _cells(worker: WorkerStatus, version: int) -> dict[str, str]:
         "silent": f"{worker.silent_s:.1f} s",
         "doing": _doing(worker),
         "memory": f"{worker.resident_bytes / 2**20:,.0f} MB" if worker.resident_bytes else "-",
-    }
+    } | ({"late actions": f"{worker.late_actions:,}"} if late else {})
 
 
 def _doing(worker: WorkerStatus) -> str:

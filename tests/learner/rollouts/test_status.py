@@ -57,6 +57,37 @@ def test_it_tells_of_the_run_and_of_every_worker_in_the_order_of_joining() -> No
     assert {worker.state for worker in told(learner).workers} == {"draining"}
 
 
+def late(learner: Learner, peer: bytes, actions: int) -> None:
+    learner.says(peer, Heartbeat(learner.session(peer), 0, 0, (), 0, {}, 0, actions))
+
+
+def test_late_actions_are_counted_once_also_when_a_worker_joins_again() -> None:
+    learner = Learner()
+    learner.joins(b"a")
+    for actions in (0, 3, 3, 5):
+        late(learner, b"a", actions)
+    assert told(learner).workers[0].late_actions == 5
+    assert told(learner).ledger["late_actions"] == 5
+    learner.joins(b"a", attempt=2)  # the same process
+    late(learner, b"a", 7)
+    assert told(learner).ledger["late_actions"] == 5
+    late(learner, b"a", 8)
+    assert told(learner).ledger["late_actions"] == 6
+    learner.joins(b"a", pid=2)
+    late(learner, b"a", 2)
+    assert told(learner).ledger["late_actions"] == 8
+
+
+def test_late_actions_have_a_column_if_there_are_any() -> None:
+    learner = Learner()
+    learner.joins(b"a")
+    assert "late actions" not in as_table(told(learner))
+    late(learner, b"a", 1_234)
+    table = as_table(told(learner)).splitlines()
+    assert table[2].endswith("late actions")
+    assert table[3].endswith("1,234")
+
+
 def test_silence_is_counted_from_the_last_message() -> None:
     learner = Learner()
     learner.joins(b"a")

@@ -21,7 +21,19 @@ from hypothesis.extra import numpy as hnp
 
 from protocol.env_spec import PickledCallable
 from protocol.errors import BadMessage
-from protocol.messages import EpisodeRows, Failure, Hello, Inquire, Refuse, Rollout, ToLearner, ToWorker, Weights, Welcome
+from protocol.messages import (
+    EpisodeRows,
+    Failure,
+    Heartbeat,
+    Hello,
+    Inquire,
+    Refuse,
+    Rollout,
+    ToLearner,
+    ToWorker,
+    Weights,
+    Welcome,
+)
 from protocol.space_spec import DictSpace, Shape, SpaceSpec, TupleSpace
 from protocol.wire.codec import DTYPES, MAX_FRAMES, MAX_HEAD_BYTES, decode_to_learner, decode_to_worker, encode
 from tests.support.fake_ends import fake_rollout, run_spec
@@ -186,7 +198,9 @@ def test_a_head_of_another_length_is_refused(message: Any, data: st.DataObject) 
 def test_a_default_stands_at_the_end_alone() -> None:
     """By position nothing else can be left out."""
     defaults = {kind: kind.__struct_defaults__ for kind in (*KINDS, Inquire) if kind.__struct_defaults__}
-    assert defaults == {Weights: (None,), Failure: (False,), EpisodeRows: (None,), Rollout: ((), None, ())}
+    assert defaults == {
+        Weights: (None,), Heartbeat: (0,), Failure: (False,), EpisodeRows: (None,), Rollout: ((), None, ()),
+    }  # fmt: skip
     assert Rollout.__struct_fields__[-3:] == ("episodes", "mask", "extras")
 
 
@@ -197,9 +211,9 @@ def test_a_default_stands_at_the_end_alone() -> None:
         (["Heartbeat", 7, 0, 0, [1, None], 0, {}, 0], "Expected `int`, got `null` - at `Heartbeat.tickets[1]`"),
         (["Heartbeat", 7, 0, 0, [], 0, {"act": "x"}, 0], "Expected `float`, got `str` - at `Heartbeat.stages[...]`"),
         (["Heartbeat", 7, 0, 0, [], 0, {}, 1.5], "Expected `int`, got `float` - at `Heartbeat.resident_bytes`"),
-        (["Heartbeat", 7, 0, 0, [], 0, {}], "Heartbeat expected 7 fields, got 6"),
-        (["Heartbeat", 7, 0, 0, [], 0, {}, 0, 0], "Heartbeat expected 7 fields, got 8"),
-        (["Heartbeat"], "Heartbeat expected 7 fields, got 0"),
+        (["Heartbeat", 7, 0, 0, [], 0, {}], "Heartbeat expected 8 fields, got 6"),
+        (["Heartbeat", 7, 0, 0, [], 0, {}, 0, 0, 0], "Heartbeat expected 8 fields, got 9"),
+        (["Heartbeat"], "Heartbeat expected 8 fields, got 0"),
         (["Inquire", 1], "Inquire expected 0 fields, got 1"),
         ({"type": "Hello", "protocol": None}, "Expected `int`, got `null` - at `$.protocol`"),
         ({"type": "Hello"}, "Object missing required field `protocol`"),
