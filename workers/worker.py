@@ -125,6 +125,7 @@ class Worker:
         self._left: Leave | None = None
         self._heartbeats = HeartbeatThread(lambda: self._do(self._session.heartbeat_if_due(self._clock())))
         self._waited_s = 0.0
+        self._statistics = self._earlier = Statistics()  # newest, and as the sessions before this one left them
         self._heard_s = clock()  # when the learner was last heard, or the connection was made
 
     def run(self) -> Leave:
@@ -297,12 +298,15 @@ class Worker:
 
     def _update_statistics(self) -> None:
         if (source := self._collector or self._stepper) is not None:
-            stages: Stages = {**source.stages, "wait": self._waited_s}
-            steps = source.steps
+            earlier = self._earlier.stages
+            stages: Stages = {stage: earlier.get(stage, 0.0) + seconds for stage, seconds in source.stages.items()}
+            steps = self._earlier.steps + source.steps
             if self._evaluator is not None and self._evaluator.steps:
-                stages["evaluate"] = self._evaluator.seconds
+                stages["evaluate"] = earlier.get("evaluate", 0.0) + self._evaluator.seconds
                 steps += self._evaluator.steps
-            self._session.update_statistics(Statistics(steps, stages, self._resident_bytes))
+            stages = {**earlier, **stages, "wait": self._waited_s}
+            self._statistics = Statistics(steps, stages, self._resident_bytes)
+            self._session.update_statistics(self._statistics)
 
     def _do(self, effects: list[Effect]) -> None:
         for effect in effects:
@@ -322,6 +326,8 @@ class Worker:
         """Make a new collector or stepper; nothing of the old one is kept."""
         activity().begin(WAITING)
         self._close_all()
+        self._update_statistics()
+        self._earlier = self._statistics
         self._collector = self._evaluator = self._stepper = None
         if why := run.rejection_reason(self._options.code):
             self._do(self._session.decline(why))

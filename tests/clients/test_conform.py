@@ -24,6 +24,13 @@ SHORT = {
         "ignores what it cannot read: extra field, missing frame, unknown type",
         "drains while it steps",
     ),
+    "collector": (
+        "keeps the row format where episodes end",
+        "sends a lost rollout again, the same",
+        "closes a lane that is released while a ticket waits",
+        "forgets the session before",
+        "drains while it collects",
+    ),
 }
 
 

@@ -82,8 +82,7 @@ class Examiner:
             self._failed(Broken(rules.PATIENCE, f"the check to end within {CHECK_S:g} s", "none of that"))
         else:
             try:
-                if learner.watch is not None and learner.runs and not learner.watch.said_goodbye and learner.hears:
-                    learner.watch.late(now)
+                learner.check_heartbeats()
                 if now >= self._due_s:
                     self._resume(None)
             except Broken as broken:

@@ -239,7 +239,7 @@ def outlives_a_restart(learner: Learner) -> Script[None]:
     before = learner.hello
     assert before is not None
     learner.cut(listen=False)
-    yield from learner.sleep(1.0)
+    yield from learner.let_pass(1.0)
     learner.listen()
     yield from learner.expect(Heartbeat, rules.CONNECTION, "a Heartbeat over a new connection", within_s=10)
     hello = yield from learner.rejoin()

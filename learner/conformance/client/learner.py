@@ -46,7 +46,6 @@ from protocol.messages import (
     Received,
     Rejoin,
     Reset,
-    Rollout,
     Step,
     ToLearner,
     ToWorker,
@@ -101,6 +100,7 @@ class Learner:
         self._lanes: dict[int, int] = {}  # lane -> incarnation, in this session
         self._numbers = 0x5EED_0000
         self._tickets = 100
+        self._steps = 0  # env steps that the process has reported
         self._welcome: Welcome | None = None
 
     # --------------------------------------------------------------------------------------------------------- sending
@@ -219,6 +219,7 @@ class Learner:
             raise Broken(rules.SESSION, f"session {current}", brief(message))
         assert not isinstance(message, Inquire | BadMessage), "they have no session"
         self.watch.see(message, self.now)
+        self._steps = self.watch.steps
         is_wanted = wanted(event)
         match message:
             case Heartbeat() if self.answers_heartbeats:
@@ -233,11 +234,17 @@ class Learner:
                 pass
         return is_wanted
 
+    def check_heartbeats(self) -> None:
+        """Raise `Broken` if a Heartbeat is overdue. None is due from a client that may leave the session by itself."""
+        if self.watch is not None and self.runs and self.hears and not (self.allows_hello or self.watch.said_goodbye):
+            self.watch.late(self.now)
+
     # ----------------------------------------------------------------------------------------------- parts of any check
 
     def start(self) -> None:
         """Start the client's process."""
         self.effects.append(StartClient())
+        self._steps = 0
         self.runs, self.hello, self.watch = True, None, None
 
     def end(self) -> None:
@@ -284,7 +291,7 @@ class Learner:
             assert isinstance(found, Heard)
             raise Broken(rule, expected, brief(found.message))
 
-    def sleep(self, for_s: float) -> Script[None]:
+    def let_pass(self, for_s: float) -> Script[None]:
         """Let time pass."""
         yield Wait(for_s)
 
@@ -325,7 +332,7 @@ class Learner:
         self._numbers += 1
         self._lanes, self.received, self.unlisted = {}, None, set()
         self.answers_heartbeats, self.hears, self.allows_hello = True, True, False
-        self.watch = Watch(self._numbers, run, self.now)
+        self.watch = Watch(self._numbers, run, self.now, self._steps)
         self._welcome = Welcome(self._numbers, self.hello.attempt, run)
         self.send(self._welcome)
 
@@ -338,14 +345,6 @@ class Learner:
         assert isinstance(found, Ended)
         if found.code != code:
             raise Broken(rule, f"exit code {code} after {after}", f"exit code {found.code}")
-
-    def rollout(self, rule: Rule, ticket: int) -> Script[Rollout]:
-        """The rollout of this ticket."""
-        return (
-            yield from self.expect(
-                Rollout, rule, f"the rollout of ticket {ticket}", within_s=2 * self.settings.patience_s, ticket=ticket
-            )
-        )
 
 
 def _rule_of_unreadable(error: str) -> Rule:

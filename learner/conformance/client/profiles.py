@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from learner.conformance.client import join_checks, step_checks
+from learner.conformance.client import collect_checks, join_checks, step_checks
 from learner.conformance.client.examiner import Check
 
 JOINING = [
@@ -51,4 +51,30 @@ FAULTS = [
     Check("says Goodbye after SIGTERM, and leaves", join_checks.stops_on_request),
     Check("leaves after SIGTERM while no learner answers", join_checks.stops_while_joining),
 ]
-PROFILES: dict[str, tuple[Check, ...]] = {"environment": (*JOINING, *STEPPING, *FAULTS)}
+COLLECTING = [
+    Check("collects rollouts of a lane", collect_checks.collects),
+    Check("keeps the row format where episodes end", collect_checks.keeps_rows),
+    Check("truncates an episode at the time limit", collect_checks.truncates_at_the_limit),
+    Check("waits for the weights that a permit asks for", collect_checks.waits_for_weights),
+    Check("acts under the newest weights", collect_checks.acts_under_the_newest),
+    Check("acknowledges new weights at once", collect_checks.acknowledges_weights),
+    Check("takes weights rounded to 16 bits", collect_checks.takes_rounded_weights),
+    Check("sends a lost rollout again, the same", collect_checks.sends_again),
+    Check("sends a rollout once", collect_checks.says_no_rollout_twice),
+    Check("ignores a late Collect of a rollout that has arrived", collect_checks.forgets_what_arrived),
+    Check("collects two lanes, and two tickets of one", collect_checks.collects_two_lanes),
+    Check("starts a lane again in a higher incarnation only", collect_checks.starts_a_lane_again),
+    Check("closes a lane that is released while a ticket waits", collect_checks.releases_a_lane),
+    Check("closes a lane that a HeartbeatReply does not list", collect_checks.closes_unlisted_lanes),
+    Check("ignores late copies of a HeartbeatReply", collect_checks.ignores_a_late_reply),
+    Check("forgets the session before", collect_checks.forgets_the_session_before),
+    Check("collects over a new connection", collect_checks.collects_over_a_new_connection),
+    Check("ignores what it cannot read", collect_checks.ignores_what_it_cannot_read),
+    Check("beats while it collects", collect_checks.beats_while_it_collects),
+    Check("evaluates, with rows", collect_checks.evaluates),
+    Check("drains while it collects", collect_checks.drains_while_it_collects),
+]
+PROFILES: dict[str, tuple[Check, ...]] = {
+    "environment": (*JOINING, *STEPPING, *FAULTS),
+    "collector": (*JOINING, *COLLECTING, *FAULTS),
+}

@@ -210,7 +210,7 @@ AFTER_RESET = Rule(
     "clear reward, terminated and truncated of each copy that is reset",
 )
 NEXT_STEP = Rule(
-    "Records, StepSpec",
+    "Records inside messages, StepSpec",
     "With autoreset NextStep, the step after an episode's end ignores the action and only resets that copy: reward 0,"
     " neither flag, and the first observation of the next episode",
     "remember which copies have ended; their next step is a reset",
@@ -226,7 +226,7 @@ SEEDED = Rule(
     "seed the environment's generator with the given seed",
 )
 IN_SPACE = Rule(
-    "Records, EnvDescription",
+    "Records inside messages, EnvDescription",
     "`observation` describes the arrays of an observation: observations are within its bounds, and finite",
     "describe the space as it is, or mend the environment",
 )
@@ -299,7 +299,7 @@ CONTINUES = Rule(
     "keep the copies and their last observations between two rollouts of a lane",
 )
 EPISODES = Rule(
-    "Records, Episode",
+    "Records inside messages, Episode",
     "An episode's return is the undiscounted sum of its raw rewards, and its length the number of its steps, also "
     "where it began in an earlier rollout",
     "add up rewards and steps of valid rows, from an episode's first step to its last",

@@ -10,6 +10,7 @@ from typing import Any
 
 import msgpack
 import numpy as np
+from msgspec.structs import replace
 
 from learner.conformance.client import rules
 from learner.conformance.client.join_checks import described
@@ -256,11 +257,11 @@ def ignores_an_old_order(learner: Learner) -> Script[None]:
 def ignores_another_session(learner: Learner) -> Script[None]:
     """Orders of the session before."""
     old = yield from stepping(learner)
-    reset, later = old.reset(), old.reset()
-    yield from old.do(reset)
+    before = learner.session
+    yield from old.do(old.reset())
     steps = yield from stepping(learner)
     yield from steps.do(steps.reset())
-    learner.send(later)
+    learner.send(replace(steps.step(), session=before))
     yield from learner.quiet(Stepped, 0.7, rules.OTHER_SESSION, "no answer to an order of the session before")
     yield from steps.do(steps.step())
 
@@ -352,7 +353,7 @@ def releases_a_lane(learner: Learner) -> Script[None]:
     learner.send(steps.step(0))  # it may be answered or not
     learner.send(Release(learner.session, (LaneIncarnation(0, 0),)))
     learner.release(0)
-    yield from learner.sleep(0.3)
+    yield from learner.let_pass(0.3)
     for _ in range(3):
         found = yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
     if found.tickets:

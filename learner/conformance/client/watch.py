@@ -53,7 +53,8 @@ class Dealt(NamedTuple):
 class Watch:
     """One session, as the learner sees it."""
 
-    def __init__(self, session: int, run: DescribeSpec | RunSpec | StepSpec, now: float) -> None:
+    def __init__(self, session: int, run: DescribeSpec | RunSpec | StepSpec, now: float, steps: int = 0) -> None:
+        """`steps`: env steps that the process has reported in earlier sessions."""
         self.session, self.run = session, run
         self.heard_heartbeat_s = now
         self.heartbeat: Heartbeat | None = None
@@ -71,10 +72,12 @@ class Watch:
         self.rollouts: dict[int, Rollout] = {}
         """the first rollout of each ticket"""
         self.said_goodbye = False
+        self._foreign = set[int]()  # tickets that were sent under the number of another session
         self._asked, self._answered = Counter[int](), Counter[int]()
         self._next_sequence: dict[tuple[int, int], int] = {}
         self._rows: dict[tuple[int, int], LaneRows] = {}
-        self._steps = -1
+        self.steps = steps
+        """the most that a Heartbeat has reported"""
 
     # ------------------------------------------------------------------------------------------ what the learner said
 
@@ -83,21 +86,19 @@ class Watch:
         match message:
             case Weights(version):
                 self.versions[version] = message
+            case Reset() | Step() | Call() | Evaluate() if message.session != self.session:
+                self._foreign.add(message.ticket)
             case Reset() | Step() | Call() | Evaluate():
-                if message.session == self.session:
-                    self.orders[message.ticket] = message
-                    self._asked[message.ticket] += 1
-            case Collect(session, version, permits) if session == self.session:
+                self.orders[message.ticket] = message
+                self._asked[message.ticket] += 1
+            case Collect(session, _, permits) if session != self.session:
+                self._foreign |= {permit.ticket for permit in permits}
+            case Collect(_, version, permits):
                 for permit in permits:
                     self.permits[permit.ticket] = Dealt(permit, version)
                     self._asked[permit.ticket] += 1
             case HeartbeatReply(session, number) if session == self.session:
                 self.replies = max(self.replies, number)
-
-    def restarted(self, lane: int, incarnation: int) -> None:
-        """The lane was closed and may begin again in this incarnation."""
-        self._next_sequence.pop((lane, incarnation), None)
-        self._rows.pop((lane, incarnation), None)
 
     # --------------------------------------------------------------------------------------------- what the client says
 
@@ -144,9 +145,9 @@ class Watch:
             )
         if before is not None and message.replies < before.replies:
             raise Broken(rules.HEARTBEAT_REPLIES, f"{before.replies} or more, as before", f"{message.replies}")
-        if message.steps < self._steps:
-            raise Broken(rules.HEARTBEAT_STEPS, f"{self._steps} or more, as before", f"{message.steps}")
-        self._steps = message.steps
+        if message.steps < self.steps:
+            raise Broken(rules.HEARTBEAT_STEPS, f"{self.steps} or more, as before", f"{message.steps}")
+        self.steps = message.steps
         if message.version != -1 and message.version not in self.versions:
             expected = (
                 f"-1 or one of {sorted(self.versions)}" if self.versions else "-1: no weights were sent in this session"
@@ -169,7 +170,14 @@ class Watch:
                 rules.HEARTBEAT_TICKETS, "only tickets that are not finished", f"ticket {finished[0]}, which was answered"
             )
 
+    def _see_foreign(self, message: Stepped | Returned | Rollout) -> None:
+        if message.ticket in self._foreign:
+            raise Broken(
+                rules.OTHER_SESSION, f"ticket {message.ticket} to be ignored: its session was another", brief(message)
+            )
+
     def _see_answer(self, message: Stepped | Returned) -> None:
+        self._see_foreign(message)
         order = self.orders.get(message.ticket)
         if order is None or isinstance(order, Evaluate):
             last = f"ticket {max(self.orders)} was the last order" if self.orders else "no order was sent in this session"
@@ -211,6 +219,7 @@ class Watch:
     def _see_rollout(self, message: Rollout) -> None:
         if not isinstance(self.run, RunSpec):
             raise Broken(rules.TICKETS, "no rollout in a session whose copies are stepped on order", brief(message))
+        self._see_foreign(message)
         dealt = self.permits.get(message.ticket)
         if dealt is None:
             raise Broken(rules.TICKETS, f"a ticket that was dealt: {sorted(self.permits) or 'none yet'}", brief(message))

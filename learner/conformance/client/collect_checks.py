@@ -1,0 +1,474 @@
+"""The checks of the collector profile: the client acts, by the flat weights, and sends rollouts.
+
+Each function is one check (`script.py`). The watch recomputes what it can of every rollout (`lane_rows.py`).
+"""
+
+from __future__ import annotations
+
+import msgpack
+import numpy as np
+
+from learner.conformance.client import rules
+from learner.conformance.client.join_checks import described
+from learner.conformance.client.learner import Learner
+from learner.conformance.client.rules import Rule
+from learner.conformance.client.script import Broken, Heard, Script, Skipped, Wait, brief
+from protocol.arrays import Floats
+from protocol.envs.spaces import action_spec, observation_leaves
+from protocol.errors import UsageError
+from protocol.messages import (
+    Collect,
+    Drain,
+    EpisodeRows,
+    Evaluate,
+    Evaluated,
+    Goodbye,
+    Heartbeat,
+    HeartbeatReply,
+    LaneIncarnation,
+    Permit,
+    Received,
+    Release,
+    Rollout,
+    Weights,
+)
+from protocol.policy.layout import acting_size, buffer_size, named_views, parameter_layout
+from protocol.specs import PolicySpec, RunSpec
+from protocol.wire.codec import encode
+from protocol.wire.weight_dtypes import to_wire_dtype
+
+STEPS = 32  # T of most checks
+NET = (16, 16)
+QUIET_S = 0.7
+MOST_LIMIT_STEPS = 2000  # of a time limit that the check walks to
+EVALUATED_STEPS = 40
+POLE_GAINS = (0.1, 0.2, 1.0, 0.6)
+"""balance the pole of a cart"""
+
+
+class Collecting:
+    """A session of the collector profile, with the messages that checks need."""
+
+    def __init__(self, learner: Learner, run: RunSpec) -> None:
+        self.learner, self.run = learner, run
+
+    def random_parameters(self, seed: int) -> Floats:
+        """Parameters [P] of a policy that prefers some actions."""
+        size = acting_size(self.run.policy)
+        return np.random.default_rng(seed).normal(0, 0.3, size).astype(np.float32)
+
+    def weights(self, version: int, parameters: Floats | None = None) -> Weights:
+        """Weights of this version, random if no parameters are given."""
+        chosen = self.random_parameters(version) if parameters is None else parameters
+        return Weights(version, chosen, np.zeros(buffer_size(self.run.policy), np.float32))
+
+    def permit(self, lane: int = 0, incarnation: int = 0) -> Permit:
+        """The next ticket, for this lane."""
+        return Permit(self.learner.ticket(), lane, incarnation)
+
+    def deal(self, *permits: Permit, version: int = 1) -> None:
+        """Send a Collect."""
+        self.learner.send(Collect(self.learner.session, version, permits, self.learner.of_lanes()))
+
+    def rollout(self, permit: Permit) -> Script[Rollout]:
+        """The rollout of a permit that was dealt."""
+        text = f"the rollout of ticket {permit.ticket}, lane {permit.lane}, incarnation {permit.incarnation}"
+        within_s = 2 * self.learner.settings.patience_s
+        return (yield from self.learner.expect(Rollout, rules.TICKETS, text, within_s=within_s, ticket=permit.ticket))
+
+    def collect(self, permit: Permit, version: int = 1) -> Script[Rollout]:
+        """Deal one permit and wait for its rollout."""
+        self.deal(permit, version=version)
+        return (yield from self.rollout(permit))
+
+    def nothing_of(self, permit: Permit, rule: Rule, whose: str) -> Script[None]:
+        """No rollout of this permit has arrived in this session, and none arrives."""
+        watch = self.learner.watch
+        assert watch is not None
+        expected = f"no rollout of ticket {permit.ticket}, {whose}"
+        if permit.ticket in watch.rollouts:
+            raise Broken(rule, expected, brief(watch.rollouts[permit.ticket]))
+        yield from self.learner.quiet(Rollout, QUIET_S, rule, expected)
+
+
+def run_spec(learner: Learner, steps: int = STEPS, heartbeat_s: float = 0.0) -> Script[RunSpec]:
+    """A run of the client's environment."""
+    env = yield from described(learner)
+    try:
+        policy = PolicySpec(observation_leaves(env.observation_space), action_spec(env.action_space), net=NET)
+    except UsageError as error:
+        raise Broken(rules.DESCRIBE, "spaces that a policy can use", str(error)) from None
+    settings = learner.settings
+    return RunSpec(
+        env=settings.env,
+        policy=policy,
+        rollout_steps=steps,
+        copies=settings.copies,
+        lanes=2,
+        seed=5,
+        heartbeat_s=heartbeat_s or settings.heartbeat_s,
+        learner_timeout_s=30.0,
+    )
+
+
+def collecting(
+    learner: Learner, steps: int = STEPS, heartbeat_s: float = 0.0, *, weights: bool = True
+) -> Script[Collecting]:
+    """A new session of the collector profile. `weights`: version 1 is sent."""
+    run = yield from run_spec(learner, steps, heartbeat_s)
+    yield from learner.joining()
+    learner.welcome(run)
+    session = Collecting(learner, run)
+    if weights:
+        learner.send(session.weights(1))
+    return session
+
+
+# ------------------------------------------------------------------------------------------------------------- rollouts
+
+
+def collects(learner: Learner) -> Script[None]:
+    """Rollouts of one lane, one after the other."""
+    session = yield from collecting(learner)
+    for _ in range(4):
+        yield from session.collect(session.permit())
+
+
+def keeps_rows(learner: Learner) -> Script[None]:
+    """Rollouts in which episodes end."""
+    session = yield from collecting(learner, steps=7)
+    ends = 0
+    for _ in range(40):
+        rollout = yield from session.collect(session.permit())
+        ends += len(rollout.episodes)
+        if ends >= 8:
+            return
+    if not ends:
+        raise Skipped(f"no episode ended in {40 * 7} steps")
+
+
+def truncates_at_the_limit(learner: Learner) -> Script[None]:
+    """Weights that act well, until the time limit."""
+    env = yield from described(learner)
+    longest = env.max_episode_steps
+    if longest is None or longest > MOST_LIMIT_STEPS:
+        raise Skipped("the environment has no time limit" if longest is None else f"its time limit is {longest} steps")
+    session = yield from collecting(learner, steps=longest + 10, weights=False)
+    learner.send(session.weights(1, _balancing(session)))
+    reached = False
+    for _ in range(2):
+        rollout = yield from session.collect(session.permit())
+        for episode in rollout.episodes:
+            if episode.length > longest:
+                raise Broken(
+                    rules.TRUNCATED, f"episodes of at most {longest} steps, as described", f"{episode.length} steps"
+                )
+            reached |= episode.length == longest
+        lengths = np.array([episode.length for episode in rollout.episodes])
+        flags = _truncated_in_order(rollout)
+        if (early := flags & (lengths < longest)).any():
+            raise Broken(rules.TRUNCATED, f"truncated after {longest} steps only", f"after {lengths[early][0]} steps")
+    if not reached:
+        raise Skipped("no episode reached the time limit")
+
+
+def _truncated_in_order(rollout: Rollout) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """For each episode of the rollout: whether only a time limit ended it."""
+    ended = (rollout.terminated | rollout.truncated) & rollout.valid
+    return np.asarray((rollout.truncated & ~rollout.terminated)[ended])
+
+
+def _balancing(session: Collecting) -> Floats:
+    """Parameters that balance the pole of a cart, as its almost linear network; random ones for another environment."""
+    policy = session.run.policy
+    if [leaf.shape for leaf in policy.observation] != [(4,)] or policy.action.sizes != (2,):
+        return session.random_parameters(1)
+    flat = np.zeros(acting_size(policy), np.float32)
+    views = [view for view in named_views(flat, parameter_layout(policy)[0]).values() if view.ndim == 2]
+    first, second, out = views
+    first[0] = 0.1 * np.array(POLE_GAINS, np.float32)
+    second[0, 0] = 1.0
+    out[:, 0] = (-2000.0, 2000.0)
+    return flat
+
+
+def waits_for_weights(learner: Learner) -> Script[None]:
+    """A permit under weights that have not come yet."""
+    session = yield from collecting(learner)
+    permit = session.permit()
+    session.deal(permit, version=2)
+    yield from learner.quiet(
+        Rollout, QUIET_S, rules.WEIGHTS_NEW_ENOUGH, f"no rollout of ticket {permit.ticket} before version 2"
+    )
+    learner.send(session.weights(2))
+    rollout = yield from session.rollout(permit)
+    if rollout.version != 2:
+        raise Broken(rules.WEIGHTS_NEW_ENOUGH, "version 2", f"version {rollout.version}")
+
+
+def acts_under_the_newest(learner: Learner) -> Script[None]:
+    """A late copy of old weights."""
+    session = yield from collecting(learner)
+    learner.send(session.weights(5))
+    learner.send(session.weights(3))
+    rollout = yield from session.collect(session.permit())
+    if rollout.version != 5:
+        raise Broken(rules.WEIGHTS_NEW_ENOUGH, "version 5, the newest held", f"version {rollout.version}")
+
+
+def acknowledges_weights(learner: Learner) -> Script[None]:
+    """Weights come, and there is nothing to collect."""
+    session = yield from collecting(learner, heartbeat_s=4.0)
+    for version in (1, 2):
+        if version > 1:
+            learner.send(session.weights(version))
+        yield from learner.expect(
+            Heartbeat, rules.ACKNOWLEDGE, f"a Heartbeat with version {version} at once", within_s=2.0, version=version
+        )
+
+
+def takes_rounded_weights(learner: Learner) -> Script[None]:
+    """Parameters rounded to bfloat16, which are sent as uint16, and to float16."""
+    session = yield from collecting(learner, weights=False)
+    for version, dtype in ((1, "bfloat16"), (2, "float16")):
+        rounded = to_wire_dtype(session.random_parameters(version), dtype)  # type: ignore[arg-type]
+        learner.send(Weights(version, rounded, np.zeros(buffer_size(session.run.policy), np.float32)))
+        yield from session.collect(session.permit(), version=version)
+
+
+def sends_again(learner: Learner) -> Script[None]:
+    """A rollout was lost: the learner asks for its ticket again."""
+    session = yield from collecting(learner)
+    learner.received = {0: Received(0, 0, 0)}
+    permit = session.permit()
+    yield from session.collect(permit)
+    for _ in range(2):
+        session.deal(permit)
+        yield from learner.expect(
+            Rollout, rules.ROLLOUT_ONCE, f"the rollout of ticket {permit.ticket} again", ticket=permit.ticket
+        )
+    yield from session.collect(session.permit())
+
+
+def forgets_what_arrived(learner: Learner) -> Script[None]:
+    """A late copy of a Collect whose rollout has arrived."""
+    session = yield from collecting(learner)
+    permit = session.permit()
+    yield from session.collect(permit)
+    for _ in range(2):
+        yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
+    session.deal(permit)
+    yield from learner.quiet(Rollout, QUIET_S, rules.RECEIVED, f"no rollout of ticket {permit.ticket} after it was received")
+    yield from session.collect(session.permit())
+
+
+def says_no_rollout_twice(learner: Learner) -> Script[None]:
+    """Nothing is asked for after a rollout, and its arrival is not yet confirmed."""
+    session = yield from collecting(learner)
+    learner.received = {0: Received(0, 0, 0)}
+    permit = session.permit()
+    yield from session.collect(permit)
+    yield from learner.quiet(Rollout, 1.0, rules.ROLLOUT_ONCE, "one rollout of a ticket that was dealt once")
+
+
+def collects_two_lanes(learner: Learner) -> Script[None]:
+    """Permits of two lanes in one Collect, and two of one lane."""
+    session = yield from collecting(learner)
+    permits = [session.permit(0), session.permit(1), session.permit(0)]
+    session.deal(*permits)
+    waiting = {permit.ticket for permit in permits}
+    while waiting:
+        text = f"rollouts of tickets {sorted(waiting)}"
+        found = yield from learner.expect(Rollout, rules.TICKETS, text, within_s=2 * learner.settings.patience_s)
+        waiting.discard(found.ticket)
+
+
+def starts_a_lane_again(learner: Learner) -> Script[None]:
+    """A higher incarnation, then a permit of the lower one."""
+    session = yield from collecting(learner)
+    yield from session.collect(session.permit())
+    yield from session.collect(session.permit(incarnation=2))
+    old = session.permit(incarnation=1)
+    session.deal(old)
+    yield from learner.quiet(Rollout, QUIET_S, rules.INCARNATION, "no rollout of incarnation 1 after one of 2")
+    yield from session.collect(session.permit(incarnation=2))
+
+
+def releases_a_lane(learner: Learner) -> Script[None]:
+    """A lane goes to another worker while a ticket of it waits for weights."""
+    session = yield from collecting(learner)
+    yield from session.collect(session.permit(0))
+    lost, kept = session.permit(0), session.permit(1)
+    session.deal(lost, kept, version=2)
+    learner.send(Release(learner.session, (LaneIncarnation(0, 0),)))
+    learner.release(0)
+    learner.send(session.weights(2))
+    yield from session.rollout(kept)
+    yield from session.nothing_of(lost, rules.RELEASE, "whose lane was released")
+    found = yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
+    if lost.ticket in found.tickets:
+        raise Broken(rules.RELEASE, "no tickets of the released lane in a Heartbeat", f"ticket {lost.ticket}")
+    yield from session.collect(session.permit(0, incarnation=1))
+
+
+def closes_unlisted_lanes(learner: Learner) -> Script[None]:
+    """A Release was lost; the next HeartbeatReply does not list the lane."""
+    session = yield from collecting(learner)
+    lost, kept = session.permit(0), session.permit(1)
+    session.deal(lost, kept, version=2)
+    learner.unlisted.add(0)
+    for _ in range(3):
+        yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
+    learner.send(session.weights(2))
+    yield from session.rollout(kept)
+    yield from learner.quiet(
+        Rollout, QUIET_S, rules.UNLISTED, f"no rollout of ticket {lost.ticket}, whose lane is not listed"
+    )
+
+
+def ignores_a_late_reply(learner: Learner) -> Script[None]:
+    """A copy of an old HeartbeatReply does not list the lane that came after it."""
+    session = yield from collecting(learner)
+    learner.answers_heartbeats = False
+    yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
+    learner.send(HeartbeatReply(learner.session, 6, ()))
+    permit = session.permit()
+    session.deal(permit, version=2)
+    learner.send(HeartbeatReply(learner.session, 6, ()))
+    learner.send(HeartbeatReply(learner.session, 2, ()))
+    yield from learner.let_pass(0.3)
+    learner.send(session.weights(2))
+    learner.answers_heartbeats = True
+    yield Wait(0.0)
+    text = f"the rollout of ticket {permit.ticket}: late copies of replies 6 and 2 close no lane"
+    yield from learner.expect(Rollout, rules.HEARTBEAT_REPLIES, text, ticket=permit.ticket)
+
+
+# --------------------------------------------------------------------------------------------------------------- faults
+
+
+def forgets_the_session_before(learner: Learner) -> Script[None]:
+    """Rejoin while it collects: nothing of the session before comes, and its weights are forgotten."""
+    session = yield from collecting(learner, steps=2000)
+    yield from session.collect(session.permit())
+    session.deal(session.permit(0), session.permit(1))
+    again = yield from collecting(learner, weights=False)
+    permit = again.permit()
+    again.deal(permit, version=0)
+    text = "no rollout before the first Weights of the session"
+    yield from learner.quiet(Rollout, 2 * QUIET_S, rules.SESSION, text)
+    learner.send(again.weights(1))
+    yield from again.rollout(permit)
+
+
+def collects_over_a_new_connection(learner: Learner) -> Script[None]:
+    """The connection is cut while it collects; the learner asks for the ticket again."""
+    session = yield from collecting(learner, steps=500)
+    permit = session.permit()
+    session.deal(permit)
+    learner.cut()
+    found = yield Wait(10, lambda event: isinstance(event, Heard) and isinstance(event.message, Heartbeat | Rollout))
+    if found is None:
+        raise Broken(rules.CONNECTION, "the client over a new connection, in the same session", "nothing within 10 s")
+    assert learner.watch is not None
+    if permit.ticket not in learner.watch.rollouts:
+        learner.send(session.weights(1))
+        session.deal(permit)
+        yield from session.rollout(permit)
+    yield from session.collect(session.permit())
+
+
+def ignores_what_it_cannot_read(learner: Learner) -> Script[None]:
+    """A Collect with an extra field, Weights with a missing frame, and one for another session."""
+    session = yield from collecting(learner)
+    yield from session.collect(session.permit())
+    message = Collect(learner.session, 1, (session.permit(),), learner.of_lanes())
+    head = msgpack.unpackb(bytes(encode(message)[0]))
+    learner.send_frames([msgpack.packb([*head, "one field too many"])])
+    learner.send_frames([msgpack.packb(head[:-1])])
+    learner.send_frames([encode(session.weights(9))[0]])
+    other = Collect(learner.session + 1000, 1, (session.permit(),), ())
+    learner.send(other)
+    text = "no rollout for a Collect with a field too many or too few, or of another session"
+    yield from learner.quiet(Rollout, QUIET_S, rules.IGNORE_UNREADABLE, text)
+    rollout = yield from session.collect(session.permit())
+    if rollout.version != 1:
+        raise Broken(
+            rules.IGNORE_UNREADABLE, "version 1: the Weights of version 9 had no frames", f"version {rollout.version}"
+        )
+
+
+def beats_while_it_collects(learner: Learner) -> Script[None]:
+    """Rollouts follow each other without a pause; the watch counts heartbeats meanwhile."""
+    session = yield from collecting(learner, steps=1000)
+    until_s = learner.now + 2 * 1.5 + 8 * learner.settings.heartbeat_s
+    while learner.now < until_s:
+        yield from session.collect(session.permit())
+
+
+def evaluates(learner: Learner) -> Script[None]:
+    """Two episodes, greedy, with their rows."""
+    yield from collecting(learner)
+    order = Evaluate(learner.session, learner.ticket(), 1, (1, 2), True, EVALUATED_STEPS, True, False)
+    learner.send(order)
+    rows: dict[int, int] = {}
+    while True:
+        within_s = 2 * learner.settings.patience_s
+        found = yield Wait(
+            within_s, lambda event: isinstance(event, Heard) and isinstance(event.message, EpisodeRows | Evaluated)
+        )
+        if found is None:
+            raise Broken(rules.EVALUATE, f"Evaluated for ticket {order.ticket}", f"none within {within_s:g} s")
+        assert isinstance(found, Heard)
+        match found.message:
+            case EpisodeRows() as part:
+                if part.first_step != rows.get(part.episode, 0):
+                    expected = f"rows of episode {part.episode} from step {rows.get(part.episode, 0)}"
+                    raise Broken(rules.EVALUATE, expected, f"from step {part.first_step}")
+                rows[part.episode] = part.first_step + len(part.reward)
+            case Evaluated() as answer:
+                break
+    if not len(answer.episodes) == len(answer.cut) == 2:
+        raise Broken(rules.EVALUATE, "2 episodes for 2 seeds", f"{len(answer.episodes)}")
+    for number, (episode, cut) in enumerate(zip(answer.episodes, answer.cut, strict=True)):
+        if episode.length > EVALUATED_STEPS or (cut and episode.length != EVALUATED_STEPS):
+            raise Broken(
+                rules.EVALUATE,
+                f"a cut after {EVALUATED_STEPS} steps (most_steps), or an end before",
+                f"{episode.length} steps",
+            )
+        if rows.get(number, 0) != episode.length:
+            raise Broken(
+                rules.EVALUATE,
+                f"rows of all {episode.length} steps of episode {number} before Evaluated (send_rows)",
+                f"{rows.get(number, 0)} rows",
+            )
+
+
+def drains_while_it_collects(learner: Learner) -> Script[None]:
+    """Drain while one ticket is collected and another waits."""
+    session = yield from collecting(learner, steps=1000)
+    yield from session.collect(session.permit())
+    permits = [session.permit(), session.permit()]
+    session.deal(*permits)
+    waits = session.permit(1)
+    session.deal(waits, version=9)
+    learner.send(Drain("the run is over"))
+    arrived: set[int] = set()
+    while True:
+        within_s = 2 * learner.settings.patience_s
+        found = yield Wait(within_s, lambda event: isinstance(event, Heard) and isinstance(event.message, Rollout | Goodbye))
+        if found is None:
+            raise Broken(rules.DRAIN, "Goodbye after Drain", f"none within {within_s:g} s")
+        assert isinstance(found, Heard)
+        match found.message:
+            case Rollout() as rollout:
+                arrived.add(rollout.ticket)
+            case Goodbye() as goodbye:
+                break
+    dealt = {permit.ticket for permit in (*permits, waits)}
+    if (listed := set(goodbye.tickets)) != dealt - arrived:
+        raise Broken(rules.DRAIN, f"Goodbye with the unfinished tickets {sorted(dealt - arrived)}", f"{sorted(listed)}")
+    if len(arrived) > 1:
+        raise Broken(rules.DRAIN, "no new rollout after Drain: at most the one in progress", f"{len(arrived)} rollouts")
+    yield from learner.left(rules.DRAIN, 0, "Drain and Goodbye")

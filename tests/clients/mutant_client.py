@@ -1,0 +1,184 @@
+"""A client that breaks one rule on purpose: our own worker, with one mistake between it and its socket.
+
+    python -m tests.clients.mutant_client MUTANT ADDRESS
+
+Rule: a mutant is a small mistake that an author of a client makes. `none` is the worker without a mistake.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import msgpack
+import msgspec
+import numpy as np
+
+from protocol.errors import BadMessage
+from protocol.messages import (
+    Described,
+    Drain,
+    Goodbye,
+    Heartbeat,
+    HeartbeatReply,
+    Hello,
+    Refuse,
+    Rejoin,
+    Release,
+    Reset,
+    Rollout,
+    Stepped,
+    ToLearner,
+    ToWorker,
+    Weights,
+    Welcome,
+)
+from protocol.specs import StepSpec
+from protocol.wire.codec import Buffer, decode_to_learner, encode
+from protocol.wire.worker_link import WorkerLink
+from workers.session import Session
+from workers.worker import Worker, WorkerOptions, identity
+
+replace = msgspec.structs.replace
+FLAT = np.zeros(0, np.uint8)
+
+
+class Mutant(WorkerLink):
+    """The socket, with a mistake."""
+
+    def __init__(self, mutant: str, address: str) -> None:
+        super().__init__(address, f"mutant-{os.getpid()}")
+        self.mutant = mutant
+        self.session = self.first_session = self.beats = self.attempt = self.newest = 0
+        self.said_hello = self.described = self.has_weights = False
+        self.seen: set[int] = set()
+
+    # ---------------------------------------------------------------- what it says
+
+    def send(self, frames: Sequence[Buffer]) -> None:
+        """Send the messages that the mutant makes of this one."""
+        message = decode_to_learner([bytes(frame) for frame in frames], 1 << 30)
+        match self.mutant, message:
+            case "oversized frame", Goodbye(session):
+                return super().send([msgpack.packb(["Goodbye", session, "x" * (2 << 20), []])])
+            case "wrong order", Heartbeat():
+                name, session, replies, version, *more = msgpack.unpackb(bytes(frames[0]))
+                return super().send([msgpack.packb([name, session, version, replies, *more])])
+        for said in self.said(message):
+            super().send(encode(said))
+        return None
+
+    def said(self, message: Any) -> list[Any]:
+        """What the mutant says in place of this message."""
+        match self.mutant, message:
+            case "stale session", Heartbeat() | Stepped() | Rollout() | Described():
+                self.first_session = self.first_session or message.session
+                return [replace(message, session=self.first_session)]
+            case "forgotten heartbeat", Heartbeat():
+                self.beats += 1
+                return [message] if self.beats <= 3 else []
+            case "wrong dtype", Stepped():
+                return [replace(message, reward=message.reward.astype(np.float32))]
+            case "lane not owned", Stepped() | Rollout():
+                return [replace(message, lane=message.lane ^ 1)]
+            case "wrong shape", Stepped():
+                return [replace(message, obs=tuple(array[..., None] for array in message.obs))]
+            case "missing truncated", Stepped():
+                return [replace(message, truncated=np.zeros_like(message.truncated))]
+            case "missing truncated in rollouts", Rollout():
+                return [replace(message, truncated=np.zeros_like(message.truncated), episodes=())]
+            case "repeated rollout", Rollout():
+                return [message, message]
+            case "wrong episode return", Rollout():
+                return [replace(message, episodes=tuple(replace(each, reward=each.reward + 1) for each in message.episodes))]
+            case "wrong log-probabilities", Rollout():
+                return [replace(message, log_prob=message.log_prob * np.float32(0.9))]
+            case "every row valid", Rollout():
+                return [replace(message, valid=np.ones_like(message.valid))]
+            case "wrong sequence", Rollout():
+                return [replace(message, sequence=message.sequence + 1)]
+            case "Goodbye without tickets", Goodbye():
+                return [replace(message, tickets=())]
+            case "same attempt after Rejoin", Hello():
+                self.attempt = self.attempt or message.attempt
+                return [replace(message, attempt=self.attempt)]
+            case "one Hello only", Hello():
+                was_said, self.said_hello = self.said_hello, True
+                return [] if was_said else [message]
+            case "described once", Described():
+                was_said, self.described = self.described, True
+                return [] if was_said else [message]
+            case "no new Hello in silence", Hello():
+                was_said, self.said_hello = self.said_hello, True
+                return [] if was_said else [message]
+            case "replies counted wrongly", Heartbeat():
+                return [replace(message, replies=message.replies + (message.replies > 0))]
+        return [message]
+
+    # ---------------------------------------------------------------- what it hears
+
+    def receive(self) -> Iterator[ToWorker | BadMessage]:
+        """The messages that the mutant hears."""
+        for message in super().receive():
+            if self.mutant == "ends on what it cannot read" and isinstance(message, BadMessage):
+                raise SystemExit(3)
+            if not isinstance(message, BadMessage):
+                yield from self.heard(message)
+
+    def heard(self, message: Any) -> list[Any]:
+        """What the mutant hears in place of this message."""
+        match self.mutant, message:
+            case "answers before reset", Welcome(session, _, StepSpec() as run):
+                N = run.lanes[0]
+                obs = tuple(np.zeros((N, *leaf.shape), leaf.dtype) for leaf in run.observation)
+                flags = np.zeros(N, bool)
+                self.say(Stepped(session, 1, 0, 0, obs, np.zeros(N), flags, flags, FLAT))
+            case "any Welcome", Welcome():
+                return [replace(message, attempt=self.attempt)]
+            case "no autoreset", Welcome(_, _, StepSpec() as run):
+                return [replace(message, run=replace(run, autoreset="SameStep"))]
+            case "no drain", Drain():
+                return []
+            case "ignores revoke", Release() | HeartbeatReply():
+                return []
+            case "ignores Rejoin", Rejoin():
+                return []
+            case "refusal is no error", Refuse(reason):
+                return [Drain(reason)]
+            case "ignores seeds", Reset():
+                return [replace(message, seeds=(None,) * len(message.seeds))]
+            case "first weights only", Weights():
+                had, self.has_weights = self.has_weights, True
+                return [] if had else [message]
+            case "executes a repeated order again", _ if hasattr(message, "ticket") and hasattr(message, "incarnation"):
+                self.newest = max(self.newest + 1, message.ticket * 1000)
+                return [replace(message, ticket=self.newest)]
+            case "any session", _ if hasattr(message, "session") and not isinstance(message, Welcome):
+                return [replace(message, session=self.session)]
+            case _, Welcome():
+                self.session = message.session
+        return [message]
+
+    def say(self, message: ToLearner) -> None:
+        """Send a message that nobody asked for."""
+        super().send(encode(message))
+
+
+def main(mutant: str, address: str) -> int:
+    """Run the mutant until it leaves."""
+    signals: list[int] = []
+    signal.signal(signal.SIGTERM, lambda number, frame: signals.append(number))
+    link = Mutant(mutant, address)
+    who = identity(f"mutant-{os.getpid()}")
+    link.attempt = who.process_nonce + 1 if mutant == "any Welcome" else 0
+    session = Session(who, time.monotonic(), join_timeout_s=30.0)
+    left = Worker(link, session, WorkerOptions(stop_requests=lambda: len(signals))).run()
+    return left.exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1], sys.argv[2]))

@@ -1,0 +1,91 @@
+"""Each mutant of a client is caught, by a sentence that names the rule it breaks; without a mistake the same checks pass."""
+
+from __future__ import annotations
+
+import sys
+from typing import NamedTuple
+
+import pytest
+
+from learner.conformance.client import rules
+from learner.conformance.client.examiner import Result
+from learner.conformance.client.learner import Settings
+from learner.conformance.client.profiles import PROFILES
+from learner.conformance.client.report import explanation
+from learner.conformance.client.rules import Rule
+from millrace.conform import Client, conform
+from protocol.env_spec import EnvSpec
+
+pytestmark = [pytest.mark.clients, pytest.mark.timeout(120)]
+
+
+class Mutant(NamedTuple):
+    """A mistake, the check that catches it, and the rule that the report names."""
+
+    name: str
+    profile: str
+    check: str
+    rule: Rule
+    got: str
+    """part of what the report says was got"""
+
+
+MUTANTS = [
+    Mutant("stale session", "environment", "joins again after Rejoin", rules.SESSION, "session"),
+    Mutant("forgotten heartbeat", "environment", "beats as often as", rules.HEARTBEAT, "none for"),
+    Mutant("oversized frame", "environment", "says Goodbye after Drain", rules.LIMITS, "head expected at most"),
+    Mutant("wrong dtype", "environment", "answers Reset and Step", rules.STEPPED_ARRAYS, "reward float32[2]"),
+    Mutant("wrong order", "environment", "describes its environment", rules.FRAMES, "Heartbeat.replies"),
+    Mutant("wrong shape", "environment", "answers Reset and Step", rules.STEPPED_ARRAYS, "obs float32[2, 4, 1]"),
+    Mutant("lane not owned", "environment", "serves two lanes", rules.LANES, "lane"),
+    Mutant("lane not owned", "collector", "collects rollouts", rules.LANES, "lane 1"),
+    Mutant("missing truncated", "environment", "truncates an episode", rules.TRUNCATED, "no end after 500 steps"),
+    Mutant("missing truncated in rollouts", "collector", "truncates an episode", rules.ROWS, "valid: expected"),
+    Mutant("repeated rollout", "collector", "sends a rollout once", rules.ROLLOUT_ONCE, "2 rollouts"),
+    Mutant("wrong episode return", "collector", "keeps the row format", rules.EPISODES, ""),
+    Mutant("wrong log-probabilities", "collector", "collects rollouts", rules.LOG_PROB, "-0."),
+    Mutant("every row valid", "collector", "keeps the row format", rules.ROWS, "valid: expected False"),
+    Mutant("wrong sequence", "collector", "collects rollouts", rules.SEQUENCE, "sequence 1"),
+    Mutant("first weights only", "collector", "acts under the newest", rules.WEIGHTS_NEW_ENOUGH, "version 1"),
+    Mutant("Goodbye without tickets", "collector", "drains while it collects", rules.DRAIN, "[]"),
+    Mutant("ignores revoke", "collector", "is released while", rules.RELEASE, "Rollout("),
+    Mutant("same attempt after Rejoin", "environment", "joins again after Rejoin", rules.REJOIN, "attempt"),
+    Mutant("ignores Rejoin", "environment", "joins again after Rejoin", rules.REJOIN, "none within"),
+    Mutant("one Hello only", "environment", "repeats Hello", rules.HELLO_AGAIN, "none within"),
+    Mutant("described once", "environment", "describes its environment", rules.DESCRIBE_AGAIN, "none within"),
+    Mutant("no new Hello in silence", "environment", "falls silent", rules.SILENT, "none within"),
+    Mutant("replies counted wrongly", "environment", "last HeartbeatReply", rules.HEARTBEAT_REPLIES, "2"),
+    Mutant("ends on what it cannot read", "environment", "ignores what it cannot read", rules.STAYS, "exit code 3"),
+    Mutant("answers before reset", "environment", "nothing without an order", rules.ORDER_ONLY, "Stepped("),
+    Mutant("any Welcome", "environment", "newest attempt only", rules.WELCOME_ATTEMPT, "session 77"),
+    Mutant("no autoreset", "environment", "ends episodes", rules.NEXT_STEP, "reward 1"),
+    Mutant("no drain", "environment", "says Goodbye after Drain", rules.DRAIN, "none within"),
+    Mutant("refusal is no error", "environment", "exit code 2 when it is refused", rules.REFUSE, "exit code 0"),
+    Mutant("ignores seeds", "environment", "the same seed", rules.SEEDED, "others"),
+    Mutant("any session", "environment", "an order of another session", rules.OTHER_SESSION, "Stepped("),
+    Mutant("any session", "collector", "ignores what it cannot read", rules.OTHER_SESSION, "Rollout("),
+]
+
+
+def checked(mutant: str, profile: str, names: set[str]) -> list[Result]:
+    """The results of the checks whose names contain one of these."""
+    checks = [check for check in PROFILES[profile] if any(name in check.name for name in names)]
+    assert checks, names
+    client = Client((sys.executable, "-m", "tests.clients.mutant_client", mutant, "{address}"))
+    return conform(client, checks, Settings(EnvSpec("CartPole-v1"), patience_s=3.0), 100.0, lambda result: None)
+
+
+@pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: f"{mutant.name}, {mutant.profile}")
+def test_the_report_names_the_rule_that_a_mutant_breaks(mutant: Mutant) -> None:
+    found = [each for each in checked(mutant.name, mutant.profile, {mutant.check}) if each.outcome == "failed"]
+    assert found, f"{mutant.name} was not caught"
+    assert found[0].rule == mutant.rule, explanation(found[0])
+    assert mutant.got in found[0].got, explanation(found[0])
+    assert mutant.rule.section in " ".join(" ".join(explanation(found[0])).split())
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_without_a_mistake_the_same_checks_pass(profile: str) -> None:
+    names = {mutant.check for mutant in MUTANTS if mutant.profile == profile}
+    found = checked("none", profile, names)
+    assert [each.outcome for each in found] == ["passed"] * len(found), [explanation(each) for each in found]

@@ -1,0 +1,197 @@
+"""The pure core of `millrace conform`: deadlines, results and their words, with a clock that the tests move."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from learner.conformance.client import rules
+from learner.conformance.client.examiner import CHECK_S, Check, Examiner
+from learner.conformance.client.learner import Learner, Settings
+from learner.conformance.client.profiles import PROFILES
+from learner.conformance.client.report import as_data, explanation, line_of, summary
+from learner.conformance.client.rules import Rule
+from learner.conformance.client.script import (
+    Broken,
+    Effect,
+    EndClient,
+    Ended,
+    Heard,
+    Script,
+    Send,
+    Skipped,
+    StartClient,
+    Wait,
+)
+from protocol.env_spec import EnvSpec
+from protocol.errors import BadMessage
+from protocol.messages import Heartbeat, Hello, Welcome
+from protocol.wire.codec import decode_to_worker
+from tests.protocol.test_wire_document import DOCUMENT
+
+SETTINGS = Settings(EnvSpec("CartPole-v1"))
+HELLO = Hello(4, "w", "host", 1, 70, "test", 71)
+
+
+def examiner(*scripts: Callable[[Learner], Script[None]], limit_s: float = 300.0) -> Examiner:
+    return Examiner([Check(script.__name__, script) for script in scripts], SETTINGS, 0.0, limit_s)
+
+
+def passes(learner: Learner) -> Script[None]:
+    yield Wait(0.0)
+
+
+def breaks(learner: Learner) -> Script[None]:
+    yield Wait(0.0)
+    raise Broken(rules.REFUSE, "exit code 2", "exit code 0")
+
+
+def skips(learner: Learner) -> Script[None]:
+    yield Wait(0.0)
+    raise Skipped("the environment has no time limit")
+
+
+def waits_for_ever(learner: Learner) -> Script[None]:
+    while True:
+        yield Wait(1.0)
+
+
+def in_a_session(learner: Learner) -> Script[None]:
+    from learner.conformance.client.join_checks import describe_spec
+
+    yield from learner.newly_started()
+    learner.welcome(describe_spec(learner))
+    yield from learner.let_pass(30.0)
+
+
+def run(test: Examiner, until_s: float, step_s: float = 0.1) -> list[Effect]:
+    """Let the time pass; the client says nothing."""
+    effects, now = [], 0.0
+    while now < until_s and not test.done:
+        effects += test.tick(now)
+        now += step_s
+    return effects
+
+
+def test_each_check_has_one_result_in_order() -> None:
+    test = examiner(passes, breaks, skips, passes)
+    run(test, 5.0)
+    assert [each.outcome for each in test.results] == ["passed", "failed", "skipped", "passed"]
+
+
+def test_a_client_that_says_nothing_has_a_deadline_and_is_ended() -> None:
+    test = examiner(PROFILES["environment"][0].script)
+    effects = run(test, 100.0)
+    (result,) = test.results
+    assert (result.outcome, result.rule) == ("failed", rules.HELLO)
+    assert SETTINGS.start_s <= result.seconds < SETTINGS.start_s + 1
+    assert effects == [StartClient(), EndClient()]
+
+
+def test_a_check_that_does_not_end_is_cut() -> None:
+    test = examiner(waits_for_ever, passes)
+    run(test, 100.0)
+    assert [each.rule for each in test.results] == [rules.PATIENCE, None]
+    assert CHECK_S <= test.results[0].seconds < CHECK_S + 1
+
+
+def test_what_is_not_checked_within_the_limit_has_failed() -> None:
+    test = examiner(passes, waits_for_ever, passes, limit_s=3.0)
+    run(test, 100.0)
+    assert [each.outcome for each in test.results] == ["passed", "failed", "failed"]
+    assert test.results[2].got == "no time left"
+
+
+def welcomed() -> tuple[Examiner, int]:
+    test = examiner(in_a_session)
+    test.tick(0.0)
+    (sent,) = test.handle(Heard(b"w", HELLO), 0.1)
+    assert isinstance(sent, Send)
+    welcome = decode_to_worker(list(sent.frames))
+    assert isinstance(welcome, Welcome)
+    return test, welcome.session
+
+
+def beat(session: int, replies: int = 0) -> Heartbeat:
+    return Heartbeat(session, replies, -1, (), 0, {}, 0)
+
+
+def test_a_heartbeat_that_is_missing_breaks_a_rule() -> None:
+    test, session = welcomed()
+    now = 0.1
+    while now < 3.0:
+        test.handle(Heard(b"w", beat(session)), now)
+        test.tick(now)
+        now += 0.25
+    assert not test.results
+    run(test, now + 2.5)
+    assert test.results[0].rule == rules.HEARTBEAT
+
+
+@pytest.mark.parametrize(
+    ("event", "rule"),
+    [
+        (Heard(b"w", beat(5)), rules.SESSION),
+        (Heard(b"w", BadMessage("head expected at most 1048576 bytes, got 2000000")), rules.LIMITS),
+        (Heard(b"w", BadMessage("head is not a message of ours")), rules.FRAMES),
+        (Ended(3, "Segmentation fault"), rules.STAYS),
+    ],
+)
+def test_what_breaks_a_rule_of_every_session_fails_the_check_at_once(event: Heard | Ended, rule: Rule) -> None:
+    test, _ = welcomed()
+    test.handle(event, 0.2)
+    assert test.results[0].rule == rule
+    if isinstance(event, Ended):
+        assert "Segmentation fault" in test.results[0].got
+
+
+def test_a_reply_that_was_never_sent_is_noticed() -> None:
+    test, session = welcomed()
+    test.handle(Heard(b"w", beat(session)), 0.2)
+    test.handle(Heard(b"w", beat(session, replies=1)), 0.4)
+    assert not test.results
+    test.handle(Heard(b"w", beat(session, replies=9)), 0.6)
+    assert test.results[0].rule == rules.HEARTBEAT_REPLIES
+
+
+def test_what_another_worker_of_the_command_says_is_not_looked_at() -> None:
+    test, _ = welcomed()
+    test.handle(Heard(b"other", beat(5)), 0.2)
+    test.handle(Heard(b"other", Hello(4, "other", "host", 2, 80, "test", 81)), 0.2)
+    assert not test.results
+
+
+def test_the_report_has_the_rule_and_where_it_stands() -> None:
+    test = examiner(passes, breaks, breaks, skips)
+    run(test, 5.0)
+    passed, failed, again, skipped = test.results
+    assert line_of(passed) == "ok       passes"
+    assert line_of(skipped) == "skipped  skips  (the environment has no time limit)"
+    text = " ".join(" ".join(explanation(failed)).split())
+    assert text == (
+        f"rule {rules.REFUSE.text}. (protocol/README.md, “The worker's half”) expected exit code 2 got exit code 0 "
+        f"next {rules.REFUSE.mend}"
+    )
+    assert explanation(again, [passed, failed]) == ["           as in: breaks"]
+    assert summary(test.results).endswith("the client does not conform")
+    data = as_data(test.results, "environment", ["client"])
+    assert data["conforms"] is False
+    assert [each["rule"] for each in data["checks"]] == ["", rules.REFUSE.text, rules.REFUSE.text, ""]
+
+
+def test_every_rule_names_a_part_of_the_wire_document() -> None:
+    every = [value for value in vars(rules).values() if isinstance(value, Rule)]
+    assert len(every) > 40
+    text = DOCUMENT.read_text()
+    for rule in every:
+        heading, _, names = rule.section.partition(", ")
+        assert f"# {heading}" in text, rule.section
+        for name in filter(None, names.split(" and ")):
+            assert f"`{name}`" in text, rule.section
+
+
+def test_no_two_checks_of_a_profile_have_one_name() -> None:
+    for checks in PROFILES.values():
+        names = [check.name for check in checks]
+        assert len(names) == len(set(names)) == 40
