@@ -40,8 +40,8 @@ def policy_of(folder: Path) -> bytes:
 @pytest.mark.parametrize(
     ("env", "settings"),
     [
-        ("CartPole-v1", {"steps": 4_000}),
-        ("Pendulum-v1", {"steps": 17_000, "n_epochs": 1, "batch_size": 256}),
+        ("CartPole-v1", {"steps": 4_000, "n_epochs": 2}),
+        ("Pendulum-v1", {"steps": 7_000, "rollout_steps": 64, "n_epochs": 1}),
         ("CartPole-v1", {"steps": 3_000, "core": "lstm", "core_size": 8, "n_epochs": 1, "normalize_observations": True}),
         ("CartPole-v1", {"steps": 3_000, "algo": "a2c"}),
         ("CartPole-v1", {"steps": 4_000, "algo": "dqn"}),
