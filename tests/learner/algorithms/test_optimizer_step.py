@@ -121,8 +121,10 @@ def test_moments_that_fade_are_zero_before_they_are_denormal_and_only_they(kind:
 def test_runs_that_compile_nothing_do_not_import_the_compiler(tmp_path: Path) -> None:
     program = f"""
 import sys, millrace
-for algo in ("ppo", "a2c", "dqn"):
-    millrace.train("CartPole-v1", algo=algo, steps=2000, run_dir={str(tmp_path)!r}, transport="inproc", eval_episodes=1)
+for algo, steps in (("ppo", 300), ("a2c", 300), ("dqn", 2000)):
+    settings = {{"run_dir": {str(tmp_path)!r}, "transport": "inproc", "eval_episodes": 1}}
+    run = millrace.train("CartPole-v1", algo=algo, steps=steps, **settings)
+    assert run.summary.updates > 0
     assert "torch" in sys.modules
     assert "torch._dynamo" not in sys.modules, algo
 """
