@@ -52,7 +52,7 @@ def worker_processes() -> list[psutil.Process]:
 @pytest.mark.parametrize(
     ("env", "settings"),
     [
-        ("CartPole-v1", {"steps": 5_300}),
+        ("CartPole-v1", {"steps": 5_300, "n_epochs": 2}),
         pytest.param("Pendulum-v1", {"steps": 10_700, "rollout_steps": 64, "n_epochs": 1}, marks=pytest.mark.soak),
     ],
 )
@@ -130,7 +130,7 @@ def test_the_best_policy_of_the_evaluations_is_kept_and_evaluated_again(tmp_path
 
     With some seeds the last one is the best: which seeds these are depends on the processor's last bits.
     """
-    settings: dict[str, Any] = {"steps": 12_000, "eval_every": 1_000, "eval_episodes": 20, "learning_rate": 0.01}
+    settings: dict[str, Any] = {"steps": 6_000, "eval_every": 500, "eval_episodes": 10, "learning_rate": 0.01}
     for seed in range(3, 8):
         folder = run(tmp_path, "CartPole-v1", seed=seed, **settings)
         if summary(folder)["best"]["env_steps"] < summary(folder)["env_steps"]:
@@ -143,7 +143,7 @@ def test_the_best_policy_of_the_evaluations_is_kept_and_evaluated_again(tmp_path
     best = summary(folder)["best"]
     assert len(evaluations) >= 10
     assert best["chosen_by"] == max(evaluations.values()) == evaluations[best["env_steps"]]
-    assert best["evaluation"]["episodes"] == 20
+    assert best["evaluation"]["episodes"] == 10
     final, kept = (load_policy(folder, which) for which in ("final", "best"))
     assert best["env_steps"] < summary(folder)["env_steps"]
     zeros = [np.zeros((1, 1, 4), np.float32)]
@@ -196,13 +196,15 @@ def test_a_killed_worker_is_replaced_and_the_run_ends_well(tmp_path: Path) -> No
             victim.kill()
         if killed and progress.workers_alive == 2:
             back.append(progress.updates)
+        if killed and not back:
+            time.sleep(0.1)  # the other worker's steps must not use up the run before the new one has started
 
-    folder = run(tmp_path, "CartPole-v1", watch, steps=60_000, **SMALL)
+    folder = run(tmp_path, "CartPole-v1", watch, steps=20_000, **SMALL)
     found = summary(folder)
     assert killed
     assert back, "the killed worker never came back"
     assert found["stop_reason"] == "all steps done"
-    assert 60_000 - 256 < found["env_steps"] <= 60_000
+    assert 20_000 - 256 < found["env_steps"] <= 20_000
     assert_balanced(found["ledger"])
 
 
@@ -357,7 +359,7 @@ def test_ctrl_c_drains_saves_and_says_how_to_resume(tmp_path: Path) -> None:
 
 
 def test_a_learner_that_was_killed_goes_on_from_its_newest_checkpoint(tmp_path: Path) -> None:
-    learner = start(tmp_path, "--checkpoint-every-s", "0.2", "--steps", "40000")
+    learner = start(tmp_path, "--checkpoint-every-s", "0.2", "--steps", "100000000")
     wait_for(lambda: len(checkpoints(tmp_path)) >= 3)
     workers = preloaded.workers_of(learner.pid)
     os.kill(learner.pid, signal.SIGKILL)
@@ -374,15 +376,15 @@ def test_a_learner_that_was_killed_goes_on_from_its_newest_checkpoint(tmp_path: 
     def watch(progress: Progress) -> None:
         first.append(progress)
 
-    config = config_from_toml((folder / "config.toml").read_text())
-    train(config, folder, watch)
+    steps = saved + 4_000
+    train(resolve(resume=folder, steps=steps), folder, watch)
     assert saved < first[0].env_steps <= saved + 256, "it did not go on from the newest checkpoint"
     assert first[0].wall_s > clock, "the clock began again"
     found = summary(folder)
-    assert 40_000 - 256 < found["env_steps"] <= 40_000
+    assert steps - 256 < found["env_steps"] <= steps
     assert_balanced(found["ledger"])
-    steps = [row["time/total_timesteps"] for row in read_rows(folder / "metrics.jsonl")]
-    assert steps == sorted(set(steps)), "the curve goes over the same steps twice"
+    curve = [row["time/total_timesteps"] for row in read_rows(folder / "metrics.jsonl")]
+    assert curve == sorted(set(curve)), "the curve goes over the same steps twice"
 
 
 @pytest.mark.parametrize("worker_timeout_s", [1.0, 30.0], ids=["shorter", "longer"])
