@@ -20,6 +20,7 @@ import numpy as np
 
 from protocol.errors import BadMessage
 from protocol.messages import (
+    Collect,
     Described,
     Drain,
     Goodbye,
@@ -55,7 +56,7 @@ class Mutant(WorkerLink):
         self.mutant = mutant
         self.session = self.first_session = self.beats = self.attempt = self.newest = 0
         self.said_hello = self.described = self.has_weights = False
-        self.seen: set[int] = set()
+        self.late_drain: Drain | None = None
 
     # ---------------------------------------------------------------- what it says
 
@@ -142,6 +143,13 @@ class Mutant(WorkerLink):
             case "no autoreset", Welcome(_, _, StepSpec() as run):
                 return [replace(message, run=replace(run, autoreset="SameStep"))]
             case "no drain", Drain():
+                return []
+            case "drains after the next Collect", Drain():
+                self.late_drain = message
+                return []
+            case "drains after the next Collect", Collect() if self.late_drain is not None:
+                return [message, self.late_drain]
+            case "joins again while it drains", Drain():
                 return []
             case "ignores revoke", Release() | HeartbeatReply():
                 return []

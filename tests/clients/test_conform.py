@@ -53,3 +53,13 @@ def test_the_python_worker_conforms(profile: str, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
     assert f"{len(PROFILES[profile])} checks passed, 0 failed" in done.stdout
     assert '"conforms": true' in report.read_text()
+
+
+@pytest.mark.clients
+@pytest.mark.timeout(900)
+def test_the_cpp_client_conforms(cpp: Path) -> None:
+    """The environment profile of the example environment."""
+    client = Client((str(cpp / "cartpole"), "{address}", "--token", "{token}"))
+    results = conform(client, PROFILES["environment"], Settings(EnvSpec("CartPole-v1")), 200.0, lambda result: None)
+    failed = [line for each in results if each.outcome == "failed" for line in (each.name, *explanation(each))]
+    assert not failed, "\n".join(failed)

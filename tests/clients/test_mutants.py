@@ -60,6 +60,8 @@ MUTANTS = [
     Mutant("any Welcome", "environment", "newest attempt only", rules.WELCOME_ATTEMPT, "session 77"),
     Mutant("no autoreset", "environment", "ends episodes", rules.NEXT_STEP, "reward 1"),
     Mutant("no drain", "environment", "says Goodbye after Drain", rules.DRAIN, "none within"),
+    Mutant("drains after the next Collect", "collector", "no work while it drains", rules.DRAINING_IGNORES, "in Goodbye"),
+    Mutant("joins again while it drains", "collector", "join again while it drains", rules.DRAINING_LEAVES, "Hello"),
     Mutant("refusal is no error", "environment", "exit code 2 when it is refused", rules.REFUSE, "exit code 0"),
     Mutant("ignores seeds", "environment", "the same seed", rules.SEEDED, "others"),
     Mutant("any session", "environment", "an order of another session", rules.OTHER_SESSION, "Stepped("),

@@ -12,7 +12,7 @@ from learner.conformance.client import rules
 from learner.conformance.client.join_checks import described
 from learner.conformance.client.learner import Learner
 from learner.conformance.client.rules import Rule
-from learner.conformance.client.script import Broken, Heard, Script, Skipped, Wait, brief
+from learner.conformance.client.script import Broken, Ended, Event, Heard, Script, Skipped, Wait, brief
 from protocol.arrays import Floats
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import UsageError
@@ -25,9 +25,12 @@ from protocol.messages import (
     Goodbye,
     Heartbeat,
     HeartbeatReply,
+    Hello,
     LaneIncarnation,
     Permit,
     Received,
+    Refuse,
+    Rejoin,
     Release,
     Rollout,
     Weights,
@@ -472,3 +475,60 @@ def drains_while_it_collects(learner: Learner) -> Script[None]:
     if len(arrived) > 1:
         raise Broken(rules.DRAIN, "no new rollout after Drain: at most the one in progress", f"{len(arrived)} rollouts")
     yield from learner.left(rules.DRAIN, 0, "Drain and Goodbye")
+
+
+def takes_no_work_while_it_drains(learner: Learner) -> Script[None]:
+    """A Collect, and a copy of the Welcome, after Drain."""
+    session = yield from collecting(learner, steps=1000)
+    yield from session.collect(session.permit())
+    first, second = session.permit(), session.permit(1)
+    session.deal(first)
+    learner.send(Drain("the run is over"))
+    session.deal(second)
+    text = "Goodbye after Drain"
+    within_s = 2 * learner.settings.patience_s
+    goodbye = yield from learner.expect(Goodbye, rules.DRAIN, text, within_s=within_s)
+    assert learner.watch is not None
+    if second.ticket in learner.watch.rollouts or second.ticket in goodbye.tickets:
+        got = "its rollout" if second.ticket in learner.watch.rollouts else "that ticket in Goodbye"
+        raise Broken(rules.DRAINING_IGNORES, f"nothing of ticket {second.ticket}, which came after Drain", got)
+    yield from learner.left(rules.DRAIN, 0, "Drain and Goodbye")
+
+
+def leaves_when_refused_while_it_drains(learner: Learner) -> Script[None]:
+    """Refuse after Drain: the client may have left already."""
+    session = yield from collecting(learner, steps=1000)
+    session.deal(session.permit())
+    learner.send(Drain("the run is over"))
+    learner.send(Refuse("the test refuses this worker"))
+    yield from _ends(learner, (0, 2), "Drain and Refuse")
+
+
+def leaves_when_unknown_while_it_drains(learner: Learner) -> Script[None]:
+    """Rejoin after Drain: the learner does not know the session any more."""
+    session = yield from collecting(learner, steps=1000)
+    session.deal(session.permit())
+    learner.send(Drain("the run is over"))
+    learner.send(Rejoin(learner.session))
+    yield from _ends(learner, (0, 1), "Drain and Rejoin")
+
+
+def _ends(learner: Learner, codes: tuple[int, ...], after: str) -> Script[None]:
+    """The client ends; a Goodbye may come before."""
+    within_s = 2 * learner.settings.patience_s
+    learner.allows_hello = True  # so that a Hello is this check's, and no Heartbeat is due
+
+    def is_answer(event: Event) -> bool:
+        return isinstance(event, Ended) or (isinstance(event, Heard) and isinstance(event.message, Goodbye | Hello))
+
+    found = yield Wait(within_s, is_answer)
+    match found:
+        case Ended(code) if code in codes:
+            return
+        case Ended(code):
+            raise Broken(rules.DRAINING_LEAVES, f"exit code {codes[0]} or {codes[1]} after {after}", f"exit code {code}")
+        case Heard(_, Goodbye()):
+            yield from learner.left(rules.DRAINING_LEAVES, codes, after)
+        case _:
+            got = "Hello" if found is not None else f"a client that still runs {within_s:g} s later"
+            raise Broken(rules.DRAINING_LEAVES, f"the client's end after {after}", got)

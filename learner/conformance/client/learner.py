@@ -228,6 +228,9 @@ class Learner:
                 if not is_wanted:
                     raise Broken(rules.STAYS, "the client to go on", f"Failure: {error}")
             case Goodbye(_, reason):
+                if not is_wanted and not (self.watch.answers or self.watch.rollouts):
+                    part = f"a client that takes part in a session with a {type(self.watch.run).__name__}"
+                    raise Broken(rules.DECLINED, part, f"Goodbye: {reason}")
                 if not is_wanted:
                     raise Broken(rules.STAYS, "the client to go on", f"Goodbye: {reason}")
             case _:
@@ -336,15 +339,16 @@ class Learner:
         self._welcome = Welcome(self._numbers, self.hello.attempt, run)
         self.send(self._welcome)
 
-    def left(self, rule: Rule, code: int, after: str) -> Script[None]:
-        """The client's process ends with this exit code. Or `Broken`."""
+    def left(self, rule: Rule, codes: int | tuple[int, ...], after: str) -> Script[None]:
+        """The client's process ends with this exit code, or one of these. Or `Broken`."""
         within_s = self.settings.patience_s
+        allowed = (codes,) if isinstance(codes, int) else codes
         found = yield Wait(within_s, lambda event: isinstance(event, Ended))
         if found is None:
             raise Broken(rule, f"the client's end after {after}", f"a client that still runs {within_s:g} s later")
         assert isinstance(found, Ended)
-        if found.code != code:
-            raise Broken(rule, f"exit code {code} after {after}", f"exit code {found.code}")
+        if found.code not in allowed:
+            raise Broken(rule, f"exit code {' or '.join(map(str, allowed))} after {after}", f"exit code {found.code}")
 
 
 def _rule_of_unreadable(error: str) -> Rule:

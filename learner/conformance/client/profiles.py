@@ -73,6 +73,9 @@ COLLECTING = [
     Check("beats while it collects", collect_checks.beats_while_it_collects),
     Check("evaluates, with rows", collect_checks.evaluates),
     Check("drains while it collects", collect_checks.drains_while_it_collects),
+    Check("takes no work while it drains", collect_checks.takes_no_work_while_it_drains),
+    Check("leaves when it is refused while it drains", collect_checks.leaves_when_refused_while_it_drains),
+    Check("leaves when it is told to join again while it drains", collect_checks.leaves_when_unknown_while_it_drains),
 ]
 PROFILES: dict[str, tuple[Check, ...]] = {
     "environment": (*JOINING, *STEPPING, *FAULTS),

@@ -325,3 +325,18 @@ PATIENCE = Rule(
     "The whole check ends within its deadline",
     "look for the step at which the client waits; run this check alone with --only",
 )
+DECLINED = Rule(
+    "The worker's half",
+    "A worker that cannot take part in what the Welcome asks for says Goodbye with the reason, and leaves with exit code 2",
+    "if the client is not meant to do this, choose the other --profile, or another --env",
+)
+DRAINING_IGNORES = Rule(
+    "The worker's half",
+    "While draining, every message but Weights, HeartbeatReply, Rejoin and Refuse is ignored: no new work is taken",
+    "look at the state before a message is handled",
+)
+DRAINING_LEAVES = Rule(
+    "The worker's half",
+    "Refuse and Rejoin while draining: the worker leaves",
+    "end the process when one of them arrives after Drain, and say Hello no more",
+)

@@ -194,4 +194,4 @@ def test_every_rule_names_a_part_of_the_wire_document() -> None:
 def test_no_two_checks_of_a_profile_have_one_name() -> None:
     for checks in PROFILES.values():
         names = [check.name for check in checks]
-        assert len(names) == len(set(names)) == 40
+        assert len(names) == len(set(names)) >= 40
