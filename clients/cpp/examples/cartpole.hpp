@@ -2,11 +2,13 @@
 // Euler's method, observations rounded to float32. The same start state and actions give the same bits as gymnasium.
 // An episode ends as terminated when the pole or the cart leaves its bounds, and as truncated after 500 steps.
 //
-// Random numbers (our own): SplitMix64; a start state is four numbers, uniform in [-0.05, 0.05).
+// Random numbers: numpy's, as gymnasium's. A start state is four numbers, uniform in [-0.05, 0.05); so a seed gives the same
+// episodes as in Python, and a learner that acts for this client learns the same weights, bit for bit.
 #pragma once
 #include <cmath>
 
 #include "millrace/worker.hpp"
+#include "numpy_random.hpp"
 
 class CartPole : public millrace::Env {
  public:
@@ -21,8 +23,8 @@ class CartPole : public millrace::Env {
   explicit CartPole(std::uint64_t seed = 0) : random_(seed) {}
 
   void reset(std::optional<std::uint64_t> seed, void* obs) override {
-    if (seed) random_ = *seed;
-    for (double& each : state) each = -0.05 + 0.1 * uniform();
+    if (seed) random_ = NumpyRandom(*seed);
+    for (double& each : state) each = random_.uniform(-0.05, 0.05);
     steps_ = 0;
     observe(obs);
   }
@@ -44,14 +46,8 @@ class CartPole : public millrace::Env {
   std::array<double, 4> state{};  // position (m), velocity, angle (rad), angular velocity
 
  private:
-  double uniform() {  // SplitMix64
-    std::uint64_t z = random_ += 0x9e3779b97f4a7c15;
-    z = (z ^ z >> 30) * 0xbf58476d1ce4e5b9;
-    z = (z ^ z >> 27) * 0x94d049bb133111eb;
-    return double((z ^ z >> 31) >> 11) * 0x1p-53;
-  }
   void observe(void* obs) const { std::copy(state.begin(), state.end(), static_cast<float*>(obs)); }
 
-  std::uint64_t random_;
+  NumpyRandom random_;
   int steps_ = 0;
 };

@@ -2,6 +2,7 @@
 //
 // Rule: a message is read to its end, and every array checked against its frame, before any of it is used.
 #pragma once
+#include <algorithm>
 #include <array>
 #include <cmath>
 #include <optional>
@@ -11,7 +12,7 @@
 namespace millrace {
 
 constexpr std::uint64_t PROTOCOL_VERSION = 4;
-constexpr std::size_t MAX_FRAMES = 256, MAX_HEAD_BYTES = 1 << 20, MAX_FRAME_BYTES = 1 << 30, MAX_DIMENSIONS = 8;
+constexpr std::size_t MAX_FRAMES = 256, MAX_HEAD_BYTES = 1 << 20, MAX_FRAME_BYTES = 1 << 30, MAX_DIMENSIONS = 8, MAX_COPIES = 1 << 16;
 
 struct Frame {  // bytes that belong to somebody else
   const void* data;
@@ -285,6 +286,8 @@ class Decoder {
     if (!collects && run.type != "StepSpec" && run.type != "DescribeSpec") throw BadMessage("Welcome: expected a known run");
     if (collects && (!run.rollout_steps || !run.copies || run.observation.empty() || run.action.empty()))
       throw BadMessage("RunSpec: expected its steps, copies and spaces");
+    bool many = run.copies > MAX_COPIES || std::any_of(run.lanes.begin(), run.lanes.end(), [](std::size_t n) { return n > MAX_COPIES; });
+    if (many) throw BadMessage("Welcome: expected at most 65536 copies in a lane");
     if (!(run.heartbeat_s > 0) || !(run.learner_timeout_s > 0)) throw BadMessage("Welcome: expected times above 0");
     return run;
   }

@@ -143,7 +143,7 @@ class Writer {  // keeps its memory: after some messages it allocates no more
     bytes.insert(bytes.end(), value.begin(), value.end());
     return *this;
   }
-  Writer& described(const char* dtype, std::size_t frame, std::initializer_list<std::size_t> lead,
+  Writer& described(std::string_view dtype, std::size_t frame, std::initializer_list<std::size_t> lead,
                                               const std::vector<std::size_t>& shape = {}) {
     array(3).text(dtype).array(lead.size() + shape.size());
     for (std::size_t side : lead) natural(side);

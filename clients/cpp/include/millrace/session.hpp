@@ -131,7 +131,46 @@ class Session {
     link_.send(head_);
     leave(1, error);
   }
-  void log(const std::string& text) const { std::fprintf(stderr, "%s: %s\n", options_.name.c_str(), text.c_str()); }
+  virtual void log(const std::string& text) const {  // override it to use your program's log
+    std::fprintf(stderr, "%s: %s\n", options_.name.c_str(), text.c_str());
+  }
+
+  void receive(const Message& m) {
+    if (m.type == Type::Drain) heard_s_ = now_s();
+    bool joining = state_ == State::joining, ready = state_ == State::ready;
+    switch (m.type) {  // the table of the wire document: what is ignored in this state
+      case Type::Welcome: if (state_ == State::draining) return; break;
+      case Type::Refuse: break;
+      case Type::Drain: if (state_ == State::draining) return; break;
+      case Type::Weights: case Type::HeartbeatReply: case Type::Rejoin: if (joining) return; break;
+      default: if (!ready) return;
+    }
+    if (m.type != Type::Welcome && m.session && *m.session != session_) return;  // of an earlier session
+    switch (m.type) {
+      case Type::Welcome: return welcome(m);
+      case Type::Refuse: return leave(2, m.text);
+      case Type::Drain: return drain(m.text, false);
+      case Type::Rejoin:
+        return state_ == State::draining ? leave(1, "the learner does not know this session") : rejoin("the learner asks for it");
+      default: break;
+    }
+    heard_s_ = now_s();
+    if (m.type == Type::Release) {
+      for (const LaneIncarnation& lane : m.lanes) release(lane.lane, lane.incarnation);
+      return;
+    }
+    if (m.type == Type::HeartbeatReply) {
+      if (m.number <= replies_) return;  // a late copy
+      replies_ = m.number;
+    }
+    handle(m);
+    if (m.type == Type::HeartbeatReply)
+      for (std::uint64_t lane : lanes()) {
+        auto same = [&](const Received& received) { return received.lane == lane; };
+        if (std::none_of(m.received.begin(), m.received.end(), same))
+          release(lane, std::numeric_limits<std::uint64_t>::max());  // its Release was lost
+      }
+  }
 
   class InEnv {  // while it exists, environment code runs and the other thread sends the heartbeats
    public:
@@ -145,6 +184,7 @@ class Session {
     Session& session_;
   };
 
+  std::uint64_t attempt() const { return attempt_; }
   State state_ = State::joining;
   Description description_;
   Run run_;
@@ -218,43 +258,6 @@ class Session {
       wake_.wait_for(lock, std::chrono::duration<double>(std::min(0.25, 0.25 * run_.heartbeat_s)));
       if (!closing_ && state_ != State::joining && state_ != State::left) heartbeat_if_due(now_s());
     }
-  }
-
-  void receive(const Message& m) {
-    if (m.type == Type::Drain) heard_s_ = now_s();
-    bool joining = state_ == State::joining, ready = state_ == State::ready;
-    switch (m.type) {  // the table of the wire document: what is ignored in this state
-      case Type::Welcome: if (state_ == State::draining) return; break;
-      case Type::Refuse: break;
-      case Type::Drain: if (state_ == State::draining) return; break;
-      case Type::Weights: case Type::HeartbeatReply: case Type::Rejoin: if (joining) return; break;
-      default: if (!ready) return;
-    }
-    if (m.type != Type::Welcome && m.session && *m.session != session_) return;  // of an earlier session
-    switch (m.type) {
-      case Type::Welcome: return welcome(m);
-      case Type::Refuse: return leave(2, m.text);
-      case Type::Drain: return drain(m.text, false);
-      case Type::Rejoin:
-        return state_ == State::draining ? leave(1, "the learner does not know this session") : rejoin("the learner asks for it");
-      default: break;
-    }
-    heard_s_ = now_s();
-    if (m.type == Type::Release) {
-      for (const LaneIncarnation& lane : m.lanes) release(lane.lane, lane.incarnation);
-      return;
-    }
-    if (m.type == Type::HeartbeatReply) {
-      if (m.number <= replies_) return;  // a late copy
-      replies_ = m.number;
-    }
-    handle(m);
-    if (m.type == Type::HeartbeatReply)
-      for (std::uint64_t lane : lanes()) {
-        auto same = [&](const Received& received) { return received.lane == lane; };
-        if (std::none_of(m.received.begin(), m.received.end(), same))
-          release(lane, std::numeric_limits<std::uint64_t>::max());  // its Release was lost
-      }
   }
 
   void welcome(const Message& m) {

@@ -1,11 +1,12 @@
 // The library drives: it makes your environment, steps it for the learner, and leaves when the learner says so.
 //
-// Rule (environment profile): an order is executed once; its answer is kept until the lane's next order, and sent again
-// if the order comes again. A step allocates nothing once the lane is open.
+// The learner decides which profile it is. Environment profile: the learner acts, and we answer Reset and Step. An order is
+// executed once; its answer is kept until the lane's next order, and sent again if the order comes again. Collector profile:
+// we act with the newest weights, and send whole rollouts. Rule: once a lane is open, a step allocates nothing.
 #pragma once
 #include <functional>
 
-#include "session.hpp"
+#include "rollouts.hpp"
 
 namespace millrace {
 
@@ -28,20 +29,23 @@ class Env {  // one env copy. What it throws ends the client, and the learner is
   virtual Result step(Action action, void* obs) = 0;
 };
 
-class Worker : public Session {
+class Worker : public CollectorSession {
  public:
   using Make = std::function<std::unique_ptr<Env>()>;
   Worker(Options options, Description description, Make make)
-      : Session(std::move(options), std::move(description)), make_(std::move(make)) {}
+      : CollectorSession(std::move(options), std::move(description)), make_(std::move(make)) {}
 
   int run() {  // until the conversation is over. Returns the exit code
     std::unique_lock lock(mutex_);
-    while (state_ != State::left) pump(0.5);
+    while (state_ != State::left) {
+      pump(0.5);
+      while (state_ == State::ready && work()) pump(0);
+    }
     return exit_code();
   }
 
  protected:
-  struct Lane {
+  struct Lane {  // of the environment profile
     std::uint64_t incarnation, ticket;
     bool answered = false;
     std::vector<std::unique_ptr<Env>> envs;
@@ -51,28 +55,30 @@ class Worker : public Session {
   };
 
   std::string begin(const Run& run) override {
-    if (run.type != "StepSpec") return "this client only steps environments; start the learner with --inference learner";
+    if (run.type == "RunSpec") return begin_collecting(run);
     if (run.autoreset == "SameStep") return "the C++ client resets a copy in the next step, the learner asks for autoreset SameStep";
-    return spaces_of(run);
+    return other_spaces(run);
   }
-  std::string spaces_of(const Run& run) const {
-    bool same = run.observation.size() == 1 && run.action.size() == 1 && description_.observation.is(run.observation[0]) &&
-                description_.action.is(run.action[0]);
-    return same ? "" : "environment " + description_.id + ": its observations or actions are not what the learner has; build both from the same version";
-  }
-  void end() override { lanes_.clear(); }
+  void end() override { lanes_.clear(), collected_.clear(), evaluation_env_.reset(), end_collecting(); }
+  bool busy() const override { return busy_; }
   std::vector<std::uint64_t> lanes() const override {
-    std::vector<std::uint64_t> all;
+    std::vector<std::uint64_t> all = CollectorSession::lanes();
     for (auto& [number, lane] : lanes_) all.push_back(number);
     return all;
   }
-  const std::vector<std::uint64_t>& tickets() override { return in_progress_; }
+  const std::vector<std::uint64_t>& tickets() override {
+    return run_.type == "StepSpec" ? in_progress_ : CollectorSession::tickets();
+  }
   void release(std::uint64_t number, std::uint64_t incarnation) override {
+    CollectorSession::release(number, incarnation);
+    auto collected = collected_.find(number);
+    if (collected != collected_.end() && collected->second->incarnation <= incarnation) collected_.erase(collected);
     auto found = lanes_.find(number);
     if (found != lanes_.end() && found->second.incarnation <= incarnation) lanes_.erase(found);
   }
 
   void handle(const Message& m) override {
+    if (run_.type == "RunSpec") return handle_collecting(m);
     if (m.type != Type::Reset && m.type != Type::Step && m.type != Type::Call) return;
     if (m.lane >= run_.lanes.size()) throw BadMessage("order: expected a lane of the run");
     auto found = lanes_.find(m.lane);
@@ -162,7 +168,126 @@ class Worker : public Session {
     send(head_, {{nullptr, 0}});
   }
 
+  // ---------------------------------------------------------------- the collector profile
+
+  struct Collected {  // a lane
+    std::uint64_t incarnation;
+    std::vector<std::unique_ptr<Env>> envs;
+    Recorder rows;
+    Random random;
+    std::vector<unsigned char> action;
+  };
+
+  bool work() {  // the next evaluation or rollout; false if there is none
+    if (run_.type != "RunSpec") return false;
+    if (EvaluationOrder* order = next_evaluation()) return evaluate(*order), true;
+    std::unique_ptr<Rollout> rollout = next_rollout();
+    return rollout ? (collect(std::move(rollout)), true) : false;
+  }
+  void pulse() {  // now and then during long work: handle messages
+    if (now_s() >= pulse_due_s_) pump(0), pulse_due_s_ = now_s() + 0.05;
+  }
+
+  void collect(std::unique_ptr<Rollout> rollout) {
+    const std::uint64_t session = session_;
+    busy_ = true;
+    try {
+      std::shared_ptr<Collected> lane = lane_of(*rollout);  // ours, even if a pulse releases it
+      Recorder& rows = lane->rows;
+      for (rows.begin(*rollout);;) {
+        pulse();
+        if (!wanted(*rollout, session)) break;
+        double began_s = now_s();
+        for (std::size_t n = 0; n < rows.N; ++n)
+          policy_.act(rows.obs_at(*rollout, n), &lane->random, rows.action_at(*rollout, n), rows.log_prob_at(*rollout, n));
+        double acted_s = now_s();
+        {
+          InEnv stepping(*this, "stepping");
+          for (std::size_t n = 0; n < rows.N; ++n) {
+            Result result;
+            if (rows.ended[n]) {
+              lane->envs[n]->reset(std::nullopt, rows.next_obs_at(*rollout, n));
+            } else {
+              policy_.to_env(rows.action_at(*rollout, n), lane->action.data());
+              result = lane->envs[n]->step({lane->action.data()}, rows.next_obs_at(*rollout, n));
+            }
+            rows.result(*rollout, n, result.reward, result.terminated, result.truncated, acted_s);
+          }
+        }
+        act_s_ += acted_s - began_s, step_s_ += now_s() - acted_s;
+        if (!rows.end_row(*rollout)) continue;
+        finished(std::move(rollout));
+        break;
+      }
+      if (rollout) collected_.erase(rollout->lane);  // abandoned in the middle of its rows
+    } catch (const std::exception& error) {
+      fail("lane " + std::to_string(rollout ? rollout->lane : 0) + ": its environment raised: " + error.what(), rollout ? std::optional(rollout->lane) : std::nullopt);
+    }
+    busy_ = false;
+    drained();
+  }
+
+  std::shared_ptr<Collected> lane_of(const Rollout& r) {  // opened, if this incarnation of it is not yet here
+    auto found = collected_.find(r.lane);
+    if (found != collected_.end() && found->second->incarnation == r.incarnation) return found->second;
+    auto lane = std::make_shared<Collected>(Collected{r.incarnation, {}, Recorder(run_, description_.observation, description_.action),
+                                                      Random{run_.seed, r.lane, r.incarnation}, {}});
+    lane->action.resize(description_.action.bytes());
+    {
+      InEnv making(*this, "making");
+      for (std::size_t n = 0; n < run_.copies; ++n) {
+        lane->envs.push_back(make_());
+        lane->envs[n]->reset(Random{run_.seed, r.lane, r.incarnation, n + 1}.bits() >> 1, &lane->rows.obs[n * lane->rows.obs_bytes]);
+        lane->rows.check(&lane->rows.obs[n * lane->rows.obs_bytes]);
+        lane->rows.started(n, now_s());
+      }
+    }
+    return collected_[r.lane] = lane;
+  }
+
+  void evaluate(const EvaluationOrder& order) {  // one episode for each seed, on a copy of its own
+    const EvaluationOrder played = order;
+    const std::uint64_t session = session_;
+    Evaluation evaluation{played.ticket, {}, {}};
+    busy_ = true;
+    double began_s = now_s();
+    try {
+      if (!evaluation_env_) evaluation_env_ = make_();
+      std::shared_ptr<Env> env = evaluation_env_;
+      std::vector<unsigned char> obs(description_.observation.bytes()), stored(description_.action.bytes()), action(stored.size());
+      Random random{played.seeds[0]};
+      float log_prob;
+      for (std::uint64_t seed : played.seeds) {
+        double start_s = now_s();
+        Episode episode;
+        Result result;
+        env->reset(seed, obs.data());
+        while (!result.terminated && !result.truncated && episode.length < played.most_steps) {
+          pulse();
+          if (state_ != State::ready || session != session_) return busy_ = false, drained();  // a client that leaves does not finish it
+          policy_.act(obs.data(), played.greedy ? nullptr : &random, stored.data(), &log_prob);
+          policy_.to_env(stored.data(), action.data());
+          InEnv evaluating(*this, "evaluating");
+          result = env->step({action.data()}, obs.data());
+          episode.reward += result.reward, ++episode.length, ++steps_;
+        }
+        episode.seconds = now_s() - start_s;
+        evaluation.episodes.push_back(episode);
+        evaluation.cut.push_back(!result.terminated && !result.truncated);
+      }
+    } catch (const std::exception& error) {
+      return busy_ = false, fail(std::string("while the policy was evaluated: its environment raised: ") + error.what(), std::nullopt);
+    }
+    evaluate_s_ += now_s() - began_s;
+    busy_ = false;
+    evaluated(evaluation);
+  }
+
   Make make_;
+  std::map<std::uint64_t, std::shared_ptr<Collected>> collected_;
+  std::shared_ptr<Env> evaluation_env_;
+  bool busy_ = false;
+  double pulse_due_s_ = 0;
   std::map<std::uint64_t, Lane> lanes_;
   std::vector<std::uint64_t> in_progress_;
 };

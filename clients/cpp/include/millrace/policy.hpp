@@ -1,0 +1,159 @@
+// The policy in the client (collector profile): an MLP from the flat weights, its distribution, and what it draws.
+//
+// Rule: everything is float32. Sums go from the first input to the last, and nothing is fused (-ffp-contract=off), so the
+// same weights, observations and random numbers give the same bits on every processor with the same libm.
+#pragma once
+#include "session.hpp"
+
+namespace millrace {
+
+class Random {  // SplitMix64 (Steele et al. 2014); normal numbers by Box and Muller
+ public:
+  Random(std::initializer_list<std::uint64_t> seed = {}) {
+    for (std::uint64_t each : seed) state_ = bits() ^ each;
+  }
+  std::uint64_t bits() {
+    std::uint64_t z = state_ += 0x9e3779b97f4a7c15;
+    z = (z ^ z >> 30) * 0xbf58476d1ce4e5b9;
+    z = (z ^ z >> 27) * 0x94d049bb133111eb;
+    return z ^ z >> 31;
+  }
+  float uniform() { return (static_cast<float>(bits() >> 40) + 0.5f) * 0x1p-24f; }  // in (0, 1)
+  float gumbel() { return -std::log(-std::log(uniform())); }
+  float normal() { float radius = std::sqrt(-2 * std::log(uniform())); return radius * std::cos(6.2831853f * uniform()); }
+
+ private:
+  std::uint64_t state_ = 0;
+};
+
+class Policy {
+ public:
+  Policy() = default;
+  Policy(const Run& run, const Space& observation, const Space& action)
+      : observation_(observation), action_(action), relu_(run.relu), normalize_(run.normalize),
+        inputs_(observation.kind == "discrete" ? static_cast<std::size_t>(observation.n) : observation.elements()),
+        outputs_(action.kind == "discrete" ? static_cast<std::size_t>(action.n) : action.elements()) {
+    std::size_t width = inputs_, widest = std::max(inputs_, outputs_);
+    for (std::size_t next : run.net) {
+      if (!next || next > 1 << 16) throw BadMessage("PolicySpec: expected widths from 1 to 65536");
+      layers_.push_back({width, next, {}, {}}), width = next, widest = std::max(widest, next);
+    }
+    layers_.push_back({width, outputs_, {}, {}});
+    x_.resize(widest), y_.resize(widest), params_.resize(outputs_), log_std_.resize(action.kind == "box" ? outputs_ : 0);
+  }
+
+  void check(const Message& weights) const {  // throws BadMessage if they are not of this policy
+    const Array &given = weights.arrays[0], &buffers = weights.arrays[1];
+    std::size_t expected = log_std_.size();
+    for (const Layer& layer : layers_) expected += layer.outputs * (layer.inputs + 1);
+    bool known = given.dtype == "<f4" || given.dtype == "<f2" || given.dtype == "<u2";
+    if (!known || given.elements != expected || buffers.elements != (normalize_ ? 2 * inputs_ : 0))
+      throw BadMessage("Weights: expected " + std::to_string(expected) + " parameters, got " + std::to_string(given.elements));
+  }
+  void load(const Message& weights) {  // checked ones, in the order of the wire document: linear weights are [out, in]
+    const Array &given = weights.arrays[0], &buffers = weights.arrays[1];
+    std::size_t at = 0;
+    for (Layer& layer : layers_) {
+      layer.weight.resize(layer.inputs * layer.outputs), layer.bias.resize(layer.outputs);
+      for (std::size_t o = 0; o < layer.outputs; ++o)
+        for (std::size_t i = 0; i < layer.inputs; ++i) layer.weight[i * layer.outputs + o] = as_float(given, at++);  // [in, out]
+      for (float& each : layer.bias) each = as_float(given, at++);
+    }
+    for (float& each : log_std_) each = as_float(given, at++);
+    const float* numbers = static_cast<const float*>(buffers.data);
+    buffers_.assign(numbers, numbers + buffers.elements);
+  }
+
+  void act(const void* obs, Random* random, void* action, float* log_prob) {  // without random numbers: the most probable action
+    forward(obs);
+    if (action_.kind == "discrete") {
+      std::size_t best = 0;
+      float highest = -std::numeric_limits<float>::infinity(), largest = highest, sum = 0;
+      for (std::size_t i = 0; i < outputs_; ++i) {
+        float value = params_[i] + (random ? random->gumbel() : 0);
+        if (value > highest) highest = value, best = i;
+        largest = std::max(largest, params_[i]);
+      }
+      for (float logit : params_) sum += std::exp(logit - largest);
+      *log_prob = params_[best] - largest - std::log(sum);
+      std::int64_t chosen = static_cast<std::int64_t>(best);
+      std::memcpy(action, &chosen, 8);  // counted from 0
+    } else {
+      float* drawn = static_cast<float*>(action);
+      *log_prob = 0;
+      for (std::size_t i = 0; i < outputs_; ++i) {
+        drawn[i] = params_[i] + (random ? std::exp(log_std_[i]) * random->normal() : 0);
+        float z = (drawn[i] - params_[i]) * std::exp(-log_std_[i]);
+        *log_prob += -0.5f * z * z - log_std_[i] - 0.918938533f;
+      }
+    }
+  }
+
+  void to_env(const void* stored, void* action) const {  // shifted by the start of a Discrete, clipped to the bounds of a Box
+    if (action_.kind == "discrete") {
+      std::int64_t chosen;
+      std::memcpy(&chosen, stored, 8), chosen += action_.start;
+      std::memcpy(action, &chosen, 8);
+    } else {
+      for (std::size_t i = 0; i < outputs_; ++i) {
+        auto bound = [&](const std::vector<double>& all) { return static_cast<float>(all[all.size() == 1 ? 0 : i]); };
+        static_cast<float*>(action)[i] = std::min(std::max(static_cast<const float*>(stored)[i], bound(action_.low)), bound(action_.high));
+      }
+    }
+  }
+
+ private:
+  struct Layer { std::size_t inputs, outputs; std::vector<float> weight, bias; };
+
+  void forward(const void* obs) {
+    for (std::size_t i = 0; i < inputs_; ++i) x_[i] = feature(obs, i);
+    for (const Layer& layer : layers_) {
+      bool last = &layer == &layers_.back();
+      float* y = last ? params_.data() : y_.data();
+      std::fill(y, y + layer.outputs, 0.0f);
+      for (std::size_t i = 0; i < layer.inputs; ++i) {
+        const float* row = &layer.weight[i * layer.outputs];
+        for (std::size_t o = 0; o < layer.outputs; ++o) y[o] += x_[i] * row[o];
+      }
+      for (std::size_t o = 0; o < layer.outputs; ++o) y[o] += layer.bias[o];
+      if (last) return;
+      for (std::size_t o = 0; o < layer.outputs; ++o) y[o] = relu_ ? std::max(y[o], 0.0f) : std::tanh(y[o]);
+      x_.swap(y_);
+    }
+  }
+  float feature(const void* obs, std::size_t i) const {
+    if (observation_.kind == "discrete") {
+      std::int64_t value;
+      std::memcpy(&value, obs, 8);
+      return value - observation_.start == static_cast<std::int64_t>(i);
+    }
+    double value = observation_.dtype == "float32"   ? static_cast<const float*>(obs)[i]
+                   : observation_.dtype == "float64" ? static_cast<const double*>(obs)[i]
+                   : observation_.dtype == "uint8"   ? static_cast<const unsigned char*>(obs)[i] * (1 / 255.0f)
+                                                     : static_cast<float>(static_cast<const std::int64_t*>(obs)[i]);
+    if (!normalize_) return static_cast<float>(value);
+    double mean = buffers_[i], std = buffers_[inputs_ + i];
+    double scaled = observation_.dtype == "float64" ? (value - mean) / std  // in the dtype of the observation
+                                                    : (static_cast<float>(value) - buffers_[i]) / buffers_[inputs_ + i];
+    return static_cast<float>(std::min(std::max(scaled, -10.0), 10.0));
+  }
+  static float as_float(const Array& array, std::size_t i) {  // float32, float16, or bfloat16 sent as uint16
+    float value;
+    std::uint32_t bits;
+    if (array.dtype == "<f4") return std::memcpy(&value, static_cast<const char*>(array.data) + 4 * i, 4), value;
+    std::uint16_t half;
+    std::memcpy(&half, static_cast<const char*>(array.data) + 2 * i, 2);
+    if (array.dtype == "<u2") return bits = std::uint32_t(half) << 16, std::memcpy(&value, &bits, 4), value;
+    int exponent = half >> 10 & 31, fraction = half & 1023;
+    value = exponent ? std::ldexp(1024.0f + static_cast<float>(fraction), exponent - 25) : std::ldexp(static_cast<float>(fraction), -24);
+    return half >> 15 ? -value : value;
+  }
+
+  Space observation_, action_;
+  bool relu_ = false, normalize_ = false;
+  std::size_t inputs_ = 0, outputs_ = 0;
+  std::vector<Layer> layers_;
+  std::vector<float> x_, y_, params_, log_std_, buffers_;
+};
+
+}  // namespace millrace

@@ -1,0 +1,296 @@
+// The tickets, rollouts and evaluation orders of the collector profile, and the columns of a rollout.
+//
+// Rule: a ticket is collected once. Its rollout is kept until the learner has received it, and sent again when the learner
+// asks for it again. The memory of a rollout that has arrived is used for the next one.
+#pragma once
+#include <deque>
+
+#include "policy.hpp"
+
+namespace millrace {
+
+struct Episode { double reward = 0; std::uint64_t length = 0; double seconds = 0; };
+
+struct Rollout {  // T rows of N copies: in obs[t] we did action[t], got reward[t] and saw obs[t+1], wherever valid[t]
+  std::uint64_t lane = 0, incarnation = 0, ticket = 0, version = 0, sequence = 0;
+  std::size_t rows = 0;                                 // that are complete
+  std::vector<unsigned char> obs, action;               // [T+1, N, …], [T, N, …]
+  std::vector<float> log_prob, reward;                  // [T, N]
+  std::vector<unsigned char> terminated, truncated, valid;
+  std::vector<Episode> episodes;
+};
+
+class Recorder {  // writes the rows of a lane, and counts its episodes from one rollout to the next
+ public:
+  Recorder(const Run& run, const Space& observation, const Space& action)
+      : T(run.rollout_steps), N(run.copies), obs_bytes(observation.bytes()), action_bytes(action.bytes()), obs(N * obs_bytes),
+        ended(N), episodes_(N), floats_(observation.dtype == "float32"), doubles_(observation.dtype == "float64"),
+        elements_(observation.elements()) {}
+
+  void begin(Rollout& r) {
+    r.rows = 0, r.episodes.clear();
+    r.obs.resize((T + 1) * N * obs_bytes), r.action.resize(T * N * action_bytes);
+    r.log_prob.resize(T * N), r.reward.resize(T * N), r.terminated.resize(T * N), r.truncated.resize(T * N), r.valid.resize(T * N);
+    std::copy(obs.begin(), obs.end(), r.obs.begin());
+  }
+  void* obs_at(Rollout& r, std::size_t n) { return &r.obs[(r.rows * N + n) * obs_bytes]; }  // of the row that is not yet complete
+  void* next_obs_at(Rollout& r, std::size_t n) { return &r.obs[((r.rows + 1) * N + n) * obs_bytes]; }
+  void* action_at(Rollout& r, std::size_t n) { return &r.action[(r.rows * N + n) * action_bytes]; }
+  float* log_prob_at(Rollout& r, std::size_t n) { return &r.log_prob[r.rows * N + n]; }
+
+  void result(Rollout& r, std::size_t n, double reward, bool terminated, bool truncated, double now) {  // of copy n in this row
+    const std::size_t i = r.rows * N + n;
+    const bool valid = !ended[n];
+    Episode& episode = episodes_[n];
+    if (!valid) reward = 0, episode = {0, 0, now};  // this row only resets the copy
+    r.reward[i] = static_cast<float>(reward), r.terminated[i] = terminated, r.truncated[i] = truncated, r.valid[i] = valid;
+    if (!std::isfinite(r.reward[i])) throw std::runtime_error("reward: expected a finite number");
+    check(next_obs_at(r, n));
+    if (valid) episode.reward += reward, ++episode.length;
+    ended[n] = terminated || truncated;
+    if (ended[n] && valid) report(r, n, now);
+  }
+  void not_applied(Rollout& r, std::size_t n, double now) {  // the action of this row: call it before `result`
+    // The row must not be learned from, so the episode ends as truncated with the row before, and another begins after it.
+    const std::size_t before = (r.rows - 1) * N + n;
+    if (r.rows && !ended[n]) {
+      r.truncated[before] = 1;
+      if (r.valid[before]) report(r, n, now);
+    }
+    ended[n] = 1;
+  }
+  void outside_of_rows(std::size_t n, double reward, bool end, double now) {  // a step between two rollouts
+    if (ended[n]) episodes_[n] = {0, 0, now};
+    else episodes_[n].reward += reward, ++episodes_[n].length;
+    ended[n] = end;
+  }
+  bool end_row(Rollout& r) {  // whether the rollout is complete
+    if (++r.rows < T) return false;
+    std::copy(r.obs.end() - static_cast<std::ptrdiff_t>(obs.size()), r.obs.end(), obs.begin());
+    return true;
+  }
+  void started(std::size_t n, double now) { ended[n] = 0, episodes_[n] = {0, 0, now}; }  // an episode of copy n began outside of a row
+  void check(const void* observed) const {
+    for (std::size_t i = 0; i < elements_ && (floats_ || doubles_); ++i)
+      if (!std::isfinite(floats_ ? static_cast<const float*>(observed)[i] : static_cast<const double*>(observed)[i]))
+        throw std::runtime_error("observation: expected finite numbers");
+  }
+
+  const std::size_t T, N, obs_bytes, action_bytes;
+  std::vector<unsigned char> obs, ended;  // [N, …] the newest observations; [N] the next row only resets this copy
+
+ private:
+  void report(Rollout& r, std::size_t n, double now) {
+    const Episode& episode = episodes_[n];  // steps between two rollouts count, as far as the learner can check the length
+    r.episodes.push_back({episode.reward, std::min<std::uint64_t>(episode.length, (r.sequence + 1) * T), now - episode.seconds});
+  }
+  std::vector<Episode> episodes_;  // that run; `seconds` holds when they began
+  bool floats_, doubles_;
+  std::size_t elements_;
+};
+
+struct Held {  // of one lane
+  std::uint64_t incarnation = 0, sequence = 0;
+  std::map<std::uint64_t, std::uint64_t> tickets;  // not yet collected -> the lowest version to collect it under
+  std::vector<std::unique_ptr<Rollout>> kept;      // that the learner may not have received
+  std::deque<std::uint64_t> finished;              // the last of them, to know a late repeat
+};
+
+struct EvaluationOrder { std::uint64_t ticket, version, most_steps; bool greedy; std::vector<std::uint64_t> seeds; };
+struct Evaluation { std::uint64_t ticket; std::vector<Episode> episodes; std::vector<bool> cut; };
+
+class CollectorSession : public Session {  // a Session that holds the weights and what belongs to tickets
+ public:
+  using Session::Session;
+
+ protected:
+  std::string other_spaces(const Run& run) const {  // why these are not our spaces, or nothing
+    bool same = run.observation.size() == 1 && run.action.size() == 1 && description_.observation.is(run.observation[0]) &&
+                description_.action.is(run.action[0]);
+    return same ? "" : "environment " + description_.id + ": its observations or actions are not what the learner has; build both from the same version";
+  }
+  std::string begin_collecting(const Run& run) {
+    const Space &seen = description_.observation, &done = description_.action;
+    if (std::string why = other_spaces(run); !why.empty()) return why;
+    if (run.rollout_steps + 1 > MAX_FRAME_BYTES / run.copies / std::max(seen.bytes(), done.bytes())) return "the learner asks for rollouts of more than 1 GB";
+    if (seen.dtype == "uint8" && seen.shape.size() == 3) return "the C++ client has no convolutions; start the learner with --inference learner";
+    if (done.kind == "box" && done.dtype != "float32") return "the C++ client chooses float32 actions; start the learner with --inference learner";
+    policy_ = Policy(run, seen, done);
+    loaded_ = false;
+    return "";
+  }
+  void end_collecting() { held_.clear(), orders_.clear(), answers_.clear(), weights_.clear(), loaded_ = false; }
+
+  void handle_collecting(const Message& m) {
+    switch (m.type) {
+      case Type::Weights: return take_weights(m);
+      case Type::Collect:
+        received(m);
+        for (const Permit& permit : m.permits) take(permit, m.version);
+        return;
+      case Type::HeartbeatReply: return received(m);
+      case Type::Evaluate: return take_evaluation(m);
+      default: return;
+    }
+  }
+  const std::vector<std::uint64_t>& tickets() override {
+    listed_.clear();
+    for (auto& [number, lane] : held_) for (auto& [ticket, version] : lane.tickets) listed_.push_back(ticket);
+    for (EvaluationOrder& order : orders_) listed_.push_back(order.ticket);
+    return listed_;
+  }
+  std::vector<std::uint64_t> lanes() const override {
+    std::vector<std::uint64_t> all;
+    for (auto& [number, lane] : held_) all.push_back(number);
+    return all;
+  }
+  void release(std::uint64_t number, std::uint64_t incarnation) override {
+    auto found = held_.find(number);
+    if (found != held_.end() && found->second.incarnation <= incarnation) held_.erase(found);
+  }
+
+  bool load_newest() {  // let the policy act under the newest weights; false if there are none
+    if (version_ < 0) return false;
+    if (!loaded_) {
+      Message weights;
+      Decoder().decode(weight_frames_, weights);
+      policy_.load(weights);
+      loaded_ = true;
+    }
+    return true;
+  }
+  std::unique_ptr<Rollout> next_rollout() {  // for the oldest ticket that can start; null if there is none
+    std::uint64_t oldest = std::numeric_limits<std::uint64_t>::max(), number = 0;
+    for (auto& [lane, held] : held_)
+      for (auto& [ticket, lowest] : held.tickets)
+        if (static_cast<std::int64_t>(lowest) <= version_ && ticket < oldest) oldest = ticket, number = lane;
+    if (oldest == std::numeric_limits<std::uint64_t>::max() || !load_newest()) return nullptr;
+    std::unique_ptr<Rollout> rollout = spare_.empty() ? std::make_unique<Rollout>() : std::move(spare_.back());
+    if (!spare_.empty()) spare_.pop_back();
+    const Held& held = held_[number];
+    rollout->lane = number, rollout->incarnation = held.incarnation, rollout->ticket = oldest, rollout->sequence = held.sequence;
+    rollout->version = static_cast<std::uint64_t>(version_);
+    return rollout;
+  }
+  bool wanted(const Rollout& r, std::uint64_t session) const {  // whether its ticket still is ours
+    auto found = held_.find(r.lane);
+    return session == session_ && (state_ == State::ready || state_ == State::draining) && found != held_.end() &&
+           found->second.incarnation == r.incarnation && found->second.tickets.count(r.ticket);
+  }
+  void finished(std::unique_ptr<Rollout> rollout) {
+    for (unsigned char valid : rollout->valid) steps_ += valid;
+    Held& held = held_[rollout->lane];
+    held.tickets.erase(rollout->ticket), ++held.sequence;
+    acknowledged_ = std::max(acknowledged_, static_cast<std::int64_t>(rollout->version));
+    send_rollout(*rollout);
+    held.kept.push_back(std::move(rollout));
+  }
+  EvaluationOrder* next_evaluation() {  // the oldest of the version held; those of older versions are dropped
+    auto older = [&](const EvaluationOrder& order) { return static_cast<std::int64_t>(order.version) < version_; };
+    orders_.erase(std::remove_if(orders_.begin(), orders_.end(), older), orders_.end());
+    for (EvaluationOrder& order : orders_)
+      if (static_cast<std::int64_t>(order.version) == version_ && load_newest()) return &order;
+    return nullptr;
+  }
+  void evaluated(const Evaluation& evaluation) {
+    auto same = [&](const EvaluationOrder& order) { return order.ticket == evaluation.ticket; };
+    auto found = std::find_if(orders_.begin(), orders_.end(), same);
+    if (found == orders_.end()) return;
+    orders_.erase(found);
+    answers_.push_back(evaluation);
+    if (answers_.size() > 8) answers_.pop_front();
+    send_evaluation(evaluation);
+  }
+
+  Policy policy_;
+
+ private:
+  void take_weights(const Message& m) {
+    if (static_cast<std::int64_t>(m.version) <= version_) return;
+    if (m.arrays.size() > 2) return decline("the C++ client has no attributes that the learner could set in its environments");
+    policy_.check(m);
+    // A rollout in progress goes on under its own weights: keep the frames until the next one starts.
+    head_.begin("Weights", 3).natural(m.version);
+    weights_.resize(3);
+    for (std::size_t i = 0; i < 2; ++i) {
+      head_.described(m.arrays[i].dtype, i + 1, {m.arrays[i].elements});
+      const char* bytes = static_cast<const char*>(m.arrays[i].data);
+      weights_[i + 1].assign(bytes, bytes + m.arrays[i].elements * item_bytes(m.arrays[i].dtype));
+    }
+    weights_[0].assign(head_.bytes.begin(), head_.bytes.end());
+    weight_frames_.clear();
+    for (const std::vector<char>& frame : weights_) weight_frames_.push_back({frame.data(), frame.size()});
+    version_ = static_cast<std::int64_t>(m.version), loaded_ = false;
+  }
+  void take(const Permit& permit, std::uint64_t version) {
+    auto found = held_.find(permit.lane);
+    if (found == held_.end() || permit.incarnation > found->second.incarnation) {
+      Held fresh;
+      fresh.incarnation = permit.incarnation;
+      held_[permit.lane] = std::move(fresh);
+    }
+    Held& held = held_[permit.lane];
+    if (permit.incarnation < held.incarnation) return;
+    if (std::find(held.finished.begin(), held.finished.end(), permit.ticket) != held.finished.end()) return;
+    for (const auto& rollout : held.kept) if (rollout->ticket == permit.ticket) return send_rollout(*rollout);
+    held.tickets.emplace(permit.ticket, version);
+  }
+  void received(const Message& m) {
+    for (const Received& got : m.received) {
+      auto found = held_.find(got.lane);
+      if (found == held_.end() || found->second.incarnation != got.incarnation) continue;
+      Held& held = found->second;
+      auto first = m.numbers.begin() + static_cast<std::ptrdiff_t>(got.first), last = first + static_cast<std::ptrdiff_t>(got.count);
+      for (std::size_t i = held.kept.size(); i-- > 0;) {
+        const std::uint64_t sequence = held.kept[i]->sequence;
+        if (sequence >= got.next_sequence && std::find(first, last, sequence) == last) continue;
+        held.finished.push_back(held.kept[i]->ticket);
+        if (held.finished.size() > 64) held.finished.pop_front();
+        spare_.push_back(std::move(held.kept[i]));
+        held.kept.erase(held.kept.begin() + static_cast<std::ptrdiff_t>(i));
+      }
+    }
+  }
+  void take_evaluation(const Message& m) {
+    if (m.send_rows) return decline("the C++ client does not record episodes, which the learner asks for");
+    for (const Evaluation& answer : answers_) if (answer.ticket == m.ticket) return send_evaluation(answer);
+    for (const EvaluationOrder& order : orders_) if (order.ticket == m.ticket) return;
+    orders_.push_back({m.ticket, m.version, m.most_steps, m.greedy, {}});
+    for (auto& seed : m.seeds) orders_.back().seeds.push_back(*seed);
+  }
+
+  void write(const Episode& episode) {
+    head_.array(4).real(episode.reward).natural(episode.length).real(std::max(0.0, episode.seconds)).array(run_.facts);
+    for (std::size_t i = 0; i < run_.facts; ++i) head_.real(std::nan(""));  // facts that the learner asks for: we have none
+  }
+  void send_rollout(const Rollout& r) {
+    const std::size_t T = run_.rollout_steps, N = run_.copies;
+    const Space &seen = description_.observation, &done = description_.action;
+    head_.begin("Rollout", 14).natural(session_).natural(r.lane).natural(r.ticket).natural(r.version).natural(r.sequence);
+    head_.array(1).described(seen.wire(), 1, {T + 1, N}, seen.shape);
+    head_.described(done.kind == "discrete" ? "<i8" : "<f4", 2, {T, N}, done.shape);
+    head_.described("<f4", 3, {T, N}).described("<f4", 4, {T, N}).described("|b1", 5, {T, N}).described("|b1", 6, {T, N});
+    head_.described("|b1", 7, {T, N}).described("<f4", 8, {N, 0}).array(r.episodes.size());
+    for (const Episode& episode : r.episodes) write(episode);
+    send(head_, {{r.obs.data(), r.obs.size()}, {r.action.data(), r.action.size()}, {r.log_prob.data(), 4 * T * N},
+                 {r.reward.data(), 4 * T * N}, {r.terminated.data(), T * N}, {r.truncated.data(), T * N}, {r.valid.data(), T * N}, {nullptr, 0}});
+  }
+  void send_evaluation(const Evaluation& e) {
+    head_.begin("Evaluated", 4).natural(session_).natural(e.ticket).array(e.episodes.size());
+    for (const Episode& episode : e.episodes) write(episode);
+    head_.array(e.cut.size());
+    for (bool cut : e.cut) head_.boolean(cut);
+    send(head_);
+  }
+
+  bool loaded_ = false;
+  std::map<std::uint64_t, Held> held_;
+  std::vector<std::unique_ptr<Rollout>> spare_;
+  std::vector<EvaluationOrder> orders_;
+  std::deque<Evaluation> answers_;
+  std::vector<std::vector<char>> weights_;
+  std::vector<Frame> weight_frames_;
+  std::vector<std::uint64_t> listed_;
+};
+
+}  // namespace millrace

@@ -1,0 +1,74 @@
+"""Valid messages of a learner, as bytes: what the fuzz programs of the clients mutate."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+
+from protocol.env_spec import EnvSpec
+from protocol.messages import (
+    Call,
+    Collect,
+    Drain,
+    Evaluate,
+    HeartbeatReply,
+    LaneIncarnation,
+    Permit,
+    Received,
+    Refuse,
+    Rejoin,
+    Release,
+    Reset,
+    Step,
+    ToWorker,
+    Weights,
+    Welcome,
+)
+from protocol.policy.layout import acting_size
+from protocol.specs import ActionSpec, DescribeSpec, Leaf, PolicySpec, RunSpec, StepSpec
+from protocol.wire.codec import encode
+from protocol.wire.plain_values import pack
+
+SESSION = 77
+CARTPOLE = EnvSpec("CartPole-v1")
+OBSERVATION = Leaf("", "box", (4,), "float32")
+STEP = StepSpec((CARTPOLE,), (0,) * 4, (2, 2), (OBSERVATION,), (Leaf("", "discrete", (), "int64", (2,), (0,)),))
+POLICY = PolicySpec((OBSERVATION,), ActionSpec("discrete", (), "int64", (2,), (0,)), net=(8,))
+RUN = RunSpec(CARTPOLE, POLICY, 64, 2, 2, 1)
+OPTIONS = np.frombuffer(pack(None), np.uint8)
+FEW = (Received(0, 0, 1), Received(1, 0, 3, (5, 6)))
+
+
+def messages() -> list[ToWorker]:
+    """Every type of message, in an order in which a client obeys them."""
+    weights = np.linspace(-1, 1, acting_size(POLICY), dtype=np.float32)
+    return [
+        Welcome(SESSION, 1, DescribeSpec(CARTPOLE)),
+        Welcome(SESSION, 1, STEP),
+        Reset(SESSION, 1, 0, 0, (0, 1), (5, None), OPTIONS),
+        Step(SESSION, 2, 0, 0, (np.array([0, 1]),)),
+        Step(SESSION, 3, 1, 2, (np.array([1, 1]),)),
+        Call(SESSION, 4, 0, 0, (0,), "spec", False, OPTIONS),
+        Release(SESSION, (LaneIncarnation(0, 0),)),
+        HeartbeatReply(SESSION, 1, FEW),
+        Rejoin(SESSION),
+        Welcome(SESSION, 2, RUN),
+        Weights(3, weights, np.zeros(0, np.float32)),
+        Weights(4, weights.astype(np.float16), np.zeros(0, np.float32)),
+        Collect(SESSION, 3, (Permit(10, 0, 0), Permit(11, 1, 1)), FEW),
+        Evaluate(SESSION, 12, 4, (1, 2), True, 30, False, False),
+        HeartbeatReply(SESSION, 2, FEW[:1]),
+        Drain("the run is over"),
+        Refuse("no"),
+    ]
+
+
+def corpus() -> bytes:
+    """For each message: the number of its frames, then the length and the bytes of each. Numbers are `<u4`."""
+    parts = []
+    for message in messages():
+        frames = encode(message)
+        parts.append(struct.pack("<I", len(frames)))
+        parts += [struct.pack("<I", len(bytes(frame))) + bytes(frame) for frame in frames]
+    return b"".join(parts)
