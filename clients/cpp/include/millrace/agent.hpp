@@ -20,12 +20,15 @@ class Agent : public CollectorSession {
       : CollectorSession(std::move(options), std::move(description)), fallback_(fallback), deadline_s_(deadline_s),
         stored_(description_.action.bytes()), action_(description_.action.bytes()) {}
 
+  ~Agent() override { close(); }
+
   // The action for this observation. `reward` and the flags are of the last action. After the end of an episode, the next
   // call gives the first observation of the next one.
   const void* step(const void* obs, double reward, bool terminated, bool truncated) {
     const double began_s = now_s();
     std::unique_lock lock(mutex_);
     ++counts_.steps;
+    now_doing("stepping");
     if (began_s - pumped_s_ > 0.05) work();
     try {
       after(obs, reward, terminated, truncated, began_s);

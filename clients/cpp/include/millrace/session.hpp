@@ -80,14 +80,7 @@ class Session {
     begin_to_join();
     beat_ = std::thread([this] { beat(); });
   }
-  virtual ~Session() {
-    {
-      std::lock_guard guard(mutex_);
-      closing_ = true;
-    }
-    wake_.notify_all();
-    beat_.join();
-  }
+  virtual ~Session() { close(); }
   int exit_code() const { return exit_code_; }  // 0: drained, 1: failed or lost the learner, 2: refused
   const std::string& reason() const { return reason_; }
 
@@ -102,6 +95,17 @@ class Session {
   virtual const std::vector<std::uint64_t>& tickets() = 0;  // held and not finished
   virtual bool busy() const { return false; }         // work in progress, which draining finishes
 
+  void close() {  // the last class calls it in its destructor, because the second thread calls the functions above
+    if (!beat_.joinable()) return;
+    {
+      std::lock_guard guard(mutex_);
+      closing_ = true;
+      if (state_ == State::ready || state_ == State::draining) goodbye("its program ended"), leave(0, "the program ended");
+    }
+    wake_.notify_all();
+    beat_.join();
+  }
+  void now_doing(const char* doing) { doing_ = doing, since_s_ = now_s(), ++env_calls_; }
   void pump(double wait_s) {  // do what is due, then handle all that arrives within `wait_s`
     for (; stops_ < stop_requests && state_ != State::left; ++stops_) drain("it was told to stop", true);
     tick(now_s());
@@ -174,11 +178,8 @@ class Session {
 
   class InEnv {  // while it exists, environment code runs and the other thread sends the heartbeats
    public:
-    InEnv(Session& session, const char* doing) : session_(session) {
-      session_.since_s_ = now_s(), session_.doing_ = doing;
-      session_.mutex_.unlock();
-    }
-    ~InEnv() { session_.mutex_.lock(), session_.doing_ = "waiting", session_.since_s_ = now_s(), ++session_.env_calls_; }
+    InEnv(Session& session, const char* doing) : session_(session) { session.now_doing(doing), session.mutex_.unlock(); }
+    ~InEnv() { session_.mutex_.lock(), session_.now_doing("waiting"); }
 
    private:
     Session& session_;

@@ -35,6 +35,8 @@ class Worker : public CollectorSession {
   Worker(Options options, Description description, Make make)
       : CollectorSession(std::move(options), std::move(description)), make_(std::move(make)) {}
 
+  ~Worker() override { close(); }
+
   int run() {  // until the conversation is over. Returns the exit code
     std::unique_lock lock(mutex_);
     while (state_ != State::left) {
