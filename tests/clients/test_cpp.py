@@ -20,7 +20,7 @@ from learner.run_folder.metrics_log import read_rows
 from protocol.messages import Drain, Hello, Refuse
 from protocol.wire.codec import decode_to_learner, encode
 from tests.clients.messages_to_clients import corpus
-from tests.system.processes import START_S, Running, Stage, free_port
+from tests.system.processes import START_S, Running, Stage, free_port, wait_for
 
 pytestmark = [pytest.mark.clients, pytest.mark.timeout(600)]  # the first test also waits for the compiler
 
@@ -49,6 +49,11 @@ def folder(stage: Stage) -> Path:
 def summary(stage: Stage) -> dict[str, Any]:
     found: dict[str, Any] = json.loads((folder(stage) / "summary.json").read_text())
     return found
+
+
+def updates(stage: Stage) -> int:
+    """Number of updates so far."""
+    return int(read_rows(folder(stage) / "metrics.jsonl")[-1]["time/iterations"])
 
 
 # ---------------------------------------------------------------- the environment
@@ -180,14 +185,15 @@ def test_a_program_that_owns_its_loop_learns_and_counts_late_actions(stage: Stag
     runs = learner(stage, address, "--envs", "1", "--lanes", "1", "--rollout-steps", "64", steps=1_500)
     command = [str(cpp / "control_50hz"), address, "--name", "robot", "--hz", "1000", "--deadline-ms", "0.02"]
     robot = stage.start(command, "robot")
-    ends_well(runs, START_S + 90)
+    ends_well(runs, START_S + 120)
     said = ends_well(robot)
     found = re.search(r"(\d+) steps, (\d+) of them recorded; (\d+) late", said)
     assert found is not None, said
-    steps, recorded, _ = map(int, found.groups())
+    steps, recorded, late = map(int, found.groups())
     ledger = summary(stage)["ledger"]
     assert ledger["transitions_invalid"] == ledger["messages_bad"] == 0
     assert 1_000 < ledger["transitions_used"] <= recorded < steps
+    assert 0 < ledger["late_actions"] <= late
 
 
 def test_two_copies_are_too_many_for_a_program_that_owns_its_loop(stage: Stage, cpp: Path) -> None:
@@ -212,7 +218,8 @@ def test_a_token_opens_the_door_and_its_end_closes_it(stage: Stage, cpp: Path) -
     lab = stage.start([str(cpp / "cartpole"), address, "--name", "lab", "--token", str(keys / "lab.token")], "lab")
     kept = stage.start([str(cpp / "cartpole"), address, "--name", "kept", "--token", str(keys / "other.token")], "kept")
     for client in (lab, kept):
-        client.hears(": joined", START_S, times=2)  # the run that describes, and then the run itself
+        client.hears(": joined", START_S)
+    runs.hears("workers 2", START_S)
     bare = stage.start([str(cpp / "cartpole"), address, "--name", "bare", "--join-timeout-s", "3"], "bare")
     assert bare.ends() == 1
     assert "perhaps it asks for a token" in bare.said()
@@ -298,14 +305,11 @@ def test_the_client_joins_a_learner_that_was_started_again(stage: Stage, cpp: Pa
     client = stage.start([str(cpp / "cartpole"), address, "--name", "cpp0"], "cpp0")
     runs.hears(r"update [1-9]\d*", START_S)
     runs.kill()
+    before = updates(stage)
     again = stage.start([*command, "--resume", str(folder(stage))], "again")
-    client.hears(": joined", START_S, times=3)
-    before = json.loads((folder(stage) / "metrics.jsonl").read_text().splitlines()[-1])["time/iterations"]
-    again.hears(r"update \d+", START_S)
+    wait_for(lambda: updates(stage) > before + 1, START_S, again.said)
     again.signal(signal.SIGINT)
     again.ends(60)
-    after = json.loads((folder(stage) / "metrics.jsonl").read_text().splitlines()[-1])["time/iterations"]
-    assert after > before
     assert client.ends() == 0, client.said()
     assert "joining again" in client.said()
 
@@ -322,7 +326,7 @@ def test_two_clients_and_a_python_worker_together(stage: Stage, cpp: Path) -> No
     for each in (*clients, worker):
         ends_well(each)
     assert summary(stage)["ledger"]["lost"] == 0
-    assert all(len(re.findall(": joined", client.said())) == 2 for client in clients)
+    assert all(": joined" in client.said() for client in clients)
     assert "workers 3" in runs.said()
 
 
@@ -367,3 +371,16 @@ def test_a_step_allocates_nothing(cpp: Path, tmp_path: Path) -> None:
     (tmp_path / "corpus").write_bytes(corpus())
     done = subprocess.run([cpp / "allocations", tmp_path / "corpus"], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.split() == ["0", "1"]
+
+
+# ---------------------------------------------------------------- conformance
+
+
+@pytest.mark.parametrize("keys", [False, True])
+def test_the_client_conforms_to_the_wire_document(cpp: Path, keys: bool) -> None:
+    command = [str(cpp / "cartpole"), "{address}", *(["--token", "{token}"] if keys else [])]
+    flags = ["--with-keys"] if keys else []
+    conform = [sys.executable, "-m", "millrace", "conform", "--patience-s", "20", *flags, "--", *command]
+    done = subprocess.run(conform, capture_output=True, text=True, timeout=500)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert " 0 failed" in done.stdout

@@ -45,7 +45,7 @@ class Agent : public CollectorSession {
       *rows_->log_prob_at(*rollout_, 0) = log_prob;
     }
     late_ = now_s() - began_s > deadline_s_;
-    counts_.late += late_;
+    counts_.late += late_, late_actions_ = counts_.late;
     return late_ ? fallback_ : action_.data();
   }
 

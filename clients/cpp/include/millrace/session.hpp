@@ -189,7 +189,7 @@ class Session {
   State state_ = State::joining;
   Description description_;
   Run run_;
-  std::uint64_t session_ = 0, steps_ = 0;
+  std::uint64_t session_ = 0, steps_ = 0, late_actions_ = 0;
   std::int64_t version_ = -1, acknowledged_ = -1;  // of the weights held; that a message of ours has named
   double act_s_ = 0, step_s_ = 0, evaluate_s_ = 0;
   Writer head_;
@@ -242,10 +242,11 @@ class Session {
     if (now < due_s_ && acknowledged_ == version_) return;
     due_s_ = now + run_.heartbeat_s, acknowledged_ = version_;
     const std::vector<std::uint64_t>& held = tickets();
-    Writer& w = beat_head_.begin("Heartbeat", 7).natural(session_).natural(replies_).whole(version_).array(held.size());
+    Writer& w = beat_head_.begin("Heartbeat", 8).natural(session_).natural(replies_).whole(version_).array(held.size());
     for (std::uint64_t ticket : held) w.natural(ticket);
     w.natural(steps_).map(4).text("act").real(act_s_).text("step").real(step_s_).text("evaluate").real(evaluate_s_)
-        .text("wait").real(std::max(0.0, now - began_s_ - act_s_ - step_s_ - evaluate_s_)).natural(resident_bytes());
+        .text("wait").real(std::max(0.0, now - began_s_ - act_s_ - step_s_ - evaluate_s_)).natural(resident_bytes())
+        .natural(late_actions_);
     link_.send(beat_head_);
     if (run_.type == "DescribeSpec") return describe();  // it may have been lost
     beat_head_.begin("Alive", 2).array(1).array(5).text(options_.name).natural(life_).text(doing_)
