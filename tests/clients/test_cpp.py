@@ -53,7 +53,8 @@ def summary(stage: Stage) -> dict[str, Any]:
 
 def updates(stage: Stage) -> int:
     """Number of updates so far."""
-    return int(read_rows(folder(stage) / "metrics.jsonl")[-1]["time/iterations"])
+    rows = read_rows(folder(stage) / "metrics.jsonl")
+    return int(rows[-1]["time/iterations"]) if rows else 0
 
 
 # ---------------------------------------------------------------- the environment
