@@ -116,6 +116,9 @@ class Examiner:
         self._record("failed", rule=broken.rule, expected=broken.expected, got=broken.got)
         if self.learner.runs:
             self.learner.end()
+        while self.learner.is_mute and not self.done:
+            self._began_s = self.learner.now
+            self._record("skipped", note="the client never said Hello")
 
     def _record(
         self,

@@ -52,7 +52,8 @@ def described(learner: Learner) -> Script[DescribedEnv]:
             raise Broken(rules.DESCRIBE, f"Described after a Welcome with a DescribeSpec, within {within_s:g} s", "none")
         assert isinstance(found, Heard)
         if not isinstance(found.message, Described):
-            raise Broken(rules.DESCRIBE, f"the environment {learner.settings.env.id}", brief(found.message))
+            got = f"Goodbye: {found.message.reason}" if isinstance(found.message, Goodbye) else brief(found.message)
+            raise Broken(rules.DECLINED, f"a description of the environment {learner.settings.env.id}", got)
         learner.description = found.message
     try:
         return read_description(learner.description.description)

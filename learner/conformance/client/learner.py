@@ -81,6 +81,8 @@ class Learner:
         self.effects: list[Effect] = []
         self.runs = False
         """whether the client's process runs"""
+        self.is_mute = False
+        """whether the client was started and has never said Hello"""
         self.peer = b""
         self.hello: Hello | None = None
         """the newest, of the process that runs"""
@@ -196,7 +198,7 @@ class Learner:
             return False  # of a second worker of the same command
         if before is not None and hello.process_nonce != before.process_nonce:
             raise Broken(rules.STAYS, "the same process, or the client's end", "the Hello of a new process under its name")
-        self.peer, self.hello = peer, hello
+        self.peer, self.hello, self.is_mute = peer, hello, False
         if not self.hears:
             return False
         is_later = before is None or hello.attempt != before.attempt
@@ -248,6 +250,7 @@ class Learner:
         """Start the client's process."""
         self.effects.append(StartClient())
         self._steps = 0
+        self.is_mute |= not self.peer
         self.runs, self.hello, self.watch = True, None, None
 
     def end(self) -> None:

@@ -6,6 +6,7 @@ expected, what was got, what to do next.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from textwrap import wrap
 from typing import Any
@@ -14,6 +15,7 @@ from learner.conformance.client.examiner import Result
 from learner.conformance.client.rules import DOCUMENT
 
 WIDTH = 110
+NUMBER = re.compile(r"\d{3,}")  # shapes and exit codes have fewer digits
 MARKS = {"passed": "ok     ", "failed": "FAILED ", "skipped": "skipped"}
 
 
@@ -27,10 +29,7 @@ def explanation(result: Result, earlier: Sequence[Result] = ()) -> list[str]:
     """What a failure means, indented. If an earlier check failed by the same rule for the same reason, only its name."""
     if result.rule is None:
         return []
-    same = next(
-        (each for each in earlier if (each.rule, each.expected, each.got) == (result.rule, result.expected, result.got)),
-        None,
-    )
+    same = next((each for each in earlier if _essence(each) == _essence(result)), None)
     if same is not None:
         return [f"           as in: {same.name}"]
     parts = {
@@ -44,6 +43,11 @@ def explanation(result: Result, earlier: Sequence[Result] = ()) -> list[str]:
         for label, text in parts.items()
         for at, line in enumerate(wrap(text, WIDTH - 21) or [""])
     ]
+
+
+def _essence(result: Result) -> tuple[object, str, str]:
+    """A failure without the numbers in it, such as those of sessions and tickets, which differ from check to check."""
+    return result.rule, NUMBER.sub("", result.expected), NUMBER.sub("", result.got)
 
 
 def summary(results: Sequence[Result]) -> str:

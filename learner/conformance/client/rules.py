@@ -122,7 +122,8 @@ IGNORE_UNREADABLE = Rule(
 STAYS = Rule(
     "The worker's half",
     "A worker leaves after Refuse, after Drain, when it is asked to stop, or when it fails; else it stays",
-    "look at the client's own output above; it must outlive lost connections and messages that it ignores",
+    "start the client's command by itself and look at what it prints; it must outlive lost connections, and messages that "
+    "it ignores",
 )
 CONNECTION = Rule(
     "Transport",
@@ -158,8 +159,7 @@ HEARTBEAT_VERSION = Rule(
 DESCRIBE = Rule(
     "Describe",
     "A worker that is welcomed with a DescribeSpec makes one env copy, sends Described, and closes the copy",
-    "answer a Welcome whose run has the type DescribeSpec with Described; a client that cannot serve the environment "
-    "says Goodbye with the reason. --env chooses what is asked for",
+    "answer a Welcome whose run has the type DescribeSpec with Described",
 )
 DESCRIBE_AGAIN = Rule(
     "Describe",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 
@@ -81,9 +82,10 @@ def test_each_check_has_one_result_in_order() -> None:
 
 
 def test_a_client_that_says_nothing_has_a_deadline_and_is_ended() -> None:
-    test = examiner(PROFILES["environment"][0].script)
+    test = examiner(PROFILES["environment"][0].script, passes)
     effects = run(test, 100.0)
-    (result,) = test.results
+    result, other = test.results
+    assert (other.outcome, other.note) == ("skipped", "the client never said Hello")
     assert (result.outcome, result.rule) == ("failed", rules.HELLO)
     assert SETTINGS.start_s <= result.seconds < SETTINGS.start_s + 1
     assert effects == [StartClient(), EndClient()]
@@ -174,6 +176,9 @@ def test_the_report_has_the_rule_and_where_it_stands() -> None:
         f"next {rules.REFUSE.mend}"
     )
     assert explanation(again, [passed, failed]) == ["           as in: breaks"]
+    assert len(explanation(again, [replace(failed, got="exit code 1")])) >= 4
+    longer = [replace(each, got=f"ticket {ticket}") for each, ticket in ((failed, 1234), (again, 4321))]
+    assert explanation(longer[1], longer[:1]) == ["           as in: breaks"]
     assert summary(test.results).endswith("the client does not conform")
     data = as_data(test.results, "environment", ["client"])
     assert data["conforms"] is False
