@@ -57,9 +57,9 @@ def test_the_python_worker_conforms(profile: str, tmp_path: Path) -> None:
 
 @pytest.mark.clients
 @pytest.mark.timeout(900)
-def test_the_cpp_client_conforms(cpp: Path) -> None:
-    """The environment profile of the example environment."""
+@pytest.mark.parametrize("profile", PROFILES)
+def test_the_cpp_client_conforms(profile: str, cpp: Path) -> None:
     client = Client((str(cpp / "cartpole"), "{address}", "--token", "{token}"))
-    results = conform(client, PROFILES["environment"], Settings(EnvSpec("CartPole-v1")), 200.0, lambda result: None)
+    results = conform(client, PROFILES[profile], Settings(EnvSpec("CartPole-v1")), 200.0, lambda result: None)
     failed = [line for each in results if each.outcome == "failed" for line in (each.name, *explanation(each))]
     assert not failed, "\n".join(failed)

@@ -410,20 +410,36 @@ def beats_while_it_collects(learner: Learner) -> Script[None]:
 
 
 def evaluates(learner: Learner) -> Script[None]:
-    """Two episodes, greedy, with their rows."""
+    """Two episodes, greedy."""
     yield from collecting(learner)
-    order = Evaluate(learner.session, learner.ticket(), 1, (1, 2), True, EVALUATED_STEPS, True, False)
+    yield from _evaluate(learner, send_rows=False)
+    yield from _evaluate(learner, send_rows=False)
+
+
+def evaluates_with_rows(learner: Learner) -> Script[None]:
+    """Two episodes with their rows. A client may decline that."""
+    yield from collecting(learner)
+    rows = yield from _evaluate(learner, send_rows=True)
+    if isinstance(rows, Goodbye):
+        yield from learner.left(rules.DECLINED, 2, "Goodbye")
+        raise Skipped(f"it declines: {rows.reason}")
+
+
+def _evaluate(learner: Learner, *, send_rows: bool) -> Script[Goodbye | None]:
+    """Order an evaluation and check its answer. Returns a Goodbye that declines rows."""
+    order = Evaluate(learner.session, learner.ticket(), 1, (1, 2), True, EVALUATED_STEPS, send_rows, False)
     learner.send(order)
     rows: dict[int, int] = {}
+    kinds = EpisodeRows | Evaluated | Goodbye if send_rows else EpisodeRows | Evaluated
+    within_s = 2 * learner.settings.patience_s
     while True:
-        within_s = 2 * learner.settings.patience_s
-        found = yield Wait(
-            within_s, lambda event: isinstance(event, Heard) and isinstance(event.message, EpisodeRows | Evaluated)
-        )
+        found = yield Wait(within_s, lambda event: isinstance(event, Heard) and isinstance(event.message, kinds))
         if found is None:
             raise Broken(rules.EVALUATE, f"Evaluated for ticket {order.ticket}", f"none within {within_s:g} s")
         assert isinstance(found, Heard)
         match found.message:
+            case Goodbye() as goodbye:
+                return goodbye
             case EpisodeRows() as part:
                 if part.first_step != rows.get(part.episode, 0):
                     expected = f"rows of episode {part.episode} from step {rows.get(part.episode, 0)}"
@@ -440,12 +456,11 @@ def evaluates(learner: Learner) -> Script[None]:
                 f"a cut after {EVALUATED_STEPS} steps (most_steps), or an end before",
                 f"{episode.length} steps",
             )
-        if rows.get(number, 0) != episode.length:
-            raise Broken(
-                rules.EVALUATE,
-                f"rows of all {episode.length} steps of episode {number} before Evaluated (send_rows)",
-                f"{rows.get(number, 0)} rows",
-            )
+        expected_rows = episode.length if send_rows else 0
+        if rows.get(number, 0) != expected_rows:
+            expected = f"{expected_rows} rows of episode {number} before Evaluated (send_rows is {str(send_rows).lower()})"
+            raise Broken(rules.EVALUATE, expected, f"{rows.get(number, 0)} rows")
+    return None
 
 
 def drains_while_it_collects(learner: Learner) -> Script[None]:
