@@ -214,34 +214,39 @@ class _Process:
 
     def ended(self) -> Ended | None:
         """How it has ended; None while it runs, and before it is started."""
-        if self._running is None or (code := self._running.poll()) is None:
+        if self._running is None or not self._has_ended():
             return None
-        self._close()
+        code = self._close()
         return Ended(code, self._lines[-1] if self._lines else "")
 
     def end(self) -> None:
         """End it and all that it started: SIGTERM, then SIGKILL."""
         if self._running is None:
             return
-        self._running.terminate()
-        try:
-            self._running.wait(STOP_WITHIN_S)
-        except subprocess.TimeoutExpired:
-            self._running.kill()
-            self._running.wait(STOP_WITHIN_S)
+        self._running.send_signal(signal.SIGTERM)
+        until_s = time.monotonic() + STOP_WITHIN_S
+        while not self._has_ended() and time.monotonic() < until_s:
+            time.sleep(POLL_S)
         self._close()
 
-    def _close(self) -> None:
-        """What is left of its process group is killed, so its pipe ends."""
+    def _has_ended(self) -> bool:
+        """Whether it has ended. It stays a zombie, so nobody else gets its number before its group is killed."""
+        assert self._running is not None
+        return os.waitid(os.P_PID, self._running.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
+
+    def _close(self) -> int:
+        """Kill what is left of its process group, so its pipe ends. Returns the exit code."""
         assert self._running is not None
         assert self._reader is not None
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self._running.pid, signal.SIGKILL)
+        code = self._running.wait(STOP_WITHIN_S)
         self._reader.join(STOP_WITHIN_S)
         assert self._running.stdout is not None
         if not self._reader.is_alive():
             self._running.stdout.close()
         self._running = self._reader = None
+        return code
 
 
 def _replaced(word: str, words: dict[str, str]) -> str:
