@@ -1,4 +1,4 @@
-"""Fixtures of the tests of clients: a stage for processes, and the C++ client, built once."""
+"""Fixtures of the tests of clients: a stage for processes, and the clients, built once."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from tests.system.processes import ROOT, Stage
 
-CPP = ROOT / "clients" / "cpp"
+CPP, JS = ROOT / "clients" / "cpp", ROOT / "clients" / "js"
 PROBE = "#include <zmq.h>\n#include <sodium.h>\n"
 
 
@@ -38,3 +38,18 @@ def cpp(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert done.returncode == 0, done.stdout + done.stderr
         assert "warning:" not in done.stderr, done.stderr
     return build
+
+
+@pytest.fixture(scope="session")
+def js(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of `clients/js` with its packages. Skips, with the reason, without Node or if a package cannot be installed."""
+    for program in ("node", "npm"):
+        if shutil.which(program) is None:
+            pytest.skip(f"{program} is missing: apt-get install nodejs npm")
+    copy = tmp_path_factory.mktemp("js") / "js"
+    shutil.copytree(JS, copy, ignore=shutil.ignore_patterns("node_modules", "package-lock.json"))
+    for command in ("npm install --no-audit --no-fund", "npm rebuild zeromq", "node --eval require('zeromq')"):
+        done = subprocess.run(command.split(), cwd=copy, capture_output=True, text=True, timeout=600)
+        if done.returncode:
+            pytest.skip(f"{command}: {done.stderr[-300:]}")
+    return copy
