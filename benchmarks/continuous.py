@@ -90,8 +90,8 @@ def main() -> None:
             for algo, width in kinds:
                 settings = COMMON | {"algo": algo, "net": [width, width]}
                 found.setdefault((f"{algo} {width}", name), []).append(rate(name, settings, arguments.steps, seed))
-                if width == 256 and algo == "sac" and not arguments.no_solve:
-                    found.setdefault(("seconds to -200", name), []).append(seconds_to_solve(name, settings, seed))
+                if algo == "sac" and not arguments.no_solve:
+                    found.setdefault((f"seconds to -200, {width}", name), []).append(seconds_to_solve(name, settings, seed))
     table = Table("", "contender", "median", "all turns", "ratio to SB3", "share of the arithmetic")
     rows = []
     for (what, name), numbers in sorted(found.items()):

@@ -14,9 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.linalg import vector_norm
 
 from learner.algorithms.continuous import Continuous, Transitions
-from learner.algorithms.kernels.bounded_actions import SquashedSample, smaller_value
+from learner.algorithms.kernels.bounded_actions import SquashedSample, smaller, which_is_smaller
 from learner.algorithms.kernels.optimizer_step import take_step
 from learner.algorithms.replay.replay_buffer import Sample
 from learner.algorithms.updates import check_finite
@@ -71,17 +72,17 @@ class SAC(Continuous):
         weighted = rows.weight * error
         self.passes.critics_backward(weighted / count)
         critic_loss, q_mean = 0.5 * float((weighted * error).sum()) / count, float(values.sum()) / (2 * count)
-        found = {"critic_loss": critic_loss, "critic_grad_norm": self.net.critics.grad.norm().item()}  # type: ignore[union-attr]
+        found = {"critic_loss": critic_loss, "critic_grad_norm": vector_norm(self.net.critics.grad).item()}
         check_finite(found, self.version, ADVICE)
         take_step(self.optimizers["critic_optimizer"])
 
         sampled = SquashedSample(self.passes.params(rows.x), noise)
-        value, by_values = smaller_value(self.passes.values(rows.x, sampled.action, constant=True))
-        by_action = self.passes.action_gradient(by_values / -count)
+        values = self.passes.values_by_action(rows.x, sampled.action, 2)
+        by_action = self.passes.action_gradient(which_is_smaller(values) / -count)
         self.passes.actor_backward(sampled.backward(by_action, alpha / count))
         log_prob = float(sampled.log_prob.sum()) / count
-        actor_loss = alpha * log_prob - float(value.sum()) / count
-        found = {"actor_loss": actor_loss, "actor_grad_norm": self.net.actor.grad.norm().item()}  # type: ignore[union-attr]
+        actor_loss = alpha * log_prob - float(smaller(values).sum()) / count
+        found = {"actor_loss": actor_loss, "actor_grad_norm": vector_norm(self.net.actor.grad).item()}
         check_finite(found, self.version, ADVICE)
         take_step(self.optimizers["actor_optimizer"])
 
@@ -95,12 +96,13 @@ class SAC(Continuous):
 
         self.target.critics.lerp_(self.net.critics, self.config.tau)
         self.gradient_steps += 1
-        self.replay.update_priorities(sample.slots, self.passes.to_numpy(abs(error).mean(0)))
+        if self.replay.prioritized:
+            self.replay.update_priorities(sample.slots, self.passes.to_numpy(abs(error).mean(0)))
         return StepMetrics(critic_loss, actor_loss, alpha, ent_coef_loss, q_mean, -log_prob)
 
     def targets(self, rows: Transitions, noise: Any, alpha: float) -> Any:
         """The targets [B] of both critics; `noise` [B, D′] samples the next action."""
         with torch.no_grad():
             sampled = SquashedSample(self.passes.params(rows.next_x), noise)
-            value, _ = smaller_value(self.target_passes.values(rows.next_x, sampled.action))
+            value = smaller(self.target_passes.values(rows.next_x, sampled.action))
             return rows.reward + rows.discount * (value - alpha * sampled.log_prob)

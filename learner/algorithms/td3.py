@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from torch.linalg import vector_norm
 
 from learner.algorithms.continuous import Continuous, Transitions
-from learner.algorithms.kernels.bounded_actions import DeterministicAction, smaller_value
+from learner.algorithms.kernels.bounded_actions import DeterministicAction, smaller
 from learner.algorithms.kernels.optimizer_step import take_step
 from learner.algorithms.replay.replay_buffer import Sample
 from learner.algorithms.updates import check_finite
@@ -54,23 +55,23 @@ class TD3(Continuous):
         weighted = rows.weight * error
         self.passes.critics_backward(weighted * (2 / count))
         critic_loss, q_mean = float((weighted * error).sum()) / count, float(values.sum()) / (2 * count)
-        found = {"critic_loss": critic_loss, "critic_grad_norm": self.net.critics.grad.norm().item()}  # type: ignore[union-attr]
+        found = {"critic_loss": critic_loss, "critic_grad_norm": vector_norm(self.net.critics.grad).item()}
         check_finite(found, self.version, ADVICE)
         take_step(self.optimizers["critic_optimizer"])
         self.gradient_steps += 1
         actor_loss = self._step_of_actor(rows) if self.gradient_steps % self.config.policy_delay == 0 else np.nan
-        self.replay.update_priorities(sample.slots, self.passes.to_numpy(abs(error).mean(0)))
+        if self.replay.prioritized:
+            self.replay.update_priorities(sample.slots, self.passes.to_numpy(abs(error).mean(0)))
         return StepMetrics(critic_loss, actor_loss, q_mean)
 
     def _step_of_actor(self, rows: Transitions) -> float:
         """A gradient step of the actor; then both targets move. Returns the loss."""
         chosen = DeterministicAction(self.passes.params(rows.x))
-        values = self.passes.values(rows.x, chosen.action, constant=True)
-        by_values = 0 * values
-        by_values[0] = -1 / len(chosen.action)
+        values = self.passes.values_by_action(rows.x, chosen.action, 1)
+        by_values = 0 * values - 1 / len(chosen.action)
         self.passes.actor_backward(chosen.backward(self.passes.action_gradient(by_values)))
-        loss = float(-values[0].mean())
-        found = {"actor_loss": loss, "actor_grad_norm": self.net.actor.grad.norm().item()}  # type: ignore[union-attr]
+        loss = float(-values.mean())
+        found = {"actor_loss": loss, "actor_grad_norm": vector_norm(self.net.actor.grad).item()}
         check_finite(found, self.version, ADVICE)
         take_step(self.optimizers["actor_optimizer"])
         self.target.flat.lerp_(self.net.flat, self.config.tau)
@@ -82,5 +83,5 @@ class TD3(Continuous):
         with torch.no_grad():
             smooth = (noise * config.target_noise).clip(-config.target_noise_clip, config.target_noise_clip)
             action = (DeterministicAction(self.target_passes.params(rows.next_x)).action + smooth).clip(-1, 1)
-            value, _ = smaller_value(self.target_passes.values(rows.next_x, action))
+            value = smaller(self.target_passes.values(rows.next_x, action))
             return rows.reward + rows.discount * value

@@ -347,12 +347,12 @@ class ActorAndCritics(FlatNetwork):
         mean, log_std = out.chunk(2, -1)
         return torch.cat((mean, log_std.clamp(*LOG_STD_BOUNDS)), -1)
 
-    def values(self, x: Tensor, action: Tensor, *, constant: bool = False) -> Tensor:
-        """The values [2, B] of both critics for features [B, D] and actions [B, D′] in [-1, 1].
+    def values(self, x: Tensor, action: Tensor, *, constant: bool = False, critics: int = len(CRITICS)) -> Tensor:
+        """The values [critics, B] of both critics, or of the first, for features [B, D] and actions [B, D′] in [-1, 1].
 
         `constant`: the critics get no gradient; the actions do. Use it for the loss of the actor.
         """
-        layers = self._constant_critics if constant else self._critics
+        layers = [layer[:critics] for layer in self._constant_critics] if constant else self._critics
         out: Tensor = StackedMLP.apply(torch.cat((x, action), -1), self._relu, *layers)  # type: ignore[no-untyped-call]
         return out[..., 0]
 

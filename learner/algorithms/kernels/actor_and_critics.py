@@ -35,8 +35,12 @@ class ActorAndCriticsPasses(Protocol):
         """Write the gradient of the actor. The argument is the loss's gradient by the last `params` [B, P]."""
         ...
 
-    def values(self, x: Any, action: Any, *, constant: bool = False) -> Any:
-        """The values [2, B] of both critics. `constant`: `action_gradient` follows, else `critics_backward`."""
+    def values(self, x: Any, action: Any) -> Any:
+        """The values [2, B] of both critics; `critics_backward` may follow."""
+        ...
+
+    def values_by_action(self, x: Any, action: Any, critics: int) -> Any:
+        """The values [critics, B] of both critics, or of the first; `action_gradient` may follow."""
         ...
 
     def critics_backward(self, by_values: Any) -> None:
@@ -44,7 +48,7 @@ class ActorAndCriticsPasses(Protocol):
         ...
 
     def action_gradient(self, by_values: Any) -> Any:
-        """The loss's gradient [B, D′] by the actions of the last `values`. The argument is that by the values [2, B]."""
+        """The loss's gradient [B, D′] by the actions of the last `values_by_action`, from that by its values."""
         ...
 
 
@@ -72,10 +76,15 @@ class AutogradPasses:
         """See `ActorAndCriticsPasses`."""
         self._net.differentiate_actor(self._params, by_params)
 
-    def values(self, x: Tensor, action: Tensor, *, constant: bool = False) -> Tensor:
+    def values(self, x: Tensor, action: Tensor) -> Tensor:
         """See `ActorAndCriticsPasses`."""
-        self._action = action.detach().requires_grad_(constant)
-        self._values = self._net.values(x, self._action, constant=constant)
+        self._values = self._net.values(x, action)
+        return self._values.detach()
+
+    def values_by_action(self, x: Tensor, action: Tensor, critics: int) -> Tensor:
+        """See `ActorAndCriticsPasses`."""
+        self._action = action.detach().requires_grad_()
+        self._values = self._net.values(x, self._action, constant=True, critics=critics)
         return self._values.detach()
 
     def critics_backward(self, by_values: Tensor) -> None:
@@ -111,9 +120,13 @@ class FusedPasses:
         """See `ActorAndCriticsPasses`. Changes its argument."""
         self._net.actor_backward(by_params.T)
 
-    def values(self, x: Array, action: Array, *, constant: bool = False) -> Array:
+    def values(self, x: Array, action: Array) -> Array:
         """See `ActorAndCriticsPasses`."""
         return self._net.values(x, action)
+
+    def values_by_action(self, x: Array, action: Array, critics: int) -> Array:
+        """See `ActorAndCriticsPasses`."""
+        return self._net.values(x, action, critics)
 
     def critics_backward(self, by_values: Array) -> None:
         """See `ActorAndCriticsPasses`."""

@@ -57,7 +57,14 @@ class DeterministicAction:
         return found
 
 
-def smaller_value(values: TensorOrArray) -> tuple[TensorOrArray, TensorOrArray]:
-    """The smaller one [B] of two values [2, B], and which it is: booleans [2, B], one of them true for each row."""
+def smaller(values: TensorOrArray) -> TensorOrArray:
+    """The smaller one [B] of two values [2, B]."""
+    found: TensorOrArray = library(values).minimum(values[0], values[1])
+    return found
+
+
+def which_is_smaller(values: TensorOrArray) -> TensorOrArray:
+    """Which of two values [2, B] is the smaller one: booleans [2, B], one of them true for each row."""
     first = values[0] <= values[1]
-    return library(values).minimum(values[0], values[1]), library(values).stack((first, ~first))
+    found: TensorOrArray = library(values).stack((first, ~first))
+    return found

@@ -116,10 +116,14 @@ class FusedActorAndCritics:
         self._clips = spec.head == "squashed"
         actor = [Linear.stacked([name], values, grads) for name in names]
         self._actor = FusedMLP(actor, [Head(Linear.stacked(["actor.out"], values, grads), 0)], relu)
-        trunks = [hidden_names(spec, critic) for critic in CRITICS]
-        critics = [Linear.stacked(layers, values, grads) for layers in zip(*trunks, strict=True)]
-        heads = [Head(Linear.stacked([f"{critic}.out"], values, grads), i) for i, critic in enumerate(CRITICS)]
-        self._critics = FusedMLP(critics, heads, relu)
+
+        def critics(names: Sequence[str]) -> FusedMLP:
+            trunks = [hidden_names(spec, critic) for critic in names]
+            layers = [Linear.stacked(each, values, grads) for each in zip(*trunks, strict=True)]
+            heads = [Head(Linear.stacked([f"{critic}.out"], values, grads), i) for i, critic in enumerate(names)]
+            return FusedMLP(layers, heads, relu)
+
+        self._critics = {count: critics(CRITICS[:count]) for count in (1, len(CRITICS))}
         self._features = feature_size(spec)
 
     def params(self, x: Array) -> Array:
@@ -138,17 +142,18 @@ class FusedActorAndCritics:
             by_params[len(by_params) // 2 :] *= self._inside
         self._actor.backward((by_params,))
 
-    def values(self, x: Array, action: Array) -> Array:
-        """Features [B, D] and actions [B, D′] -> the values [2, B] of both critics."""
-        return np.concatenate(self._critics.forward(np.concatenate((x, action), 1)))
+    def values(self, x: Array, action: Array, critics: int = len(CRITICS)) -> Array:
+        """Features [B, D] and actions [B, D′] -> the values [critics, B] of both critics, or of the first."""
+        return np.concatenate(self._critics[critics].forward(np.concatenate((x, action), 1)))
 
     def critics_backward(self, by_values: Array) -> None:
         """Write the gradient of both critics. `by_values` [2, B]: the loss's gradient by the last `values`."""
-        self._critics.backward((by_values[:1], by_values[1:]))
+        self._critics[len(CRITICS)].backward((by_values[:1], by_values[1:]))
 
     def action_gradient(self, by_values: Array) -> Array:
-        """The loss's gradient [D′, B] by the actions of the last `values`, from that by the values [2, B]."""
-        return self._critics.input_gradient((by_values[:1], by_values[1:]))[self._features :]
+        """The loss's gradient [D′, B] by the actions of the last `values` of so many critics, from that by these values."""
+        by_each = [by_values[i : i + 1] for i in range(len(by_values))]
+        return self._critics[len(by_values)].input_gradient(by_each)[self._features :]
 
 
 def _mean(array: Array) -> Array:

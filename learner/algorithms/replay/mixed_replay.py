@@ -6,7 +6,7 @@ they are and are drawn uniformly. They are no part of a saved state: whoever loa
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -64,6 +64,12 @@ class MixedReplay(ReplayBuffer):
             drawn = self.prior.sample(prior)
             parts.append(drawn._replace(slots=np.full(prior, PRIOR_SLOT)))
         return parts[0] if len(parts) == 1 else _joined(*parts)
+
+    def samples(self, number: int, count: int, beta: float = 1.0) -> Iterator[Sample]:
+        """So many draws of `count` transitions, as by `sample`."""
+        if self.prior is None:
+            return super().samples(number, count, beta)
+        return (self.sample(count, beta) for _ in range(number))
 
     def update_priorities(self, slots: Ints, error: Floats) -> None:
         """Set the priorities of the own transitions among these slots [B] from their errors [B]."""

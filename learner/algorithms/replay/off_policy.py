@@ -104,8 +104,8 @@ class OffPolicy(Algorithm):
         self.env_steps += batch.env_steps
         self.version += 1
         measured: list[Any] = []
-        for _ in range(self.steps_due() if len(self.replay) else 0):
-            measured.append(self.step(self.sample(beta)))
+        for sample in self.samples(self.steps_due() if len(self.replay) else 0, beta):
+            measured.append(self.step(sample))
             pulse()
         metrics = {
             "train/learning_rate": learning_rate,
@@ -131,17 +131,17 @@ class OffPolicy(Algorithm):
 
     def learn_from_prior(self, pulse: Callable[[], None]) -> None:
         """Make `prior_steps` gradient steps on prior data alone, less those that were made."""
-        while self.prior_gradient_steps < self.config.prior_steps:
-            self.step(self.sample())
+        for sample in self.samples(self.config.prior_steps - self.prior_gradient_steps):
+            self.step(sample)
             self.prior_gradient_steps += 1
             pulse()
 
-    def sample(self, beta: float = 1.0) -> Sample:
-        """A minibatch from the replay buffer and from prior data. `beta`: see `ReplayBuffer.sample`."""
-        drawn = self.replay.sample(self.config.batch_size, beta)
-        if self.config.normalize_rewards:
-            drawn = drawn._replace(reward=(drawn.reward / self.rewards.std).astype(np.float32))
-        return drawn
+    def samples(self, number: int, beta: float = 1.0) -> Iterator[Sample]:
+        """Minibatches from the replay buffer and from prior data. `beta`: see `ReplayBuffer.sample`."""
+        for drawn in self.replay.samples(number, self.config.batch_size, beta):
+            if self.config.normalize_rewards:
+                drawn = drawn._replace(reward=(drawn.reward / self.rewards.std).astype(np.float32))
+            yield drawn
 
     def inputs(self, leaves: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Features [B, D], normalized with the current statistics, and images [B, *leaf] uint8, of leaves [B, *leaf]."""

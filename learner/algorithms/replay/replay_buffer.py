@@ -11,7 +11,7 @@ the oldest slot first. So a row that is still stored always finds the rows that 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +26,7 @@ from protocol.specs import ActionSpec, Leaf
 
 PRIORITY_OFFSET = 1e-6  # added to errors, so that every transition can be drawn again
 NO_SLOT = -1
+DRAWN_AT_ONCE = 1 << 20  # bytes of the transitions that are drawn together, at most: they stay in the cache
 DISCRETE = ActionSpec("discrete", (), "int64")
 
 
@@ -46,6 +47,19 @@ class Sample(NamedTuple):
     next_leaves: tuple[Array, ...]  # [B, *leaf] each, k steps later
     weight: Floats  # [B] importance-sampling weight of the loss, at most 1
     next_mask: Bools | None = None  # [B, choices] actions allowed in the next observation; None without action masks
+
+    def part(self, rows: slice) -> Sample:
+        """Some of these transitions, without a copy."""
+        return Sample(
+            self.slots[rows],
+            tuple(leaf[rows] for leaf in self.leaves),
+            self.action[rows],
+            self.reward[rows],
+            self.discount[rows],
+            tuple(leaf[rows] for leaf in self.next_leaves),
+            self.weight[rows],
+            None if self.next_mask is None else self.next_mask[rows],
+        )
 
 
 def memory_bytes(
@@ -115,6 +129,7 @@ class ReplayBuffer:
         check_fits_memory(*self._content)
         self.size = size  # slots
         self.bytes = memory_bytes(*self._content)
+        self._transition_bytes = 2 * self.bytes // size  # of a draw: two observations
         self._n_step, self._gamma, self._alpha = n_step, gamma, alpha
         self.generator = np.random.default_rng(seed)  # decides what is drawn
         self._obs = tuple(np.zeros((size, *leaf.shape), leaf.dtype) for leaf in observation)
@@ -216,8 +231,7 @@ class ReplayBuffer:
 
     def sample(self, count: int, beta: float = 1.0) -> Sample:
         """Draw transitions with replacement. `beta`: how much the weights correct for the priorities; 1 corrects fully."""
-        slots, weight = self._uniform(count) if self._tree is None else self._by_priority(self._tree, count, beta)
-        row = self._row[slots]
+        slots, row, weight = self._uniform(count) if self._tree is None else self._by_priority(self._tree, count, beta)
         reward, discount, last = self._follow(row)
         return Sample(
             slots=slots,
@@ -230,19 +244,30 @@ class ReplayBuffer:
             next_mask=None if self._mask is None else self._mask[last],
         )
 
-    def _uniform(self, count: int) -> tuple[Ints, Floats]:
+    def samples(self, number: int, count: int, beta: float = 1.0) -> Iterator[Sample]:
+        """So many draws of `count` transitions. The buffer may change between them only in its priorities.
+
+        Small uniform draws are made many at once, which takes less time.
+        """
+        at_once = 1 if self.prioritized else max(1, DRAWN_AT_ONCE // (count * self._transition_bytes))
+        for first in range(0, number, at_once):
+            these = min(at_once, number - first)
+            drawn = self.sample(these * count, beta)
+            yield from (drawn.part(slice(i * count, (i + 1) * count)) for i in range(these))
+
+    def _uniform(self, count: int) -> tuple[Ints, Array, Floats]:
         used = min(self._written, self.size)
         slots = self.generator.integers(0, used, count)
-        while not (found := self._is_row[slots]).all():  # at least half of the slots have a row; usually nearly all
+        while not (found := (row := self._row[slots])["is_row"]).all():  # at least half of the slots have a row
             slots[~found] = self.generator.integers(0, used, np.count_nonzero(~found))
-        return slots, np.ones(count, np.float32)
+        return slots, row, np.ones(count, np.float32)
 
-    def _by_priority(self, tree: SumTree, count: int, beta: float) -> tuple[Ints, Floats]:
+    def _by_priority(self, tree: SumTree, count: int, beta: float) -> tuple[Ints, Array, Floats]:
         """P(i) = pᵢ^α / Σ p^α;  wᵢ = (rows · P(i))^−β, divided by the greatest of them (Schaul et al. 2016, section 3.4)."""
         slots = tree.draw(self.generator, count)
         chance = tree.weights[slots] / tree.total
         weight = (self._rows * chance) ** -beta
-        return slots, (weight / weight.max()).astype(np.float32)
+        return slots, self._row[slots], (weight / weight.max()).astype(np.float32)
 
     def _follow(self, row: Array) -> tuple[Doubles, Doubles, Ints]:
         """Follow each row for up to n steps. Returns the discounted reward, γᵏ (0 if the task ended) and the last slot."""
@@ -254,6 +279,11 @@ class ReplayBuffer:
             discount = np.where(going, discount * self._gamma * ~row["terminated"], discount)
             at = np.where(going, row["follows"], at)
         return reward, discount, at
+
+    @property
+    def prioritized(self) -> bool:
+        """Whether priorities decide what is drawn."""
+        return self._tree is not None
 
     def update_priorities(self, slots: Ints, error: Floats) -> None:
         """Set the priorities of these slots [B] from their errors [B]. Call it before the next `add`."""

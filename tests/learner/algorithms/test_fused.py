@@ -75,7 +75,7 @@ def make(spec: PolicySpec, seed: int, scale: float = 0.4) -> tuple[ActorCriticNe
 def test_outputs_and_gradients_are_autograds(
     action: str, activation: Any, net: list[int], shared_net: bool, rows: int, piece: int, by_torch: bool, seed: int
 ) -> None:
-    with patch.multiple(layers, CHUNK_ROWS=piece, TORCH_PRODUCT_SIZE=0 if by_torch else layers.TORCH_PRODUCT_SIZE):
+    with patch.multiple(layers, CHUNK_ROWS=piece, uses_torch=lambda _: by_torch):
         outputs_and_gradients(PolicySpec(BOX, ACTIONS[action], tuple(net), activation, shared_net=shared_net), rows, seed)
 
 
@@ -124,13 +124,13 @@ def outputs_and_gradients(spec: PolicySpec, rows: int, seed: int) -> None:
 @pytest.mark.parametrize("action", sorted(ACTIONS))
 @pytest.mark.parametrize("activation", ["tanh", "relu"])
 @pytest.mark.parametrize("shared_net", [False, True])
-@pytest.mark.parametrize(("piece", "large"), [(512, layers.TORCH_PRODUCT_SIZE), (4, 0)])
+@pytest.mark.parametrize(("piece", "by_torch"), [(512, False), (4, True)])
 def test_the_gradient_is_the_slope_in_float64(
-    action: str, activation: Any, shared_net: bool, piece: int, large: int, monkeypatch: pytest.MonkeyPatch
+    action: str, activation: Any, shared_net: bool, piece: int, by_torch: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Central differences of a weighted sum of all outputs, by every parameter."""
     monkeypatch.setattr(layers, "CHUNK_ROWS", piece)
-    monkeypatch.setattr(layers, "TORCH_PRODUCT_SIZE", large)
+    monkeypatch.setattr(layers, "uses_torch", lambda _: by_torch)
     generator = np.random.default_rng(3)
     spec = PolicySpec(BOX, ACTIONS[action], (5, 3), activation, shared_net=shared_net)
     flat = generator.normal(0, 0.5, sum(map(total_size, parameter_layout(spec))))

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from learner.algorithms.kernels import fused
 from learner.algorithms.kernels.actor_and_critics import ActorAndCriticsPasses, AutogradPasses, FusedPasses, passes_of
-from learner.algorithms.kernels.bounded_actions import DeterministicAction, SquashedSample, smaller_value
+from learner.algorithms.kernels.bounded_actions import DeterministicAction, SquashedSample, smaller, which_is_smaller
 from protocol.arrays import Array
 from protocol.policy.networks import ActorAndCritics
 from protocol.policy.torch_distributions import squashed_sample
@@ -64,8 +64,10 @@ def everything(passes: ActorAndCriticsPasses, net: ActorAndCritics, rows: int, s
     found = [passes.to_numpy(passes.values(x, action)).copy()]
     passes.critics_backward(by_values)
     found.append(net.critics.grad.numpy().copy())  # type: ignore[union-attr]
-    passes.values(x, action, constant=True)
-    found.append(passes.to_numpy(passes.action_gradient(by_values)).copy())
+    for critics in (1, 2):
+        found.append(passes.to_numpy(passes.values_by_action(x, action, critics)).copy())
+        np.testing.assert_array_equal(len(found[-1]), critics)
+        found.append(passes.to_numpy(passes.action_gradient(by_values[:critics])).copy())
     np.testing.assert_array_equal(net.critics.grad, found[1])  # the gradient by the actions leaves that of the weights
     found.append(passes.to_numpy(passes.params(x)).copy())
     passes.actor_backward(by_actor)
@@ -134,9 +136,9 @@ def test_a_deterministic_action_and_its_gradient() -> None:
 
 @pytest.mark.parametrize("library", [np.array, torch.tensor])
 def test_the_smaller_value_of_each_row(library: Any) -> None:
-    value, which = smaller_value(library([[1.0, 5.0, 2.0], [3.0, 4.0, 2.0]]))
-    assert value.tolist() == [1, 4, 2]
-    assert which.tolist() == [[True, False, True], [False, True, False]]
+    values = library([[1.0, 5.0, 2.0], [3.0, 4.0, 2.0]])
+    assert smaller(values).tolist() == [1, 4, 2]
+    assert which_is_smaller(values).tolist() == [[True, False, True], [False, True, False]]
 
 
 @pytest.mark.parametrize(

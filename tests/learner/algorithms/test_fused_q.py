@@ -85,7 +85,7 @@ def outputs_and_gradients(spec: PolicySpec, rows: int, seed: int) -> None:
 def test_outputs_and_gradients_are_autograds(
     activation: Any, net: list[int], dueling: bool, rows: int, piece: int, by_torch: bool, seed: int
 ) -> None:
-    with patch.multiple(layers, CHUNK_ROWS=piece, TORCH_PRODUCT_SIZE=0 if by_torch else layers.TORCH_PRODUCT_SIZE):
+    with patch.multiple(layers, CHUNK_ROWS=piece, uses_torch=lambda _: by_torch):
         outputs_and_gradients(policy(tuple(net), activation, dueling), rows, seed)
 
 
@@ -99,13 +99,13 @@ def test_so_they_are_at_the_sizes_that_are_used(dueling: bool, rows: int) -> Non
 @pytest.mark.parametrize("dueling", [False, True])
 @pytest.mark.parametrize("activation", ["tanh", "relu"])
 @pytest.mark.parametrize("loss", sorted(LOSSES))
-@pytest.mark.parametrize(("piece", "large"), [(512, layers.TORCH_PRODUCT_SIZE), (4, 0)])
+@pytest.mark.parametrize(("piece", "by_torch"), [(512, False), (4, True)])
 def test_the_gradient_is_the_slope_of_the_loss_in_float64(
-    dueling: bool, activation: Any, loss: str, piece: int, large: int, monkeypatch: pytest.MonkeyPatch
+    dueling: bool, activation: Any, loss: str, piece: int, by_torch: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Central differences of the loss of the values of some actions, by every parameter."""
     monkeypatch.setattr(layers, "CHUNK_ROWS", piece)
-    monkeypatch.setattr(layers, "TORCH_PRODUCT_SIZE", large)
+    monkeypatch.setattr(layers, "uses_torch", lambda _: by_torch)
     generator, rows = np.random.default_rng(5), 9
     spec = policy((5, 3), activation, dueling)
     flat = generator.normal(0, 0.5, sum(map(total_size, parameter_layout(spec))))

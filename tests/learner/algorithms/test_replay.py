@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import math
 from collections.abc import Iterator
@@ -206,6 +207,25 @@ def test_a_full_ring_keeps_the_newest_and_breaks_no_chain(seed: int, n_step: int
         assert newest in found
     assert len(kept) >= size // 2 - 4  # but for final observations, each after a row of its own, and the newest ones
     assert min(lanes.rows) not in found
+
+
+@pytest.mark.parametrize(("alpha", "at_once", "draws"), [(None, 1 << 20, 1), (None, 0, 7), (1.0, 1 << 20, 7)])
+def test_minibatches_are_drawn_together_where_that_is_cheaper(
+    alpha: float | None, at_once: int, draws: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "DRAWN_AT_ONCE", at_once)
+    lanes, kept = Lanes(1), replay(n_step=3, alpha=alpha)
+    filled(lanes, kept, 8)
+    same = copy.deepcopy(kept)
+    found = list(kept.samples(7, 20))
+    whole = [same.sample(7 * 20 // draws) for _ in range(draws)]
+    assert [len(each.slots) for each in found] == [20] * 7
+    np.testing.assert_array_equal(
+        np.concatenate([each.slots for each in found]), np.concatenate([each.slots for each in whole])
+    )
+    for each in found:
+        check(each, lanes, 3)
+    assert list(kept.samples(0, 20)) == []
 
 
 @pytest.mark.parametrize("others", [2, 4])  # it is overwritten by the very rollout that would go on from it; was so before
