@@ -2,7 +2,8 @@
 
 Rule: every valid row is in exactly one whole episode, or waits for its episode to end (`waiting`), or is counted as left out
 (`left_out`). A reset row is not part of an episode. An episode that spans several rollouts is assembled only if all of them
-arrived, in order, from the same incarnation of their lane, so no episode has a hole.
+arrived, in order, from the same incarnation of their lane, and each continues the one before, so no episode has a hole. (If
+the first row of a rollout is not valid and does not follow an end, a client made steps between the two rollouts.)
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ class _LaneState:
     incarnation: int
     sequence: int  # of the next rollout
     running: list[list[_Fragment] | None] = field(default_factory=list)
-    """[N] the unfinished episode of each env copy. It is None until the next reset if its beginning is missing."""
+    """[N] the unfinished episode of each env copy. It is None until the next end if its beginning is missing."""
 
     @property
     def waiting(self) -> int:
@@ -90,10 +91,8 @@ class EpisodeAssembler:
             return []
         if lane is None or (incarnation, rollout.sequence) != (lane.incarnation, lane.sequence):
             self.left_out += lane.waiting if lane is not None else 0
-            begins = rollout.sequence == 0
-            lane = _LaneState(
-                incarnation, rollout.sequence, [[] if begins else None for _ in range(rollout.reward.shape[1])]
-            )
+            begins = rollout.valid[0] & (rollout.sequence == 0)
+            lane = _LaneState(incarnation, rollout.sequence, [[] if one else None for one in begins])
             self._lanes[rollout.lane] = lane
         lane.sequence += 1
         ended = [end for n in range(len(lane.running)) for end in self._column(rollout, lane, n)]
@@ -105,13 +104,12 @@ class EpisodeAssembler:
         start, steps = 0, len(rollout.reward)
         valid, ended = rollout.valid[:, n], rollout.terminated[:, n] | rollout.truncated[:, n]
         for t in np.flatnonzero(ended | ~valid).tolist():
-            if not valid[t]:  # a reset row: the next row begins an episode
-                self.left_out += sum(
-                    len(fragment.reward) for fragment in lane.running[n] or ()
-                )  # the env copy was lost before the episode ended
-                lane.running[n], start = [], t + 1
-                continue
             fragments = lane.running[n]
+            if not valid[t]:
+                follows_end = t > 0 or fragments == []
+                self.left_out += sum(len(fragment.reward) for fragment in fragments or ())
+                lane.running[n], start = [] if follows_end else None, t + 1
+                continue
             if fragments is None:
                 self.left_out += t + 1 - start
             else:

@@ -2,11 +2,13 @@
 
 import sys
 import warnings
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import gymnasium
+import msgspec
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -154,6 +156,27 @@ def test_an_episode_has_no_hole_whatever_is_dropped_or_late(stream: list[tuple[i
         check_whole(episode)
     starts = [tuple(episode.obs[0][0]) for episode in episodes]
     assert len(set(starts)) == len(starts)
+    assert sum(episode.length for episode in episodes) + assembler.waiting + assembler.left_out == steps
+
+
+@settings(deadline=None)
+@given(rollouts(), st.data())
+def test_an_episode_has_no_hole_where_steps_are_in_no_rollout(stream: list[tuple[int, Rollout]], data: st.DataObject) -> None:
+    """A client that owns its loop leaves steps out between two rollouts; then the first row is not valid."""
+    sequences: Counter[int] = Counter()
+    assembler, episodes, steps = EpisodeAssembler(taken), [], 0
+    for incarnation, rollout in stream:
+        if data.draw(st.booleans()):  # this one is not recorded
+            continue
+        sequence = sequences[incarnation]
+        sequences[incarnation] += 1
+        if sequence != rollout.sequence:
+            rollout.valid[0] = False
+        rollout = msgspec.structs.replace(rollout, sequence=sequence)
+        episodes += assembler.add(rollout, incarnation)
+        steps += rollout.env_steps
+    for episode in episodes:
+        check_whole(episode)
     assert sum(episode.length for episode in episodes) + assembler.waiting + assembler.left_out == steps
 
 

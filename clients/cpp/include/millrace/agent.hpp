@@ -69,7 +69,7 @@ class Agent : public CollectorSession {
     if (run.copies != 1) return "this client has one env copy, the learner asks for " + std::to_string(run.copies) + " in a lane; give it --envs and --lanes equal to the number of clients";
     if (std::string why = begin_collecting(run); !why.empty()) return why;
     rows_ = std::make_unique<Recorder>(run, description_.observation, description_.action);
-    rows_->ended[0] = 1;  // the first row may begin in the middle of an episode, whose figures nobody knows
+    rows_->started(0, now_s()), rows_->gap[0] = 1;  // in the middle of an episode, perhaps
     random_ = Random{run.seed, session_};
     acts_ = false;
     return "";

@@ -24,7 +24,7 @@ class Recorder {  // writes the rows of a lane, and counts its episodes from one
  public:
   Recorder(const Run& run, const Space& observation, const Space& action)
       : T(run.rollout_steps), N(run.copies), obs_bytes(observation.bytes()), action_bytes(action.bytes()), obs(N * obs_bytes),
-        ended(N), episodes_(N), floats_(observation.dtype == "float32"), doubles_(observation.dtype == "float64"),
+        ended(N), gap(N), episodes_(N), floats_(observation.dtype == "float32"), doubles_(observation.dtype == "float64"),
         elements_(observation.elements()) {}
 
   void begin(Rollout& r) {
@@ -40,14 +40,13 @@ class Recorder {  // writes the rows of a lane, and counts its episodes from one
 
   void result(Rollout& r, std::size_t n, double reward, bool terminated, bool truncated, double now) {  // of copy n in this row
     const std::size_t i = r.rows * N + n;
-    const bool valid = !ended[n];
-    Episode& episode = episodes_[n];
-    if (!valid) reward = 0, episode = {0, 0, now};  // this row only resets the copy
-    r.reward[i] = static_cast<float>(reward), r.terminated[i] = terminated, r.truncated[i] = truncated, r.valid[i] = valid;
-    if (!std::isfinite(r.reward[i])) throw std::runtime_error("reward: expected a finite number");
+    const bool valid = !ended[n] && !gap[n];
+    if (ended[n]) reward = 0;  // this row only resets the copy
+    if (!std::isfinite(static_cast<float>(reward))) throw std::runtime_error("reward: expected a finite number");
+    count(n, reward, now);
+    r.reward[i] = valid ? static_cast<float>(reward) : 0, r.terminated[i] = terminated, r.truncated[i] = truncated, r.valid[i] = valid;
     check(next_obs_at(r, n));
-    if (valid) episode.reward += reward, ++episode.length;
-    ended[n] = terminated || truncated;
+    ended[n] = terminated || truncated, gap[n] = 0;
     if (ended[n] && valid) report(r, n, now);
   }
   void not_applied(Rollout& r, std::size_t n, double now) {  // the action of this row: call it before `result`
@@ -59,10 +58,9 @@ class Recorder {  // writes the rows of a lane, and counts its episodes from one
     }
     ended[n] = 1;
   }
-  void outside_of_rows(std::size_t n, double reward, bool end, double now) {  // a step between two rollouts
-    if (ended[n]) episodes_[n] = {0, 0, now};
-    else episodes_[n].reward += reward, ++episodes_[n].length;
-    ended[n] = end;
+  void outside_of_rows(std::size_t n, double reward, bool end, double now) {  // a step that is in no rollout
+    count(n, reward, now);
+    ended[n] = end, gap[n] = 1;
   }
   bool end_row(Rollout& r) {  // whether the rollout is complete
     if (++r.rows < T) return false;
@@ -77,11 +75,16 @@ class Recorder {  // writes the rows of a lane, and counts its episodes from one
   }
 
   const std::size_t T, N, obs_bytes, action_bytes;
-  std::vector<unsigned char> obs, ended;  // [N, …] the newest observations; [N] the next row only resets this copy
+  std::vector<unsigned char> obs;         // [N, …] the newest observations
+  std::vector<unsigned char> ended, gap;  // [N] the next row only resets this copy; does not continue the row before it
 
  private:
+  void count(std::size_t n, double reward, double now) {  // a step, or the reset after an end
+    if (ended[n]) episodes_[n] = {0, 0, now};
+    else episodes_[n].reward += reward, ++episodes_[n].length;
+  }
   void report(Rollout& r, std::size_t n, double now) {
-    const Episode& episode = episodes_[n];  // steps between two rollouts count, as far as the learner can check the length
+    const Episode& episode = episodes_[n];  // steps in no rollout count, as far as the learner can check the length
     r.episodes.push_back({episode.reward, std::min<std::uint64_t>(episode.length, (r.sequence + 1) * T), now - episode.seconds});
   }
   std::vector<Episode> episodes_;  // that run; `seconds` holds when they began
