@@ -28,6 +28,7 @@ from protocol.specs import DescribeSpec, PolicySpec, RunSpec
 from protocol.wire.learner_link import LearnerLink
 
 WORKER_TIMEOUT_S, NO_WORKERS_TIMEOUT_S, STALL_TIMEOUT_S = 5.0, 60.0, 600.0
+DESCRIBE = DescribeSettings(WORKER_TIMEOUT_S, NO_WORKERS_TIMEOUT_S, STALL_TIMEOUT_S, max_env_failures=0)
 
 
 class SavedPolicy(NamedTuple):
@@ -84,14 +85,16 @@ class PolicyPlayer:
         processes: ProcessCallbacks,
         check_interrupt: Callable[[], None],
         watch: Callable[[str], None],
+        described: DescribedEnv | None = None,
     ) -> None:
         """`check_interrupt` is called while it waits: what it raises ends the wait.
 
-        `watch` is called several times a second with how far it is, as text.
+        `watch` is called several times a second with how far it is, as text. `described`: the environment, if a worker has
+        described it.
         """
         self.policy = policy
         self._link, self._processes = link, processes
-        self._check_interrupt, self._watch = check_interrupt, watch
+        self._check_interrupt, self._watch, self._described = check_interrupt, watch, described
         self._hub: Hub | None = None
 
     @property
@@ -101,9 +104,10 @@ class PolicyPlayer:
 
     def describe(self, render_mode: str | None = None) -> DescribedEnv:
         """Have a worker describe the environment. Call it before the first `play`. Raises `UserFacingError`."""
-        settings = DescribeSettings(WORKER_TIMEOUT_S, NO_WORKERS_TIMEOUT_S, STALL_TIMEOUT_S, max_env_failures=0)
+        if self._described is not None:
+            return self._described
         spec = DescribeSpec(self.policy.env, render_mode=render_mode)
-        return described_by_workers(self._link, spec, settings, self._processes, self._check_interrupt)
+        return described_by_workers(self._link, spec, DESCRIBE, self._processes, self._check_interrupt)
 
     def play(self, plan: EvaluationPlan, on_rows: OnRows | None = None, before: int = 0) -> list[PlayedEpisode]:
         """Play these episodes. Returns them in the order of the seeds. Raises `RunError` if that is not possible.

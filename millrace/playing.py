@@ -48,6 +48,7 @@ class PlayKeywords(TypedDict, total=False):
     workers: int
     transport: Literal["inproc", "ipc", "tcp"]
     bind: str
+    inference: Literal["workers", "learner"]
 
 
 class EvaluateKeywords(PlayKeywords, total=False):
@@ -101,7 +102,7 @@ def evaluate(
         progress: Show how far it is.
         **keywords: The flags of `millrace evaluate`. `seed` of the episodes; `best`, to use the policy with the best
             evaluation during the run in place of the newest; the number of `workers`, and of the `copies` that each plays
-            side by side; `max_steps` of all episodes together; `transport` or `bind`; `video`, to film them.
+            side by side; `max_steps` of all episodes together; `transport` or `bind`; `inference`; `video`, to film them.
 
     Returns the `Evaluation`: `return_mean`, `return_std`, `length_mean`, `episodes` and `cut`. It does not depend on the
     number of workers. Raises `UserFacingError` with a message of one line.
@@ -137,7 +138,7 @@ def record(
         wrappers: Likewise the wrappers.
         progress: Show how far it is.
         **keywords: The flags of `millrace record`: `stochastic`, to sample actions; `npy`, a file for rows of observation
-            and action; `seed`, `best`, `workers`, `transport` and `bind`.
+            and action; `seed`, `best`, `workers`, `transport`, `bind` and `inference`.
 
     Returns a `RecordedDataset`: `dataset_id`, `episodes`, `steps`, `return_mean`, `return_std` and `cut`. It does not depend
     on the number of workers. Raises `UserFacingError` with a message of one line; then it leaves no files.
@@ -179,12 +180,15 @@ def play(flags: EvaluateFlags, watch: Watch, given: Given | None = None) -> tupl
     if flags.copies > MAX_SEEDS:
         raise UsageError(f"copies: expected int <= {MAX_SEEDS}, got {flags.copies}")
     if flags.video:
+        if flags.inference == "learner":
+            raise UsageError("video: expected inference workers, got learner; only a worker that acts renders its episodes")
         from learner.recording.video import prepare_rendering, record_videos
 
         prepare_rendering()
     saved = _saved(flags, given)
     copies = 1 if flags.video else flags.copies
-    workers = PlayingWorkers(useful_workers(flags.workers, episodes, copies), flags.transport, flags.bind)
+    count = useful_workers(flags.workers, episodes, copies)
+    workers = PlayingWorkers(count, flags.transport, flags.bind, flags.inference, min(copies, episodes))
     with policy_player(saved, workers, watch) as player:
         if flags.video:
             return record_videos(player, flags.run, episodes, flags.seed)
@@ -197,7 +201,7 @@ def write_dataset(flags: RecordFlags, watch: Watch, given: Given | None = None) 
     _at_least("steps", flags.steps, 1)
     _at_least("seed", flags.seed, 0)
     _at_least("workers", flags.workers, 1)
-    saved, workers = _saved(flags, given), PlayingWorkers(flags.workers, flags.transport, flags.bind)
+    saved, workers = _saved(flags, given), PlayingWorkers(flags.workers, flags.transport, flags.bind, flags.inference)
     with policy_player(saved, workers, watch) as player:
         return record_dataset(
             player, flags.run, flags.out, flags.steps, flags.seed, stochastic=flags.stochastic, npy=flags.npy

@@ -30,7 +30,7 @@ from learner.vector_env.spec import VectorEnvDescription
 from learner.vector_env.step_hub import StepHub
 from protocol.arrays import Array
 from protocol.envs.spaces import make_flatten
-from protocol.errors import BadMessage, UsageError, WorkerLost
+from protocol.errors import BadMessage, NoWorkers, UsageError, WorkerLost
 from protocol.messages import Answer, Status, Stepped
 from protocol.wire.plain_values import repr_paths
 from protocol.wire.shared_memory import SharedMemory
@@ -406,6 +406,10 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
     def wait_for(self, workers: int, timeout_s: float) -> None:
         """Wait until this many workers have joined. Raises `NoWorkers`."""
         self._hub.wait_for(workers, timeout_s)
+
+    def no_workers(self, timeout_s: float) -> NoWorkers:
+        """The error when no worker has been there for this long."""
+        return self._hub.no_workers(timeout_s)
 
     def watch(self, callback: Callable[[], None]) -> None:
         """Set what is called regularly during each wait. An exception that it raises ends the wait."""

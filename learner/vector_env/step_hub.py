@@ -20,7 +20,7 @@ from learner.members.process_callbacks import ProcessCallbacks
 from learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator
 from learner.vector_env.status import status, status_of_run
 from protocol.address import worker_name
-from protocol.errors import EnvironmentFailed
+from protocol.errors import EnvironmentFailed, NoWorkers
 from protocol.messages import Answer, Order, Status, WorkerActivity, WorkerExit
 from protocol.specs import StepSpec
 from protocol.wire.learner_link import LearnerLink
@@ -261,7 +261,7 @@ class StepHub:
     def give_up(self, lane: int, timeout_s: float) -> None:
         """Give up the worker of a lane that took longer than this. Raises `NoWorkers` if the lane had none all the time."""
         if lane in self._waiting_orders:
-            raise self._server.no_workers(1, timeout_s)
+            raise self.no_workers(timeout_s)
         self._give_up_lane(lane, f"did not answer within {timeout_s:g} s")
 
     def raise_failures(self) -> None:
@@ -350,6 +350,10 @@ class StepHub:
         """Wait until this number of `workers` have joined. Raises `NoWorkers`."""
         self._server.wait_for(workers, timeout_s, lambda: self._turn(POLL_S))
 
+    def no_workers(self, timeout_s: float) -> NoWorkers:
+        """The error when no worker has been there for this long."""
+        return self._server.no_workers(1, timeout_s)
+
     def close(self, timeout_s: float) -> None:
         """Ask every worker to leave, wait a moment for their Goodbye, and end those that are ours."""
         busy = bool(self._under_way or self._coordinator.orders)
@@ -419,7 +423,7 @@ class StepHub:
         """The deadline has passed: give up every worker that has not answered."""
         if self._waiting_orders and not self._coordinator.orders:
             self._waiting_orders.clear()
-            raise self._server.no_workers(1, timeout_s)
+            raise self.no_workers(timeout_s)
         for order in list(self._coordinator.orders.values()):
             self._give_up_lane(order.lane, f"did not answer within {timeout_s:g} s")
 

@@ -27,6 +27,8 @@ class PlayFlags(msgspec.Struct, frozen=True, kw_only=True):
     """how local workers are connected: as threads of this process, by local sockets, or by TCP"""
     bind: str = ""
     """address at which workers from elsewhere can join, such as tcp://0.0.0.0:5555; no workers are then started here"""
+    inference: Literal["workers", "learner"] = "workers"
+    """where the policy acts: in each worker, or in this process; workers that only step the environment need learner"""
 
 
 class EvaluateFlags(PlayFlags, frozen=True, kw_only=True):

@@ -18,29 +18,20 @@ from learner.config.config import Config
 from learner.interrupts import Interrupts
 from learner.members.describe_coordinator import Accept
 from learner.members.endpoint import BindSettings
-from learner.members.process_callbacks import ProcessCallbacks
 from learner.resumption import Resumption
 from learner.rollout_service.service import describe_settings
 from learner.run import Run, RunSetup, known_environment, prometheus_observer, run_folder
-from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.settings import VectorEnvSettings
+from millrace.launch.acting_thread import NEVER_S, BeforeWaits, acting_processes, acting_thread
 from millrace.launch.endpoint import open_endpoint
 from millrace.launch.local_worker_options import worker_flags
 from millrace.launch.vector import listen
-from protocol.alive import WorkerExit
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
-from protocol.policy.policy import Policy, make_policy
-from protocol.specs import DescribeSpec, ImagesDtype, PolicySpec, RunSpec
-from workers.collect.collector import Collector
+from protocol.specs import DescribeSpec
 from workers.collect.split_vector_env import SplitVectorEnv
-from workers.env_loop import Pulse
-from workers.evaluate.evaluator import Evaluator
 from workers.evaluate.split_evaluation_copies import SplitEvaluationCopies
-from workers.supervise.worker_thread import WorkerThread
-from workers.supervisor import STOP_WITHIN_S, Supervisor
-
-NEVER_S = 1e9
+from workers.supervisor import STOP_WITHIN_S
 
 
 def train(
@@ -71,49 +62,27 @@ def train(
         env = started.vector_env(known.described)
         stack.callback(env.close)
         workers = config.min_workers or (1 if elsewhere else min(config.workers, config.envs))
-        before_wait = _before_waits(env, workers, config.no_workers_timeout_s)
+        before_wait = BeforeWaits(env, workers, config.no_workers_timeout_s)
         lanes = SplitVectorEnv(
             env, config.lanes, before_wait, env.step_lanes, config.fact_names(), masked=known.spaces.masked
         )
         evaluation_copies = SplitEvaluationCopies(lanes, config.lanes, config.eval_copies)
 
-        def collector(spec: RunSpec) -> tuple[Collector, Evaluator]:
+        def device() -> str:
             from learner.torch_setup import torch_device
 
-            policy = acting_policy(spec.policy, torch_device(config), spec.images_dtype)
-            evaluator = Evaluator(spec, policy, lambda run, count, render_mode, pulse: evaluation_copies)
-            return Collector(spec, policy, lanes.open_lane, lanes.step_all), evaluator
+            return torch_device(config)
 
-        def start(name: str) -> WorkerThread:
-            return WorkerThread(link.address, name, endpoint.context, collector)
-
-        supervisor = Supervisor(start, 1, prefix="inference")
+        thread = acting_thread(endpoint, lanes, evaluation_copies, device)
         interrupts = Interrupts(config.grace_s)
-        stack.callback(lambda: supervisor.stop(interrupts.at_most(STOP_WITHIN_S)))
-        stack.callback(supervisor.ask_to_leave)  # if it is asked a second time, the worker leaves at once
-
-        def ended() -> list[WorkerExit]:
-            lanes.raise_if_no_workers()
-            return supervisor.poll()
-
-        processes = ProcessCallbacks(ended, supervisor.activities, lambda: env.workers, 0 if elsewhere else config.workers)
+        stack.callback(lambda: thread.stop(interrupts.at_most(STOP_WITHIN_S)))
+        stack.callback(thread.ask_to_leave)  # if it is asked a second time, the worker leaves at once
+        processes = acting_processes(thread, lanes, env, 0 if elsewhere else config.workers)
         run = Run(RunSetup(config, known, folder, resume is not None, interrupts), link, processes, watch, observer)
         env.answer_for(run.status)  # the learner's own endpoint is inproc: `millrace status` asks where the workers join
         run.announce(env.address, config.advertise, listening.endpoint.keyring)
         run.train(1)
         return run.folder.path
-
-
-def acting_policy(spec: PolicySpec, device: str, images: ImagesDtype) -> Policy:
-    """The policy that acts. If numpy can compute it, it runs in numpy on the CPU and gives the same bits as on a worker.
-
-    Otherwise it runs in torch on the device, for all lanes in one pass.
-    """
-    if device == "cpu" and not spec.needs_torch:
-        return make_policy(spec)
-    from protocol.policy.torch_policy import TorchPolicy
-
-    return TorchPolicy(spec, device, together=True, images=images)
 
 
 def _settings(config: Config, env: EnvSpec, *, elsewhere: bool) -> VectorEnvSettings:
@@ -136,17 +105,3 @@ def _longest_order_s(config: Config) -> float:
     timeouts = config.call_timeouts()
     each = (timeouts.construct_s, timeouts.reset_s, timeouts.step_s)
     return sum(each) * config.envs if all(each) else NEVER_S
-
-
-def _before_waits(env: ZmqVectorEnv, workers: int, timeout_s: float) -> Callable[[Pulse], None]:
-    """A function to call before each wait for `env`. It calls the pulse. The first call waits until workers have joined."""
-    waited = False
-
-    def before(pulse: Pulse) -> None:
-        nonlocal waited
-        env.watch(pulse)
-        if not waited:
-            env.wait_for(workers, timeout_s)
-            waited = True
-
-    return before

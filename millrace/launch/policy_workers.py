@@ -15,8 +15,15 @@ from typing import Literal
 from learner.interrupts import Interrupts
 from learner.members.endpoint import BindSettings
 from learner.members.process_callbacks import ProcessCallbacks
-from learner.policy_player import PolicyPlayer, SavedPolicy
+from learner.policy_player import DESCRIBE, NO_WORKERS_TIMEOUT_S, PolicyPlayer, SavedPolicy
+from learner.vector_env.settings import VectorEnvSettings
+from millrace.launch.acting_thread import NEVER_S, BeforeWaits, acting_processes, acting_thread
 from millrace.launch.endpoint import open_endpoint
+from millrace.launch.local_worker_options import WorkerFlags
+from millrace.launch.vector import listen
+from protocol.alive import CallTimeouts
+from workers.collect.split_vector_env import SplitVectorEnv
+from workers.evaluate.split_evaluation_copies import SplitEvaluationCopies
 from workers.supervisor import Supervisor
 
 
@@ -29,6 +36,10 @@ class PlayingWorkers:
     transport: Literal["inproc", "ipc", "tcp"] = "ipc"
     bind: str = ""
     """Address at which workers from elsewhere join. Then no local worker is started."""
+    inference: Literal["workers", "learner"] = "workers"
+    """Where the policy acts: in each worker, or in this process."""
+    copies: int = 1
+    """Episodes that are played at the same time, if the policy acts in this process."""
 
 
 @contextmanager
@@ -41,16 +52,10 @@ def policy_player(policy: SavedPolicy, which: PlayingWorkers, watch: Callable[[s
             if interrupts.received:
                 raise KeyboardInterrupt
 
-        endpoint = open_endpoint(BindSettings(which.bind), which.transport, stack)
-        if which.bind:
-            processes = ProcessCallbacks()
-            endpoint.announce("")
+        if which.inference == "learner":
+            player = _acting_player(policy, which, check_interrupt, watch, stack)
         else:
-            logs = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="millrace-")))
-            supervisor = Supervisor(endpoint.starter(lambda name: ([], logs / f"{name}.log")), which.workers)
-            stack.callback(supervisor.stop, 2.0)
-            processes = ProcessCallbacks(supervisor.poll, expected=which.workers)
-        player = PolicyPlayer(policy, endpoint.link, processes, check_interrupt, watch)
+            player = _player(policy, which, check_interrupt, watch, stack)
         reason = "all episodes played"
         try:
             yield player
@@ -59,3 +64,60 @@ def policy_player(policy: SavedPolicy, which: PlayingWorkers, watch: Callable[[s
             raise
         finally:
             player.leave(reason)
+
+
+def _player(
+    policy: SavedPolicy,
+    which: PlayingWorkers,
+    check_interrupt: Callable[[], None],
+    watch: Callable[[str], None],
+    stack: ExitStack,
+) -> PolicyPlayer:
+    """A player whose workers act."""
+    endpoint = open_endpoint(BindSettings(which.bind), which.transport, stack)
+    if which.bind:
+        processes = ProcessCallbacks()
+        endpoint.announce("")
+    else:
+        supervisor = Supervisor(endpoint.starter(_own_logs(stack)), which.workers)
+        stack.callback(supervisor.stop, 2.0)
+        processes = ProcessCallbacks(supervisor.poll, expected=which.workers)
+    return PolicyPlayer(policy, endpoint.link, processes, check_interrupt, watch)
+
+
+def _acting_player(
+    policy: SavedPolicy,
+    which: PlayingWorkers,
+    check_interrupt: Callable[[], None],
+    watch: Callable[[str], None],
+    stack: ExitStack,
+) -> PolicyPlayer:
+    """A player that acts itself, in a thread: its workers step the copies of a vector environment, each a lane."""
+    endpoint = open_endpoint(BindSettings(), "inproc", stack)
+    workers = None if which.bind else min(which.workers, which.copies)
+    copies = VectorEnvSettings(
+        policy.env,
+        which.copies,
+        workers,
+        which.copies,
+        BindSettings(which.bind),
+        which.transport,
+        timeout_s=NEVER_S,
+        copy=False,
+    )
+    started = listen(copies, stack.enter_context(ExitStack())).start(_own_logs(stack), CallTimeouts())
+    described = started.describe(DESCRIBE, check_interrupt)
+    env = started.vector_env(described)
+    stack.callback(env.close)
+    before_wait = BeforeWaits(env, workers or 1, NO_WORKERS_TIMEOUT_S)
+    lanes = SplitVectorEnv(env, 0, before_wait, env.step_lanes, policy.facts, masked=policy.masked)
+    thread = acting_thread(endpoint, lanes, SplitEvaluationCopies(lanes, 0, which.copies), lambda: "cpu")
+    stack.callback(thread.stop, 2.0)
+    processes = acting_processes(thread, lanes, env, workers or 0)
+    return PolicyPlayer(policy, endpoint.link, processes, check_interrupt, watch, described)
+
+
+def _own_logs(stack: ExitStack) -> WorkerFlags:
+    """No flags, and for each worker a log in a folder that is removed at the end."""
+    logs = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="millrace-")))
+    return lambda name: ([], logs / f"{name}.log")

@@ -21,7 +21,7 @@ from learner.run_folder.progress import Progress
 from millrace.launch.local_run import train
 from protocol.errors import EnvironmentFailed, NoWorkers, UsageError
 from tests.support import preloaded
-from tests.system.processes import Stage, free_port, wait_for
+from tests.system.processes import Learner, Stage, free_port, wait_for
 from tests.system.run_folders import summary
 from tests.system.test_local_run import assert_balanced, run, start, worker_processes
 
@@ -287,6 +287,28 @@ def test_workers_elsewhere_step_while_the_policy_acts_in_the_learner(tmp_path: P
         (folder,) = stage.runs.iterdir()
         alone = run(tmp_path, "CartPole-v1", seed=3, steps=2_500, **SMALL)
         assert policy_of(folder) == policy_of(alone)
+    finally:
+        stage.close()
+
+
+def test_the_run_ends_when_the_workers_elsewhere_have_left(tmp_path: Path) -> None:
+    """After --no-workers-timeout-s, although an order may take --step-timeout-s. It says why the last one left."""
+    stage = Stage(tmp_path / "stage")
+    address = f"tcp://127.0.0.1:{free_port()}"
+    flags = ["--steps", "1000000", "--inference", "learner", "--no-workers-timeout-s", "5", "--run-dir", str(stage.runs)]
+    command = [sys.executable, "-m", "millrace", "learner", "CartPole-v1", "--bind", address, *flags]
+    try:
+        learner = Learner(command, stage.tmp_path / "learner.log", stage.runs)
+        stage.started.append(learner)
+        worker = stage.worker(address, "w0")
+        learner.trains(2)
+        worker.signal(signal.SIGTERM)
+        assert worker.ends() == 0
+        assert learner.ends(60) == 1
+        last = learner.said().splitlines()[-1]
+        assert "waited 5 s for 1 worker" in last
+        assert "(the last one left: told to stop)" in last
+        assert "env steps are saved" in last
     finally:
         stage.close()
 

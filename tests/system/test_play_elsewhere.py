@@ -10,13 +10,19 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 
+import millrace
 from learner.config.layers import resolve
+from learner.policy_player import saved_policy
+from learner.rollouts.evaluation_tickets import EvaluationPlan
 from millrace.launch.local_run import train
-from tests.system.processes import START_S, Running, Stage, crowding
+from millrace.launch.policy_workers import PlayingWorkers, policy_player
+from protocol.errors import UsageError
+from tests.system.processes import START_S, Running, Stage, crowding, free_port
+from tests.system.test_local_run import worker_processes
 
 ANY_PORT = "tcp://127.0.0.1:*"
 MILLRACE = (sys.executable, "-m", "millrace")
@@ -61,10 +67,15 @@ def result(player: Running) -> str:
     return [line for line in player.said().splitlines() if "waiting for" not in line][-1]
 
 
-@pytest.mark.parametrize("bind", ["tcp with keys", "tcp", "ipc"])
-def test_an_evaluation_by_workers_from_elsewhere_is_that_of_local_ones(stage: Stage, run: Path, bind: str) -> None:
-    evaluate = ["evaluate", run, "--episodes", 10]
-    local = result(play(stage, "local", [*evaluate, "--workers", 1]))
+@pytest.mark.parametrize(
+    ("bind", "inference"),
+    [("tcp with keys", "workers"), ("tcp", "workers"), ("ipc", "workers"), ("tcp with keys", "learner")],
+)
+def test_an_evaluation_by_workers_from_elsewhere_is_that_of_local_ones(
+    stage: Stage, run: Path, bind: str, inference: str
+) -> None:
+    evaluate = ["evaluate", run, "--episodes", 10, "--inference", inference]
+    local = result(play(stage, "local", ["evaluate", run, "--episodes", 10, "--workers", 1]))
     keys, _ = stage.keys()
     variables = {"MILLRACE_KEYS": keys} if bind == "tcp with keys" else {}
     address = f"ipc://{stage.tmp_path}/socket" if bind == "ipc" else ANY_PORT
@@ -90,25 +101,70 @@ def test_a_worker_without_a_token_is_not_let_in_and_one_with_it_plays(stage: Sta
     assert worker.ends() == 0, worker.said()
 
 
-@pytest.mark.parametrize("bind", ["tcp with keys", pytest.param("ipc", marks=pytest.mark.soak)])
-def test_a_dataset_of_workers_from_elsewhere_is_that_of_local_ones(stage: Stage, run: Path, bind: str) -> None:
+@pytest.mark.parametrize(
+    ("bind", "inference"),
+    [("tcp with keys", "workers"), ("tcp", "learner"), pytest.param("ipc", "workers", marks=pytest.mark.soak)],
+)
+def test_a_dataset_of_workers_from_elsewhere_is_that_of_local_ones(
+    stage: Stage, run: Path, bind: str, inference: str
+) -> None:
     pytest.importorskip("minari")
     keys, _ = stage.keys()
     variables: dict[str, object] = {"MINARI_DATASETS_PATH": stage.tmp_path / "datasets"}
     rows = {name: stage.tmp_path / f"{name}.npy" for name in ("local", "elsewhere")}
 
     def record(name: str, *more: object, **keys: object) -> Running:
-        arguments = ["record", run, "--out", f"{name}/box-v0", "--steps", 300, "--npy", rows[name], *more]
+        flags = ["--steps", 300, "--npy", rows[name], *more]
+        arguments = ["record", run, "--out", f"{name}/box-v0", *flags]
         return play(stage, name, arguments, **variables, **keys)
 
     assert record("local", "--workers", 1).ends(START_S) == 0
     address = f"ipc://{stage.tmp_path}/socket" if bind == "ipc" else ANY_PORT
-    player = record("elsewhere", "--bind", address, **({"MILLRACE_KEYS": keys} if bind == "tcp with keys" else {}))
+    player = record(
+        "elsewhere",
+        "--bind",
+        address,
+        "--inference",
+        inference,
+        **({"MILLRACE_KEYS": keys} if bind == "tcp with keys" else {}),
+    )
     worker = join(stage, player, "w0")
     assert player.ends(START_S) == 0, player.said()
     assert rows["elsewhere"].read_bytes() == rows["local"].read_bytes()
     assert (stage.tmp_path / "datasets" / "elsewhere" / "box-v0").is_dir()
     assert worker.ends() == 0, worker.said()
+
+
+@pytest.mark.parametrize("inference", ["workers", "learner"])
+def test_the_policy_may_act_here(run: Path, inference: Literal["workers", "learner"]) -> None:
+    """With two processes over ipc, the result is that of one worker in this process. No worker is left."""
+    alone = millrace.evaluate(run, 6, transport="inproc", progress=False)
+    assert millrace.evaluate(run, 6, inference=inference, workers=2, progress=False) == alone
+    assert not worker_processes()
+
+
+def test_a_lost_worker_costs_its_episodes_only(stage: Stage, run: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """The policy acts here, and the worker that steps is killed: the next worker plays its episodes from their seeds."""
+    address, plan = f"tcp://127.0.0.1:{free_port()}", EvaluationPlan.of(40, 1, 4, 100_000)
+    workers = [stage.worker(address, "first")]
+
+    def watch(text: str) -> None:
+        if len(workers) == 1 and not text.startswith("0 of"):
+            workers[0].kill()
+            workers.append(stage.worker(address, "second"))
+
+    played = []
+    for which in (PlayingWorkers(bind=address, inference="learner", copies=4), PlayingWorkers(1, "inproc")):
+        with policy_player(saved_policy(run), which, watch) as player:
+            played.append([(one.episode.reward, one.episode.length, one.cut) for one in player.play(plan)])
+    assert played[0] == played[1]
+    assert "worker first silent" in caplog.text
+    assert workers[1].ends() == 0
+
+
+def test_only_a_worker_that_acts_films(run: Path) -> None:
+    with pytest.raises(UsageError, match="video: expected inference workers, got learner"):
+        millrace.evaluate(run, 1, inference="learner", video=True)
 
 
 @pytest.mark.parametrize("command", ["evaluate", "record"])

@@ -161,7 +161,9 @@ def test_an_episode_has_no_hole_whatever_is_dropped_or_late(stream: list[tuple[i
 
 @settings(deadline=None)
 @given(rollouts(), st.data())
-def test_an_episode_has_no_hole_where_steps_are_in_no_rollout(stream: list[tuple[int, Rollout]], data: st.DataObject) -> None:
+def test_an_episode_has_no_hole_where_steps_are_in_no_rollout(
+    stream: list[tuple[int, Rollout]], data: st.DataObject
+) -> None:
     """A client that owns its loop leaves steps out between two rollouts; then the first row is not valid."""
     sequences: Counter[int] = Counter()
     assembler, episodes, steps = EpisodeAssembler(taken), [], 0

@@ -1,0 +1,92 @@
+"""A worker that is a thread of this process: it acts for the env copies of a vector environment, whose workers only step.
+
+It is the only worker of its learner. So the learner's tickets, rollouts, evaluations and errors are those of every run, and
+a lane gets the same seeds and random numbers as in a worker that acts itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from time import monotonic
+
+from learner.members.process_callbacks import ProcessCallbacks
+from learner.vector_env.env import ZmqVectorEnv
+from millrace.launch.endpoint import Endpoint
+from protocol.alive import WorkerExit
+from protocol.policy.policy import Policy, make_policy
+from protocol.specs import ImagesDtype, PolicySpec, RunSpec
+from workers.collect.collector import Collector
+from workers.collect.split_vector_env import SplitVectorEnv
+from workers.env_loop import Pulse
+from workers.evaluate.evaluator import Evaluator
+from workers.evaluate.split_evaluation_copies import SplitEvaluationCopies
+from workers.supervise.worker_thread import WorkerThread
+from workers.supervisor import Supervisor
+
+NEVER_S = 1e9  # the timeout of an order that may take any time
+
+
+def acting_thread(
+    endpoint: Endpoint, lanes: SplitVectorEnv, evaluation_copies: SplitEvaluationCopies, device: Callable[[], str]
+) -> Supervisor:
+    """Start the thread. `device`: that of the policy."""
+
+    def collector(spec: RunSpec) -> tuple[Collector, Evaluator]:
+        policy = acting_policy(spec.policy, device(), spec.images_dtype)
+        evaluator = Evaluator(spec, policy, lambda run, count, render_mode, pulse: evaluation_copies)
+        return Collector(spec, policy, lanes.open_lane, lanes.step_all), evaluator
+
+    def start(name: str) -> WorkerThread:
+        return WorkerThread(endpoint.link.address, name, endpoint.context, collector)
+
+    return Supervisor(start, 1, prefix="inference")
+
+
+def acting_processes(thread: Supervisor, lanes: SplitVectorEnv, env: ZmqVectorEnv, expected: int) -> ProcessCallbacks:
+    """The thread, and the workers that step the copies of `env`. `expected`: number of these that the user asked for."""
+
+    def ended() -> list[WorkerExit]:
+        lanes.raise_if_no_workers()
+        return thread.poll()
+
+    return ProcessCallbacks(ended, thread.activities, lambda: env.workers, expected)
+
+
+def acting_policy(spec: PolicySpec, device: str, images: ImagesDtype) -> Policy:
+    """The policy that acts. If numpy can compute it, it runs in numpy on the CPU and gives the same bits as on a worker.
+
+    Otherwise it runs in torch on the device, for all lanes in one pass.
+    """
+    if device == "cpu" and not spec.needs_torch:
+        return make_policy(spec)
+    from protocol.policy.torch_policy import TorchPolicy
+
+    return TorchPolicy(spec, device, together=True, images=images)
+
+
+class BeforeWaits:
+    """Call it before each wait for `env`: it calls the pulse during the wait. The first wait is for workers to join.
+
+    Rule: a wait raises `NoWorkers` once no worker has been there for `timeout_s`, however long an order may take.
+    """
+
+    def __init__(self, env: ZmqVectorEnv, workers: int, timeout_s: float) -> None:
+        self._env, self._workers, self._timeout_s = env, workers, timeout_s
+        self._there_s = 0.0  # when a worker was there, or the wait began
+
+    def __call__(self, pulse: Pulse) -> None:
+        """A wait begins."""
+        self._there_s = monotonic()
+        self._env.watch(partial(self._during, pulse))
+        if self._workers:
+            self._env.wait_for(self._workers, self._timeout_s)
+            self._workers = 0
+
+    def _during(self, pulse: Pulse) -> None:
+        pulse()
+        now = monotonic()
+        if self._env.workers:
+            self._there_s = now
+        elif now - self._there_s > self._timeout_s:
+            raise self._env.no_workers(self._timeout_s)
