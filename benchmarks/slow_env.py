@@ -1,7 +1,9 @@
-"""An environment whose steps and resets take time and no CPU, because they sleep: `benchmarks.slow_env:Lognormal-v0`.
+"""Environments whose steps and resets take time and no CPU, because they sleep.
 
-A step takes 5 ms in the mean (lognormal, sigma 1), a reset 200 ms, and an episode has 50 to 150 steps. The durations follow
-from the reset seed. A copy that never waits makes 100 steps in 0.7 s.
+`benchmarks.slow_env:TenMilliseconds-v0` is Pendulum-v1 with 10 ms more for each step.
+
+`benchmarks.slow_env:Lognormal-v0`: a step takes 5 ms in the mean (lognormal, sigma 1), a reset 200 ms, and an episode has
+50 to 150 steps. The durations follow from the reset seed. A copy that never waits makes 100 steps in 0.7 s.
 
 With the environment variable `SLOW_ENV_TIMELINE` each copy appends every step and reset to a file in that folder: three
 float64 numbers: start and end by the monotonic clock, and 1 for a reset.
@@ -18,6 +20,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.classic_control import PendulumEnv
 from gymnasium.envs.registration import register
 from gymnasium.spaces import Box, Discrete
 
@@ -58,4 +61,13 @@ class Lognormal(gymnasium.Env[Any, Any]):
             self._timeline.write(struct.pack("3d", began_s, time.monotonic(), is_reset))
 
 
+class TenMilliseconds(PendulumEnv):
+    """Pendulum-v1 whose steps take 10 ms longer."""
+
+    def step(self, action: Any) -> Any:
+        time.sleep(0.01)
+        return super().step(action)
+
+
 register("Lognormal-v0", "benchmarks.slow_env:Lognormal")
+register("TenMilliseconds-v0", "benchmarks.slow_env:TenMilliseconds", max_episode_steps=200)
