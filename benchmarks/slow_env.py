@@ -66,7 +66,7 @@ class TenMilliseconds(PendulumEnv):
 
     def step(self, action: Any) -> Any:
         time.sleep(0.01)
-        return super().step(action)
+        return super().step(action)  # type: ignore[no-untyped-call]
 
 
 register("Lognormal-v0", "benchmarks.slow_env:Lognormal")
