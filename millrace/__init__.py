@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from millrace.runs import Metrics, Run, train
     from protocol.env_spec import EnvLike
     from protocol.envs.wrappers import WrapperLike
+    from workers.envs.reset_ahead import ResetAhead
 
 __all__ = [
     "CNN",
@@ -69,6 +70,7 @@ __all__ = [
     "Progress",
     "RecordedDataset",
     "Recurrent",
+    "ResetAhead",
     "RolloutBatch",
     "RolloutService",
     "Run",
@@ -103,6 +105,7 @@ _IMPORTED_WHEN_USED = {
     "Progress": "learner.run_folder.progress",
     "RecordedDataset": "learner.recording.record",
     "Recurrent": "millrace.policies",
+    "ResetAhead": "workers.envs.reset_ahead",
     "RolloutBatch": "millrace.rollout_service",
     "RolloutService": "millrace.rollout_service",
     "Run": "millrace.runs",

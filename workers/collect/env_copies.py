@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from copy import deepcopy
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -27,6 +28,7 @@ from workers.collect.mask_reader import MaskReader
 from workers.env_errors import CopyRaised, Unusable
 from workers.env_loop import EnvLoop, Infos, Pulse
 from workers.env_results import missing_leaf, read_leaves
+from workers.envs.reset_ahead import ResetAhead
 from workers.supervise.activity import CLOSING, RESETTING, STEPPING, activity
 
 # For each leaf of the observation: an array [N, *leaf], or a sequence of N observations. In a masked run the masks follow.
@@ -158,6 +160,10 @@ def set_attribute(copy: int | None, env: Any, name: str, value: Any) -> None:
     """Set an attribute that the environment, or one of its wrappers, has. Raises `CopyRaised`."""
     owner = env
     while not hasattr(owner, name) and isinstance(owner, gymnasium.Wrapper | VectorWrapper):
+        if isinstance(owner, ResetAhead):
+            for instance in owner.instances():
+                set_attribute(copy, instance, name, deepcopy(value))  # each its own value: they may change it
+            return
         owner = owner.env
     if not hasattr(owner, name) or callable(getattr(owner, name)):
         what = "a method" if hasattr(owner, name) else "none"

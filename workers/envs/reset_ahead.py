@@ -1,0 +1,109 @@
+"""`millrace:ResetAhead`, a wrapper for environments whose reset is slow: the next episode is prepared while this one runs.
+
+Rule: which instance plays an episode, and from which random numbers, depends on the resets before it and never on time. A
+reset with a seed or with options is made at once, by the instance that plays. The first reset without one makes a second
+instance in a thread. From then on the two take turns: one plays, and the thread resets the other.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import suppress
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from protocol.errors import UsageError
+
+Prepared = tuple[gymnasium.Env[Any, Any], Any, dict[str, Any]]  # an instance, its first observation and its first info
+
+
+class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """An environment that resets a second instance of itself while an episode runs.
+
+    Use it as the innermost wrapper, so that other wrappers see one environment. It takes the memory of two instances. A
+    reset overlaps with steps where either waits or computes without Python's global interpreter lock, as most simulators do.
+
+    Attributes that a run sets in its environment reach both instances. The next episode was reset before that.
+
+    >>> import gymnasium, millrace
+    >>> env = millrace.ResetAhead(gymnasium.make("CartPole-v1"))
+    >>> observation, info = env.reset(seed=1)
+    >>> observation, info = env.reset()
+    >>> env.close()
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        """Raises `UsageError` for an environment that `gymnasium.make` did not make: no second one can be made."""
+        super().__init__(env)
+        if env.spec is None:
+            raise UsageError(
+                f"ResetAhead: expected an environment of gymnasium.make, got {type(env).__name__} without a spec"
+            )
+        self._make: Callable[[], gymnasium.Env[Any, Any]] = lambda: gymnasium.make(env.spec)  # type: ignore[arg-type]
+        self._second: gymnasium.Env[Any, Any] | None = None
+        self._second_seed: int | None = None  # of the second instance's next reset
+        self._prepared: Future[Prepared] | None = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """See `gymnasium.Env.reset`. Raises what the prepared reset raised."""
+        if seed is not None or options is not None:
+            self._finish()
+            self._second_seed = None if seed is None else second_seed(seed)
+            return self.env.reset(seed=seed, options=options)
+        if self._prepared is None:
+            self._prepare(self._second)
+            return self.env.reset()
+        prepared, self._prepared = self._prepared, None
+        played, (self.env, observation, info) = self.env, prepared.result()
+        self._second = played
+        self._prepare(played)
+        return observation, info
+
+    def _prepare(self, instance: gymnasium.Env[Any, Any] | None) -> None:
+        """Reset the second instance in a thread; make it first if there is none."""
+        prepared: Future[Prepared] = Future()
+        seed, self._second_seed = self._second_seed, None
+
+        def prepare() -> None:
+            try:
+                env = self._make() if instance is None else instance
+                self._second = env
+                prepared.set_result((env, *env.reset(seed=seed)))
+            except BaseException as error:
+                prepared.set_exception(error)
+
+        self._prepared = prepared
+        threading.Thread(target=prepare, name="reset-ahead", daemon=True).start()
+
+    def instances(self) -> tuple[gymnasium.Env[Any, Any], gymnasium.Env[Any, Any]]:
+        """The instance that plays, and the other one, which is not being reset now."""
+        if self._prepared is not None:
+            with suppress(BaseException):  # the next `reset` raises it
+                self._prepared.result()
+        if self._second is None:
+            self._second = self._make()
+        return self.env, self._second
+
+    def _finish(self) -> None:
+        """Wait until the reset in progress has ended. Its episode will not be played."""
+        prepared, self._prepared = self._prepared, None
+        if prepared is not None:
+            with suppress(BaseException):
+                prepared.result()
+
+    def close(self) -> None:
+        """Close both instances."""
+        self._finish()
+        if self._second is not None:
+            with suppress(Exception):
+                self._second.close()
+        super().close()
+
+
+def second_seed(seed: int) -> int:
+    """The seed of the second instance, 31 bits, where that of the first is this one."""
+    return int(np.random.SeedSequence([seed], spawn_key=(1,)).generate_state(1)[0] >> 1)
