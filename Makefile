@@ -16,7 +16,8 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 train: .venv/installed  ## train CartPole-v1 on two worker processes until a greedy evaluation averages 475
 	$(BIN)/millrace train CartPole-v1 --workers 2 --target-return 475 --eval-episodes 20 --eval-every 5000
 
-test: lint type unit  ## everything that CI runs
+test: .venv/installed-dev  ## everything that CI runs: the types are checked while the tests begin
+	@$(MAKE) --no-print-directory --jobs 2 lint type unit
 
 lint: .venv/installed-dev
 	$(BIN)/ruff check .
