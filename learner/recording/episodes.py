@@ -2,8 +2,8 @@
 
 Rule: every valid row is in exactly one whole episode, or waits for its episode to end (`waiting`), or is counted as left out
 (`left_out`). A reset row is not part of an episode. An episode that spans several rollouts is assembled only if all of them
-arrived, in order, from the same incarnation of their lane, and each continues the one before, so no episode has a hole. (If
-the first row of a rollout is not valid and does not follow an end, a client made steps between the two rollouts.)
+arrived, in order, from the same incarnation of their lane, and each continues the one before, so no episode has a hole. (A
+client that owns its loop makes steps between two rollouts. Then the first row of the second one is not valid.)
 """
 
 from __future__ import annotations
@@ -59,10 +59,19 @@ class _LaneState:
     sequence: int  # of the next rollout
     running: list[list[_Fragment] | None] = field(default_factory=list)
     """[N] the unfinished episode of each env copy. It is None until the next end if its beginning is missing."""
+    last_obs: tuple[Array, ...] = ()  # [N, *leaf] each
+    ended: Bools = field(default_factory=lambda: np.zeros(0, bool))  # [N] in the last row
 
     @property
     def waiting(self) -> int:
         return sum(len(fragment.reward) for fragments in self.running for fragment in fragments or ())
+
+    def continued_by(self, rollout: Rollout) -> Bools:
+        """[N] whether it begins where the last one ended, with a reset row if, and only if, an episode ended there."""
+        continued: Bools = rollout.valid[0] != self.ended
+        for last, leaf in zip(self.last_obs, rollout.obs, strict=True):
+            continued &= (last == leaf[0]).reshape(len(last), -1).all(1)
+        return continued
 
 
 class EpisodeAssembler:
@@ -94,9 +103,15 @@ class EpisodeAssembler:
             begins = rollout.valid[0] & (rollout.sequence == 0)
             lane = _LaneState(incarnation, rollout.sequence, [[] if one else None for one in begins])
             self._lanes[rollout.lane] = lane
+        else:
+            waiting, continued = lane.waiting, lane.continued_by(rollout)
+            lane.running = [one if continued[n] else None for n, one in enumerate(lane.running)]
+            self.left_out += waiting - lane.waiting
+        ends = [end for n in range(len(lane.running)) for end in self._column(rollout, lane, n)]
         lane.sequence += 1
-        ended = [end for n in range(len(lane.running)) for end in self._column(rollout, lane, n)]
-        return [episode for _, episode in sorted(ended, key=lambda end: end[0])]
+        lane.last_obs = tuple(leaf[-1].copy() for leaf in rollout.obs)
+        lane.ended = rollout.terminated[-1] | rollout.truncated[-1]
+        return [episode for _, episode in sorted(ends, key=lambda end: end[0])]
 
     def _column(self, rollout: Rollout, lane: _LaneState, n: int) -> list[tuple[int, RecordedEpisode]]:
         """The episodes of env copy `n` that end in this rollout, each with the step of its end."""
@@ -104,12 +119,10 @@ class EpisodeAssembler:
         start, steps = 0, len(rollout.reward)
         valid, ended = rollout.valid[:, n], rollout.terminated[:, n] | rollout.truncated[:, n]
         for t in np.flatnonzero(ended | ~valid).tolist():
-            fragments = lane.running[n]
-            if not valid[t]:
-                follows_end = t > 0 or fragments == []
-                self.left_out += sum(len(fragment.reward) for fragment in fragments or ())
-                lane.running[n], start = [] if follows_end else None, t + 1
+            if not valid[t]:  # the next row begins an episode; after the first row, only if it was to reset the copy
+                lane.running[n], start = [] if t else lane.running[n], t + 1
                 continue
+            fragments = lane.running[n]
             if fragments is None:
                 self.left_out += t + 1 - start
             else:
