@@ -29,6 +29,8 @@ class VectorEnvSettings:
     autoreset_mode: AutoresetMode | str = "NextStep"
     on_worker_loss: Literal["truncate", "raise"] = "truncate"
     timeout_s: float = 60.0
+    worker_timeout_s: float = 5.0
+    """A worker elsewhere is lost if it is silent for this long while the learner listens."""
     copy: bool = True
     render_mode: str | None = None
     kwargs: dict[str, Scalar] = field(default_factory=dict)

@@ -95,6 +95,7 @@ def _settings(config: Config, env: EnvSpec, *, elsewhere: bool) -> VectorEnvSett
         listen=BindSettings(config.bind if elsewhere else "", config.keys, config.insecure, config.advertise),
         transport=config.transport,
         timeout_s=_longest_order_s(config),
+        worker_timeout_s=config.worker_timeout_s,
         copy=False,
         single_lanes=config.eval_copies,
     )

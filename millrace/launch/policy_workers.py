@@ -15,7 +15,7 @@ from typing import Literal
 from learner.interrupts import Interrupts
 from learner.members.endpoint import BindSettings
 from learner.members.process_callbacks import ProcessCallbacks
-from learner.policy_player import DESCRIBE, NO_WORKERS_TIMEOUT_S, PolicyPlayer, SavedPolicy
+from learner.policy_player import DESCRIBE, NO_WORKERS_TIMEOUT_S, WORKER_TIMEOUT_S, PolicyPlayer, SavedPolicy
 from learner.vector_env.settings import VectorEnvSettings
 from millrace.launch.acting_thread import NEVER_S, BeforeWaits, acting_processes, acting_thread
 from millrace.launch.endpoint import open_endpoint
@@ -103,6 +103,7 @@ def _acting_player(
         BindSettings(which.bind),
         which.transport,
         timeout_s=NEVER_S,
+        worker_timeout_s=WORKER_TIMEOUT_S,
         copy=False,
     )
     started = listen(copies, stack.enter_context(ExitStack())).start(_own_logs(stack), CallTimeouts())

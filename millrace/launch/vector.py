@@ -31,7 +31,6 @@ from workers.supervisor import Supervisor, timeout_flags
 
 CLOSE_TIMEOUT_S = 5.0  # seconds for workers to leave; then local workers are killed
 JOIN_TIMEOUT_S = 60.0  # seconds for local workers to join
-WORKER_TIMEOUT_S = 5.0  # a worker elsewhere is lost if it is silent for this long while the learner listens
 LEARNER_TIMEOUT_S = 600.0  # a worker elsewhere joins again if it hears nothing from the learner for this long
 STEP_TIMEOUT_LEAST_S, STEP_TIMEOUT_MOST_S = 60.0, 1e6
 
@@ -43,7 +42,7 @@ def make_vec(settings: VectorEnvSettings) -> ZmqVectorEnv:
     local_workers = settings.local_workers
     join_timeout_s = JOIN_TIMEOUT_S if local_workers else settings.timeout_s
     describe = DescribeSettings(
-        worker_timeout_s=math.inf if local_workers else WORKER_TIMEOUT_S,
+        worker_timeout_s=math.inf if local_workers else settings.worker_timeout_s,
         no_workers_timeout_s=join_timeout_s,
         stall_timeout_s=max(join_timeout_s, settings.timeout_s),
         max_env_failures=0,
@@ -144,7 +143,7 @@ class StartedVectorEnv:
             first_session=int.from_bytes(os.urandom(6), "little"),
             local_workers=self.supervisor,
             shared=shared,
-            worker_timeout_s=WORKER_TIMEOUT_S if settings.listen.bind else math.inf,
+            worker_timeout_s=settings.worker_timeout_s if settings.listen.bind else math.inf,
             spin_s=SPIN_S if settings.local_workers < usable_cores() else 0.0,  # only if one core is free for the learner
         )
         listening.resources.callback(hub.close, CLOSE_TIMEOUT_S)

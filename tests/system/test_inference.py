@@ -291,6 +291,22 @@ def test_workers_elsewhere_step_while_the_policy_acts_in_the_learner(tmp_path: P
         stage.close()
 
 
+def test_a_worker_elsewhere_may_be_silent_for_as_long_as_the_setting_says(tmp_path: Path) -> None:
+    stage = Stage(tmp_path / "stage")
+    address = f"tcp://127.0.0.1:{free_port()}"
+    flags = ["--steps", "1000000", "--inference", "learner", "--worker-timeout-s", "1", "--run-dir", str(stage.runs)]
+    command = [sys.executable, "-m", "millrace", "learner", "CartPole-v1", "--bind", address, *flags]
+    try:
+        learner = Learner(command, stage.tmp_path / "learner.log", stage.runs)
+        stage.started.append(learner)
+        worker = stage.worker(address, "w0")
+        learner.trains(1)
+        worker.kill()
+        learner.hears("worker w0 .*silent for 1 s")
+    finally:
+        stage.close()
+
+
 def test_the_run_ends_when_the_workers_elsewhere_have_left(tmp_path: Path) -> None:
     """After --no-workers-timeout-s, although an order may take --step-timeout-s. It says why the last one left."""
     stage = Stage(tmp_path / "stage")
