@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import msgspec
+
+if TYPE_CHECKING:
+    from learner.config.config import Config
 
 PRESETS = Path(__file__).with_name("presets.toml")
 NAMED = "named"  # the table of presets.toml that holds whole runs
@@ -33,6 +38,29 @@ def environment_presets(algo: str) -> dict[str, dict[str, Any]]:
 def algorithms_and_environments() -> list[tuple[str, str]]:
     """Algorithm and environment of every preset that applies without --preset."""
     return [(algo, env) for algo, envs in _tables().items() if algo != NAMED for env in envs]
+
+
+def origin(config: Config) -> str:
+    """Where the settings of a new run come from, as one line for the user.
+
+    The preset is in use if a setting has its value, and that is not the default.
+    """
+    preset = environment_presets(config.algo).get(config.env)
+    if preset is None:
+        return f"settings: defaults, because {config.algo} has no preset for {config.env}"
+    mine, defaults = _settings(config), _settings(type(config)(algorithm=type(config.algorithm)()))
+    changed = [name for name, value in preset.items() if mine[name] != value]
+    if all(defaults[name] == preset[name] for name in preset.keys() - changed):
+        return f"settings: without the preset of {config.algo} for {config.env}"
+    found = f"settings: preset of {config.algo} for {config.env}"
+    return f"{found}, except {', '.join(changed)}" if changed else found
+
+
+def _settings(config: Config) -> dict[str, Any]:
+    """The settings of the run and of the algorithm, in the types of TOML."""
+    found: dict[str, Any] = msgspec.to_builtins(config)
+    algorithm: dict[str, Any] = found.pop("algorithm")
+    return found | algorithm
 
 
 def _tables() -> dict[str, Any]:

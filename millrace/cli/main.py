@@ -9,6 +9,7 @@ command imports what it needs when it runs, so that `--help` answers at once.
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import sys
 from collections.abc import Callable
@@ -22,9 +23,14 @@ from learner.run_folder.last_line import last_line
 from learner.standard_streams import open_closed, unfailing
 from protocol.bounds import escaped, indented
 from protocol.errors import UsageError, UserFacingError
+from protocol.logs.notices import log_notice
 
 if TYPE_CHECKING:
     from learner.callbacks.callbacks import Watch
+    from learner.config.config import Config
+    from learner.run_folder.progress import Progress
+
+log = logging.getLogger("millrace.learner")
 
 ABOUT = "Worker processes step copies of a gymnasium environment; one learner trains a policy in PyTorch."
 HELP_FLAGS = ("-h", "--help")
@@ -126,7 +132,7 @@ def _train(argv: list[str]) -> int:
     config, resume = read_config("train", argv)
     from millrace.launch import local_run
 
-    return _run(argv, lambda watch: local_run.train(config, resume, watch))
+    return _run(argv, lambda watch: local_run.train(config, resume, watch), None if resume else config)
 
 
 def _learner(argv: list[str]) -> int:
@@ -144,17 +150,38 @@ def _learner(argv: list[str]) -> int:
             return inference.train(config, checked, watch, env, elsewhere=True)
         return serve(config, checked, watch)
 
-    return _run(argv, lambda watch: unless_finished(config, resume, lambda checked: train(checked, watch)))
+    return _run(
+        argv,
+        lambda watch: unless_finished(config, resume, lambda checked: train(checked, watch)),
+        None if resume else config,
+    )
 
 
-def _run(argv: list[str], train: Callable[[Watch], Path]) -> int:
-    """Train, show the progress meanwhile, and print how the run ended. Output that cannot be written is dropped."""
+def _run(argv: list[str], train: Callable[[Watch], Path], new: Config | None = None) -> int:
+    """Train, show the progress meanwhile, and print how the run ended. Output that cannot be written is dropped.
+
+    `new`: the settings of a new run, whose origin is shown before its first progress.
+    """
     from millrace.terminal import progress_view
 
     with unfailing("stdout"):
         with progress_view("--log-json" in argv) as watch:
-            run = train(watch)
+            run = train(watch if new is None else _after_origin(new, watch))
         return _print_result(run)
+
+
+def _after_origin(config: Config, watch: Callable[[Progress], None]) -> Callable[[Progress], None]:
+    """The same function, which at first logs where the settings come from."""
+    from learner.config.presets import origin
+
+    lines = iter([origin(config)])
+
+    def logged(progress: Progress) -> None:
+        for line in lines:
+            log_notice(log, line)
+        watch(progress)
+
+    return logged
 
 
 def _print_result(run: Path) -> int:

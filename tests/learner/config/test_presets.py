@@ -1,0 +1,26 @@
+"""Where the settings of a run come from, as a line for the user."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from learner.config.layers import resolve
+from learner.config.presets import origin
+
+
+@pytest.mark.parametrize(
+    ("keywords", "expected"),
+    [
+        ({}, "settings: preset of ppo for CartPole-v1"),
+        ({"gamma": 0.98}, "settings: preset of ppo for CartPole-v1"),
+        ({"seed": 5, "workers": 1}, "settings: preset of ppo for CartPole-v1"),
+        ({"rollout_steps": 64, "net": (32,)}, "settings: preset of ppo for CartPole-v1, except rollout_steps"),
+        ({"preset": "none"}, "settings: without the preset of ppo for CartPole-v1"),
+        ({"preset": "none", "seed": 2}, "settings: without the preset of ppo for CartPole-v1"),
+        ({"algo": "reinforce", "env": "Acrobot-v1"}, "settings: defaults, because reinforce has no preset for Acrobot-v1"),
+    ],
+)
+def test_the_origin_of_the_settings(keywords: dict[str, Any], expected: str) -> None:
+    assert origin(resolve(keywords.pop("env", "CartPole-v1"), **keywords)) == expected
