@@ -15,6 +15,7 @@ from protocol.address import advertised_address, check_address
 from protocol.bounds import MAX_FACTS, MAX_NAME, one_line
 from protocol.envs.wrappers import wrapper_name
 from protocol.errors import UsageError
+from protocol.own_module import is_name
 
 Record = TypeVar("Record", bound=msgspec.Struct)
 
@@ -52,6 +53,9 @@ def validate(config: Config, where: str = "") -> Config:
     if config.inference == "learner":
         _check_learner_inference(config, at)
     _check_prior(config, at)
+    encoder = getattr(config.algorithm, "encoder", None)
+    if encoder is not None and not is_name(encoder):
+        raise UsageError(f"{at}encoder {encoder}: expected module:factory, as in my_package.networks:encoder")
     return config
 
 
@@ -92,9 +96,9 @@ def check_rollout_settings(config: RolloutConfig, at: str = "") -> None:
         raise UsageError(
             f"{at}vector {config.vector}: wrappers are applied to single env copies; expected loop, which is the default"
         )
-    for wrapper in config.wrapper:
-        wrapper_name(wrapper)
     try:
+        for wrapper in config.wrapper:
+            wrapper_name(wrapper)
         check_address(config.bind)
     except UsageError as error:
         raise UsageError(f"{at}{error}") from None

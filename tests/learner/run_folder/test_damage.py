@@ -181,6 +181,8 @@ def check(whole: Path, tmp_path: Path, name: str, cuts: int, flips: int, caplog:
         ("lanes = 2", "lanes = 6"),
         ("tcp://127.0.0.1:5555", "tcp:+/127.0.0.1:5555"),
         ("batch_size", "bathc_size"),
+        ('encoder = "none"', 'encoder = "noje"'),
+        ("wrapper = []", 'wrapper = ["gymnasium.wrappers"]'),
     ],
 )
 def test_a_value_that_no_run_can_have_is_one_line_with_the_name_of_the_file(
