@@ -210,7 +210,7 @@ class _Process:
     def ask_to_stop(self) -> None:
         """Send SIGTERM."""
         if self._running is not None:
-            self._running.send_signal(signal.SIGTERM)
+            os.kill(self._running.pid, signal.SIGTERM)  # `send_signal` would take its exit code if it has just ended
 
     def ended(self) -> Ended | None:
         """How it has ended; None while it runs, and before it is started."""
@@ -223,7 +223,7 @@ class _Process:
         """End it and all that it started: SIGTERM, then SIGKILL."""
         if self._running is None:
             return
-        self._running.send_signal(signal.SIGTERM)
+        self.ask_to_stop()
         until_s = time.monotonic() + STOP_WITHIN_S
         while not self._has_ended() and time.monotonic() < until_s:
             time.sleep(POLL_S)

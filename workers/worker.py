@@ -245,6 +245,7 @@ class Worker:
         except Exception as error:
             self._fail(error)
             return
+        self._update_statistics()
         self._do(self._session.answered(answer))
 
     def _serve_shared_memory(self, timeout_s: float) -> float:

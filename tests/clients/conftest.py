@@ -24,14 +24,19 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
 
 
 @pytest.fixture(scope="session")
-def cpp(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder with the programs of `clients/cpp`, built with its tests. Skips, naming the package, without a compiler."""
+def compiler() -> None:
+    """Skips, naming the package, without what the C++ client is built with."""
     for program, package in (("g++", "g++"), ("cmake", "cmake")):
         if shutil.which(program) is None:
             pytest.skip(f"{program} is missing: apt-get install {package}")
     headers = subprocess.run(["g++", "-fsyntax-only", "-xc++", "-"], input=PROBE.encode(), capture_output=True, timeout=60)
     if headers.returncode:
         pytest.skip("zmq.h or sodium.h is missing: apt-get install libzmq3-dev libsodium-dev")
+
+
+@pytest.fixture(scope="session")
+def cpp(compiler: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder with the programs of `clients/cpp`, built with its tests."""
     build = tmp_path_factory.mktemp("cpp")
     for command in (["cmake", "-S", str(CPP), "-B", str(build), "-DTESTS=ON"], ["cmake", "--build", str(build), "-j2"]):
         done = subprocess.run(command, capture_output=True, text=True, timeout=600)

@@ -337,9 +337,14 @@ def test_a_signal_drains_the_client(stage: Stage, cpp: Path) -> None:
     runs = learner(stage, address, "--inference", "learner", steps=1_000_000)
     client = stage.start([str(cpp / "cartpole"), address, "--name", "cpp0"], "cpp0")
     runs.hears("update", START_S)
-    asked = [sys.executable, "-m", "millrace", "status", address, "--json"]
-    status = json.loads(subprocess.run(asked, capture_output=True, timeout=60, check=True).stdout)
-    (worker,) = status["workers"]
+
+    def status() -> dict[str, Any]:
+        asked = [sys.executable, "-m", "millrace", "status", address, "--json"]
+        (found,) = json.loads(subprocess.run(asked, capture_output=True, timeout=60, check=True).stdout)["workers"]
+        return dict(found)
+
+    wait_for(lambda: status()["doing"], START_S, "an Alive of the client")
+    worker = status()
     assert worker["worker"] == "cpp0"
     assert worker["doing"] in ("waiting", "stepping", "resetting")
     assert worker["steps"] > 0
@@ -372,16 +377,3 @@ def test_a_step_allocates_nothing(cpp: Path, tmp_path: Path) -> None:
     (tmp_path / "corpus").write_bytes(corpus())
     done = subprocess.run([cpp / "allocations", tmp_path / "corpus"], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.split() == ["0", "1"]
-
-
-# ---------------------------------------------------------------- conformance
-
-
-@pytest.mark.parametrize("keys", [False, True])
-def test_the_client_conforms_to_the_wire_document(cpp: Path, keys: bool) -> None:
-    command = [str(cpp / "cartpole"), "{address}", *(["--token", "{token}"] if keys else [])]
-    flags = ["--with-keys"] if keys else []
-    conform = [sys.executable, "-m", "millrace", "conform", "--patience-s", "20", *flags, "--", *command]
-    done = subprocess.run(conform, capture_output=True, text=True, timeout=500)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert " 0 failed" in done.stdout

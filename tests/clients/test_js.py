@@ -1,4 +1,4 @@
-"""The JavaScript client: training through kills and restarts, tokens, the wire document, hostile messages."""
+"""The JavaScript client: training through kills and restarts, tokens, hostile messages."""
 
 from __future__ import annotations
 
@@ -90,16 +90,6 @@ def test_a_damaged_token_is_named_in_one_line(stage: Stage, js: Path, text: str,
     assert client.said().strip() == f"damaged: {said}"
 
 
-@pytest.mark.parametrize("keys", [False, True])
-def test_it_conforms_to_the_wire_document(js: Path, keys: bool) -> None:
-    command = ["node", str(js / "examples" / "cartpole.js"), "{address}", *(["--token", "{token}"] if keys else [])]
-    flags = ["--with-keys"] if keys else []
-    done = subprocess.run(
-        [sys.executable, "-m", "millrace", "conform", *flags, "--", *command], capture_output=True, text=True, timeout=300
-    )
-    assert done.returncode == 0, done.stdout
-
-
 # ---------------------------------------------------------------- hostile messages
 
 
@@ -174,7 +164,7 @@ def test_hostile_messages_do_not_end_it(stage: Stage, js: Path, router: tuple[Ro
         (["HeartbeatReply", 7, 1, [[0, 0, 0, []]]],),
         (["Release", 7, [[0, 0]]],),
         (["Weights", 3, ["<f4", [2], 1], ["<f4", [0], 2], None], bytes(8), b""),
-        (["Welcome", 8, attempt + 1, run],),
+        (["Welcome", 8, 1, run],),  # of another attempt, and no mutation makes it this one
     ]
     messages = [[msgpack.packb(head), *frames] for head, *frames in heads]
     chance = random.Random(1)

@@ -13,6 +13,7 @@ from learner.conformance.client.join_checks import described
 from learner.conformance.client.learner import Learner
 from learner.conformance.client.rules import Rule
 from learner.conformance.client.script import Broken, Ended, Event, Heard, Script, Skipped, Wait, brief
+from learner.conformance.client.watch import resets_too_early
 from protocol.arrays import Floats
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import UsageError
@@ -41,6 +42,8 @@ from protocol.wire.codec import encode
 from protocol.wire.weight_dtypes import to_wire_dtype
 
 STEPS = 32  # T of most checks
+TIMED_STEPS = 500  # T of a rollout that tells how fast the client is
+LONG_S, LONGEST_STEPS = 1.0, 50_000  # of a rollout during which something happens
 NET = (16, 16)
 QUIET_S = 0.7
 MOST_LIMIT_STEPS = 2000  # of a time limit that the check walks to
@@ -127,6 +130,17 @@ def collecting(
     return session
 
 
+def collecting_at_length(learner: Learner) -> Script[Collecting]:
+    """A session with rollouts that last, so that something can happen while one is in progress."""
+    if not learner.steps_per_s:
+        session = yield from collecting(learner, TIMED_STEPS)
+        yield from session.collect(session.permit())  # opens the lane
+        began_s = learner.now
+        yield from session.collect(session.permit())
+        learner.steps_per_s = TIMED_STEPS / max(learner.now - began_s, 1e-3)
+    return (yield from collecting(learner, min(max(int(LONG_S * learner.steps_per_s), STEPS), LONGEST_STEPS)))
+
+
 # ------------------------------------------------------------------------------------------------------------- rollouts
 
 
@@ -137,17 +151,32 @@ def collects(learner: Learner) -> Script[None]:
         yield from session.collect(session.permit())
 
 
+def _repeats(one: Rollout, other: Rollout) -> bool:
+    """Whether the copies saw and did the same in both, step by step."""
+    return all(a.tobytes() == b.tobytes() for a, b in zip((*one.obs, one.action), (*other.obs, other.action), strict=True))
+
+
 def keeps_rows(learner: Learner) -> Script[None]:
     """Rollouts in which episodes end."""
     session = yield from collecting(learner, steps=7)
     ends = 0
+    around: list[tuple[bytes, bytes]] = []  # the last observation of an episode, the first one of the next
     for _ in range(40):
         rollout = yield from session.collect(session.permit())
         ends += len(rollout.episodes)
-        if ends >= 8:
-            return
+        for t, n in np.argwhere(rollout.terminated[:-1]):
+            last, first = (b"".join(leaf[row, n].tobytes() for leaf in rollout.obs) for row in (t + 1, t + 2))
+            around.append((last, first))
+        if ends >= 8 and len(around) >= 3:
+            break
     if not ends:
         raise Skipped(f"no episode ended in {40 * 7} steps")
+    if resets_too_early(around):
+        raise Broken(
+            rules.LAST_OBSERVATION,
+            "the last observation of an episode in obs[t+1] of the row that ends it",
+            f"the first one of the next episode, at each of {len(around)} ends",
+        )
 
 
 def truncates_at_the_limit(learner: Learner) -> Script[None]:
@@ -219,6 +248,20 @@ def acts_under_the_newest(learner: Learner) -> Script[None]:
         raise Broken(rules.WEIGHTS_NEW_ENOUGH, "version 5, the newest held", f"version {rollout.version}")
 
 
+def keeps_its_weights(learner: Learner) -> Script[None]:
+    """New weights arrive while a rollout is collected. The watch compares log_prob with the weights of its version."""
+    session = yield from collecting_at_length(learner)
+    permit = session.permit()
+    session.deal(permit)
+    for version in range(2, 20):
+        learner.send(session.weights(version))
+        yield from learner.let_pass(LONG_S / 10)
+    assert learner.watch is not None
+    if permit.ticket not in learner.watch.rollouts:
+        yield from session.rollout(permit)
+    yield from session.collect(session.permit(), version=version)
+
+
 def acknowledges_weights(learner: Learner) -> Script[None]:
     """Weights come, and there is nothing to collect."""
     session = yield from collecting(learner, heartbeat_s=4.0)
@@ -280,17 +323,25 @@ def collects_two_lanes(learner: Learner) -> Script[None]:
     permits = [session.permit(0), session.permit(1), session.permit(0)]
     session.deal(*permits)
     waiting = {permit.ticket for permit in permits}
+    first: dict[int, Rollout] = {}  # of each lane
     while waiting:
         text = f"rollouts of tickets {sorted(waiting)}"
         found = yield from learner.expect(Rollout, rules.TICKETS, text, within_s=2 * learner.settings.patience_s)
         waiting.discard(found.ticket)
+        first.setdefault(found.lane, found)
+    if _repeats(first[0], first[1]):
+        got = f"the same observations and actions in lane 1 as in lane 0, for {STEPS} steps"
+        raise Broken(rules.INDEPENDENT, "lanes that differ", got)
 
 
 def starts_a_lane_again(learner: Learner) -> Script[None]:
     """A higher incarnation, then a permit of the lower one."""
     session = yield from collecting(learner)
-    yield from session.collect(session.permit())
-    yield from session.collect(session.permit(incarnation=2))
+    before = yield from session.collect(session.permit())
+    after = yield from session.collect(session.permit(incarnation=2))
+    if _repeats(before, after):
+        got = f"the same observations and actions as in incarnation 0, for {STEPS} steps"
+        raise Broken(rules.INDEPENDENT, "other episodes in incarnation 2", got)
     old = session.permit(incarnation=1)
     session.deal(old)
     yield from learner.quiet(Rollout, QUIET_S, rules.INCARNATION, "no rollout of incarnation 1 after one of 2")
@@ -324,9 +375,7 @@ def closes_unlisted_lanes(learner: Learner) -> Script[None]:
         yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
     learner.send(session.weights(2))
     yield from session.rollout(kept)
-    yield from learner.quiet(
-        Rollout, QUIET_S, rules.UNLISTED, f"no rollout of ticket {lost.ticket}, whose lane is not listed"
-    )
+    yield from session.nothing_of(lost, rules.UNLISTED, "whose lane is not listed")
 
 
 def ignores_a_late_reply(learner: Learner) -> Script[None]:
@@ -352,9 +401,9 @@ def ignores_a_late_reply(learner: Learner) -> Script[None]:
 
 def forgets_the_session_before(learner: Learner) -> Script[None]:
     """Rejoin while it collects: nothing of the session before comes, and its weights are forgotten."""
-    session = yield from collecting(learner, steps=2000)
-    yield from session.collect(session.permit())
+    session = yield from collecting_at_length(learner)
     session.deal(session.permit(0), session.permit(1))
+    yield from learner.let_pass(LONG_S / 5)
     again = yield from collecting(learner, weights=False)
     permit = again.permit()
     again.deal(permit, version=0)
@@ -366,9 +415,10 @@ def forgets_the_session_before(learner: Learner) -> Script[None]:
 
 def collects_over_a_new_connection(learner: Learner) -> Script[None]:
     """The connection is cut while it collects; the learner asks for the ticket again."""
-    session = yield from collecting(learner, steps=500)
+    session = yield from collecting_at_length(learner)
     permit = session.permit()
     session.deal(permit)
+    yield from learner.let_pass(LONG_S / 5)
     learner.cut()
     found = yield Wait(10, lambda event: isinstance(event, Heard) and isinstance(event.message, Heartbeat | Rollout))
     if found is None:
@@ -410,27 +460,50 @@ def beats_while_it_collects(learner: Learner) -> Script[None]:
 
 
 def evaluates(learner: Learner) -> Script[None]:
-    """Two episodes, greedy."""
+    """Two episodes, greedy, once more with a short limit. The answer to an order is lost."""
     yield from collecting(learner)
-    yield from _evaluate(learner, send_rows=False)
-    yield from _evaluate(learner, send_rows=False)
+    yield from _evaluate(learner, _evaluation(learner))
+    order = _evaluation(learner, most_steps=2)
+    answer = yield from _evaluate(learner, order)
+    learner.send(order)
+    text = f"Evaluated for ticket {order.ticket} again"
+    again = yield from learner.expect(Evaluated, rules.EVALUATE_ONCE, text, ticket=order.ticket)
+    if again != answer:
+        raise Broken(rules.EVALUATE_ONCE, f"the same answer to ticket {order.ticket} again", "another")
+
+
+def evaluates_one_version(learner: Learner) -> Script[None]:
+    """An evaluation under weights that have not come yet."""
+    session = yield from collecting(learner)
+    order = _evaluation(learner, version=2)
+    learner.send(order)
+    text = f"no Evaluated for ticket {order.ticket} before version 2"
+    yield from learner.quiet(Evaluated, QUIET_S, rules.EVALUATE_VERSION, text)
+    learner.send(session.weights(2))
+    text = f"Evaluated for ticket {order.ticket}"
+    yield from learner.expect(Evaluated, rules.EVALUATE, text, within_s=2 * learner.settings.patience_s, ticket=order.ticket)
 
 
 def evaluates_with_rows(learner: Learner) -> Script[None]:
     """Two episodes with their rows. A client may decline that."""
     yield from collecting(learner)
-    rows = yield from _evaluate(learner, send_rows=True)
-    if isinstance(rows, Goodbye):
+    answer = yield from _evaluate(learner, _evaluation(learner, send_rows=True))
+    if isinstance(answer, Goodbye):
         yield from learner.left(rules.DECLINED, 2, "Goodbye")
-        raise Skipped(f"it declines: {rows.reason}")
+        raise Skipped(f"it declines: {answer.reason}")
 
 
-def _evaluate(learner: Learner, *, send_rows: bool) -> Script[Goodbye | None]:
-    """Order an evaluation and check its answer. Returns a Goodbye that declines rows."""
-    order = Evaluate(learner.session, learner.ticket(), 1, (1, 2), True, EVALUATED_STEPS, send_rows, False)
+def _evaluation(
+    learner: Learner, *, version: int = 1, most_steps: int = EVALUATED_STEPS, send_rows: bool = False
+) -> Evaluate:
+    return Evaluate(learner.session, learner.ticket(), version, (1, 2), True, most_steps, send_rows, False)
+
+
+def _evaluate(learner: Learner, order: Evaluate) -> Script[Evaluated | Goodbye]:
+    """Order an evaluation and check its answer; a Goodbye declines rows."""
     learner.send(order)
     rows: dict[int, int] = {}
-    kinds = EpisodeRows | Evaluated | Goodbye if send_rows else EpisodeRows | Evaluated
+    kinds = EpisodeRows | Evaluated | Goodbye if order.send_rows else EpisodeRows | Evaluated
     within_s = 2 * learner.settings.patience_s
     while True:
         found = yield Wait(within_s, lambda event: isinstance(event, Heard) and isinstance(event.message, kinds))
@@ -450,27 +523,28 @@ def _evaluate(learner: Learner, *, send_rows: bool) -> Script[Goodbye | None]:
     if not len(answer.episodes) == len(answer.cut) == 2:
         raise Broken(rules.EVALUATE, "2 episodes for 2 seeds", f"{len(answer.episodes)}")
     for number, (episode, cut) in enumerate(zip(answer.episodes, answer.cut, strict=True)):
-        if episode.length > EVALUATED_STEPS or (cut and episode.length != EVALUATED_STEPS):
+        if episode.length > order.most_steps or (cut and episode.length != order.most_steps):
             raise Broken(
                 rules.EVALUATE,
-                f"a cut after {EVALUATED_STEPS} steps (most_steps), or an end before",
+                f"a cut after {order.most_steps} steps (most_steps), or an end before",
                 f"{episode.length} steps",
             )
-        expected_rows = episode.length if send_rows else 0
+        expected_rows = episode.length if order.send_rows else 0
         if rows.get(number, 0) != expected_rows:
-            expected = f"{expected_rows} rows of episode {number} before Evaluated (send_rows is {str(send_rows).lower()})"
+            told = f"send_rows is {str(order.send_rows).lower()}"
+            expected = f"{expected_rows} rows of episode {number} before Evaluated ({told})"
             raise Broken(rules.EVALUATE, expected, f"{rows.get(number, 0)} rows")
-    return None
+    return answer
 
 
 def drains_while_it_collects(learner: Learner) -> Script[None]:
     """Drain while one ticket is collected and another waits."""
-    session = yield from collecting(learner, steps=1000)
-    yield from session.collect(session.permit())
+    session = yield from collecting_at_length(learner)
     permits = [session.permit(), session.permit()]
     session.deal(*permits)
     waits = session.permit(1)
     session.deal(waits, version=9)
+    yield from learner.let_pass(LONG_S / 5)
     learner.send(Drain("the run is over"))
     arrived: set[int] = set()
     while True:
@@ -494,10 +568,10 @@ def drains_while_it_collects(learner: Learner) -> Script[None]:
 
 def takes_no_work_while_it_drains(learner: Learner) -> Script[None]:
     """A Collect, and a copy of the Welcome, after Drain."""
-    session = yield from collecting(learner, steps=1000)
-    yield from session.collect(session.permit())
+    session = yield from collecting_at_length(learner)
     first, second = session.permit(), session.permit(1)
     session.deal(first)
+    yield from learner.let_pass(LONG_S / 5)
     learner.send(Drain("the run is over"))
     session.deal(second)
     text = "Goodbye after Drain"
@@ -512,8 +586,9 @@ def takes_no_work_while_it_drains(learner: Learner) -> Script[None]:
 
 def leaves_when_refused_while_it_drains(learner: Learner) -> Script[None]:
     """Refuse after Drain: the client may have left already."""
-    session = yield from collecting(learner, steps=1000)
+    session = yield from collecting_at_length(learner)
     session.deal(session.permit())
+    yield from learner.let_pass(LONG_S / 5)
     learner.send(Drain("the run is over"))
     learner.send(Refuse("the test refuses this worker"))
     yield from _ends(learner, (0, 2), "Drain and Refuse")
@@ -521,8 +596,9 @@ def leaves_when_refused_while_it_drains(learner: Learner) -> Script[None]:
 
 def leaves_when_unknown_while_it_drains(learner: Learner) -> Script[None]:
     """Rejoin after Drain: the learner does not know the session any more."""
-    session = yield from collecting(learner, steps=1000)
+    session = yield from collecting_at_length(learner)
     session.deal(session.permit())
+    yield from learner.let_pass(LONG_S / 5)
     learner.send(Drain("the run is over"))
     learner.send(Rejoin(learner.session))
     yield from _ends(learner, (0, 1), "Drain and Rejoin")
@@ -532,6 +608,9 @@ def _ends(learner: Learner, codes: tuple[int, ...], after: str) -> Script[None]:
     """The client ends; a Goodbye may come before."""
     within_s = 2 * learner.settings.patience_s
     learner.allows_hello = True  # so that a Hello is this check's, and no Heartbeat is due
+    learner.allows_another_process = True
+    before = learner.hello
+    assert before is not None
 
     def is_answer(event: Event) -> bool:
         return isinstance(event, Ended) or (isinstance(event, Heard) and isinstance(event.message, Goodbye | Hello))
@@ -542,6 +621,8 @@ def _ends(learner: Learner, codes: tuple[int, ...], after: str) -> Script[None]:
             return
         case Ended(code):
             raise Broken(rules.DRAINING_LEAVES, f"exit code {codes[0]} or {codes[1]} after {after}", f"exit code {code}")
+        case Heard(_, Hello(process_nonce=life)) if life != before.process_nonce:
+            return
         case Heard(_, Goodbye()):
             yield from learner.left(rules.DRAINING_LEAVES, codes, after)
         case _:

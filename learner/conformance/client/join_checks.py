@@ -144,8 +144,8 @@ def answers_heartbeats_in_order(learner: Learner) -> Script[None]:
     yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat although the last one was not answered")
     learner.send(HeartbeatReply(learner.session, 9, learner.of_lanes()))
     yield from _replies(learner, 9)
-    learner.send(HeartbeatReply(learner.session, 4, learner.of_lanes()))
     learner.send(HeartbeatReply(learner.session, 9, learner.of_lanes()))
+    learner.send(HeartbeatReply(learner.session, 4, learner.of_lanes()))
     for _ in range(2):
         late = yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
         if late.replies != 9:
@@ -283,9 +283,9 @@ def drains_while_joining(learner: Learner) -> Script[None]:
 
 
 def drains_while_idle(learner: Learner) -> Script[None]:
-    """Drain while there is nothing to do."""
+    """Drain while there is nothing to do. Its reason is as long as a reason may be."""
     yield from in_any_session(learner)
-    learner.send(Drain("the run is over"))
+    learner.send(Drain("…" * MAX_LINE))
     goodbye = yield from learner.expect(Goodbye, rules.DRAIN, "Goodbye after Drain")
     if goodbye.tickets:
         raise Broken(rules.DRAIN, "Goodbye without tickets", f"tickets {list(goodbye.tickets)}")

@@ -93,8 +93,12 @@ class Learner:
         self.answers_heartbeats = True
         self.allows_hello = False
         """whether the client may start to join by itself"""
+        self.allows_another_process = False
+        """whether the client's process may have left, and another have started under its name, by its supervisor"""
         self.description: Described | None = None
         """what the client has described, in this whole run of the test"""
+        self.steps_per_s = 0.0
+        """how fast the client collects, in this whole run of the test; 0: that is not known yet"""
         self.received: dict[int, Received] | None = None
         """by lane: what HeartbeatReply and Collect say has arrived; None: all that has"""
         self.unlisted: set[int] = set()
@@ -196,7 +200,8 @@ class Learner:
         before = self.hello
         if before is not None and peer != self.peer:
             return False  # of a second worker of the same command
-        if before is not None and hello.process_nonce != before.process_nonce:
+        is_another = before is not None and hello.process_nonce != before.process_nonce
+        if is_another and not self.allows_another_process:
             raise Broken(rules.STAYS, "the same process, or the client's end", "the Hello of a new process under its name")
         self.peer, self.hello, self.is_mute = peer, hello, False
         if not self.hears:
@@ -278,6 +283,8 @@ class Learner:
         """The next message of this kind whose fields have these values, within `within_s` (or the patience). Or `Broken`."""
 
         def is_it(event: Event) -> bool:
+            if kind is Goodbye and isinstance(event, Ended):
+                return True
             if not (isinstance(event, Heard) and isinstance(event.message, kind)):
                 return False
             return all(getattr(event.message, name) == value for name, value in fields.items())
@@ -286,7 +293,8 @@ class Learner:
         found = yield Wait(within_s, is_it)
         if found is None:
             raise Broken(rule, expected, f"none within {within_s:g} s")
-        assert isinstance(found, Heard)
+        if isinstance(found, Ended):
+            raise Broken(rule, expected, f"the client's end with exit code {found.code}, without Goodbye")
         message: M = found.message  # type: ignore[assignment]
         return message
 
@@ -327,6 +335,7 @@ class Learner:
         before = self.hello
         assert before is not None
         self.send(Rejoin(self.session))
+        self.allows_hello = True  # so that no Heartbeat is due
         hello = yield from self.expect(Hello, rules.REJOIN, "Hello with a later attempt after Rejoin")
         if hello.attempt <= before.attempt:
             raise Broken(rules.REJOIN, f"an attempt later than {before.attempt}", f"attempt {hello.attempt}")
@@ -337,7 +346,7 @@ class Learner:
         assert self.hello is not None
         self._numbers += 1
         self._lanes, self.received, self.unlisted = {}, None, set()
-        self.answers_heartbeats, self.hears, self.allows_hello = True, True, False
+        self.answers_heartbeats, self.hears, self.allows_hello, self.allows_another_process = True, True, False, False
         self.watch = Watch(self._numbers, run, self.now, self._steps)
         self._welcome = Welcome(self._numbers, self.hello.attempt, run)
         self.send(self._welcome)
@@ -355,4 +364,4 @@ class Learner:
 
 
 def _rule_of_unreadable(error: str) -> Rule:
-    return rules.LIMITS if "at most" in error or "1 to" in error else rules.FRAMES
+    return rules.LIMITS if any(words in error for words in ("at most", "1 to", "length <=")) else rules.FRAMES

@@ -215,6 +215,11 @@ NEXT_STEP = Rule(
     " neither flag, and the first observation of the next episode",
     "remember which copies have ended; their next step is a reset",
 )
+OWN_ROW = Rule(
+    "Environment profile",
+    "Row n of every array is that of copy n, in actions and in answers",
+    "give row n of the actions to copy n, and write what comes of it to row n of every array",
+)
 TRUNCATED = Rule(
     "Messages, Rollout and Stepped",
     "truncated: a time limit ended the episode. An episode is at most `longest_episode` steps long",
@@ -288,6 +293,17 @@ ROWS = Rule(
     "valid[t+1] == not (terminated[t] or truncated[t])",
     "write the rows as docs/explanation/rows.md says",
 )
+LAST_OBSERVATION = Rule(
+    "Collector profile",
+    "The row after the end of an episode only resets that copy: its observation is the last one of the old episode, "
+    "obs[t+1] the first one of the new",
+    "do not reset a copy in the step that ends its episode: write the observation of that step, and reset in the next row",
+)
+INDEPENDENT = Rule(
+    "Records inside messages, RunSpec",
+    "Env copies and action generators are seeded by (seed, lane, incarnation, …): no copy repeats what another one does",
+    "seed each env copy with a number of its own, made of the run's seed, the lane, the incarnation and the copy's number",
+)
 FIRST_VALID = Rule(
     "Messages, Rollout",
     "valid is False on the row in which a finished copy is reset, also when that is the first row of the next rollout",
@@ -314,6 +330,16 @@ EVALUATE = Rule(
     "Messages, Evaluate",
     "Evaluate is answered by Evaluated: an episode for each seed, in their order, each cut at `most_steps`",
     "play the episodes on copies of their own, under the weights of the order's version",
+)
+EVALUATE_ONCE = Rule(
+    "Collector profile",
+    "An Evaluate is executed once. The last 8 answers are kept, and sent again if the order comes again",
+    "keep each Evaluated by its ticket, and send it when that ticket comes again",
+)
+EVALUATE_VERSION = Rule(
+    "Collector profile",
+    "An Evaluate is executed under exactly its version: it waits until those weights are held",
+    "compare the order's version with that of the weights held before the first episode",
 )
 REAPPEARS = Rule(
     "Messages, Hello",

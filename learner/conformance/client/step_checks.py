@@ -16,7 +16,9 @@ from learner.conformance.client import rules
 from learner.conformance.client.join_checks import described
 from learner.conformance.client.learner import Learner
 from learner.conformance.client.script import Broken, Heard, Script, Skipped, Wait, brief
+from learner.conformance.client.watch import resets_too_early
 from protocol.arrays import Array
+from protocol.bounds import MAX_LINE
 from protocol.envs.spaces import leaves_with_own_dtype, make_flatten
 from protocol.messages import (
     Call,
@@ -38,6 +40,7 @@ from protocol.wire.plain_values import pack, unpack
 
 WALK_STEPS = 300  # steps of the walk that looks for ends of episodes
 LIMIT_STEPS = 2000  # most steps of the walk to a time limit
+APART_STEPS = 8  # in which actions that copies do not share make a difference
 LANES = 2
 
 
@@ -136,6 +139,7 @@ def ends_episodes(learner: Learner) -> Script[None]:
     before = yield from steps.do(steps.reset())
     length = np.zeros(steps.spec.lanes[0], int)
     ends = 0
+    around: list[tuple[bytes, bytes]] = []  # the last observation of an episode, the first one of the next
     for _ in range(WALK_STEPS):
         row = yield from steps.do(steps.step())
         ended = before.terminated | before.truncated
@@ -146,14 +150,26 @@ def ends_episodes(learner: Learner) -> Script[None]:
                     f"reward 0 and neither flag in copy {n}, in the step after the end of its episode",
                     f"reward {row.reward[n]:g}, terminated {row.terminated[n]}, truncated {row.truncated[n]}",
                 )
+            if before.terminated[n]:
+                around.append((_of_copy(before, int(n)), _of_copy(row, int(n))))
         length = np.where(ended, 0, length + 1)
         _within(longest, length, row)
         ends += int((row.terminated | row.truncated).sum())
         before = row
         if ends >= 6:
-            return
+            break
     if not ends:
         raise Skipped(f"no episode ended in {WALK_STEPS} steps")
+    if resets_too_early(around):
+        raise Broken(
+            rules.NEXT_STEP,
+            "the last observation of an episode in the step that ends it, and the first one of the next in the step after",
+            f"the same observation in both, at each of {len(around)} ends",
+        )
+
+
+def _of_copy(row: Stepped, n: int) -> bytes:
+    return b"".join(leaf[n].tobytes() for leaf in row.obs)
 
 
 def _within(longest: int | None, length: Array, row: Stepped) -> None:
@@ -217,6 +233,37 @@ def _same(one: Stepped, other: Stepped) -> bool:
     return all(a.tobytes() == b.tobytes() for a, b in zip(one.obs, other.obs, strict=True))
 
 
+def keeps_copies_apart(learner: Learner) -> Script[None]:
+    """All copies have one seed and the same actions, then others; then some copies have those and the rest have these."""
+    steps = yield from stepping(learner)
+    N = steps.spec.lanes[0]
+    if N < 2:
+        raise Skipped("the lanes have one copy each (--copies)")
+    seeds = (21, 22)
+    plans = [[steps.random_actions(1) for _ in range(APART_STEPS)] for _ in seeds]
+
+    def play(of_copy: Sequence[int]) -> Script[list[Stepped]]:
+        """What the copies answer if each has the seed and the actions of its plan."""
+        first = yield from steps.do(replace(steps.reset(), seeds=tuple(seeds[plan] for plan in of_copy)))
+        rest = yield from steps.walk(
+            [
+                tuple(np.concatenate(leaves) for leaves in zip(*(plans[plan][t] for plan in of_copy), strict=True))
+                for t in range(APART_STEPS)
+            ]
+        )
+        return [first, *rest]
+
+    first, second = (yield from play([0] * N)), (yield from play([1] * N))
+    alone = (first, second)
+    mixed = yield from play([n % 2 for n in range(N)])
+    for t, row in enumerate(mixed):
+        for n in range(N):
+            if _of_copy(row, n) != _of_copy(alone[n % 2][t], n):
+                as_before = f"what all copies observed when they had its seed {seeds[n % 2]} and its actions"
+                expected = f"copy {n} to observe after {t} steps {as_before}"
+                raise Broken(rules.OWN_ROW if t else rules.SEEDED, expected, "another observation")
+
+
 def executes_an_order_once(learner: Learner) -> Script[None]:
     """Orders are repeated, because their answers were lost."""
     steps = yield from stepping(learner)
@@ -255,15 +302,23 @@ def ignores_an_old_order(learner: Learner) -> Script[None]:
 
 
 def ignores_another_session(learner: Learner) -> Script[None]:
-    """Orders of the session before."""
+    """Orders of the session before. Its steps still count."""
     old = yield from stepping(learner)
     before = learner.session
     yield from old.do(old.reset())
+    yield from old.do(old.step())
+    for _ in range(4):  # some may have been on their way
+        heartbeat = yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
+        if heartbeat.steps:
+            break
+    else:
+        raise Broken(rules.HEARTBEAT_STEPS, "steps above 0 after a Step", "0")
     steps = yield from stepping(learner)
     yield from steps.do(steps.reset())
     learner.send(replace(steps.step(), session=before))
     yield from learner.quiet(Stepped, 0.7, rules.OTHER_SESSION, "no answer to an order of the session before")
     yield from steps.do(steps.step())
+    yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
 
 
 def serves_two_lanes(learner: Learner) -> Script[None]:
@@ -310,10 +365,10 @@ def resets_some_copies(learner: Learner) -> Script[None]:
 
 
 def answers_calls(learner: Learner) -> Script[None]:
-    """A Call of an attribute that every gymnasium environment has, and of one that none has."""
+    """A Call of an attribute that every gymnasium environment has, and of two that none has."""
     steps = yield from stepping(learner)
     yield from steps.do(steps.reset())
-    for name in ("render_mode", "no_such_attribute_anywhere"):
+    for name in ("render_mode", "no_such_attribute_anywhere", "…" * MAX_LINE):
         given = np.frombuffer(pack(((), {})), np.uint8)
         call = Call(learner.session, learner.ticket(), 0, 0, (0,), name, False, given)
         learner.send(call)
@@ -321,7 +376,7 @@ def answers_calls(learner: Learner) -> Script[None]:
         if found.error:
             continue
         results = unpack(found.results.tobytes())
-        if name == "no_such_attribute_anywhere" or not isinstance(results, list) or len(results) != 1:
+        if name != "render_mode" or not isinstance(results, list) or len(results) != 1:
             raise Broken(rules.RETURNED, "one result for the one copy, or an error", f"{results!r}"[:100])
     yield from steps.do(steps.step())
 
@@ -403,6 +458,7 @@ def ignores_what_it_cannot_read(learner: Learner) -> Script[None]:
     learner.send_frames([msgpack.packb(head[:-1])])
     learner.send_frames([msgpack.packb(head)])
     learner.send_frames([msgpack.packb(head), *arrays, b"one frame too many"])
+    learner.send_frames([msgpack.packb(head) + b"\0", *arrays])
     learner.send_frames([msgpack.packb(["NoSuchMessage", learner.session])])
     learner.send_frames([msgpack.packb({"type": "Refuse"})])
     learner.send_frames([b"\xc1"])

@@ -73,6 +73,8 @@ class Watch:
         """the first rollout of each ticket"""
         self.said_goodbye = False
         self._foreign = set[int]()  # tickets that were sent under the number of another session
+        self._incarnations: dict[int, int] = {}  # the highest dealt, by lane
+        self._outdated = set[int]()  # tickets that were dealt for a lower one
         self._asked, self._answered = Counter[int](), Counter[int]()
         self._next_sequence: dict[tuple[int, int], int] = {}
         self._rows: dict[tuple[int, int], LaneRows] = {}
@@ -95,6 +97,10 @@ class Watch:
                 self._foreign |= {permit.ticket for permit in permits}
             case Collect(_, version, permits):
                 for permit in permits:
+                    newest = max(permit.incarnation, self._incarnations.get(permit.lane, 0))
+                    self._incarnations[permit.lane] = newest
+                    if permit.incarnation < newest:
+                        self._outdated.add(permit.ticket)
                     self.permits[permit.ticket] = Dealt(permit, version)
                     self._asked[permit.ticket] += 1
             case HeartbeatReply(session, number) if session == self.session:
@@ -228,6 +234,13 @@ class Watch:
             raise Broken(
                 rules.LANES, f"lane {permit.lane}, as in the permit with ticket {permit.ticket}", f"lane {message.lane}"
             )
+        if message.ticket in self._outdated:
+            newest = self._incarnations[message.lane]
+            raise Broken(
+                rules.INCARNATION,
+                f"ticket {message.ticket} to be ignored: it is of incarnation {permit.incarnation}, its lane is in {newest}",
+                brief(message),
+            )
         if message.version not in self.versions or message.version < version:
             raise Broken(
                 rules.WEIGHTS_NEW_ENOUGH, f"version {version} or newer, of those sent", f"version {message.version}"
@@ -291,6 +304,14 @@ def check_stepped(message: Stepped, spec: StepSpec) -> None:
     for leaf, array in zip(spec.observation, message.obs, strict=True):
         if why := outside(array, leaf):
             raise Broken(rules.IN_SPACE, f"values of its space in obs {leaf.path}".strip(), why)
+
+
+def resets_too_early(around: Sequence[tuple[bytes, bytes]]) -> bool:
+    """Whether the last observation of every episode that terminated is the first one of the next: the copy was reset too
+    early. `around`: these pairs. If all episodes begin in the same way, that says nothing.
+    """
+    first = {after for _, after in around}
+    return len(around) >= 3 and len(first) > 1 and all(last == after for last, after in around)
 
 
 def outside(array: Array, leaf: Leaf) -> str:

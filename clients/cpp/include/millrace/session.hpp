@@ -185,6 +185,11 @@ class Session {
     Session& session_;
   };
 
+  static std::string line(const std::string& text) {  // as the wire wants a text. ASCII: no cut is within a character
+    std::string one = text.substr(0, 1000);
+    for (char& c : one) if (c < ' ' || c > '~') c = '?';
+    return one;
+  }
   std::uint64_t attempt() const { return attempt_; }
   State state_ = State::joining;
   Description description_;
@@ -203,12 +208,6 @@ class Session {
     if (options.address.compare(0, 6, "tcp://") != 0) throw UsageError("token: expected a tcp:// address with it");
     return Token::read(options.token);
   }
-  static std::string line(const std::string& text) {  // one line, as the wire wants it
-    std::string one = text.substr(0, 1000);
-    for (char& c : one) if (static_cast<unsigned char>(c) < 32 || c == 127) c = ' ';
-    return one;
-  }
-
   void begin_to_join() {
     ++attempt_;
     state_ = State::joining;

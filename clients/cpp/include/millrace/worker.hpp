@@ -166,7 +166,7 @@ class Worker : public CollectorSession {
   }
   void returned(const Message& m) {
     head_.begin("Returned", 7).natural(session_).natural(m.ticket).natural(m.lane).natural(m.incarnation)
-        .described("|u1", 1, {0}).text("AttributeError: an environment written in C++ has no attribute " + m.text.substr(0, 100)).text("");
+        .described("|u1", 1, {0}).text(line("AttributeError: an environment written in C++ has no attribute " + m.text)).text("");
     send(head_, {{nullptr, 0}});
   }
 

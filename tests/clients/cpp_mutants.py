@@ -1,0 +1,387 @@
+"""Mistakes in the C++ client: a table of changes to its source, and what `millrace conform` says of each.
+
+Rule: a mutant is one change of one header, a mistake that an author of a client makes.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from learner.conformance.client import rules
+from learner.conformance.client.rules import Rule
+
+
+class Mutant(NamedTuple):
+    """A mistake, the check that catches it, and what the report says."""
+
+    name: str
+    header: str
+    """in clients/cpp/include/millrace"""
+    old: str
+    """stands there exactly once"""
+    new: str
+    """stands there instead"""
+    profile: str
+    check: str
+    """part of its name"""
+    rule: Rule
+    """the rule that the report names"""
+    got: str
+    """part of what the report says was got"""
+
+
+# fmt: off
+MUTANTS = [
+    Mutant(
+        "stale session", "session.hpp",
+        "session_ = *m.session, run_",
+        "session_ += session_ ? 0 : *m.session, run_",
+        "environment", "joins again after Rejoin", rules.SESSION, "Described(session",
+    ),
+    Mutant(
+        "stale attempt", "session.hpp",
+        "    ++attempt_;\n",
+        "    attempt_ = life_ + 1;\n",
+        "environment", "joins again after Rejoin", rules.REJOIN, "attempt",
+    ),
+    Mutant(
+        "late rejoin", "session.hpp",
+        "    begin_to_join();\n"
+        "    tick(now_s());",
+        "    begin_to_join();\n"
+        "    due_s_ += 20;",
+        "environment", "joins again after Rejoin", rules.REJOIN, "none within",
+    ),
+    Mutant(
+        "same life in every process", "session.hpp",
+        "(std::uint64_t(random()) << 32 | random()) >> 16",
+        "7",
+        "environment", "draws another life", rules.REAPPEARS, "the same",
+    ),
+    Mutant(
+        "begins again at a repeated Welcome", "session.hpp",
+        " || (state_ == State::ready && *m.session == session_)",
+        "",
+        "environment", "late copy of its Welcome", rules.REPEATED_WELCOME, "another observation",
+    ),
+    Mutant(
+        "oversized text", "session.hpp",
+        "\"millrace C++ client\"",
+        "std::string(2000, 'x')",
+        "environment", "says Hello first", rules.LIMITS, "software",
+    ),
+    Mutant(
+        "forgotten heartbeat", "session.hpp",
+        "due_s_ = now + run_.heartbeat_s, acknowledged_",
+        "due_s_ = now + 60, acknowledged_",
+        "environment", "beats as often as", rules.HEARTBEAT, "none",
+    ),
+    Mutant(
+        "late copies of a reply count", "session.hpp",
+        "if (m.number <= replies_) return;",
+        "",
+        "environment", "last HeartbeatReply", rules.HEARTBEAT_REPLIES, "4",
+    ),
+    Mutant(
+        "steps counted by session", "session.hpp",
+        "version_ = acknowledged_ = -1, replies_ = 0;",
+        "version_ = acknowledged_ = -1, replies_ = 0, steps_ = 0;",
+        "environment", "ignores an order of another session", rules.HEARTBEAT_STEPS, "0",
+    ),
+    Mutant(
+        "obeys another session", "session.hpp",
+        "if (m.type != Type::Welcome && m.session && *m.session != session_) return;",
+        "",
+        "environment", "an order of another session", rules.OTHER_SESSION, "Stepped(",
+    ),
+    Mutant(
+        "ends on what it cannot read", "session.hpp",
+        "catch (const BadMessage& error) {",
+        "catch (const BadMessage& error) {\n"
+        "        leave(3, error.what());",
+        "environment", "ignores what it cannot read", rules.STAYS, "exit code 3",
+    ),
+    Mutant(
+        "ignores Drain", "session.hpp",
+        "case Type::Drain: return drain(m.text, false);",
+        "case Type::Drain: return;",
+        "environment", "says Goodbye after Drain", rules.DRAIN, "none within",
+    ),
+    Mutant(
+        "refusal is no error", "session.hpp",
+        "return leave(2, m.text);",
+        "return leave(0, m.text);",
+        "environment", "exit code 2 when it is refused", rules.REFUSE, "exit code 0",
+    ),
+    Mutant(
+        "drained is an error", "session.hpp",
+        "    leave(0, reason_);",
+        "    leave(1, reason_);",
+        "environment", "says Goodbye after Drain", rules.DRAIN, "exit code 1",
+    ),
+    Mutant(
+        "leaves without Goodbye after SIGTERM", "session.hpp",
+        "drain(\"it was told to stop\", true)",
+        "leave(0, \"it was told to stop\")",
+        "environment", "Goodbye after SIGTERM", rules.STOP, "without Goodbye",
+    ),
+    Mutant(
+        "wrong dtype", "worker.hpp",
+        ".described(\"<f8\", 2, {N})",
+        ".described(\"<i8\", 2, {N})",
+        "environment", "answers Reset and Step", rules.STEPPED_ARRAYS, "reward int64",
+    ),
+    Mutant(
+        "wrong frame", "worker.hpp",
+        "{lane.reward.data(), 8 * N}",
+        "{lane.reward.data(), 4 * N}",
+        "environment", "answers Reset and Step", rules.FRAMES, "",
+    ),
+    Mutant(
+        "wrong incarnation", "worker.hpp",
+        ".natural(m.lane).natural(lane.incarnation)",
+        ".natural(m.lane).natural(0)",
+        "environment", "starts a lane again", rules.INCARNATION, "incarnation 0",
+    ),
+    Mutant(
+        "obeys a lower incarnation", "worker.hpp",
+        "m.incarnation < lane.incarnation || ",
+        "",
+        "environment", "starts a lane again", rules.INCARNATION, "incarnation 2",
+    ),
+    Mutant(
+        "wrong ticket", "worker.hpp",
+        "\"Stepped\", 9).natural(session_).natural(lane.ticket)",
+        "\"Stepped\", 9).natural(session_).natural(lane.ticket - 1)",
+        "environment", "answers Reset and Step", rules.ORDER_ONLY, "ticket",
+    ),
+    Mutant(
+        "executes a repeated order again", "worker.hpp",
+        "return lane.answered && m.type != Type::Call ? answer(m, lane) : void();",
+        "{}",
+        "environment", "executes an order once", rules.ORDER_ONCE, "",
+    ),
+    Mutant(
+        "obeys an old order", "worker.hpp",
+        "m.incarnation == lane.incarnation && m.ticket < lane.ticket",
+        "false",
+        "environment", "ignores a late copy of an order", rules.ORDER_OLD, "Stepped(",
+    ),
+    Mutant(
+        "missing truncated", "worker.hpp",
+        "lane.truncated[n] = result.truncated;",
+        "lane.truncated[n] = 0;",
+        "environment", "truncates an episode", rules.TRUNCATED, "no end after 500 steps",
+    ),
+    Mutant(
+        "steps a copy that has ended", "worker.hpp",
+        "(lane.terminated[n] || lane.truncated[n]) && run_.autoreset == \"NextStep\"",
+        "false",
+        "environment", "ends episodes", rules.NEXT_STEP, "reward 1",
+    ),
+    Mutant(
+        "forgotten final observation", "worker.hpp",
+        "          lane.envs[n]->reset(std::nullopt, &lane.obs[n * bytes]);\n"
+        "          lane.reward[n] = 0, lane.terminated[n] = lane.truncated[n] = 0;\n"
+        "        } else {\n"
+        "          Result result = lane.envs[n]->step({action}, &lane.obs[n * bytes]);\n",
+        "          lane.reward[n] = 0, lane.terminated[n] = lane.truncated[n] = 0;\n"
+        "        } else {\n"
+        "          Result result = lane.envs[n]->step({action}, &lane.obs[n * bytes]);\n"
+        "          if (result.terminated) lane.envs[n]->reset(std::nullopt, &lane.obs[n * bytes]);\n",
+        "environment", "ends episodes", rules.NEXT_STEP, "the same observation in both",
+    ),
+    Mutant(
+        "one seed for all copies", "worker.hpp",
+        "reset(m.seeds[i], &lane",
+        "reset(m.seeds[0], &lane",
+        "environment", "own seed and actions", rules.SEEDED, "another",
+    ),
+    Mutant(
+        "one action for all copies", "worker.hpp",
+        "++n, action += description_.action.bytes()",
+        "++n",
+        "environment", "own seed and actions", rules.OWN_ROW, "another",
+    ),
+    Mutant(
+        "rows in another order", "worker.hpp",
+        "Result result = lane.envs[n]->step(",
+        "Result result = lane.envs[lane.envs.size() - 1 - n]->step(",
+        "environment", "own seed and actions", rules.OWN_ROW, "another",
+    ),
+    Mutant(
+        "resets all copies", "worker.hpp",
+        "std::size_t n = m.copies[i];\n",
+        "std::size_t n = m.copies[i];\n"
+        "        for (std::size_t k = 0; k < lane.envs.size(); ++k)\n"
+        "          lane.envs[k]->reset(m.seeds[i], &lane.obs[k * bytes]);\n",
+        "environment", "only the copies that a Reset lists", rules.RESET_SOME, "others",
+    ),
+    Mutant(
+        "missing truncated", "rollouts.hpp",
+        "r.truncated[i] = truncated",
+        "r.truncated[i] = 0",
+        "collector", "truncates an episode", rules.ROWS, "valid: expected",
+    ),
+    Mutant(
+        "forgotten final observation", "rollouts.hpp",
+        "std::copy(r.obs.end() - static_cast<std::ptrdiff_t>(obs.size()), r.obs.end(), obs.begin());",
+        "",
+        "collector", "collects rollouts", rules.CONTINUES, "another observation",
+    ),
+    Mutant(
+        "rows in another order", "rollouts.hpp",
+        "return &r.log_prob[r.rows * N + n];",
+        "return &r.log_prob[n * T + r.rows];",
+        "collector", "collects rollouts", rules.LOG_PROB, "",
+    ),
+    Mutant(
+        "wrong episode length", "rollouts.hpp",
+        "if (valid) episode.reward += reward, ++episode.length;",
+        "if (valid) episode.reward += reward, episode.length = r.rows + 1;",
+        "collector", "keeps the row format", rules.EPISODES, "",
+    ),
+    Mutant(
+        "wrong layout of weights", "policy.hpp",
+        "layer.weight[i * layer.outputs + o] = as_float",
+        "layer.weight[o * layer.inputs + i] = as_float",
+        "collector", "collects rollouts", rules.LOG_PROB, "-",
+    ),
+    Mutant(
+        "bfloat16 read as float16", "policy.hpp",
+        "if (array.dtype == \"<u2\")",
+        "if (false)",
+        "collector", "weights rounded to 16 bits", rules.LOG_PROB, "",
+    ),
+    Mutant(
+        "repeated ticket", "rollouts.hpp",
+        "held.tickets.erase(rollout->ticket), ++held.sequence",
+        "++held.sequence",
+        "collector", "sends a rollout once", rules.ROLLOUT_ONCE, "2 rollouts",
+    ),
+    Mutant(
+        "collects a repeated ticket again", "rollouts.hpp",
+        "for (const auto& rollout : held.kept) if (rollout->ticket == permit.ticket) return send_rollout(*rollout);",
+        "",
+        "collector", "sends a lost rollout again", rules.ROLLOUT_ONCE, "another",
+    ),
+    Mutant(
+        "forgets finished tickets", "rollouts.hpp",
+        "held.finished.push_back(held.kept[i]->ticket);",
+        "",
+        "collector", "late Collect", rules.ROLLOUT_ONCE, "another",
+    ),
+    Mutant(
+        "wrong sequence", "rollouts.hpp",
+        "held.tickets.erase(rollout->ticket), ++held.sequence",
+        "held.tickets.erase(rollout->ticket)",
+        "collector", "collects rollouts", rules.SEQUENCE, "sequence 0",
+    ),
+    Mutant(
+        "obeys a lower incarnation", "rollouts.hpp",
+        "if (permit.incarnation < held.incarnation) return;",
+        "",
+        "collector", "starts a lane again", rules.INCARNATION, "Rollout(",
+    ),
+    Mutant(
+        "takes old weights", "rollouts.hpp",
+        "if (static_cast<std::int64_t>(m.version) <= version_) return;",
+        "",
+        "collector", "acts under the newest", rules.WEIGHTS_NEW_ENOUGH, "version 3",
+    ),
+    Mutant(
+        "does not wait for weights", "rollouts.hpp",
+        "static_cast<std::int64_t>(lowest) <= version_ && ticket",
+        "ticket",
+        "collector", "waits for the weights", rules.WEIGHTS_NEW_ENOUGH, "version 1",
+    ),
+    Mutant(
+        "does not acknowledge weights", "session.hpp",
+        "if (now < due_s_ && acknowledged_ == version_) return;",
+        "if (now < due_s_) return;",
+        "collector", "acknowledges new weights", rules.ACKNOWLEDGE, "none within",
+    ),
+    Mutant(
+        "other weights in the middle of a rollout", "rollouts.hpp",
+        "    policy_.check(m);\n",
+        "    policy_.check(m), policy_.load(m);\n",
+        "collector", "keeps the weights of a rollout", rules.LOG_PROB, "",
+    ),
+    Mutant(
+        "keeps the tickets of the session before", "rollouts.hpp",
+        "void end_collecting() { held_.clear(), ",
+        "void end_collecting() { ",
+        "collector", "forgets the session before", rules.HEARTBEAT_TICKETS, "ticket",
+    ),
+    Mutant(
+        "the same random numbers in every lane", "policy.hpp",
+        "state_ = bits() ^ each;",
+        "state_ = each & 0;",
+        "collector", "collects two lanes", rules.INDEPENDENT, "lane 1 as in lane 0",
+    ),
+    Mutant(
+        "forgets an end between two rollouts", "rollouts.hpp",
+        "if (++r.rows < T) return false;",
+        "if (++r.rows < T) return false;\n"
+        "    ended.assign(N, 0);",
+        "collector", "keeps the row format", rules.FIRST_VALID, "True",
+    ),
+    Mutant(
+        "forgotten final observation of an episode", "worker.hpp",
+        "              lane->envs[n]->reset(std::nullopt, rows.next_obs_at(*rollout, n));\n"
+        "            } else {\n"
+        "              policy_.to_env(rows.action_at(*rollout, n), lane->action.data());\n"
+        "              result = lane->envs[n]->step({lane->action.data()}, rows.next_obs_at(*rollout, n));\n",
+        "              std::memcpy(rows.next_obs_at(*rollout, n), rows.obs_at(*rollout, n), rows.obs_bytes);\n"
+        "            } else {\n"
+        "              policy_.to_env(rows.action_at(*rollout, n), lane->action.data());\n"
+        "              result = lane->envs[n]->step({lane->action.data()}, rows.next_obs_at(*rollout, n));\n"
+        "              if (result.terminated) lane->envs[n]->reset(std::nullopt, rows.next_obs_at(*rollout, n));\n",
+        "collector", "keeps the row format", rules.LAST_OBSERVATION, "the first one",
+    ),
+    Mutant(
+        "an episode more", "worker.hpp",
+        "evaluation.episodes.push_back(episode);",
+        "evaluation.episodes.insert(evaluation.episodes.end(), 2, episode);",
+        "collector", "evaluates", rules.EVALUATE, "4",
+    ),
+    Mutant(
+        "ignores Release", "session.hpp",
+        "for (const LaneIncarnation& lane : m.lanes) release(lane.lane, lane.incarnation);",
+        "",
+        "collector", "is released while", rules.RELEASE, "Rollout(",
+    ),
+    Mutant(
+        "keeps an unlisted lane", "session.hpp",
+        "release(lane, std::numeric_limits<std::uint64_t>::max());",
+        "{}",
+        "collector", "does not list", rules.UNLISTED, "Rollout(",
+    ),
+    Mutant(
+        "takes work while it drains", "session.hpp",
+        "default: if (!ready) return;",
+        "default: if (joining) return;",
+        "collector", "no work while it drains", rules.DRAINING_IGNORES, "",
+    ),
+    Mutant(
+        "Goodbye without tickets", "session.hpp",
+        "for (std::uint64_t ticket : tickets()) w.natural(ticket);\n"
+        "    link_.send(head_);",
+        "head_.begin(\"Goodbye\", 3).natural(session_).text(line(why)).array(0);\n"
+        "    link_.send(head_);",
+        "collector", "drains while it collects", rules.DRAIN, "[]",
+    ),
+    Mutant(
+        "evaluates without end", "worker.hpp",
+        " && episode.length < played.most_steps",
+        "",
+        "collector", "evaluates", rules.EVALUATE, "steps",
+    ),
+    Mutant(
+        "evaluates again", "rollouts.hpp",
+        "for (const Evaluation& answer : answers_) if (answer.ticket == m.ticket) return send_evaluation(answer);",
+        "",
+        "collector", "evaluates", rules.EVALUATE_ONCE, "another",
+    ),
+]
+# fmt: on

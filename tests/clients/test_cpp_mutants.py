@@ -1,0 +1,71 @@
+"""Mistakes in the source of the C++ client: `millrace conform` catches each, by a sentence that names the rule it breaks.
+
+`test_conform.py` shows that the client without a mistake passes every check.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from learner.conformance.client.learner import Settings
+from learner.conformance.client.profiles import PROFILES
+from learner.conformance.client.report import explanation
+from millrace.conform import Client, conform
+from protocol.env_spec import EnvSpec
+from tests.clients.conftest import CPP
+from tests.clients.cpp_mutants import MUTANTS, Mutant
+
+pytestmark = [pytest.mark.clients, pytest.mark.timeout(1800)]  # the first test waits for the compiler
+FLAGS = ["-std=c++17", "-O0", "-ffp-contract=off", "-lzmq", "-lsodium", "-pthread"]
+BUILD_S = 300  # of one mutant, on a busy machine
+
+
+def mutated(mutant: Mutant, include: Path) -> None:
+    """Make the mistake in this copy of the headers."""
+    header = include / "millrace" / mutant.header
+    text = header.read_text()
+    assert text.count(mutant.old) == 1, (
+        f"{mutant.header}: expected {mutant.old!r} once, found it {text.count(mutant.old)} times"
+    )
+    header.write_text(text.replace(mutant.old, mutant.new))
+
+
+def build(mutant: Mutant, folder: Path) -> Path:
+    """The client with this mistake."""
+    include, program = folder / "include", folder / "cartpole"
+    shutil.copytree(CPP / "include", include)
+    mutated(mutant, include)
+    command = ["g++", "-I", str(include), str(CPP / "examples" / "cartpole.cpp"), "-o", str(program), *FLAGS]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=BUILD_S)
+    assert done.returncode == 0, done.stderr
+    return program
+
+
+@pytest.fixture(scope="module")
+def programs(
+    compiler: None, request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> dict[Mutant, Future[Path]]:
+    """The programs of the mutants that are tested, built side by side."""
+    tests = [test for test in request.session.items if isinstance(test, pytest.Function) and test.path == request.path]
+    mutants = [mutant for test in tests if isinstance(mutant := test.callspec.params["mutant"], Mutant)]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return {mutant: pool.submit(build, mutant, tmp_path_factory.mktemp("mutant")) for mutant in mutants}
+
+
+@pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: f"{mutant.name}, {mutant.profile}")
+def test_the_report_names_the_rule_that_a_mutant_breaks(mutant: Mutant, programs: dict[Mutant, Future[Path]]) -> None:
+    checks = [check for check in PROFILES[mutant.profile] if mutant.check in check.name]
+    assert checks, mutant.check
+    client = Client((str(programs[mutant].result()), "{address}"))
+    results = conform(client, checks, Settings(EnvSpec("CartPole-v1"), patience_s=3.0), 100.0, lambda result: None)
+    failed = [each for each in results if each.outcome == "failed"]
+    assert failed, f"{mutant.name} was not caught"
+    assert failed[0].rule == mutant.rule, explanation(failed[0])
+    assert mutant.got in failed[0].got, explanation(failed[0])
+    assert mutant.rule.text in " ".join(" ".join(explanation(failed[0])).split())
