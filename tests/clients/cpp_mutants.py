@@ -237,8 +237,8 @@ MUTANTS = [
     ),
     Mutant(
         "wrong episode length", "rollouts.hpp",
-        "if (valid) episode.reward += reward, ++episode.length;",
-        "if (valid) episode.reward += reward, episode.length = r.rows + 1;",
+        "else episodes_[n].reward += reward, ++episodes_[n].length;",
+        "else episodes_[n].reward += reward, episodes_[n].length = 1;",
         "collector", "keeps the row format", rules.EPISODES, "",
     ),
     Mutant(

@@ -21,7 +21,6 @@ from protocol.env_spec import EnvSpec
 from tests.clients.conftest import CPP
 from tests.clients.cpp_mutants import MUTANTS, Mutant
 
-pytestmark = [pytest.mark.clients, pytest.mark.timeout(1800)]  # the first test waits for the compiler
 FLAGS = ["-std=c++17", "-O0", "-ffp-contract=off", "-lzmq", "-lsodium", "-pthread"]
 BUILD_S = 300  # of one mutant, on a busy machine
 
@@ -53,11 +52,19 @@ def programs(
 ) -> dict[Mutant, Future[Path]]:
     """The programs of the mutants that are tested, built side by side."""
     tests = [test for test in request.session.items if isinstance(test, pytest.Function) and test.path == request.path]
-    mutants = [mutant for test in tests if isinstance(mutant := test.callspec.params["mutant"], Mutant)]
+    parameters = [test.callspec.params["mutant"] for test in tests if "mutant" in test.fixturenames]
+    mutants = [each for each in parameters if isinstance(each, Mutant)]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return {mutant: pool.submit(build, mutant, tmp_path_factory.mktemp("mutant")) for mutant in mutants}
 
 
+def test_every_mutant_changes_one_place(tmp_path: Path) -> None:
+    for number, mutant in enumerate(MUTANTS):
+        mutated(mutant, Path(shutil.copytree(CPP / "include", tmp_path / str(number))))
+
+
+@pytest.mark.clients
+@pytest.mark.timeout(1800)  # the first test waits for the compiler
 @pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: f"{mutant.name}, {mutant.profile}")
 def test_the_report_names_the_rule_that_a_mutant_breaks(mutant: Mutant, programs: dict[Mutant, Future[Path]]) -> None:
     checks = [check for check in PROFILES[mutant.profile] if mutant.check in check.name]
