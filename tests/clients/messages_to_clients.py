@@ -35,13 +35,12 @@ CARTPOLE = EnvSpec("CartPole-v1")
 OBSERVATION = Leaf("", "box", (4,), "float32")
 STEP = StepSpec((CARTPOLE,), (0,) * 4, (2, 2), (OBSERVATION,), (Leaf("", "discrete", (), "int64", (2,), (0,)),))
 POLICY = PolicySpec((OBSERVATION,), ActionSpec("discrete", (), "int64", (2,), (0,)), net=(8,))
-RUN = RunSpec(CARTPOLE, POLICY, 64, 2, 2, 1)
 OPTIONS = np.frombuffer(pack(None), np.uint8)
 FEW = (Received(0, 0, 1), Received(1, 0, 3, (5, 6)))
 
 
-def messages() -> list[ToWorker]:
-    """Every type of message, in an order in which a client obeys them."""
+def messages(lanes: int) -> list[ToWorker]:
+    """Every type of message, in an order in which a client obeys them. With one lane of a run, that has one copy."""
     weights = np.linspace(-1, 1, acting_size(POLICY), dtype=np.float32)
     return [
         Welcome(SESSION, 1, DescribeSpec(CARTPOLE)),
@@ -53,10 +52,10 @@ def messages() -> list[ToWorker]:
         Release(SESSION, (LaneIncarnation(0, 0),)),
         HeartbeatReply(SESSION, 1, FEW),
         Rejoin(SESSION),
-        Welcome(SESSION, 2, RUN),
+        Welcome(SESSION, 2, RunSpec(CARTPOLE, POLICY, rollout_steps=64, copies=lanes, lanes=lanes, seed=1)),
         Weights(3, weights, np.zeros(0, np.float32)),
         Weights(4, weights.astype(np.float16), np.zeros(0, np.float32)),
-        Collect(SESSION, 3, (Permit(10, 0, 0), Permit(11, 1, 1)), FEW),
+        Collect(SESSION, 3, (Permit(10, 0, 0), Permit(11, 1, 1))[:lanes], FEW[:lanes]),
         Evaluate(SESSION, 12, 4, (1, 2), True, 30, False, False),
         HeartbeatReply(SESSION, 2, FEW[:1]),
         Drain("the run is over"),
@@ -64,10 +63,10 @@ def messages() -> list[ToWorker]:
     ]
 
 
-def corpus() -> bytes:
+def corpus(lanes: int = 2) -> bytes:
     """For each message: the number of its frames, then the length and the bytes of each. Numbers are `<u4`."""
     parts = []
-    for message in messages():
+    for message in messages(lanes):
         frames = encode(message)
         parts.append(struct.pack("<I", len(frames)))
         parts += [struct.pack("<I", len(bytes(frame))) + bytes(frame) for frame in frames]

@@ -1,7 +1,6 @@
 // Counts what this library allocates in its step paths: allocations CORPUS. Prints how many allocations 1000 steps of the
 // environment profile made, and how many each of 20 rollouts of the collector profile made, after some to warm up.
 #include <cstdlib>
-#include <fstream>
 #include <new>
 
 static thread_local bool counting = false;
@@ -15,8 +14,7 @@ __attribute__((noinline)) void operator delete(void* made) noexcept { std::free(
 __attribute__((noinline)) void operator delete(void* made, std::size_t) noexcept { std::free(made); }
 
 #include "../examples/cartpole.hpp"
-
-using Frames = std::vector<std::vector<unsigned char>>;
+#include "corpus.hpp"
 
 class Counted : public millrace::Worker {
  public:
@@ -41,14 +39,7 @@ class Counted : public millrace::Worker {
 };
 
 int main(int, char** words) {
-  std::ifstream file(words[1], std::ios::binary);
-  std::vector<Frames> corpus;
-  std::uint32_t number;
-  auto next = [&] { return bool(file.read(reinterpret_cast<char*>(&number), 4)); };
-  while (next()) {
-    corpus.emplace_back(number);
-    for (auto& frame : corpus.back()) next(), frame.resize(number), file.read(reinterpret_cast<char*>(frame.data()), number);
-  }
+  const std::vector<Frames> corpus = read_corpus(words[1]);
   Counted client;
   millrace::Writer head;
   client.take(corpus[1]);  // Welcome, StepSpec

@@ -1,21 +1,50 @@
-// Feeds mutated messages of a learner to a whole client, in both profiles: fuzz CORPUS COUNT. Built with sanitizers.
-// Prints how many messages were read, and how many were refused as unreadable.
-#include <fstream>
+// Feeds mutated messages of a learner to whole clients, built with sanitizers: fuzz CORPUS COUNT worker|agent.
+// A worker takes part in both profiles. Prints how many messages were read, and how many were refused as unreadable.
 #include <iterator>
 
 #include "../examples/cartpole.hpp"
-
-using Bytes = std::vector<unsigned char>;
-using Frames = std::vector<Bytes>;
+#include "corpus.hpp"
+#include "millrace/agent.hpp"
 
 static millrace::Random random_bits{20261123};
 static std::size_t below(std::size_t n) { return n ? random_bits.bits() % n : 0; }
+static const std::int64_t fallback = 0;
 
-class Victim : public millrace::Worker {
+class Worker : public millrace::Worker {
  public:
-  Victim() : Worker({"inproc://nobody", "victim", ""}, CartPole::description(), [] { return std::make_unique<CartPole>(1); }) {}
-  bool take(const Frames& frames) {  // as if they had come from the socket; whether they could be read
+  Worker() : millrace::Worker({"inproc://nobody", "victim", ""}, CartPole::description(), [] { return std::make_unique<CartPole>(1); }) {}
+
+ protected:
+  void proceed() {
     std::unique_lock lock(mutex_);
+    for (int i = 0; i < 4 && state_ == State::ready && work(); ++i) {}
+  }
+};
+
+class Agent : public millrace::Agent {
+ public:
+  Agent() : millrace::Agent({"inproc://nobody", "victim", ""}, CartPole::description(), &fallback, 1) { world_.reset(1, obs_); }
+
+ protected:
+  void proceed() {
+    for (int i = 0; i < 8; ++i) {
+      const millrace::Action action{step(obs_, last_.reward, last_.terminated, last_.truncated)};
+      const bool ended = last_.terminated || last_.truncated;
+      last_ = ended ? millrace::Result{} : world_.step(action, obs_);
+      if (ended) world_.reset(std::nullopt, obs_);
+    }
+  }
+
+ private:
+  CartPole world_;
+  millrace::Result last_;
+  float obs_[4];
+};
+
+template <class Client>
+class Victim : public Client {
+ public:
+  bool take(const Frames& frames) {  // as if they had come from the socket; whether they could be read
     std::vector<millrace::Frame> views;
     std::vector<std::unique_ptr<unsigned char[]>> exact;  // so that a read beyond the end is seen
     for (const Bytes& frame : frames) {
@@ -24,23 +53,22 @@ class Victim : public millrace::Worker {
       views.push_back({exact.back().get(), frame.size()});
     }
     try {
-      decoder.decode(views, message);
+      std::unique_lock lock(this->mutex_);
+      decoder_.decode(views, message_);
+      if (message_.type == millrace::Type::Welcome) message_.attempt = this->attempt();
+      this->receive(message_);
     } catch (const millrace::BadMessage&) {
       return false;
     }
-    if (message.type == millrace::Type::Welcome) message.attempt = attempt();
-    try {
-      receive(message);
-      for (int i = 0; i < 4 && state_ == State::ready && work(); ++i) {}
-    } catch (const millrace::BadMessage&) {
-      return false;
-    }
+    this->proceed();
     return true;
   }
   void log(const std::string&) const override {}
-  bool over() const { return state_ == State::left; }
-  millrace::Decoder decoder;
-  millrace::Message message;
+  bool over() const { return this->state_ == Client::State::left; }
+
+ private:
+  millrace::Decoder decoder_;
+  millrace::Message message_;
 };
 
 static void mutate(Frames& frames) {
@@ -67,19 +95,11 @@ static void mutate(Frames& frames) {
   }
 }
 
-int main(int count, char** words) {
-  if (count != 3) return 2;
-  std::ifstream file(words[1], std::ios::binary);
-  std::vector<Frames> corpus;
-  std::uint32_t number;
-  auto next = [&] { return bool(file.read(reinterpret_cast<char*>(&number), 4)); };
-  while (next()) {
-    corpus.emplace_back(number);
-    for (Bytes& frame : corpus.back()) next(), frame.resize(number), file.read(reinterpret_cast<char*>(frame.data()), number);
-  }
-  long read = 0, unreadable = 0, left = std::atol(words[2]);
+template <class Client>
+void fuzz(const std::vector<Frames>& corpus, long left) {
+  long read = 0, unreadable = 0;
   while (left > 0) {
-    Victim victim;  // until it leaves, or for some messages
+    Victim<Client> victim;  // until it leaves, or for some messages
     for (std::size_t i = 0, start = below(2) ? 0 : 9; i < 300 && left > 0 && !victim.over(); ++i, --left) {
       Frames frames = corpus[i < corpus.size() - start ? start + i : below(corpus.size())];
       if (i) mutate(frames);
@@ -87,4 +107,10 @@ int main(int count, char** words) {
     }
   }
   std::printf("%ld read, %ld unreadable\n", read, unreadable);
+}
+
+int main(int count, char** words) {
+  if (count != 4) return 2;
+  const auto chosen = std::string(words[3]) == "agent" ? fuzz<Agent> : fuzz<Worker>;
+  chosen(read_corpus(words[1]), std::atol(words[2]));
 }
