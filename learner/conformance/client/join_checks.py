@@ -135,8 +135,9 @@ def describes(learner: Learner) -> Script[None]:
 
 def answers_heartbeats_in_order(learner: Learner) -> Script[None]:
     """Replies are lost, late and repeated."""
-    yield from in_any_session(learner)
-    first = yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat")
+    yield from learner.joining()
+    learner.welcome(describe_spec(learner))  # the first Heartbeat may come before Described, and is answered
+    first = yield from learner.expect(Heartbeat, rules.HEARTBEAT, "a Heartbeat", within_s=learner.settings.start_s)
     if first.replies:
         raise Broken(rules.HEARTBEAT_REPLIES, "replies 0 before the first HeartbeatReply of a session", f"{first.replies}")
     yield from _replies(learner, 1)

@@ -1,0 +1,28 @@
+# A walk to the corner of a grid, as a millrace worker: ruby grid_world.rb ADDRESS [NAME]
+require_relative "../millrace"
+
+class GridWorld
+  ID = "GridWorld-v0"
+  SIZE = 5
+  SHAPE, LOW, HIGH = [2], 0.0, 1.0 # an observation: x and y
+  ACTIONS = 4 # right, left, up, down
+  LONGEST_EPISODE = 30
+  MOVES = [[1, 0], [-1, 0], [0, 1], [0, -1]].freeze
+
+  def reset(seed)
+    @random = Random.new(seed) if seed || !@random
+    @x, @y, @steps = @random.rand(SIZE), @random.rand(SIZE - 1), 0 # never the goal
+    observation
+  end
+
+  # Returns the observation, the reward, whether the goal is reached, and whether the time is over.
+  def step(action)
+    @x, @y = [@x, @y].zip(MOVES[action]).map { |at, by| (at + by).clamp(0, SIZE - 1) }
+    @steps += 1
+    [observation, -1.0, [@x, @y] == [SIZE - 1, SIZE - 1], @steps == LONGEST_EPISODE]
+  end
+
+  def observation = [@x.fdiv(SIZE - 1), @y.fdiv(SIZE - 1)]
+end
+
+exit Worker.new(ARGV[0], GridWorld, ARGV[1] || "grid-#{Process.pid}").run

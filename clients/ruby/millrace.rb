@@ -1,0 +1,148 @@
+# A millrace worker in Ruby, environment profile: the learner acts, the worker resets and steps its env copies.
+# docs/how-to/write_a_client.md writes this file step by step. Observations are a Box of float32, actions Discrete.
+require "ffi-rzmq"
+require "msgpack"
+require "socket"
+
+class Worker
+  def initialize(address, environment, name)
+    @address, @environment, @name = address, environment, name
+    @context, @lock, @lanes, @steps = ZMQ::Context.new, Mutex.new, {}, 0
+    @life = @attempt = rand(2**52)
+    @give_up_at = now + 600
+    %w[TERM INT].each { |signal| trap(signal) { @stop = true } }
+  end
+
+  def run
+    @lock.lock
+    join
+    Thread.new { loop { sleep(0.1) && @lock.synchronize { beat if @session && now > @next_at } } }
+    until @exit_code
+      message = []
+      take(*message) if @socket.recv_strings(message) != -1
+      tick unless @exit_code
+    end
+    @socket.close
+    @context.terminate # waits until what was said is sent, for at most LINGER
+    @exit_code
+  end
+
+  def join
+    @session, @silence_s, @next_at, @pause_s = nil, 20, 0, 0.25
+    @attempt, @heard_at = @attempt + 1, now
+    @lanes.clear
+    @socket&.close
+    @socket = @context.socket(ZMQ::DEALER)
+    { ZMQ::IDENTITY => @name, ZMQ::LINGER => 2000, ZMQ::RCVTIMEO => 50 }.each { |key, value| @socket.setsockopt(key, value) }
+    @socket.connect(@address)
+  end
+
+  def say(head, *frames) = @socket.send_strings([head.to_msgpack, *frames], ZMQ::DONTWAIT)
+
+  def now = Process.clock_gettime(Process::CLOCK_MONOTONIC)
+
+  def tick
+    return leave(0, "asked to stop") if @stop
+    return leave(1, "no learner answers at #{@address}") if now > @give_up_at
+    return join if now > @heard_at + @silence_s
+
+    @session ? beat : hello if now > @next_at
+  end
+
+  def hello
+    say({ type: "Hello", protocol: 4, worker: @name, host: Socket.gethostname.encode("UTF-8"),
+          pid: Process.pid, life: @life, software: "millrace.rb", attempt: @attempt })
+    @next_at, @pause_s = now + @pause_s, [2 * @pause_s, 4].min
+  end
+
+  def leave(code, reason, last_message = ["Goodbye", @session, reason, []])
+    say(last_message) if @session && last_message
+    warn "#{@name}: #{reason}"
+    @exit_code = code
+  end
+
+  def take(head, *frames)
+    @heard_at = now
+    case [MessagePack.unpack(head, symbolize_keys: true), *frames]
+    in [{ type: "Refuse", reason: }] then leave(2, reason, nil)
+    in [["Drain", reason]] then leave(0, reason)
+    in [["Welcome", session, ^@attempt, run]] if @session.nil? then welcome(session, run)
+    in [["Rejoin", ^@session]] then join
+    in [["HeartbeatReply", ^@session, number, received]] if number > @replies
+      @replies = number
+      @lanes.select! { |lane, _| received.any? { |entry| entry[0] == lane } }
+    in [["Release", ^@session, lanes]] then @lanes.reject! { |number, lane| lanes.include?([number, lane.incarnation]) }
+    in [["Reset", ^@session, ticket, lane, incarnation, copies, seeds, _], _]
+      order(ticket, lane, incarnation) { |lane| copies.zip(seeds) { |copy, seed| lane[copy].reset(seed) } }
+    in [["Step", ^@session, ticket, lane, incarnation, [["<i8", [n], 1]]], bytes]
+      order(ticket, lane, incarnation) { |lane| lane.zip(bytes.unpack("q<#{n}")) { |copy, action| copy.step(action) } }
+    in [["Call", ^@session, ticket, lane, incarnation, _, name, _, _], _]
+      say(["Returned", @session, ticket, lane, incarnation, ["|u1", [1], 1], "#{name}: no such attribute", ""], [].to_msgpack)
+    else nil # of another session, or of no use to this worker
+    end
+  rescue StandardError => e
+    warn "#{@name}: cannot use a message: #{e.message}"
+  end
+
+  def welcome(session, run)
+    @session, @run, @replies, @next_at = session, run, 0, 0
+    @silence_s = run.fetch(:learner_timeout_s) { run[:type] == "StepSpec" ? 600 : 30 }
+    envs = (run[:envs] || [run[:env]]).map { |env| env.reject { |_, value| value.nil? || value.empty? } }
+    return if run[:type] != "RunSpec" && envs == [{ id: @environment::ID }] && [nil, "NextStep"].include?(run[:autoreset])
+
+    leave(2, "expected --inference learner and #{@environment::ID}, got a #{run[:type]} of #{envs}"[0, 1000])
+  end
+
+  def beat
+    say(["Heartbeat", @session, @replies, -1, [], @steps, {}, 0])
+    describe if @run[:type] == "DescribeSpec"
+    @next_at, @give_up_at = now + @run.fetch(:heartbeat_s, 1), now + 600
+  end
+
+  def describe
+    env = @environment
+    spaces = [["BoxSpace", env::SHAPE, "float32", ["<f4", [], 1], ["<f4", [], 2]], ["DiscreteSpace", env::ACTIONS, 0, "int64"]]
+    say(["Described", @session, [*spaces, ["|u1", [1], 3], "", env::LONGEST_EPISODE, ""]],
+        [env::LOW].pack("e"), [env::HIGH].pack("e"), {}.to_msgpack)
+  end
+
+  Lane = Struct.new(:incarnation, :copies, :ticket)
+  Copy = Struct.new(:env, :row) do # the row: observation, reward, terminated, truncated
+    def reset(seed) = self.row = [env.reset(seed), 0, false, false]
+
+    def step(action) = row && row.last(2).none? ? self.row = env.step(action) : reset(nil)
+  end
+
+  def order(ticket, number, incarnation)
+    lane = @lanes[number]
+    lane = open_lane(number, incarnation) if lane.nil? || incarnation > lane.incarnation
+    return if incarnation < lane.incarnation || ticket < lane.ticket # a late copy
+
+    beside_heartbeats { yield lane.copies } if ticket > lane.ticket # else its answer was lost
+    lane.ticket = ticket
+    answer([ticket, number, incarnation], lane.copies)
+  rescue StandardError => e
+    error, traceback = "lane #{number}: #{e.message.inspect}"[0, 1000], e.full_message(highlight: false)[0, 64_000]
+    leave(1, traceback, ["Failure", @session, error, traceback, number])
+  end
+
+  def open_lane(number, incarnation)
+    @lanes[number] = Lane.new(incarnation, Array.new(@run[:lanes][number] || 1) { Copy.new(@environment.new) }, -1)
+  end
+
+  def beside_heartbeats
+    @lock.unlock
+    yield
+  ensure
+    @lock.lock
+  end
+
+  def answer(order, copies)
+    n, shape = copies.size, @environment::SHAPE
+    before_the_first = [[0] * shape.reduce(1, :*), 0, false, false]
+    obs, reward, *flags = copies.map { |copy| copy.row || before_the_first }.transpose
+    arrays = [[["<f4", [n, *shape], 1]], ["<f8", [n], 2], ["|b1", [n], 3], ["|b1", [n], 4], ["|u1", [0], 5]]
+    flags.map! { |of_copies| of_copies.map { |flag| flag ? 1 : 0 }.pack("C*") }
+    say(["Stepped", @session, *order, *arrays], obs.flatten.pack("e*"), reward.pack("E*"), *flags, "")
+  end
+end
