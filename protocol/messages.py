@@ -49,7 +49,7 @@ class Hello(Message, frozen=True, array_like=False):  # a map, as in every versi
     """drawn at random for each process, for pids repeat in containers; a secret of the worker, its supervisor and learner"""
     software: Line
     attempt: Natural
-    """`process_nonce` + 1 when the process first joins, and one more each time that it starts to join again. A repeated
+    """`life` + 1 when the process first joins, and one more each time that it starts to join again. A repeated
     Hello keeps the number. So it also tells which process a Welcome answers."""
 
     @property
@@ -260,7 +260,7 @@ class Reset(Message, frozen=True):
     copies: tuple[Natural, ...]
     """which of the lane's copies, from 0"""
     seeds: tuple[int | None, ...]
-    """one seed for each of `copies`"""
+    """one seed for each of `copies`; null: go on with the random numbers that the copy has"""
     options: Array
     """[bytes] uint8, `protocol.wire.plain_values`: the options of `Env.reset`, or None"""
 
@@ -321,7 +321,7 @@ class Returned(Message, frozen=True):
     lane: Natural
     incarnation: Natural
     results: Array
-    """[bytes] uint8, `protocol.wire.plain_values`: a list with one result for each copy"""
+    """[bytes] uint8, `protocol.wire.plain_values`: a list with one result for each copy; no bytes if the call raised"""
     error: Line
     """type and message of the exception, in one line, if the call raised; else empty"""
     traceback: Text

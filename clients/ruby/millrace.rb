@@ -1,5 +1,5 @@
-# A millrace worker in Ruby, environment profile: the learner acts, the worker resets and steps its env copies.
-# docs/how-to/write_a_client.md writes this file step by step. Observations are a Box of float32, actions Discrete.
+# A millrace worker: the policy acts beside the learner, this worker resets and steps (environment profile).
+# docs/how-to/write_a_client.md writes this file, step by step. Observations: a float32 Box. Actions: Discrete.
 require "ffi-rzmq"
 require "msgpack"
 require "socket"
@@ -7,23 +7,23 @@ require "socket"
 class Worker
   def initialize(address, environment, name)
     @address, @environment, @name = address, environment, name
-    @context, @lock, @lanes, @steps = ZMQ::Context.new, Mutex.new, {}, 0
+    @context, @lock, @lanes, @held, @steps = ZMQ::Context.new, Mutex.new, {}, [], 0
     @life = @attempt = rand(2**52)
-    @give_up_at = now + 600
+    @give_up_at = now + 600 # seconds
     %w[TERM INT].each { |signal| trap(signal) { @stop = true } }
   end
 
   def run
     @lock.lock
     join
-    Thread.new { loop { sleep(0.1) && @lock.synchronize { beat if @session && now > @next_at } } }
+    Thread.new { loop { sleep 0.05; @lock.synchronize { beat if @session && now > @next_at } } } # see work
     until @exit_code
       message = []
-      take(*message) if @socket.recv_strings(message) != -1
+      take(*message) if @socket.recv_strings(message) != -1 # it waits for RCVTIMEO at most
       tick unless @exit_code
     end
     @socket.close
-    @context.terminate # waits until what was said is sent, for at most LINGER
+    @context.terminate # it waits until all is sent, for LINGER at most
     @exit_code
   end
 
@@ -33,19 +33,18 @@ class Worker
     @lanes.clear
     @socket&.close
     @socket = @context.socket(ZMQ::DEALER)
-    { ZMQ::IDENTITY => @name, ZMQ::LINGER => 2000, ZMQ::RCVTIMEO => 50 }.each { |key, value| @socket.setsockopt(key, value) }
+    @socket.identity = @name
+    { ZMQ::LINGER => 2000, ZMQ::RCVTIMEO => 50 }.each { |option, ms| @socket.setsockopt(option, ms) }
     @socket.connect(@address)
   end
 
-  def say(head, *frames) = @socket.send_strings([head.to_msgpack, *frames], ZMQ::DONTWAIT)
-
   def now = Process.clock_gettime(Process::CLOCK_MONOTONIC)
+  def say(head, *frames) = @socket.send_strings([head.to_msgpack, *frames], ZMQ::DONTWAIT)
 
   def tick
     return leave(0, "asked to stop") if @stop
     return leave(1, "no learner answers at #{@address}") if now > @give_up_at
     return join if now > @heard_at + @silence_s
-
     @session ? beat : hello if now > @next_at
   end
 
@@ -53,12 +52,6 @@ class Worker
     say({ type: "Hello", protocol: 4, worker: @name, host: Socket.gethostname.encode("UTF-8"),
           pid: Process.pid, life: @life, software: "millrace.rb", attempt: @attempt })
     @next_at, @pause_s = now + @pause_s, [2 * @pause_s, 4].min
-  end
-
-  def leave(code, reason, last_message = ["Goodbye", @session, reason, []])
-    say(last_message) if @session && last_message
-    warn "#{@name}: #{reason}"
-    @exit_code = code
   end
 
   def take(head, *frames)
@@ -71,39 +64,47 @@ class Worker
     in [["HeartbeatReply", ^@session, number, received]] if number > @replies
       @replies = number
       @lanes.select! { |lane, _| received.any? { |entry| entry[0] == lane } }
-    in [["Release", ^@session, lanes]] then @lanes.reject! { |number, lane| lanes.include?([number, lane.incarnation]) }
+    in [["Release", ^@session, lanes]]
+      @lanes.reject! { |held, lane| lanes.any? { |number, last| held == number && lane.incarnation <= last } }
     in [["Reset", ^@session, ticket, lane, incarnation, copies, seeds, _], _]
-      order(ticket, lane, incarnation) { |lane| copies.zip(seeds) { |copy, seed| lane[copy].reset(seed) } }
-    in [["Step", ^@session, ticket, lane, incarnation, [["<i8", [n], 1]]], bytes]
-      order(ticket, lane, incarnation) { |lane| lane.zip(bytes.unpack("q<#{n}")) { |copy, action| copy.step(action) } }
+      order(ticket, lane, incarnation) { |all| copies.zip(seeds) { |copy, seed| all[copy].reset(seed) } }
+    in [["Step", ^@session, ticket, lane, incarnation, [["<i8", [n], 1]]], bytes] if bytes.bytesize == 8 * n
+      @steps += n
+      order(ticket, lane, incarnation) { |all| all.zip(bytes.unpack("q<*")) { |copy, action| copy.step(action) } }
     in [["Call", ^@session, ticket, lane, incarnation, _, name, _, _], _]
-      say(["Returned", @session, ticket, lane, incarnation, ["|u1", [1], 1], "#{name}: no such attribute", ""], [].to_msgpack)
-    else nil # of another session, or of no use to this worker
+      say(["Returned", @session, ticket, lane, incarnation, ["|u1", [0], 1], "no attribute #{name}"[0, 1000], ""], "")
+    else nil # of another session, of no use here, or with a field or a frame too many
     end
   rescue StandardError => e
-    warn "#{@name}: cannot use a message: #{e.message}"
+    warn "#{@name}: cannot read a message: #{e.message}"
+  end
+
+  def leave(code, reason, last_words = ["Goodbye", @session, reason, []])
+    say(last_words) if @session && last_words
+    warn "#{@name}: #{reason}"
+    @exit_code = code
   end
 
   def welcome(session, run)
     @session, @run, @replies, @next_at = session, run, 0, 0
     @silence_s = run.fetch(:learner_timeout_s) { run[:type] == "StepSpec" ? 600 : 30 }
     envs = (run[:envs] || [run[:env]]).map { |env| env.reject { |_, value| value.nil? || value.empty? } }
-    return if run[:type] != "RunSpec" && envs == [{ id: @environment::ID }] && [nil, "NextStep"].include?(run[:autoreset])
-
+    return if run[:type] != "RunSpec" && envs == [{ id: @environment::ID }] &&
+              (run[:autoreset] || "NextStep") == "NextStep"
     leave(2, "expected --inference learner and #{@environment::ID}, got a #{run[:type]} of #{envs}"[0, 1000])
   end
 
   def beat
-    say(["Heartbeat", @session, @replies, -1, [], @steps, {}, 0])
+    say(["Heartbeat", @session, @replies, -1, @held, @steps, {}, 0])
     describe if @run[:type] == "DescribeSpec"
     @next_at, @give_up_at = now + @run.fetch(:heartbeat_s, 1), now + 600
   end
 
   def describe
-    env = @environment
-    spaces = [["BoxSpace", env::SHAPE, "float32", ["<f4", [], 1], ["<f4", [], 2]], ["DiscreteSpace", env::ACTIONS, 0, "int64"]]
-    say(["Described", @session, [*spaces, ["|u1", [1], 3], "", env::LONGEST_EPISODE, ""]],
-        [env::LOW].pack("e"), [env::HIGH].pack("e"), {}.to_msgpack)
+    box = ["BoxSpace", @environment::SHAPE, "float32", ["<f4", [], 1], ["<f4", [], 2]]
+    discrete = ["DiscreteSpace", @environment::ACTIONS, 0, "int64"]
+    say(["Described", @session, [box, discrete, ["|u1", [1], 3], "", @environment::LONGEST_EPISODE, ""]],
+        [@environment::LOW].pack("e"), [@environment::HIGH].pack("e"), {}.to_msgpack)
   end
 
   Lane = Struct.new(:incarnation, :copies, :ticket)
@@ -115,32 +116,31 @@ class Worker
 
   def order(ticket, number, incarnation)
     lane = @lanes[number]
-    lane = open_lane(number, incarnation) if lane.nil? || incarnation > lane.incarnation
+    lane = @lanes[number] = Lane.new(incarnation, nil, -1) if lane.nil? || incarnation > lane.incarnation
     return if incarnation < lane.incarnation || ticket < lane.ticket # a late copy
-
-    beside_heartbeats { yield lane.copies } if ticket > lane.ticket # else its answer was lost
+    work(ticket) { yield lane.copies ||= open_copies(number) } if ticket > lane.ticket # else its answer was lost
     lane.ticket = ticket
     answer([ticket, number, incarnation], lane.copies)
   rescue StandardError => e
-    error, traceback = "lane #{number}: #{e.message.inspect}"[0, 1000], e.full_message(highlight: false)[0, 64_000]
-    leave(1, traceback, ["Failure", @session, error, traceback, number])
+    error, traceback = "lane #{number}: #{e.message.inspect}", e.full_message(highlight: false)
+    leave(1, traceback, ["Failure", @session, error[0, 1000], traceback[0, 64_000], number])
   end
 
-  def open_lane(number, incarnation)
-    @lanes[number] = Lane.new(incarnation, Array.new(@run[:lanes][number] || 1) { Copy.new(@environment.new) }, -1)
-  end
+  def open_copies(number) = Array.new(@run[:lanes][number]) { Copy.new(@environment.new) }
 
-  def beside_heartbeats
+  def work(ticket) # while the environment works, the thread of run sends heartbeats
+    @held = [ticket]
     @lock.unlock
     yield
   ensure
     @lock.lock
+    @held = []
   end
 
   def answer(order, copies)
     n, shape = copies.size, @environment::SHAPE
-    before_the_first = [[0] * shape.reduce(1, :*), 0, false, false]
-    obs, reward, *flags = copies.map { |copy| copy.row || before_the_first }.transpose
+    none = [[0] * shape.reduce(1, :*), 0, false, false]
+    obs, reward, *flags = copies.map { |copy| copy.row || none }.transpose
     arrays = [[["<f4", [n, *shape], 1]], ["<f8", [n], 2], ["|b1", [n], 3], ["|b1", [n], 4], ["|u1", [0], 5]]
     flags.map! { |of_copies| of_copies.map { |flag| flag ? 1 : 0 }.pack("C*") }
     say(["Stepped", @session, *order, *arrays], obs.flatten.pack("e*"), reward.pack("E*"), *flags, "")

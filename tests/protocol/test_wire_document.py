@@ -181,6 +181,8 @@ def record(kind: type[msgspec.Struct]) -> str:
         lines += [f"A map; `{config.tag_field}` is `{kind.__name__}`." if config.tag else "A map.", ""]
     elif not rows:
         lines += [f'It has no fields: `["{kind.__name__}"]`.', ""]
+    elif config.tag and kind in RECORDS:
+        lines += [f"At place 0 stands its name, `{kind.__name__}`.", ""]
     if rows:
         places = "| place " if config.array_like else ""
         lines += [f"{places}| field | type | meaning |", "|---" * (4 if places else 3) + "|"]
@@ -228,7 +230,7 @@ def part_version() -> str:
 def part_example() -> str:
     weights = Weights(3, np.arange(6, dtype=np.float32), np.zeros(0, np.float32))
     collect = Collect(81985529216486895, 3, (Permit(40, 0, 1),), (Received(0, 1, 9, (10,)),))
-    hello = Hello(PROTOCOL_VERSION, "w0", "host", 7, 77, "millrace", 1)
+    hello = Hello(PROTOCOL_VERSION, "w0", "host", 7, 77, "millrace", 78)
     lines = ["```"]
     for message in (hello, collect, weights):
         head, *arrays = codec.encode(message)
@@ -241,7 +243,8 @@ def part_example() -> str:
 
 
 def part_dtypes() -> str:
-    return "Dtypes, in numpy's letters: " + ", ".join(f"`{dtype}`" for dtype in sorted(codec.DTYPES)) + ".\n"
+    names = [f"`{dtype}` is `{codec.DTYPES[dtype].name}`" for dtype in sorted(codec.DTYPES)]
+    return "Dtypes, in numpy's letters, and their names in spaces and specifications: " + ", ".join(names) + ".\n"
 
 
 def part_messages() -> str:
@@ -278,6 +281,10 @@ def part_types() -> str:
                 lines.append(f"| `{name}` | `{getattr(base, '__name__', base)}` | {', '.join(limits)} |")
             elif typing.get_origin(kind) is Literal:
                 lines.append(f"| `{name}` | `str` | one of {', '.join(f'`{one}`' for one in typing.get_args(kind))} |")
+            elif typing.get_origin(kind) is dict:
+                lines.append(f"| `{name}` | map | any of the names of `Stage`, each with `Seconds`; it may be empty |")
+            elif kind is space_spec.SpaceSpec:
+                lines.append(f"| `{name}` | record | {', '.join(f'`{one.__name__}`' for one in typing.get_args(kind))} |")
     return "\n".join(lines) + "\n"
 
 
@@ -329,6 +336,13 @@ OF_OBSERVERS = (messages.Inquire, messages.Status)
 def test_every_message_and_field_says_what_it_means(kind: type) -> None:
     assert ast.get_docstring(class_of(kind))
     assert [name for name, _, _, meaning in fields_of(kind) if not (meaning or WORDS.get(name))] == []
+
+
+def test_a_field_is_named_as_on_the_wire() -> None:
+    """No text calls it by a name that only the code has."""
+    renamed = {field.name: field.encode_name for field in msgspec.structs.fields(Hello) if field.name != field.encode_name}
+    assert renamed
+    assert not [name for name in renamed if re.search(rf"`{name}`", record(Hello))]
 
 
 def test_every_record_that_travels_is_described() -> None:

@@ -25,4 +25,4 @@ class GridWorld
   def observation = [@x.fdiv(SIZE - 1), @y.fdiv(SIZE - 1)]
 end
 
-exit Worker.new(ARGV[0], GridWorld, ARGV[1] || "grid-#{Process.pid}").run
+exit Worker.new(ARGV[0], GridWorld, ARGV[1] || "grid-#{Process.pid}").run if __FILE__ == $PROGRAM_NAME
