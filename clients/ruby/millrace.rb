@@ -6,10 +6,9 @@ require "socket"
 
 class Worker
   def initialize(address, environment, name)
-    @address, @environment, @name = address, environment, name
+    @address, @environment, @name, @give_up_at = address, environment, name, now + 600 # seconds
     @context, @lock, @lanes, @held, @steps = ZMQ::Context.new, Mutex.new, {}, [], 0
     @life = @attempt = rand(2**52)
-    @give_up_at = now + 600 # seconds
     %w[TERM INT].each { |signal| trap(signal) { @stop = true } }
   end
 
@@ -69,8 +68,10 @@ class Worker
     in [["Reset", ^@session, ticket, lane, incarnation, copies, seeds, _], _]
       order(ticket, lane, incarnation) { |all| copies.zip(seeds) { |copy, seed| all[copy].reset(seed) } }
     in [["Step", ^@session, ticket, lane, incarnation, [["<i8", [n], 1]]], bytes] if bytes.bytesize == 8 * n
-      @steps += n
-      order(ticket, lane, incarnation) { |all| all.zip(bytes.unpack("q<*")) { |copy, action| copy.step(action) } }
+      order(ticket, lane, incarnation) do |all|
+        all.zip(bytes.unpack("q<*")) { |copy, action| copy.step(action) }
+        @steps += n
+      end
     in [["Call", ^@session, ticket, lane, incarnation, _, name, _, _], _]
       say(["Returned", @session, ticket, lane, incarnation, ["|u1", [0], 1], "no attribute #{name}"[0, 1000], ""], "")
     else nil # of another session, of no use here, or with a field or a frame too many
@@ -122,7 +123,7 @@ class Worker
     lane.ticket = ticket
     answer([ticket, number, incarnation], lane.copies)
   rescue StandardError => e
-    error, traceback = "lane #{number}: #{e.message.inspect}", e.full_message(highlight: false)
+    error, traceback = "lane #{number}: #{e.message.inspect}", [e.message, *e.backtrace].join("\n")
     leave(1, traceback, ["Failure", @session, error[0, 1000], traceback[0, 64_000], number])
   end
 

@@ -10,7 +10,7 @@ class GridWorld
   MOVES = [[1, 0], [-1, 0], [0, 1], [0, -1]].freeze
 
   def reset(seed)
-    @random = Random.new(seed) if seed || !@random
+    @random = seed ? Random.new(seed) : @random || Random.new
     @x, @y, @steps = @random.rand(SIZE), @random.rand(SIZE - 1), 0 # never the goal
     observation
   end
