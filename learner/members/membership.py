@@ -52,6 +52,7 @@ from protocol.specs import DescribeSpec, RunSpec, StepSpec
 MEASURE_S = 0.5  # at least, between the two heartbeats that a worker's speed is measured by
 REMEMBERED = 1_000  # refused processes, and names of silent workers; a peer with many names must not fill the memory
 MAX_MEMBERS = 4_096
+MAX_LATE_ACTIONS = 1_000_000  # between two heartbeats
 SUPERVISOR_WORD_S = 5.0  # what a supervisor said is shown for this long
 
 Outgoing = tuple[bytes, ToWorker]
@@ -117,12 +118,16 @@ class Member:
         return self.lost_on_the_way(heartbeat, self.tickets)
 
     def new_late_actions(self, heartbeat: Heartbeat) -> int:
-        """The late actions since the last heartbeat. Those before this session belong to an earlier one."""
+        """The late actions since the last heartbeat. Those before this session belong to an earlier one.
+
+        A number that no loop can reach between two heartbeats is not counted.
+        """
         if self.heartbeat is not None:
             before = self.heartbeat.late_actions
         else:
             before = 0 if self.hello.is_first_attempt else heartbeat.late_actions
-        return max(0, heartbeat.late_actions - before)
+        more = heartbeat.late_actions - before
+        return more if 0 <= more <= MAX_LATE_ACTIONS else 0
 
     def lost_on_the_way(self, heartbeat: Heartbeat, sent: Mapping[int, int]) -> list[int]:
         """Those of the tickets in `sent` that were lost; for each, it has the value of `replies` when it was last sent.

@@ -90,6 +90,7 @@ class Soak:
 
     def __init__(self, stage: Stage, network: Network, seed: int, eval_every: int, minutes: float) -> None:
         self.seconds = 60 * minutes
+        self._eval_every = eval_every
         hosts = [network.host(number) for number in (1, 2, 3)]
         here = hosts[0]
         self.address = f"tcp://{here.address}:{PORT}"
@@ -183,7 +184,7 @@ class Soak:
         assert code == 0, f"the last learner ended with {code}: {self.scene.learner.said()[-3000:]}"
 
     def _an_evaluation_began(self) -> bool:
-        """Whether an evaluation is under way that was not seen before: there is a checkpoint of it, and no row yet."""
+        """Whether an evaluation is under way that was not seen before."""
         checkpoints = self.scene.learner.checkpoints()
         if not checkpoints or checkpoints[-1].name == self._evaluation or not self._evaluates(checkpoints[-1]):
             return False
@@ -191,10 +192,15 @@ class Soak:
         return True
 
     def _evaluates(self, newest: Path) -> bool:
+        """Whether an evaluation is due after the newest row, its checkpoint is written, and its result is not."""
         with (self.scene.learner.folder / "metrics.jsonl").open("rb") as file:
             file.seek(max(0, file.seek(0, 2) - 20_000))
-            steps = re.findall(rb'"time/total_timesteps": ?(\d+)', file.read())
-        return bool(steps) and int(newest.stem) > int(steps[-1])
+            lines = file.read().splitlines(keepends=True)[1:]
+        rows = [json.loads(line) for line in lines if line.endswith(b"\n")]
+        if not rows or int(rows[-1]["time/total_timesteps"]) != int(newest.stem) or "eval/mean_reward" in rows[-1]:
+            return False
+        earlier = [steps for row in rows if (steps := int(row["time/total_timesteps"])) < int(newest.stem)]
+        return bool(earlier) and int(newest.stem) // self._eval_every > earlier[-1] // self._eval_every
 
     def _make(self, fault: Fault, now: float) -> None:
         self.faults[fault.name] += 1

@@ -13,6 +13,7 @@ import pytest
 import zmq
 
 from learner.members.events import Event, RejoinRequested, RolloutDropped, WorkerLeft, describe
+from learner.members.membership import MAX_LATE_ACTIONS
 from learner.rollouts.hub import Hub, HubSettings
 from learner.rollouts.status import status
 from learner.run_folder.json_log import JsonLines, progress_line
@@ -76,6 +77,14 @@ def test_late_actions_are_counted_once_also_when_a_worker_joins_again() -> None:
     learner.joins(b"a", pid=2)
     late(learner, b"a", 2)
     assert told(learner).ledger["late_actions"] == 8
+
+
+def test_a_number_of_late_actions_that_no_loop_can_reach_is_not_counted() -> None:
+    learner = Learner()
+    learner.joins(b"a")
+    for actions in (2, 2**60, 1, MAX_LATE_ACTIONS + 1):
+        late(learner, b"a", actions)
+    assert told(learner).ledger["late_actions"] == 2 + MAX_LATE_ACTIONS
 
 
 def test_late_actions_have_a_column_if_there_are_any() -> None:
