@@ -362,7 +362,7 @@ def test_a_signal_drains_the_client(stage: Stage, cpp: Path) -> None:
 def test_a_hundred_thousand_mutated_messages_do_no_harm(cpp: Path, tmp_path: Path, client: str) -> None:
     """Built with the address and undefined-behaviour sanitizers, a client takes each of them: a worker in both profiles."""
     (tmp_path / "corpus").write_bytes(corpus(1 if client == "agent" else 2))
-    command = [cpp / "fuzz", tmp_path / "corpus", "100000", client]
+    command = [str(cpp / "fuzz"), str(tmp_path / "corpus"), "100000", client]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-4000:]
     read, unreadable = map(int, re.findall(r"\d+", done.stdout))
