@@ -1,5 +1,5 @@
-# A millrace worker: the policy acts beside the learner, this worker resets and steps (environment profile).
-# docs/how-to/write_a_client.md writes this file, step by step. Observations: a float32 Box. Actions: Discrete.
+# A millrace worker of the environment profile: the learner acts, this worker resets and steps.
+# docs/how-to/write_a_client.md writes it step by step. Observations: a float32 Box. Actions: Discrete.
 require "ffi-rzmq"
 require "msgpack"
 require "socket"
@@ -15,7 +15,7 @@ class Worker
   def run
     @lock.lock
     join
-    Thread.new { loop { sleep 0.05; @lock.synchronize { beat if @session && now > @next_at } } } # see work
+    Thread.new { loop { sleep 0.05; @lock.synchronize { beat if @session && now > @next_at } } }
     until @exit_code
       message = []
       take(*message) if @socket.recv_strings(message) != -1 # it waits for RCVTIMEO at most
@@ -64,16 +64,16 @@ class Worker
       @replies = number
       @lanes.select! { |lane, _| received.any? { |entry| entry[0] == lane } }
     in [["Release", ^@session, lanes]]
-      @lanes.reject! { |held, lane| lanes.any? { |number, last| held == number && lane.incarnation <= last } }
+      @lanes.reject! { |held, lane| lanes.any? { |n, last| held == n && lane.incarnation <= last } }
     in [["Reset", ^@session, ticket, lane, incarnation, copies, seeds, _], _]
-      order(ticket, lane, incarnation) { |all| copies.zip(seeds) { |copy, seed| all[copy].reset(seed) } }
-    in [["Step", ^@session, ticket, lane, incarnation, [["<i8", [n], 1]]], bytes] if bytes.bytesize == 8 * n
+      order(ticket, lane, incarnation) { |all| copies.zip(seeds) { |n, seed| all[n].reset(seed) } }
+    in [["Step", ^@session, ticket, lane, incarnation, [["<i8", [n], 1]]], raw] if raw.bytesize == 8 * n
       order(ticket, lane, incarnation) do |all|
-        all.zip(bytes.unpack("q<*")) { |copy, action| copy.step(action) }
+        all.zip(raw.unpack("q<*")) { |copy, action| copy.step(action) }
         @steps += n
       end
-    in [["Call", ^@session, ticket, lane, incarnation, _, name, _, _], _]
-      say(["Returned", @session, ticket, lane, incarnation, ["|u1", [0], 1], "no attribute #{name}"[0, 1000], ""], "")
+    in [["Call", ^@session, ticket, lane, incarnation, _, _, _, _], _]
+      say(["Returned", @session, ticket, lane, incarnation, ["|u1", [0], 1], "no attributes", ""], "")
     else nil # of another session, of no use here, or with a field or a frame too many
     end
   rescue StandardError => e
@@ -89,10 +89,10 @@ class Worker
   def welcome(session, run)
     @session, @run, @replies, @next_at = session, run, 0, 0
     @silence_s = run.fetch(:learner_timeout_s) { run[:type] == "StepSpec" ? 600 : 30 }
-    envs = (run[:envs] || [run[:env]]).map { |env| env.reject { |_, value| value.nil? || value.empty? } }
+    envs = (run[:envs] || [run[:env]]).map { |env| env.reject { |_, v| v.nil? || v.empty? } }
     return if run[:type] != "RunSpec" && envs == [{ id: @environment::ID }] &&
               (run[:autoreset] || "NextStep") == "NextStep"
-    leave(2, "expected --inference learner and #{@environment::ID}, got a #{run[:type]} of #{envs}"[0, 1000])
+    leave(2, "expected --inference learner, #{@environment::ID}; got #{run[:type]}, #{envs}"[0, 1000])
   end
 
   def beat
@@ -104,22 +104,21 @@ class Worker
   def describe
     box = ["BoxSpace", @environment::SHAPE, "float32", ["<f4", [], 1], ["<f4", [], 2]]
     discrete = ["DiscreteSpace", @environment::ACTIONS, 0, "int64"]
-    say(["Described", @session, [box, discrete, ["|u1", [1], 3], "", @environment::LONGEST_EPISODE, ""]],
+    say(["Described", @session, [box, discrete, ["|u1", [1], 3], "", @environment::TIME_LIMIT, ""]],
         [@environment::LOW].pack("e"), [@environment::HIGH].pack("e"), {}.to_msgpack)
   end
 
   Lane = Struct.new(:incarnation, :copies, :ticket)
   Copy = Struct.new(:env, :row) do # the row: observation, reward, terminated, truncated
     def reset(seed) = self.row = [env.reset(seed), 0, false, false]
-
     def step(action) = row && row.last(2).none? ? self.row = env.step(action) : reset(nil)
   end
 
   def order(ticket, number, incarnation)
     lane = @lanes[number]
-    lane = @lanes[number] = Lane.new(incarnation, nil, -1) if lane.nil? || incarnation > lane.incarnation
+    lane = @lanes[number] = Lane.new(incarnation, nil, -1) if !lane || incarnation > lane.incarnation
     return if incarnation < lane.incarnation || ticket < lane.ticket # a late copy
-    work(ticket) { yield lane.copies ||= open_copies(number) } if ticket > lane.ticket # else its answer was lost
+    work(ticket) { yield lane.copies ||= open_copies(number) } if ticket > lane.ticket # only once
     lane.ticket = ticket
     answer([ticket, number, incarnation], lane.copies)
   rescue StandardError => e
@@ -142,8 +141,9 @@ class Worker
     n, shape = copies.size, @environment::SHAPE
     none = [[0] * shape.reduce(1, :*), 0, false, false]
     obs, reward, *flags = copies.map { |copy| copy.row || none }.transpose
-    arrays = [[["<f4", [n, *shape], 1]], ["<f8", [n], 2], ["|b1", [n], 3], ["|b1", [n], 4], ["|u1", [0], 5]]
     flags.map! { |of_copies| of_copies.map { |flag| flag ? 1 : 0 }.pack("C*") }
-    say(["Stepped", @session, *order, *arrays], obs.flatten.pack("e*"), reward.pack("E*"), *flags, "")
+    say(["Stepped", @session, *order, [["<f4", [n, *shape], 1]], ["<f8", [n], 2],
+         ["|b1", [n], 3], ["|b1", [n], 4], ["|u1", [0], 5]],
+        obs.flatten.pack("e*"), reward.pack("E*"), *flags, "")
   end
 end

@@ -6,7 +6,7 @@ class GridWorld
   SIZE = 5
   SHAPE, LOW, HIGH = [2], 0.0, 1.0 # an observation: x and y
   ACTIONS = 4 # right, left, up, down
-  LONGEST_EPISODE = 30
+  TIME_LIMIT = 30 # steps of an episode
   MOVES = [[1, 0], [-1, 0], [0, 1], [0, -1]].freeze
 
   def reset(seed)
@@ -19,7 +19,7 @@ class GridWorld
   def step(action)
     @x, @y = [@x, @y].zip(MOVES[action]).map { |at, by| (at + by).clamp(0, SIZE - 1) }
     @steps += 1
-    [observation, -1.0, [@x, @y] == [SIZE - 1, SIZE - 1], @steps == LONGEST_EPISODE]
+    [observation, -1.0, [@x, @y] == [SIZE - 1, SIZE - 1], @steps == TIME_LIMIT]
   end
 
   def observation = [@x.fdiv(SIZE - 1), @y.fdiv(SIZE - 1)]
