@@ -90,8 +90,8 @@ MUTANTS = [
     ),
     Mutant(
         "obeys another session", "session.hpp",
-        "if (m.type != Type::Welcome && m.session && *m.session != session_) return;",
-        "",
+        "state_ == State::joining || (m.session && *m.session != session_)",
+        "state_ == State::joining",
         "environment", "an order of another session", rules.OTHER_SESSION, "Stepped(",
     ),
     Mutant(
@@ -103,8 +103,8 @@ MUTANTS = [
     ),
     Mutant(
         "ignores Drain", "session.hpp",
-        "case Type::Drain: return drain(m.text, false);",
-        "case Type::Drain: return;",
+        "draining ? void() : drain(m.text, false);",
+        "void();",
         "environment", "says Goodbye after Drain", rules.DRAIN, "none within",
     ),
     Mutant(
@@ -145,8 +145,8 @@ MUTANTS = [
     ),
     Mutant(
         "obeys a lower incarnation", "worker.hpp",
-        "m.incarnation < lane.incarnation || ",
-        "",
+        "if (order < newest) return;",
+        "if (order < newest && m.incarnation == lane.incarnation) return;",
         "environment", "starts a lane again", rules.INCARNATION, "incarnation 2",
     ),
     Mutant(
@@ -163,8 +163,8 @@ MUTANTS = [
     ),
     Mutant(
         "obeys an old order", "worker.hpp",
-        "m.incarnation == lane.incarnation && m.ticket < lane.ticket",
-        "false",
+        "if (order < newest) return;",
+        "if (m.incarnation < lane.incarnation) return;",
         "environment", "ignores a late copy of an order", rules.ORDER_OLD, "Stepped(",
     ),
     Mutant(
@@ -243,8 +243,8 @@ MUTANTS = [
     ),
     Mutant(
         "wrong layout of weights", "policy.hpp",
-        "layer.weight[i * layer.outputs + o] = as_float",
-        "layer.weight[o * layer.inputs + i] = as_float",
+        "layer.weight[i * layer.outputs + o] = *next++",
+        "layer.weight[o * layer.inputs + i] = *next++",
         "collector", "collects rollouts", rules.LOG_PROB, "-",
     ),
     Mutant(
@@ -303,8 +303,8 @@ MUTANTS = [
     ),
     Mutant(
         "other weights in the middle of a rollout", "rollouts.hpp",
-        "    policy_.check(m);\n",
-        "    policy_.check(m), policy_.load(m);\n",
+        "policy_.take(m);",
+        "policy_.take(m), policy_.load();",
         "collector", "keeps the weights of a rollout", rules.LOG_PROB, "",
     ),
     Mutant(
@@ -359,8 +359,8 @@ MUTANTS = [
     ),
     Mutant(
         "takes work while it drains", "session.hpp",
-        "default: if (!ready) return;",
-        "default: if (joining) return;",
+        "default: if (draining) return;",
+        "default: break;",
         "collector", "no work while it drains", rules.DRAINING_IGNORES, "",
     ),
     Mutant(
@@ -373,7 +373,7 @@ MUTANTS = [
     ),
     Mutant(
         "evaluates without end", "worker.hpp",
-        " && episode.length < played.most_steps",
+        " && episode.length < evaluation.most_steps",
         "",
         "collector", "evaluates", rules.EVALUATE, "steps",
     ),

@@ -103,8 +103,8 @@ class Agent : public CollectorSession {
   void begin_rows(const void* obs) {
     if (load_newest()) acts_ = true;
     if (evaluation_) return;
-    if (EvaluationOrder* order = next_evaluation()) {  // on the one environment that there is, from the next episode on
-      if (rows_->ended[0]) evaluation_ = std::make_unique<Playing>(Playing{*order, {order->ticket, {}, {}}, {}, now_s(), false});
+    if (const Evaluation* order = next_evaluation()) {  // on the one environment that there is, from the next episode on
+      if (rows_->ended[0]) evaluation_ = std::make_unique<Playing>(Playing{*order, {}, now_s(), false});
       return;
     }
     rollout_ = next_rollout();
@@ -113,7 +113,7 @@ class Agent : public CollectorSession {
     rows_->begin(*rollout_);
   }
 
-  struct Playing { EvaluationOrder order; Evaluation evaluation; Episode episode; double start_s; bool counts; };
+  struct Playing { Evaluation evaluation; Episode episode; double start_s; bool counts; };
   void evaluate(double reward, bool end, double now) {  // seeds are not used: the client resets its environment as it does
     Playing& p = *evaluation_;
     if (rows_->ended[0]) {  // a new episode began
@@ -122,11 +122,11 @@ class Agent : public CollectorSession {
     }
     if (!p.counts) return;
     p.episode.reward += reward, ++p.episode.length;
-    if (!end && p.episode.length < p.order.most_steps) return;
+    if (!end && p.episode.length < p.evaluation.most_steps) return;
     p.episode.seconds = now - p.start_s, p.counts = false;
     p.evaluation.episodes.push_back(p.episode);
     p.evaluation.cut.push_back(!end);
-    if (p.evaluation.episodes.size() == p.order.seeds.size()) evaluated(p.evaluation), evaluation_.reset();
+    if (p.evaluation.episodes.size() == p.evaluation.seeds.size()) evaluated(p.evaluation), evaluation_.reset();
   }
 
   const void* fallback_;

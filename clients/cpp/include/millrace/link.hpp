@@ -6,7 +6,6 @@
 #include <zmq.h>
 
 #include <cerrno>
-#include <initializer_list>
 
 #include "messages.hpp"
 
@@ -82,10 +81,9 @@ class Link {
   ~Link() { close(); }
   Link(const Link&) = delete;
 
-  void send(const Writer& head, std::initializer_list<Frame> arrays = {}) {
-    std::size_t left = arrays.size();
+  void send(const Writer& head, const Frame* arrays = nullptr, std::size_t left = 0) {
     if (zmq_send(socket_, head.bytes.data(), head.bytes.size(), ZMQ_DONTWAIT | (left ? ZMQ_SNDMORE : 0)) < 0) return;
-    for (const Frame& frame : arrays) zmq_send(socket_, frame.data, frame.size, ZMQ_DONTWAIT | (--left ? ZMQ_SNDMORE : 0));
+    for (; left; ++arrays) zmq_send(socket_, arrays->data, arrays->size, ZMQ_DONTWAIT | (--left ? ZMQ_SNDMORE : 0));
   }
   bool wait(double seconds) {  // until something arrived; also ends at a signal
     zmq_pollitem_t items[] = {{socket_, 0, ZMQ_POLLIN, 0}, {monitor_, 0, ZMQ_POLLIN, 0}};

@@ -30,7 +30,6 @@ struct Leaf {  // Leaf and ActionSpec of the wire document
   std::string kind, dtype;
   std::vector<std::size_t> shape;
   std::vector<std::int64_t> sizes, start;
-  std::vector<double> low, high;
 };
 
 struct Run {  // DescribeSpec, RunSpec or StepSpec
@@ -196,8 +195,7 @@ class Decoder {
   template <class T> static void list(Reader& r, std::vector<T>& into) {
     into.clear();
     for (std::size_t n = r.array(); n; --n) {
-      if constexpr (std::is_same_v<T, double>) into.push_back(r.real());
-      else if constexpr (std::is_same_v<T, std::int64_t>) into.push_back(r.whole());
+      if constexpr (std::is_same_v<T, std::int64_t>) into.push_back(r.whole());
       else into.push_back(r.natural());
     }
   }
@@ -210,8 +208,6 @@ class Decoder {
       else if (name == "shape") list(r, leaf.shape);
       else if (name == "sizes") list(r, leaf.sizes);
       else if (name == "start") list(r, leaf.start);
-      else if (name == "low") list(r, leaf.low);
-      else if (name == "high") list(r, leaf.high);
       else return false;
       return true;
     });
@@ -243,7 +239,6 @@ class Decoder {
       else if (name == "activation") run.relu = r.text(40) == "relu";
       else if (name == "normalize_observations") run.normalize = r.boolean();
       else if (name == "head") { if (r.text(40) != "actor_critic") run.beyond = "a policy of this algorithm"; }
-      else if (name == "dueling") r.boolean();
       else if (name == "encoder") must_be_nil("an encoder");
       else if (name == "core") must_be_nil("a recurrent core");
       else if (name == "own") {

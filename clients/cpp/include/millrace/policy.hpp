@@ -40,28 +40,30 @@ class Policy {
     }
     layers_.push_back({width, outputs_, {}, {}});
     x_.resize(widest), y_.resize(widest), params_.resize(outputs_), log_std_.resize(action.kind == "box" ? outputs_ : 0);
+    size_ = log_std_.size();
+    for (const Layer& layer : layers_) size_ += layer.outputs * (layer.inputs + 1);
   }
 
-  void check(const Message& weights) const {  // throws BadMessage if they are not of this policy
+  void take(const Message& weights) {  // the next weights. Throws BadMessage if they are not of this policy
     const Array &given = weights.arrays[0], &buffers = weights.arrays[1];
-    std::size_t expected = log_std_.size();
-    for (const Layer& layer : layers_) expected += layer.outputs * (layer.inputs + 1);
     bool known = given.dtype == "<f4" || given.dtype == "<f2" || given.dtype == "<u2";
-    if (!known || given.elements != expected || buffers.elements != (normalize_ ? 2 * inputs_ : 0))
-      throw BadMessage("Weights: expected " + std::to_string(expected) + " parameters, got " + std::to_string(given.elements));
+    if (!known || given.elements != size_ || buffers.elements != (normalize_ ? 2 * inputs_ : 0))
+      throw BadMessage("Weights: expected " + std::to_string(size_) + " parameters, got " + std::to_string(given.elements));
+    next_.resize(size_);
+    for (std::size_t i = 0; i < size_; ++i) next_[i] = as_float(given, i);
+    const float* numbers = static_cast<const float*>(buffers.data);
+    next_buffers_.assign(numbers, numbers + buffers.elements);
   }
-  void load(const Message& weights) {  // checked ones, in the order of the wire document: linear weights are [out, in]
-    const Array &given = weights.arrays[0], &buffers = weights.arrays[1];
-    std::size_t at = 0;
+  void load() {  // act under the weights that were taken last, which are in the order of the wire document
+    const float* next = next_.data();
     for (Layer& layer : layers_) {
       layer.weight.resize(layer.inputs * layer.outputs), layer.bias.resize(layer.outputs);
       for (std::size_t o = 0; o < layer.outputs; ++o)
-        for (std::size_t i = 0; i < layer.inputs; ++i) layer.weight[i * layer.outputs + o] = as_float(given, at++);  // [in, out]
-      for (float& each : layer.bias) each = as_float(given, at++);
+        for (std::size_t i = 0; i < layer.inputs; ++i) layer.weight[i * layer.outputs + o] = *next++;  // [out, in] -> [in, out]
+      for (float& each : layer.bias) each = *next++;
     }
-    for (float& each : log_std_) each = as_float(given, at++);
-    const float* numbers = static_cast<const float*>(buffers.data);
-    buffers_.assign(numbers, numbers + buffers.elements);
+    for (float& each : log_std_) each = *next++;
+    buffers_ = next_buffers_;
   }
 
   void act(const void* obs, Random* random, void* action, float* log_prob) {  // without random numbers: the most probable action
@@ -151,9 +153,9 @@ class Policy {
 
   Space observation_, action_;
   bool relu_ = false, normalize_ = false;
-  std::size_t inputs_ = 0, outputs_ = 0;
+  std::size_t inputs_ = 0, outputs_ = 0, size_ = 0;
   std::vector<Layer> layers_;
-  std::vector<float> x_, y_, params_, log_std_, buffers_;
+  std::vector<float> x_, y_, params_, log_std_, buffers_, next_, next_buffers_;
 };
 
 }  // namespace millrace

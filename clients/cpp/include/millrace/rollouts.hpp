@@ -99,8 +99,13 @@ struct Held {  // of one lane
   std::deque<std::uint64_t> finished;              // the last of them, to know a late repeat
 };
 
-struct EvaluationOrder { std::uint64_t ticket, version, most_steps; bool greedy; std::vector<std::uint64_t> seeds; };
-struct Evaluation { std::uint64_t ticket; std::vector<Episode> episodes; std::vector<bool> cut; };
+struct Evaluation {  // an order, and its answer: an episode for each seed
+  std::uint64_t ticket, version, most_steps;
+  bool greedy;
+  std::vector<std::uint64_t> seeds;
+  std::vector<Episode> episodes;
+  std::vector<bool> cut;
+};
 
 class CollectorSession : public Session {  // a Session that holds the weights and what belongs to tickets
  public:
@@ -122,7 +127,7 @@ class CollectorSession : public Session {  // a Session that holds the weights a
     loaded_ = false;
     return "";
   }
-  void end_collecting() { held_.clear(), orders_.clear(), answers_.clear(), weights_.clear(), loaded_ = false; }
+  void end_collecting() { held_.clear(), orders_.clear(), answers_.clear(); }
 
   void handle_collecting(const Message& m) {
     switch (m.type) {
@@ -139,7 +144,7 @@ class CollectorSession : public Session {  // a Session that holds the weights a
   const std::vector<std::uint64_t>& tickets() override {
     listed_.clear();
     for (auto& [number, lane] : held_) for (auto& [ticket, version] : lane.tickets) listed_.push_back(ticket);
-    for (EvaluationOrder& order : orders_) listed_.push_back(order.ticket);
+    for (const Evaluation& order : orders_) listed_.push_back(order.ticket);
     return listed_;
   }
   std::vector<std::uint64_t> lanes() const override {
@@ -154,12 +159,7 @@ class CollectorSession : public Session {  // a Session that holds the weights a
 
   bool load_newest() {  // let the policy act under the newest weights; false if there are none
     if (version_ < 0) return false;
-    if (!loaded_) {
-      Message weights;
-      Decoder().decode(weight_frames_, weights);
-      policy_.load(weights);
-      loaded_ = true;
-    }
+    if (!loaded_) policy_.load(), loaded_ = true;
     return true;
   }
   std::unique_ptr<Rollout> next_rollout() {  // for the oldest ticket that can start; null if there is none
@@ -188,15 +188,15 @@ class CollectorSession : public Session {  // a Session that holds the weights a
     send_rollout(*rollout);
     held.kept.push_back(std::move(rollout));
   }
-  EvaluationOrder* next_evaluation() {  // the oldest of the version held; those of older versions are dropped
-    auto older = [&](const EvaluationOrder& order) { return static_cast<std::int64_t>(order.version) < version_; };
+  const Evaluation* next_evaluation() {  // the oldest of the version held; those of older versions are dropped
+    auto older = [&](const Evaluation& order) { return static_cast<std::int64_t>(order.version) < version_; };
     orders_.erase(std::remove_if(orders_.begin(), orders_.end(), older), orders_.end());
-    for (EvaluationOrder& order : orders_)
+    for (const Evaluation& order : orders_)
       if (static_cast<std::int64_t>(order.version) == version_ && load_newest()) return &order;
     return nullptr;
   }
   void evaluated(const Evaluation& evaluation) {
-    auto same = [&](const EvaluationOrder& order) { return order.ticket == evaluation.ticket; };
+    auto same = [&](const Evaluation& order) { return order.ticket == evaluation.ticket; };
     auto found = std::find_if(orders_.begin(), orders_.end(), same);
     if (found == orders_.end()) return;
     orders_.erase(found);
@@ -211,18 +211,7 @@ class CollectorSession : public Session {  // a Session that holds the weights a
   void take_weights(const Message& m) {
     if (static_cast<std::int64_t>(m.version) <= version_) return;
     if (m.arrays.size() > 2) return decline("the C++ client has no attributes that the learner could set in its environments");
-    policy_.check(m);
-    // A rollout in progress goes on under its own weights: keep the frames until the next one starts.
-    head_.begin("Weights", 3).natural(m.version);
-    weights_.resize(3);
-    for (std::size_t i = 0; i < 2; ++i) {
-      head_.described(m.arrays[i].dtype, i + 1, {m.arrays[i].elements});
-      const char* bytes = static_cast<const char*>(m.arrays[i].data);
-      weights_[i + 1].assign(bytes, bytes + m.arrays[i].elements * item_bytes(m.arrays[i].dtype));
-    }
-    weights_[0].assign(head_.bytes.begin(), head_.bytes.end());
-    weight_frames_.clear();
-    for (const std::vector<char>& frame : weights_) weight_frames_.push_back({frame.data(), frame.size()});
+    policy_.take(m);  // and a rollout in progress goes on under its own weights
     version_ = static_cast<std::int64_t>(m.version), loaded_ = false;
   }
   void take(const Permit& permit, std::uint64_t version) {
@@ -257,8 +246,8 @@ class CollectorSession : public Session {  // a Session that holds the weights a
   void take_evaluation(const Message& m) {
     if (m.send_rows) return decline("the C++ client does not record episodes, which the learner asks for");
     for (const Evaluation& answer : answers_) if (answer.ticket == m.ticket) return send_evaluation(answer);
-    for (const EvaluationOrder& order : orders_) if (order.ticket == m.ticket) return;
-    orders_.push_back({m.ticket, m.version, m.most_steps, m.greedy, {}});
+    for (const Evaluation& order : orders_) if (order.ticket == m.ticket) return;
+    orders_.push_back({m.ticket, m.version, m.most_steps, m.greedy, {}, {}, {}});
     for (auto& seed : m.seeds) orders_.back().seeds.push_back(*seed);
   }
 
@@ -289,10 +278,8 @@ class CollectorSession : public Session {  // a Session that holds the weights a
   bool loaded_ = false;
   std::map<std::uint64_t, Held> held_;
   std::vector<std::unique_ptr<Rollout>> spare_;
-  std::vector<EvaluationOrder> orders_;
+  std::vector<Evaluation> orders_;
   std::deque<Evaluation> answers_;
-  std::vector<std::vector<char>> weights_;
-  std::vector<Frame> weight_frames_;
   std::vector<std::uint64_t> listed_;
 };
 

@@ -140,40 +140,23 @@ class Session {
   }
 
   void receive(const Message& m) {
-    if (m.type == Type::Drain) heard_s_ = now_s();
-    bool joining = state_ == State::joining, ready = state_ == State::ready;
-    switch (m.type) {  // the table of the wire document: what is ignored in this state
-      case Type::Welcome: if (state_ == State::draining) return; break;
-      case Type::Refuse: break;
-      case Type::Drain: if (state_ == State::draining) return; break;
-      case Type::Weights: case Type::HeartbeatReply: case Type::Rejoin: if (joining) return; break;
-      default: if (!ready) return;
-    }
-    if (m.type != Type::Welcome && m.session && *m.session != session_) return;  // of an earlier session
-    switch (m.type) {
-      case Type::Welcome: return welcome(m);
+    const bool draining = state_ == State::draining;
+    switch (m.type) {  // the table of the wire document
       case Type::Refuse: return leave(2, m.text);
-      case Type::Drain: return drain(m.text, false);
-      case Type::Rejoin:
-        return state_ == State::draining ? leave(1, "the learner does not know this session") : rejoin("the learner asks for it");
+      case Type::Welcome: return draining ? void() : welcome(m);
+      case Type::Drain: return heard_s_ = now_s(), draining ? void() : drain(m.text, false);
       default: break;
     }
+    if (state_ == State::joining || (m.session && *m.session != session_)) return;  // of an earlier session
     heard_s_ = now_s();
-    if (m.type == Type::Release) {
-      for (const LaneIncarnation& lane : m.lanes) release(lane.lane, lane.incarnation);
-      return;
+    switch (m.type) {
+      case Type::Rejoin: return draining ? leave(1, "the learner does not know this session") : rejoin("the learner asks for it");
+      case Type::Weights: return handle(m);
+      case Type::HeartbeatReply: return replied(m);
+      default: if (draining) return;
     }
-    if (m.type == Type::HeartbeatReply) {
-      if (m.number <= replies_) return;  // a late copy
-      replies_ = m.number;
-    }
-    handle(m);
-    if (m.type == Type::HeartbeatReply)
-      for (std::uint64_t lane : lanes()) {
-        auto same = [&](const Received& received) { return received.lane == lane; };
-        if (std::none_of(m.received.begin(), m.received.end(), same))
-          release(lane, std::numeric_limits<std::uint64_t>::max());  // its Release was lost
-      }
+    if (m.type != Type::Release) return handle(m);
+    for (const LaneIncarnation& lane : m.lanes) release(lane.lane, lane.incarnation);
   }
 
   class InEnv {  // while it exists, environment code runs and the other thread sends the heartbeats
@@ -200,7 +183,7 @@ class Session {
   Writer head_;
   std::mutex mutex_;
   Options options_;
-  void send(const Writer& head, std::initializer_list<Frame> arrays = {}) { link_.send(head, arrays); }
+  void send(const Writer& head, std::initializer_list<Frame> arrays = {}) { link_.send(head, arrays.begin(), arrays.size()); }
 
  private:
   static std::optional<Token> token_of(const Options& options) {
@@ -285,6 +268,17 @@ class Session {
     tick(now_s());
   }
 
+  void replied(const Message& m) {
+    if (m.number <= replies_) return;  // a late copy
+    replies_ = m.number;
+    handle(m);
+    for (std::uint64_t lane : lanes()) {
+      auto same = [&](const Received& received) { return received.lane == lane; };
+      if (std::none_of(m.received.begin(), m.received.end(), same))
+        release(lane, std::numeric_limits<std::uint64_t>::max());  // its Release was lost
+    }
+  }
+
   void drain(const std::string& why, bool signal) {
     if (state_ == State::joining || (signal && state_ == State::draining)) return leave(0, why);
     state_ = State::draining, reason_ = why;
@@ -303,13 +297,9 @@ class Session {
     space(description_.observation, bounds), space(description_.action, bounds);
     bounds.push_back({char(0x80)});  // an empty dict
     beat_head_.described("|u1", bounds.size(), {1}).text("").natural(description_.longest_episode).text("");
-    std::array<Frame, 5> f{};
-    for (std::size_t i = 0; i < bounds.size(); ++i) f[i] = {bounds[i].data(), bounds[i].size()};
-    switch (bounds.size()) {
-      case 1: return link_.send(beat_head_, {f[0]});
-      case 3: return link_.send(beat_head_, {f[0], f[1], f[2]});
-      default: return link_.send(beat_head_, {f[0], f[1], f[2], f[3], f[4]});
-    }
+    std::vector<Frame> frames;
+    for (const std::vector<char>& bound : bounds) frames.push_back({bound.data(), bound.size()});
+    link_.send(beat_head_, frames.data(), frames.size());
   }
   void space(const Space& space, std::vector<std::vector<char>>& bounds) {
     if (space.kind == "discrete") {
@@ -337,10 +327,7 @@ class Session {
 
   static std::uint64_t resident_bytes() {
     std::uint64_t all = 0, resident = 0;
-    if (std::FILE* file = std::fopen("/proc/self/statm", "r")) {
-      if (std::fscanf(file, "%lu %lu", &all, &resident) != 2) resident = 0;
-      std::fclose(file);
-    }
+    std::ifstream("/proc/self/statm") >> all >> resident;
     return resident * static_cast<std::uint64_t>(sysconf(_SC_PAGESIZE));
   }
 

@@ -83,15 +83,16 @@ class Worker : public CollectorSession {
     if (run_.type == "RunSpec") return handle_collecting(m);
     if (m.type != Type::Reset && m.type != Type::Step && m.type != Type::Call) return;
     if (m.lane >= run_.lanes.size()) throw BadMessage("order: expected a lane of the run");
-    auto found = lanes_.find(m.lane);
-    if (found != lanes_.end()) {
-      Lane& lane = found->second;
-      if (m.incarnation < lane.incarnation || (m.incarnation == lane.incarnation && m.ticket < lane.ticket)) return;
-      if (m.incarnation == lane.incarnation && m.ticket == lane.ticket) return lane.answered && m.type != Type::Call ? answer(m, lane) : void();
-      if (m.incarnation > lane.incarnation) lanes_.erase(found), found = lanes_.end();
-    }
     const std::size_t N = run_.lanes[m.lane];
     check(m, N);
+    auto found = lanes_.find(m.lane);
+    if (found != lanes_.end()) {
+      const Lane& lane = found->second;
+      const std::pair order{m.incarnation, m.ticket}, newest{lane.incarnation, lane.ticket};
+      if (order < newest) return;  // a late copy
+      if (order == newest) return lane.answered && m.type != Type::Call ? answer(m, lane) : void();
+      if (m.incarnation > lane.incarnation) lanes_.erase(found), found = lanes_.end();
+    }
     in_progress_.assign(1, m.ticket);
     try {
       Lane& lane = found == lanes_.end() ? open(m, N) : found->second;
@@ -182,7 +183,7 @@ class Worker : public CollectorSession {
 
   bool work() {  // the next evaluation or rollout; false if there is none
     if (run_.type != "RunSpec") return false;
-    if (EvaluationOrder* order = next_evaluation()) return evaluate(*order), true;
+    if (const Evaluation* order = next_evaluation()) return evaluate(*order), true;
     std::unique_ptr<Rollout> rollout = next_rollout();
     return rollout ? (collect(std::move(rollout)), true) : false;
   }
@@ -191,7 +192,7 @@ class Worker : public CollectorSession {
   }
 
   void collect(std::unique_ptr<Rollout> rollout) {
-    const std::uint64_t session = session_;
+    const std::uint64_t session = session_, number = rollout->lane;
     busy_ = true;
     try {
       std::shared_ptr<Collected> lane = lane_of(*rollout);  // ours, even if a pulse releases it
@@ -221,9 +222,9 @@ class Worker : public CollectorSession {
         finished(std::move(rollout));
         break;
       }
-      if (rollout) collected_.erase(rollout->lane);  // abandoned in the middle of its rows
+      if (rollout) collected_.erase(number);  // abandoned in the middle of its rows
     } catch (const std::exception& error) {
-      fail("lane " + std::to_string(rollout ? rollout->lane : 0) + ": its environment raised: " + error.what(), rollout ? std::optional(rollout->lane) : std::nullopt);
+      fail("lane " + std::to_string(number) + ": its environment raised: " + error.what(), number);
     }
     busy_ = false;
     drained();
@@ -247,27 +248,25 @@ class Worker : public CollectorSession {
     return collected_[r.lane] = lane;
   }
 
-  void evaluate(const EvaluationOrder& order) {  // one episode for each seed, on a copy of its own
-    const EvaluationOrder played = order;
+  void evaluate(Evaluation evaluation) {  // one episode for each seed, on a copy of its own
     const std::uint64_t session = session_;
-    Evaluation evaluation{played.ticket, {}, {}};
     busy_ = true;
     double began_s = now_s();
     try {
       if (!evaluation_env_) evaluation_env_ = make_();
       std::shared_ptr<Env> env = evaluation_env_;
       std::vector<unsigned char> obs(description_.observation.bytes()), stored(description_.action.bytes()), action(stored.size());
-      Random random{played.seeds[0]};
+      Random random{evaluation.seeds[0]};
       float log_prob;
-      for (std::uint64_t seed : played.seeds) {
+      for (std::uint64_t seed : evaluation.seeds) {
         double start_s = now_s();
         Episode episode;
         Result result;
         env->reset(seed, obs.data());
-        while (!result.terminated && !result.truncated && episode.length < played.most_steps) {
+        while (!result.terminated && !result.truncated && episode.length < evaluation.most_steps) {
           pulse();
           if (state_ != State::ready || session != session_) return busy_ = false, drained();  // a client that leaves does not finish it
-          policy_.act(obs.data(), played.greedy ? nullptr : &random, stored.data(), &log_prob);
+          policy_.act(obs.data(), evaluation.greedy ? nullptr : &random, stored.data(), &log_prob);
           policy_.to_env(stored.data(), action.data());
           InEnv evaluating(*this, "evaluating");
           result = env->step({action.data()}, obs.data());
