@@ -115,6 +115,7 @@ class Worker
   end
 
   def order(ticket, number, incarnation)
+    return unless [ticket, number, incarnation].all?(Integer) && @run[:lanes]&.at(number)
     lane = @lanes[number]
     lane = @lanes[number] = Lane.new(incarnation, nil, -1) if !lane || incarnation > lane.incarnation
     return if incarnation < lane.incarnation || ticket < lane.ticket # a late copy
@@ -141,9 +142,8 @@ class Worker
     n, shape = copies.size, @environment::SHAPE
     none = [[0] * shape.reduce(1, :*), 0, false, false]
     obs, reward, *flags = copies.map { |copy| copy.row || none }.transpose
-    flags.map! { |of_copies| of_copies.map { |flag| flag ? 1 : 0 }.pack("C*") }
     say(["Stepped", @session, *order, [["<f4", [n, *shape], 1]], ["<f8", [n], 2],
          ["|b1", [n], 3], ["|b1", [n], 4], ["|u1", [0], 5]],
-        obs.flatten.pack("e*"), reward.pack("E*"), *flags, "")
+        obs.flatten.pack("e*"), reward.pack("E*"), *flags.map { |f| f.map { |v| v ? 1 : 0 }.pack("C*") }, "")
   end
 end
