@@ -7,6 +7,7 @@ import os
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # as the command line does: bits must not depend on the number of cores
 
+import gc
 import signal
 import sys
 
@@ -32,6 +33,17 @@ worker_process.popen = preloaded.start_worker  # type: ignore[assignment]
 
 LEAVE_WITHIN_S = 5.0
 SOAK_TIMEOUT_S = 1200  # of a test of that mark: it takes minutes, and longer on a busy machine
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Garbage collections do not look again and again at what is imported and collected, which stays until the end."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

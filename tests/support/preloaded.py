@@ -28,11 +28,12 @@ from workers.supervise.worker_process import NONCE_VARIABLE
 
 PROGRAM = Path(__file__).with_name("preloaded_parent.py")
 LEARNERS = (["learner"], ["millrace", "train"], ["millrace", "learner"], ["millrace", "evaluate"], ["millrace", "record"])
-"""Modules, and their first argument. Other commands do without PyTorch, and must be seen to."""
-SUPERVISOR = ["workers"]
+"""Modules, and their first argument: what the parent with PyTorch forks."""
+WITHOUT_PYTORCH = (["workers"], ["millrace", "worker"], ["millrace", "status"], ["millrace", "keys"])
 WORKER = ["-P", "-m", "workers"]  # as a supervisor starts it
 PER_COMMAND = {
-    "COLUMNS", "MINARI_DATASETS_PATH", "PYTEST_CURRENT_TEST", "PYTHONPATH", "PYTHONUNBUFFERED", "TMPDIR", NONCE_VARIABLE,
+    "COLUMNS", "HOME", "MILLRACE_KEYS", "MILLRACE_TOKEN", "MILLRACE_TOY_SLEEPS_S", "MINARI_DATASETS_PATH", "MPLBACKEND",
+    "PYTEST_CURRENT_TEST", "PYTHONPATH", "PYTHONUNBUFFERED", "TERM", "TMPDIR", "WANDB_MODE", NONCE_VARIABLE,
 }  # fmt: skip
 """Variables that a child may have otherwise than its parent: nobody reads them before the command runs, or `become` does."""
 BY_IMPORTS = {
@@ -62,8 +63,9 @@ def start(
     env: Mapping[str, str] | None = None,
 ) -> subprocess.Popen[bytes] | ForkedProcess:
     """Start a process, as `subprocess.Popen` does: forked if it may be, or executed."""
-    if may_be_forked(command, env):
-        return ForkedProcess(command, (stdin, stdout, stderr), cwd or Path.cwd(), env or os.environ)
+    program, environment, namespace = without_words_before(command, env)
+    if may_be_forked(program, environment):
+        return ForkedProcess(program, (stdin, stdout, stderr), cwd or Path.cwd(), environment, namespace)
     return subprocess.Popen(command, stdin=stdin, stdout=stdout, stderr=stderr, cwd=cwd, env=env)
 
 
@@ -99,14 +101,37 @@ def start_worker(
     )
 
 
+def without_words_before(command: Sequence[str], env: Mapping[str, str] | None) -> tuple[list[str], dict[str, str], str]:
+    """The command that `env` or `ip netns exec` would execute, its environment, and its network namespace or ""."""
+    rest, environment, namespace = list(command), dict(os.environ if env is None else env), ""
+    while True:
+        match rest:
+            case ["env", "-u", name, *after]:
+                environment.pop(name, None)
+                rest = ["env", *after]
+            case ["env", word, *after] if "=" in word:
+                name, _, value = word.partition("=")
+                environment[name] = value
+                rest = ["env", *after]
+            case ["env", *after]:
+                rest = after
+            case ["ip", "netns", "exec", namespace, *after]:
+                rest = after
+            case _:
+                return rest, environment, namespace
+
+
 def may_be_forked(command: Sequence[str], env: Mapping[str, str] | None = None) -> bool:
     """Whether a command is one of ours, and its environment is the parent's as far as it is read at the start."""
     if os.environ.get("TESTS_EXEC") or "PYTEST_CURRENT_TEST" not in os.environ or not hasattr(os, "pidfd_open"):
         return False  # a benchmark or the soak starts processes as a user does
-    forked = [["-m", *each] for each in (*LEARNERS, SUPERVISOR)] + [WORKER]
+    forked = [["-m", *each] for each in (*LEARNERS, *WITHOUT_PYTORCH)] + [WORKER]
     if command[0] != PYTHON or not any(list(command[1:][: len(each)]) == each for each in forked):
         return False
-    return _read_at_start(os.environ if env is None else env) == _read_at_start(ENVIRONMENT)
+    environment = os.environ if env is None else env
+    if any(Path(folder, "sitecustomize.py").exists() for folder in environment.get("PYTHONPATH", "").split(os.pathsep)):
+        return False  # Python imports it when it starts
+    return _read_at_start(environment) == _read_at_start(ENVIRONMENT)
 
 
 def _read_at_start(environment: Mapping[str, str]) -> dict[str, str]:
@@ -118,7 +143,12 @@ class ForkedProcess:
     """A child of the preloaded parent. Its methods are those of `subprocess.Popen`."""
 
     def __init__(
-        self, command: Sequence[str], streams: tuple[Stream, Stream, Stream], folder: Path, env: Mapping[str, str]
+        self,
+        command: Sequence[str],
+        streams: tuple[Stream, Stream, Stream],
+        folder: Path,
+        env: Mapping[str, str],
+        namespace: str = "",
     ) -> None:
         self.args = list(command)
         self.returncode: int | None = None
@@ -131,8 +161,10 @@ class ForkedProcess:
                 ours.append(own)
                 theirs.append(given)
             self.stdin, self.stdout, self.stderr = ours
-            request = {"argv": list(command[2:]), "environment": dict(env), "folder": str(folder)}
-            self._parent = _parent("worker" if command[2] in SUPERVISOR else "learner")
+            argv = list(command[2:])
+            request = {"argv": argv, "environment": dict(env), "folder": str(folder), "namespace": namespace}
+            light = any(argv[: len(each)] == each for each in WITHOUT_PYTORCH)
+            self._parent = _parent("worker" if light else "learner")
             self.pid = self._parent.ask(request, theirs)
         finally:
             for each in made:

@@ -11,6 +11,7 @@ a process of its own. The parent has one thread, no open files but its socket, a
 
 from __future__ import annotations
 
+import ctypes
 import fcntl
 import gc
 import importlib
@@ -27,6 +28,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+CLONE_NEWNET = 0x40000000  # of linux/sched.h
 MOST_BYTES, MOST_FILES = 1 << 18, 16
 ADOPTED_WITHIN_S = 10.0
 LEARNER = (
@@ -50,7 +52,7 @@ LEARNER = (
     "safetensors.numpy",
 )
 WORKER = ("gymnasium.envs.classic_control", "tests.support.preloaded", "workers.__main__", "workers.program")
-START_WORKERS = (["workers"], ["millrace", "train"])
+START_WORKERS = (["workers"], *(["millrace", command] for command in ("evaluate", "record", "train", "worker")))
 
 
 def import_ahead(modules: tuple[str, ...]) -> None:
@@ -143,6 +145,8 @@ def become(request: dict[str, Any], descriptors: list[int], own_paths: list[str]
     os.environ.clear()
     os.environ.update(request["environment"])
     os.chdir(request["folder"])
+    if request.get("namespace"):
+        enter_network_namespace(request["namespace"])
     if "passed" in request:
         os.setsid()
     put_in_place(descriptors, [0, 1, 2, *request.get("passed", [])])
@@ -161,6 +165,12 @@ def become(request: dict[str, Any], descriptors: list[int], own_paths: list[str]
     signal.signal(signal.SIGINT, on_interrupt)
     random.seed()
     sys.modules["numpy"].random.seed()  # children must not draw the same numbers
+
+
+def enter_network_namespace(name: str) -> None:
+    """Do with this process what `ip netns exec` does with the one that it executes."""
+    with Path("/run/netns", name).open() as file:
+        assert ctypes.CDLL(None, use_errno=True).setns(file.fileno(), CLONE_NEWNET) == 0, ctypes.get_errno()
 
 
 def put_in_place(received: list[int], numbers: list[int]) -> None:

@@ -13,7 +13,6 @@ import os
 import pty
 import re
 import struct
-import subprocess
 import sys
 import termios
 import threading
@@ -35,6 +34,7 @@ from protocol.bounds import Stage as WorkerStage
 from protocol.keys.key_folder import KeyFolder, read_token
 from protocol.wire.worker_link import WorkerLink
 from tests.support.extreme_messages import MARK
+from tests.support.preloaded import start
 from tests.system.hostile_worker import FLOODS, NAME, Hostile, sayings
 from tests.system.processes import ROOT, SMALL, START_S, TOY, Learner, Stage, free_port, wait_for
 from tests.system.runs import accounted
@@ -57,7 +57,7 @@ class OnTerminal(Learner):
         master, slave = pty.openpty()
         fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 50, 200, 0, 0))
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "TERM": "xterm-256color"}
-        self.process = subprocess.Popen(command, stdin=slave, stdout=slave, stderr=slave, cwd=ROOT, env=environment)
+        self.process = start(command, stdin=slave, stdout=slave, stderr=slave, cwd=ROOT, env=environment)
         os.close(slave)
         self.pid = self.process.pid
         self._reader = threading.Thread(target=self._read, args=(master,), daemon=True)

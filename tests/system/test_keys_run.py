@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -19,6 +18,7 @@ from learner.config.layers import resolve
 from learner.run_folder.run_format import check_format
 from millrace.launch.local_run import train
 from protocol.wire import compression as packing
+from tests.support import preloaded
 from tests.system.processes import START_S, Learner, Stage, crowding
 from tests.system.runs import accounted
 
@@ -46,10 +46,8 @@ def test_a_revoked_worker_leaves_with_the_reason_and_the_run_goes_on_without_it(
     address = join_address(learner)
     assert f"--token {keys}/default.token" in learner.said()
     millrace = [sys.executable, "-m", "millrace"]
-    made = subprocess.run(
-        [*millrace, "keys", "new", "lab", "--keys", str(keys)], capture_output=True, timeout=60, check=True
-    )
-    assert b"lab.token" in made.stdout
+    made = preloaded.run([*millrace, "keys", "new", "lab", "--keys", str(keys)], timeout=60)
+    assert "lab.token" in made.stdout
     copy = stage.tmp_path / "copy.token"
     copy.touch(mode=0o600)
     copy.write_text((keys / "lab.token").read_text())
@@ -63,7 +61,7 @@ def test_a_revoked_worker_leaves_with_the_reason_and_the_run_goes_on_without_it(
     learner.trains()
 
     began_s = time.monotonic()
-    subprocess.run([*millrace, "keys", "revoke", "lab", "--keys", str(keys)], timeout=60, check=True)
+    assert preloaded.run([*millrace, "keys", "revoke", "lab", "--keys", str(keys)], timeout=60).returncode == 0
     assert revoked.ends() == 2
     assert time.monotonic() - began_s < 5 * crowding()
     assert "was revoked" in revoked.said().splitlines()[-1]
@@ -110,7 +108,7 @@ def test_status_of_a_run_on_this_machine_needs_nothing_but_its_folder(stage: Sta
         worker = stage.worker(f"tcp://[::1]:{port}", "w6", "--token", str(keys / "default.token"))
     learner.trains()
     command = [sys.executable, "-m", "millrace", "status", str(learner.folder)]
-    asked = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    asked = preloaded.run(command, timeout=60)
     assert (asked.returncode, asked.stderr) == (0, "")
     assert asked.stdout.startswith("CartPole-v1: ")
     assert check_format(learner.folder).workers_elsewhere

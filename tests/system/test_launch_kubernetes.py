@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 from millrace.cli.main import main
+from tests.support import preloaded
 from tests.system.processes import START_S, Learner, Stage, free_port
 
 
@@ -66,9 +67,7 @@ def test_the_commands_of_the_manifest_train(capsys: pytest.CaptureFixture[str], 
     for probe in ("startupProbe", "livenessProbe"):
         name, *asks = learner[probe]["exec"]["command"]
         assert name == "millrace"
-        done = subprocess.run(
-            [*program, *asks], capture_output=True, timeout=60, check=False, env={**os.environ, "PYTHONPATH": "."}
-        )
+        done = preloaded.run([*program, *asks], timeout=60, env={**os.environ, "PYTHONPATH": "."})
         assert done.returncode == 0, done.stderr
     (worker,) = found["Deployment"]["spec"]["template"]["spec"]["containers"]
     command = [*with_variables(worker, secret), sys.executable, "-m", "workers", *worker["args"]]

@@ -20,8 +20,10 @@ from tests.support.preloaded import (
     command_line,
     may_be_forked,
     start_worker,
+    without_words_before,
     workers_of,
 )
+from tests.system.network import Network
 from tests.system.processes import ROOT, Stage, wait_for
 from workers.supervise import worker_process
 
@@ -58,7 +60,7 @@ match sys.argv[1:]:
             "files": [number for number in range(256) if os.path.exists(f"/proc/self/fd/{number}")],
             "limits": resource.getrlimit(resource.RLIMIT_NOFILE), "temporary": tempfile.gettempdir(),
             "faulthandler": faulthandler.is_enabled(), "cpus": sorted(os.sched_getaffinity(0)), "nice": os.nice(0),
-            "umask": os.umask(0),
+            "umask": os.umask(0), "network": os.readlink("/proc/self/ns/net"),
         }))
 """
 
@@ -191,7 +193,32 @@ def test_workers_of_this_process_are_forked() -> None:
     assert worker_process.popen is start_worker
 
 
-def test_only_learners_whose_environment_is_the_parents_are_forked(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_words_before_a_command_say_its_environment_and_its_network() -> None:
+    command = [sys.executable, "-m", "learner", "env", "A=1"]
+    rest, environment, namespace = without_words_before(
+        ["env", "-u", "LEFT_OUT", "A=1=2", "B=", *command], {"LEFT_OUT": "x", "C": "3"}
+    )
+    assert (rest, environment, namespace) == (command, {"A": "1=2", "B": "", "C": "3"}, "")
+    rest, environment, namespace = without_words_before(["ip", "netns", "exec", "host", "env", "A=1", *command], {})
+    assert (rest, environment, namespace) == (command, {"A": "1"}, "host")
+    assert without_words_before(["sh", "env"], None) == (["sh", "env"], dict(os.environ), "")
+
+
+def test_a_process_is_forked_on_another_host(network: Network, probe: dict[str, str]) -> None:
+    host = network.host(1)
+    found = []
+    for before in ((), host.before):
+        rest, environment, namespace = without_words_before([*before, sys.executable, "-m", "probe"], probe)
+        process = ForkedProcess(rest, PIPES, ROOT, environment, namespace)
+        stdout, stderr = process.communicate(timeout=WITHIN_S)
+        assert (process.returncode, stderr) == (0, b"")
+        found.append(json.loads(stdout)["network"])
+    assert found[0] == os.readlink("/proc/self/ns/net") != found[1]
+
+
+def test_only_commands_of_ours_whose_environment_is_the_parents_are_forked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.delenv("TESTS_EXEC", raising=False)
     learner = [sys.executable, "-m", "learner", "CartPole-v1"]
     changed = {name for name in {*os.environ, *ENVIRONMENT} if os.environ.get(name) != ENVIRONMENT.get(name)}
@@ -199,20 +226,25 @@ def test_only_learners_whose_environment_is_the_parents_are_forked(monkeypatch: 
     assert may_be_forked([sys.executable, "-m", "workers", "x"])
     assert may_be_forked([sys.executable, "-P", "-m", "workers", "x"])
     assert may_be_forked([sys.executable, "-m", "millrace", "train"], {**os.environ, "PYTHONPATH": "x", "TMPDIR": "/x"})
+    for command in ("worker", "status", "keys"):
+        assert may_be_forked([sys.executable, "-m", "millrace", command, "x"])
     for other in (
         [sys.executable, "-P", *learner[1:]],
         ["ip", "netns", "exec", "x", *learner],
-        [sys.executable, "-m", "millrace", "worker", "x"],
-        [sys.executable, "-m", "millrace", "status", "x"],
+        [sys.executable, "-m", "millrace", "plot", "x"],
         [sys.executable, "-m", "millrace"],
         [sys.executable],
     ):
         assert not may_be_forked(other), other
-    for name in ("LC_ALL", "OMP_NUM_THREADS", "PYTHONHASHSEED", "PYTHONIOENCODING", "HOME", "ANYTHING"):
+    for name in ("LC_ALL", "OMP_NUM_THREADS", "PYTHONHASHSEED", "PYTHONIOENCODING", "ANYTHING"):
         assert not may_be_forked(learner, {**os.environ, name: "7"}), name
     fewer = dict(os.environ)
     del fewer["OMP_NUM_THREADS"]
     assert not may_be_forked(learner, fewer)
+    path = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}"}
+    assert may_be_forked(learner, path)
+    (tmp_path / "sitecustomize.py").touch()
+    assert not may_be_forked(learner, path)
     with monkeypatch.context() as outside_a_test:
         outside_a_test.delenv("PYTEST_CURRENT_TEST")
         assert not may_be_forked(learner)

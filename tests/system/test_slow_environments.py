@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
 import sys
 import time
 from collections.abc import Mapping
@@ -16,6 +15,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from tests.support import preloaded
 from tests.support.preloaded import workers_of
 from tests.system.processes import ROOT, START_S, Learner, Running, Stage, free_port, wait_for
 from tests.system.runs import within
@@ -197,7 +197,9 @@ def test_status_says_what_a_worker_does_and_for_how_long(stage: Stage) -> None:
 
     def status(*flags: str) -> str:
         command = [sys.executable, "-m", "millrace", "status", address, *flags]
-        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True).stdout
+        done = preloaded.run(command, cwd=ROOT, timeout=60)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
 
     (worker,) = json.loads(status("--json"))["workers"]
     assert worker["doing"] == "stepping"

@@ -17,6 +17,7 @@ import pytest
 
 from learner.run_folder import checkpoint
 from learner.run_folder.metrics_log import read_rows
+from tests.support import preloaded
 
 COMMAND = [sys.executable, "-m", "millrace"]
 FLAGS = ["--steps", "600", "--workers", "1", "--eval-episodes", "2", "--rollout-steps", "16", "--n-epochs", "1"]
@@ -59,12 +60,12 @@ def sighup_ends_processes() -> Iterator[None]:
     signal.signal(signal.SIGHUP, before)
 
 
-def done(tmp_path: Path, command: Sequence[str], **streams: Any) -> subprocess.CompletedProcess[bytes]:
-    found = subprocess.run(command, stdin=subprocess.DEVNULL, timeout=WITHIN_S, check=False, cwd=tmp_path, **streams)
-    assert found.returncode == 0, found
+def done(tmp_path: Path, command: Sequence[str], **streams: Any) -> None:
+    with preloaded.start(command, stdin=subprocess.DEVNULL, cwd=tmp_path, **streams) as process:
+        process.communicate(timeout=WITHIN_S)
+    assert process.returncode == 0
     assert is_whole(tmp_path)
     assert '"all steps done"' in (folder(tmp_path) / "summary.json").read_text()
-    return found
 
 
 @pytest.mark.skipif(not FULL.exists(), reason="this system has no /dev/full")
@@ -81,14 +82,17 @@ def test_output_that_is_closed_from_the_start(tmp_path: Path, closed: str) -> No
 
 
 def test_a_reader_that_has_read_enough(tmp_path: Path) -> None:
-    command = ["bash", "-o", "pipefail", "-c", '"$@" 2>&1 | head -1', "bash", *train(tmp_path)]
-    assert done(tmp_path, command, stdout=subprocess.PIPE).stdout.count(b"\n") == 1
+    with subprocess.Popen(["head", "-1"], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as reader:
+        assert reader.stdin is not None
+        with reader.stdin as output:
+            done(tmp_path, train(tmp_path), stdout=output, stderr=output)
+        assert reader.stdout is not None
+        assert reader.stdout.read().count(b"\n") == 1
 
 
-@pytest.mark.parametrize(
-    "locale", [{"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}]
-)
-def test_a_locale_that_has_only_ascii(tmp_path: Path, locale: dict[str, str]) -> None:
+def test_a_locale_that_has_only_ascii(tmp_path: Path) -> None:
+    """File names and output: without PYTHONIOENCODING, such a locale would allow some other characters in the output."""
+    locale = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii"}
     (tmp_path / "öä ✓").mkdir()
     command = train(tmp_path / "öä ✓")
     found = subprocess.run(
@@ -103,7 +107,7 @@ def test_a_locale_that_has_only_ascii(tmp_path: Path, locale: dict[str, str]) ->
 
 
 def test_sighup_ends_a_run_as_sigterm_does(tmp_path: Path) -> None:
-    running = subprocess.Popen(train(tmp_path, "--steps", "1000000"), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    running = preloaded.start(train(tmp_path, "--steps", "1000000"), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     wait_for(lambda: updates(tmp_path) > 3)
     running.send_signal(signal.SIGHUP)
     _, said = running.communicate(timeout=WITHIN_S)
