@@ -162,6 +162,7 @@ def become(request: dict[str, Any], descriptors: list[int], own_paths: list[str]
     sys.argv[:] = ["-m", *request["argv"][1:]]
     sys.orig_argv[:] = [sys.executable, *(() if here else ("-P",)), "-m", *request["argv"]]
     sys.modules["__main__"] = ModuleType("__main__")
+    sys.modules.pop(f"{request['argv'][0]}.__main__", None)  # else there is a warning that it is imported already
     signal.signal(signal.SIGINT, on_interrupt)
     random.seed()
     sys.modules["numpy"].random.seed()  # children must not draw the same numbers
