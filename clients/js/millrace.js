@@ -1,12 +1,13 @@
 // A millrace worker for environments of Node: it resets and steps env copies on order; the policy acts beside the learner.
 //
-// Rule: this is the worker's half of ../../protocol/README.md, with the states joining, ready, draining and left. An order is
-// executed once; its answer is kept until the lane's next order, and sent again if the order comes again.
+// Rule: this is the worker's half of ../../protocol/README.md, with the states joining, ready, draining and left. What happens
+// to the env copies is in lanes.js.
 import { randomBytes } from "node:crypto";
 import { hostname } from "node:os";
 import { decode, encode } from "@msgpack/msgpack";
 import { Dealer } from "zeromq";
-import { actionOf, arrayIn, box, discrete, Frames, put, UsageError, zeros } from "./arrays.js";
+import { box, discrete, Frames, UsageError } from "./arrays.js";
+import { Activity, Lanes, now } from "./lanes.js";
 import { readToken, routingId } from "./token.js";
 
 export { box, discrete, UsageError };
@@ -15,9 +16,15 @@ const PROTOCOL_VERSION = 4;
 const FIELDS = { // how many fields each message of the learner has
   Welcome: 3, Rejoin: 1, Weights: 4, Collect: 4, Release: 2, Evaluate: 8, HeartbeatReply: 3, Drain: 1, Reset: 7, Step: 5, Call: 8,
 };
+const OF_ANY_SESSION = ["Welcome", "Refuse", "Drain", "Weights"];
+const OBEYED = { // the table of the wire document: what is not ignored in each state
+  joining: ["Welcome", "Refuse", "Drain"],
+  ready: ["Refuse", ...Object.keys(FIELDS)],
+  draining: ["Refuse", "HeartbeatReply", "Rejoin"],
+  left: [],
+};
 const MAX_FRAME_BYTES = 2 ** 31 - 1;
 const FIRST_BACKOFF_S = 0.25, LONGEST_BACKOFF_S = 4, CONNECT_AGAIN_S = 20, TICK_MS = 50;
-const now = () => performance.now() / 1000;
 const line = (text) => String(text).replace(/[\u0000-\u001f\u007f-\u009f\u2028\u2029]/g, " ").slice(0, 1000);
 
 /** Work for a learner until the conversation is over. Returns the exit code: 0 drained, 1 failed or lost the learner, 2 refused. */
@@ -31,13 +38,12 @@ export async function work(options, description) {
   }
 }
 
-export class Worker {
+class Worker {
   #state = "joining";
-  #session = 0; #run = null; #replies = 0;
-  #lanes = new Map(); #orders = Promise.resolve(); #unfinished = new Set();
-  #life = randomBytes(6).readUIntBE(0, 6); #attempt = this.#life;
-  #steps = 0; #stepSeconds = 0; #calls = 0; #doing = "starting"; #since = now();
-  #reason = ""; #problem = ""; #sending = Promise.resolve();
+  #session = 0; #run = null; #lanes = null; #replies = 0;
+  #life = randomBytes(6).readUIntBE(0, 6); #attempt = this.#life; #activity = new Activity();
+  #joining = 0; #due = 0; #backoff = 0; #heard = 0; #heardWire = 0; // times in seconds
+  #reason = ""; #problem = ""; #unreadable = 0; #sending = Promise.resolve();
   #left; #over = new Promise((resolve) => { this.#left = resolve; });
 
   /** `address`: tcp://HOST:PORT or ipc://PATH. `name`: of this client alone. `token`: the text of a join token, or nothing. */
@@ -84,8 +90,8 @@ export class Worker {
   async #receive() {
     try {
       for await (const frames of this.socket) {
-        this.heardWire = now();
-        this.read(frames);
+        this.#heardWire = now();
+        this.#read(frames);
         if (this.#state === "left") return;
       }
     } catch (error) {
@@ -94,7 +100,7 @@ export class Worker {
   }
 
   /** Handle one message of the learner. What cannot be read is ignored. */
-  read(frames) {
+  #read(frames) {
     try {
       const head = decode(frames[0]);
       if (!Array.isArray(head)) { // only Refuse is a map
@@ -106,8 +112,8 @@ export class Worker {
       if (missing !== 0 && !(missing === 1 && type === "Weights")) throw new Error("unknown type, or other fields than expected");
       this.#handle(type, fields, frames);
     } catch (error) {
-      this.unreadable = (this.unreadable ?? 0) + 1;
-      if (this.unreadable <= 3) this.log(`the learner sent a message that cannot be used: ${error.message}`);
+      this.#unreadable += 1;
+      if (this.#unreadable <= 3) this.log(`the learner sent a message that cannot be used: ${error.message}`);
     }
   }
 
@@ -127,77 +133,74 @@ export class Worker {
   #join() {
     this.#state = "joining";
     this.#attempt += 1;
-    this.backoff = FIRST_BACKOFF_S;
-    this.joining = this.due = this.heardWire = now();
+    this.#backoff = FIRST_BACKOFF_S;
+    this.#joining = this.#due = this.#heardWire = now();
     this.#tick();
   }
 
   #tick() {
     const at = now();
     if (this.#state === "joining") {
-      if (at - this.joining > this.joinTimeoutS) return this.#leave(1, `no learner answered at ${this.address}; ${this.#problem}`);
-      if (at - this.heardWire > CONNECT_AGAIN_S) { // the connection may only look open
-        this.heardWire = at;
+      if (at - this.#joining > this.joinTimeoutS) return this.#leave(1, `no learner answered at ${this.address}; ${this.#problem}`);
+      if (at - this.#heardWire > CONNECT_AGAIN_S) { // the connection may only look open
+        this.#heardWire = at;
         this.socket.disconnect(this.address);
         this.socket.connect(this.address);
       }
-      if (at < this.due) return;
-      this.due = at + this.backoff;
-      this.backoff = Math.min(2 * this.backoff, LONGEST_BACKOFF_S);
+      if (at < this.#due) return;
+      this.#due = at + this.#backoff;
+      this.#backoff = Math.min(2 * this.#backoff, LONGEST_BACKOFF_S);
       this.#send({
         type: "Hello", protocol: PROTOCOL_VERSION, worker: this.name, host: line(hostname()), pid: process.pid, life: this.#life,
         software: "millrace JavaScript client", attempt: this.#attempt,
       });
     } else if (this.#state !== "left") {
-      if (at - this.heard > this.#run.learner_timeout_s) this.#rejoin(`the learner was silent for ${this.#run.learner_timeout_s} s`);
-      else if (at >= this.due) this.#heartbeat(at);
+      if (at - this.#heard > this.#run.learner_timeout_s) this.#rejoin(`the learner was silent for ${this.#run.learner_timeout_s} s`);
+      else if (at >= this.#due) this.#heartbeat(at);
     }
   }
 
   #heartbeat(at) {
-    this.due = at + this.#run.heartbeat_s;
-    const stages = { step: this.#stepSeconds, wait: Math.max(0, at - this.began - this.#stepSeconds) };
-    const held = [...this.#unfinished].map((order) => order.ticket);
-    this.#send(["Heartbeat", this.#session, this.#replies, -1, held, this.#steps, stages, process.memoryUsage.rss()]);
+    this.#due = at + this.#run.heartbeat_s;
+    const { began, steps, stepSeconds, doing, since, calls } = this.#activity;
+    const stages = { step: stepSeconds, wait: Math.max(0, at - began - stepSeconds) };
+    this.#send(["Heartbeat", this.#session, this.#replies, -1, this.#lanes.tickets, steps, stages, process.memoryUsage.rss()]);
     if (this.#run.type === "DescribeSpec") return this.#describe(); // it may have been lost
-    this.#send(["Alive", [[this.name, this.#life, this.#doing, Math.max(0, at - this.#since), this.#calls]], []]);
+    this.#send(["Alive", [[this.name, this.#life, doing, Math.max(0, at - since), calls]], []]);
   }
 
   #handle(type, fields, frames) {
-    const state = this.#state;
-    if (state === "left") return;
-    if (type === "Refuse") return this.#leave(2, line(fields[0]));
-    if (type === "Welcome") return state === "draining" ? undefined : this.#welcome(...fields);
-    if (type === "Drain") {
-      this.heard = now();
-      return state === "draining" ? undefined : this.#drain(line(fields[0]));
+    if (!OF_ANY_SESSION.includes(type) && fields[0] !== this.#session) return;
+    this.#heard = now();
+    if (!OBEYED[this.#state].includes(type)) return;
+    switch (type) {
+      case "Refuse": return this.#leave(2, line(fields[0]));
+      case "Welcome": return this.#welcome(...fields);
+      case "Drain": return this.#drain(line(fields[0]));
+      case "Rejoin": return this.#rejoin("the learner asks for it");
+      case "Release": return fields[1].forEach(([lane, incarnation]) => this.#lanes.close(lane, incarnation));
+      case "HeartbeatReply": return this.#replied(...fields.slice(1));
+      case "Reset": case "Step": case "Call": if (this.#run.type === "StepSpec") this.#lanes.order(type, fields, frames);
     }
-    if (state === "joining" || (type !== "Weights" && fields[0] !== this.#session)) return;
-    if (state === "draining" && !["Weights", "HeartbeatReply", "Rejoin"].includes(type)) return;
-    if (type === "Rejoin")
-      return state === "draining" ? this.#leave(1, "the learner does not know this session") : this.#rejoin("the learner asks for it");
-    this.heard = now();
-    if (type === "Release") for (const [lane, incarnation] of fields[1]) this.#close(lane, incarnation);
-    else if (type === "HeartbeatReply") this.#replied(...fields.slice(1));
-    else if (["Reset", "Step", "Call"].includes(type) && this.#run.type === "StepSpec") this.#order(type, fields, frames);
   }
 
   #welcome(session, attempt, run) {
     if (attempt !== this.#attempt || (this.#state === "ready" && session === this.#session)) return;
     if (!Number.isSafeInteger(session) || typeof run !== "object") throw new Error("Welcome: expected a session and a run");
-    this.#end();
+    this.#lanes?.keep([]);
     this.#state = "ready";
     this.#session = session;
     this.#run = { heartbeat_s: 1, learner_timeout_s: run.type === "StepSpec" ? 600 : 30, autoreset: "NextStep", ...run };
-    this.#replies = this.#stepSeconds = 0;
-    this.heard = this.began = now();
-    this.due = this.heard + this.#run.heartbeat_s;
+    this.#lanes = new Lanes(session, this.#run, this.description, this.#activity, {
+      send: (head, frames) => this.#send(head, frames),
+      failed: (error, lane) => this.#failed(error, lane),
+      idle: () => this.#state === "draining" && this.#goodbye(0, this.#reason),
+    });
+    this.#replies = 0;
+    this.#due = now() + this.#run.heartbeat_s;
     this.joinTimeoutS = this.rejoinTimeoutS;
     const why = this.#unable();
-    if (why) {
-      this.#goodbye(why);
-      return this.#leave(2, why);
-    }
+    if (why) return this.#goodbye(2, why);
     this.log("joined");
     if (run.type === "DescribeSpec") this.#describe();
   }
@@ -205,14 +208,13 @@ export class Worker {
   /** Why this client cannot take part in the run, or nothing. */
   #unable() {
     const run = this.#run;
-    if (run.type === "RunSpec") return "this client steps copies on order; start the learner with --inference learner";
+    if (run.type === "RunSpec") return "this client does not act: it needs --inference learner, or millrace.make_vec";
     for (const env of run.type === "StepSpec" ? run.envs : [run.env]) {
       if (env.id !== this.description.id) return `this client has the environment ${this.description.id}, the learner asks for ${env.id}`;
       if (env.factory || env.wrappers?.length || Object.keys(env.kwargs ?? {}).length)
         return "this client takes no factory, wrappers or arguments of an environment";
     }
-    if (run.type === "StepSpec" && run.autoreset !== "NextStep")
-      return `this client resets a copy in the next step, the learner asks for autoreset ${run.autoreset}`;
+    if (run.autoreset === "SameStep") return "this client resets a copy in the next step, the learner asks for autoreset SameStep";
   }
 
   #describe() {
@@ -225,14 +227,14 @@ export class Worker {
 
   #replied(number, received) {
     if (!(number > this.#replies)) return; // a late copy
-    const lanes = new Set(received.map(([lane]) => lane));
+    this.#lanes.keep(received.map(([lane]) => lane)); // a Release may have been lost
     this.#replies = number;
-    for (const lane of [...this.#lanes.keys()]) if (!lanes.has(lane)) this.#close(lane, Infinity); // its Release was lost
   }
 
   #rejoin(why) {
+    if (this.#state === "draining") return this.#leave(1, "the learner does not know this session");
     this.log(`${why}; joining again`);
-    this.#end();
+    this.#lanes.keep([]);
     this.#join();
   }
 
@@ -241,146 +243,25 @@ export class Worker {
     if (this.#state !== "ready") return;
     this.#state = "draining";
     this.#reason = reason;
-    if (!this.#unfinished.size) this.#drained();
+    if (!this.#lanes.tickets.length) this.#goodbye(0, reason);
   }
 
-  #drained() {
-    this.#goodbye(this.#reason);
-    this.#leave(0, this.#reason);
+  #goodbye(code, reason) {
+    this.#send(["Goodbye", this.#session, line(reason), this.#lanes.tickets]);
+    this.#leave(code, reason);
   }
 
-  #goodbye(reason) {
-    this.#send(["Goodbye", this.#session, line(reason), [...this.#unfinished].map((order) => order.ticket)]);
+  #failed(error, lane) {
+    const text = line(`lane ${lane}: its environment raised: ${error?.message ?? error}`);
+    this.#send(["Failure", this.#session, text, String(error?.stack ?? "").slice(0, 64000), lane]);
+    this.#leave(1, text);
   }
 
   #leave(code, reason) {
     if (this.#state === "left") return;
     this.#state = "left";
     this.#reason = reason;
-    this.#end();
+    this.#lanes?.keep([]);
     this.#left(code);
-  }
-
-  // ---------------------------------------------------------------- lanes and orders
-
-  /** A session ended: forget its env copies and orders. */
-  #end() {
-    for (const lane of [...this.#lanes.keys()]) this.#close(lane, Infinity);
-    this.#unfinished.clear();
-  }
-
-  #close(number, incarnation) {
-    const lane = this.#lanes.get(number);
-    if (!lane || lane.incarnation > incarnation) return;
-    this.#lanes.delete(number);
-    for (const order of this.#unfinished) if (order.lane === lane) this.#unfinished.delete(order);
-    for (const env of lane.envs) env.close?.();
-  }
-
-  #order(type, fields, frames) {
-    const [, ticket, number, incarnation] = fields;
-    const size = this.#run.lanes[number];
-    if (![ticket, number, incarnation].every(Number.isSafeInteger) || !size) throw new Error(`${type}: expected a lane of the run`);
-    let lane = this.#lanes.get(number);
-    if (lane && (incarnation < lane.incarnation || (incarnation === lane.incarnation && ticket < lane.ticket))) return;
-    if (lane && incarnation === lane.incarnation && ticket === lane.ticket)
-      return lane.answer ? this.#send(lane.answer.head, lane.answer.frames) : undefined;
-    const arguments_ = this.#arguments(type, fields, frames, size);
-    if (lane && incarnation > lane.incarnation) {
-      this.#close(number, incarnation);
-      lane = undefined;
-    }
-    lane ??= this.#open(number, incarnation, size);
-    Object.assign(lane, { ticket, answer: null });
-    const order = { type, ticket, lane, ...arguments_ };
-    this.#unfinished.add(order);
-    this.#orders = this.#orders.then(() => this.#execute(order));
-  }
-
-  /** The checked arguments of an order. */
-  #arguments(type, fields, frames, size) {
-    if (type === "Reset") {
-      const [copies, seeds] = [fields[4], fields[5]];
-      const natural = (number) => Number.isInteger(number) && number >= 0;
-      if (copies.length !== seeds.length || !copies.every((copy) => natural(copy) && copy < size)
-          || !seeds.every((seed) => seed === null || natural(seed)))
-        throw new Error("Reset: expected copies of the lane, and a seed for each");
-      return { copies, seeds };
-    }
-    if (type === "Call") return {};
-    if (fields[4].length !== 1 || frames.length !== 2) throw new Error("Step: expected one array of actions");
-    const { action } = this.description;
-    const actions = arrayIn(fields[4][0], frames);
-    if (fields[4][0][0] !== action.wire || actions.length !== size * action.size) throw new Error("Step: expected one action for each copy");
-    return { actions };
-  }
-
-  #open(number, incarnation, size) {
-    const lane = {
-      number, incarnation, size, envs: [], observation: zeros(this.description.observation, size), reward: new Float64Array(size),
-      terminated: new Uint8Array(size), truncated: new Uint8Array(size).fill(1), // a step resets the copies, unless a Reset did
-    };
-    this.#lanes.set(number, lane);
-    return lane;
-  }
-
-  async #execute(order) {
-    const { lane, type } = order, began = now();
-    if (!this.#unfinished.has(order)) return; // its session or lane ended
-    try {
-      if (!lane.envs.length) for (let n = 0; n < lane.size; ++n) lane.envs.push(await this.#call("making", () => this.description.make()));
-      if (type === "Reset") for (const [i, n] of order.copies.entries()) await this.#reset(lane, n, order.seeds[i] ?? undefined);
-      else if (type === "Step") for (let n = 0; n < lane.size; ++n) await this.#step(lane, n, actionOf(this.description.action, order.actions, n));
-    } catch (error) {
-      if (!this.#unfinished.has(order)) return;
-      const text = line(`lane ${lane.number}: its environment raised: ${error?.message ?? error}`);
-      this.#send(["Failure", this.#session, text, String(error?.stack ?? "").slice(0, 64000), lane.number]);
-      return this.#leave(1, text);
-    }
-    this.#stepSeconds += now() - began;
-    if (!this.#unfinished.delete(order)) return;
-    this.#answer(order);
-    if (this.#state === "draining" && !this.#unfinished.size) this.#drained();
-  }
-
-  async #call(doing, code) {
-    this.#doing = doing;
-    this.#since = now();
-    try {
-      return await code();
-    } finally {
-      this.#doing = "waiting";
-      this.#since = now();
-      this.#calls += 1;
-    }
-  }
-
-  async #reset(lane, n, seed) {
-    const observation = await this.#call("resetting", () => lane.envs[n].reset(seed));
-    put(this.description.observation, lane.observation, n, observation, "observation of reset");
-    lane.reward[n] = lane.terminated[n] = lane.truncated[n] = 0;
-  }
-
-  async #step(lane, n, action) {
-    if (lane.terminated[n] || lane.truncated[n]) return this.#reset(lane, n);
-    const { observation, reward, terminated, truncated } = await this.#call("stepping", () => lane.envs[n].step(action));
-    put(this.description.observation, lane.observation, n, observation, "observation of step");
-    if (!Number.isFinite(reward)) throw new Error(`reward: expected a finite number, got ${reward}`);
-    lane.reward[n] = reward;
-    lane.terminated[n] = terminated ? 1 : 0;
-    lane.truncated[n] = truncated ? 1 : 0;
-    this.#steps += 1;
-  }
-
-  #answer({ type, ticket, lane }) {
-    const frames = new Frames(), { observation } = this.description, N = [lane.size];
-    const begin = [this.#session, ticket, lane.number, lane.incarnation];
-    const nothing = () => frames.add("|u1", [0], new Uint8Array(0));
-    const head = type === "Call"
-      ? ["Returned", ...begin, nothing(), "AttributeError: this environment has no attributes for Python", ""]
-      : ["Stepped", ...begin, [frames.add(observation.wire, [...N, ...observation.shape], lane.observation)],
-        frames.add("<f8", N, lane.reward), frames.add("|b1", N, lane.terminated), frames.add("|b1", N, lane.truncated), nothing()];
-    lane.answer = { head, frames: frames.list };
-    this.#send(head, frames.list);
   }
 }

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.clients.programs import Clients, no_warning
 from tests.system.processes import ROOT, Stage
 
 CPP, JS = ROOT / "clients" / "cpp", ROOT / "clients" / "js"
@@ -35,14 +36,18 @@ def compiler() -> None:
 
 
 @pytest.fixture(scope="session")
-def cpp(compiler: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder with the programs of `clients/cpp`, built with its tests."""
+def cpp_build(compiler: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A build folder of `clients/cpp`, configured."""
     build = tmp_path_factory.mktemp("cpp")
-    for command in (["cmake", "-S", str(CPP), "-B", str(build), "-DTESTS=ON"], ["cmake", "--build", str(build), "-j2"]):
-        done = subprocess.run(command, capture_output=True, text=True, timeout=600)
-        assert done.returncode == 0, done.stdout + done.stderr
-        assert "warning:" not in done.stderr, done.stderr
+    no_warning("cmake", "-S", str(CPP), "-B", str(build), "-DTESTS=ON")
     return build
+
+
+@pytest.fixture(scope="session")
+def cpp(cpp_build: Path) -> Path:
+    """The folder with the programs of `clients/cpp`, built with its tests."""
+    no_warning("cmake", "--build", str(cpp_build), "-j2")
+    return cpp_build
 
 
 @pytest.fixture(scope="session")
@@ -58,3 +63,9 @@ def js(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if done.returncode:
             pytest.skip(f"{command}: {done.stderr[-300:]}")
     return copy
+
+
+@pytest.fixture
+def clients(request: pytest.FixtureRequest, stage: Stage) -> Clients:
+    """The programs of the clients, built when they are first asked for."""
+    return Clients(request, stage)

@@ -74,6 +74,7 @@ class Agent : public CollectorSession {
     acts_ = false;
     return "";
   }
+  std::string no_rows() const override { return "a program that owns its loop does not record episodes; train with --record"; }
   void end() override { rollout_.reset(), evaluation_.reset(), end_collecting(); }
   bool busy() const override { return rollout_ != nullptr; }
   void handle(const Message& message) override {

@@ -117,6 +117,7 @@ class CollectorSession : public Session {  // a Session that holds the weights a
                 description_.action.is(run.action[0]);
     return same ? "" : "environment " + description_.id + ": its observations or actions are not what the learner has; build both from the same version";
   }
+  virtual std::string no_rows() const { return "the C++ client does not record episodes by itself; add --inference learner"; }
   std::string begin_collecting(const Run& run) {
     const Space &seen = description_.observation, &done = description_.action;
     if (std::string why = other_spaces(run); !why.empty()) return why;
@@ -244,7 +245,7 @@ class CollectorSession : public Session {  // a Session that holds the weights a
     }
   }
   void take_evaluation(const Message& m) {
-    if (m.send_rows) return decline("the C++ client does not record episodes, which the learner asks for");
+    if (m.send_rows) return decline(no_rows());
     for (const Evaluation& answer : answers_) if (answer.ticket == m.ticket) return send_evaluation(answer);
     for (const Evaluation& order : orders_) if (order.ticket == m.ticket) return;
     orders_.push_back({m.ticket, m.version, m.most_steps, m.greedy, {}, {}, {}});

@@ -249,8 +249,7 @@ class Session {
     end();
     state_ = State::ready, session_ = *m.session, run_ = m.run;
     version_ = acknowledged_ = -1, replies_ = 0;
-    heard_s_ = began_s_ = now_s(), due_s_ = heard_s_ + run_.heartbeat_s;
-    act_s_ = step_s_ = evaluate_s_ = 0;
+    heard_s_ = now_s(), due_s_ = heard_s_ + run_.heartbeat_s;
     join_timeout_s_ = options_.rejoin_timeout_s;
     std::string why;
     if (run_.env != description_.id) why = "this client has the environment " + description_.id + ", the learner asks for " + run_.env;
@@ -336,7 +335,7 @@ class Session {
   Decoder decoder_;
   Message message_;
   Writer beat_head_;
-  double join_timeout_s_, joining_s_ = 0, due_s_ = 0, backoff_s_ = 0, heard_s_ = 0, heard_wire_s_ = 0, since_s_ = now_s(), began_s_ = 0;
+  double join_timeout_s_, joining_s_ = 0, due_s_ = 0, backoff_s_ = 0, heard_s_ = 0, heard_wire_s_ = 0, since_s_ = now_s(), began_s_ = now_s();
   std::uint64_t life_, attempt_, replies_ = 0, env_calls_ = 0;
   const char* doing_ = "starting";
   char host_[256] = "";

@@ -1,0 +1,80 @@
+"""Starts the clients, and commands of millrace for which they work."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.system.processes import START_S, Learner, Running, Stage, free_port
+
+IN_LEARNER = ("--inference", "learner")
+
+
+def no_warning(*command: str) -> None:
+    """Run a command of the compiler. Fails if it does, or warns."""
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "warning:" not in done.stderr, done.stderr
+
+
+def loopback() -> str:
+    """An address that nobody uses."""
+    return f"tcp://127.0.0.1:{free_port()}"
+
+
+def millrace(stage: Stage, name: str, *words: object) -> Running:
+    """Start a command of millrace."""
+    return stage.start([sys.executable, "-m", "millrace", *map(str, words)], name)
+
+
+def learner(stage: Stage, address: str, *words: object, env: str = "CartPole-v1", steps: int = 4_000) -> Learner:
+    """Start `millrace learner` at this address. `words`: more flags."""
+    command = [sys.executable, "-m", "millrace", "learner", env, "--bind", address, "--run-dir", str(stage.runs)]
+    settings = ["--preset", "none", "--steps", str(steps), "--eval-episodes", "2"]
+    made = Learner([*command, *settings, *map(str, words)], stage.tmp_path / f"learner-{len(stage.started)}.log", stage.runs)
+    stage.started.append(made)
+    return made
+
+
+class Client:
+    """A program of a client, which is built."""
+
+    def __init__(self, stage: Stage, command: list[str]) -> None:
+        self._stage, self._command = stage, command
+
+    def start(self, address: str, name: str = "client", *flags: object) -> Running:
+        """Start it for the learner at this address."""
+        return self._stage.start([*self._command, address, "--name", name, *map(str, flags)], name)
+
+
+class Clients:
+    """The programs of the clients. Take one before a learner is started, which would wait for the compiler."""
+
+    def __init__(self, request: pytest.FixtureRequest, stage: Stage) -> None:
+        self._request, self._stage = request, stage
+
+    def __getitem__(self, program: str) -> Client:
+        """`cpp cartpole`, `js corridor` and so on. Skips the test if it cannot be built."""
+        language, _, file = program.partition(" ")
+        if language == "cpp":
+            build: Path = self._request.getfixturevalue("cpp_build")
+            no_warning("cmake", "--build", str(build), "--target", file)
+            return Client(self._stage, [str(build / file)])
+        folder: Path = self._request.getfixturevalue("js")
+        (script,) = folder.glob(f"*/{file}.js")
+        return Client(self._stage, ["node", str(script)])
+
+
+def ends_well(running: Running, within_s: float = START_S + 60) -> str:
+    """Wait until it ends with exit code 0. Returns what it said."""
+    assert running.ends(within_s) == 0, running.said()
+    return running.said()
+
+
+def last_line(running: Running, exit_code: int, within_s: float = START_S) -> str:
+    """Wait until it ends with this exit code. Returns the last line that it said."""
+    assert running.ends(within_s) == exit_code, running.said()
+    return running.said().splitlines()[-1]
