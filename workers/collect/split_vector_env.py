@@ -138,13 +138,20 @@ class SplitVectorEnv:
     def _assign_now(self, copies: slice, name: str, packed: bytes) -> None:
         chosen = range(copies.start, copies.stop)
         try:
-            there = all(self._calls.call_some(chosen, "has_wrapper_attr", name))
+            there = self._have(chosen, name)
             if not there or name in METHODS:
                 what = "a method" if there else "none"
                 raise Unusable(None, f"expected an attribute of the environment that is called {name}, got {what}")
             self._calls.assign_some(chosen, name, [unpack(packed)] * len(chosen))
         except EnvironmentFailed as error:
             raise CopyRaised(None, f"set_env_attr {name}") from error
+
+    def _have(self, copies: Sequence[int], name: str) -> bool:
+        """Whether these copies have the attribute. Those of a client in another language have none, nor gymnasium's methods."""
+        try:
+            return all(self._calls.call_some(copies, "has_wrapper_attr", name))
+        except AttributeError:
+            return False
 
     def _assign_again(self, pulse: Pulse) -> None:
         """Set the attributes of copies that replace lost ones. If a worker is lost meanwhile, the next step tries again."""

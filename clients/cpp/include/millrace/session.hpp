@@ -253,7 +253,7 @@ class Session {
     join_timeout_s_ = options_.rejoin_timeout_s;
     std::string why;
     if (run_.env != description_.id) why = "this client has the environment " + description_.id + ", the learner asks for " + run_.env;
-    else if (!run_.beyond.empty()) why = "the C++ client does not support " + run_.beyond + ", which the learner asks for; try --inference learner";
+    else if (!run_.beyond.empty()) why = "the C++ client does not support " + run_.beyond + ", which the learner asks for" + (run_.type == "RunSpec" ? "; try --inference learner" : "");
     else if (run_.vector != "loop") why = "the C++ client steps copies one by one, the learner asks for --vector " + run_.vector;
     else if (run_.type == "DescribeSpec") return log("joined"), describe();
     else why = begin(run_);
