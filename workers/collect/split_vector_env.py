@@ -147,7 +147,7 @@ class SplitVectorEnv:
             raise CopyRaised(None, f"set_env_attr {name}") from error
 
     def _have(self, copies: Sequence[int], name: str) -> bool:
-        """Whether these copies have the attribute. Those of a client in another language have none, nor gymnasium's methods."""
+        """Whether these copies have the attribute. Those of a client in another language have none."""
         try:
             return all(self._calls.call_some(copies, "has_wrapper_attr", name))
         except AttributeError:
