@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,8 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 import millrace
+from learner.vector_env import settings
 from learner.vector_env.env import ZmqVectorEnv
-from millrace.launch import vector
 from protocol.env_spec import EnvLike
 from protocol.errors import EnvironmentFailed, NoWorkers, UserFacingError, WorkerLost
 from protocol.keys.key_folder import KeyFolder
@@ -431,7 +432,7 @@ def test_a_silent_worker_elsewhere_is_lost_long_before_the_deadline(elsewhere: E
 
 def test_a_slow_step_or_a_slow_caller_does_not_lose_a_worker(elsewhere: Elsewhere, monkeypatch: pytest.MonkeyPatch) -> None:
     """Both take longer than the time after which a silent worker counts as lost."""
-    monkeypatch.setattr(vector, "WORKER_TIMEOUT_S", 2.0)
+    monkeypatch.setattr(settings, "VectorEnvSettings", partial(settings.VectorEnvSettings, worker_timeout_s=2.0))
     elsewhere.start("a")
     with millrace.make_vec("workers.envs.toy:Slow-v0", 1, bind=elsewhere.address, seconds=3.0, timeout=60.0) as env:
         env.reset(seed=1)
