@@ -121,7 +121,7 @@ def what_to_write(env_id: str) -> str:
             )
     if (similar := most_similar(env_id, [f"{one.module}:{env}" for one in packages for env in one.examples])) is not None:
         return f"did you mean {similar}?"
-    own = "one of your own is given as my_module:MyEnv-v0"
+    own = "one of your own is given as my_module:MyEnv-v0, one of a client in another language needs the client (--bind)"
     names = [package.module for package in packages if package.ids]
     if not names:
         return f"is the package that has it installed? {own[0].upper()}{own[1:]}"

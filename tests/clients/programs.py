@@ -39,6 +39,14 @@ def learner(stage: Stage, address: str, *words: object, env: str = "CartPole-v1"
     return made
 
 
+def resumed(stage: Stage, runs: Learner, address: str, *words: object) -> Learner:
+    """Start `millrace learner` that goes on with this run."""
+    command = [sys.executable, "-m", "millrace", "learner", "--resume", str(runs.folder), "--bind", address]
+    made = Learner([*command, *map(str, words)], stage.tmp_path / f"learner-{len(stage.started)}.log", stage.runs)
+    stage.started.append(made)
+    return made
+
+
 class Client:
     """A program of a client, which is built."""
 

@@ -105,7 +105,8 @@ def test_an_id_that_nothing_resembles_says_which_packages_there_are(site: Site) 
     site.install("fake_flappy", REGISTERS_ON_IMPORT)
     line = refusal("Qqqqqqqqqqq-v7")
     assert "packages with environments are installed (" in line
-    assert line.endswith("and one of your own is given as my_module:MyEnv-v0")
+    assert "and one of your own is given as my_module:MyEnv-v0" in line
+    assert line.endswith("one of a client in another language needs the client (--bind)")
     assert most_similar("Qqqqqqqqqqq-v7") is None
 
 
