@@ -97,8 +97,10 @@ class Learner:
         """whether the client's process may have left, and another have started under its name, by its supervisor"""
         self.description: Described | None = None
         """what the client has described, in this whole run of the test"""
-        self.steps_per_s = 0.0
-        """how fast the client collects, in this whole run of the test; 0: that is not known yet"""
+        self.long_steps = 0
+        """T of a rollout during which something can happen, in this whole run of the test; 0: that is not known yet"""
+        self.long_s = 0.0
+        """how long the client takes for that rollout"""
         self.received: dict[int, Received] | None = None
         """by lane: what HeartbeatReply and Collect say has arrived; None: all that has"""
         self.unlisted: set[int] = set()
