@@ -10,7 +10,7 @@ import logging
 from collections.abc import Callable
 
 from learner.algorithms import Algorithm
-from learner.config.run_rules import EvaluationSettings
+from learner.config.run_rules import EvaluationSettings, EvaluationSize
 from learner.rollout_service.service import RolloutService
 from learner.rollouts.evaluation_tickets import EvaluationPlan
 from learner.run_folder.results import Best, Evaluation
@@ -18,6 +18,7 @@ from learner.run_folder.run_folder import RunFolder
 from learner.run_state import RunState
 from protocol.arrays import Floats
 from protocol.errors import RunError, UsageError
+from protocol.logs.notices import log_notice
 from protocol.specs import RunSpec
 
 log = logging.getLogger("millrace.learner")
@@ -65,14 +66,20 @@ class Evaluations:
 
     def evaluate_newest(self, version: int, env_steps: int) -> dict[str, float | None]:
         """Make the evaluation that is due, of the newest policy, which is this version. Returns its metrics."""
-        found = self._evaluate_version(version, env_steps)
+        found = self._evaluate_version(version, env_steps, self._settings.size())
         self._keep_if_best(found, env_steps)
         self.next_at += self._settings.every_env_steps
         return found.metrics()
 
-    def conclude(self, version: int, env_steps: int) -> Best | None:
-        """Evaluate the final policy. If the run kept a best policy, evaluate that one on other episodes and return it."""
-        found = self._evaluate_version(version, env_steps)
+    def conclude(self, version: int, env_steps: int, episode_length: float | None) -> Best | None:
+        """Evaluate the final policy. If the run kept a best policy, evaluate that one on other episodes and return it.
+
+        `episode_length`: mean length of the last episodes of training, if one has ended.
+        """
+        size = self._settings.final_size(env_steps, episode_length)
+        if size != self._settings.size():
+            log_notice(log, _smaller(size))
+        found = self._evaluate_version(version, env_steps, size)
         if self._settings.every_env_steps:
             self._keep_if_best(found, env_steps)
         if self.best is None:
@@ -86,28 +93,28 @@ class Evaluations:
             self.best_policy = parameters, buffers
         chosen_by, at_env_steps = self.best
         self._service.publish(version + 1, *self.best_policy, deal=False)  # training is over: no update has this number
-        confirmed = self._evaluate("the best policy", CONFIRMATION_SEED)
+        confirmed = self._evaluate("the best policy", CONFIRMATION_SEED, size)
         return Best(env_steps=int(at_env_steps), chosen_by=chosen_by, evaluation=confirmed)
 
     def of_version(self, version: int) -> Evaluation | None:
         """The evaluation of this version, if there is one."""
         return self.newest if self.version == version else None
 
-    def _evaluate_version(self, version: int, env_steps: int) -> Evaluation:
+    def _evaluate_version(self, version: int, env_steps: int, size: EvaluationSize) -> Evaluation:
         """Evaluate the newest policy, which is this version; the same version is not evaluated twice."""
-        if self.newest is None or self.version != version or self.newest.episodes != self._settings.episodes:
-            self.newest = self._evaluate("", EVALUATION_SEED)
+        if self.newest is None or self.version != version or self.newest.episodes != size.episodes:
+            self.newest = self._evaluate("", EVALUATION_SEED, size)
             self.version = version
             self.note = f"{env_steps:,} env steps: greedy {self.newest}"
         return self.newest
 
-    def _evaluate(self, what: str, seed: int) -> Evaluation:
+    def _evaluate(self, what: str, seed: int, size: EvaluationSize) -> Evaluation:
         """Evaluate the weights that were published last."""
         settings = self._settings
-        plan = EvaluationPlan.of(settings.episodes, seed + settings.seed, settings.copies, settings.max_steps)
+        plan = EvaluationPlan.of(size.episodes, seed + settings.seed, settings.copies, size.max_steps)
 
         def show(played: int) -> None:
-            self.doing = f"evaluating{f' {what}' if what else ''}: {played:,} of {settings.episodes:,} episodes"
+            self.doing = f"evaluating{f' {what}' if what else ''}: {played:,} of {size.episodes:,} episodes"
             self._watch()
 
         try:
@@ -125,6 +132,14 @@ class Evaluations:
     def _write_best(self, parameters: Floats, buffers: Floats) -> None:
         policy, env, facts = self._spec.policy, self._spec.env, self._spec.facts
         warn_on_error(lambda: self._folder.write_policy(policy, env, parameters, buffers, "best", facts, self._spec.masked))
+
+
+def _smaller(size: EvaluationSize) -> str:
+    """Says that an evaluation is smaller than usual."""
+    return (
+        f"the evaluation has {size.episodes} episodes, because it should take fewer env steps than the training; "
+        "--eval-episodes sets another number"
+    )
 
 
 def warn_on_error(write: Callable[[], object]) -> None:

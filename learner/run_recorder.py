@@ -224,7 +224,7 @@ class RunRecorder:
         """Evaluate the final policy, which must be published, and the best one."""
         before = self._evaluations.of_version(self.version)
         with self._evaluation_time():
-            self._confirmed = self._evaluations.conclude(self.version, self.env_steps)
+            self._confirmed = self._evaluations.conclude(self.version, self.env_steps, self._window.length_mean)
         if self._evaluations.of_version(self.version) is not before:
             self._callbacks.on_evaluation(self.progress())
 

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import msgspec
 
 
@@ -52,11 +54,22 @@ class CheckpointPolicy(msgspec.Struct, frozen=True, kw_only=True):
         return by_episodes or by_updates or since_last_s > self.every_s
 
 
+MOST_EPISODES, FEWEST_EPISODES = 100, 10  # of an evaluation whose number of episodes is not set
+
+
+class EvaluationSize(NamedTuple):
+    """How large one evaluation is."""
+
+    episodes: int
+    max_steps: int
+    """largest number of env steps, of all episodes together"""
+
+
 class EvaluationSettings(msgspec.Struct, frozen=True, kw_only=True):
     """How often the policy is evaluated greedily, and on which episodes."""
 
-    episodes: int
-    """episodes of one evaluation"""
+    episodes: int | None
+    """episodes of one evaluation; None: 100, and at the end of a run perhaps fewer (`final_size`)"""
     every_env_steps: int
     """env steps between evaluations during training; 0: evaluate only at the end"""
     copies: int
@@ -65,3 +78,21 @@ class EvaluationSettings(msgspec.Struct, frozen=True, kw_only=True):
     """largest number of env steps of one evaluation"""
     seed: int
     """the run's seed: it decides which episodes are played"""
+
+    def size(self) -> EvaluationSize:
+        """The size of an evaluation during training."""
+        return EvaluationSize(MOST_EPISODES if self.episodes is None else self.episodes, self.max_steps)
+
+    def final_size(self, env_steps: int, episode_length: float | None) -> EvaluationSize:
+        """The size of the evaluation after training.
+
+        `env_steps`: of the training. `episode_length`: mean length of its last episodes, in env steps; None if none has
+        ended. The size depends on these counts, and not on seconds, so that the result of a run is always the same.
+        """
+        if self.episodes is not None or self.every_env_steps:
+            return self.size()
+        budget = 3 * env_steps // 4
+        if episode_length is None:  # episodes may have no end
+            return EvaluationSize(FEWEST_EPISODES, max(min(self.max_steps, budget), 1))
+        fitting = int(budget / max(episode_length, 1.0))
+        return EvaluationSize(min(max(fitting, FEWEST_EPISODES), MOST_EPISODES), self.max_steps)

@@ -45,6 +45,7 @@ STEPS = 32  # T of most checks
 TIMED_STEPS = 500  # T of a rollout that tells how fast the client is
 LONG_S, LONGEST_STEPS = 1.0, 50_000  # of a rollout during which something happens: what is aimed at, the bound
 NET = (16, 16)
+LONG_NET = (256, 256)  # of long rollouts: a compiled client would make 50,000 steps by a small one in a few milliseconds
 QUIET_S = 0.7
 MOST_LIMIT_STEPS = 2000  # of a time limit that the check walks to
 EVALUATED_STEPS = 40
@@ -97,11 +98,11 @@ class Collecting:
         yield from self.learner.quiet(Rollout, QUIET_S, rule, expected)
 
 
-def run_spec(learner: Learner, steps: int = STEPS, heartbeat_s: float = 0.0) -> Script[RunSpec]:
+def run_spec(learner: Learner, steps: int = STEPS, heartbeat_s: float = 0.0, net: tuple[int, ...] = NET) -> Script[RunSpec]:
     """A run of the client's environment."""
     env = yield from described(learner)
     try:
-        policy = PolicySpec(observation_leaves(env.observation_space), action_spec(env.action_space), net=NET)
+        policy = PolicySpec(observation_leaves(env.observation_space), action_spec(env.action_space), net=net)
     except UsageError as error:
         raise Broken(rules.DESCRIBE, "spaces that a policy can use", str(error)) from None
     settings = learner.settings
@@ -118,10 +119,15 @@ def run_spec(learner: Learner, steps: int = STEPS, heartbeat_s: float = 0.0) -> 
 
 
 def collecting(
-    learner: Learner, steps: int = STEPS, heartbeat_s: float = 0.0, *, weights: bool = True
+    learner: Learner,
+    steps: int = STEPS,
+    heartbeat_s: float = 0.0,
+    *,
+    weights: bool = True,
+    net: tuple[int, ...] = NET,
 ) -> Script[Collecting]:
     """A new session of the collector profile. `weights`: version 1 is sent."""
-    run = yield from run_spec(learner, steps, heartbeat_s)
+    run = yield from run_spec(learner, steps, heartbeat_s, net)
     yield from learner.joining()
     learner.welcome(run)
     session = Collecting(learner, run)
@@ -135,7 +141,7 @@ def collecting_at_length(learner: Learner) -> Script[Collecting]:
     if not learner.long_steps:
         steps, took_s = TIMED_STEPS, 0.0
         while True:
-            session = yield from collecting(learner, steps)
+            session = yield from collecting(learner, steps, net=LONG_NET)
             yield from session.collect(session.permit())  # opens the lane
             began_s = learner.now
             yield from session.collect(session.permit())
@@ -145,7 +151,7 @@ def collecting_at_length(learner: Learner) -> Script[Collecting]:
             steps = min(10 * steps, LONGEST_STEPS)
         learner.long_steps = min(max(int(LONG_S * steps / took_s), STEPS), LONGEST_STEPS)
         learner.long_s = took_s * learner.long_steps / steps
-    return (yield from collecting(learner, learner.long_steps))
+    return (yield from collecting(learner, learner.long_steps, net=LONG_NET))
 
 
 # ------------------------------------------------------------------------------------------------------------- rollouts
@@ -411,7 +417,7 @@ def forgets_the_session_before(learner: Learner) -> Script[None]:
     session = yield from collecting_at_length(learner)
     session.deal(session.permit(0), session.permit(1))
     yield from learner.let_pass(learner.long_s / 5)
-    again = yield from collecting(learner, weights=False)
+    again = yield from collecting(learner, weights=False, net=LONG_NET)
     permit = again.permit()
     again.deal(permit, version=0)
     text = "no rollout before the first Weights of the session"

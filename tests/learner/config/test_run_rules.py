@@ -53,3 +53,29 @@ def test_records_take_their_settings_from_the_configuration() -> None:
     assert config.evaluation_settings() == EvaluationSettings(
         episodes=5, every_env_steps=1000, copies=4, max_steps=1_000_000, seed=3
     )
+
+
+@pytest.mark.parametrize(
+    ("settings", "env_steps", "episode_length", "size"),
+    [
+        ({}, 100_000, 500.0, (100, 1_000_000)),
+        ({}, 100_000, 1000.0, (75, 1_000_000)),
+        ({}, 100_000, 1.0, (100, 1_000_000)),
+        ({}, 100_000, 50_000.0, (10, 1_000_000)),
+        ({}, 100_000, None, (10, 75_000)),
+        ({}, 0, None, (10, 1)),
+        ({"eval_max_steps": 500}, 100_000, None, (10, 500)),
+        ({"eval_episodes": 100}, 100_000, 50_000.0, (100, 1_000_000)),
+        ({"eval_episodes": 3}, 100_000, None, (3, 1_000_000)),
+        ({"eval_every": 10_000}, 100_000, 50_000.0, (100, 1_000_000)),
+    ],
+)
+def test_the_evaluation_after_training_takes_three_quarters_of_its_env_steps_or_ten_episodes(
+    settings: dict[str, Any], env_steps: int, episode_length: float | None, size: tuple[int, int]
+) -> None:
+    assert Config(**settings).evaluation_settings().final_size(env_steps, episode_length) == size
+
+
+def test_during_training_evaluations_have_a_hundred_episodes_or_as_many_as_are_set() -> None:
+    assert Config().evaluation_settings().size() == (100, 1_000_000)
+    assert Config(eval_episodes=7, eval_max_steps=50).evaluation_settings().size() == (7, 50)
