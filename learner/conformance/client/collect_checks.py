@@ -139,18 +139,13 @@ def collecting(
 def collecting_at_length(learner: Learner) -> Script[Collecting]:
     """A session with rollouts that last, so that something can happen while one is in progress."""
     if not learner.long_steps:
-        steps, took_s = TIMED_STEPS, 0.0
-        while True:
-            session = yield from collecting(learner, steps, net=LONG_NET)
-            yield from session.collect(session.permit())  # opens the lane
-            began_s = learner.now
-            yield from session.collect(session.permit())
-            took_s = max(learner.now - began_s, 1e-3)
-            if took_s > LONG_S / 4 or steps == LONGEST_STEPS:  # so long that messages hardly count
-                break
-            steps = min(10 * steps, LONGEST_STEPS)
-        learner.long_steps = min(max(int(LONG_S * steps / took_s), STEPS), LONGEST_STEPS)
-        learner.long_s = took_s * learner.long_steps / steps
+        session = yield from collecting(learner, TIMED_STEPS, net=LONG_NET)
+        yield from session.collect(session.permit())  # opens the lane
+        began_s = learner.now
+        yield from session.collect(session.permit())
+        step_s = max(learner.now - began_s, 1e-3) / TIMED_STEPS
+        learner.long_steps = min(max(int(LONG_S / step_s), STEPS), LONGEST_STEPS)
+        learner.long_s = step_s * learner.long_steps
     return (yield from collecting(learner, learner.long_steps, net=LONG_NET))
 
 
