@@ -53,7 +53,8 @@ def saved_policy(
     be found.
     """
     card, parameters, buffers = RunFolder.open_policy(run).read_policy(which)
-    spec = EnvSpec.of(card.env if env is None else env, card.env_kwargs, card.wrappers if wrappers is None else wrappers)
+    outer = card.wrappers if wrappers is None else wrappers
+    spec = EnvSpec.of(card.env if env is None else env, card.env_kwargs, outer, card.eval_env_kwargs)
     facts = _facts_of_older(run) if card.facts is None else card.facts
     return SavedPolicy(card.policy, spec, parameters, buffers, facts, card.masked)
 

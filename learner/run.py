@@ -250,7 +250,10 @@ def serve(config: Config, resume: Resumption | None, watch: Watch) -> Path:
         bound = listen(config, stack)
         observer = stack.enter_context(prometheus_observer(config))
         bound.announce(config.advertise)
-        env, processes = EnvSpec.of(config.env, config.env_kwargs, config.wrapper), ProcessCallbacks()
+        env, processes = (
+            EnvSpec.of(config.env, config.env_kwargs, config.wrapper, config.eval_env_kwargs),
+            ProcessCallbacks(),
+        )
         known = known_environment(config, env, resume, describe_over(bound.link, config, processes))
         folder = folder or stack.enter_context(run_folder(config, None))
         run = Run(

@@ -151,7 +151,7 @@ class RolloutService:
         self._taken, self._published = 0, 0
         self._moments: Moments | None = None
         self._resources = ExitStack()
-        spec = EnvSpec.of(env, config.env_kwargs, wrappers)
+        spec = EnvSpec.of(env, config.env_kwargs, wrappers, config.eval_env_kwargs)
         try:
             with self._interrupts:
                 started = start(

@@ -267,7 +267,9 @@ def train(
     given = None
     if not isinstance(env, str) or wrappers is not None:
         outer = settings.wrapper if wrappers is None else wrappers
-        given = EnvSpec.of(settings.env if isinstance(env, str) else env, settings.env_kwargs, outer)
+        given = EnvSpec.of(
+            settings.env if isinstance(env, str) else env, settings.env_kwargs, outer, settings.eval_env_kwargs
+        )
     with shown_progress(watch, show=progress) as both:
         folder = local_run.train(settings, run, Callbacks(callbacks, both), given)
     return Run._trained(folder, objects)

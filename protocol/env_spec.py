@@ -111,13 +111,20 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """wrappers of every copy, the innermost first: `module:Class`, or `module:Class(key=value)` with plain values. If one of
     them is in the factory, all are, and these are only their names.
     """
+    eval_kwargs: dict[str, Scalar] = {}
+    """keyword arguments of copies that play evaluations, in addition to `kwargs` or in place of those of the same name"""
 
     @staticmethod
-    def of(env: EnvLike | EnvSpec, kwargs: dict[str, Scalar] | None = None, wrappers: Sequence[WrapperLike] = ()) -> EnvSpec:
+    def of(
+        env: EnvLike | EnvSpec,
+        kwargs: dict[str, Scalar] | None = None,
+        wrappers: Sequence[WrapperLike] = (),
+        eval_kwargs: dict[str, Scalar] | None = None,
+    ) -> EnvSpec:
         """Make a spec from what a user gives: an id or a name, gymnasium's `EnvSpec`, or a callable that takes `kwargs`.
 
-        `wrappers`: each takes an environment and returns one, or is the name of such a callable. Raises `UsageError` for
-        what cannot be found, and for a callable that is too large to send.
+        `wrappers`: each takes an environment and returns one, or is the name of such a callable. `eval_kwargs`: as the
+        field. Raises `UsageError` for what cannot be found, and for a callable that is too large to send.
         """
         if isinstance(env, EnvSpec):
             return env
@@ -128,9 +135,14 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if any(wrapper is not None for wrapper in own):
             layers = [name if wrapper is None else wrapper for name, wrapper in zip(names, own, strict=True)]
             factory = _WrappedFactory(name, factory, tuple(layers))
-        return EnvSpec(
-            name, kwargs or {}, None if factory is None else PickledCallable.of(factory, f"environment {name}"), names
-        )
+        pickled = None if factory is None else PickledCallable.of(factory, f"environment {name}")
+        return EnvSpec(name, kwargs or {}, pickled, names, eval_kwargs or {})
+
+    def for_evaluation(self) -> EnvSpec:
+        """The environment of copies that play evaluations."""
+        if not self.eval_kwargs:
+            return self
+        return msgspec.structs.replace(self, kwargs=self.kwargs | self.eval_kwargs, eval_kwargs={})
 
     def rejection_reason(self, code: AllowedCode) -> str:
         """Why a worker that allows only this code cannot make it; empty if it can."""

@@ -211,7 +211,7 @@ class Worker {
     if (run.type === "RunSpec") return "this client does not act: it needs --inference learner, or millrace.make_vec";
     for (const env of run.type === "StepSpec" ? run.envs : [run.env]) {
       if (env.id !== this.description.id) return `this client has the environment ${this.description.id}, the learner asks for ${env.id}`;
-      if (env.factory || env.wrappers?.length || Object.keys(env.kwargs ?? {}).length)
+      if (env.factory || env.wrappers?.length || Object.keys({ ...env.kwargs, ...env.eval_kwargs }).length)
         return "this client takes no factory, wrappers or arguments of an environment";
     }
     if (run.autoreset === "SameStep") return "this client resets a copy in the next step, the learner asks for autoreset SameStep";

@@ -6,7 +6,7 @@ import functools
 from pathlib import Path
 from typing import Any
 
-from learner.config.config import Config
+from learner.config.config import TABLES, Config
 from learner.config.flag_help import show_help
 from learner.config.flag_parser import parse_flags
 from learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig, PPOConfig, algorithms_with
@@ -68,13 +68,13 @@ def _read_layers(command: str, argv: list[str], resumed: Path | None = None) -> 
     if type(algorithm) is not type(first.algorithm):  # then the values of its own flags may have been mistaken for ENV
         first = parse(without_help, default=RunFlags(algo="", algorithm=algorithm), ignore_unknown=True)
     base = below(first.env)
-    default = RunFlags(**{**_fields(base), "env_kwargs": {}, "wrapper": ()})
+    default = RunFlags(**{**_fields(base), **{name: {} for name in TABLES}, "wrapper": ()})
     if without_help != argv:
         show_help(default, command)
     flags = parse(argv, default=default)
     config = Config(**_fields(flags))
-    both = {"env_kwargs": base.env_kwargs | config.env_kwargs, "wrapper": config.wrapper or base.wrapper}
-    return validate(override(config, both, "")), flags.resume
+    merged = {name: getattr(base, name) | getattr(config, name) for name in TABLES}
+    return validate(override(config, {**merged, "wrapper": config.wrapper or base.wrapper}, "")), flags.resume
 
 
 def _none_for_tyro(argv: list[str], algorithm: AlgorithmConfig) -> list[str]:

@@ -20,6 +20,7 @@ from learner.config.rollout_config import Count, Natural, RolloutConfig, Seconds
 from learner.config.run_rules import CheckpointPolicy, EvaluationSettings, StopRule
 from protocol.bounds import MAX_SEEDS
 
+TABLES = ("env_kwargs", "eval_env_kwargs")  # settings that are tables: layers are merged key by key
 PRESETS = Path(__file__).with_name("presets.toml")
 
 
@@ -131,7 +132,7 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     def to_toml(self) -> str:
         """All settings as TOML, in the order of the fields. A setting that is None is written as "none"."""
         plain: dict[str, Any] = msgspec.to_builtins(self)
-        tables = {"env_kwargs": plain.pop("env_kwargs"), self.algo: _without_none(plain.pop("algorithm"))}
+        tables = {name: plain.pop(name) for name in TABLES} | {self.algo: _without_none(plain.pop("algorithm"))}
         return tomli_w.dumps(_without_none(plain) | tables)
 
 

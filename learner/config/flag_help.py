@@ -27,7 +27,7 @@ BASIC = (
     "run_dir", "eval_episodes", "eval_every", "target_return", "target_mean_return",
 )  # fmt: skip
 GROUPS = {
-    "evaluation": ("eval_copies", "eval_max_steps", "info_keys"),
+    "evaluation": ("eval_env_kwargs", "eval_copies", "eval_max_steps", "info_keys"),
     "worker": (
         "lanes", "max_lag", "vector", "action_masks", "inference", "images_dtype", "torch_threads", "pin_workers",
         "min_workers",
@@ -46,6 +46,7 @@ GROUPS = {
 METAVARS = {
     "algo": f"{{{','.join(HYPERPARAMETERS)}}}|MODULE:CLASS",
     "env_kwargs": "NAME VALUE ...",
+    "eval_env_kwargs": "NAME VALUE ...",
     "wrapper": "MODULE:CLASS",
     "net": "INT ...",
     "callback": "MODULE:FACTORY",

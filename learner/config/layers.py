@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 
 from learner.config.algorithm_names import is_own, name_of, settings_record, with_algorithm
-from learner.config.config import Config
+from learner.config.config import TABLES, Config
 from learner.config.hyperparameters import HYPERPARAMETERS, algorithms_with
 from learner.config.presets import PRESETS, environment_presets, named_presets
 from learner.config.validation import convert, validate
@@ -105,7 +105,8 @@ def lower_layers(
 def override(config: Config, values: Mapping[str, Any], where: str) -> Config:
     """The configuration with these values instead of its own. Types are checked.
 
-    `values` has settings of the run and of the algorithm side by side. `env_kwargs` are merged with those that are there.
+    `values` has settings of the run and of the algorithm side by side. `env_kwargs` and `eval_env_kwargs` are merged with
+    those that are there.
     """
     config = _defaults_of(values["algo"], f"{where}: ") if values.get("algo", config.algo) != config.algo else config
     settings: dict[str, Any] = msgspec.to_builtins(config)
@@ -113,7 +114,7 @@ def override(config: Config, values: Mapping[str, Any], where: str) -> Config:
     for name, value in values.items():
         if name in algorithm:
             algorithm[name] = _coerce(config.algorithm, name, value)
-        elif name == "env_kwargs" and isinstance(value, Mapping):
+        elif name in TABLES and isinstance(value, Mapping):
             settings[name] |= value
         elif name in settings and name != "algorithm":
             settings[name] = _coerce(config, name, value)

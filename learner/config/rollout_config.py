@@ -32,6 +32,8 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """Environment id for gymnasium.make, such as CartPole-v1, ALE/Pong-v5 or my_package.envs:MyEnv-v0."""
     env_kwargs: Fixed[dict[str, Scalar]] = {}
     """Keyword arguments for gymnasium.make: NAME VALUE NAME VALUE ..."""
+    eval_env_kwargs: Fixed[dict[str, Scalar]] = {}
+    """Keyword arguments of evaluation copies, in addition to env_kwargs or in place of those of the same name."""
     wrapper: Fixed[Annotated[tuple[str, ...], UseAppendAction]] = ()
     """Wrapper of every env copy, also in evaluations, such as gymnasium.wrappers:FlattenObservation. Arguments must be
     literals: "my_module:Scale(by=0.5)". Repeat the flag to add more wrappers. The first one is the innermost.

@@ -84,6 +84,8 @@ class PolicyDescription(msgspec.Struct, frozen=True, kw_only=True):
     """names of the numbers that the run logs of each episode; None: an older millrace wrote it, which did not say"""
     masked: bool = False
     """whether the environment says which actions are allowed"""
+    eval_env_kwargs: dict[str, Scalar] = {}
+    """keyword arguments of evaluation copies, in addition to `env_kwargs` or in place of those of the same name"""
 
 
 class RunSettings(Protocol):
@@ -254,6 +256,7 @@ class RunFolder:
             wrappers=env.wrappers,
             facts=facts,
             masked=masked,
+            eval_env_kwargs=env.eval_kwargs,
         )
         contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         checksum = str(zlib.crc32(_split(save(contiguous))[1]))

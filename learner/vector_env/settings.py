@@ -38,7 +38,9 @@ class VectorEnvSettings:
     wrappers: Sequence[WrapperLike] = ()
     """Wrappers of every env copy, the innermost first."""
     single_lanes: int = 0
-    """Number of further copies, after the others: each is a lane of its own, which `ZmqVectorEnv.step_lanes` steps."""
+    """Number of further copies for evaluations, after the others: each is a lane of its own, which `ZmqVectorEnv.step_lanes`
+    steps.
+    """
 
     @property
     def envs(self) -> list[EnvLike | EnvSpec]:

@@ -10,7 +10,7 @@ import gymnasium
 from gymnasium.vector import AutoresetMode
 
 from learner.vector_env.settings import VectorEnvSettings
-from protocol.env_spec import EnvSpec
+from protocol.env_spec import EnvSpec, PickledCallable
 from protocol.envs.description import DescribedEnv
 from protocol.envs.spaces import leaves_with_own_dtype
 from protocol.errors import UsageError
@@ -68,6 +68,11 @@ class RequestedCopies:
         return VectorEnvDescription(step, env.observation_space, env.action_space, metadata, env.render_mode, spec)
 
 
+def _identity(spec: EnvSpec) -> tuple[str, PickledCallable | None, str]:
+    """Equal for specs that make the same environment; the wrappers of all are the same."""
+    return spec.id, spec.factory, repr(spec.kwargs)
+
+
 def requested_copies(settings: VectorEnvSettings, learner_timeout_s: float = math.inf) -> RequestedCopies:
     """The env copies that the settings ask for.
 
@@ -79,17 +84,17 @@ def requested_copies(settings: VectorEnvSettings, learner_timeout_s: float = mat
         raise UsageError(f"num_envs: expected at least 1 and, with a list, its length ({N}), got {settings.num_envs}")
     if not 1 <= lanes <= N:
         raise UsageError(f"lanes: expected 1 to num_envs ({N}), got {lanes}; each lane lives in one worker")
-    with_single = [*envs, *envs[:1] * settings.single_lanes]
-    keys = [env if isinstance(env, str) else id(env) for env in with_single]  # gymnasium's specs cannot be hashed
+    keys = [env if isinstance(env, str) else id(env) for env in envs]  # gymnasium's specs cannot be hashed
     env_specs = {
-        key: EnvSpec.of(env, settings.kwargs, settings.wrappers)
-        for key, env in dict(zip(keys, with_single, strict=True)).items()
+        key: EnvSpec.of(env, settings.kwargs, settings.wrappers) for key, env in dict(zip(keys, envs, strict=True)).items()
     }
-    different = list({(spec.id, spec.factory): spec for spec in env_specs.values()}.values())
-    index = {(spec.id, spec.factory): n for n, spec in enumerate(different)}
+    specs = [env_specs[key] for key in keys]
+    specs += [specs[0].for_evaluation()] * settings.single_lanes
+    different = list({_identity(spec): spec for spec in specs}.values())
+    index = {_identity(spec): n for n, spec in enumerate(different)}
     return RequestedCopies(
         envs=tuple(different),
-        copies=tuple(index[env_specs[key].id, env_specs[key].factory] for key in keys),
+        copies=tuple(index[_identity(spec)] for spec in specs),
         lanes=settings.lane_sizes,
         autoreset=_autoreset_mode(settings.autoreset_mode),
         render_mode=settings.render_mode,

@@ -146,7 +146,7 @@ def _learner(argv: list[str]) -> int:
 
     def train(checked: Resumption | None, watch: Watch) -> Path:
         if config.inference == "learner":
-            env = EnvSpec.of(config.env, config.env_kwargs, config.wrapper)
+            env = EnvSpec.of(config.env, config.env_kwargs, config.wrapper, config.eval_env_kwargs)
             return inference.train(config, checked, watch, env, elsewhere=True)
         return serve(config, checked, watch)
 

@@ -34,7 +34,7 @@ def train(config: Config, resume: Path | None, watch: Watch, env: EnvSpec | None
 
 
 def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec | None) -> Path:
-    env = env or EnvSpec.of(config.env, config.env_kwargs, config.wrapper)
+    env = env or EnvSpec.of(config.env, config.env_kwargs, config.wrapper, config.eval_env_kwargs)
     if config.inference == "learner":
         from millrace.launch import learner_inference as inference
 

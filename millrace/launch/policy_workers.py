@@ -96,7 +96,7 @@ def _acting_player(
     endpoint = open_endpoint(BindSettings(), "inproc", stack)
     workers = None if which.bind else min(which.workers, which.copies)
     copies = VectorEnvSettings(
-        policy.env,
+        policy.env.for_evaluation(),
         which.copies,
         workers,
         which.copies,

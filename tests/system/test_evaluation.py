@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import pytest
 
+import millrace
 from learner.config.layers import resolve
 from learner.policy_player import SavedPolicy
 from learner.rollouts.evaluation_tickets import EvaluationPlan
@@ -46,6 +47,22 @@ def test_the_returns_are_the_same_bits_for_any_number_of_workers_over_any_transp
     first = found["inproc", 1]
     assert len({reward for reward, _, _ in first}) > 2
     assert not {key for key, figures in found.items() if figures != first}
+
+
+@pytest.mark.parametrize("inference", ["workers", "learner"])
+def test_evaluations_of_a_run_and_of_its_policy_have_their_own_arguments_of_the_environment(
+    inference: Literal["workers", "learner"], tmp_path: Path
+) -> None:
+    """CartPole pays 1 for each step; with the reward of Sutton and Barto, 0, and -1 at the end."""
+    given: dict[str, Any] = {"steps": 600, "workers": 1, "run_dir": str(tmp_path), "eval_episodes": 5, "progress": False}
+    run = millrace.train(
+        "CartPole-v1", inference=inference, n_epochs=1, eval_env_kwargs={"sutton_barto_reward": True}, **given
+    )
+    assert run.summary is not None
+    assert run.summary.evaluation is not None
+    assert run.summary.evaluation.return_mean == -1
+    assert run.metrics["rollout/ep_rew_mean"][-1] > 5
+    assert run.evaluate(episodes=3, workers=1, inference=inference).return_mean == -1
 
 
 def test_a_run_reports_the_same_evaluation_whatever_the_number_of_workers(tmp_path: Path) -> None:
@@ -100,7 +117,7 @@ def test_an_environment_that_raises_ends_the_evaluation_with_its_traceback() -> 
 def test_a_signal_during_an_evaluation_ends_the_run_at_once_with_its_checkpoint(stage: Stage, number: int) -> None:
     """CliffWalking-v1 has no time limit: the greedy policy may walk on for ever."""
     command = [sys.executable, "-m", "millrace", "train", "CliffWalking-v1", "--steps", "1200", "--rollout-steps", "32"]
-    command += ["--run-dir", str(stage.runs), "--eval-max-steps", "1000000000"]
+    command += ["--run-dir", str(stage.runs), "--eval-max-steps", "1000000000", "--eval-episodes", "100"]
     run = stage.start(command, "train")
     run.hears("evaluating: ", START_S)
     saved_at = max(map(_steps, stage.runs.glob("*/checkpoints/*.pt")))

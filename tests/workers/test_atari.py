@@ -42,8 +42,7 @@ def test_the_vectorized_form_shows_rewards_and_ends_as_the_loop_does(
 ) -> None:
     """Screens, flags and reset rows, of episodes that begin alike; Breakout's end by themselves, Pong's by the clock."""
     monkeypatch.setattr(atari, "MAX_FRAMES", max_frames)
-    monkeypatch.setattr(atari, "NOOPS", 0)
-    N, env = 2, EnvSpec("millrace/Atari-v0", {"game": game})
+    N, env = 2, EnvSpec("millrace/Atari-v0", {"game": game, "noop_max": 0})
     one, other = OPEN["native"](env, N), OPEN["loop"](env, N)
     np.testing.assert_array_equal(one.reset([3, 4], no_pulse)[0], other.reset([3, 4], no_pulse)[0])
     generator, ended = np.random.default_rng(0), {"terminated": 0, "truncated": 0}
@@ -58,6 +57,64 @@ def test_the_vectorized_form_shows_rewards_and_ends_as_the_loop_does(
     assert [name for name, times in ended.items() if times > 1] == [flag]
     for copies in (one, other):
         copies.close()
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"fire_on_reset": True},
+        {"clip_rewards": True},
+        {"terminal_on_life_loss": True},
+        {"fire_on_reset": True, "clip_rewards": True, "terminal_on_life_loss": True},
+    ],
+    ids=lambda settings: " ".join(settings),
+)
+@pytest.mark.parametrize("game", ["Breakout", "SpaceInvaders"])
+def test_settings_mean_the_same_in_the_vectorized_form_as_in_the_loop(game: str, settings: dict[str, bool]) -> None:
+    """With no-op actions in the steps that only reset: there, the loop takes them by itself."""
+    N, env = 2, EnvSpec("millrace/Atari-v0", {"game": game, "noop_max": 0, **settings})
+    one, other = OPEN["native"](env, N), OPEN["loop"](env, N)
+    np.testing.assert_array_equal(one.reset([3, 4], no_pulse)[0], other.reset([3, 4], no_pulse)[0])
+    generator, ended, ends, rewards = np.random.default_rng(0), np.zeros(N, bool), 0, set()
+    for _ in range(700):
+        actions = np.where(ended, atari.NOOP, generator.integers(4, size=N))
+        row, looped = one.step(actions, no_pulse), other.step(actions, no_pulse)
+        np.testing.assert_array_equal(row.leaves[0], looped.leaves[0])
+        assert row.reward.tolist() == looped.reward
+        assert (row.terminated.tolist(), row.truncated.tolist()) == (looped.terminated, looped.truncated)
+        assert not (ended & (row.terminated | row.truncated)).any(), "an end in a step that only resets"
+        assert not row.reward[ended].any(), "a reward in a step that only resets"
+        ended = row.terminated | row.truncated
+        ends += int(ended.sum())
+        rewards |= set(row.reward.tolist())
+    assert ends > 1
+    assert (max(rewards) == 1) == ("clip_rewards" in settings or game == "Breakout"), rewards
+    for copies in (one, other):
+        copies.close()
+
+
+def test_after_a_lost_life_the_same_game_goes_on_until_it_has_ended_or_a_seed_is_given() -> None:
+    env = atari.make_game("Breakout", noop_max=0, fire_on_reset=True, terminal_on_life_loss=True)
+    env.reset(seed=1)
+    lives, generator = [], np.random.default_rng(0)
+
+    def play() -> None:
+        """Until an episode ends."""
+        while not env.step(generator.integers(4))[2]:
+            pass
+        lives.append(env.unwrapped.ale.lives())  # type: ignore[attr-defined]
+
+    for _ in range(6):
+        play()
+        env.reset()
+    assert lives == [4, 3, 2, 1, 0, 4]
+    play()
+    env.reset(seed=2)
+    assert env.unwrapped.ale.lives() == 5  # type: ignore[attr-defined]
+    env.step(0)
+    env.reset()
+    assert env.unwrapped.ale.getEpisodeFrameNumber() < 4, "a reset in the middle of an episode starts a game"  # type: ignore[attr-defined]
+    env.close()
 
 
 def described(vector: Any) -> RunSpec:

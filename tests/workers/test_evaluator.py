@@ -122,6 +122,14 @@ def test_each_seed_gives_one_episode_in_the_order_of_the_seeds(made: list[Echo])
     assert evaluator.seconds > 0
 
 
+def test_copies_that_play_evaluations_have_arguments_of_their_own(made: list[Echo]) -> None:
+    run = echo_run(endless=True, fails_at=2)
+    env = msgspec.structs.replace(run.env, eval_kwargs={"fails_at": 0})
+    answer = play(Evaluator(msgspec.structs.replace(run, env=env), Repeats()), order(5, most_steps=20))
+    assert figures(answer) == [(20.0, 20)]
+    assert [(env.endless, env.fails_at) for env in made] == [(True, 0)]
+
+
 def test_copies_are_kept_for_the_next_order_and_closed_at_the_end(made: list[Echo]) -> None:
     evaluator = Evaluator(echo_run(), Repeats())
     first = play(evaluator, order(1, 2, 3))

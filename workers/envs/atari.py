@@ -2,7 +2,20 @@
 
 Rule: an observation is a stack of screens [4, 84, 84], whichever program steps the game. A single game, the vectorized
 form of the emulator and envpool differ only in their random numbers, and in the frames before an episode's first screen:
-zeros, except that envpool repeats the first screen. An episode starts with up to 30 no-op actions. Rewards are not clipped.
+zeros, except that envpool repeats the first screen.
+
+Settings, as keyword arguments of the environment. What makes scores incomparable with those of other work:
+
+- `game`: the name, as in `ALE/Pong-v5`.
+- `repeat_action_probability`: sticky actions. 0.25 is that of Machado et al. (2018), 0 that of Mnih et al. (2015) and of
+  most published tables. Sticky actions make games harder.
+- `noop_max`: a game starts with up to so many no-op actions, a random number. 0: it always starts alike.
+- `fire_on_reset`: a game starts with the action FIRE, where the game has it. After a lost life the policy must press it.
+- `terminal_on_life_loss`: an episode ends with each life, and the next one goes on with the same game. Returns are then
+  those of lives: evaluate without it.
+- `clip_rewards`: rewards are clipped to ±1. Returns are then no scores: evaluate without it.
+
+The last two are settings of training: `eval_env_kwargs` takes them back for evaluations.
 """
 
 from __future__ import annotations
@@ -10,13 +23,25 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium
-from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation
+import numpy as np
+from gymnasium.vector import VectorEnv, VectorWrapper
+from gymnasium.wrappers import AtariPreprocessing, ClipReward, FrameStackObservation
 
 FRAMES, SKIP, SIDE, NOOPS = 4, 4, 84, 30
-MAX_FRAMES = 108_000  # in an episode: half an hour of play
+MAX_FRAMES = 108_000  # in a game: half an hour of play
+NOOP, FIRE = 0, 1  # actions
 
 
-def make_game(game: str = "Pong", repeat_action_probability: float = 0.0, **options: Any) -> gymnasium.Env[Any, Any]:
+def make_game(
+    game: str = "Pong",
+    repeat_action_probability: float = 0.0,
+    noop_max: int = NOOPS,
+    *,
+    fire_on_reset: bool = False,
+    terminal_on_life_loss: bool = False,
+    clip_rewards: bool = False,
+    **options: Any,
+) -> gymnasium.Env[Any, Any]:
     """One env copy. `options` are further arguments of `gymnasium.make`. Needs ale-py and OpenCV."""
     _silence_emulator()
     sticky: dict[str, Any] = {
@@ -24,24 +49,109 @@ def make_game(game: str = "Pong", repeat_action_probability: float = 0.0, **opti
         "max_num_frames_per_episode": MAX_FRAMES,
     }
     env = gymnasium.make(f"ale_py:ALE/{game}-v5", frameskip=1, disable_env_checker=True, **sticky, **options)
-    return FrameStackObservation(AtariPreprocessing(env, NOOPS, SKIP, SIDE), FRAMES, padding_type="zero")
+    if fire_on_reset:
+        env = _StartsGames(env)
+    env = FrameStackObservation(AtariPreprocessing(env, noop_max, SKIP, SIDE), FRAMES, padding_type="zero")
+    if clip_rewards:
+        env = ClipReward(env, -1.0, 1.0)
+    return _EndsWithLives(env) if terminal_on_life_loss else env
 
 
-def make_games(num_envs: int, game: str = "Pong", repeat_action_probability: float = 0.0) -> Any:
+def make_games(
+    num_envs: int,
+    game: str = "Pong",
+    repeat_action_probability: float = 0.0,
+    noop_max: int = NOOPS,
+    *,
+    fire_on_reset: bool = False,
+    terminal_on_life_loss: bool = False,
+    clip_rewards: bool = False,
+    **options: Any,
+) -> VectorEnv[Any, Any, Any]:
     """`num_envs` copies that the emulator steps together; in one thread, because there is a worker for each core."""
     _silence_emulator()
-    return gymnasium.make_vec(
+    made = gymnasium.make_vec(
         f"ale_py:ALE/{game}-v5",
         num_envs,
         "vector_entry_point",
         frameskip=SKIP,
         repeat_action_probability=repeat_action_probability,
         max_num_frames_per_episode=MAX_FRAMES,
-        noop_max=NOOPS,
-        use_fire_reset=False,
-        reward_clipping=False,
+        noop_max=noop_max,
+        use_fire_reset=fire_on_reset,
+        life_loss_info=terminal_on_life_loss,  # `episodic_life` would start a new game after each life
+        reward_clipping=clip_rewards,
         num_threads=1,
+        **options,
     )
+    return _StepAfterLives(made) if terminal_on_life_loss else made
+
+
+class _StartsGames(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Presses FIRE for one screen after a reset, in games that have it."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self._has_fire = env.unwrapped.get_action_meanings()[FIRE] == "FIRE"  # type: ignore[attr-defined]
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        first = self.env.reset(seed=seed, options=options)
+        if not self._has_fire:
+            return first
+        observation, _, _, _, info = self.env.step(FIRE)
+        return observation, info
+
+
+class _EndsWithLives(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Ends an episode with each life. The reset after it makes one no-op step, unless the game is over or has a seed."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self._lives = 0
+        self._goes_on = False  # whether a life was lost in the newest step, and the game did not end
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        goes_on, self._goes_on = self._goes_on and seed is None, False
+        if goes_on:
+            observation, _, terminated, truncated, info = self.env.step(NOOP)
+            goes_on = not (terminated or truncated)
+        if not goes_on:
+            observation, info = self.env.reset(seed=seed, options=options)
+        self._lives = self._lives_left()
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        before, self._lives = self._lives, self._lives_left()
+        life_lost = self._lives < before
+        self._goes_on = life_lost and not (terminated or truncated)
+        return observation, reward, terminated or life_lost, truncated, info
+
+    def _lives_left(self) -> int:
+        lives: int = self.env.unwrapped.ale.lives()  # type: ignore[attr-defined]
+        return lives
+
+
+class _StepAfterLives(VectorWrapper):
+    """Makes the step after a lost life one that only resets, as in a loop over copies: it has no reward and no end.
+
+    The emulator goes on with the game in it, by the action of the policy.
+    """
+
+    def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
+        super().__init__(env)
+        self._ended = np.zeros(env.num_envs, bool)
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        self._ended = np.zeros(self.num_envs, bool)
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(actions)
+        plays = ~self._ended
+        terminated, truncated = terminated & plays, truncated & plays
+        self._ended = terminated | truncated
+        return observation, np.where(plays, reward, 0), terminated, truncated, info
 
 
 def _silence_emulator() -> None:
@@ -51,9 +161,18 @@ def _silence_emulator() -> None:
     ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)
 
 
-def _envpool(game: str = "Pong", repeat_action_probability: float = 0.0) -> tuple[str, dict[str, Any]]:
+def _envpool(
+    game: str = "Pong",
+    repeat_action_probability: float = 0.0,
+    noop_max: int = NOOPS,
+    *,
+    fire_on_reset: bool = False,
+    terminal_on_life_loss: bool = False,
+    clip_rewards: bool = False,
+) -> tuple[str, dict[str, Any]]:
     """Name and options of the game in envpool."""
-    options = {"noop_max": NOOPS, "use_fire_reset": False, "repeat_action_probability": repeat_action_probability}
+    options = {"noop_max": noop_max, "use_fire_reset": fire_on_reset, "repeat_action_probability": repeat_action_probability}
+    options |= {"episodic_life": terminal_on_life_loss, "reward_clip": clip_rewards}
     return f"{game}-v5", {**options, "frame_skip": SKIP, "stack_num": FRAMES, "max_episode_steps": MAX_FRAMES // SKIP}
 
 

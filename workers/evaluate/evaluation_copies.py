@@ -87,7 +87,7 @@ class LoopedEvaluationCopies:
         `facts`: names of the numbers in `info` that belong to an episode. `masked`: read masks of the allowed actions.
         """
         self.count, self._activity, self._facts = count, activity(), facts
-        make = partial(made_without_order_check, partial(env.make, render_mode))
+        make = partial(made_without_order_check, partial(env.for_evaluation().make, render_mode))
         with warnings.catch_warnings():
             if render_mode is not None:
                 warnings.simplefilter("ignore")  # gymnasium's, about a render mode that is refused below

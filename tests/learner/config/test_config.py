@@ -84,9 +84,11 @@ def test_what_was_unset_over_a_preset_stays_unset(tmp_path: Path) -> None:
     assert resolve(file=written(tmp_path, text.replace("475.0", '"none"'))).target_return is None
 
 
-def test_env_kwargs_are_merged(tmp_path: Path) -> None:
-    file = written(tmp_path, "[env_kwargs]\ng = 9.0\nmode = 'a'\n")
-    assert resolve("Pendulum-v1", file=file, env_kwargs={"g": 1.0}).env_kwargs == {"g": 1.0, "mode": "a"}
+@pytest.mark.parametrize("table", ["env_kwargs", "eval_env_kwargs"])
+def test_env_kwargs_are_merged(table: str, tmp_path: Path) -> None:
+    file = written(tmp_path, f"[{table}]\ng = 9.0\nmode = 'a'\n")
+    given: dict[str, Any] = {table: {"g": 1.0}}
+    assert getattr(resolve("Pendulum-v1", file=file, **given), table) == {"g": 1.0, "mode": "a"}
 
 
 def test_a_whole_number_may_be_written_in_powers_of_ten(tmp_path: Path) -> None:

@@ -223,7 +223,7 @@ class Decoder {
     r.fields([&](std::string_view name) {
       if (name == "id") run.env = r.text(1000);
       else if (name == "factory") { if (!r.nil()) array(r), run.beyond = "an environment that is a Python callable"; }
-      else if (name == "kwargs") { if (std::size_t n = r.map()) for (run.beyond = "arguments of the environment"; n; --n) r.skip(), r.skip(); }
+      else if (name == "kwargs" || name == "eval_kwargs") { if (std::size_t n = r.map()) for (run.beyond = "arguments of the environment"; n; --n) r.skip(), r.skip(); }
       else if (name == "wrappers") { if (std::size_t n = r.array()) for (run.beyond = "wrappers written in Python"; n; --n) r.skip(); }
       else return false;
       return true;
