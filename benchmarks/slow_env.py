@@ -1,6 +1,7 @@
 """Environments whose steps and resets take time and no CPU, because they sleep.
 
-`benchmarks.slow_env:TenMilliseconds-v0` is Pendulum-v1 with 10 ms more for each step.
+`benchmarks.slow_env:TenMilliseconds-v0` is Pendulum-v1 with 10 ms more for each step, `FiftyMilliseconds-v0` with 50 ms, and
+with episodes of 1,000 steps in place of 200.
 
 `benchmarks.slow_env:Lognormal-v0`: a step takes 5 ms in the mean (lognormal, sigma 1), a reset 200 ms, and an episode has
 50 to 150 steps. The durations follow from the reset seed. A copy that never waits makes 100 steps in 0.7 s.
@@ -61,13 +62,20 @@ class Lognormal(gymnasium.Env[Any, Any]):
             self._timeline.write(struct.pack("3d", began_s, time.monotonic(), is_reset))
 
 
-class TenMilliseconds(PendulumEnv):
-    """Pendulum-v1 whose steps take 10 ms longer."""
+class SlowPendulum(PendulumEnv):
+    """Pendulum-v1 whose steps take longer."""
+
+    def __init__(self, render_mode: str | None = None, *, step_s: float) -> None:
+        """`step_s`: by how many seconds."""
+        super().__init__(render_mode)
+        self._step_s = step_s
 
     def step(self, action: Any) -> Any:
-        time.sleep(0.01)
+        time.sleep(self._step_s)
         return super().step(action)  # type: ignore[no-untyped-call]
 
 
 register("Lognormal-v0", "benchmarks.slow_env:Lognormal")
-register("TenMilliseconds-v0", "benchmarks.slow_env:TenMilliseconds", max_episode_steps=200)
+SLOW_PENDULUM = "benchmarks.slow_env:SlowPendulum"
+register("TenMilliseconds-v0", SLOW_PENDULUM, max_episode_steps=200, kwargs={"step_s": 0.01})
+register("FiftyMilliseconds-v0", SLOW_PENDULUM, max_episode_steps=1000, kwargs={"step_s": 0.05})
