@@ -49,11 +49,16 @@ def origin(config: Config) -> str:
     if preset is None:
         return f"settings: defaults, because {config.algo} has no preset for {config.env}"
     mine, defaults = _settings(config), _settings(type(config)(algorithm=type(config.algorithm)()))
-    changed = [name for name, value in preset.items() if mine[name] != value]
+    changed = [name for name, value in preset.items() if not _agrees(mine[name], value)]
     if all(defaults[name] == preset[name] for name in preset.keys() - changed):
         return f"settings: without the preset of {config.algo} for {config.env}"
     found = f"settings: preset of {config.algo} for {config.env}"
     return f"{found}, except {', '.join(changed)}" if changed else found
+
+
+def _agrees(mine: Any, preset: Any) -> bool:
+    """Whether a setting has the preset's value; a table, whether it has all of the preset's entries."""
+    return mine | preset == mine if isinstance(preset, dict) else bool(mine == preset)
 
 
 def _settings(config: Config) -> dict[str, Any]:

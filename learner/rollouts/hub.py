@@ -156,6 +156,7 @@ class Hub:
     def gather(self) -> list[AcceptedRollout]:
         """The rollouts of the next update. Raises `NoWorkers`, `Stalled`, `EnvironmentFailed` or `PolicyFailed`."""
         started_s = logged_s = self._clock()
+        steps = self._worker_steps()
         self._stall_watch.begin(started_s)
         self._turn(0.0)
         while True:
@@ -172,8 +173,8 @@ class Hub:
                 stall_timeout_s = self.settings.stall_timeout_s
                 raise Stalled(f"no rollout came for {stall_timeout_s:.0f} s; {self.waiting_for()}")
             if now - logged_s > LOG_WAITING_EVERY_S:
-                logged_s = now
-                log.warning("%s", self.waiting_for())
+                logged_s, before, steps = now, steps, self._worker_steps()
+                log.log(logging.INFO if steps > before else logging.WARNING, "%s", self.waiting_for())
 
     def not_used(self, taken: list[AcceptedRollout]) -> None:
         """The update of the rollouts that `gather` returned last failed: they are counted as lost."""

@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 from typing import cast
 
+import msgspec
 import numpy as np
 import pytest
 
 from learner.members.member_server import AWAY_S
-from learner.rollouts.hub import POLL_S, PULSE_S, Hub, HubSettings
+from learner.rollouts.hub import LOG_WAITING_EVERY_S, POLL_S, PULSE_S, Hub, HubSettings
 from learner.rollouts.ticket_coordinator import TicketCoordinator
 from protocol.errors import RunError
 from protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello, Weights
@@ -17,7 +18,7 @@ from protocol.rollout import rollout_bytes
 from protocol.wire.codec import decode_to_worker
 from protocol.wire.learner_link import LearnerLink
 from protocol.wire.weight_dtypes import WeightsDtype, to_float32
-from tests.support.fake_ends import run_spec
+from tests.support.fake_ends import fake_rollout, run_spec
 from tests.support.fake_link import FakeLink
 
 WORKER_TIMEOUT_S = 3.0
@@ -116,6 +117,29 @@ def test_a_flood_of_an_ended_session_is_one_line(caplog: pytest.LogCaptureFixtur
     link.inbox.append((b"w1", Heartbeat(7, 100, -1, (), 0, {}, 0)))
     hub.pulse()
     assert caplog.records[-1].getMessage().endswith("had ended (99 more like this since the last line)")
+
+
+def test_it_warns_of_a_long_wait_only_while_no_worker_steps(caplog: pytest.LogCaptureFixture) -> None:
+    """A rollout of a slow environment takes long, and nothing is wrong."""
+    link, hub, heartbeat = hub_with_a_worker()
+    hub.publish(0, np.zeros(1, np.float32), np.zeros(0, np.float32))
+    steps_until_s = link.now + 3 * LOG_WAITING_EVERY_S
+    arrives_s = steps_until_s + 2 * LOG_WAITING_EVERY_S
+    poll = link.poll
+
+    def poll_while_it_works(timeout_s: float) -> bool:
+        steps = int(10 * min(link.now, steps_until_s))
+        link.inbox.append((b"w0", msgspec.structs.replace(heartbeat, version=0, tickets=(0,), steps=steps)))
+        if link.now > arrives_s:
+            link.inbox.append((b"w0", fake_rollout(1, 0, 0, 0, 0)))
+        link.now += timeout_s
+        return poll(timeout_s)
+
+    link.poll = poll_while_it_works  # type: ignore[method-assign]
+    caplog.set_level(logging.INFO)
+    hub.gather()
+    levels = [record.levelname for record in caplog.records if "waiting for rollouts" in record.getMessage()]
+    assert levels == ["INFO"] * 3 + ["WARNING"]
 
 
 def test_between_short_minibatches_it_listens_now_and_then() -> None:
