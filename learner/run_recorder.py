@@ -27,6 +27,7 @@ from learner.rollouts.lanes import AcceptedRollout
 from learner.run_folder import checkpoint
 from learner.run_folder.env_attributes import EnvAttributes
 from learner.run_folder.episode_window import EpisodeWindow
+from learner.run_folder.image_sample import image_samples
 from learner.run_folder.metrics_log import MetricsLog
 from learner.run_folder.progress import Progress, Row, named
 from learner.run_folder.requests import Requests
@@ -134,6 +135,8 @@ class RunRecorder:
         if self._spec.facts and self._window.full and not self._said_missing:
             self._say_missing_facts()
         self._episodes_since_save += len(batch.episodes)
+        if self.version == 1:
+            warn_on_error(lambda: self._folder.write_images(image_samples(batch.obs, self._spec.policy.observation)))
 
     def env_attributes(self) -> Array | None:
         """The attributes of env copies that the weights of this version carry."""

@@ -41,6 +41,7 @@ def page(runs: Sequence[Path]) -> str:
         sections.head(report),
         sections.results(report),
         sections.curves(report),
+        sections.images(report),
         sections.videos(report),
         sections.settings(report),
         ledger_and_stages.ledgers(report),

@@ -63,6 +63,8 @@ class Run:
     """None before the first episode has ended"""
     evaluations: Doubles  # [K, 2] env steps and mean return of the evaluations during training
     videos: tuple[Path, ...]
+    images: tuple[Path, ...]
+    """pictures of what the policy sees, one for each image of an observation"""
 
 
 @dataclass(frozen=True)
@@ -152,6 +154,7 @@ def read_run(path: Path, purpose: Purpose = "report on") -> Run:
         curve=files.curve(),
         evaluations=np.asarray(files.points(EVALUATION_KEY), np.float64).reshape(-1, 2),
         videos=tuple(sorted((path / "videos").glob("*.mp4"))),
+        images=tuple(sorted(path.glob("observation*.png"))),
     )
 
 

@@ -138,6 +138,23 @@ def _series(group: RunGroup) -> Iterable[Series]:
             yield Series("line", group.color, grid, returns.mean(0), f"{group.name}: mean of {len(averaged)}")
 
 
+def images(report: ReportData) -> str:
+    """What the policy sees: of each environment with images, the picture of its first run that has one."""
+    figures = []
+    for env in report.envs:
+        runs = [run for group, run in report.runs if group.env == env and run.images]
+        for path in runs[0].images if runs else ():
+            name = path.stem.removeprefix("observation").lstrip("-")
+            data = base64.b64encode(path.read_bytes()).decode()
+            alt = f"Image observations of {env}"
+            caption = f"<figcaption>{escape(env)}<span>{escape(name)}</span></figcaption>"
+            figures.append(f'<figure><img alt="{escape(alt)}" src="data:image/png;base64,{data}">{caption}</figure>')
+    if not figures:
+        return ""
+    about = "Image observations at four steps of the first rollout, from above. Stacked frames are side by side."
+    return section("What the policy sees", about, f'<div class="seen">{"".join(figures)}</div>')
+
+
 def videos(report: ReportData) -> str:
     """The newest video of each run. Large ones are named instead of shown."""
     figures, bytes_left = [], MOST_BYTES_OF_ALL_VIDEOS

@@ -24,6 +24,7 @@ import re
 import shutil
 import time
 import zlib
+from collections.abc import Mapping
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
@@ -316,6 +317,11 @@ class RunFolder:
                 "%s cannot be read: %s; the run counts as not finished", self.path / "summary.json", one_line(str(error))
             )
             return None
+
+    def write_images(self, files: Mapping[str, bytes]) -> None:
+        """Write pictures, by the names of their files."""
+        for name, content in files.items():
+            self._write(name, content)
 
     def _write(self, name: str, content: bytes) -> None:
         try:

@@ -1,5 +1,6 @@
 """The report: one file that needs nothing else, and tells what the run folders tell."""
 
+import base64
 import html
 import os
 import re
@@ -355,3 +356,13 @@ def test_the_report_and_the_recorder_start_quickly(module: str) -> None:
     asks = f"import sys, {module}; assert not sys.modules.keys() & {heavy}, sys.modules.keys() & {heavy}"
     done = subprocess.run([sys.executable, "-c", asks], cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_pictures_of_what_the_policy_sees_are_shown_once_for_each_environment(tmp_path: Path) -> None:
+    run = a_run(tmp_path)
+    assert sections.images(report_data(run)) == ""
+    (run / "observation.png").write_bytes(b"first")
+    (run / "observation-wrist.png").write_bytes(b"second")
+    shown = sections.images(report_data(run))
+    assert [base64.b64decode(data) for data in re.findall(r"base64,([^\"]+)", shown)] == [b"second", b"first"]
+    assert "<span>wrist</span>" in shown

@@ -1,0 +1,61 @@
+"""What the policy sees, as a picture: some image observations of the first rollouts. Pure.
+
+A row for each of four steps, from the first to the last of a rollout of one env copy. The channels are side by side, as
+those of stacked frames are; three channels are red, green and blue.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from learner.run_folder.run_folder import as_folder_name
+from protocol.arrays import Array
+from protocol.specs import Leaf
+
+ROWS, GAP, GRAY = 4, 2, 128  # rows of the picture; pixels between images, and their brightness
+Pixels = npt.NDArray[np.uint8]
+
+
+def image_samples(obs: Sequence[Array], leaves: Sequence[Leaf]) -> dict[str, bytes]:
+    """A PNG file for each image among the arrays of a batch [T+1, ΣN, *leaf], by the name of the file."""
+    names = ["-".join(filter(None, ("observation", leaf.path and as_folder_name(leaf.path)))) + ".png" for leaf in leaves]
+    return {name: png(_sheet(array, leaf)) for name, array, leaf in zip(names, obs, leaves, strict=True) if leaf.is_image}
+
+
+def png(pixels: Pixels) -> bytes:
+    """A PNG file of pixels [height, width] in gray, or [height, width, 3] in color (ISO/IEC 15948)."""
+    height, width = pixels.shape[:2]
+    color = 2 if pixels.ndim == 3 else 0
+    lines = np.concatenate([np.zeros((height, 1), np.uint8), pixels.reshape(height, -1)], axis=1)  # 0: no filter
+    head = struct.pack(">IIBBBBB", width, height, 8, color, 0, 0, 0)
+    chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(lines.tobytes())), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks
+    )
+
+
+def _sheet(array: Array, leaf: Leaf) -> Pixels:
+    """Rows of images, as one image."""
+    steps = np.linspace(0, len(array) - 1, ROWS).astype(int)
+    return _joined([_row(array[t, 0], leaf) for t in dict.fromkeys(steps.tolist())], axis=0)
+
+
+def _row(image: Array, leaf: Leaf) -> Pixels:
+    """The channels of an image side by side; three of them as colors."""
+    last = np.asarray(image if leaf.has_channels_last else np.moveaxis(image, 0, -1), np.uint8)
+    if last.shape[-1] == 3:
+        return last
+    return _joined(list(np.moveaxis(last, -1, 0)), axis=1)
+
+
+def _joined(images: Sequence[Pixels], axis: int) -> Pixels:
+    """Images next to each other, with a gap between them."""
+    shape = list(images[0].shape)
+    shape[axis] = GAP
+    gap = np.full(shape, GRAY, np.uint8)
+    return np.concatenate([part for image in images for part in (gap, image)][1:], axis=axis)
