@@ -1,32 +1,83 @@
-"""docs/results.md is what `benchmarks/results.py` writes: its text is that of the program, and its commands parse."""
+"""docs/results.md has the table of benchmarks/scores.json, and the commands of the scores parse."""
 
 from __future__ import annotations
 
-import re
 import shlex
+from pathlib import Path
+from typing import Any
 
 import pytest
 
-from benchmarks.results import HEAD, OUT, TAIL
+from benchmarks import results
+from benchmarks.scores import Score, merged, read_published, read_scores, seeds_text, table, write_scores
+from learner.config.hyperparameters import HYPERPARAMETERS
+from learner.config.layers import resolve
 from millrace.cli.main import main
 
-TEXT = OUT.read_text()
-COMMANDS = re.findall(r"`millrace (train .+?)` \|$", TEXT, re.MULTILINE)
+SCORES = read_scores()
 
 
-def test_the_page_has_the_text_of_the_program() -> None:
-    before, after = TAIL.split("{versions}")
-    assert TEXT.startswith(HEAD)
-    assert before in TEXT
-    assert TEXT.endswith(after)
+def test_the_page_has_the_table_of_the_scores() -> None:
+    assert f"\n\n{table(SCORES)}\n" in results.PAGE.read_text()
 
 
-def test_each_row_names_its_command() -> None:
-    table = TEXT.removeprefix(HEAD).partition("\n\n")[0].splitlines()
-    assert len(table) == len(COMMANDS) > 0
+def test_the_file_is_as_the_program_writes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("benchmarks.scores.SCORES", tmp_path / "scores.json")
+    write_scores(SCORES)
+    assert (tmp_path / "scores.json").read_bytes() == Path(results.__file__).with_name("scores.json").read_bytes()
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+def test_published_scores_have_algorithms_that_exist() -> None:
+    published = read_published()
+    assert {score.algo for score in published} <= HYPERPARAMETERS.keys()
+    assert len({(score.env, score.algo, score.system) for score in published}) == len(published)
+
+
+@pytest.mark.parametrize("command", [score.command for score in SCORES])
 def test_each_command_parses(command: str, capfd: pytest.CaptureFixture[str]) -> None:
-    assert main([*shlex.split(command.replace("--seed S", "--seed 1")), "--steps", "none_of_this"]) == 2
+    words = shlex.split(command.replace("--seed S", "--seed 1"))
+    assert main([*words[1:], "--steps", "none_of_this"]) == 2
     assert "steps" in capfd.readouterr().err  # nothing else is wrong with it
+
+
+@pytest.mark.parametrize(
+    ("env", "settings", "words"),
+    [
+        ("CartPole-v1", {}, ""),
+        ("CartPole-v1", {"algo": "dqn", "double": False}, "--algo dqn --no-double"),
+        ("CartPole-v1", {"normalize_rewards": True, "net": [8, 4]}, "--net 8 4 --normalize-rewards"),
+        ("millrace/Atari-v0", {"env_kwargs": {"game": "Breakout"}}, "--env-kwargs game Breakout"),
+        ("CartPole-v1", {"eval_episodes": 20}, "--eval-episodes 20"),
+        ("Pendulum-v1", {"algo": "sac", "eval_episodes": None}, "--algo sac --eval-episodes none"),
+    ],
+)
+def test_a_command_names_what_differs_from_the_preset_and_the_defaults(
+    env: str, settings: dict[str, Any], words: str
+) -> None:
+    command = results.command(resolve(env, **settings))
+    assert sorted(command.split()) == sorted(["millrace", "train", env, "--seed", "S", *words.split()])
+
+
+def score(final: dict[int, float], **given: Any) -> Score:
+    return Score(env="E", algo="ppo", command="c", env_steps=5, final=final, **given)
+
+
+def test_a_new_run_is_added_to_the_other_seeds_of_its_row() -> None:
+    old = score({1: 1.0, 3: 3.0}, best={1: 2.0}, seconds=9.0, note="masked")
+    both = merged(old, score({2: 5.0, 3: 4.0}, seconds=7.0))
+    assert (both.final, both.best, both.seconds, both.note) == ({1: 1.0, 2: 5.0, 3: 4.0}, {1: 2.0}, 9.0, "masked")
+    assert merged(None, old) is old
+
+
+@pytest.mark.parametrize(
+    ("returns", "text"),
+    [
+        ({1: 500.0, 2: 499.6, 3: -1234.5}, "500, 500, -1,234"),
+        ({1: 8.314, 2: -0.5, 3: 9.999}, "8.31, -0.50, 10.00"),
+        ({2: 6967.0}, "6,967 (seed 2 only)"),
+        ({1: 1.0, 3: 2.0}, "1.00, 2.00 (seeds 1, 3)"),
+        ({}, "–"),
+    ],
+)
+def test_returns_are_shown_in_the_order_of_seeds(returns: dict[int, float], text: str) -> None:
+    assert seeds_text(returns) == text

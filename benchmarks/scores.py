@@ -1,0 +1,115 @@
+"""Returns that millrace's runs have reached (scores.json), returns that others have published (published_scores.toml).
+
+Run folders are not kept in the repository; what tables need of them is. `python -m benchmarks.results RUN ...` adds runs.
+"""
+
+from __future__ import annotations
+
+import statistics
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+
+import msgspec
+
+SCORES, PUBLISHED = (Path(__file__).with_name(name) for name in ("scores.json", "published_scores.toml"))
+EPISODES = 100
+"""greedy episodes of every score of ours"""
+
+
+class Score(msgspec.Struct, kw_only=True, omit_defaults=True):
+    """Runs that differ in their seed only."""
+
+    env: str
+    algo: str
+    command: str
+    """the command of each run, with S in place of the seed"""
+    env_steps: int
+    """of the longest run"""
+    final: dict[int, float]
+    """mean return of the final policy, by seed"""
+    best: dict[int, float] = {}
+    """by seed: mean return of the best policy of the run's own evaluations, on other episodes; empty without such"""
+    seconds: float | None = None
+    """wall-clock seconds of the longest run, if they mean something"""
+    versions: dict[str, str] = {}
+    """versions of the packages that decide the results"""
+    note: str = ""
+    """what else a reader must know of the row"""
+
+    def mean(self) -> float:
+        """Mean over the seeds, of the final policies."""
+        return statistics.fmean(self.final.values())
+
+
+class PublishedScore(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
+    """A return that another project has published."""
+
+    env: str
+    """the environment of ours that it is compared with"""
+    algo: str
+    system: str
+    returns: float
+    env_steps: int
+    how: str = ""
+    """what differs: another version of the environment, how many runs, how it was evaluated"""
+
+
+def read_scores() -> list[Score]:
+    """The scores of millrace, by environment, algorithm and number of env steps."""
+    return msgspec.json.decode(SCORES.read_bytes(), type=list[Score])
+
+
+def write_scores(scores: Iterable[Score]) -> None:
+    """Write the scores of millrace."""
+    ordered = sorted(scores, key=lambda score: (score.env, score.algo, score.env_steps, score.command))
+    SCORES.write_bytes(b"[\n" + b",\n".join(map(msgspec.json.encode, ordered)) + b"\n]\n")
+
+
+def read_published() -> list[PublishedScore]:
+    """The scores of others."""
+    return msgspec.convert(tomllib.loads(PUBLISHED.read_text())["score"], list[PublishedScore])
+
+
+def merged(old: Score | None, new: Score) -> Score:
+    """`new` and, of the seeds that it lacks, the runs of `old`."""
+    if old is None:
+        return new
+    return msgspec.structs.replace(
+        new,
+        final=dict(sorted({**old.final, **new.final}.items())),
+        best=dict(sorted({**old.best, **new.best}.items())),
+        env_steps=max(old.env_steps, new.env_steps),
+        seconds=max((each for each in (old.seconds, new.seconds) if each is not None), default=None),
+        note=old.note,
+    )
+
+
+def return_text(value: float) -> str:
+    """A return for a table: small ones with two decimals."""
+    return f"{value:,.2f}" if abs(value) < 10 else f"{value:,.0f}"
+
+
+def seeds_text(returns: dict[int, float]) -> str:
+    """The returns of seeds 1, 2 and 3; other seeds are named."""
+    if not returns:
+        return "–"
+    text = ", ".join(return_text(value) for _, value in sorted(returns.items()))
+    if sorted(returns) == [1, 2, 3]:
+        return text
+    which = ", ".join(map(str, sorted(returns)))
+    return f"{text} (seed {which} only)" if len(returns) == 1 else f"{text} (seeds {which})"
+
+
+def table(scores: Iterable[Score]) -> str:
+    """The table of docs/results.md."""
+    lines = [
+        "| environment | algorithm | env steps | best | final | seconds | command (for each seed) |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for score in scores:
+        seconds = "–" if score.seconds is None else f"{score.seconds:.0f}"
+        env = f"{score.env}, {score.note}" if score.note else score.env
+        cells = (env, score.algo, f"{score.env_steps:,}", seeds_text(score.best), seeds_text(score.final), seconds)
+        lines.append(f"| {' | '.join(cells)} | `{score.command}` |")
+    return "\n".join(lines) + "\n"
