@@ -65,7 +65,7 @@ class Contender(NamedTuple):
     own: bool = False
     """whether it has its own settings instead of the common ones"""
     flags: tuple[str, ...] = ()
-    """additional flags of millrace"""
+    """additional flags of the program"""
 
     @property
     def ours(self) -> bool:
@@ -217,4 +217,4 @@ def _flag(name: str, value: Any) -> list[str]:
 
 def _theirs(contender: Contender, settings: dict[str, Any], target: float | None) -> list[str]:
     until = [] if target is None else ["--target", str(target)]
-    return [json.dumps(settings), *(["--how", contender.how] if contender.how else []), *until]
+    return [json.dumps(settings), *(["--how", contender.how] if contender.how else []), *contender.flags, *until]

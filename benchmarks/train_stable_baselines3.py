@@ -1,9 +1,8 @@
 """PPO, A2C, DQN, SAC and TD3 of Stable-Baselines3 as a program, with our names for their settings.
 
-`benchmarks/train.py` and `benchmarks/continuous.py` run it.
-It uses one torch thread, which is fastest here. For each update it prints a line of JSON: env steps, and the time by the
-monotonic clock. Two settings differ: our DQN counts the age of a hard target in gradient steps, and may have several env
-copies.
+`benchmarks/train.py`, `benchmarks/continuous.py` and `benchmarks/real_sizes.py` run it. It uses one torch thread, which is
+fastest for small networks, or `--threads`. For each update it prints a line of JSON: env steps, and the time by the
+monotonic clock. Two settings differ: our DQN counts the age of a hard target in gradient steps, and may have several env copies.
 """
 
 from __future__ import annotations
@@ -18,7 +17,10 @@ from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, StopTrainingOnRewardThreshold
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+
+import workers.envs  # noqa: F401  # registers millrace/Atari-v0
 
 
 class PrintUpdates(BaseCallback):
@@ -79,7 +81,7 @@ def make(s: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
         case _:
             clip = s["clip_range"]
             return PPO(
-                "MlpPolicy",
+                "CnnPolicy" if is_image_space(env.observation_space) else "MlpPolicy",
                 env,
                 n_steps=s["rollout_steps"],
                 batch_size=s["batch_size"],
@@ -99,8 +101,9 @@ def main() -> None:
     parser.add_argument("settings", type=json.loads)
     parser.add_argument("--how", choices=("one", "subproc"), default="one")
     parser.add_argument("--target", type=float, help="stop as soon as a greedy evaluation averages at least this")
+    parser.add_argument("--threads", type=int, default=1)
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
+    torch.set_num_threads(arguments.threads)
     s: dict[str, Any] = arguments.settings
     copies = 1 if s["algo"] in ("dqn", "sac", "td3") else s["envs"]
     env = make_vec_env(s["env"], copies, s["seed"], vec_env_cls=SubprocVecEnv if arguments.how == "subproc" else DummyVecEnv)
