@@ -2,7 +2,8 @@
 
 `benchmarks/train.py`, `benchmarks/continuous.py` and `benchmarks/real_sizes.py` run it. It uses one torch thread, which is
 fastest for small networks, or `--threads`. For each update it prints a line of JSON: env steps, and the time by the
-monotonic clock. Two settings differ: our DQN counts the age of a hard target in gradient steps, and may have several env copies.
+monotonic clock. Two settings differ: our DQN counts the age of a hard target in gradient steps, and may have several env
+copies.
 """
 
 from __future__ import annotations
