@@ -27,7 +27,7 @@ from millrace.launch.policy_workers import PlayingWorkers, policy_player
 PAGE = Path(__file__).parents[1] / "docs" / "results.md"
 TABLE = re.compile(r"^\| environment \| algorithm \|.*?\n(?=\n)", re.MULTILINE | re.DOTALL)
 OTHER_EPISODES = 1_000_000  # the seed of `millrace evaluate`; no run chooses its best policy by these episodes
-NOT_IN_COMMANDS = ("env", "algo", "seed", "run_dir")
+NOT_IN_COMMANDS = ("env", "algo", "seed", "run_dir", "torch_threads")  # the last one is chosen for the machine
 EVALUATION = ("eval_every", "eval_episodes")
 
 
