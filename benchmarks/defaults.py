@@ -1,8 +1,8 @@
 """What an environment without a preset reaches with the defaults, and with other settings: `python -m benchmarks.defaults`.
 
-Rule: each run is `millrace train ENV --preset none` with the flags of a variant, in an environment that has nothing in
-common with the others but that a beginner would try it. A figure is the mean return of the final policy over the run's own
-greedy episodes. Finished runs are kept in benchmarks/results/defaults, so that a later call only makes those that lack.
+Rule: each run is `millrace train ENV --preset none` with the flags of a variant. A figure is the mean return of the final
+policy over the run's own greedy episodes. Finished runs are kept in benchmarks/results/defaults, by the name of the variant,
+and a later call makes only the missing ones: remove that folder after a change of the code or of a variant.
 
 `--variant NAME=FLAGS` adds a variant; without one, only the defaults are run.
 """
@@ -46,6 +46,7 @@ class Case(NamedTuple):
     """package without which it is left out"""
 
 
+MINIGRID = "--wrapper minigrid.wrappers:ImgObsWrapper --wrapper gymnasium.wrappers:FlattenObservation"
 CASES = (
     Case("CartPole-v1"),
     Case("Acrobot-v1"),
@@ -54,8 +55,8 @@ CASES = (
     Case("CliffWalking-v1", "--wrapper gymnasium.wrappers:TimeLimit(max_episode_steps=200)"),
     Case("Taxi-v4"),
     Case("LunarLander-v3", needs="Box2D"),
-    Case("minigrid:MiniGrid-Empty-8x8-v0", "--wrapper minigrid.wrappers:FlatObsWrapper", needs="minigrid"),
-    Case("minigrid:MiniGrid-DoorKey-5x5-v0", "--wrapper minigrid.wrappers:ImgObsWrapper", needs="minigrid"),
+    Case("minigrid:MiniGrid-Empty-8x8-v0", MINIGRID, needs="minigrid"),
+    Case("minigrid:MiniGrid-DoorKey-5x5-v0", MINIGRID, needs="minigrid"),
     Case("Pendulum-v1", continuous=True),
     Case("MountainCarContinuous-v0", continuous=True),
     Case("BipedalWalker-v3", continuous=True, needs="Box2D"),

@@ -26,7 +26,9 @@ from learner.run_folder.metrics_log import read_rows
 
 ROOT = Path(__file__).parents[1]
 COMMON: dict[str, Any] = {"env": "CartPole-v1", "eval_every": 5000, "eval_episodes": 20}
-ACTOR_CRITIC = COMMON | {"vf_coef": 0.5, "max_grad_norm": 0.5}
+ACTOR_CRITIC = COMMON | {
+    "vf_coef": 0.5, "max_grad_norm": 0.5, "normalize_observations": False, "normalize_rewards": False,
+}  # fmt: skip
 # RL Zoo's for CartPole-v1, and a large batch. Names are those of our flags.
 ZOO = ACTOR_CRITIC | {
     "algo": "ppo", "envs": 8, "rollout_steps": 32, "batch_size": 256, "n_epochs": 20, "gamma": 0.98, "gae_lambda": 0.8,
@@ -84,6 +86,7 @@ def _flags(sizes: str, more: str) -> tuple[str, ...]:
     """Flags for a peer's own settings: env copies, steps, minibatch, one epoch, and its network."""
     copies, steps, minibatch = sizes.split()
     given = f"--preset none --envs {copies} --lanes 2 --rollout-steps {steps} --batch-size {minibatch} --n-epochs 1 {more}"
+    given += " --no-normalize-observations --no-normalize-rewards"
     return tuple(given.split())
 
 

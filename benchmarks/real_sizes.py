@@ -33,7 +33,7 @@ SUBPROC = "SB3, SubprocVecEnv"
 NATIVE = "millrace, --vector native"
 COMMON: dict[str, Any] = {
     "algo": "ppo", "batch_size": 256, "gamma": 0.99, "gae_lambda": 0.95, "vf_coef": 0.5, "max_grad_norm": 0.5,
-    "clip_range": 0.2, "ent_coef": 0.0, "learning_rate": 3e-4,
+    "clip_range": 0.2, "ent_coef": 0.0, "learning_rate": 3e-4, "normalize_observations": False, "normalize_rewards": False,
 }  # fmt: skip
 WARM_UP = 1  # updates
 
@@ -73,7 +73,9 @@ def sizes(cores: int) -> dict[str, Size]:
             {
                 OURS: Contender("millrace", flags=(*flags, str(cores))),
                 NATIVE: Contender("millrace", flags=(*flags, str(cores), "--vector", "native")),
-                OVERLAPPED: Contender("millrace", flags=(*flags, str(cores), "--vector", "native", "--max-lag", "1")),
+                f"{NATIVE} --max-lag 1": Contender(
+                    "millrace", flags=(*flags, str(cores), "--vector", "native", "--max-lag", "1")
+                ),
                 THEIRS: Contender(sb3, "one", flags=("--threads", str(cores))),
             },
             10_240,

@@ -16,7 +16,7 @@ from pathlib import Path
 import msgspec
 
 from benchmarks.scores import EPISODES, Score, merged, read_scores, table, write_scores
-from learner.config.config import Config
+from learner.config.config import TABLES, Config
 from learner.config.layers import config_of_run, resolve
 from learner.policy_player import saved_policy
 from learner.rollouts.evaluation_tickets import EvaluationPlan, evaluation_of
@@ -28,6 +28,7 @@ PAGE = Path(__file__).parents[1] / "docs" / "results.md"
 TABLE = re.compile(r"^\| environment \| algorithm \|.*?\n(?=\n)", re.MULTILINE | re.DOTALL)
 OTHER_EPISODES = 1_000_000  # the seed of `millrace evaluate`; no run chooses its best policy by these episodes
 NOT_IN_COMMANDS = ("env", "algo", "seed", "run_dir", "torch_threads")  # the last one is chosen for the machine
+REPEATED = ("wrapper", "callback")  # flags with one value each
 EVALUATION = ("eval_every", "eval_episodes")
 
 
@@ -70,8 +71,10 @@ def command(config: Config, leave_out: Sequence[str] = NOT_IN_COMMANDS) -> str:
     words = ["millrace", "train", config.env, "--seed", "S"]
     if config.algo != "ppo":
         words += ["--algo", config.algo]
-    defaults = msgspec.to_builtins(resolve(config.env, algo=config.algo))
-    settings = msgspec.to_builtins(config)
+    preset = resolve(config.env, algo=config.algo)
+    if any(getattr(preset, name).keys() - getattr(config, name).keys() for name in TABLES):  # a flag cannot remove an entry
+        preset, words = resolve(config.env, algo=config.algo, preset="none"), [*words, "--preset", "none"]
+    defaults, settings = msgspec.to_builtins(preset), msgspec.to_builtins(config)
     defaults |= defaults.pop("algorithm")
     settings |= settings.pop("algorithm")
     for name, value in settings.items():
@@ -87,6 +90,8 @@ def _flag(name: str, value: object, default: object) -> list[str]:
         case dict():
             pairs = [(key, one) for key, one in value.items() if not (isinstance(default, dict) and default.get(key) == one)]
             return [f"--{name}", *(str(word) for pair in pairs for word in pair)]
+        case list() | tuple() if name in REPEATED:
+            return [str(word) for one in value for word in (f"--{name}", one)]
         case list() | tuple():
             return [f"--{name}", *map(str, value)]
         case _:

@@ -33,7 +33,7 @@ class Score(msgspec.Struct, kw_only=True, omit_defaults=True):
     seconds: float | None = None
     """wall-clock seconds of the longest run, if they mean something"""
     versions: dict[str, str] = {}
-    """versions of the packages that decide the results"""
+    """versions of the packages that decide the results, if they are the same for all seeds"""
     note: str = ""
     """what else a reader must know of the row"""
 
@@ -81,6 +81,7 @@ def merged(old: Score | None, new: Score) -> Score:
         best=dict(sorted({**old.best, **new.best}.items())),
         env_steps=max(old.env_steps, new.env_steps),
         seconds=max((each for each in (old.seconds, new.seconds) if each is not None), default=None),
+        versions=new.versions if new.versions == old.versions else {},
         note=old.note,
     )
 

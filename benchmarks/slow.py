@@ -42,7 +42,7 @@ SETTINGS: dict[str, Any] = {
     "env": "benchmarks.slow_env:Lognormal-v0", "algo": "ppo", "envs": COPIES, "rollout_steps": 64, "batch_size": 256,
     "n_epochs": 10, "gamma": 0.99, "gae_lambda": 0.95, "ent_coef": 0.0, "vf_coef": 0.5, "max_grad_norm": 0.5,
     "learning_rate": 3e-4, "learning_rate_schedule": "constant", "clip_range": 0.2, "clip_range_schedule": "constant",
-    "eval_every": 0, "eval_episodes": 1, "processes": COPIES,
+    "eval_every": 0, "eval_episodes": 1, "processes": COPIES, "normalize_observations": False, "normalize_rewards": False,
 }  # fmt: skip
 UPDATES, UPDATES_OF_PEERS = 24, 8
 SUBPROC = "SB3, SubprocVecEnv"

@@ -71,12 +71,12 @@ class Evaluations:
         self.next_at += self._settings.every_env_steps
         return found.metrics()
 
-    def conclude(self, version: int, env_steps: int, episode_length: float | None) -> Best | None:
+    def conclude(self, version: int, env_steps: int, episode_length: float | None, time_limit: int | None) -> Best | None:
         """Evaluate the final policy. If the run kept a best policy, evaluate that one on other episodes and return it.
 
-        `episode_length`: mean length of the last episodes of training, if one has ended.
+        `episode_length`, `time_limit`: see `EvaluationSettings.final_size`.
         """
-        size = self._settings.final_size(env_steps, episode_length)
+        size = self._settings.final_size(env_steps, episode_length, time_limit)
         if size != self._settings.size():
             log_notice(log, _smaller(size))
         found = self._evaluate_version(version, env_steps, size)
@@ -136,9 +136,10 @@ class Evaluations:
 
 def _smaller(size: EvaluationSize) -> str:
     """Says that an evaluation is smaller than usual."""
+    longest = max(1, size.max_steps // size.episodes)
     return (
-        f"the evaluation has {size.episodes} episodes, because it should take fewer env steps than the training; "
-        "--eval-episodes sets another number"
+        f"the evaluation has {size.episodes} episodes of at most {longest:,} env steps, so that it takes less than the "
+        "training; --eval-episodes sets another number"
     )
 
 

@@ -88,6 +88,16 @@ def run_folder(config: Config, resume: Resumption | None) -> Iterator[RunFolder]
         raise
 
 
+def check_evaluation_spaces(config: Config, training: DescribedEnv, evaluation: DescribedEnv) -> None:
+    """Raises `UsageError` if an environment with `eval_env_kwargs` has other spaces than one without them."""
+    expected, got = (EnvSpaces.of_description(env, config.action_masks) for env in (training, evaluation))
+    if (expected.observation, expected.action) != (got.observation, got.action):
+        raise UsageError(
+            f"eval_env_kwargs: expected the spaces of training, {training.observation_space} and {training.action_space}, "
+            f"got {evaluation.observation_space} and {evaluation.action_space}"
+        )
+
+
 Describe = Callable[[DescribeSpec, Callable[[], None], Accept], DescribedEnv]
 """Has a worker describe the environment. What the second argument raises ends the wait; the third accepts a description."""
 
@@ -115,6 +125,9 @@ def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, d
         described = describe(
             DescribeSpec(env, config.chosen_vector(), heartbeat_s=config.heartbeat_s), check_interrupt, accept
         )
+        if env.eval_kwargs:
+            spec = DescribeSpec(env.for_evaluation(), heartbeat_s=config.heartbeat_s)
+            check_evaluation_spaces(config, described, describe(spec, check_interrupt, lambda found: None))
         imports.wait(check_interrupt)
     spaces = EnvSpaces.of_description(described, config.action_masks)
     if spaces.masked:
@@ -181,6 +194,7 @@ class Run:
         # Nothing of a resumed run is written before everything fits.
         self.folder.write_config(config, workers_elsewhere=not processes.expected)
         self.recorder = RunRecorder(config, self.folder, spec, self.algorithm, self.service, state, made, episodes)
+        self.recorder.time_limit = setup.known.spaces.max_episode_steps
         self.folder.keep()
         self.announce(link.address, config.advertise, link.keyring)
 

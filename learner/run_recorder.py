@@ -20,6 +20,7 @@ from learner.algorithms import Algorithm
 from learner.callbacks.callbacks import Callbacks
 from learner.config.config import Config
 from learner.evaluations import Evaluations, warn_on_error
+from learner.recording.image_sample import image_samples
 from learner.recording.training_recorder import TrainingRecorder
 from learner.rollout_service.service import RolloutService
 from learner.rollouts.hub import HubSnapshot
@@ -27,7 +28,6 @@ from learner.rollouts.lanes import AcceptedRollout
 from learner.run_folder import checkpoint
 from learner.run_folder.env_attributes import EnvAttributes
 from learner.run_folder.episode_window import EpisodeWindow
-from learner.run_folder.image_sample import image_samples
 from learner.run_folder.metrics_log import MetricsLog
 from learner.run_folder.progress import Progress, Row, named
 from learner.run_folder.requests import Requests
@@ -62,6 +62,8 @@ class RunRecorder:
         episode_recorder: TrainingRecorder | None,
     ) -> None:
         """`state`: where the run stands. `episode_recorder` is closed with this recorder."""
+        self.time_limit: int | None = None
+        """Env steps after which the environment truncates an episode, if it does; for the size of the last evaluation."""
         self.version, self.env_steps = state.version, state.env_steps
         self._config, self._folder, self._spec = config, folder, spec
         self._algorithm, self._service, self._callbacks = algorithm, service, callbacks
@@ -227,7 +229,9 @@ class RunRecorder:
         """Evaluate the final policy, which must be published, and the best one."""
         before = self._evaluations.of_version(self.version)
         with self._evaluation_time():
-            self._confirmed = self._evaluations.conclude(self.version, self.env_steps, self._window.length_mean)
+            self._confirmed = self._evaluations.conclude(
+                self.version, self.env_steps, self._window.length_mean, self.time_limit
+            )
         if self._evaluations.of_version(self.version) is not before:
             self._callbacks.on_evaluation(self.progress())
 

@@ -93,6 +93,12 @@ class ActorCriticConfig(RecurrentConfig, frozen=True):
 class PPOConfig(ActorCriticConfig, frozen=True):
     """Proximal policy optimization (Schulman et al. 2017)."""
 
+    normalize_observations: Fixed[bool] = True
+    """Normalize observations, except images: subtract the running mean, divide by the running standard deviation, clip to
+    ±10. docs/explanation/defaults.md shows why PPO does by default.
+    """
+    normalize_rewards: Fixed[bool] = True
+    """Divide rewards by the running standard deviation of the discounted return."""
     clip_range: Free[Positive] = 0.2
     """ε of the clipped objective: the ratio of new to old action probability is clipped to 1 ± ε."""
     clip_range_schedule: Free[Schedule] = "constant"

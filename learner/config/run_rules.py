@@ -55,6 +55,7 @@ class CheckpointPolicy(msgspec.Struct, frozen=True, kw_only=True):
 
 
 MOST_EPISODES, FEWEST_EPISODES = 100, 10  # of an evaluation whose number of episodes is not set
+LONGEST_EPISODE = 10  # its episodes are cut after so many times the mean length of training, if there is no time limit
 
 
 class EvaluationSize(NamedTuple):
@@ -83,16 +84,21 @@ class EvaluationSettings(msgspec.Struct, frozen=True, kw_only=True):
         """The size of an evaluation during training."""
         return EvaluationSize(MOST_EPISODES if self.episodes is None else self.episodes, self.max_steps)
 
-    def final_size(self, env_steps: int, episode_length: float | None) -> EvaluationSize:
+    def final_size(self, env_steps: int, episode_length: float | None, time_limit: int | None) -> EvaluationSize:
         """The size of the evaluation after training.
 
         `env_steps`: of the training. `episode_length`: mean length of its last episodes, in env steps; None if none has
-        ended. The size depends on these counts, and not on seconds, so that the result of a run is always the same.
+        ended. `time_limit`: env steps after which the environment truncates an episode, if it does. The size depends on
+        these counts, and not on seconds, so that the result of a run is always the same.
         """
         if self.episodes is not None or self.every_env_steps:
             return self.size()
         budget = 3 * env_steps // 4
-        if episode_length is None:  # episodes may have no end
+        length = episode_length or time_limit
+        if length is None:  # episodes may have no end
             return EvaluationSize(FEWEST_EPISODES, max(min(self.max_steps, budget), 1))
-        fitting = int(budget / max(episode_length, 1.0))
-        return EvaluationSize(min(max(fitting, FEWEST_EPISODES), MOST_EPISODES), self.max_steps)
+        episodes = min(max(int(budget / max(length, 1.0)), FEWEST_EPISODES), MOST_EPISODES)
+        if time_limit is not None:
+            return EvaluationSize(episodes, self.max_steps)
+        # A greedy policy may last for ever where the policies of training did not.
+        return EvaluationSize(episodes, min(self.max_steps, max(budget, int(LONGEST_EPISODE * episodes * length))))

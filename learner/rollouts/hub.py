@@ -174,7 +174,7 @@ class Hub:
                 raise Stalled(f"no rollout came for {stall_timeout_s:.0f} s; {self.waiting_for()}")
             if now - logged_s > LOG_WAITING_EVERY_S:
                 logged_s, before, steps = now, steps, self._worker_steps()
-                log.log(logging.INFO if steps > before else logging.WARNING, "%s", self.waiting_for())
+                log.log(logging.INFO if steps != before else logging.WARNING, "%s", self.waiting_for())
 
     def not_used(self, taken: list[AcceptedRollout]) -> None:
         """The update of the rollouts that `gather` returned last failed: they are counted as lost."""

@@ -56,7 +56,7 @@ def train(
         started = listening.start(worker_flags(config, folder.path), config.call_timeouts())
 
         def describe(spec: DescribeSpec, check_interrupt: Callable[[], None], accept: Accept) -> DescribedEnv:
-            return started.describe(describe_settings(config, config.steps), check_interrupt, accept)
+            return started.describe(describe_settings(config, config.steps), check_interrupt, accept, spec.env)
 
         known = known_environment(config, env_spec, resume, describe)
         env = started.vector_env(known.described)

@@ -11,6 +11,8 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 
+import msgspec
+
 from learner.members.describe import DescribeSettings, described_by_workers
 from learner.members.describe_coordinator import Accept, accept_any
 from learner.members.process_callbacks import ProcessCallbacks
@@ -23,6 +25,7 @@ from millrace.launch.local_worker_options import LEAVE_AT_ONCE_S, WorkerFlags
 from protocol.address import advertised_address, check_address
 from protocol.alive import CallTimeouts
 from protocol.cpu_cores import usable_cores
+from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.errors import EnvironmentFailed, UsageError
 from protocol.wire.shared_memory import SUPPORTED, InheritedDescriptors, SharedMemory, new_memory
@@ -117,12 +120,14 @@ class StartedVectorEnv:
         settings: DescribeSettings,
         check_interrupt: Callable[[], None] = lambda: None,
         accept: Accept = accept_any,
+        env: EnvSpec | None = None,
     ) -> DescribedEnv:
-        """Have a worker describe the environment; `accept` takes the description, or not.
+        """Have a worker describe the environment, or `env`; `accept` takes the description, or not.
 
         Raises `UserFacingError`, and what `check_interrupt` raises.
         """
         spec, processes = self.listening.requested.to_describe, ProcessCallbacks()
+        spec = spec if env is None else msgspec.structs.replace(spec, env=env)
         if self.supervisor is not None:
             processes = ProcessCallbacks(
                 self.supervisor.poll, self.supervisor.activities, expected=self.listening.settings.local_workers

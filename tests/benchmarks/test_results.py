@@ -48,6 +48,16 @@ def test_each_command_parses(command: str, capfd: pytest.CaptureFixture[str]) ->
         ("CartPole-v1", {"normalize_rewards": True, "net": [8, 4]}, "--net 8 4 --normalize-rewards"),
         ("millrace/Atari-v0", {"env_kwargs": {"game": "Breakout"}}, "--env-kwargs game Breakout"),
         ("CartPole-v1", {"eval_episodes": 20}, "--eval-episodes 20"),
+        (
+            "CartPole-v1",
+            {"wrapper": ["a:B", "c:D"]},
+            "--wrapper a:B --wrapper c:D",
+        ),
+        (
+            "millrace/Atari-v0",
+            {"preset": "none", "env_kwargs": {"game": "Pong"}},
+            "--preset none --env-kwargs game Pong",
+        ),
         ("Pendulum-v1", {"algo": "sac", "eval_episodes": None}, "--algo sac --eval-episodes none"),
     ],
 )

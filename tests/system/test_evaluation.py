@@ -18,7 +18,7 @@ from learner.rollouts.evaluation_tickets import EvaluationPlan
 from learner.run_folder.metrics_log import read_rows
 from millrace.launch.local_run import train
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
-from protocol.errors import EnvironmentFailed
+from protocol.errors import EnvironmentFailed, UserFacingError
 from tests.support.collectors import TOY, random_weights, run_of
 from tests.system.processes import START_S, Stage, crowding, wait_for
 
@@ -63,6 +63,37 @@ def test_evaluations_of_a_run_and_of_its_policy_have_their_own_arguments_of_the_
     assert run.summary.evaluation.return_mean == -1
     assert run.metrics["rollout/ep_rew_mean"][-1] > 5
     assert run.evaluate(episodes=3, workers=1, inference=inference).return_mean == -1
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "says"),
+    [
+        ({"nonsense": 1}, "unexpected keyword argument 'nonsense'"),
+        ({"observation": "image"}, "eval_env_kwargs: expected the spaces of training"),
+    ],
+)
+@pytest.mark.parametrize("inference", ["workers", "learner"])
+def test_wrong_arguments_of_evaluations_are_refused_before_training(
+    kwargs: dict[str, Any], says: str, inference: Literal["workers", "learner"], tmp_path: Path
+) -> None:
+    with pytest.raises(UserFacingError, match=says) as caught:
+        millrace.train(
+            "workers.envs.toy:Spaces-v0", inference=inference, steps=10_000, workers=1, run_dir=str(tmp_path / "runs"),
+            progress=False, eval_env_kwargs=kwargs,
+        )  # fmt: skip
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "runs").exists(), "a run folder was left"
+
+
+def test_the_evaluation_after_a_short_run_is_small_and_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Episodes of CartPole-v1 last about 20 steps at first: 300 env steps hold 10 of them."""
+    given: dict[str, Any] = {"steps": 300, "rollout_steps": 16, "workers": 1, "run_dir": str(tmp_path), "progress": False}
+    run = millrace.train("CartPole-v1", **given)
+    assert run.summary is not None
+    assert run.summary.evaluation is not None
+    assert 10 <= run.summary.evaluation.episodes < 40
+    assert any("the evaluation has" in record.getMessage() for record in caplog.records)
+    assert millrace.train("CartPole-v1", resume=run, workers=1, progress=False).summary == run.summary
 
 
 def test_a_run_reports_the_same_evaluation_whatever_the_number_of_workers(tmp_path: Path) -> None:

@@ -93,6 +93,19 @@ def test_settings_mean_the_same_in_the_vectorized_form_as_in_the_loop(game: str,
         copies.close()
 
 
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"noop_max": 0}, "envpool: noop_max: expected at least 1, got 0"),
+        ({"fire_on_reset": True, "terminal_on_life_loss": True}, "envpool: it presses FIRE after each lost life"),
+    ],
+)
+@envpool
+def test_settings_that_mean_something_else_in_envpool_are_refused(settings: dict[str, Any], says: str) -> None:
+    with pytest.raises(UsageError, match=says):
+        envpool_spec(EnvSpec(BREAKOUT.id, {"game": "Breakout", **settings}))
+
+
 def test_after_a_lost_life_the_same_game_goes_on_until_it_has_ended_or_a_seed_is_given() -> None:
     env = atari.make_game("Breakout", noop_max=0, fire_on_reset=True, terminal_on_life_loss=True)
     env.reset(seed=1)

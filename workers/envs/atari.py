@@ -4,15 +4,15 @@ Rule: an observation is a stack of screens [4, 84, 84], whichever program steps 
 form of the emulator and envpool differ only in their random numbers, and in the frames before an episode's first screen:
 zeros, except that envpool repeats the first screen.
 
-Settings, as keyword arguments of the environment. What makes scores incomparable with those of other work:
+Settings, as keyword arguments of the environment. Scores with different values of these settings cannot be compared:
 
 - `game`: the name, as in `ALE/Pong-v5`.
 - `repeat_action_probability`: sticky actions. 0.25 is that of Machado et al. (2018), 0 that of Mnih et al. (2015) and of
   most published tables. Sticky actions make games harder.
-- `noop_max`: a game starts with up to so many no-op actions, a random number. 0: it always starts alike.
+- `noop_max`: a game starts with up to so many no-op actions, a random number. 0: it always starts in the same state.
 - `fire_on_reset`: a game starts with the action FIRE, where the game has it. After a lost life the policy must press it.
 - `terminal_on_life_loss`: an episode ends with each life, and the next one goes on with the same game. Returns are then
-  those of lives: evaluate without it.
+  those of lives: evaluate without it. envpool makes no-op actions after each life.
 - `clip_rewards`: rewards are clipped to ±1. Returns are then no scores: evaluate without it.
 
 The last two are settings of training: `eval_env_kwargs` takes them back for evaluations.
@@ -26,6 +26,8 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.wrappers import AtariPreprocessing, ClipReward, FrameStackObservation
+
+from protocol.errors import UsageError
 
 FRAMES, SKIP, SIDE, NOOPS = 4, 4, 84, 30
 MAX_FRAMES = 108_000  # in a game: half an hour of play
@@ -135,7 +137,8 @@ class _EndsWithLives(gymnasium.Wrapper[Any, Any, Any, Any]):
 class _StepAfterLives(VectorWrapper):
     """Makes the step after a lost life one that only resets, as in a loop over copies: it has no reward and no end.
 
-    The emulator goes on with the game in it, by the action of the policy.
+    The emulator goes on with the game in it, by the action of the policy. If the game ends in that very step, which takes an
+    unlikely clock, the end is not seen.
     """
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
@@ -170,7 +173,14 @@ def _envpool(
     terminal_on_life_loss: bool = False,
     clip_rewards: bool = False,
 ) -> tuple[str, dict[str, Any]]:
-    """Name and options of the game in envpool."""
+    """Name and options of the game in envpool. Raises `UsageError` for settings that mean something else there."""
+    if noop_max < 1:
+        raise UsageError(f"envpool: noop_max: expected at least 1, got {noop_max}; use --vector native or loop")
+    if fire_on_reset and terminal_on_life_loss:
+        raise UsageError(
+            "envpool: it presses FIRE after each lost life, not at the start of a game only; use --vector native or loop, "
+            "or one of fire_on_reset and terminal_on_life_loss"
+        )
     options = {"noop_max": noop_max, "use_fire_reset": fire_on_reset, "repeat_action_probability": repeat_action_probability}
     options |= {"episodic_life": terminal_on_life_loss, "reward_clip": clip_rewards}
     return f"{game}-v5", {**options, "frame_skip": SKIP, "stack_num": FRAMES, "max_episode_steps": MAX_FRAMES // SKIP}

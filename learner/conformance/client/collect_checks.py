@@ -42,8 +42,8 @@ from protocol.wire.codec import encode
 from protocol.wire.weight_dtypes import to_wire_dtype
 
 STEPS = 32  # T of most checks
-TIMED_STEPS = 500  # T of a rollout that tells how fast the client is
-LONG_S, LONGEST_STEPS = 1.0, 50_000  # of a rollout during which something happens: what is aimed at, the bound
+TIMED_STEPS = 200  # T of a rollout that tells how fast the client is
+LONG_S, LONGEST_STEPS = 1.0, 50_000  # duration of a long rollout; its most steps
 NET = (16, 16)
 LONG_NET = (256, 256)  # of long rollouts: a compiled client would make 50,000 steps by a small one in a few milliseconds
 QUIET_S = 0.7

@@ -98,7 +98,7 @@ class Learner:
         self.description: Described | None = None
         """what the client has described, in this whole run of the test"""
         self.long_steps = 0
-        """T of a rollout during which something can happen, in this whole run of the test; 0: that is not known yet"""
+        """T of a rollout that takes so long that the test can act before its end; 0: it was not measured yet"""
         self.long_s = 0.0
         """how long the client takes for that rollout"""
         self.received: dict[int, Received] | None = None

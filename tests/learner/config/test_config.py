@@ -91,6 +91,14 @@ def test_env_kwargs_are_merged(table: str, tmp_path: Path) -> None:
     assert getattr(resolve("Pendulum-v1", file=file, **given), table) == {"g": 1.0, "mode": "a"}
 
 
+def test_the_file_of_a_run_repeats_it_also_where_the_preset_has_more_arguments(tmp_path: Path) -> None:
+    run = resolve("millrace/Atari-v0", preset="none", env_kwargs={"game": "Pong"})
+    assert resolve(file=written(tmp_path, run.to_toml())) == run
+    merged = resolve(file=written(tmp_path, 'env = "millrace/Atari-v0"\n[env_kwargs]\ngame = "Pong"\n'))
+    assert merged.env_kwargs["clip_rewards"] is True
+    assert merged.env_kwargs["game"] == "Pong"
+
+
 def test_a_whole_number_may_be_written_in_powers_of_ten(tmp_path: Path) -> None:
     assert resolve("CartPole-v1", steps=1e6).steps == 1_000_000
     assert resolve("CartPole-v1", file=written(tmp_path, "steps = 3e5")).steps == 300_000

@@ -56,24 +56,33 @@ def test_records_take_their_settings_from_the_configuration() -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "env_steps", "episode_length", "size"),
+    ("settings", "env_steps", "episode_length", "time_limit", "size"),
     [
-        ({}, 100_000, 500.0, (100, 1_000_000)),
-        ({}, 100_000, 1000.0, (75, 1_000_000)),
-        ({}, 100_000, 1.0, (100, 1_000_000)),
-        ({}, 100_000, 50_000.0, (10, 1_000_000)),
-        ({}, 100_000, None, (10, 75_000)),
-        ({}, 0, None, (10, 1)),
-        ({"eval_max_steps": 500}, 100_000, None, (10, 500)),
-        ({"eval_episodes": 100}, 100_000, 50_000.0, (100, 1_000_000)),
-        ({"eval_episodes": 3}, 100_000, None, (3, 1_000_000)),
-        ({"eval_every": 10_000}, 100_000, 50_000.0, (100, 1_000_000)),
+        ({}, 100_000, 500.0, 500, (100, 1_000_000)),
+        ({}, 100_000, 1000.0, 1000, (75, 1_000_000)),
+        ({}, 100_000, 50_000.0, 60_000, (10, 1_000_000)),
+        ({}, 600, None, 200, (10, 1_000_000)),
+        ({}, 100_000, None, 1000, (75, 1_000_000)),
+        ({}, 100_000, 1.0, None, (100, 75_000)),
+        ({}, 100_000, 1000.0, None, (75, 750_000)),
+        ({}, 1_000, 90.0, None, (10, 9_000)),
+        ({}, 100_000, None, None, (10, 75_000)),
+        ({}, 0, None, None, (10, 1)),
+        ({"eval_max_steps": 500}, 100_000, None, None, (10, 500)),
+        ({"eval_max_steps": 500}, 100_000, 40.0, None, (100, 500)),
+        ({"eval_episodes": 100}, 100_000, 50_000.0, None, (100, 1_000_000)),
+        ({"eval_episodes": 3}, 100_000, None, None, (3, 1_000_000)),
+        ({"eval_every": 10_000}, 100_000, 50_000.0, None, (100, 1_000_000)),
     ],
 )
 def test_the_evaluation_after_training_takes_three_quarters_of_its_env_steps_or_ten_episodes(
-    settings: dict[str, Any], env_steps: int, episode_length: float | None, size: tuple[int, int]
+    settings: dict[str, Any],
+    env_steps: int,
+    episode_length: float | None,
+    time_limit: int | None,
+    size: tuple[int, int],
 ) -> None:
-    assert Config(**settings).evaluation_settings().final_size(env_steps, episode_length) == size
+    assert Config(**settings).evaluation_settings().final_size(env_steps, episode_length, time_limit) == size
 
 
 def test_during_training_evaluations_have_a_hundred_episodes_or_as_many_as_are_set() -> None:

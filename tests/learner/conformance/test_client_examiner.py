@@ -27,12 +27,12 @@ from learner.conformance.client.script import (
 )
 from protocol.env_spec import EnvSpec
 from protocol.errors import BadMessage
-from protocol.messages import Heartbeat, Hello, Welcome
+from protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello, Welcome
 from protocol.wire.codec import decode_to_worker
 from tests.protocol.test_wire_document import DOCUMENT
 
 SETTINGS = Settings(EnvSpec("CartPole-v1"))
-HELLO = Hello(4, "w", "host", 1, 70, "test", 71)
+HELLO = Hello(PROTOCOL_VERSION, "w", "host", 1, 70, "test", 71)
 
 
 def examiner(*scripts: Callable[[Learner], Script[None]], limit_s: float = 300.0) -> Examiner:
@@ -160,7 +160,7 @@ def test_a_reply_that_was_never_sent_is_noticed() -> None:
 def test_what_another_worker_of_the_command_says_is_not_looked_at() -> None:
     test, _ = welcomed()
     test.handle(Heard(b"other", beat(5)), 0.2)
-    test.handle(Heard(b"other", Hello(4, "other", "host", 2, 80, "test", 81)), 0.2)
+    test.handle(Heard(b"other", Hello(PROTOCOL_VERSION, "other", "host", 2, 80, "test", 81)), 0.2)
     assert not test.results
 
 

@@ -10,7 +10,7 @@ from learner.members.events import WorkerLeft, WorkerProcessFailed
 from learner.rollouts.evaluation_tickets import EvaluationPlan
 from learner.rollouts.stall_watch import ENDED_WITHIN_S, StallWatch
 from protocol.alive import Alive, CallTimeouts, Doing, WorkerActivity, WorkerExit
-from protocol.messages import Drain, Heartbeat, Hello
+from protocol.messages import PROTOCOL_VERSION, Drain, Heartbeat, Hello
 from tests.learner.rollouts.test_ticket_coordinator import TIMEOUT_S, Learner, permits
 from tests.support.fake_ends import BUFFERS, PARAMETERS
 
@@ -85,7 +85,7 @@ def test_who_uses_another_key_is_not_believed(key: bytes, believed: bool) -> Non
     """With keys, a peer is its routing id and its key."""
     learner = Learner()
     peer = b"a\0tag\0aa"
-    learner.says(peer, Hello(4, "a", "host", 1, NONCE, "fake", 1))
+    learner.says(peer, Hello(PROTOCOL_VERSION, "a", "host", 1, NONCE, "fake", 1))
     speaker = b"supervisor\0tag\0" + key if key else SUPERVISOR
     learner.now += TIMEOUT_S - 0.5
     speaks(learner, activity(), speaker)

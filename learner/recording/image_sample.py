@@ -1,7 +1,8 @@
 """What the policy sees, as a picture: some image observations of the first rollouts. Pure.
 
 A row for each of four steps, from the first to the last of a rollout of one env copy. The channels are side by side, as
-those of stacked frames are; three channels are red, green and blue.
+those of stacked frames are; three channels are shown as red, green and blue. Of large images every second, third, … pixel is
+taken.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from protocol.arrays import Array
 from protocol.specs import Leaf
 
 ROWS, GAP, GRAY = 4, 2, 128  # rows of the picture; pixels between images, and their brightness
+MOST_PIXELS = 256  # of a side of an image
 Pixels = npt.NDArray[np.uint8]
 
 
@@ -48,6 +50,8 @@ def _sheet(array: Array, leaf: Leaf) -> Pixels:
 def _row(image: Array, leaf: Leaf) -> Pixels:
     """The channels of an image side by side; three of them as colors."""
     last = np.asarray(image if leaf.has_channels_last else np.moveaxis(image, 0, -1), np.uint8)
+    every = -(-max(last.shape[:2]) // MOST_PIXELS)
+    last = last[::every, ::every]
     if last.shape[-1] == 3:
         return last
     return _joined(list(np.moveaxis(last, -1, 0)), axis=1)
