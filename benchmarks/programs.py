@@ -203,19 +203,20 @@ def _ours(contender: Contender, settings: dict[str, Any], target: float | None, 
         }
     else:
         named |= {"preset": "none"}
-    flags = [word for name, value in named.items() for word in _flag(name, value)]
+    flags = [word for name, value in named.items() for word in flag(name, value)]
     return ["train", settings["env"], "--run-dir", folder, *flags, *contender.flags]
 
 
-def _flag(name: str, value: Any) -> list[str]:
-    flag = name.replace("_", "-")
+def flag(name: str, value: Any) -> list[str]:
+    """The words of the command line that give a setting this value."""
+    name = name.replace("_", "-")
     match value:
         case bool():
-            return [f"--{flag}" if value else f"--no-{flag}"]
-        case list():
-            return [f"--{flag}", *map(str, value)]
+            return [f"--{name}" if value else f"--no-{name}"]
+        case list() | tuple():
+            return [f"--{name}", *map(str, value)]
         case _:
-            return [f"--{flag}", str(value)]
+            return [f"--{name}", "none" if value is None else str(value)]
 
 
 def _theirs(contender: Contender, settings: dict[str, Any], target: float | None) -> list[str]:

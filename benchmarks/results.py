@@ -15,6 +15,7 @@ from pathlib import Path
 
 import msgspec
 
+from benchmarks.programs import flag
 from benchmarks.scores import EPISODES, Score, merged, read_scores, table, write_scores
 from learner.config.config import TABLES, Config
 from learner.config.layers import config_of_run, resolve
@@ -79,23 +80,19 @@ def command(config: Config, leave_out: Sequence[str] = NOT_IN_COMMANDS) -> str:
     settings |= settings.pop("algorithm")
     for name, value in settings.items():
         if name not in leave_out and value != defaults[name]:
-            words += _flag(name.replace("_", "-"), value, defaults[name])
+            words += _words(name, value, defaults[name])
     return shlex.join(words)
 
 
-def _flag(name: str, value: object, default: object) -> list[str]:
+def _words(name: str, value: object, default: object) -> list[str]:
     match value:
-        case bool():
-            return [f"--{name}" if value else f"--no-{name}"]
         case dict():
             pairs = [(key, one) for key, one in value.items() if not (isinstance(default, dict) and default.get(key) == one)]
-            return [f"--{name}", *(str(word) for pair in pairs for word in pair)]
+            return [*flag(name, True), *(str(word) for pair in pairs for word in pair)]
         case list() | tuple() if name in REPEATED:
-            return [str(word) for one in value for word in (f"--{name}", one)]
-        case list() | tuple():
-            return [f"--{name}", *map(str, value)]
+            return [word for one in value for word in flag(name, one)]
         case _:
-            return [f"--{name}", "none" if value is None else str(value)]
+            return flag(name, value)
 
 
 def main() -> None:

@@ -27,8 +27,7 @@ Look here for the name, the range and the default of a setting. Each setting of 
 
 Settings of an algorithm stand in a table of the TOML file that has the algorithm's name, as `[ppo]`. Keyword arguments
 of the environment stand in the tables `[env_kwargs]` and `[eval_env_kwargs]`. A flag wins over `--config`, and `--config`
-wins over a preset. The
-config.toml of a run folder has every setting of that run.
+wins over a preset. The config.toml of a run folder has every setting of that run.
 
 A list is written as `--net 64 64` and as `net = [64, 64]`. A setting that may be none is written as `--core none` and as
 `core = "none"`. A setting that is true or false is written as `--shared-net` or `--no-shared-net`, and as
