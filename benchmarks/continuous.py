@@ -65,9 +65,8 @@ def products_s(algo: str, width: int, repeats: int = 200) -> float:
 
 def rate(name: str, settings: dict[str, Any], steps: int, seed: int) -> float:
     """Env steps/s after the warm-up."""
-    updates = run(name, settings | {"steps": steps, "seed": seed}, contender=CONTENDERS[name]).updates
-    first = next(update for update in updates if update[0] >= WARM_UP_STEPS)
-    return (updates[-1][0] - first[0]) / (updates[-1][1] - first[1])
+    done = run(name, settings | {"steps": steps, "seed": seed}, contender=CONTENDERS[name])
+    return done.steps_per_s(after_steps=WARM_UP_STEPS)
 
 
 def seconds_to_solve(name: str, settings: dict[str, Any], seed: int) -> float:

@@ -120,6 +120,12 @@ class ProgramResult(NamedTuple):
     updates: list[tuple[int, float]]
     """env steps and time in seconds at the end of each update"""
 
+    def steps_per_s(self, *, after_updates: int = 0, after_steps: int = 0) -> float:
+        """Env steps/s from the first update after both, which are the warm-up, until the last."""
+        first, began_s = next(update for update in self.updates[after_updates:] if update[0] >= after_steps)
+        last, ended_s = self.updates[-1]
+        return (last - first) / (ended_s - began_s)
+
 
 def contenders(peers: bool = False) -> list[str]:
     """The contenders that can run here. Other systems than Stable-Baselines3 are included only with `peers`."""

@@ -87,8 +87,7 @@ def sizes(cores: int) -> dict[str, Size]:
 def rate(name: str, size: Size, seed: int) -> float:
     """Env steps/s after the warm-up."""
     settings = size.settings | {"steps": size.steps, "seed": seed}
-    updates = run(name, settings, contender=size.contenders[name]).updates[WARM_UP:]
-    return (updates[-1][0] - updates[0][0]) / (updates[-1][1] - updates[0][1])
+    return run(name, settings, contender=size.contenders[name]).steps_per_s(after_updates=WARM_UP)
 
 
 def network_s(size: Size, threads: int, repeats: int = 8) -> float:

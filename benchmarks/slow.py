@@ -66,9 +66,7 @@ def rate(name: str, contender: Contender, seed: int) -> float:
     settings = SETTINGS | {"steps": updates * COPIES * SETTINGS["rollout_steps"], "seed": seed}
     if contender.ours:
         del settings["processes"]
-    ends = programs.run(name, settings, contender=contender).updates
-    (first, began_s), (last, ended_s) = ends[WARM_UP], ends[-1]
-    return (last - first) / (ended_s - began_s)
+    return programs.run(name, settings, contender=contender).steps_per_s(after_updates=WARM_UP)
 
 
 def rate_without_waiting(seed: int) -> float:

@@ -35,11 +35,8 @@ WORKERS_ALONE, LEARNER_ALONE = "the workers alone", "the learner alone"
 def rate(settings: dict[str, Any], max_lag: int, steps: int, seed: int) -> float:
     """Env steps/s after the warm-up."""
     flags = ("--workers", str(WORKERS), "--lanes", str(WORKERS), "--max-lag", str(max_lag))
-    found = run(
-        "millrace", SETTINGS | settings | {"steps": steps, "seed": seed}, contender=Contender("millrace", flags=flags)
-    )
-    first = next(update for update in found.updates if update[0] >= WARM_UP_STEPS)
-    return (found.updates[-1][0] - first[0]) / (found.updates[-1][1] - first[1])
+    settings = SETTINGS | settings | {"steps": steps, "seed": seed}
+    return run("millrace", settings, contender=Contender("millrace", flags=flags)).steps_per_s(after_steps=WARM_UP_STEPS)
 
 
 def main() -> None:

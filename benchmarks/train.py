@@ -54,7 +54,7 @@ class Measure(NamedTuple):
         settings = self.settings | {"steps": self.steps, "seed": seed}
         match self.kind:
             case "rate":
-                return {self.column: _rate(run(contender, settings).updates)}
+                return {self.column: run(contender, settings).steps_per_s(after_updates=WARM_UP)}
             case "memory":
                 tree = Tree()
                 run(contender, settings, look=tree.measure)
@@ -63,12 +63,6 @@ class Measure(NamedTuple):
                 ran = run(contender, settings, SOLVED)
                 steps = NAN if math.isnan(ran.solved_s) else ran.updates[-1][0]
                 return {self.column: ran.solved_s, f"{self.column}, env steps": steps}
-
-
-def _rate(updates: list[tuple[int, float]]) -> float:
-    """Env steps/s after the warm-up."""
-    (first, began_s), (last, ended_s) = updates[WARM_UP], updates[-1]
-    return (last - first) / (ended_s - began_s)
 
 
 SMALL_RATE, LARGE_RATE = "env steps/s, 8 × 32", "env steps/s, 64 × 128"
