@@ -136,8 +136,8 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     not apply while such a call is in progress and within its timeout.
     """
     max_env_failures: Free[Natural] = 3
-    """End the run after more failures than this. A failure is an exception or an unusable result of the environment or of an
-    `OwnPolicy`, or the end of a worker process that one of them caused.
+    """End the run after more failures than this within an hour. A failure is an exception or an unusable result of the
+    environment or of an `OwnPolicy`, or the end of a worker process without an order: the environment may have ended it.
     """
 
     def fact_names(self) -> tuple[str, ...]:

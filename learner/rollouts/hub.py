@@ -42,6 +42,7 @@ POLL_S = 0.1
 PULSE_S = 0.003
 LOG_WAITING_EVERY_S = 10.0
 MOST_NAMES = 50  # of workers in one line
+FAILURES_WITHIN_S = 3600.0
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,7 @@ class HubSettings:
     no_workers_timeout_s: float
     stall_timeout_s: float
     max_env_failures: int
+    """How many failures within an hour the run survives."""
     weights_dtype: WeightsDtype = "float32"
     """Dtype in which parameters are sent."""
     call_timeouts: CallTimeouts = NO_TIMEOUTS
@@ -128,7 +130,7 @@ class Hub:
         self._lags: list[int] = []  # lag of each rollout of the last `gather`
         self._weight_age = WeightAge()
         self._progress = Progress()
-        self._env_failures = 0
+        self._failed_at_s: list[float] = []  # times of the failures of the last hour
         self._failure: EnvironmentFailed | PolicyFailed | None = None
         self._no_members_since_s: float | None = None
         self._stall_watch = StallWatch(coordinator, settings.stall_timeout_s, settings.call_timeouts)
@@ -326,7 +328,10 @@ class Hub:
         return status(self.coordinator, self._progress, now)
 
     def _on_event(self, event: Event) -> None:
-        """Count failures of environments and of the user's policy together; too many end the run by the kind of the last."""
+        """Count the failures of environments and of the user's policy together.
+
+        Too many within an hour end the run; the last one decides the kind of the error.
+        """
         match event:
             case EnvironmentRaised(worker, host, _, error, traceback, spare) if not spare:
                 self._count_failure(EnvironmentFailed, f"worker {worker} ({host}): {error}", traceback)
@@ -338,10 +343,11 @@ class Hub:
                 pass
 
     def _count_failure(self, kind: type[EnvironmentFailed | PolicyFailed], line: str, traceback: str) -> None:
-        self._env_failures += 1
-        allowed = self.settings.max_env_failures
-        if self._env_failures > allowed:
-            counted = f"failure {self._env_failures}; max_env_failures allows {allowed}"
+        now = self._clock()
+        self._failed_at_s = [*(at_s for at_s in self._failed_at_s if now - at_s < FAILURES_WITHIN_S), now]
+        failures, allowed = len(self._failed_at_s), self.settings.max_env_failures
+        if failures > allowed:
+            counted = f"failure {failures} within an hour; max_env_failures allows {allowed}"
             self._failure = kind(one_line(f"{line}; {counted}", 4 * MAX_LINE), traceback)
 
     def _check_members(self) -> None:

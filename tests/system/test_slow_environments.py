@@ -136,7 +136,7 @@ def test_too_many_ends_of_the_process_end_the_run_and_name_the_code(stage: Stage
         learner, supervisor = served(stage, "Ends-v0", settings)
     assert learner.ends(RUN_ENDS_S) == 1
     line = learner.said().splitlines()[-1]
-    assert "ended with exit code 0 in a step of its environment; failure 2; max_env_failures allows 1" in line
+    assert "ended with exit code 0 in a step of its environment; failure 2 within an hour; max_env_failures allows 1" in line
     if supervisor is not None:
         supervisor.signal(15)
         supervisor.ends(15)

@@ -305,14 +305,28 @@ def test_a_spare_worker_cannot_end_the_run_with_failures() -> None:
         noisy.hears("spare", Failure(session, "boom", "", 0))
     noisy.hub._turn(0.0)
     noisy.hears("honest", Failure(1, "boom", "", 0))
-    with pytest.raises(EnvironmentFailed, match="boom; failure 1; max_env_failures allows 0"):
+    with pytest.raises(EnvironmentFailed, match="boom; failure 1 within an hour; max_env_failures allows 0"):
+        noisy.hub._turn(0.0)
+
+
+@pytest.mark.parametrize(("apart_s", "ends"), [(3590.0, True), (3600.0, False)])
+def test_only_the_failures_of_an_hour_end_the_run(apart_s: float, ends: bool) -> None:
+    noisy = Noisy(max_env_failures=1)
+    for nonce in range(2, 5):
+        session = noisy.joins("honest", nonce)
+        noisy.hears("honest", Failure(session, "boom", "", 0))
+        noisy.link.now += apart_s
+    if ends:
+        with pytest.raises(EnvironmentFailed, match="boom; failure 2 within an hour; max_env_failures allows 1"):
+            noisy.hub._turn(0.0)
+    else:
         noisy.hub._turn(0.0)
 
 
 def test_a_worker_cannot_blame_a_policy_that_is_not_the_users() -> None:
     noisy = Noisy(max_env_failures=0)
     noisy.hears("honest", Failure(1, "boom", "", None, of_policy=True))
-    with pytest.raises(EnvironmentFailed, match="boom; failure 1; max_env_failures allows 0"):
+    with pytest.raises(EnvironmentFailed, match="boom; failure 1 within an hour; max_env_failures allows 0"):
         noisy.hub._turn(0.0)
 
 
