@@ -49,13 +49,18 @@ def read(path: Path, *, only_final: bool) -> Score | None:
     return Score(
         env=config.env,
         algo=config.algo,
-        command=command(config, (*NOT_IN_COMMANDS, *EVALUATION) if only_final else NOT_IN_COMMANDS),
+        command=command(config, _not_in_command(config, only_final=only_final)),
         env_steps=summary.env_steps,
         final={config.seed: final},
         best={} if best is None else {config.seed: best},
         seconds=summary.wall_s,
         versions=summary.versions,
     )
+
+
+def _not_in_command(config: Config, *, only_final: bool) -> tuple[str, ...]:
+    without_effect = () if config.max_lag else ("workers",)
+    return (*NOT_IN_COMMANDS, *without_effect, *(EVALUATION if only_final else ()))
 
 
 def _played(path: Path, config: Config, found: Evaluation | None, which: Which) -> float | None:

@@ -20,7 +20,7 @@ class OnResume(Enum):
 
     FREE = "Another value takes effect at once."
     ADAPTABLE = "Another value takes effect at once. The state of each lane and env copy starts again from the beginning."
-    FIXED = "Another value is refused: the weights or the state of the run would mean something else."
+    FIXED = "Another value is refused: the weights or the state of the run would not match the new value."
 
 
 Setting = TypeVar("Setting")
