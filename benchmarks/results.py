@@ -49,18 +49,13 @@ def read(path: Path, *, only_final: bool) -> Score | None:
     return Score(
         env=config.env,
         algo=config.algo,
-        command=command(config, _not_in_command(config, only_final=only_final)),
+        command=command(config, EVALUATION if only_final else ()),
         env_steps=summary.env_steps,
         final={config.seed: final},
         best={} if best is None else {config.seed: best},
         seconds=summary.wall_s,
         versions=summary.versions,
     )
-
-
-def _not_in_command(config: Config, *, only_final: bool) -> tuple[str, ...]:
-    without_effect = () if config.max_lag else ("workers",)
-    return (*NOT_IN_COMMANDS, *without_effect, *(EVALUATION if only_final else ()))
 
 
 def _played(path: Path, config: Config, found: Evaluation | None, which: Which) -> float | None:
@@ -72,8 +67,9 @@ def _played(path: Path, config: Config, found: Evaluation | None, which: Which) 
     return None if found is None else found.return_mean
 
 
-def command(config: Config, leave_out: Sequence[str] = NOT_IN_COMMANDS) -> str:
+def command(config: Config, leave_out: Sequence[str] = ()) -> str:
     """The shortest command line that repeats this run, with S as the seed and without the settings to leave out."""
+    leave_out = (*leave_out, *NOT_IN_COMMANDS, *(() if config.max_lag else ("workers",)))  # with max_lag 0 it has no effect
     words = ["millrace", "train", config.env, "--seed", "S"]
     if config.algo != "ppo":
         words += ["--algo", config.algo]

@@ -58,6 +58,8 @@ def test_each_command_parses(command: str, capfd: pytest.CaptureFixture[str]) ->
             {"preset": "none", "env_kwargs": {"game": "Pong"}},
             "--preset none --env-kwargs game Pong",
         ),
+        ("CartPole-v1", {"workers": 1}, ""),
+        ("CartPole-v1", {"workers": 1, "max_lag": 1}, "--workers 1 --max-lag 1"),
         ("Pendulum-v1", {"algo": "sac", "eval_episodes": None}, "--algo sac --eval-episodes none"),
     ],
 )
