@@ -104,10 +104,10 @@ class PolicyPlayer:
         return 0 if self._hub is None else len(self._hub.coordinator.members)
 
     def describe(self, render_mode: str | None = None) -> DescribedEnv:
-        """Have a worker describe the environment. Call it before the first `play`. Raises `UserFacingError`."""
+        """Have a worker describe the environment of evaluations, before the first `play`. Raises `UserFacingError`."""
         if self._described is not None:
             return self._described
-        spec = DescribeSpec(self.policy.env, render_mode=render_mode)
+        spec = DescribeSpec(self.policy.env.for_evaluation(), render_mode=render_mode)
         return described_by_workers(self._link, spec, DESCRIBE, self._processes, self._check_interrupt)
 
     def play(self, plan: EvaluationPlan, on_rows: OnRows | None = None, before: int = 0) -> list[PlayedEpisode]:

@@ -42,6 +42,7 @@ from protocol.errors import MillraceError, RunTakenOver, UsageError, first_line
 from protocol.keys.key_folder import Keyring
 from protocol.logs.notices import log_notice
 from protocol.messages import Status
+from protocol.rollout import Batch
 from protocol.specs import DescribeSpec, PolicySpec, RunSpec
 from protocol.wire.learner_link import LearnerLink
 
@@ -69,6 +70,12 @@ class RunSetup:
     folder: RunFolder
     resumed: bool
     interrupts: Interrupts
+    """Entered: signals are noted from now on."""
+
+    def check_interrupt(self) -> None:
+        """Raises `KeyboardInterrupt` if the user has stopped the program, before there is anything to save."""
+        if self.interrupts.received:
+            raise Interrupted(self.folder.path) if self.resumed else KeyboardInterrupt
 
 
 @contextmanager
@@ -181,7 +188,7 @@ class Run:
                 raise UsageError(
                     f"prior {config.prior}: a dataset has no action masks, and this run uses them; take --action-masks none"
                 )
-            _add_prior(self.algorithm, config.prior, spec.policy)
+            _add_prior(self.algorithm, config.prior, spec.policy, setup.check_interrupt)
         state = RunState()
         if setup.resumed:
             state = restore(self.folder, self.algorithm)
@@ -190,6 +197,7 @@ class Run:
         past = (state.ledger, state.incarnations)
         self.service = rollout_service(config, spec, link, processes, self._check_interrupt, observer, past)
         episodes = _training_recorder(config, self.folder, setup.known, spec)
+        setup.check_interrupt()
         self.folder.remove_temporary()
         # Nothing of a resumed run is written before everything fits.
         self.folder.write_config(config, workers_elsewhere=not processes.expected)
@@ -218,15 +226,15 @@ class Run:
     def train(self, workers: int) -> None:
         """Wait for this number of `workers`, then train to the end.
 
-        Raises `Interrupted` if the user interrupts the run, and `MillraceError`, with a one-line message, if it fails.
+        `setup.interrupts` must be entered. Raises `Interrupted` if the user interrupts the run, and `MillraceError`, with a
+        one-line message, if it fails.
         """
         from learner.train import train
 
         try:
-            with self._interrupts:
-                if self._learns_from_prior and self.recorder.version == 0:
-                    self.algorithm.learn_from_prior(self.service.pulse)
-                train(self.algorithm, self.service, self.recorder, workers, self._check_time)
+            if self._learns_from_prior and self.recorder.version == 0:
+                self._learn_from_prior()
+            train(self.algorithm, self.service, self.recorder, workers, self._check_time)
         except RunTakenOver as error:
             self.service.drain(str(error), timeout_s=DRAIN_S)
             raise
@@ -242,6 +250,20 @@ class Run:
             raise
         finally:
             self.recorder.close()
+
+    def _learn_from_prior(self) -> None:
+        """Make the gradient steps before the first rollouts, with checkpoints when it is time, and at an interrupt."""
+
+        def pulse() -> None:
+            self.service.pulse()
+            self.recorder.save_if_time()
+            self._check_interrupt()
+
+        try:
+            self.algorithm.learn_from_prior(pulse)
+        except Interrupted:
+            self.recorder.save()
+            raise
 
     def _check_interrupt(self) -> None:
         if self._interrupts.received:
@@ -270,15 +292,10 @@ def serve(config: Config, resume: Resumption | None, watch: Watch) -> Path:
         )
         known = known_environment(config, env, resume, describe_over(bound.link, config, processes))
         folder = folder or stack.enter_context(run_folder(config, None))
-        run = Run(
-            RunSetup(config, known, folder, resume is not None, Interrupts(config.grace_s)),
-            bound.link,
-            processes,
-            watch,
-            observer,
-        )
-        run.train(config.min_workers or 1)
-        return run.folder.path
+        with Interrupts(config.grace_s) as interrupts:
+            setup = RunSetup(config, known, folder, resume is not None, interrupts)
+            Run(setup, bound.link, processes, watch, observer).train(config.min_workers or 1)
+        return folder.path
 
 
 def _why(error: BaseException) -> str:
@@ -287,13 +304,19 @@ def _why(error: BaseException) -> str:
     return one_line(text if isinstance(error, MillraceError) else f"{type(error).__name__}: {text}")
 
 
-def _add_prior(algorithm: Algorithm, dataset_id: str, policy: PolicySpec) -> None:
+def _add_prior(algorithm: Algorithm, dataset_id: str, policy: PolicySpec, check_interrupt: Callable[[], None]) -> None:
     from learner.recording.prior_dataset import PriorDataset
 
     if missing := [name for name in FOR_PRIOR if not hasattr(algorithm, name)]:
         raise UsageError(f"prior {dataset_id}: {type(algorithm).__name__} lacks {', '.join(missing)}")
     dataset = PriorDataset(dataset_id, policy)
-    algorithm.add_prior(dataset.batches(), dataset.rows + dataset.episodes)
+
+    def batches() -> Iterator[Batch]:
+        for batch in dataset.batches():
+            check_interrupt()
+            yield batch
+
+    algorithm.add_prior(batches(), dataset.rows + dataset.episodes)
     log.info("prior %s: %d transitions of %d episodes", dataset_id, dataset.rows, dataset.episodes)
 
 

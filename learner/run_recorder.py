@@ -201,6 +201,11 @@ class RunRecorder:
             finally:
                 self._requests.closed = ""
 
+    def save_if_time(self) -> None:
+        """Write a checkpoint and the policy if the newest checkpoint is older than `checkpoint_every_s`."""
+        if time.monotonic() - self._saved_s > self._checkpoints.every_s:
+            self.save()
+
     def save_unless_saved(self) -> None:
         """Write a checkpoint and the policy, unless the newest checkpoint already has this state."""
         if self._saved != self._position():

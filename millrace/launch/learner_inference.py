@@ -78,11 +78,12 @@ def train(
         stack.callback(lambda: thread.stop(interrupts.at_most(STOP_WITHIN_S)))
         stack.callback(thread.ask_to_leave)  # if it is asked a second time, the worker leaves at once
         processes = acting_processes(thread, lanes, env, 0 if elsewhere else config.workers)
-        run = Run(RunSetup(config, known, folder, resume is not None, interrupts), link, processes, watch, observer)
-        env.answer_for(run.status)  # the learner's own endpoint is inproc: `millrace status` asks where the workers join
-        run.announce(env.address, config.advertise, listening.endpoint.keyring)
-        run.train(1)
-        return run.folder.path
+        with interrupts:
+            run = Run(RunSetup(config, known, folder, resume is not None, interrupts), link, processes, watch, observer)
+            env.answer_for(run.status)  # the learner's own endpoint is inproc: `millrace status` asks where the workers join
+            run.announce(env.address, config.advertise, listening.endpoint.keyring)
+            run.train(1)
+        return folder.path
 
 
 def _settings(config: Config, env: EnvSpec, *, elsewhere: bool) -> VectorEnvSettings:

@@ -53,6 +53,7 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
         processes = ProcessCallbacks(supervisor.poll, supervisor.activities, expected=config.workers)
         with stopped_on_error(supervisor):
             known = known_environment(config, env, resume, describe_over(endpoint.link, config, processes))
-        run = Run(RunSetup(config, known, folder, resume is not None, interrupts), endpoint.link, processes, watch, observer)
-        run.train(config.min_workers or config.workers)
-        return run.folder.path
+        with interrupts:
+            setup = RunSetup(config, known, folder, resume is not None, interrupts)
+            Run(setup, endpoint.link, processes, watch, observer).train(config.min_workers or config.workers)
+        return folder.path

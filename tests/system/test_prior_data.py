@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import signal
 import warnings
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +12,16 @@ import gymnasium
 import numpy as np
 import pytest
 
+from learner.algorithms.dqn import DQN
+from learner.algorithms.replay.replay_buffer import Sample
 from learner.config.layers import resolve
+from learner.recording.prior_dataset import PriorDataset
 from learner.run_folder.metrics_log import read_rows
+from learner.run_folder.run_folder import Interrupted
 from millrace.cli.main import main
 from millrace.launch.local_run import train
 from protocol.errors import UsageError
+from protocol.rollout import Batch
 
 minari = pytest.importorskip("minari")
 DATASET = "cartpole/random-v0"
@@ -107,6 +114,40 @@ def test_a_resumed_run_keeps_its_dataset_and_refuses_another(tmp_path: Path) -> 
     assert read_rows(resumed / "metrics.jsonl")[-1]["train/n_updates"] > 10
     with pytest.raises(UsageError, match=r"prior: expected cartpole/random-v0 as in its config.toml, got ;"):
         run(tmp_path, "first", resume=folder, workers=1, steps=2_000, prior="", prior_steps=0)
+
+
+def test_gradient_steps_before_the_first_rollouts_can_be_interrupted_and_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings: dict[str, Any] = {"workers": 1, "prior_steps": 50}
+    whole = run(tmp_path, "whole", **settings)
+    step = DQN.step
+
+    def interrupted_step(self: DQN, sample: Sample) -> Sequence[float]:
+        if self.gradient_steps == 20:
+            signal.raise_signal(signal.SIGTERM)
+        return step(self, sample)
+
+    with monkeypatch.context() as patched, pytest.raises(Interrupted) as stopped:
+        patched.setattr(DQN, "step", interrupted_step)
+        run(tmp_path, "stopped", **settings)
+    resumed = run(tmp_path, "stopped", resume=stopped.value.run, **settings)
+    assert policy(resumed) == policy(whole)
+
+
+def test_an_interrupt_while_the_dataset_is_read_leaves_no_run_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    batches = PriorDataset.batches
+
+    def interrupted_batches(self: PriorDataset) -> Iterator[Batch]:
+        signal.raise_signal(signal.SIGTERM)
+        return batches(self)
+
+    monkeypatch.setattr(PriorDataset, "batches", interrupted_batches)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, "stopped", workers=1)
+    assert not (tmp_path / "stopped").exists()
 
 
 @pytest.mark.parametrize(

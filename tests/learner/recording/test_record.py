@@ -343,8 +343,11 @@ def test_minari_reads_back_what_was_played(
     assert [found.return_mean, found.return_std] == [float(np.mean(returns)), float(np.std(returns))]
 
 
-def test_the_environment_comes_back_with_the_dataset_and_each_episode_can_be_repeated(tmp_path: Path, root: Path) -> None:
-    run = a_run(tmp_path, EnvSpec("CartPole-v1"))
+@pytest.mark.parametrize("eval_kwargs", [{}, {"sutton_barto_reward": True}])
+def test_the_environment_comes_back_with_the_dataset_and_each_episode_can_be_repeated(
+    eval_kwargs: dict[str, Any], tmp_path: Path, root: Path
+) -> None:
+    run = a_run(tmp_path, EnvSpec("CartPole-v1", eval_kwargs=eval_kwargs))
     assert str(record(run, "cartpole/greedy-v0", 60, seed=1)).startswith("dataset cartpole/greedy-v0: ")
     dataset = read("cartpole/greedy-v0")
     env = dataset.recover_environment()
@@ -353,7 +356,8 @@ def test_the_environment_comes_back_with_the_dataset_and_each_episode_can_be_rep
         obs, _ = env.reset(seed=metadata["seed"])
         for t, action in enumerate(episode.actions):
             assert np.array_equal(obs, episode.observations[t])
-            obs, _, terminated, truncated, _ = env.step(action)
+            obs, reward, terminated, truncated, _ = env.step(action)
+            assert reward == episode.rewards[t]
         assert np.array_equal(obs, episode.observations[-1])
         assert (terminated, truncated) == (episode.terminations[-1], episode.truncations[-1])
     env.close()
