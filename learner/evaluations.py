@@ -68,7 +68,8 @@ class Evaluations:
         """Make the evaluation that is due, of the newest policy, which is this version. Returns its metrics."""
         found = self._evaluate_version(version, env_steps, self._settings.size())
         self._keep_if_best(found, env_steps)
-        self.next_at += self._settings.every_env_steps
+        every = self._settings.every_env_steps
+        self.next_at += every * (1 + (env_steps - self.next_at) // every)  # the next multiple that is not reached yet
         return found.metrics()
 
     def conclude(self, version: int, env_steps: int, episode_length: float | None, time_limit: int | None) -> Best | None:
@@ -80,7 +81,7 @@ class Evaluations:
         if size != self._settings.size():
             log_notice(log, _smaller(size))
         found = self._evaluate_version(version, env_steps, size)
-        if self._settings.every_env_steps:
+        if self._settings.every_env_steps or self.best is not None:  # best: of a run that was resumed with eval_every 0
             self._keep_if_best(found, env_steps)
         if self.best is None:
             return None
@@ -136,10 +137,9 @@ class Evaluations:
 
 def _smaller(size: EvaluationSize) -> str:
     """Says that an evaluation is smaller than usual."""
-    longest = max(1, size.max_steps // size.episodes)
     return (
-        f"the evaluation has {size.episodes} episodes of at most {longest:,} env steps, so that it takes less than the "
-        "training; --eval-episodes sets another number"
+        f"the evaluation has {size.episodes} episodes, and at most {size.max_steps:,} env steps, because the training was "
+        "short; --eval-episodes sets another number"
     )
 
 

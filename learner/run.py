@@ -59,6 +59,8 @@ class KnownEnvironment:
     spaces: EnvSpaces
     described: DescribedEnv
     """As a worker described it."""
+    evaluation_limit: int | None
+    """Env steps after which an episode of an evaluation is truncated, if it is."""
 
 
 @dataclass(frozen=True)
@@ -132,14 +134,16 @@ def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, d
         described = describe(
             DescribeSpec(env, config.chosen_vector(), heartbeat_s=config.heartbeat_s), check_interrupt, accept
         )
+        evaluation = described
         if env.eval_kwargs:
             spec = DescribeSpec(env.for_evaluation(), heartbeat_s=config.heartbeat_s)
-            check_evaluation_spaces(config, described, describe(spec, check_interrupt, lambda found: None))
+            evaluation = describe(spec, check_interrupt, lambda found: None)
+            check_evaluation_spaces(config, described, evaluation)
         imports.wait(check_interrupt)
     spaces = EnvSpaces.of_description(described, config.action_masks)
     if spaces.masked:
         log_notice(log, f"only actions that the environment allows are taken (action_masks {config.action_masks})")
-    return KnownEnvironment(env, spaces, described)
+    return KnownEnvironment(env, spaces, described, evaluation.max_episode_steps)
 
 
 def describe_over(link: LearnerLink, config: Config, processes: ProcessCallbacks) -> Describe:
@@ -201,8 +205,8 @@ class Run:
         self.folder.remove_temporary()
         # Nothing of a resumed run is written before everything fits.
         self.folder.write_config(config, workers_elsewhere=not processes.expected)
-        self.recorder = RunRecorder(config, self.folder, spec, self.algorithm, self.service, state, made, episodes)
-        self.recorder.time_limit = setup.known.spaces.max_episode_steps
+        limit = setup.known.evaluation_limit
+        self.recorder = RunRecorder(config, self.folder, spec, self.algorithm, self.service, state, made, episodes, limit)
         self.folder.keep()
         self.announce(link.address, config.advertise, link.keyring)
 

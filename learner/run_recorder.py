@@ -60,10 +60,12 @@ class RunRecorder:
         state: RunState,
         callbacks: Callbacks,
         episode_recorder: TrainingRecorder | None,
+        evaluation_limit: int | None,
     ) -> None:
-        """`state`: where the run stands. `episode_recorder` is closed with this recorder."""
-        self.time_limit: int | None = None
-        """Env steps after which the environment truncates an episode, if it does; for the size of the last evaluation."""
+        """`state`: where the run stands. `episode_recorder` is closed with this recorder.
+
+        `evaluation_limit`: env steps after which an episode of an evaluation is truncated, if it is.
+        """
         self.version, self.env_steps = state.version, state.env_steps
         self._config, self._folder, self._spec = config, folder, spec
         self._algorithm, self._service, self._callbacks = algorithm, service, callbacks
@@ -76,6 +78,7 @@ class RunRecorder:
         refusal = "envpool's env copies have no attributes" if spec.vector == "envpool" else ""
         self._requests = Requests(EnvAttributes(state.env_attributes, refusal))
         self._settings = msgspec.to_builtins(config)
+        self._evaluation_limit = evaluation_limit
         self._update: dict[str, Any] = {}  # facts of the last update: fields of `Progress`
         self._window = EpisodeWindow.from_state(state.episodes, state.facts, spec.facts)
         self._metrics = MetricsLog(folder.path, state.env_steps)
@@ -235,7 +238,7 @@ class RunRecorder:
         before = self._evaluations.of_version(self.version)
         with self._evaluation_time():
             self._confirmed = self._evaluations.conclude(
-                self.version, self.env_steps, self._window.length_mean, self.time_limit
+                self.version, self.env_steps, self._window.length_mean, self._evaluation_limit
             )
         if self._evaluations.of_version(self.version) is not before:
             self._callbacks.on_evaluation(self.progress())

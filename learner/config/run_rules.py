@@ -88,13 +88,13 @@ class EvaluationSettings(msgspec.Struct, frozen=True, kw_only=True):
         """The size of the evaluation after training.
 
         `env_steps`: of the training. `episode_length`: mean length of its last episodes, in env steps; None if none has
-        ended. `time_limit`: env steps after which the environment truncates an episode, if it does. The size depends on
-        these counts, and not on seconds, so that the result of a run is always the same.
+        ended. `time_limit`: env steps after which the environment truncates an episode of an evaluation, if it does. The
+        size depends on these counts, and not on seconds, so that the result of a run is always the same.
         """
         if self.episodes is not None or self.every_env_steps:
             return self.size()
         budget = 3 * env_steps // 4
-        length = episode_length or time_limit
+        length = time_limit or episode_length
         if length is None:  # episodes may have no end
             return EvaluationSize(FEWEST_EPISODES, max(min(self.max_steps, budget), 1))
         episodes = min(max(int(budget / max(length, 1.0)), FEWEST_EPISODES), MOST_EPISODES)

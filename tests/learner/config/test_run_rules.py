@@ -59,6 +59,7 @@ def test_records_take_their_settings_from_the_configuration() -> None:
     ("settings", "env_steps", "episode_length", "time_limit", "size"),
     [
         ({}, 100_000, 500.0, 500, (100, 1_000_000)),
+        ({}, 5_000, 20.0, 500, (10, 1_000_000)),  # a better policy may last as long as the time limit
         ({}, 100_000, 1000.0, 1000, (75, 1_000_000)),
         ({}, 100_000, 50_000.0, 60_000, (10, 1_000_000)),
         ({}, 600, None, 200, (10, 1_000_000)),

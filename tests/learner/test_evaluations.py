@@ -1,0 +1,81 @@
+"""When a run evaluates its policy, and which policy it keeps as the best: also after a resume with other settings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, cast
+
+import numpy as np
+
+from learner.algorithms import Algorithm
+from learner.config.config import Config
+from learner.evaluations import Evaluations
+from learner.rollout_service.service import RolloutService
+from learner.rollouts.evaluation_tickets import EvaluationPlan
+from learner.run_folder.results import Evaluation
+from learner.run_folder.run_folder import RunFolder
+from learner.run_state import RunState
+from tests.support.fake_ends import run_spec
+
+
+class Fakes:
+    """An algorithm whose weights are the number of evaluations so far, a service that finds `returns` in turn, a folder."""
+
+    def __init__(self, *returns: float) -> None:
+        self.returns: Iterator[float] = iter(returns)
+        self.evaluated = 0
+        self.written: list[float] = []
+        """The weights of each policy that was written as the best."""
+
+    def weights(self) -> Any:
+        return np.array([self.evaluated], np.float32), np.zeros(0, np.float32)
+
+    def evaluate(self, plan: EvaluationPlan, watch: Callable[[int], None]) -> Evaluation:
+        self.evaluated += 1
+        return Evaluation(episodes=len(plan.seeds), return_mean=next(self.returns), return_std=0.0, length_mean=1.0)
+
+    def publish(self, version: int, *weights: Any, deal: bool) -> None:
+        pass
+
+    def write_policy(self, policy: Any, env: Any, parameters: Any, *rest: Any) -> None:
+        self.written.append(float(parameters[0]))
+
+    def evaluations(self, every: int, state: RunState) -> Evaluations:
+        settings = Config(eval_every=every, eval_episodes=10).evaluation_settings()
+        parts = cast(RunFolder, self), run_spec(), cast(Algorithm, self), cast(RolloutService, self)
+        return Evaluations(settings, *parts, state, lambda: None)
+
+
+def due(evaluations: Evaluations, *env_steps: int) -> list[int]:
+    """Those of these numbers of env steps after which an evaluation is due. They are made."""
+    made = []
+    for version, steps in enumerate(env_steps, 1):
+        if evaluations.is_due(steps):
+            evaluations.evaluate_newest(version, steps)
+            made.append(steps)
+    return made
+
+
+def test_one_evaluation_follows_each_multiple_of_eval_every() -> None:
+    evaluations = Fakes(*range(9)).evaluations(100, RunState())
+    assert due(evaluations, 60, 120, 180, 240, 300, 360) == [120, 240, 300]
+
+
+def test_updates_that_are_larger_than_eval_every_are_each_evaluated_once() -> None:
+    evaluations = Fakes(*range(9)).evaluations(100, RunState())
+    assert due(evaluations, 250, 280, 290, 310, 550, 560) == [250, 310, 550]
+
+
+def test_evaluations_do_not_come_in_bursts_after_a_resume_with_another_eval_every() -> None:
+    """The run had none between 1,000 and 4,000 env steps. One is made at once, and the next ones when they are due."""
+    evaluations = Fakes(*range(9)).evaluations(500, RunState(version=9, env_steps=4_000, next_evaluation=1_000))
+    assert due(evaluations, 4_000, 4_010, 4_020, 4_510) == [4_000, 4_510]
+
+
+def test_the_final_policy_can_be_the_best_after_a_resume_without_evaluations() -> None:
+    fakes = Fakes(7.0, 7.5)
+    policy = np.array([-1], np.float32), np.zeros(0, np.float32)
+    best = fakes.evaluations(0, RunState(best=[5.0, 100.0], best_policy=policy)).conclude(9, 4_000, 10.0, None)
+    assert best is not None
+    assert (best.chosen_by, best.env_steps, best.evaluation.return_mean) == (7.0, 4_000, 7.5)
+    assert fakes.written == [-1.0, 1.0]
