@@ -384,6 +384,8 @@ def _make_error(env_id: str, error: Exception, plugins_failed: Sequence[str] = (
             return (
                 f"environment {env_id} has no vectorized form of its own (gymnasium's vector_entry_point); use --vector loop"
             )
+        case gymnasium.error.UnregisteredEnv() if env_id.rpartition(":")[2] in gymnasium.registry:
+            return f"environment {env_id} cannot be made: {says}"  # it is registered, and makes another one that is not
         case gymnasium.error.UnregisteredEnv() if not colon:
             broken = f" ({'; '.join(plugins_failed)})" if plugins_failed else ""
             return f"environment {env_id} is not registered: {what_to_write(env_id)}{broken}"

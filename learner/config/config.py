@@ -46,7 +46,7 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     eval_episodes: Free[Count | None] = None
     """Number of greedy episodes in an evaluation. none: 100. Without eval_every, the evaluation at the end has fewer,
-    but at least 10, if 100 would take more than three quarters of the env steps of training.
+    but at least 10, if 100 could take more than three quarters of the env steps of training.
     """
     eval_every: Free[Natural] = 0
     """Env steps between evaluations during training. 0: evaluate only at the end."""

@@ -68,18 +68,18 @@ def envpool_spec(env: EnvSpec) -> EnvpoolSpec:
         line = f"environment {env.id}: vector envpool needs envpool ({error}); pip install 'millrace-rl[envpool]'"
         raise UsageError(line) from error
     known = env.registered()
-    task, options = _task_and_options(env, known)
-    if task not in envpool.list_all_envs():
-        raise UsageError(f"environment {env.id}: envpool has none of this name; {vector_alternative(env)}")
     try:
+        task, options = _task_and_options(env, known)
+        if task not in envpool.list_all_envs():
+            raise UsageError(f"environment {env.id}: envpool has none of this name; {vector_alternative(env)}")
         with _ignore_warnings():
             made = envpool.make_spec(task, **options)
             observation, action = made.gymnasium_observation_space, made.gymnasium_action_space
             if isinstance(action, spaces.Box):  # envpool casts actions to float32
                 action = spaces.Box(action.low.astype(np.float32), action.high.astype(np.float32))
     except (TypeError, AssertionError) as error:
-        says = str(error).strip().removeprefix("Config.__new__() ")
-        raise UsageError(f"environment {env.id}: envpool cannot make it: {says}; use --vector loop") from error
+        says = str(error).strip().partition("() ")  # the name of a function that takes no such argument
+        raise UsageError(f"environment {env.id}: envpool cannot make it: {says[2] or says[0]}; use --vector loop") from error
     limit = options.get("max_episode_steps") or known.max_episode_steps or made.config.max_episode_steps
     return EnvpoolSpec(task, {**options, "max_episode_steps": min(limit + 1, MAX_EPISODE_STEPS)}, limit, observation, action)
 

@@ -159,4 +159,5 @@ def stored_actions_of(policy: PolicySpec) -> Callable[[Array], Array]:
         return lambda action: action.astype(spec.stored_dtype)
     low, high = (np.reshape(bound, spec.shape) for bound in (spec.low, spec.high))
     middle, half = (low + high) / 2, (high - low) / 2
+    half = np.where(half > 0, half, 1)  # an element with one value alone is stored as 0
     return lambda action: np.clip((action - middle) / half, -1, 1).astype(spec.stored_dtype)

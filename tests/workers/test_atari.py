@@ -96,6 +96,7 @@ def test_settings_mean_the_same_in_the_vectorized_form_as_in_the_loop(game: str,
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
+        ({"mode": 0}, "cannot make it: got an unexpected keyword argument 'mode'; use"),
         ({"noop_max": 0}, "envpool: noop_max: expected at least 1, got 0"),
         ({"fire_on_reset": True, "terminal_on_life_loss": True}, "envpool: it presses FIRE after each lost life"),
     ],

@@ -11,12 +11,26 @@ from typing import Any
 
 import numpy as np
 
-from learner.algorithms.replay.replay_buffer import DISCRETE, ReplayBuffer, Sample
+from learner.algorithms.replay.available_memory import GIB, available_bytes
+from learner.algorithms.replay.replay_buffer import DISCRETE, ReplayBuffer, Sample, memory_bytes
 from protocol.arrays import Floats, Ints
+from protocol.errors import UsageError
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf
 
 PRIOR_SLOT = -1  # `Sample.slots` of a prior transition
+
+
+class PriorTransitions(ReplayBuffer):
+    """The transitions of a dataset, which no checkpoint copies."""
+
+    def _check_memory(self, choices: int = 0) -> None:
+        needed, free = memory_bytes(*self._content, choices), available_bytes()
+        if free is not None and needed > free:
+            raise UsageError(
+                f"prior: {self._content[1]} observations of the dataset take {needed / GIB:.1f} GiB, "
+                f"but {free / GIB:.1f} GiB of memory are free; record a smaller dataset"
+            )
 
 
 class MixedReplay(ReplayBuffer):
@@ -42,7 +56,7 @@ class MixedReplay(ReplayBuffer):
 
     def add_prior(self, batches: Iterable[Batch], slots: int) -> None:
         """Store prior transitions. `slots`: how many observations they have. Raises `UsageError` if memory is too small."""
-        prior = ReplayBuffer(
+        prior = PriorTransitions(
             self._observation,
             size=slots,
             n_step=self._n_step,

@@ -126,7 +126,7 @@ class ReplayBuffer:
         Raises `UsageError` if memory is too small.
         """
         self._content = observation, size, alpha is not None, action
-        check_fits_memory(*self._content)
+        self._check_memory()
         self.size = size  # slots
         self.bytes = memory_bytes(*self._content)
         self._transition_bytes = 2 * self.bytes // size  # of a draw: two observations
@@ -197,9 +197,12 @@ class ReplayBuffer:
         ended = terminated[-1] | batch.truncated[-1, columns] | ~valid[-1]
         self._newest[lane] = np.where(ended, NO_SLOT, written[-1])
 
+    def _check_memory(self, choices: int = 0) -> None:
+        check_fits_memory(*self._content, choices)
+
     def _make_mask(self, choices: int) -> None:
         if self._mask is None:
-            check_fits_memory(*self._content, choices)
+            self._check_memory(choices)
             self.bytes = memory_bytes(*self._content, choices)
             self._mask = np.ones((self.size, choices), bool)
 

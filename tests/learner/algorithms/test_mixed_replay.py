@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 import torch
 
+from learner.algorithms.replay import mixed_replay
 from learner.algorithms.replay.mixed_replay import PRIOR_SLOT, MixedReplay
+from learner.algorithms.replay.replay_buffer import memory_bytes
+from protocol.errors import UsageError
 from tests.learner.algorithms.test_replay import GAMMA, OBS, Lanes, replay
 
 SHARE = 0.25
@@ -110,3 +113,12 @@ def test_a_restored_replay_draws_on_to_the_bit_and_needs_the_same_dataset() -> N
     without, _ = mixed(own=0, prior=0)
     with pytest.raises(ValueError, match=r"got 0$"):
         without.load_state_dict(state)
+
+
+def test_a_dataset_that_does_not_fit_memory_is_refused_as_such(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It takes its own size, once: no checkpoint copies it."""
+    made, _ = mixed(prior=0)
+    monkeypatch.setattr(mixed_replay, "available_bytes", lambda: memory_bytes(OBS, 10_000, False))
+    made.add_prior([], 10_000)
+    with pytest.raises(UsageError, match=r"^prior: 10001 observations of the dataset take .* record a smaller dataset$"):
+        made.add_prior([], 10_001)

@@ -98,6 +98,7 @@ def test_leaves_of_a_dict_and_choices_that_do_not_begin_at_0(store: Store) -> No
         spaces.MultiDiscrete([3, 2], start=[1, 5]),
         spaces.MultiBinary(3),
         spaces.Box(-2, 3, (2, 2), np.float32),
+        spaces.Box(np.array([-2, 1], np.float32), np.array([3, 1], np.float32)),  # the second element is always 1
     ],
 )
 def test_stored_actions_are_converted_to_those_of_the_environment(space: gymnasium.Space[Any], head: Any) -> None:

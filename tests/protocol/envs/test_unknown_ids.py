@@ -93,6 +93,12 @@ def test_the_line_names_the_installed_package_and_what_to_write(site: Site) -> N
     assert type(EnvSpec("fake_flappy:FakeFlappy-v0").make().unwrapped).__name__ == "Game"
 
 
+def test_a_registered_environment_that_makes_another_one_is_not_blamed(site: Site) -> None:
+    gymnasium.register("FakeOuter-v0", entry_point=lambda **_: gymnasium.make("FakeInner-v0"))
+    assert refusal("FakeOuter-v0").startswith("environment FakeOuter-v0 cannot be made: ")
+    assert "FakeInner" in refusal("FakeOuter-v0")
+
+
 def test_a_misspelled_id_is_suggested_with_its_module(site: Site) -> None:
     site.install("fake_flappy", REGISTERS_ON_IMPORT)
     assert refusal("FakeFlapy-v0").endswith("is not registered: did you mean fake_flappy:FakeFlappy-v0?")
