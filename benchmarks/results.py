@@ -1,7 +1,7 @@
-"""Adds runs to benchmarks/scores.json, and writes the table of docs/results.md: `python -m benchmarks.results RUN ...`.
+"""Adds runs to benchmarks/scores.json, and writes the tables of docs/results.md: `python -m benchmarks.results RUN ...`.
 
-Without runs it only writes the table. For each run it takes the best policy of the run's own evaluations, evaluated again on
-100 other episodes, and the final policy. If a run's own evaluations had fewer episodes, the policies are evaluated here.
+Without runs it only writes the tables. For each run it takes the best policy of the run's own evaluations, evaluated again
+on 100 other episodes, and the final policy. If a run's own evaluations had fewer episodes, the policies are evaluated here.
 Runs that differ only in their seed form one row.
 """
 
@@ -16,7 +16,7 @@ from pathlib import Path
 import msgspec
 
 from benchmarks.programs import flag
-from benchmarks.scores import EPISODES, Score, merged, read_scores, table, write_scores
+from benchmarks.scores import EPISODES, Score, comparison, merged, read_published, read_scores, table, write_scores
 from learner.config.config import TABLES, Config
 from learner.config.layers import config_of_run, resolve
 from learner.policy_player import saved_policy
@@ -26,7 +26,7 @@ from learner.run_folder.run_folder import RunFolder, Which
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
 
 PAGE = Path(__file__).parents[1] / "docs" / "results.md"
-TABLE = re.compile(r"^\| environment \| algorithm \|.*?\n(?=\n)", re.MULTILINE | re.DOTALL)
+TABLES_OF_PAGE = re.compile(r"^\| environment \| algorithm \|.*?\n(?=\n)", re.MULTILINE | re.DOTALL)
 OTHER_EPISODES = 1_000_000  # the seed of `millrace evaluate`; no run chooses its best policy by these episodes
 NOT_IN_COMMANDS = ("env", "algo", "seed", "run_dir", "torch_threads")  # the last one is chosen for the machine
 REPEATED = ("wrapper", "callback")  # flags with one value each
@@ -108,7 +108,8 @@ def main() -> None:
         if score is not None:
             scores[score.command] = merged(scores.get(score.command), score)
     write_scores(scores.values())
-    PAGE.write_text(TABLE.sub(lambda old: table(read_scores()), PAGE.read_text(), count=1))
+    tables = iter((table(read_scores()), comparison(read_scores(), read_published())))
+    PAGE.write_text(TABLES_OF_PAGE.sub(lambda old: next(tables), PAGE.read_text()))
     print(PAGE)
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import statistics
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import msgspec
@@ -91,6 +91,11 @@ def return_text(value: float) -> str:
     return f"{value:,.2f}" if abs(value) < 10 else f"{value:,.0f}"
 
 
+def steps_text(env_steps: int) -> str:
+    """A number of env steps, rounded: 300k, 1M."""
+    return f"{round(env_steps / 1e6, 1):g}M" if env_steps > 0.95e6 else f"{round(env_steps / 1e3)}k"
+
+
 def seeds_text(returns: dict[int, float]) -> str:
     """The returns of seeds 1, 2 and 3; other seeds are named."""
     if not returns:
@@ -113,4 +118,19 @@ def table(scores: Iterable[Score]) -> str:
         env = f"{score.env}, {score.note}" if score.note else score.env
         cells = (env, score.algo, f"{score.env_steps:,}", seeds_text(score.best), seeds_text(score.final), seconds)
         lines.append(f"| {' | '.join(cells)} | `{score.command}` |")
+    return "\n".join(lines) + "\n"
+
+
+def comparison(scores: Iterable[Score], published: Sequence[PublishedScore]) -> str:
+    """The second table of docs/results.md: the scores for which others have published one of the same algorithm."""
+    lines = ["| environment | algorithm | millrace | published |", "|---|---|---|---|"]
+    for score in scores:
+        others = [
+            f"{other.system} {return_text(other.returns)} ({steps_text(other.env_steps)})"
+            for other in published
+            if (other.env, other.algo) == (score.env, score.algo)
+        ]
+        if others:
+            ours = f"{return_text(score.mean())} ({steps_text(score.env_steps)})"
+            lines.append(f"| {score.env} | {score.algo} | {ours} | {', '.join(others)} |")
     return "\n".join(lines) + "\n"

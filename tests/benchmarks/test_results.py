@@ -9,7 +9,17 @@ from typing import Any
 import pytest
 
 from benchmarks import results
-from benchmarks.scores import Score, merged, read_published, read_scores, seeds_text, table, write_scores
+from benchmarks.scores import (
+    PublishedScore,
+    Score,
+    comparison,
+    merged,
+    read_published,
+    read_scores,
+    seeds_text,
+    table,
+    write_scores,
+)
 from learner.config.hyperparameters import HYPERPARAMETERS
 from learner.config.layers import resolve
 from millrace.cli.main import main
@@ -17,8 +27,19 @@ from millrace.cli.main import main
 SCORES = read_scores()
 
 
-def test_the_page_has_the_table_of_the_scores() -> None:
-    assert f"\n\n{table(SCORES)}\n" in results.PAGE.read_text()
+def test_the_page_has_the_tables_of_the_scores() -> None:
+    text = results.PAGE.read_text()
+    assert f"\n\n{table(SCORES)}\n" in text
+    assert f"\n\n{comparison(SCORES, read_published())}\n" in text
+
+
+def test_scores_are_compared_with_those_of_the_same_environment_and_algorithm() -> None:
+    score = Score(env="A-v5", algo="ppo", command="", env_steps=998_915, final={1: 10.0, 2: 30.0})
+    rows = (("A-v5", "ppo", 25.0, 1_000_000), ("A-v5", "sac", 99.0, 300_000), ("B-v5", "ppo", 98.0, 1))
+    published = [
+        PublishedScore(env=env, algo=algo, system="X", returns=value, env_steps=steps) for env, algo, value, steps in rows
+    ]
+    assert comparison([score], published).splitlines()[2:] == ["| A-v5 | ppo | 20 (1M) | X 25 (1M) |"]
 
 
 def test_the_file_is_as_the_program_writes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
