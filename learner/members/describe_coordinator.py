@@ -97,7 +97,7 @@ class DescribeCoordinator:
             case Failure(_, error, traceback, lane):
                 hello = member.hello
                 self.membership.events.append(EnvironmentRaised(hello.worker, hello.host, lane, error, escaped(traceback)))
-                self.membership.remove(member, Failure, f"broke: {error}")
+                self.membership.remove(member, Failure, "failed")
                 self._count_failure(f"worker {hello.worker} ({hello.host}): {error}", escaped(traceback))
         return []
 

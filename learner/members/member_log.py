@@ -29,6 +29,7 @@ class MemberLog:
         self._link, self._clock = link, clock
         self._limit = LogRateLimiter()
         self._of_key: dict[str, LogBudget] = {}  # as many as there are keys, and one more
+        self._traceback = ""  # the newest that was logged
         self._of_worker: dict[tuple[str, str], LogBudget] = {}  # by key and name: workers of two keys may share a name
 
     def warn_limited(self, peer: bytes, line: str) -> None:
@@ -37,7 +38,7 @@ class MemberLog:
             self._write(logging.WARNING, [self._budget_of_key(peer)], one_line(line), suppressed_note(kept_back))
 
     def log_event(self, level: int, event: Event, lines: str, cause: bytes | None) -> None:
-        """Log an event. If its `lines` are too long together, only the first is logged: the others are a traceback.
+        """Log an event. Lines after the first are a traceback. It is left out if it is too long, or the same as the newest.
 
         `cause` is the peer whose message caused the event; None if no message did. Requests to join again are limited
         more: after a restart of the learner they come in floods.
@@ -68,6 +69,9 @@ class MemberLog:
         suppressed = max(budget.spend(size) for budget in budgets)
         note += f" ({suppressed} more lines about it, or about workers of the same key, were left out)" if suppressed else ""
         first, _, more = lines.partition("\n")
+        if more and more == self._traceback:
+            first, more = f"{first}; its traceback is the same as the one before", ""
+        self._traceback = more or self._traceback
         log.log(level, "%s%s%s", first, note, f"\n{more}" if more else "", extra={"event": event} if event else None)
 
     def _budget_of_key(self, peer: bytes | None) -> LogBudget:

@@ -162,7 +162,7 @@ class TicketCoordinator:
                     self.events.append(PolicyRaised(hello.worker, hello.host, error, shown, spare))
                 else:
                     self.events.append(EnvironmentRaised(hello.worker, hello.host, lane, error, shown, spare))
-                self.membership.remove(member, Failure, f"broke: {error}")
+                self.membership.remove(member, Failure, "failed")
                 return self._deal()
 
     def reject_message(self, peer: bytes, why: str, now: float) -> list[Outgoing]:

@@ -116,7 +116,7 @@ class OrderCoordinator:
                 if not spare:
                     self.failures.append(failure)
                 self.membership.events.append(failure)
-                self.membership.remove(member, Failure, f"broke: {error}")
+                self.membership.remove(member, Failure, "failed")
             case Rollout() | Described() | Evaluated() | EpisodeRows():
                 why = f"it sent {type(message).__name__}, which a vector environment does not ask for"
                 return self.membership.refuse(member, SentUnusable, why)

@@ -122,7 +122,7 @@ def test_of_a_failure_that_would_fill_the_log_only_the_line_is_logged(caplog: py
     noisy = Noisy()
     for number in range(5):
         session = noisy.joins("spare", number)
-        noisy.hears("spare", Failure(session, "boom", "y" * 30_000, None))
+        noisy.hears("spare", Failure(session, "boom", "y" * (30_000 + number), None))
     broke = [line for line in caplog.messages if "boom" in line and "(host)" in line]
     assert ["\n    yyy" in line for line in broke] == [True, True, False, False, False]
     assert "its traceback is left out" in broke[2]
@@ -321,6 +321,20 @@ def test_only_the_failures_of_an_hour_end_the_run(apart_s: float, ends: bool) ->
             noisy.hub._turn(0.0)
     else:
         noisy.hub._turn(0.0)
+
+
+def test_a_failure_is_told_once_and_the_same_traceback_is_not_repeated(caplog: pytest.LogCaptureFixture) -> None:
+    noisy = Noisy(max_env_failures=9)
+    for nonce, traceback in enumerate(("line 1", "line 1", "line 2", "line 1"), 2):
+        session = noisy.joins("honest", nonce)
+        caplog.clear()
+        noisy.hears("honest", Failure(session, "boom", traceback, 0))
+        first, second = (record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING)
+        if nonce == 3:
+            assert first == "worker honest (host): boom; its traceback is the same as the one before"
+        else:
+            assert first == f"worker honest (host): boom\n    {traceback}"
+        assert second == "worker honest failed; 1 of its tickets are dealt again"
 
 
 def test_a_worker_cannot_blame_a_policy_that_is_not_the_users() -> None:

@@ -783,7 +783,7 @@ def test_failure_forgets_the_worker_and_its_traceback_is_kept_for_the_log() -> N
     assert A not in learner.coordinator.members
     assert [permit.incarnation for permit in permits(outs, B)] == [1]
     assert EnvironmentRaised("a", "host", 0, "ValueError: x", "Traceback: …") in learner.coordinator.events
-    assert learner.coordinator.events[-1] == WorkerLeft("a", "broke: ValueError: x", 1, False)
+    assert learner.coordinator.events[-1] == WorkerLeft("a", "failed", 1, False)
 
 
 def test_silent_workers_are_removed_in_tick_only() -> None:
