@@ -108,7 +108,7 @@ def test_settings_that_mean_something_else_in_envpool_are_refused(settings: dict
 
 
 def test_after_a_lost_life_the_same_game_goes_on_until_it_has_ended_or_a_seed_is_given() -> None:
-    env = atari.make_game("Breakout", noop_max=0, fire_on_reset=True, terminal_on_life_loss=True)
+    env = atari.make_game(game="Breakout", noop_max=0, fire_on_reset=True, terminal_on_life_loss=True)
     env.reset(seed=1)
     lives, generator = [], np.random.default_rng(0)
 

@@ -4,22 +4,14 @@ Rule: an observation is a stack of screens [4, 84, 84], whichever program steps 
 form of the emulator and envpool differ only in their random numbers, and in the frames before an episode's first screen:
 zeros, except that envpool repeats the first screen.
 
-Settings, as keyword arguments of the environment. Scores with different values of these settings cannot be compared:
-
-- `game`: the name, as in `ALE/Pong-v5`.
-- `repeat_action_probability`: sticky actions. 0.25 is that of Machado et al. (2018), 0 that of Mnih et al. (2015) and of
-  most published tables. Sticky actions make games harder.
-- `noop_max`: a game starts with up to so many no-op actions, a random number. 0: it always starts in the same state.
-- `fire_on_reset`: a game starts with the action FIRE, where the game has it. After a lost life the policy must press it.
-- `terminal_on_life_loss`: an episode ends with each life, and the next one goes on with the same game. Returns are then
-  those of lives: evaluate without it. envpool makes no-op actions after each life.
-- `clip_rewards`: rewards are clipped to ±1. Returns are then no scores: evaluate without it.
-
-The last two are settings of training: `eval_env_kwargs` takes them back for evaluations.
+Keyword arguments of the environment are the fields of `GameSettings`, and further arguments of the emulator. Scores with
+different settings cannot be compared. Life loss and clipped rewards are settings of training: `eval_env_kwargs` takes them
+back for evaluations.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields
 from typing import Any
 
 import gymnasium
@@ -29,64 +21,76 @@ from gymnasium.wrappers import AtariPreprocessing, ClipReward, FrameStackObserva
 
 from protocol.errors import UsageError
 
-FRAMES, SKIP, SIDE, NOOPS = 4, 4, 84, 30
+FRAMES, SKIP, SIDE = 4, 4, 84
 MAX_FRAMES = 108_000  # in a game: half an hour of play
 NOOP, FIRE = 0, 1  # actions
 
 
-def make_game(
-    game: str = "Pong",
-    repeat_action_probability: float = 0.0,
-    noop_max: int = NOOPS,
-    *,
-    fire_on_reset: bool = False,
-    terminal_on_life_loss: bool = False,
-    clip_rewards: bool = False,
-    **options: Any,
-) -> gymnasium.Env[Any, Any]:
-    """One env copy. `options` are further arguments of `gymnasium.make`. Needs ale-py and OpenCV."""
+@dataclass(frozen=True)
+class GameSettings:
+    """A game, and how it is played."""
+
+    game: str = "Pong"
+    """Its name, as in `ALE/Pong-v5`."""
+    repeat_action_probability: float = 0.0
+    """Sticky actions. 0.25 is that of Machado et al. (2018), 0 that of Mnih et al. (2015) and of most published tables.
+    Sticky actions make games harder.
+    """
+    noop_max: int = 30
+    """A game starts with up to so many no-op actions, a random number. 0: it always starts in the same state."""
+    fire_on_reset: bool = False
+    """A game starts with the action FIRE, where the game has it. After a lost life the policy must press it."""
+    terminal_on_life_loss: bool = False
+    """An episode ends with each life, and the next one goes on with the same game. Returns are then those of lives:
+    evaluate without it. envpool makes no-op actions after each life.
+    """
+    clip_rewards: bool = False
+    """Rewards are clipped to ±1. Returns are then no scores: evaluate without it."""
+
+    @staticmethod
+    def split(kwargs: dict[str, Any]) -> tuple[GameSettings, dict[str, Any]]:
+        """The settings among these keyword arguments, and the other arguments."""
+        names = {field.name for field in fields(GameSettings)}
+        options = {name: value for name, value in kwargs.items() if name not in names}
+        return GameSettings(**{name: value for name, value in kwargs.items() if name in names}), options
+
+
+def make_game(**kwargs: Any) -> gymnasium.Env[Any, Any]:
+    """One env copy. `kwargs`: `GameSettings`, and further arguments of `gymnasium.make`. Needs ale-py and OpenCV."""
     _silence_emulator()
-    sticky: dict[str, Any] = {
-        "repeat_action_probability": repeat_action_probability,
+    settings, options = GameSettings.split(kwargs)
+    options |= {
+        "repeat_action_probability": settings.repeat_action_probability,
         "max_num_frames_per_episode": MAX_FRAMES,
     }
-    env = gymnasium.make(f"ale_py:ALE/{game}-v5", frameskip=1, disable_env_checker=True, **sticky, **options)
-    if fire_on_reset:
+    env = gymnasium.make(f"ale_py:ALE/{settings.game}-v5", frameskip=1, disable_env_checker=True, **options)
+    if settings.fire_on_reset:
         env = _StartsGames(env)
-    env = FrameStackObservation(AtariPreprocessing(env, noop_max, SKIP, SIDE), FRAMES, padding_type="zero")
-    if clip_rewards:
+    env = FrameStackObservation(AtariPreprocessing(env, settings.noop_max, SKIP, SIDE), FRAMES, padding_type="zero")
+    if settings.clip_rewards:
         env = ClipReward(env, -1.0, 1.0)
-    return _EndsWithLives(env) if terminal_on_life_loss else env
+    return _EndsWithLives(env) if settings.terminal_on_life_loss else env
 
 
-def make_games(
-    num_envs: int,
-    game: str = "Pong",
-    repeat_action_probability: float = 0.0,
-    noop_max: int = NOOPS,
-    *,
-    fire_on_reset: bool = False,
-    terminal_on_life_loss: bool = False,
-    clip_rewards: bool = False,
-    **options: Any,
-) -> VectorEnv[Any, Any, Any]:
+def make_games(num_envs: int, **kwargs: Any) -> VectorEnv[Any, Any, Any]:
     """`num_envs` copies that the emulator steps together; in one thread, because there is a worker for each core."""
     _silence_emulator()
+    settings, options = GameSettings.split(kwargs)
     made = gymnasium.make_vec(
-        f"ale_py:ALE/{game}-v5",
+        f"ale_py:ALE/{settings.game}-v5",
         num_envs,
         "vector_entry_point",
         frameskip=SKIP,
-        repeat_action_probability=repeat_action_probability,
+        repeat_action_probability=settings.repeat_action_probability,
         max_num_frames_per_episode=MAX_FRAMES,
-        noop_max=noop_max,
-        use_fire_reset=fire_on_reset,
-        life_loss_info=terminal_on_life_loss,  # `episodic_life` would start a new game after each life
-        reward_clipping=clip_rewards,
+        noop_max=settings.noop_max,
+        use_fire_reset=settings.fire_on_reset,
+        life_loss_info=settings.terminal_on_life_loss,  # `episodic_life` would start a new game after each life
+        reward_clipping=settings.clip_rewards,
         num_threads=1,
         **options,
     )
-    return _StepAfterLives(made) if terminal_on_life_loss else made
+    return _StepAfterLives(made) if settings.terminal_on_life_loss else made
 
 
 class _StartsGames(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -164,26 +168,25 @@ def _silence_emulator() -> None:
     ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)
 
 
-def _envpool(
-    game: str = "Pong",
-    repeat_action_probability: float = 0.0,
-    noop_max: int = NOOPS,
-    *,
-    fire_on_reset: bool = False,
-    terminal_on_life_loss: bool = False,
-    clip_rewards: bool = False,
-) -> tuple[str, dict[str, Any]]:
+def _envpool(**kwargs: Any) -> tuple[str, dict[str, Any]]:
     """Name and options of the game in envpool. Raises `UsageError` for settings that mean something else there."""
-    if noop_max < 1:
-        raise UsageError(f"envpool: noop_max: expected at least 1, got {noop_max}; use --vector native or loop")
-    if fire_on_reset and terminal_on_life_loss:
+    settings = GameSettings(**kwargs)
+    if settings.noop_max < 1:
+        raise UsageError(f"envpool: noop_max: expected at least 1, got {settings.noop_max}; use --vector native or loop")
+    if settings.fire_on_reset and settings.terminal_on_life_loss:
         raise UsageError(
             "envpool: it presses FIRE after each lost life, not at the start of a game only; use --vector native or loop, "
             "or one of fire_on_reset and terminal_on_life_loss"
         )
-    options = {"noop_max": noop_max, "use_fire_reset": fire_on_reset, "repeat_action_probability": repeat_action_probability}
-    options |= {"episodic_life": terminal_on_life_loss, "reward_clip": clip_rewards}
-    return f"{game}-v5", {**options, "frame_skip": SKIP, "stack_num": FRAMES, "max_episode_steps": MAX_FRAMES // SKIP}
+    options = {
+        "noop_max": settings.noop_max,
+        "use_fire_reset": settings.fire_on_reset,
+        "repeat_action_probability": settings.repeat_action_probability,
+        "episodic_life": settings.terminal_on_life_loss,
+        "reward_clip": settings.clip_rewards,
+    }
+    sizes = {"frame_skip": SKIP, "stack_num": FRAMES, "max_episode_steps": MAX_FRAMES // SKIP}
+    return f"{settings.game}-v5", options | sizes
 
 
 make_game.envpool = _envpool  # type: ignore[attr-defined]  # for protocol/envs/envpool.py
