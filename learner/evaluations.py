@@ -78,8 +78,8 @@ class Evaluations:
         `episode_length`, `time_limit`: see `EvaluationSettings.final_size`.
         """
         size = self._settings.final_size(env_steps, episode_length, time_limit)
-        if size != self._settings.size():
-            log_notice(log, _smaller(size))
+        if size != (usual := self._settings.size()):
+            log_notice(log, _smaller(size, usual))
         found = self._evaluate_version(version, env_steps, size)
         if self._settings.every_env_steps or self.best is not None:  # best: of a run that was resumed with eval_every 0
             self._keep_if_best(found, env_steps)
@@ -135,12 +135,11 @@ class Evaluations:
         warn_on_error(lambda: self._folder.write_policy(policy, env, parameters, buffers, "best", facts, self._spec.masked))
 
 
-def _smaller(size: EvaluationSize) -> str:
+def _smaller(size: EvaluationSize, usual: EvaluationSize) -> str:
     """Says that an evaluation is smaller than usual."""
-    return (
-        f"the evaluation has {size.episodes} episodes, and at most {size.max_steps:,} env steps, because the training was "
-        "short; --eval-episodes sets another number"
-    )
+    steps = f" and at most {size.max_steps:,} env steps" if size.max_steps < usual.max_steps else ""
+    why = "because the training was short; --eval-episodes sets another number"
+    return f"the evaluation has {size.episodes} episodes{steps}, {why}"
 
 
 def warn_on_error(write: Callable[[], object]) -> None:
