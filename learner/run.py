@@ -172,7 +172,7 @@ class Run:
         import torch
 
         from learner.algorithms import algorithm_class
-        from learner.run_recorder import RunRecorder
+        from learner.run_recorder import EpisodeSettings, RunRecorder
         from learner.run_spec import run_spec
         from learner.run_state import RunState, restore
         from learner.torch_setup import threads, torch_device
@@ -200,13 +200,12 @@ class Run:
         self._learns_from_prior = bool(config.prior)
         past = (state.ledger, state.incarnations)
         self.service = rollout_service(config, spec, link, processes, self._check_interrupt, observer, past)
-        episodes = _training_recorder(config, self.folder, setup.known, spec)
+        episodes = EpisodeSettings(_training_recorder(config, self.folder, setup.known, spec), setup.known.evaluation_limit)
         setup.check_interrupt()
         self.folder.remove_temporary()
         # Nothing of a resumed run is written before everything fits.
         self.folder.write_config(config, workers_elsewhere=not processes.expected)
-        limit = setup.known.evaluation_limit
-        self.recorder = RunRecorder(config, self.folder, spec, self.algorithm, self.service, state, made, episodes, limit)
+        self.recorder = RunRecorder(config, self.folder, spec, self.algorithm, self.service, state, made, episodes)
         self.folder.keep()
         self.announce(link.address, config.advertise, link.keyring)
 

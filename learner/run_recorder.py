@@ -12,7 +12,7 @@ import shlex
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -47,6 +47,15 @@ SHOW_EVERY_S = 0.2  # progress of an evaluation
 SAY_AGAIN_S = 60.0  # that rows of metrics are not written
 
 
+class EpisodeSettings(NamedTuple):
+    """What a run does with its episodes."""
+
+    recorder: TrainingRecorder | None
+    """Writes the episodes of training to a dataset. It is closed with the `RunRecorder`."""
+    evaluation_limit: int | None
+    """Env steps after which an episode of an evaluation is truncated, if it is."""
+
+
 class RunRecorder:
     """Counts the updates of one run, evaluates its policy, writes its files, and decides when it ends."""
 
@@ -59,13 +68,9 @@ class RunRecorder:
         service: RolloutService,
         state: RunState,
         callbacks: Callbacks,
-        episode_recorder: TrainingRecorder | None,
-        evaluation_limit: int | None,
+        episodes: EpisodeSettings,
     ) -> None:
-        """`state`: where the run stands. `episode_recorder` is closed with this recorder.
-
-        `evaluation_limit`: env steps after which an episode of an evaluation is truncated, if it is.
-        """
+        """`state`: where the run stands."""
         self.version, self.env_steps = state.version, state.env_steps
         self._config, self._folder, self._spec = config, folder, spec
         self._algorithm, self._service, self._callbacks = algorithm, service, callbacks
@@ -78,11 +83,11 @@ class RunRecorder:
         refusal = "envpool's env copies have no attributes" if spec.vector == "envpool" else ""
         self._requests = Requests(EnvAttributes(state.env_attributes, refusal))
         self._settings = msgspec.to_builtins(config)
-        self._evaluation_limit = evaluation_limit
+        self._evaluation_limit = episodes.evaluation_limit
         self._update: dict[str, Any] = {}  # facts of the last update: fields of `Progress`
         self._window = EpisodeWindow.from_state(state.episodes, state.facts, spec.facts)
         self._metrics = MetricsLog(folder.path, state.env_steps)
-        self._episode_recorder = episode_recorder
+        self._episode_recorder = episodes.recorder
         self._stages_s = {"update": 0.0, "other": 0.0}
         self._wall_before_s, self._steps_before = state.wall_s, state.env_steps
         self._started_s = self._saved_s = time.monotonic()
