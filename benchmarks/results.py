@@ -108,7 +108,8 @@ def main() -> None:
         if score is not None:
             scores[score.command] = merged(scores.get(score.command), score)
     write_scores(scores.values())
-    tables = iter((table(read_scores()), comparison(read_scores(), read_published())))
+    written = read_scores()
+    tables = iter((table(written), comparison(written, read_published())))
     PAGE.write_text(TABLES_OF_PAGE.sub(lambda old: next(tables), PAGE.read_text()))
     print(PAGE)
 

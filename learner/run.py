@@ -51,6 +51,11 @@ log = logging.getLogger("millrace.learner")
 DRAIN_S = 2.0  # for the workers to leave, when a run is cut short
 
 
+def stopped(resumed: Path | None) -> KeyboardInterrupt:
+    """The exception if the user stops the program before it trains. `resumed`: the run that it was to resume, if any."""
+    return KeyboardInterrupt() if resumed is None else Interrupted(resumed)
+
+
 @dataclass(frozen=True)
 class KnownEnvironment:
     """What a run must know of its environment before it begins."""
@@ -77,7 +82,7 @@ class RunSetup:
     def check_interrupt(self) -> None:
         """Raises `KeyboardInterrupt` if the user has stopped the program, before there is anything to save."""
         if self.interrupts.received:
-            raise Interrupted(self.folder.path) if self.resumed else KeyboardInterrupt
+            raise stopped(self.folder.path if self.resumed else None)
 
 
 @contextmanager
@@ -123,7 +128,7 @@ def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, d
 
         def check_interrupt() -> None:
             if interrupts.received:
-                raise KeyboardInterrupt if resume is None else Interrupted(resume.run)
+                raise stopped(None if resume is None else resume.run)
 
         policy = None if resume is None else RunFolder.open(resume.run).policy_spec()
 

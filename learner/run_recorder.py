@@ -211,7 +211,7 @@ class RunRecorder:
 
     def save_if_time(self) -> None:
         """Write a checkpoint and the policy if the newest checkpoint is older than `checkpoint_every_s`."""
-        if time.monotonic() - self._saved_s > self._checkpoints.every_s:
+        if self._checkpoints.is_time(time.monotonic() - self._saved_s):
             self.save()
 
     def save_unless_saved(self) -> None:

@@ -51,7 +51,11 @@ class CheckpointPolicy(msgspec.Struct, frozen=True, kw_only=True):
         """Whether to write one now. `since_last_s` and `episodes_since_last`: since the last one; `updates`: in all."""
         by_episodes = self.every_episodes > 0 and episodes_since_last >= self.every_episodes
         by_updates = self.every_updates > 0 and updates % self.every_updates == 0
-        return by_episodes or by_updates or since_last_s > self.every_s
+        return by_episodes or by_updates or self.is_time(since_last_s)
+
+    def is_time(self, since_last_s: float) -> bool:
+        """Whether the last one is so old that the time alone asks for another."""
+        return since_last_s > self.every_s
 
 
 MOST_EPISODES, FEWEST_EPISODES = 100, 10  # of an evaluation whose number of episodes is not set

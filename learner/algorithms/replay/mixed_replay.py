@@ -28,7 +28,7 @@ class PriorTransitions(ReplayBuffer):
         needed, free = memory_bytes(*self._content, choices), available_bytes()
         if free is not None and needed > free:
             raise UsageError(
-                f"prior: {self._content[1]} observations of the dataset take {needed / GIB:.1f} GiB, "
+                f"prior: {self.size} observations of the dataset take {needed / GIB:.1f} GiB, "
                 f"but {free / GIB:.1f} GiB of memory are free; record a smaller dataset"
             )
 

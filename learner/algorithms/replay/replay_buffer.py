@@ -126,8 +126,8 @@ class ReplayBuffer:
         Raises `UsageError` if memory is too small.
         """
         self._content = observation, size, alpha is not None, action
-        self._check_memory()
         self.size = size  # slots
+        self._check_memory()
         self.bytes = memory_bytes(*self._content)
         self._transition_bytes = 2 * self.bytes // size  # of a draw: two observations
         self._n_step, self._gamma, self._alpha = n_step, gamma, alpha
