@@ -20,6 +20,9 @@ from protocol.messages import EpisodeRows, Evaluate, Evaluated
 from protocol.policy.policy import Policy
 from protocol.specs import PolicySpec, RunSpec
 from tests.support.collectors import no_pulse, random_policy, run_of
+from workers.collect.collector import Collector
+from workers.collect.held_rollouts import Assignment
+from workers.env_errors import LaneFailed
 from workers.evaluate import episode_rows
 from workers.evaluate.evaluator import EvaluationFailed, Evaluator
 
@@ -52,7 +55,7 @@ class Echo(gymnasium.Env[Any, Any]):
             raise RuntimeError("the spring broke\nin two")
         right: Any = float(action == self.number)
         right = {"reward": float("nan"), "text": "one", "vector": np.ones(2), "list": [right]}.get(self.bad, right)
-        observation = np.zeros(2, np.int64) if self.bad == "shape" else self._next()
+        observation = {"shape": np.zeros(2, np.int64), "outside": 7}.get(self.bad, self._next())
         return observation, right, not self.endless and self.steps == self.longest, False, {}
 
     def _next(self) -> int:
@@ -184,11 +187,49 @@ def test_an_environment_that_raises_is_named_with_its_traceback(made: list[Echo]
         ("reward", "copy 0, step 0: reward: expected a finite float32, got nan"),
         ("text", "copy 0, step 0: reward: expected a number, got 'one'"),
         ("shape", r"copy 0, step 0: observation: expected int64\[\] as its space says, got int64\[2\]"),
+        ("outside", "copy 0, step 0: observation: expected values of its space, got 7 to 7"),
     ],
 )
 def test_an_unusable_value_is_named(bad: str, says: str) -> None:
     with pytest.raises(EvaluationFailed, match=says):
         play(Evaluator(echo_run(bad=bad), Repeats()), order(1))
+
+
+class Counts(gymnasium.Env[Any, Any]):
+    """Counts its steps in an observation of bytes, which it returns as int64."""
+
+    def __init__(self, first: int = 0) -> None:
+        self.observation_space = spaces.Box(0, 255, (2,), np.uint8)
+        self.action_space = spaces.Discrete(2)
+        self.first = first
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.steps = 0
+        return np.array([self.first, 0]), {}
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        self.steps += 1
+        return np.array([self.first, self.steps]), 1.0, self.steps == 3, False, {}
+
+
+@pytest.mark.parametrize("first", [255, 256])
+def test_integers_of_another_dtype_are_taken_as_in_training_if_they_keep_their_values(first: int) -> None:
+    spec = EnvSpec.of(lambda: Counts(first))
+    policy = PolicySpec(observation_leaves(Counts().observation_space), action_spec(spaces.Discrete(2)))
+    run = RunSpec(spec, policy, rollout_steps=4, copies=1, lanes=1, seed=1)
+    evaluator = Evaluator(run, random_policy(policy))
+    collector = Collector(run, random_policy(policy))
+    if first < 256:
+        assert figures(play(evaluator, order(1))) == [(3.0, 3)]
+        (rollout,) = collector.collect([Assignment(0, 0, 0, 0)], 0, 1, no_pulse)
+        assert rollout.obs[0][:, 0].tolist() == [[255, 0], [255, 1], [255, 2], [255, 3], [255, 0]]
+        return
+    says = r"expected uint8\[2\] as its space says, got int64\[2\] with the value 256"
+    with pytest.raises(EvaluationFailed, match=f"copy 0, first reset: observation: {says}"):
+        play(evaluator, order(1))
+    with pytest.raises(LaneFailed, match=says):
+        collector.collect([Assignment(0, 0, 0, 0)], 0, 1, no_pulse)
 
 
 def test_a_vector_reward_gets_the_advice_of_training(monkeypatch: pytest.MonkeyPatch) -> None:

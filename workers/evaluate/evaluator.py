@@ -24,12 +24,12 @@ from protocol.policy.masks import stored_leaves
 from protocol.policy.own_policy import OwnPolicy
 from protocol.policy.policy import Policy
 from protocol.policy.recurrent import zero_state
-from protocol.rollout import LARGEST_REWARD, Episode
-from protocol.specs import Leaf, RunSpec
+from protocol.rollout import LARGEST_REWARD, Episode, outside_of_space
+from protocol.specs import RunSpec
 from workers.collect.acting import acting_of
 from workers.env_errors import CopyRaised, Unusable
 from workers.env_loop import Pulse
-from workers.env_results import one_number
+from workers.env_results import leaf_writers, one_number
 from workers.evaluate.episode_rows import RowSender, Send, as_frame
 from workers.evaluate.evaluation_copies import CopiesLost, EvaluationCopies, LoopedEvaluationCopies
 
@@ -63,6 +63,7 @@ class Evaluator:
         self._run, self._open_copies = run, open_copies
         self._acting = acting_of(run, policy)
         self._stored = stored_leaves(run)
+        self._writers = leaf_writers(self._stored, 1)
         self._to_env_action = action_converter_of(run.policy)
         self._copies: dict[str | None, EvaluationCopies] = {}  # by render mode
 
@@ -111,7 +112,7 @@ class Evaluator:
             self._store(obs, n, leaves, "first reset")
             if senders:
                 self._observe(senders[n], obs, n, copies)
-        self._check_finite(obs, "first reset")
+        self._check_values(obs, "first reset")
         running = list(range(k))
         while running:
             pulse()
@@ -131,7 +132,7 @@ class Evaluator:
                     senders[n].step(chosen[n], reward, bool(step.terminated), bool(step.truncated) or cut[n])
                 if over or cut[n]:
                     ended, seconds[n], facts[n] = True, perf_counter() - began_s, step.facts or no_facts
-            self._check_finite(obs, lengths[running[0]] - 1)  # all that run have made equally many steps
+            self._check_values(obs, lengths[running[0]] - 1)  # all that run have made equally many steps
             self.steps += len(running)
             if ended:
                 running = [n for n in running if not seconds[n]]
@@ -159,18 +160,26 @@ class Evaluator:
 
         `when` is a text, or the number of the step.
         """
-        for array, leaf, value in zip(obs, self._stored, leaves, strict=True):
-            if type(value) is not np.ndarray or value.dtype != array.dtype or value.shape != leaf.shape:
-                value = _converted(value, leaf, array.dtype, f"copy {n}, {_moment(when)}")
-            array[0, n] = value
+        for array, leaf, value, writer in zip(obs, self._stored, leaves, self._writers, strict=True):
+            if type(value) is np.ndarray and value.dtype == array.dtype and value.shape == leaf.shape:
+                array[0, n] = value
+                continue
+            try:
+                writer.write_one(array[0], n, value)
+            except Unusable as error:
+                raise EvaluationFailed(f"copy {n}, {_moment(when)}: {error.line}") from error
 
-    def _check_finite(self, obs: tuple[Array, ...], when: str | int) -> None:
-        """Raise if an observation of the batch is not finite."""
+    def _check_values(self, obs: tuple[Array, ...], when: str | int) -> None:
+        """Raise if an observation of the batch is not finite, or not a value of a space that counts its values."""
         for array, leaf in zip(obs, self._stored, strict=True):
             if array.dtype.kind == "f" and not np.isfinite(array).all():
                 n = next(n for n in range(array.shape[1]) if not np.isfinite(array[0, n]).all())
                 where = f"copy {n}, {_moment(when)}: observation {leaf.path}".strip()
                 raise EvaluationFailed(f"{where}: expected finite numbers, got {array[0, n].tolist()}"[:500])
+            if leaf.sizes and outside_of_space(array, leaf):
+                n, why = next((n, why) for n in range(array.shape[1]) if (why := outside_of_space(array[0, n], leaf)))
+                where = f"copy {n}, {_moment(when)}: observation {leaf.path}".strip()
+                raise EvaluationFailed(f"{where}: {why}")
 
     def _observe(self, sender: RowSender, obs: tuple[Array, ...], n: int, copies: EvaluationCopies) -> None:
         try:
@@ -183,21 +192,6 @@ class Evaluator:
 
 def _moment(when: str | int) -> str:
     return when if isinstance(when, str) else f"step {when}"
-
-
-def _converted(value: Any, leaf: Leaf, dtype: np.dtype[Any], where: str) -> Array:
-    """An observation as an array of its space. Raises `EvaluationFailed` if it has another shape or kind."""
-    try:
-        given = np.asarray(value)
-    except ValueError:  # rows of different lengths
-        given = np.asarray(None)
-    if given.shape == leaf.shape and np.can_cast(given.dtype, dtype, "same_kind"):
-        return given
-    what = f"observation {leaf.path}".strip()
-    raise EvaluationFailed(
-        f"{where}: {what}: expected {dtype}{list(leaf.shape)} as its space says, "
-        f"got {given.dtype}{list(given.shape)}; fix the environment or its observation_space"
-    )
 
 
 def _finite_reward(reward: Any, n: int, t: int) -> float:
