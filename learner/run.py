@@ -210,6 +210,7 @@ class Run:
         self.folder.remove_temporary()
         # Nothing of a resumed run is written before everything fits.
         self.folder.write_config(config, workers_elsewhere=not processes.expected)
+        self.folder.remove_summary()
         self.recorder = RunRecorder(config, self.folder, spec, self.algorithm, self.service, state, made, episodes)
         self.folder.keep()
         self.announce(link.address, config.advertise, link.keyring)

@@ -197,6 +197,10 @@ class RunFolder:
             with suppress(OSError):
                 left.unlink()
 
+    def remove_summary(self) -> None:
+        """A run that had ended goes on: its summary is no longer true."""
+        (self.path / "summary.json").unlink(missing_ok=True)
+
     def keep(self) -> None:
         """The run has begun: `remove` does nothing from now on."""
         self._made = None

@@ -22,6 +22,7 @@ import pytest
 import millrace
 from learner.config.layers import config_from_toml, resolve
 from learner.policy_player import load_policy
+from learner.report.runs import read_run
 from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.progress import Progress
 from learner.run_folder.run_format import check_format
@@ -384,6 +385,22 @@ def test_a_learner_that_was_killed_goes_on_from_its_newest_checkpoint(tmp_path: 
     assert_balanced(found["ledger"])
     curve = [row["time/total_timesteps"] for row in read_rows(folder / "metrics.jsonl")]
     assert curve == sorted(set(curve)), "the curve goes over the same steps twice"
+
+
+def test_a_run_that_goes_on_has_no_summary_until_it_ends_again(tmp_path: Path) -> None:
+    folder = run(tmp_path, "CartPole-v1", steps=512, transport="inproc", workers=1, **SMALL)
+    ended = millrace.Run(folder)
+    assert ended.summary is not None
+    meanwhile: list[str] = []
+
+    def watch(progress: Progress) -> None:
+        if progress.env_steps > 1_000 and not meanwhile:
+            assert ended.summary is None
+            meanwhile.append(read_run(folder).results.stop_reason)
+
+    train(resolve(resume=folder, steps=1_536), folder, watch)
+    assert meanwhile == ["not finished"]
+    assert ended.summary.env_steps > 1_000
 
 
 @pytest.mark.parametrize("worker_timeout_s", [1.0, 30.0], ids=["shorter", "longer"])
