@@ -246,7 +246,7 @@ class RunRecorder:
                 self.version, self.env_steps, self._window.length_mean, self._evaluation_limit
             )
         if self._evaluations.of_version(self.version) is not before:
-            self._callbacks.on_evaluation(self.progress())
+            self._tell_evaluation(self.progress())
 
     def finish(self, reason: str, *, cut_short: bool = False) -> None:
         """Write the summary, and tell the callbacks. Does nothing if that was done.
@@ -350,8 +350,8 @@ class RunRecorder:
         return self.version, self._evaluations.next_at, self._evaluations.best, self._requests.attributes.changes
 
     def _write_logged(self) -> None:
-        """Add what callbacks logged to the row of this update."""
-        if logged := self._requests.take_logged():
+        """Add what callbacks logged to the row of this update, if there was one."""
+        if (logged := self._requests.take_logged()) and self.version:
             self._write_row(self.progress(), logged)
 
     def _evaluate(self) -> None:
@@ -361,6 +361,10 @@ class RunRecorder:
         progress = self.progress()
         self._write_row(progress, metrics)
         self._service.report(progress)
+        self._tell_evaluation(progress)
+
+    def _tell_evaluation(self, progress: Progress) -> None:
+        """Tell the callbacks, and add what they log to the row of the update that was evaluated."""
         try:
             self._callbacks.on_evaluation(progress)
         finally:

@@ -124,7 +124,18 @@ def test_numbers_that_callbacks_log_stand_in_the_row_of_the_update(tmp_path: Pat
     assert [row["mine/updates"] for row in found] == rows(folder)
     assert all(0.0 <= row["custom/reward"] <= 1.0 for row in found)
     assert [row["time/iterations"] for row in found if "eval/mean_reward" in row] == [*EVALUATED]
-    assert [row.get("custom/evaluated") for row in found if "custom/evaluated" in row] == [*EVALUATED]
+    assert [row.get("custom/evaluated") for row in found if "custom/evaluated" in row] == [*EVALUATED, UPDATES]
+
+
+def test_numbers_that_callbacks_log_before_the_first_update_make_no_row(tmp_path: Path) -> None:
+    class Stops(Callback):
+        def on_rollouts(self, progress: Progress) -> bool:
+            return False
+
+        def on_evaluation(self, progress: Progress) -> None:
+            progress.log("evaluated", progress.updates)
+
+    assert rows(run(tmp_path, Stops())) == []
 
 
 STOPS = [moment for moment in MOMENTS if moment != "on_end"]
