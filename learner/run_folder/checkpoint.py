@@ -33,10 +33,10 @@ class _Unreadable(Exception):
 
 
 def save(folder: Path, state: dict[str, Any], env_steps: int, keep: int) -> Path:
-    """Write a checkpoint into the run folder and remove all but the newest `keep`.
+    """Write a checkpoint into the run folder. Of those up to it, remove all but the newest `keep`.
 
-    Raises `CheckpointError` if it cannot be written; older checkpoints then stay untouched. Raises TypeError if the state
-    contains something that could not be read back.
+    A later one stays: a resumed run passed over it because it is damaged. Raises `CheckpointError` if it cannot be written;
+    older checkpoints then stay untouched. Raises TypeError if the state contains something that could not be read back.
     """
     import torch
 
@@ -48,7 +48,7 @@ def save(folder: Path, state: dict[str, Any], env_steps: int, keep: int) -> Path
         for left in path.parent.glob(f"*{TEMPORARY}"):  # from a process that was killed
             left.unlink()
         write_atomically(path, lambda file: torch.save(record, file))
-        for old in sorted(path.parent.glob(f"*{SUFFIX}"))[:-keep]:
+        for old in sorted(each for each in path.parent.glob(f"*{SUFFIX}") if each <= path)[:-keep]:
             old.unlink()
     except (OSError, RuntimeError) as error:  # torch raises RuntimeError when it cannot write
         raise CheckpointError(f"checkpoint {path} not written: {_why(error)}; older checkpoints are untouched") from error

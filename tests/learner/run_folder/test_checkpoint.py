@@ -52,6 +52,16 @@ def test_only_the_newest_stay(tmp_path: Path) -> None:
     assert files(tmp_path) == ["000001000000.pt", "000002000000.pt"]
 
 
+def test_a_later_one_that_was_passed_over_does_not_cost_the_newest_whole_one(tmp_path: Path) -> None:
+    for steps in (100, 200, 300):
+        path = checkpoint.save(tmp_path, state(1), steps, keep=3)
+    path.write_bytes(b"not a checkpoint at all")
+    checkpoint.save(tmp_path, state(2), 200, keep=1)
+    assert checkpoint.newest(tmp_path)[0].env_steps == 200
+    checkpoint.save(tmp_path, state(3), 400, keep=1)
+    assert files(tmp_path) == ["000000000400.pt"]
+
+
 @pytest.mark.parametrize("step", ["fsync", "replace"])
 def test_a_failure_at_any_step_leaves_the_old_one_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
     checkpoint.save(tmp_path, state(1), 100, keep=3)
