@@ -57,8 +57,7 @@ class Evaluations:
         due_at = state.env_steps + settings.every_env_steps
         self.next_at = min(state.next_evaluation or due_at, due_at)
         """Env steps at which the next evaluation is due."""
-        if self.best_policy is not None:
-            self._write_best(*self.best_policy)  # the folder may have that of a later version, which was lost
+        self.write_best()  # the folder may have that of a later version, which was lost
 
     def is_due(self, env_steps: int) -> bool:
         """Whether an evaluation is due after so many env steps."""
@@ -97,6 +96,14 @@ class Evaluations:
         confirmed = self._evaluate("the best policy", CONFIRMATION_SEED, size)
         return Best(env_steps=int(at_env_steps), chosen_by=chosen_by, evaluation=confirmed)
 
+    def write_best(self) -> None:
+        """Write the best policy into the run folder, if it is known."""
+        if self.best_policy is None:
+            return
+        (parameters, buffers), spec = self.best_policy, self._spec
+        write = self._folder.write_policy
+        warn_on_error(lambda: write(spec.policy, spec.env, parameters, buffers, "best", spec.facts, spec.masked))
+
     def of_version(self, version: int) -> Evaluation | None:
         """The evaluation of this version, if there is one."""
         return self.newest if self.version == version else None
@@ -128,11 +135,7 @@ class Evaluations:
         if self.best is None or found.return_mean > self.best[0]:
             self.best = [found.return_mean, env_steps]
             self.best_policy = self._algorithm.weights()
-            self._write_best(*self.best_policy)
-
-    def _write_best(self, parameters: Floats, buffers: Floats) -> None:
-        policy, env, facts = self._spec.policy, self._spec.env, self._spec.facts
-        warn_on_error(lambda: self._folder.write_policy(policy, env, parameters, buffers, "best", facts, self._spec.masked))
+            self.write_best()
 
 
 def _smaller(size: EvaluationSize, usual: EvaluationSize) -> str:

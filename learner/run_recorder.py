@@ -318,6 +318,8 @@ class RunRecorder:
             self._saved = self._saved_env_steps = None
             if made or line != self._trouble:
                 log.warning("%s", line)
+            if made:
+                self._evaluations.write_best()
         self._trouble = line
         return made
 

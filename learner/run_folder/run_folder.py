@@ -124,6 +124,7 @@ class RunFolder:
     def __init__(self, path: Path, made: Path | None = None) -> None:
         """`made`: if the folder is new, the topmost folder that was made for it."""
         self.path, self._made = path, made
+        self._workers_elsewhere = False  # as `write_config` was told last
         self.lock: RunLock | None = None
         """Held while this process trains the run."""
 
@@ -219,11 +220,12 @@ class RunFolder:
                 self.path.mkdir(parents=True)
             except OSError as error:
                 raise RunError(f"run folder {self.path} was deleted, and cannot be made again: {error.strerror}") from error
-        self.write_config(config)
+        self.write_config(config, workers_elsewhere=self._workers_elsewhere)
         return line
 
     def write_config(self, config: RunSettings, *, workers_elsewhere: bool = False) -> None:
         """Write config.toml and run.json: at the start, and again when a run is resumed, perhaps with other settings."""
+        self._workers_elsewhere = workers_elsewhere
         try:
             write_format(self.path, workers_elsewhere=workers_elsewhere)
         except OSError as error:

@@ -182,6 +182,18 @@ def test_a_run_folder_that_is_deleted_is_made_again(tmp_path: Path, caplog: pyte
     assert saved(folder) > before
 
 
+def test_a_run_folder_that_is_made_again_has_the_best_policy(tmp_path: Path) -> None:
+    def watch(progress: Progress) -> None:
+        if progress.updates == 12 and not progress.doing:  # after the best evaluation: the later ones are no better
+            shutil.rmtree(progress.run)
+
+    folder = run(tmp_path, watch, eval_every=64)
+    best = summary(folder)["best"]
+    assert best["chosen_by"] == 10.0
+    assert best["env_steps"] < read_rows(folder / "metrics.jsonl")[0]["time/total_timesteps"]
+    assert (folder / "best.safetensors").is_file()
+
+
 @pytest.mark.parametrize("what", ["checkpoints", "metrics.jsonl", "tensorboard", "policy.safetensors", "all"])
 def test_a_part_of_the_folder_that_is_deleted_or_cannot_be_written(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, what: str

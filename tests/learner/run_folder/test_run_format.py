@@ -84,3 +84,11 @@ def test_a_resumed_folder_gets_the_current_format(run: Path) -> None:
     folder = RunFolder.open(run)
     folder.write_config(config_of_run(run))
     assert check_format(run).format == RUN_FORMAT
+
+
+def test_a_folder_that_is_made_again_knows_where_its_workers_were_started(run: Path) -> None:
+    folder, config = RunFolder.open(run), config_of_run(run)
+    folder.write_config(config, workers_elsewhere=True)
+    (run / "config.toml").unlink()
+    assert folder.make_again(config) == f"{run / 'config.toml'} was deleted; it is written again"
+    assert check_format(run).workers_elsewhere
