@@ -116,6 +116,11 @@ Describe = Callable[[DescribeSpec, Callable[[], None], Accept], DescribedEnv]
 """Has a worker describe the environment. What the second argument raises ends the wait; the third accepts a description."""
 
 
+def named_environment(config: Config) -> EnvSpec:
+    """The environment that the settings name."""
+    return EnvSpec.of(config.env, config.env_kwargs, config.wrapper, config.eval_env_kwargs)
+
+
 def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, describe: Describe) -> KnownEnvironment:
     """The environment, as `describe` learns it. Meanwhile another thread imports PyTorch.
 
@@ -295,10 +300,7 @@ def serve(config: Config, resume: Resumption | None, watch: Watch) -> Path:
         bound = listen(config, stack)
         observer = stack.enter_context(prometheus_observer(config))
         bound.announce(config.advertise)
-        env, processes = (
-            EnvSpec.of(config.env, config.env_kwargs, config.wrapper, config.eval_env_kwargs),
-            ProcessCallbacks(),
-        )
+        env, processes = named_environment(config), ProcessCallbacks()
         known = known_environment(config, env, resume, describe_over(bound.link, config, processes))
         folder = folder or stack.enter_context(run_folder(config, None))
         with Interrupts(config.grace_s) as interrupts:

@@ -65,7 +65,7 @@ def _settings(config: Config) -> dict[str, Any]:
     """The settings of the run and of the algorithm, in the types of TOML."""
     found: dict[str, Any] = msgspec.to_builtins(config)
     algorithm: dict[str, Any] = found.pop("algorithm")
-    return found | algorithm
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in (found | algorithm).items()}
 
 
 def _tables() -> dict[str, Any]:

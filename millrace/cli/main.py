@@ -140,14 +140,12 @@ def _learner(argv: list[str]) -> int:
 
     config, resume = read_config("learner", argv)
     from learner.resumption import Resumption, unless_finished
-    from learner.run import serve
+    from learner.run import named_environment, serve
     from millrace.launch import learner_inference as inference
-    from protocol.env_spec import EnvSpec
 
     def train(checked: Resumption | None, watch: Watch) -> Path:
         if config.inference == "learner":
-            env = EnvSpec.of(config.env, config.env_kwargs, config.wrapper, config.eval_env_kwargs)
-            return inference.train(config, checked, watch, env, elsewhere=True)
+            return inference.train(config, checked, watch, named_environment(config), elsewhere=True)
         return serve(config, checked, watch)
 
     return _run(

@@ -16,7 +16,15 @@ from learner.interrupts import Interrupts
 from learner.members.endpoint import BindSettings
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.resumption import Resumption, unless_finished
-from learner.run import Run, RunSetup, describe_over, known_environment, prometheus_observer, run_folder
+from learner.run import (
+    Run,
+    RunSetup,
+    describe_over,
+    known_environment,
+    named_environment,
+    prometheus_observer,
+    run_folder,
+)
 from millrace.launch.endpoint import open_endpoint
 from millrace.launch.local_worker_options import no_flags, stopped_on_error, worker_flags
 from protocol.env_spec import EnvSpec
@@ -34,7 +42,7 @@ def train(config: Config, resume: Path | None, watch: Watch, env: EnvSpec | None
 
 
 def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec | None) -> Path:
-    env = env or EnvSpec.of(config.env, config.env_kwargs, config.wrapper, config.eval_env_kwargs)
+    env = env or named_environment(config)
     if config.inference == "learner":
         from millrace.launch import learner_inference as inference
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from gymnasium.vector import VectorEnv
 
 from learner.config.config import Config
 from learner.config.hyperparameters import PPOConfig
@@ -129,6 +130,29 @@ def test_after_a_lost_life_the_same_game_goes_on_until_it_has_ended_or_a_seed_is
     env.reset()
     assert env.unwrapped.ale.getEpisodeFrameNumber() < 4, "a reset in the middle of an episode starts a game"  # type: ignore[attr-defined]
     env.close()
+
+
+def test_a_game_that_ends_in_the_step_after_a_lost_life_ends_an_episode_in_the_next_step() -> None:
+    class Emulator(VectorEnv[Any, Any, Any]):
+        """Copy 0 loses a life in step 1 and its game in step 2. Copy 1 loses a life in step 2."""
+
+        num_envs = 2
+        terminated: ClassVar = iter([[1, 0], [0, 1], [0, 0], [0, 0], [0, 0]])
+        truncated: ClassVar = iter([[0, 0], [1, 0], [0, 0], [0, 0], [0, 0]])
+
+        def step(self, actions: Any) -> Any:
+            ends = (np.array(next(flags), bool) for flags in (self.terminated, self.truncated))
+            return np.zeros((2, 1)), np.ones(2), *ends, {}
+
+    games = atari._StepAfterLives(Emulator())
+    rows = [games.step([0, 0]) for _ in range(5)]
+    assert [[*reward, *terminated, *truncated] for _, reward, terminated, truncated, _ in rows] == [
+        [1, 1, True, False, False, False],
+        [0, 1, False, True, False, False],
+        [1, 0, True, False, False, False],
+        [0, 1, False, False, False, False],
+        [1, 1, False, False, False, False],
+    ]
 
 
 def described(vector: Any) -> RunSpec:

@@ -141,23 +141,24 @@ class _EndsWithLives(gymnasium.Wrapper[Any, Any, Any, Any]):
 class _StepAfterLives(VectorWrapper):
     """Makes the step after a lost life one that only resets, as in a loop over copies: it has no reward and no end.
 
-    The emulator goes on with the game in it, by the action of the policy. If the game ends in that very step, which takes an
-    unlikely clock, the end is not seen.
+    The emulator goes on with the game in it, by the action of the policy. If the game, or a life, ends in that very step,
+    the next step ends the episode, which has one step.
     """
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
         super().__init__(env)
-        self._ended = np.zeros(env.num_envs, bool)
+        self._ended = np.zeros(env.num_envs, bool)  # in the newest step
+        self._hidden = np.zeros(env.num_envs, bool)  # an end in the newest step that its row did not show
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        self._ended = np.zeros(self.num_envs, bool)
+        self._ended[:] = self._hidden[:] = False
         return self.env.reset(seed=seed, options=options)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(actions)
-        plays = ~self._ended
-        terminated, truncated = terminated & plays, truncated & plays
-        self._ended = terminated | truncated
+        plays, ends = ~self._ended, terminated | truncated
+        terminated, truncated = (terminated & plays) | self._hidden, truncated & plays
+        self._ended, self._hidden = terminated | truncated, ends & ~plays
         return observation, np.where(plays, reward, 0), terminated, truncated, info
 
 

@@ -17,6 +17,8 @@ from learner.config.presets import origin
         ({"gamma": 0.98}, "settings: preset of ppo for CartPole-v1"),
         ({"seed": 5, "workers": 1}, "settings: preset of ppo for CartPole-v1"),
         ({"rollout_steps": 64, "net": (32,)}, "settings: preset of ppo for CartPole-v1, except rollout_steps"),
+        ({"env": "millrace/Atari-v0"}, "settings: preset of ppo for millrace/Atari-v0"),
+        ({"env": "millrace/Atari-v0", "net": (64,)}, "settings: preset of ppo for millrace/Atari-v0, except net"),
         ({"preset": "none"}, "settings: without the preset of ppo for CartPole-v1"),
         ({"preset": "none", "seed": 2}, "settings: without the preset of ppo for CartPole-v1"),
         ({"algo": "reinforce", "env": "Acrobot-v1"}, "settings: defaults, because reinforce has no preset for Acrobot-v1"),
