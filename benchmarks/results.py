@@ -47,7 +47,7 @@ def read(path: Path, *, only_final: bool) -> Score | None:
     if final is None:
         return None
     return Score(
-        env=config.env,
+        env=environment(config),
         algo=config.algo,
         command=command(config, EVALUATION if only_final else ()),
         env_steps=summary.env_steps,
@@ -65,6 +65,12 @@ def _played(path: Path, config: Config, found: Evaluation | None, which: Which) 
         with policy_player(saved_policy(path, which), PlayingWorkers(config.workers), lambda text: None) as player:
             found = evaluation_of(player.play(plan))
     return None if found is None else found.return_mean
+
+
+def environment(config: Config) -> str:
+    """The environment's id, with the keyword arguments that its preset does not set: `millrace/Atari-v0 game Pong`."""
+    preset = resolve(config.env, algo=config.algo)
+    return shlex.join([config.env, *_words("env_kwargs", config.env_kwargs, preset.env_kwargs)[1:]])
 
 
 def command(config: Config, leave_out: Sequence[str] = ()) -> str:

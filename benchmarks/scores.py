@@ -87,8 +87,8 @@ def merged(old: Score | None, new: Score) -> Score:
 
 
 def return_text(value: float) -> str:
-    """A return for a table: small ones with two decimals."""
-    return f"{value:,.2f}" if abs(value) < 10 else f"{value:,.0f}"
+    """A return for a table: three digits or more."""
+    return f"{value:,.{2 if abs(value) < 10 else 1 if abs(value) < 100 else 0}f}"
 
 
 def steps_text(env_steps: int) -> str:

@@ -39,7 +39,7 @@ def test_scores_are_compared_with_those_of_the_same_environment_and_algorithm() 
     published = [
         PublishedScore(env=env, algo=algo, system="X", returns=value, env_steps=steps) for env, algo, value, steps in rows
     ]
-    assert comparison([score], published).splitlines()[2:] == ["| A-v5 | ppo | 20 (1M) | X 25 (1M) |"]
+    assert comparison([score], published).splitlines()[2:] == ["| A-v5 | ppo | 20.0 (1M) | X 25.0 (1M) |"]
 
 
 def test_the_file_is_as_the_program_writes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,6 +93,16 @@ def test_a_command_names_what_differs_from_the_preset_and_the_defaults(
 
 def score(final: dict[int, float], **given: Any) -> Score:
     return Score(env="E", algo="ppo", command="c", env_steps=5, final=final, **given)
+
+
+@pytest.mark.parametrize(
+    ("env", "env_kwargs", "name"),
+    [("CartPole-v1", {}, "CartPole-v1"), ("millrace/Atari-v0", {"game": "Pong"}, "millrace/Atari-v0 game Pong")],
+)
+def test_the_table_names_an_environment_with_the_arguments_that_its_preset_lacks(
+    env: str, env_kwargs: dict[str, Any], name: str
+) -> None:
+    assert results.environment(resolve(env, env_kwargs=env_kwargs)) == name
 
 
 def test_a_new_run_is_added_to_the_other_seeds_of_its_row() -> None:
