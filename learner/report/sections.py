@@ -89,7 +89,8 @@ def _rows_of_group(group: RunGroup) -> str:
     name = f"{color_dot(group)}<b>{escape(group.env)}</b> {escape(group.name)}"
     if group.differences:
         name += f"<span>{escape(group.differences)}</span>"
-    returns = [run.results.evaluation.return_mean for run in group.runs if run.results.evaluation is not None]
+    whole = [run.results for run in group.runs if not run.results.cut_short]
+    returns = [results.evaluation.return_mean for results in whole if results.evaluation is not None]
     if len(returns) > 1:
         mean, worst, best = map(return_text, (sum(returns) / len(returns), min(returns), max(returns)))
         which = f" of {len(returns)} of {len(group.runs)} runs" if len(returns) < len(group.runs) else ""

@@ -11,6 +11,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 import tomli_w
@@ -229,6 +230,12 @@ def test_a_failed_run_is_in_its_group_and_in_no_mean(tmp_path: Path) -> None:
     said = text_of(sections.results(report_data(*good, failed)))
     assert "greedy −1,233.1 on average of 2 of 3 runs" in said
     assert "seed 3 – not evaluated" in said
+    summary = RunFolder(good[1]).summary()
+    assert summary is not None
+    interrupted = a_run(tmp_path, seed=4)
+    RunFolder(interrupted).write_summary(msgspec.structs.replace(summary, stop_reason="interrupted", cut_short=True))
+    said = text_of(sections.results(report_data(*good, interrupted)))
+    assert "greedy −1,233.1 on average of 2 of 3 runs" in said, "it was evaluated, and then ended early"
     one_good = sections.curves(report_data(good[0], failed))
     assert "PPO, 2 seeds; seed 3 ended early<" in one_good
     assert "mean over seeds" not in one_good
