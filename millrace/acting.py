@@ -23,6 +23,7 @@ from protocol.policy.distributions import distribution
 from protocol.policy.masks import MASK, choices, forbid, masked_distribution, no_choice
 from protocol.policy.policy import make_policy
 from protocol.policy.recurrent import zero_state
+from protocol.rollout import outside_of_space
 from protocol.specs import Leaf, PolicySpec
 
 Observation: TypeAlias = Any
@@ -210,4 +211,6 @@ def _checked(value: Any, leaf: Leaf) -> Array:
         array = given.astype(leaf.dtype, copy=False)
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise UsageError(f"{what}: expected finite numbers, got {array.tolist()}"[:500])
+    if why := outside_of_space(array, leaf):
+        raise UsageError(f"{what}: {why}")
     return array

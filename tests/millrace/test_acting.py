@@ -176,6 +176,14 @@ def test_what_is_no_observation_is_refused_in_one_line(given: Any, message: str,
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("given", [16, -1, [3, 16]])
+def test_a_number_that_is_not_in_the_space_is_refused(given: Any, tmp_path: Path) -> None:
+    policy = millrace.load(folder_of(run_of("FrozenLake-v1"), tmp_path))
+    assert policy([0, 15]).shape == (2,)
+    with pytest.raises(millrace.UsageError, match="observation: expected values of its space, got"):
+        policy(given)
+
+
 def test_a_part_of_a_dict_that_is_missing_or_of_another_number_is_named(tmp_path: Path) -> None:
     run = run_of(f"{TOY}Spaces-v0", kwargs={"observation": "dict", "action": "discrete"})
     policy = millrace.load(folder_of(run, tmp_path))
