@@ -13,6 +13,7 @@ from learner.rollouts.lanes import AcceptedRollout
 from protocol.envs.action_masks import without_mask
 from protocol.envs.description import DescribedEnv
 from protocol.envs.spaces import action_converter_of
+from protocol.errors import RunError
 from protocol.specs import RunSpec
 
 
@@ -33,16 +34,24 @@ class TrainingRecorder:
         self._dataset = MinariDataset(dataset_id, EnvironmentOfDataset(env, masked=run.masked), about)
 
     def add(self, rollouts: Sequence[AcceptedRollout]) -> None:
-        """Add the rollouts of an update."""
+        """Add the rollouts of an update. Raises `RunError` if the dataset cannot be written; then it is removed."""
         for arrived in rollouts:
             for episode in self._assembler.add(arrived.rollout, arrived.incarnation):
-                self._dataset.add(episode)
+                try:
+                    self._dataset.add(episode)
+                except RunError:
+                    self._episodes = 0  # so `close` removes it
+                    raise
                 self._episodes += 1
 
     def close(self) -> str:
-        """Finish the dataset. Returns one line that describes it. Without a whole episode, no dataset is written."""
+        """Finish the dataset. Returns one line that describes it. Without a whole episode, no dataset is written.
+
+        Raises `RunError` if it cannot be written; then it is removed.
+        """
         if self._episodes:
-            self._dataset.close()
+            with self._dataset:
+                pass  # leaving it writes the episodes that are still in memory
         else:
             self._dataset.discard()
         parts = self._assembler.waiting + self._assembler.left_out

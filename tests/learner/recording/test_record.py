@@ -22,6 +22,8 @@ from learner.recording.episodes import EpisodeAssembler, RecordedEpisode
 from learner.recording.played_episodes import recording_seeds
 from learner.recording.record import RecordedDataset
 from learner.recording.record import record as record_with
+from learner.recording.training_recorder import TrainingRecorder
+from learner.rollouts.lanes import AcceptedRollout
 from learner.run_folder.run_folder import RunFolder
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
 from protocol.env_spec import EnvSpec
@@ -32,6 +34,10 @@ from protocol.policy.layout import acting_size, buffer_size
 from protocol.policy.recurrent import zero_state
 from protocol.rollout import Rollout
 from protocol.specs import PolicySpec
+from tests.support.collectors import TOY, no_pulse, random_policy, run_of
+from tests.support.described import described
+from workers.collect.collector import Collector
+from workers.collect.held_rollouts import Assignment
 
 Array = np.ndarray[Any, Any]
 
@@ -467,6 +473,38 @@ def test_what_minari_leaves_when_it_fails_is_removed(tmp_path: Path, root: Path,
     fails(run, "ns/box-v0", RunError, says, npy=tmp_path / "rows.npy")
     assert everything(root) == set()
     assert not [path for path in tmp_path.iterdir() if path.is_file()]
+
+
+@pytest.mark.parametrize("chunk_bytes", [1, 2**20])
+def test_nothing_is_left_of_a_training_dataset_that_cannot_be_written(
+    root: Path, monkeypatch: pytest.MonkeyPatch, chunk_bytes: int
+) -> None:
+    """`chunk_bytes`: whether the second episode is written while the run trains, or at its end."""
+    from minari.dataset.minari_dataset import MinariDataset
+    from minari.dataset.minari_storage import MinariStorage
+
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    run = run_of(f"{TOY}Countdown-v0", T=6, N=1)  # an episode, and the reset after it
+    collector = Collector(run, random_policy(run.policy))
+    first, second = ([AcceptedRollout(collector.collect([Assignment(n, 0, 0, n)], 0, 1, no_pulse)[0], 0)] for n in range(2))
+    recorder = TrainingRecorder("ns/countdown-v0", described(run.env), run, "a test")
+    monkeypatch.setattr(dataset_module, "CHUNK_BYTES", chunk_bytes)
+    recorder.add(first)
+    monkeypatch.setattr(MinariDataset, "update_dataset_from_buffer", full)
+    monkeypatch.setattr(MinariStorage, "new", full)
+    says = "dataset ns/countdown-v0 was not written: OSError: .*No space left on device"
+    if chunk_bytes == 1:
+        assert "ns/countdown-v0/data" in everything(root)
+        with pytest.raises(RunError, match=says):
+            recorder.add(second)
+        assert recorder.close() == "dataset ns/countdown-v0: 0 training episodes; 0 steps of others left out"
+    else:
+        recorder.add(second)
+        with pytest.raises(RunError, match=says):
+            recorder.close()
+    assert everything(root) == set()
 
 
 @pytest.mark.parametrize("dataset_id", ["box", "../box-v0", "/abs/box-v0", "two words-v0", ""])
