@@ -191,7 +191,7 @@ def play(flags: EvaluateFlags, watch: Watch, given: Given | None = None) -> tupl
     workers = PlayingWorkers(count, flags.transport, flags.bind, flags.inference, min(copies, episodes))
     with policy_player(saved, workers, watch) as player:
         if flags.video:
-            return record_videos(player, flags.run, episodes, flags.seed)
+            return record_videos(player, flags.run, episodes, flags.seed, flags.max_steps)
         played = player.play(EvaluationPlan.of(episodes, flags.seed, copies, flags.max_steps))
         return evaluation_of(played, saved.facts), []
 

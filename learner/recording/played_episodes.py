@@ -9,7 +9,7 @@ import numpy as np
 
 from learner.policy_player import PolicyPlayer
 from learner.recording.episodes import RecordedEpisode
-from learner.rollouts.evaluation_tickets import EvaluationPlan
+from learner.rollouts.evaluation_tickets import EvaluationPlan, PlayedEpisode
 from protocol.arrays import Array
 from protocol.envs.spaces import action_converter_of
 from protocol.messages import EpisodeRows
@@ -30,8 +30,8 @@ class Played(NamedTuple):
     """An episode that workers played."""
 
     episode: RecordedEpisode
-    cut: bool
-    """whether it was stopped because it was too long"""
+    result: PlayedEpisode
+    """its figures, and whether it was stopped because it was too long"""
     frames: list[Array]
     """[H, W, 3] uint8 for each of the first observations, if they were asked for"""
 
@@ -52,10 +52,10 @@ class PlayedEpisodes:
         """
         taken = 0
         while taken < steps:
-            for episode, was_cut, _ in self.play(self._wanted(steps - taken), longest=2 * steps - taken):
+            for episode, result, _ in self.play(self._wanted(steps - taken), longest=2 * steps - taken):
                 longest = 2 * steps - taken
                 is_longer = episode.length > longest
-                yield (_cut(episode, longest) if is_longer else episode), was_cut or is_longer
+                yield (_cut(episode, longest) if is_longer else episode), result.cut or is_longer
                 taken += min(episode.length, longest)
                 if taken >= steps:
                     break
@@ -74,7 +74,7 @@ class PlayedEpisodes:
         )
         results = self._player.play(plan, lambda number, some: rows[number].append(some), before=self._episodes)
         played = [
-            Played(self._whole(some, seed), result.cut, _frames(some))
+            Played(self._whole(some, seed), result, _frames(some))
             for some, seed, result in zip(rows, seeds, results, strict=True)
         ]
         self._episodes += count

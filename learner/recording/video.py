@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from learner.policy_player import PolicyPlayer
-from learner.recording.played_episodes import Played, PlayedEpisodes
+from learner.recording.played_episodes import PlayedEpisodes
+from learner.rollouts.evaluation_tickets import PlayedEpisode, evaluation_of
 from learner.run_folder.results import Evaluation
 from protocol.errors import EnvironmentFailed, RunError, UsageError
 
@@ -34,9 +35,12 @@ def prepare_rendering() -> None:
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 
 
-def record_videos(player: PolicyPlayer, run: Path, episodes: int, seed: int) -> tuple[Evaluation, list[Path]]:
+def record_videos(
+    player: PolicyPlayer, run: Path, episodes: int, seed: int, max_steps: int
+) -> tuple[Evaluation, list[Path]]:
     """Have the workers of `player` play greedy episodes, and write a video of each.
 
+    `max_steps`: env steps of all episodes together at most; each gets an equal share, and at most `LONGEST_EPISODE`.
     Returns the evaluation and the paths of the videos. Raises `UserFacingError`, with a one-line message, if videos cannot
     be made.
     """
@@ -50,18 +54,19 @@ def record_videos(player: PolicyPlayer, run: Path, episodes: int, seed: int) -> 
         frames_per_s = FRAMES_PER_S
     folder = run / FOLDER
     episodes_played = PlayedEpisodes(player, seed)
-    played: list[Played] = []
+    longest = min(LONGEST_EPISODE, max(1, max_steps // episodes))
+    results: list[PlayedEpisode] = []
     videos: list[Path] = []
     try:
         folder.mkdir(exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".new-") as new:
-            while len(played) < episodes:
-                count = min(AT_ONCE, episodes - len(played))
-                for one in episodes_played.play(count, LONGEST_EPISODE, frames=True):
-                    video = Path(new, f"seed-{seed}-episode-{len(played)}.mp4")
+            while len(results) < episodes:
+                count = min(AT_ONCE, episodes - len(results))
+                for one in episodes_played.play(count, longest, frames=True):
+                    video = Path(new, f"seed-{seed}-episode-{len(results)}.mp4")
                     _write(video, one.frames, frames_per_s)
                     videos.append(video)
-                    played.append(one._replace(frames=[]))
+                    results.append(one.result)
             videos = [video.replace(folder / video.name) for video in videos]
     except EnvironmentFailed as error:
         if "DependencyNotInstalled" in str(error):
@@ -71,8 +76,7 @@ def record_videos(player: PolicyPlayer, run: Path, episodes: int, seed: int) -> 
         raise
     except OSError as error:
         raise RunError(f"videos of run {run} were not written: {error.strerror or error}") from error
-    returns, lengths = [one.episode.episode_return for one in played], [one.episode.length for one in played]
-    return Evaluation.of(returns, lengths, sum(one.cut for one in played)), videos
+    return evaluation_of(results, player.policy.facts), videos
 
 
 def _write(path: Path, frames: list[Any], frames_per_s: float) -> None:
