@@ -14,6 +14,7 @@ those of `millrace train`. Imports no torch.
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -30,6 +31,8 @@ from learner.rollout_service.saved_state import ServiceState, digest, read, writ
 from learner.rollouts.evaluation_tickets import EvaluationPlan
 from learner.rollouts.lanes import AcceptedRollout
 from learner.rollouts.ledger import Ledger
+from learner.run_folder.episode_window import EpisodeWindow
+from learner.run_folder.progress import Progress
 from learner.run_folder.results import Evaluation
 from millrace.launch.rollouts import start
 from millrace.policies import MLP, PolicyChoice, PolicyParameters
@@ -149,6 +152,7 @@ class RolloutService:
         self._over = threading.Event()
         self._owner = threading.get_ident()
         self._taken, self._published = 0, 0
+        self._window, self._steps_before, self._began_s = EpisodeWindow(), self.env_steps, time.monotonic()
         self._moments: Moments | None = None
         self._resources = ExitStack()
         spec = EnvSpec.of(env, config.env_kwargs, wrappers, config.eval_env_kwargs)
@@ -251,6 +255,9 @@ class RolloutService:
         self._taken += 1
         batch = self._batch(arrived)
         self.env_steps += batch.env_steps
+        self._window.extend(batch.episodes)
+        with self._lock:
+            self._service.report(self._progress(self._version - batch.version))
         return batch
 
     def __iter__(self) -> Iterator[RolloutBatch]:
@@ -393,6 +400,18 @@ class RolloutService:
                 "extras": {extra.name: array for extra, array in extras},
                 "version": np.repeat(np.array([rollout.version for rollout in in_order]), stacked.copies),
             }
+        )
+
+    def _progress(self, lags: Ints) -> Progress:
+        """What `millrace status` shows after a batch with these lags [N]."""
+        here_s = time.monotonic() - self._began_s
+        return Progress(
+            env_steps=self.env_steps,
+            steps_per_s=(self.env_steps - self._steps_before) / here_s if here_s else 0.0,
+            return_mean=self._window.return_mean,
+            length_mean=self._window.length_mean,
+            lag_mean=float(lags.mean()),
+            lag_max=int(lags.max()),
         )
 
     def _check_interrupt(self) -> None:

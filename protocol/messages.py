@@ -374,7 +374,7 @@ class Status(Message, frozen=True):
     env_steps: int
     """env steps used by updates since the run began"""
     total_steps: int
-    """env steps at which the run ends; 0 for a vector environment, which has no updates and no end"""
+    """env steps at which the run ends; 0 for one without an end: a learner of one's own, or a vector environment"""
     steps_per_s: float
     """env steps used per second, since this learner started"""
     return_mean: float | None

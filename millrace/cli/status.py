@@ -172,12 +172,13 @@ def redraw(text: str, out: TextIO) -> None:
 
 def _run_line(status: Status) -> str:
     env = _printable(status.env)
-    if not status.total_steps:
-        return f"{env}, a vector environment: {status.env_steps:,} env steps, {status.steps_per_s:,.0f} steps/s"
-    done = f"{status.env_steps:,} of {status.total_steps:,} env steps"
+    speed = f"{status.steps_per_s:,.0f} steps/s"
+    if not (status.total_steps or status.ledger):
+        return f"{env}, a vector environment: {status.env_steps:,} env steps, {speed}"
+    done = f"{status.env_steps:,} of {status.total_steps:,}" if status.total_steps else f"{status.env_steps:,}"
     score = "none yet" if status.return_mean is None else f"{status.return_mean:,.1f}"
     lag = f"lag {status.lag_mean:.1f} (max {status.lag_max})"
-    return f"{env}: {done}, {status.steps_per_s:,.0f} steps/s, return {score}, update {max(status.version, 0)}, {lag}"
+    return f"{env}: {done} env steps, {speed}, return {score}, update {max(status.version, 0)}, {lag}"
 
 
 def _cells(worker: WorkerStatus, version: int, late: bool) -> dict[str, str]:

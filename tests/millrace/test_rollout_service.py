@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import re
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +15,7 @@ import numpy as np
 import pytest
 
 import millrace
+from millrace.cli.status import as_table
 from millrace.policies import PolicyParameters
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import CheckpointError, UsageError
@@ -141,6 +144,18 @@ def test_published_arrays_may_change_afterwards() -> None:
         made.publish(parameters)
         parameters[:] = 0
         assert same(made.gather(), batches(1)[0])
+
+
+def test_a_status_request_gets_the_figures_of_the_batches() -> None:
+    with service("workers.envs.toy:Countdown-v0", max_lag=1) as made:
+        made.publish(made.policy.initial())
+        made.gather()
+        made.gather()
+        text = as_table(made._service.status(time.monotonic()))
+    assert made.env_steps == 2 * 28
+    speed = r"[\d,]+ steps/s"
+    line = rf"workers\.envs\.toy:Countdown-v0: 56 env steps, {speed}, return 5\.0, update 0, lag 0\.0 \(max 0\)\n"
+    assert re.match(line, text), text
 
 
 def test_an_evaluation_does_not_disturb_the_rollouts() -> None:
