@@ -232,6 +232,35 @@ def test_integers_of_another_dtype_are_taken_as_in_training_if_they_keep_their_v
         collector.collect([Assignment(0, 0, 0, 0)], 0, 1, no_pulse)
 
 
+class Parts(gymnasium.Env[Any, Any]):
+    """A Dict observation, of which one part is missing after so many steps."""
+
+    def __init__(self, lost_after: int = 9) -> None:
+        self.observation_space = spaces.Dict({"left": spaces.Discrete(2), "right": spaces.Discrete(2)})
+        self.action_space = spaces.Discrete(2)
+        self.lost_after, self.steps = lost_after, 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        return self.show(), {}
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        self.steps += 1
+        return self.show(), 1.0, False, False, {}
+
+    def show(self) -> dict[str, int]:
+        return {"left": 1} | ({} if self.steps >= self.lost_after else {"right": 1})
+
+
+@pytest.mark.parametrize(("lost_after", "where"), [(0, "reset"), (2, "step 1")])
+def test_a_part_of_an_observation_that_is_missing_is_named(lost_after: int, where: str) -> None:
+    policy = PolicySpec(observation_leaves(Parts().observation_space), action_spec(spaces.Discrete(2)))
+    run = RunSpec(EnvSpec.of(lambda: Parts(lost_after)), policy, rollout_steps=4, copies=1, lanes=1, seed=1)
+    says = f"copy 0, {where}: observation: expected the structure of its space, got a dict of 'left'"
+    with pytest.raises(EvaluationFailed, match=says):
+        play(Evaluator(run, random_policy(policy)), order(1))
+
+
 def test_a_vector_reward_gets_the_advice_of_training(monkeypatch: pytest.MonkeyPatch) -> None:
     line = "copy 0, step 0: reward: expected a number, got an array of shape (2,)"
     line += "; wrap the environment so that it returns one number"

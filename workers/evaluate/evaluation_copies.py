@@ -23,6 +23,7 @@ from workers.collect.facts import facts_of_info
 from workers.collect.mask_reader import MaskReader
 from workers.env_errors import CopyRaised, Unusable
 from workers.env_loop import PULSE_S, EnvLoop, Pulse
+from workers.env_results import missing_leaf
 from workers.supervise.activity import EVALUATING, activity
 
 
@@ -109,12 +110,7 @@ class LoopedEvaluationCopies:
         observations: list[Any] = [None] * len(seeds)
         infos = dict(self._loop.reset(range(len(seeds)), seeds, observations, pulse))
         self._steps[: len(seeds)] = [0] * len(seeds)
-        if (masks := self._masks) is None:
-            return [self._read(observation) for observation in observations]
-        return [
-            (*self._read(observation), masks.read(n, observation, infos.get(n, {}), False, False))
-            for n, observation in enumerate(observations)
-        ]
+        return [self._leaves(n, observation, infos.get(n, {}), False, False) for n, observation in enumerate(observations)]
 
     def step(self, actions: Array, copies: Sequence[int], pulse: Pulse) -> list[CopyStep]:
         """Step these copies one after another, with actions [count, *action] of which only theirs are used."""
@@ -125,9 +121,7 @@ class LoopedEvaluationCopies:
             try:
                 observation, reward, terminated, truncated, info = self._loop.envs[n].step(actions[n])
                 facts = facts_of_info(self._facts, info, n) if self._facts and (terminated or truncated) else ()
-                leaves = self._read(observation)
-                if self._masks is not None:
-                    leaves = (*leaves, self._masks.read(n, observation, info, terminated, truncated))
+                leaves = self._leaves(n, observation, info, terminated, truncated)
                 results.append(CopyStep(leaves, reward, terminated, truncated, facts))
             except Unusable as error:
                 raise Unusable(n, error.line, f"step {self._steps[n]}") from error
@@ -141,6 +135,16 @@ class LoopedEvaluationCopies:
                 pulse_due_s = perf_counter() + PULSE_S
         self._activity.end(len(results))
         return results
+
+    def _leaves(self, n: int, observation: Any, info: dict[str, Any], terminated: Any, truncated: Any) -> tuple[Any, ...]:
+        """The arrays of an observation of copy `n`; in a masked run the mask follows. Raises `Unusable`."""
+        try:
+            leaves = self._read(observation)
+        except (LookupError, TypeError) as error:
+            raise missing_leaf(n, observation, error) from error
+        if self._masks is None:
+            return leaves
+        return (*leaves, self._masks.read(n, observation, info, terminated, truncated))
 
     def render(self, copy: int) -> Any:
         """What the environment renders."""
