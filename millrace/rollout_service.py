@@ -280,6 +280,9 @@ class RolloutService:
         self._check_open()
         if not self._published:
             raise UsageError("rollout service: expected weights to evaluate; call publish first")
+        for name, value, least in (("episodes", episodes, 1), ("seed", seed, 0), ("max_steps", max_steps, 1)):
+            if value < least:
+                raise UsageError(f"evaluate: {name}: expected int >= {least}, got {value}")
         plan = EvaluationPlan.of(episodes, seed, EVALUATION_COPIES, max_steps)
         with self._lock, self._interrupts:
             return self._service.evaluate(plan, lambda played: None)

@@ -167,6 +167,16 @@ def test_an_evaluation_does_not_disturb_the_rollouts() -> None:
         assert same(made.gather(), batches(1)[0])
 
 
+def test_an_evaluation_that_cannot_be_made_is_refused() -> None:
+    with service() as made:
+        made.publish(made.policy.initial())
+        for wrong in ({"episodes": 0}, {"seed": -1}, {"max_steps": 0}):
+            (name,) = wrong
+            with pytest.raises(UsageError, match=f"evaluate: {name}: expected int >= "):
+                made.evaluate(**wrong)
+        assert made.evaluate(episodes=1).episodes == 1
+
+
 def test_a_saved_service_goes_on(tmp_path: Path) -> None:
     file = tmp_path / "state.npz"
     with service() as made:
