@@ -172,6 +172,39 @@ def test_an_episode_without_end_is_cut_and_said() -> None:
     assert ends.cut == (False, True), "an episode that ends at its last allowed step was not cut"
 
 
+class Smooth(gymnasium.Env[Any, Any]):
+    """The reward is how little the action has changed. It keeps its last action: the array that it was given, or a copy."""
+
+    def __init__(self, copies: bool) -> None:
+        self.observation_space = spaces.Box(-1, 1, (2,))
+        self.action_space = spaces.Box(-1, 1, (2,))
+        self.copies, self.last = copies, np.zeros(2, np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.last, self.steps = np.zeros(2, np.float32), 0
+        return self.show(), {}
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        self.steps += 1
+        change = np.abs(action - self.last).sum()
+        self.last = action.copy() if self.copies else action
+        return self.show(), -float(change), self.steps == 5, False, {}
+
+    def show(self) -> Any:
+        return self.np_random.uniform(-1, 1, 2).astype(np.float32)
+
+
+def test_an_environment_may_keep_its_action() -> None:
+    policy = PolicySpec(observation_leaves(Smooth(True).observation_space), action_spec(Smooth(True).action_space))
+
+    def returns(copies: bool) -> list[tuple[float, int]]:
+        run = RunSpec(EnvSpec.of(lambda: Smooth(copies)), policy, rollout_steps=4, copies=1, lanes=1, seed=1)
+        return figures(play(Evaluator(run, random_policy(policy)), order(1, 2, greedy=False)))
+
+    assert returns(copies=False) == returns(copies=True)
+
+
 def test_an_environment_that_raises_is_named_with_its_traceback(made: list[Echo]) -> None:
     with pytest.raises(EvaluationFailed) as caught:
         play(Evaluator(echo_run(fails_at=2), Repeats()), order(1, 2))

@@ -101,7 +101,6 @@ class Evaluator:
         k, policy = len(order.seeds), self._run.policy
         copies = self._opened(k, "rgb_array" if order.send_frames else None, pulse)
         obs = tuple(np.empty((1, k, *leaf.shape), leaf.dtype) for leaf in self._stored)
-        actions = np.zeros((copies.count, *policy.action.shape), policy.action.dtype)
         state, generator = zero_state(policy, 1, k), np.random.default_rng(order.seeds[0])
         returns, lengths, cut, seconds = [0.0] * k, [0] * k, [False] * k, [0.0] * k
         no_facts = (math.nan,) * len(self._run.facts)
@@ -118,6 +117,8 @@ class Evaluator:
             pulse()
             with np.errstate(all="ignore"):
                 chosen = self._acting.choose(obs, state, generator, greedy=order.greedy)
+                # A new array at each step, because an environment may keep its action.
+                actions = np.zeros((copies.count, *policy.action.shape), policy.action.dtype)
                 actions[:k] = self._to_env_action(chosen)
             ended = False
             for n, step in zip(running, copies.step(actions, running, pulse), strict=True):
