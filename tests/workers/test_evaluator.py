@@ -366,15 +366,19 @@ def test_rows_are_cut_into_messages_and_are_whole(monkeypatch: pytest.MonkeyPatc
 
 
 class Painted(Echo):
-    """Renders its number of steps as the color of a picture."""
+    """Renders its number of steps as the color of a picture, always in the same array if it has a canvas."""
 
     metadata = {"render_modes": ["rgb_array"]}
 
-    def __init__(self, render_mode: str | None = None, blank: bool = False) -> None:
+    def __init__(self, render_mode: str | None = None, blank: bool = False, canvas: bool = False) -> None:
         super().__init__()
         self.render_mode, self.blank = render_mode, blank
+        self.canvas = np.zeros((2, 3, 3), np.uint8) if canvas else None
 
     def render(self) -> Any:
+        if self.canvas is not None:
+            self.canvas[:] = self.steps
+            return self.canvas
         return np.zeros((2, 3)) if self.blank else np.full((2, 3, 3), self.steps, np.uint8)
 
 
@@ -394,10 +398,11 @@ def painted(**kwargs: Any) -> RunSpec:
     return msgspec.structs.replace(echo_run(), env=EnvSpec("millrace-tests/Painted-v0", kwargs))
 
 
-def test_a_frame_is_sent_of_every_observation_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("canvas", [False, True])
+def test_a_frame_is_sent_of_every_observation_up_to_a_limit(monkeypatch: pytest.MonkeyPatch, canvas: bool) -> None:
     monkeypatch.setattr(episode_rows, "MOST_FRAMES", 6)
     sent: list[EpisodeRows] = []
-    answer = Evaluator(painted(), Repeats()).play(order(1, 9, frames=True), sent.append, no_pulse)
+    answer = Evaluator(painted(canvas=canvas), Repeats()).play(order(1, 9, frames=True), sent.append, no_pulse)
     assert [episode.length for episode in answer.episodes] == [4, 12]
     for n, colors in enumerate([[0, 1, 2, 3, 4], [0, 1, 2, 3, 4, 5]]):
         chunks = [rows for rows in sent if rows.episode == n]

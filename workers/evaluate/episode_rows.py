@@ -79,8 +79,8 @@ class RowSender:
 
 
 def as_frame(rendered: Any) -> Array:
-    """A rendered picture [H, W, 3] uint8. Raises `ValueError` for anything else."""
+    """A copy of a rendered picture [H, W, 3] uint8. Raises `ValueError` for anything else."""
     frame = np.asarray(rendered)
     if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
         raise ValueError(f"render: expected an array [H, W, 3] of uint8, got {frame.dtype}{list(frame.shape)}")
-    return np.ascontiguousarray(frame)
+    return frame.copy()  # an environment may draw the next one into the same array
