@@ -96,6 +96,31 @@ def test_an_observation_that_does_not_fit_is_refused_at_every_step(nested: bool,
     assert str(caught.value) == f"lane 0, copy 0, step 3: {expected}"
 
 
+class Halves(Countdown):
+    """Halves its action in place; the reward is the first number of it."""
+
+    def __init__(self) -> None:
+        super().__init__(50)
+        self.action_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+
+    def step(self, action: Any) -> Any:
+        action *= 0.5
+        observation, _, *rest = super().step(action)
+        return observation, float(action[0]), *rest
+
+
+def test_an_environment_may_change_its_action() -> None:
+    stepper = Stepper(step_spec(VectorEnvSettings(Halves, 2, lanes=1)))
+    stepper.execute(Reset(1, 1, 0, 0, (0, 1), (0, 1), np.frombuffer(pack(None), np.uint8)), lambda: None)
+    actions = np.ones((2, 2), np.float32)
+    actions.flags.writeable = False  # as that of a message
+    for t in (2, 3):
+        answer = stepper.execute(Step(1, t, 0, 0, (actions,)), lambda: None)
+        assert isinstance(answer, Stepped)
+        assert answer.reward.tolist() == [0.5, 0.5]
+    stepper.close_all()
+
+
 def test_rewards_are_numbers_or_arrays_of_one_element() -> None:
     assert stepped(partial(Changes, reward=np.array([2.5])), 1)[1].reward.tolist() == [2.5, 2.5]
     with pytest.raises(LaneFailed, match=r"copy 0, step 0: reward: expected a number, got an array of shape \(2,\); wrap"):

@@ -111,8 +111,7 @@ class Stepper:
             return False
         self._executed[number] = order
         try:
-            # A copy of the actions, because an environment may keep its action.
-            infos = pack_infos(self._step(lane, [array.copy() for array in memory.lanes[number].actions], pulse))
+            infos = pack_infos(self._step(lane, memory.lanes[number].actions, pulse))
         except CopyRaised as error:
             self.close([number])
             raise lane_failed(number, error.doing, error) from error
@@ -128,7 +127,8 @@ class Stepper:
 
     def _step(self, lane: SteppedLane, actions: Iterable[Array], pulse: Pulse) -> Infos:
         began = perf_counter()
-        infos = lane.step(list(actions), pulse)
+        # A copy of the actions, because an environment may keep its action, or change it.
+        infos = lane.step([array.copy() for array in actions], pulse)
         self.steps += len(lane.rows.reward)
         self.stages["step"] += perf_counter() - began
         return infos
