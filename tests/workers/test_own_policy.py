@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import gymnasium
 import msgspec
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 from millrace.own_policy import OwnPolicy as Declared
 from protocol.arrays import Array
@@ -16,9 +18,10 @@ from protocol.messages import Evaluate
 from protocol.policy.own_policy import OwnPolicy
 from protocol.rollout import Rollout
 from protocol.specs import RunSpec
-from tests.support.collectors import bits, collect, no_pulse, run_of
+from tests.support.collectors import bits, collect, no_pulse, run_around, run_of
 from tests.support.own_policies import ARRAYS, EXTRAS, Broken, Linear
 from workers.collect.collector import Collector
+from workers.collect.env_copies import LoopedCopies
 from workers.evaluate.evaluator import Evaluator
 
 HERE = "tests.support.own_policies:"
@@ -63,6 +66,40 @@ def test_without_log_probs_there_are_zeros() -> None:
     (rollout,) = collect(Collector(run, loaded(run)), run)
     assert not rollout.log_prob.any()
     assert rollout.extras == ()
+
+
+class Shifts(gymnasium.Env[Any, Any]):
+    """Adds 1 to its action in place."""
+
+    def __init__(self) -> None:
+        self.observation_space, self.action_space = spaces.Box(-1, 1, (2,)), spaces.MultiDiscrete([3, 3])
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        action += 1
+        return np.zeros(2, np.float32), 0.0, False, False, {}
+
+
+class Ones:
+    """Always takes the same action."""
+
+    def load(self, arrays: dict[str, Array]) -> None:
+        """Keep nothing."""
+
+    def act(self, obs: Array, state: Array, rng: np.random.Generator) -> Any:
+        return np.ones((len(obs), 2), np.int64), state, None
+
+
+def test_an_environment_that_changes_its_action_does_not_change_the_rollout() -> None:
+    run = run_around(Shifts(), 5)
+    policy = Declared(Ones, {})
+    run = msgspec.structs.replace(run, policy=policy.spec(run.policy.observation, run.policy.action))
+    collector = Collector(run, OwnPolicy(run.policy, ()), lambda run, lane, pulse: LoopedCopies([Shifts], pulse))
+    (rollout,) = collect(collector, run)
+    assert (rollout.action == 1).all()
 
 
 class Silent(Linear):

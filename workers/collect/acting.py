@@ -147,7 +147,7 @@ class _OwnActions:
             self._action[i, t], state[i] = acted.action, acted.state
             for array, extra in zip(self._written, acted.extras, strict=False):  # the last may be absent: log_prob
                 array[i, t] = extra
-        return np.asarray(self._action[:, t])
+        return np.array(self._action[:, t])  # a copy, because an environment may change its action
 
     def columns(self, i: int) -> ActedRows:
         return ActedRows(self._action[i], self._log_prob[i], tuple(extra[i] for extra in self._extras))
