@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from copy import deepcopy
 from time import perf_counter
 from typing import Any, Literal
 
@@ -118,7 +119,7 @@ class EnvLoop:
                     observation, reward[n], terminated[n], truncated[n], info = step(action)
                     if same_step and (terminated[n] or truncated[n]):
                         resets = True
-                        last = {"final_obs": observation, "final_info": info}
+                        last = {"final_obs": deepcopy(observation), "final_info": info}  # the reset may overwrite it
                         begin(RESETTING)
                         observation, info = self.envs[n].reset()
                         begin(STEPPING)

@@ -17,6 +17,7 @@ from protocol.messages import Call, Reset, Returned, Step, Stepped
 from protocol.wire.plain_values import pack, unpack
 from tests.support.described import step_spec
 from workers.env_errors import LaneFailed
+from workers.env_loop import EnvLoop
 from workers.envs.toy import Countdown
 from workers.step.stepper import Stepper
 
@@ -119,6 +120,27 @@ def test_an_environment_may_change_its_action() -> None:
         assert isinstance(answer, Stepped)
         assert answer.reward.tolist() == [0.5, 0.5]
     stepper.close_all()
+
+
+class Buffered(Countdown):
+    """Returns its observation in the same array again and again."""
+
+    def __init__(self) -> None:
+        super().__init__(2)
+        self._buffer = np.zeros(1, np.float32)
+
+    def _observation(self) -> Any:
+        self._buffer[:] = self._left
+        return self._buffer
+
+
+def test_the_last_observation_of_an_episode_is_not_that_of_the_reset() -> None:
+    loop, observations = EnvLoop([Buffered], lambda: None, "SameStep"), [np.zeros(1)]
+    loop.reset([0], [1], observations, lambda: None)
+    loop.step([0], observations, lambda: None)
+    ((copy, info),) = loop.step([0], observations, lambda: None)
+    assert (copy, info["final_obs"].tolist(), observations[0].tolist()) == (0, [0.0], [2.0])
+    loop.close()
 
 
 def test_rewards_are_numbers_or_arrays_of_one_element() -> None:
