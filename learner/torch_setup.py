@@ -36,3 +36,12 @@ def threads(policy: PolicySpec, max_lag: int, workers: int) -> int:
     cores = usable_cores()
     left = cores - workers if max_lag else cores
     return left if 2 * left > cores else cores
+
+
+def use_all_cores(config: Config) -> bool:
+    """Whether updates use all cores while workers collect; then the workers of this machine should have a lower priority.
+
+    Each operation of an update ends when its slowest thread has ended. If a worker holds the core of one, all wait. Updates
+    with one thread leave the workers a core, and there workers decide the speed: a lower priority would cost it.
+    """
+    return config.max_lag > 0 and 1 < usable_cores() <= (config.torch_threads or 1)

@@ -50,6 +50,10 @@ class Running(Protocol):
         """End it if a call of its environment takes too long."""
         ...
 
+    def lower_priority(self) -> None:
+        """Give it the lowest CPU priority: it uses what other processes leave of the cores. A thread keeps its own."""
+        ...
+
     def stop(self) -> None:
         """Ask it to leave."""
         ...
@@ -105,6 +109,7 @@ class Supervisor:
         """
         self._start, self._clock, self._timeouts = start, clock, timeouts
         self._stopping = False
+        self._low_priority = False
         self._enforce_due_s = 0.0
         self._slots = [_WorkerSlot(name, start(name), clock()) for name in (f"{prefix}{number}" for number in range(count))]
 
@@ -127,6 +132,8 @@ class Supervisor:
                 slot.restart_s = None
                 slot.started_s = now
                 slot.running = self._start(slot.name)
+                if self._low_priority:
+                    slot.running.lower_priority()
         return ended
 
     def _record_end(self, slot: _WorkerSlot, end: Ending, now: float) -> None:
@@ -161,6 +168,13 @@ class Supervisor:
         for slot in self._slots:
             if slot.running is not None:
                 slot.running.stop()
+
+    def lower_priority(self) -> None:
+        """Give all workers the lowest CPU priority, also those that will be started again."""
+        self._low_priority = True
+        for slot in self._slots:
+            if slot.running is not None:
+                slot.running.lower_priority()
 
     def kill(self, name: str) -> bool:
         """End the worker of this name at once; False if no such worker runs here."""

@@ -18,5 +18,7 @@ class ProcessCallbacks:
     """Returns what the workers do whose processes run. A stopped process is left out."""
     count: Callable[[], int] | None = None
     """Returns the number of processes that step the environment. None: one per member."""
+    lower_priority: Callable[[], None] = lambda: None
+    """Gives these processes, and those that replace them, the lowest CPU priority."""
     expected: int = 0
     """Number of processes that the user asked for. 0: any number."""

@@ -58,7 +58,9 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
         supervisor = Supervisor(endpoint.starter(flags), config.workers, timeouts=config.call_timeouts())
         interrupts = Interrupts(config.grace_s)
         stack.callback(lambda: supervisor.stop(interrupts.at_most(STOP_WITHIN_S)))
-        processes = ProcessCallbacks(supervisor.poll, supervisor.activities, expected=config.workers)
+        processes = ProcessCallbacks(
+            supervisor.poll, supervisor.activities, lower_priority=supervisor.lower_priority, expected=config.workers
+        )
         with stopped_on_error(supervisor):
             known = known_environment(config, env, resume, describe_over(endpoint.link, config, processes))
         with interrupts:

@@ -134,3 +134,15 @@ def test_a_run_keeps_the_number_of_threads_that_it_began_with(tmp_path: Path, mo
     again = millrace.train(config=folder / "config.toml", run_dir=str(tmp_path / "again")).path
     assert used == [3, 3, 3]
     assert "torch_threads = 3" in (again / "config.toml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("max_lag", "torch_threads", "cores", "all_of_them"),
+    [(1, 2, 2, True), (1, 4, 2, True), (0, 2, 2, False), (1, 1, 2, False), (1, 2, 4, False), (1, 1, 1, False)],
+)
+def test_updates_use_all_cores_while_workers_collect(
+    max_lag: int, torch_threads: int, cores: int, all_of_them: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch_setup, "usable_cores", lambda: cores)
+    config = resolve("CartPole-v1", max_lag=max_lag, torch_threads=torch_threads)
+    assert torch_setup.use_all_cores(config) is all_of_them

@@ -118,6 +118,17 @@ def test_lag_never_exceeds_its_bound(tmp_path: Path, max_lag: int) -> None:
 
 
 @pytest.mark.parametrize("max_lag", [0, 1])
+def test_workers_have_a_lower_priority_than_updates_that_use_all_cores_meanwhile(
+    tmp_path: Path, max_lag: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("learner.torch_setup.usable_cores", lambda: 2)
+    found: list[int] = []
+    settings = {"max_lag": max_lag, "torch_threads": 2, "steps": 500, "eval_episodes": 1}
+    run(tmp_path, "CartPole-v1", lambda progress: found.extend(each.nice() for each in worker_processes()), **settings)
+    assert set(found) == ({19} if max_lag else {os.nice(0)})
+
+
+@pytest.mark.parametrize("max_lag", [0, 1])
 def test_the_learners_stages_sum_to_its_time(tmp_path: Path, max_lag: int) -> None:
     folder = run(tmp_path, "CartPole-v1", max_lag=max_lag, steps=12_000, **SMALL)
     first, *_, last = read_rows(folder / "metrics.jsonl")

@@ -43,6 +43,9 @@ class FakeRunning:
     def enforce(self, timeouts: CallTimeouts, now: float) -> None:
         self.enforced.append(now)
 
+    def lower_priority(self) -> None:
+        self.requests.append("lower_priority")
+
     def stop(self) -> None:
         self.requests.append("stop")
 
@@ -137,6 +140,14 @@ def test_activities_are_those_of_running_workers() -> None:
     machine = Machine(workers=2)
     machine.die(1)
     assert machine.host.activities() == [WorkerActivity("w0", NONCE, "waiting", 0.0, 0)]
+
+
+def test_a_lower_priority_is_also_that_of_workers_that_are_started_again() -> None:
+    machine = Machine()
+    machine.host.lower_priority()
+    machine.die(1)
+    machine.pause_s()
+    assert [worker.requests for _, worker in machine.started] == [["lower_priority"], ["lower_priority"]]
 
 
 def test_each_end_is_reported_once() -> None:

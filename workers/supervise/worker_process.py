@@ -32,6 +32,7 @@ NONCE_VARIABLE = "MILLRACE_WORKER_NONCE"
 WRITE_STACKS_S = 0.3  # from the signal until the worker is killed
 CLOSE_WITHIN_S = 5.0  # a worker that leaves must have closed its environments and ended within this time
 POLL_S = 0.02
+LOWEST_PRIORITY = 19  # niceness
 SINGLE_THREADED = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 WHILE: dict[Doing, str] = {
     "starting": " while it started",
@@ -125,6 +126,17 @@ class WorkerProcess:
                 self._because, self._kill_at_s = timeouts.reason(page.doing), now + WRITE_STACKS_S
                 if STACK_SIGNAL is not None:
                     self._process.send_signal(STACK_SIGNAL)
+
+    def lower_priority(self) -> None:
+        """Give its main thread, which steps the environments, the lowest CPU priority.
+
+        With Linux's autogroup, niceness counts only within a session, and a worker is a session of its own. So the session
+        gets the niceness, too.
+        """
+        if self.ended() is None:
+            os.setpriority(os.PRIO_PROCESS, self.pid, LOWEST_PRIORITY)
+            with suppress(OSError):  # this system has no autogroup
+                Path(f"/proc/{self.pid}/autogroup").write_text(str(LOWEST_PRIORITY))
 
     def stop(self) -> None:
         """SIGTERM: it finishes the rollout in progress, and leaves."""

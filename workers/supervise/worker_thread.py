@@ -63,6 +63,9 @@ class WorkerThread:
     def enforce(self, timeouts: CallTimeouts, now: float) -> None:
         """Nothing: a thread cannot be ended from outside."""
 
+    def lower_priority(self) -> None:
+        """A thread keeps its priority."""
+
     def stop(self) -> None:
         """Ask it to leave."""
         self._stop_requests += 1
