@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Any, TypeVar, get_args, get_type_hints
 
 import msgspec
 
 from learner.config.algorithm_names import settings_record
-from learner.config.config import Config
+from learner.config.config import TABLES, Config
 from learner.config.hyperparameters import HYPERPARAMETERS, OffPolicyConfig
 from learner.config.rollout_config import RolloutConfig
 from protocol.address import advertised_address, check_address
@@ -45,6 +46,12 @@ def validate(config: Config, where: str = "") -> Config:
     if not config.env:
         raise UsageError(f"{at}which environment? expected one that gymnasium.make takes, as in: millrace train CartPole-v1")
     check_rollout_settings(config, at)
+    for table in TABLES:
+        for name, value in getattr(config, table).items():
+            if isinstance(value, float) and not math.isfinite(value):  # JSON has no such number, and policy.json names it
+                raise UsageError(
+                    f"{at}{table} {name}: expected a finite number, got {value}; leave it out, or take a large one"
+                )
     match config.algorithm:
         case OffPolicyConfig(replay_size=size, rollout_steps=steps) if size < (
             most := (steps + 1) * config.envs // config.lanes

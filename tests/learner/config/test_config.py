@@ -242,3 +242,9 @@ def test_rollouts_that_do_not_travel_are_not_compressed() -> None:
     assert "compress: expected none, got zstd" in refusal(inference="learner", compress="zstd")
     assert "compress: expected one of none, zstd, got 'gzip'" in refusal(compress="gzip")
     assert resolve("CartPole-v1", compress="none").compress == "none"
+
+
+@pytest.mark.parametrize("table", ["env_kwargs", "eval_env_kwargs"])
+def test_arguments_of_the_environment_that_policy_json_cannot_hold_are_refused(table: str) -> None:
+    with pytest.raises(UsageError, match=f"^{table} limit: expected a finite number, got inf"):
+        resolve("CartPole-v1", **{table: {"limit": float("inf")}})
