@@ -123,7 +123,7 @@ def test_workers_have_a_lower_priority_than_updates_that_use_all_cores_meanwhile
 ) -> None:
     monkeypatch.setattr("learner.torch_setup.usable_cores", lambda: 2)
     found: list[int] = []
-    settings = {"max_lag": max_lag, "torch_threads": 2, "steps": 500, "eval_episodes": 1}
+    settings: dict[str, Any] = {"max_lag": max_lag, "torch_threads": 2, "steps": 500, "eval_episodes": 1}
     run(tmp_path, "CartPole-v1", lambda progress: found.extend(each.nice() for each in worker_processes()), **settings)
     assert set(found) == ({19} if max_lag else {os.nice(0)})
 

@@ -246,5 +246,6 @@ def test_rollouts_that_do_not_travel_are_not_compressed() -> None:
 
 @pytest.mark.parametrize("table", ["env_kwargs", "eval_env_kwargs"])
 def test_arguments_of_the_environment_that_policy_json_cannot_hold_are_refused(table: str) -> None:
+    settings: dict[str, Any] = {table: {"limit": float("inf")}}
     with pytest.raises(UsageError, match=f"^{table} limit: expected a finite number, got inf"):
-        resolve("CartPole-v1", **{table: {"limit": float("inf")}})
+        resolve("CartPole-v1", **settings)
