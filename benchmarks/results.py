@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import msgspec
@@ -70,7 +70,7 @@ def _played(path: Path, config: Config, found: Evaluation | None, which: Which) 
 def environment(config: Config) -> str:
     """The environment's id, with the keyword arguments that its preset does not set: `millrace/Atari-v0 game Pong`."""
     preset = resolve(config.env, algo=config.algo)
-    return shlex.join([config.env, *_words("env_kwargs", config.env_kwargs, preset.env_kwargs)[1:]])
+    return shlex.join([config.env, *_added(config.env_kwargs, preset.env_kwargs)])
 
 
 def command(config: Config, leave_out: Sequence[str] = ()) -> str:
@@ -94,12 +94,16 @@ def command(config: Config, leave_out: Sequence[str] = ()) -> str:
 def _words(name: str, value: object, default: object) -> list[str]:
     match value:
         case dict():
-            pairs = [(key, one) for key, one in value.items() if not (isinstance(default, dict) and default.get(key) == one)]
-            return [*flag(name, True), *(str(word) for pair in pairs for word in pair)]
+            return [*flag(name, True), *_added(value, default if isinstance(default, dict) else {})]
         case list() | tuple() if name in REPEATED:
             return [word for one in value for word in flag(name, one)]
         case _:
             return flag(name, value)
+
+
+def _added(table: Mapping[str, object], default: Mapping[str, object]) -> list[str]:
+    """Names and values of the entries of a table that its default does not have."""
+    return [str(word) for key, value in table.items() if default.get(key) != value for word in (key, value)]
 
 
 def main() -> None:

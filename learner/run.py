@@ -185,7 +185,7 @@ class Run:
         from learner.run_recorder import EpisodeSettings, RunRecorder
         from learner.run_spec import run_spec
         from learner.run_state import RunState, restore
-        from learner.torch_setup import threads, torch_device, use_all_cores
+        from learner.torch_setup import threads, torch_device, updates_use_all_cores
 
         config, self.folder = setup.config, setup.folder
         made = Callbacks.of(watch).with_named(config.callback)
@@ -194,7 +194,7 @@ class Run:
             # Another number changes the last bits, so the run keeps it, wherever it is resumed or repeated.
             config = msgspec.structs.replace(config, torch_threads=threads(spec.policy, config.max_lag, processes.expected))
         torch.set_num_threads(config.torch_threads or 1)
-        if use_all_cores(config):
+        if updates_use_all_cores(config):
             processes.lower_priority()
         self.algorithm = algorithm_class(config.algo)(
             config.algorithm, spec.policy, total_steps=config.steps, seed=config.seed, device=torch_device(config)

@@ -38,7 +38,7 @@ def threads(policy: PolicySpec, max_lag: int, workers: int) -> int:
     return left if 2 * left > cores else cores
 
 
-def use_all_cores(config: Config) -> bool:
+def updates_use_all_cores(config: Config) -> bool:
     """Whether updates use all cores while workers collect; then the workers of this machine should have a lower priority.
 
     Each operation of an update ends when its slowest thread has ended. If a worker holds the core of one, all wait. Updates

@@ -25,7 +25,7 @@ from protocol.bounds import MAX_SEEDS
 from protocol.did_you_mean import did_you_mean
 from protocol.env_spec import EnvLike
 from protocol.envs.wrappers import WrapperLike
-from protocol.errors import UsageError
+from protocol.errors import UsageError, check_at_least
 
 NOT_KEYWORDS = ("wrapper",)  # in Python they are `wrappers`
 Watch = Callable[[str], None]
@@ -176,7 +176,7 @@ def play(flags: EvaluateFlags, watch: Watch, given: Given | None = None) -> tupl
         ("copies", flags.copies, 1),
         ("max_steps", flags.max_steps, 1),
     ):
-        _at_least(name, value, least)
+        check_at_least(name, value, least)
     if flags.copies > MAX_SEEDS:
         raise UsageError(f"copies: expected int <= {MAX_SEEDS}, got {flags.copies}")
     if flags.video:
@@ -198,9 +198,9 @@ def play(flags: EvaluateFlags, watch: Watch, given: Given | None = None) -> tupl
 
 def write_dataset(flags: RecordFlags, watch: Watch, given: Given | None = None) -> RecordedDataset:
     """Write a dataset. Raises `UserFacingError`, or `KeyboardInterrupt` if the user stops it; then it leaves no files."""
-    _at_least("steps", flags.steps, 1)
-    _at_least("seed", flags.seed, 0)
-    _at_least("workers", flags.workers, 1)
+    check_at_least("steps", flags.steps, 1)
+    check_at_least("seed", flags.seed, 0)
+    check_at_least("workers", flags.workers, 1)
     saved, workers = _saved(flags, given), PlayingWorkers(flags.workers, flags.transport, flags.bind, flags.inference)
     with policy_player(saved, workers, watch) as player:
         return record_dataset(
@@ -211,8 +211,3 @@ def write_dataset(flags: RecordFlags, watch: Watch, given: Given | None = None) 
 def _saved(flags: EvaluateFlags | RecordFlags, given: Given | None) -> SavedPolicy:
     env, wrappers = given or Given(flags.env or None, flags.wrapper or None)
     return saved_policy(flags.run, "best" if flags.best else "final", env=env, wrappers=wrappers)
-
-
-def _at_least(name: str, value: int, least: int) -> None:
-    if value < least:
-        raise UsageError(f"{name}: expected int >= {least}, got {value}")

@@ -40,7 +40,7 @@ from protocol.arrays import Array, Ints
 from protocol.did_you_mean import did_you_mean
 from protocol.env_spec import EnvLike, EnvSpec, remembered_name
 from protocol.envs.wrappers import WrapperLike, wrapper_name
-from protocol.errors import CheckpointError, UsageError, first_line
+from protocol.errors import CheckpointError, UsageError, check_at_least, first_line
 from protocol.rollout import Batch, stack_rollouts
 from protocol.specs import PolicySpec
 
@@ -281,8 +281,7 @@ class RolloutService:
         if not self._published:
             raise UsageError("rollout service: expected weights to evaluate; call publish first")
         for name, value, least in (("episodes", episodes, 1), ("seed", seed, 0), ("max_steps", max_steps, 1)):
-            if value < least:
-                raise UsageError(f"evaluate: {name}: expected int >= {least}, got {value}")
+            check_at_least(f"evaluate: {name}", value, least)
         plan = EvaluationPlan.of(episodes, seed, EVALUATION_COPIES, max_steps)
         with self._lock, self._interrupts:
             return self._service.evaluate(plan, lambda played: None)

@@ -198,3 +198,9 @@ def unexpected_arguments(words: Sequence[str], *, one_run: bool) -> str:
     if one_run:
         return f"expected one run, got {1 + len(words)}; name one of them"
     return f"unexpected argument {words[0]}"
+
+
+def check_at_least(name: str, value: int, least: int) -> None:
+    """Raise `UsageError` if a value that the user gave is less."""
+    if value < least:
+        raise UsageError(f"{name}: expected int >= {least}, got {value}")

@@ -46,12 +46,7 @@ def validate(config: Config, where: str = "") -> Config:
     if not config.env:
         raise UsageError(f"{at}which environment? expected one that gymnasium.make takes, as in: millrace train CartPole-v1")
     check_rollout_settings(config, at)
-    for table in TABLES:
-        for name, value in getattr(config, table).items():
-            if isinstance(value, float) and not math.isfinite(value):  # JSON has no such number, and policy.json names it
-                raise UsageError(
-                    f"{at}{table} {name}: expected a finite number, got {value}; leave it out, or take a large one"
-                )
+    _check_env_arguments(config, at)
     match config.algorithm:
         case OffPolicyConfig(replay_size=size, rollout_steps=steps) if size < (
             most := (steps + 1) * config.envs // config.lanes
@@ -121,6 +116,15 @@ def check_rollout_settings(config: RolloutConfig, at: str = "") -> None:
         raise UsageError(
             f"{at}advertise {config.advertise}: expected a host name or an IP address, without a port"
         ) from None
+
+
+def _check_env_arguments(config: Config, at: str) -> None:
+    """Raise `UsageError` for a number that policy.json, which names the environment with its arguments, cannot hold."""
+    for table in TABLES:
+        for name, value in getattr(config, table).items():
+            if isinstance(value, float) and not math.isfinite(value):
+                expected = "expected a finite number"
+                raise UsageError(f"{at}{table} {name}: {expected}, got {value}; leave it out, or take a large one")
 
 
 def _check_learner_inference(config: Config, at: str) -> None:

@@ -145,4 +145,4 @@ def test_updates_use_all_cores_while_workers_collect(
 ) -> None:
     monkeypatch.setattr(torch_setup, "usable_cores", lambda: cores)
     config = resolve("CartPole-v1", max_lag=max_lag, torch_threads=torch_threads)
-    assert torch_setup.use_all_cores(config) is all_of_them
+    assert torch_setup.updates_use_all_cores(config) is all_of_them
