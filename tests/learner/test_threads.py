@@ -144,5 +144,13 @@ def test_updates_use_all_cores_while_workers_collect(
     max_lag: int, torch_threads: int, cores: int, all_of_them: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch_setup, "usable_cores", lambda: cores)
-    config = resolve("CartPole-v1", max_lag=max_lag, torch_threads=torch_threads)
+    config = resolve("CartPole-v1", max_lag=max_lag, torch_threads=torch_threads, device="cpu")
     assert torch_setup.updates_use_all_cores(config) is all_of_them
+
+
+def test_updates_on_a_gpu_leave_workers_all_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch_setup, "usable_cores", lambda: 2)
+    monkeypatch.setattr(torch_setup.torch.cuda, "is_available", lambda: True)
+    for device, all_cores in [("cpu", True), ("cuda", False), ("auto", False)]:
+        config = resolve("CartPole-v1", max_lag=1, torch_threads=2, device=device)
+        assert torch_setup.updates_use_all_cores(config) is all_cores
