@@ -2,7 +2,8 @@
 
 Plain is None, bool, int, float, complex, str, bytes, list, tuple, dict, and numpy's scalars and arrays (of these dtypes,
 and of objects that are plain). Anything else raises `TypeError`, or, if the caller asks for it, is sent as its `repr` and
-arrives as a `ReprString`, which cannot be confused with a string.
+arrives as a `ReprString`, which cannot be confused with a string. For such a caller, subclasses of dict are plain, too: they
+arrive as dicts.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ def _to_msgpack(value: Any, where: str, use_repr: bool, depth: int) -> Any:
     if kind is tuple:
         inside = [_to_msgpack(inner, f"{where}[{i}]", use_repr, depth + 1) for i, inner in enumerate(value)]
         return msgpack.ExtType(_TUPLE, _pack(inside))
-    if kind is dict:
+    if kind is dict or (use_repr and isinstance(value, dict)):
         inside = [
             _to_msgpack(inner, f"{where}.{key}" if where else str(key), use_repr, depth + 1) for key, inner in value.items()
         ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict, defaultdict
 from contextlib import suppress
 from typing import Any
 
@@ -63,6 +64,13 @@ def test_what_is_not_plain_is_shown_if_asked_so_and_can_be_found() -> None:
     assert back == {"a": {"b": "<odd>"}, "c": "<odd>"}
     assert type(back["a"]["b"]) is ReprString
     assert repr_paths(back) == ["a.b"]
+
+
+def test_a_subclass_of_dict_arrives_as_a_dict_if_asked_so() -> None:
+    counts = defaultdict(int, {"a": 1})
+    assert bit_equal(unpack(pack([OrderedDict(b=counts)], use_repr=True)), [{"b": {"a": 1}}])
+    with pytest.raises(TypeError, match="got defaultdict"):
+        pack({"level": counts})
 
 
 def test_what_is_too_deep_is_refused() -> None:
