@@ -14,6 +14,7 @@ from time import perf_counter
 from typing import Any, Literal
 
 import gymnasium
+import numpy as np
 
 from protocol.errors import UsageError
 from workers.env_errors import CopyRaised
@@ -119,7 +120,8 @@ class EnvLoop:
                     observation, reward[n], terminated[n], truncated[n], info = step(action)
                     if same_step and (terminated[n] or truncated[n]):
                         resets = True
-                        last = {"final_obs": deepcopy(observation), "final_info": info}  # the reset may overwrite it
+                        # Copies, because the reset may overwrite them.
+                        last = {"final_obs": deepcopy(observation), "final_info": _kept(info)}
                         begin(RESETTING)
                         observation, info = self.envs[n].reset()
                         begin(STEPPING)
@@ -149,3 +151,10 @@ class EnvLoop:
         for env in self.envs:
             with suppress(BaseException), self._activity.during(CLOSING):
                 env.close()
+
+
+def _kept(info: Any) -> Any:
+    """The info with copies of its dicts and arrays, as gymnasium keeps it. Not every other value can be copied."""
+    if isinstance(info, dict):
+        return {key: _kept(value) for key, value in info.items()}
+    return info.copy() if isinstance(info, np.ndarray) else info

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections import defaultdict
 from collections.abc import Callable
 from functools import partial
 from types import ModuleType
@@ -11,10 +12,13 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.vector import SyncVectorEnv
 
+import millrace
 from learner.vector_env.settings import VectorEnvSettings
 from protocol.messages import Call, Reset, Returned, Step, Stepped
 from protocol.wire.plain_values import pack, unpack
+from tests.support.bit_equality import bit_equal
 from tests.support.described import step_spec
 from workers.env_errors import LaneFailed
 from workers.env_loop import EnvLoop
@@ -141,6 +145,37 @@ def test_the_last_observation_of_an_episode_is_not_that_of_the_reset() -> None:
     ((copy, info),) = loop.step([0], observations, lambda: None)
     assert (copy, info["final_obs"].tolist(), observations[0].tolist()) == (0, [0.0], [2.0])
     loop.close()
+
+
+class BufferedInfo(Countdown):
+    """Returns the same info again and again, as a subclass of dict. Its array is always the same one, too."""
+
+    def __init__(self) -> None:
+        super().__init__(2)
+        self._info: dict[str, Any] = defaultdict(lambda: np.zeros(1))
+
+    def _observation(self) -> Any:
+        self._info["left"][:] = self._left
+        self._info["deep"] = {"left": self._left}
+        return super()._observation()
+
+    def reset(self, **keywords: Any) -> Any:
+        return super().reset(**keywords)[0], self._info
+
+    def step(self, action: Any) -> Any:
+        return *super().step(action)[:4], self._info
+
+
+def test_the_last_info_of_an_episode_is_not_that_of_the_reset() -> None:
+    zeros = np.zeros(1, np.int64)
+    theirs = SyncVectorEnv([BufferedInfo], autoreset_mode="SameStep")
+    with millrace.make_vec(BufferedInfo, 1, transport="inproc", autoreset_mode="SameStep", timeout=20) as ours:
+        assert bit_equal(ours.reset(seed=1), theirs.reset(seed=1))
+        for _ in range(4):
+            infos, wanted = ours.step(zeros)[4], theirs.step(zeros)[4]
+            assert bit_equal(infos, wanted)
+    assert infos["final_info"]["left"].tolist() == [[0.0]]
+    assert infos["left"].tolist() == [[2.0]]
 
 
 def test_rewards_are_numbers_or_arrays_of_one_element() -> None:
