@@ -72,6 +72,7 @@ class Sb3VecEnv(VecEnv):
     """The SB3 interface of a vector environment whose autoreset mode is `SameStep`."""
 
     def __init__(self, env: ZmqVectorEnv) -> None:
+        env.merge_infos = False  # merged infos have one dtype and shape for all copies
         self.env = env
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
@@ -81,8 +82,8 @@ class Sb3VecEnv(VecEnv):
         options = self._options[0] or None
         if any(options_of_copy != self._options[0] for options_of_copy in self._options):
             raise ValueError("set_options: expected the same options for every copy, got different ones")
-        observation, infos = self.env.reset(seed=seeds, options=options)
-        self.reset_infos = self._info_list(infos)
+        observation, _ = self.env.reset(seed=seeds, options=options)
+        self.reset_infos = self._info_list()
         self._reset_seeds()
         self._reset_options()
         return observation
@@ -93,11 +94,11 @@ class Sb3VecEnv(VecEnv):
 
     def step_wait(self) -> Any:
         """Observations, rewards (float32), dones and a list with one info for each env copy."""
-        observation, reward, terminated, truncated, infos = self.env.step_wait()
+        observation, reward, terminated, truncated, _ = self.env.step_wait()
         done = terminated | truncated
-        if not infos and not done.any():
+        if not self.env.infos_by_copy and not done.any():
             return observation, reward.astype(np.float32), done, [{"TimeLimit.truncated": False} for _ in done]
-        info_list = self._info_list(infos)
+        info_list = self._info_list()
         for n, info in enumerate(info_list):
             if done[n]:
                 final_info, reset_info = info.pop("final_info", {}), dict(info)
@@ -140,21 +141,9 @@ class Sb3VecEnv(VecEnv):
         results = dict(zip(ascending, self.env.call_some(ascending, name, *args, **kwargs), strict=True))
         return [results[n] for n in copies]
 
-    def _info_list(self, infos: dict[str, Any]) -> list[dict[str, Any]]:
-        """Gymnasium's dict of arrays as a list of dicts, one for each env copy."""
-        return [_info_of_copy(infos, n) for n in range(self.num_envs)]
-
-
-def _info_of_copy(infos: dict[str, Any], n: int) -> dict[str, Any]:
-    """The info of env copy `n`: it has the keys whose mask is true for this copy."""
-    info = {}
-    for key, values in infos.items():
-        if key.startswith("_") and key[1:] in infos:
-            continue
-        mask = infos.get(f"_{key}")
-        if mask is None or mask[n]:
-            info[key] = _info_of_copy(values, n) if isinstance(values, dict) else values[n]
-    return info
+    def _info_list(self) -> list[dict[str, Any]]:
+        """The newest infos: a dict for each env copy, as its environment returned it."""
+        return [self.env.infos_by_copy.get(n, {}) for n in range(self.num_envs)]
 
 
 class _Wrapping:

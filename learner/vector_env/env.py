@@ -71,6 +71,10 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self.observation_space = batch_space(self.single_observation_space, N)
         self.action_space = batch_space(self.single_action_space, N)
         self.timeout_s, self.on_worker_loss, self.copy = timeout_s, on_worker_loss, copy
+        self.merge_infos = True
+        """whether infos are returned, merged as gymnasium does it; otherwise only `infos_by_copy` has them"""
+        self.infos_by_copy: dict[int, Infos] = {}
+        """the newest infos that are not empty, as each copy returned them"""
         self._described = {
             "spec": self.spec,
             "observation_space": self.single_observation_space,
@@ -470,11 +474,13 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
                     by_copy[n] = by_copy.get(n, {}) | info
             except BadMessage as error:
                 self._hub.refuse_owner(lane, f"lane {lane}: infos cannot be read: {error}")
+        self.infos_by_copy = by_copy
         infos: Infos = {}
         merged: VectorEnv[Any, Any, Array] = self if copies is None else OfSomeCopies(len(copies))
         row_of = range(self.num_envs) if copies is None else {n: row for row, n in enumerate(copies)}
         for n in sorted(by_copy):
-            infos = merged._add_info(infos, by_copy[n], row_of[n])
+            if self.merge_infos:
+                infos = merged._add_info(infos, by_copy[n], row_of[n])
             for key in repr_paths(by_copy[n]):
                 if key not in self._warned_infos:
                     self._warned_infos.add(key)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -40,6 +41,34 @@ def test_it_is_the_dummy_vec_env_to_the_bit(env: str) -> None:
             for info, other in zip(infos, their_infos, strict=True):
                 assert info.keys() == other.keys()
                 assert all(np.array_equal(info[key], other[key]) for key in info)
+    finally:
+        ours.close(), theirs.close()
+
+
+class DifferentInfos(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """The info of each step has an array that is longer than the last one, and a number of its own type."""
+
+    def __init__(self, number: float) -> None:
+        super().__init__(gymnasium.make("CartPole-v1", max_episode_steps=5 if type(number) is int else 4))
+        self._number, self._length = number, 1
+
+    def step(self, action: Any) -> Any:
+        self._length += 1
+        return *super().step(action)[:4], {"number": self._number, "array": np.zeros(self._length), "deep": {"none": None}}
+
+
+def test_infos_are_those_of_each_copy() -> None:
+    makes = [partial(DifferentInfos, 1), partial(DifferentInfos, 0.5)]
+    ours, theirs = make_vec_env(makes, monitor=False, transport="inproc"), DummyVecEnv(makes)
+    try:
+        ours.seed(1), theirs.seed(1)
+        assert bit_equal(ours.reset(), theirs.reset())
+        for t in range(20):
+            (*mine, infos), (*wanted, their_infos) = ours.step(np.full(2, t % 2)), theirs.step(np.full(2, t % 2))
+            assert bit_equal(mine, wanted)
+            assert bit_equal(
+                [dict(sorted(info.items())) for info in infos], [dict(sorted(info.items())) for info in their_infos]
+            )
     finally:
         ours.close(), theirs.close()
 
