@@ -117,9 +117,13 @@ class Sb3VecEnv(VecEnv):
         """An attribute of each env copy."""
         return self._call_each(indices, attr_name)
 
+    def has_attr(self, attr_name: str) -> bool:
+        """Whether every env copy has this attribute. A method is not called."""
+        return all(self._call_each(None, "has_wrapper_attr", attr_name))
+
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
         """Set an attribute of each env copy to the same value."""
-        copies = sorted(self._get_indices(indices))
+        copies = sorted(set(self._copies(indices)))
         self.env.assign_some(copies, attr_name, [value] * len(copies))
 
     def env_method(self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any) -> list[Any]:
@@ -136,10 +140,14 @@ class Sb3VecEnv(VecEnv):
 
     def _call_each(self, indices: Indices, name: str, *args: Any, **kwargs: Any) -> list[Any]:
         """The result of each env copy, in the order of `indices`."""
-        copies = list(self._get_indices(indices))
+        copies = self._copies(indices)
         ascending = sorted(set(copies))
         results = dict(zip(ascending, self.env.call_some(ascending, name, *args, **kwargs), strict=True))
         return [results[n] for n in copies]
+
+    def _copies(self, indices: Indices) -> list[int]:
+        """The numbers of these env copies, as plain integers. As in a list, -1 is the last one."""
+        return [range(self.num_envs)[n] for n in self._get_indices(indices)]
 
     def _info_list(self) -> list[dict[str, Any]]:
         """The newest infos: a dict for each env copy, as its environment returned it."""

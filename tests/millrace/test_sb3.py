@@ -80,7 +80,13 @@ def test_attributes_and_methods_by_index() -> None:
     assert env.get_attr("level") == [7, 1, 7]
     assert env.get_attr("level", indices=[1, 0]) == [1, 7]
     assert env.env_method("shout", "a", indices=1) == ["A"]
+    assert env.env_method("shout", "a", indices=np.array([0, 2])) == ["A", "A"]
+    env.set_attr("level", 9, indices=np.array([-1, 2]))
+    assert env.get_attr("level") == [7, 1, 9]
+    with pytest.raises(IndexError):
+        env.get_attr("level", indices=3)
     assert env.has_attr("level")
+    assert env.has_attr("shout")  # which needs an argument
     assert not env.has_attr("no_such_thing")
     assert env.env_is_wrapped(gymnasium.Wrapper) == [False] * 3
     env.close()
