@@ -13,16 +13,26 @@ import numpy as np
 from protocol.arrays import Array, Bools
 from protocol.specs import Leaf
 
+SEEDS = range(-(2**63), 2**64)
+"""Seeds that a message can carry. The environment refuses others that it cannot use."""
+
 
 def seed_list(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int | None]:
-    """The seed of each env copy. A single seed s gives s, s + 1, …. Raises `ValueError` for a wrong number of seeds."""
+    """The seed of each env copy. A single seed s gives s, s + 1, ….
+
+    Raises `ValueError` for a wrong number of seeds, and for a seed that no message can carry.
+    """
+    seeds: list[int | None]
     if seed is None:
         return [None] * num_envs
     if isinstance(seed, int | np.integer):
-        return [int(seed) + n for n in range(num_envs)]
-    seeds = [None if one is None else int(one) for one in seed]
+        seeds = [int(seed) + n for n in range(num_envs)]
+    else:
+        seeds = [None if one is None else int(one) for one in seed]
     if len(seeds) != num_envs:
         raise ValueError(f"seed: expected one for each of {num_envs} copies, got {len(seeds)}")
+    if wrong := [one for one in seeds if one is not None and one not in SEEDS]:
+        raise ValueError(f"seed: expected whole numbers of at most 64 bits, got {wrong[0]}")
     return seeds
 
 
@@ -56,8 +66,10 @@ def action_arrays(
             raise (ValueError if array.ndim else TypeError)(
                 f"actions: expected one for each of {num_envs} copies, got shape {list(array.shape)}"
             )
-        if array.dtype.kind not in "biuf":
-            raise TypeError(f"actions: expected numbers, got {array.dtype}")
+        if array.dtype.kind not in "biuf" or array.dtype.itemsize > 8:
+            raise TypeError(f"actions: expected numbers of at most 64 bits, got {array.dtype}")
+        if not array.dtype.isnative:
+            array = array.astype(array.dtype.newbyteorder("="))
         fit = fit and array.shape[1:] == leaf.shape and (array.dtype == leaf.dtype or np.can_cast(array.dtype, leaf.dtype))
         arrays.append(array)
     return arrays, fit

@@ -293,10 +293,9 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         """
         self._check_no_step("async_reset")
         copies = numbered(env_ids, self.num_envs)
-        seeds = seed_list(seed, len(copies))
         if isinstance(seed, int | np.integer):
-            seeds = [int(seed) + n for n in copies]
-        self._send_recv.reset(copies, seeds, options)
+            seed = [int(seed) + n for n in copies]
+        self._send_recv.reset(copies, seed_list(seed, len(copies)), options)
 
     def send(self, actions: Any, env_ids: Sequence[int] | Array | None = None) -> None:
         """Step these copies, by default all, with one action each, in the order of `env_ids`; `recv` returns the results.

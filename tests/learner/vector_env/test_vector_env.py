@@ -279,6 +279,20 @@ def test_calls_in_the_wrong_order_raise_the_errors_of_gymnasium() -> None:
         env.reset()
 
 
+def test_arguments_that_no_message_can_carry_are_refused_before_anything_is_sent() -> None:
+    zeros = np.zeros(2, np.int64)
+    with millrace.make_vec("CartPole-v1", 2, transport="inproc", timeout=20) as env:
+        wanted = env.reset(seed=1)
+        for seed in 2**64 - 1, [1, 2**64]:
+            with pytest.raises(ValueError, match="seed: expected whole numbers of at most 64 bits, got 184467440737095516"):
+                env.reset(seed=seed)
+        with pytest.raises(TypeError, match="actions: expected numbers of at most 64 bits, got float128"):
+            env.step(zeros.astype(np.longdouble))
+        result = env.step(zeros.astype(">i8"))
+        assert bit_equal(env.reset(seed=1), wanted)
+        assert bit_equal(env.step(zeros), result)
+
+
 seeds = st.none() | st.integers(0, 9) | st.lists(st.none() | st.integers(0, 9), min_size=3, max_size=3)
 options = st.none() | st.dictionaries(st.sampled_from(["why", "how"]), st.text(max_size=3) | st.integers(-3, 3), max_size=2)
 masks = st.lists(st.booleans(), min_size=3, max_size=3).filter(any)
