@@ -171,7 +171,12 @@ class StepHub:
         self._send_waiting_orders()
 
     def uses_shared_memory(self, lane: int) -> bool:
-        """Whether a step of this lane may go through shared memory: its worker was handed the memory."""
+        """Whether a step of this lane may go through shared memory: its worker was handed it, and has no other order.
+
+        It has one if the wait for the answer was interrupted. The worker might execute it after the step.
+        """
+        if any(order.lane == lane for order in self._coordinator.orders.values()):
+            return False
         if lane not in self._wake_pipes:
             member = self._coordinator.owner(lane)
             if member is None or not self._coordinator.lanes[lane].started or self._shared is None:

@@ -542,6 +542,28 @@ def test_what_a_watch_raises_ends_the_wait_and_loses_nothing() -> None:
         assert sorted(received(env, 3)) == [0, 1, 2]
 
 
+@BOTH_WAYS
+def test_a_step_after_an_interrupted_reset_has_its_own_results(shared: bool) -> None:
+    with made(copies=1, lanes=1, workers=1, shared=shared) as (env, link):
+        env.reset(seed=1)
+        assert env.step([0])[0].tolist() == [[pytest.approx(0.8)]]
+        link.frozen = {"w0"}
+        calls = iter([None, InterruptedError("stop")])  # the second time, the order was sent
+
+        def stop() -> None:
+            if (error := next(calls)) is not None:
+                raise error
+
+        env.watch(stop)
+        with pytest.raises(InterruptedError):
+            env.reset()
+        env.watch(lambda: None)
+        link.frozen = set()
+        for left in 0.8, 0.6:
+            observation, reward, *_ = env.step([0])
+            assert (observation.tolist(), reward.tolist()) == ([[pytest.approx(left)]], [1.0])
+
+
 # ---------------------------------------------------------------- the pure parts
 
 
