@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol, get_args
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from protocol.policy.layout import Field, acting_size, buffer_layout, named_view
 from protocol.specs import ActionSpec, ExtraArray, Leaf, PolicySpec
 
 Activation = Literal["tanh", "relu"]
+Core = Literal["lstm", "gru"]
 
 
 class PolicyChoice(Protocol):
@@ -76,6 +77,8 @@ class MLP:
         """The policy for these spaces."""
         if not all(type(width) is int and width > 0 for width in self.net):
             raise UsageError(f"policy: expected widths of hidden layers, as in MLP(64, 64), got {self.net}")
+        if self.activation not in get_args(Activation):
+            raise UsageError(f"policy: activation: expected {' or '.join(get_args(Activation))}, got {self.activation!r}")
         return PolicySpec(
             observation,
             action,
@@ -120,14 +123,14 @@ class Recurrent(MLP):
     (2, 16)
     """
 
-    core: Literal["lstm", "gru"]
+    core: Core
     core_size: int
     """number of units of the core"""
 
     def __init__(
         self,
         *net: int,
-        core: Literal["lstm", "gru"] = "lstm",
+        core: Core = "lstm",
         core_size: int = 64,
         activation: Activation = "tanh",
         normalize_observations: bool = False,
@@ -140,6 +143,10 @@ class Recurrent(MLP):
         """The policy for these spaces."""
         from msgspec.structs import replace
 
+        if self.core not in get_args(Core):
+            raise UsageError(f"policy: core: expected {' or '.join(get_args(Core))}, got {self.core!r}")
+        if not (type(self.core_size) is int and self.core_size > 0):
+            raise UsageError(f"policy: core_size: expected a whole number above 0, got {self.core_size!r}")
         return replace(super().spec(observation, action), core=self.core, core_size=self.core_size)
 
 

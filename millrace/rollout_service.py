@@ -133,6 +133,9 @@ class RolloutService:
         """
         listens = bool(settings.get("bind"))
         config = _config(env, wrappers, settings)
+        policy = MLP() if policy is None else policy
+        if isinstance(policy, type) or not hasattr(policy, "spec"):
+            raise UsageError(f"policy: expected MLP, CNN, Recurrent or OwnPolicy, as in MLP(64, 64), got {policy!r}")
         if not (type(rollout_steps) is int and rollout_steps > 0):
             raise UsageError(f"rollout_steps: expected a whole number above 0, got {rollout_steps!r}")
         self.restored: dict[str, Array] = {}
@@ -161,7 +164,7 @@ class RolloutService:
                 started = start(
                     config,
                     spec,
-                    policy or MLP(),
+                    policy,
                     rollout_steps,
                     self._check_interrupt,
                     self._resources,
