@@ -147,7 +147,7 @@ class RolloutService:
             state, self.restored = read(Path(restore))
             state.ledger.end_outstanding()
             past = state.ledger, state.incarnations
-            self._version, self.env_steps = state.version - 1, state.env_steps
+            self._version, self.env_steps = max(state.version - 1, -1), state.env_steps
         self.config = config
         """All settings of collecting rollouts."""
         self._interrupts = Interrupts()

@@ -198,6 +198,15 @@ def test_a_saved_service_goes_on(tmp_path: Path) -> None:
         assert not np.array_equal(batch.obs[0], batches(1)[0].obs[0])  # lanes are started anew, with other seeds
 
 
+def test_a_service_that_was_saved_before_it_published_goes_on(tmp_path: Path) -> None:
+    with service() as made:
+        made.save(tmp_path / "state.npz")
+    with service(restore=tmp_path / "state.npz") as made:
+        assert made.version == -1
+        assert made.publish(made.policy.initial()) == 0
+        assert made.gather().version.tolist() == [0] * 4
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [({"policy": millrace.MLP(32)}, "expected the policy"), ({"env": "Acrobot-v1"}, "expected environment CartPole-v1")],
