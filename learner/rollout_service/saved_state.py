@@ -18,6 +18,7 @@ from protocol.errors import CheckpointError, UsageError
 from protocol.specs import PolicySpec
 
 OURS = "millrace"  # name of our entry, JSON as bytes; the user's arrays have other names
+OF_NUMPY = ("file", "allow_pickle")  # arguments of numpy.savez, which an array cannot have as its name
 FORMAT = 1
 
 
@@ -51,8 +52,9 @@ def write(path: Path, state: ServiceState, arrays: Mapping[str, Any]) -> None:
     kept = {}
     for name, value in arrays.items():
         array = np.asarray(value)
-        if name == OURS or array.dtype.hasobject:
-            raise UsageError(f"save: {name}: expected an array of numbers under another name than {OURS}, got {array.dtype}")
+        if name == OURS or name in OF_NUMPY or array.dtype.hasobject:
+            taken = ", ".join((OURS, *OF_NUMPY))
+            raise UsageError(f"save: {name}: expected an array of numbers, not called {taken}; got {array.dtype}")
         kept[name] = array
     ours = np.frombuffer(msgspec.json.encode(state), np.uint8)
     write_atomically(path, lambda file: np.savez(file, **{OURS: ours}, **kept))  # type: ignore[arg-type]
