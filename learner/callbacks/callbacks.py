@@ -35,7 +35,7 @@ class Callbacks:
         """Why a callback ended the run, or None."""
         self._callbacks = [_checked(callback) for callback in callbacks]
         self._watch = watch
-        self._started = False
+        self._started: list[object] = []  # those whose `on_start` was called, also if it raised
 
     @staticmethod
     def of(watch: Watch) -> Callbacks:
@@ -53,8 +53,9 @@ class Callbacks:
 
     def on_start(self, progress: Progress) -> None:
         """The run begins, or goes on."""
-        self._started = True
-        self._call("on_start", progress)
+        for callback in self._callbacks:
+            self._started.append(callback)
+            self._call_one(callback, "on_start", progress)
 
     def on_rollouts(self, progress: Progress) -> None:
         """Rollouts have come."""
@@ -83,8 +84,7 @@ class Callbacks:
         """The run has ended. Raises what the first callback raised; what others raise is logged."""
         raised: BaseException | None = None
         calls = [self._show]
-        if self._started:
-            calls += [lambda progress, each=each: _call(each, "on_end", progress) for each in self._callbacks]  # type: ignore[misc]
+        calls += [lambda progress, each=each: _call(each, "on_end", progress) for each in self._started]  # type: ignore[misc]
         for call in calls:
             try:
                 call(progress)
@@ -102,8 +102,11 @@ class Callbacks:
 
     def _call(self, moment: str, progress: Progress) -> None:
         for callback in self._callbacks:
-            if _ends_the_run(_call(callback, moment, progress)):
-                self._stop(f"{_name(callback)}.{moment}")
+            self._call_one(callback, moment, progress)
+
+    def _call_one(self, callback: object, moment: str, progress: Progress) -> None:
+        if _ends_the_run(_call(callback, moment, progress)):
+            self._stop(f"{_name(callback)}.{moment}")
 
     def _stop(self, who: str) -> None:
         if self.stop_reason is None:

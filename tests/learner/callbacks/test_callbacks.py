@@ -127,6 +127,20 @@ def test_one_that_was_not_started_hears_of_no_end() -> None:
     assert one.told == []
 
 
+def test_after_an_on_start_that_raises_those_behind_it_hear_of_no_end() -> None:
+    class Broken(Told):
+        def on_start(self, progress: Progress) -> object:
+            super().on_start(progress)
+            raise ValueError("no")
+
+    before, broken, behind = Told(), Broken(), Told()
+    callbacks = Callbacks([before, broken, behind])
+    with pytest.raises(ValueError, match="no"):
+        callbacks.on_start(NOW)
+    callbacks.on_end(NOW)
+    assert (before.told, broken.told, behind.told) == (["on_start", "on_end"], ["on_start", "on_end"], [])
+
+
 @pytest.mark.parametrize(
     ("callback", "line"),
     [
