@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from protocol.env_spec import PickledCallable, Scalar
+from protocol.env_spec import PickledCallable, Scalar, check_scalars
 from protocol.errors import UsageError
 from protocol.policy.own_policy import LOG_PROB
 from protocol.specs import ActionSpec, ExtraArray, Leaf, NamedShape, OwnPolicySpec, PolicySpec
@@ -83,6 +83,7 @@ class OwnPolicy:
             raise UsageError(f"policy {self.factory}: expected module:factory, as in my_package.policies:make_policy")
         if not (type(self.state_size) is int and self.state_size >= 0):
             raise UsageError(f"policy {self.name}: state_size: expected a whole number from 0, got {self.state_size!r}")
+        check_scalars(f"policy {self.name}", self.kwargs)
         own = OwnPolicySpec(
             self.name,
             tuple(NamedShape(name, self._shape(name, shape)) for name, shape in self.arrays.items()),

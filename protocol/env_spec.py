@@ -13,10 +13,10 @@ import dataclasses
 import importlib
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from importlib.util import find_spec
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import gymnasium
 import msgspec
@@ -96,6 +96,16 @@ class PickledCallable:
         return f"PickledCallable({len(self.data)} bytes)"
 
 
+def check_scalars(what: str, kwargs: Mapping[str, object]) -> None:
+    """Raise `UsageError` unless all these keyword arguments are scalars. `what` they are of, it says."""
+    for name, value in kwargs.items():
+        if type(value) not in get_args(Scalar):
+            raise UsageError(
+                f"{what}: argument {name}: expected a number, text, True or False, got {type(value).__name__}; to give it "
+                "something else, pass a function without arguments that makes it"
+            )
+
+
 class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The environment: a gymnasium id, the name of a function that returns one, or a factory that the learner pickled."""
 
@@ -124,12 +134,14 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Make a spec from what a user gives: an id or a name, gymnasium's `EnvSpec`, or a callable that takes `kwargs`.
 
         `wrappers`: each takes an environment and returns one, or is the name of such a callable. `eval_kwargs`: as the
-        field. Raises `UsageError` for what cannot be found, and for a callable that is too large to send.
+        field. Raises `UsageError` for what cannot be found, for a callable that is too large to send, and for other
+        arguments than scalars.
         """
         if isinstance(env, EnvSpec):
             return env
         name, factory = _given(env)
         name = env if isinstance(env, str) else name
+        check_scalars(f"environment {name}", {**(kwargs or {}), **(eval_kwargs or {})})
         names = tuple(map(wrapper_name, wrappers))
         own = [not_named(wrapper) for wrapper in wrappers]
         if any(wrapper is not None for wrapper in own):

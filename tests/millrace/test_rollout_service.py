@@ -264,6 +264,7 @@ def test_calls_from_another_thread_and_after_the_end_are_refused() -> None:
         ({"policy": millrace.MLP(8, activation="gelu")}, "policy: activation: expected tanh or relu, got 'gelu'"),  # type: ignore[arg-type]
         ({"policy": millrace.Recurrent(8, core="rnn")}, "policy: core: expected lstm or gru, got 'rnn'"),  # type: ignore[arg-type]
         ({"policy": millrace.Recurrent(8, core_size=0)}, "policy: core_size: expected a whole number above 0, got 0"),
+        ({"policy": millrace.OwnPolicy(dict, {"w": (2,)}, kwargs={"a": [1]})}, "policy dict: argument a: expected a number"),  # type: ignore[dict-item]
         ({"policy": millrace.MLP}, "policy: expected MLP, CNN, Recurrent or OwnPolicy, as in MLP(64, 64), got <class"),
     ],
 )
