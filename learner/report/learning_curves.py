@@ -80,7 +80,7 @@ def curves(runs: Sequence[Path]) -> PngFigure:
 
     from learner.report.figure import PngFigure
 
-    found = [read_run(run, "plot") for run in runs]
+    found = [read_run(run, "plot") for run in dict.fromkeys(runs)]
     read = [run for run in found if run.curve is not None]
     empty = [nothing_to_plot(run.path) for run in found if run.curve is None]
     if not read:

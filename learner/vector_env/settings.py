@@ -59,7 +59,7 @@ class VectorEnvSettings:
     @property
     def lane_count(self) -> int:
         """Number of lanes: by default one for each local worker."""
-        return self.lanes or max(self.local_workers, 1)
+        return max(self.local_workers, 1) if self.lanes is None else self.lanes
 
     @property
     def lane_sizes(self) -> tuple[int, ...]:

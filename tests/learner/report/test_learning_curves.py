@@ -68,6 +68,12 @@ def test_the_picture_shows_curves(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["curves.png"]
 
 
+def test_a_run_that_is_given_twice_is_drawn_once(tmp_path: Path) -> None:
+    run = a_run(tmp_path)
+    (panel,) = curves([run, run]).axes
+    assert panel.get_legend_handles_labels()[1] == ["PPO, seed 1"]
+
+
 def test_each_environment_has_a_panel_of_its_own(tmp_path: Path) -> None:
     runs = [a_run(tmp_path, env) for env in ("CartPole-v1", "Pendulum-v1", "Acrobot-v1", "MountainCar-v0")]
     image = pixels(plot(runs, tmp_path / "curves.png"))

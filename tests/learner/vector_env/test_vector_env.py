@@ -234,6 +234,7 @@ def test_a_status_request_is_answered_while_it_steps() -> None:
     [
         ({"num_envs": 0}, "num_envs: expected at least 1"),
         ({"lanes": 9}, "lanes: expected 1 to num_envs"),
+        ({"lanes": 0}, "lanes: expected 1 to num_envs"),
         ({"transport": "pigeon"}, "transport: expected"),
         ({"bind": "tcp://127.0.0.1:*"}, "workers: expected 0, got "),
         ({"workers": None, "bind": "tcp://127.0.0.1:*", "env": lambda: None}, "factory"),
