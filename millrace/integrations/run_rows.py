@@ -1,6 +1,7 @@
 """What the integrations send of a run: its settings, flat, and its numbers, at most one row in `every_s` seconds.
 
-Rule: a row with an evaluation and the last row are always sent. Numbers that are missing are left out.
+Rule: a row with an evaluation and the last row are always sent, with what callbacks before this one logged for them. Numbers
+that are missing are left out.
 """
 
 from __future__ import annotations
@@ -23,9 +24,12 @@ class RowFilter:
         self._every_s, self._clock = every_s, clock
         self._sent_s: float | None = None
         self._sent_update = -1
+        self._logged_update = -1
+        self._logged: dict[str, float | None] = {}  # for the row of this update
 
     def due(self, progress: Progress) -> dict[str, float] | None:
         """The row of the last update, if it is to be sent now."""
+        self._remember_logged(progress)
         now = self._clock()
         if self._sent_s is not None and now - self._sent_s < self._every_s:
             return None
@@ -34,11 +38,17 @@ class RowFilter:
 
     def last(self, progress: Progress) -> dict[str, float] | None:
         """The row of the last update, unless it was sent."""
+        self._remember_logged(progress)
         if progress.updates == self._sent_update or not progress.metrics:
             return None
         self._sent_update = progress.updates
-        logged = {} if progress.requests is None else progress.requests.logged()
-        return numbers(progress.row({**progress.metrics, **logged}))
+        return numbers(progress.row({**progress.metrics, **self._logged}))
+
+    def _remember_logged(self, progress: Progress) -> None:
+        """The run forgets these numbers when it has written the row; here it may not have been sent."""
+        if progress.updates != self._logged_update:
+            self._logged_update, self._logged = progress.updates, {}
+        self._logged |= logged(progress)
 
 
 class RowCallback(Callback):
@@ -54,9 +64,10 @@ class RowCallback(Callback):
 
     def on_evaluation(self, progress: Progress) -> None:
         """Log the evaluation."""
-        self._log(self._rows.last(progress), progress)
+        row = self._rows.last(progress) or {}
         if progress.evaluation is not None:
-            self._log(numbers(progress.evaluation.metrics()), progress)
+            row |= numbers({**progress.evaluation.metrics(), **logged(progress)})
+        self._log(row, progress)
 
     def _log(self, row: dict[str, float] | None, progress: Progress) -> None:
         if row:
@@ -64,6 +75,11 @@ class RowCallback(Callback):
 
     def _send(self, row: dict[str, float], progress: Progress) -> None:
         raise NotImplementedError
+
+
+def logged(progress: Progress) -> dict[str, float | None]:
+    """What callbacks have logged at this moment of the run."""
+    return {} if progress.requests is None else progress.requests.logged()
 
 
 def numbers(row: dict[str, float | None]) -> dict[str, float]:

@@ -99,6 +99,27 @@ def test_a_run_that_is_cut_short_is_marked(tmp_path: Path, wandb_runs: list[Fake
     assert [row["time/iterations"] for row in told.rows] == [1]
 
 
+@pytest.mark.parametrize("every_s", [0.0, 1e9])
+def test_numbers_of_callbacks_are_sent_with_a_row(tmp_path: Path, wandb_runs: list[FakeWandbRun], every_s: float) -> None:
+    class Logs(millrace.Callback):
+        def on_update(self, progress: Progress) -> None:
+            progress.log("update", progress.updates)
+
+        def on_evaluation(self, progress: Progress) -> None:
+            progress.log("evaluated", progress.updates)
+
+    callbacks = [Logs(), WandbCallback(every_s=every_s)]
+    summary = millrace.train(ENV, run_dir=str(tmp_path), callbacks=callbacks, **SMALL).summary
+    (told,) = wandb_runs
+    rows = [row for row in told.rows if "time/iterations" in row]
+    assert all(row["custom/update"] == row["time/iterations"] for row in rows)
+    assert summary is not None
+    assert rows[-1]["time/iterations"] == summary.updates
+    evaluations = [row for row in told.rows if "eval/mean_reward" in row]
+    assert len(evaluations) > 1
+    assert all("custom/evaluated" in row for row in evaluations)
+
+
 class FakeMlflow:
     """As much of MLflow as the callback uses."""
 
