@@ -14,12 +14,14 @@ from typing import Any
 import gymnasium
 import msgspec
 import numpy as np
+from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 import millrace
 from learner.vector_env.env import ZmqVectorEnv
 from protocol.arrays import Array
 from protocol.env_spec import EnvLike, EnvSpec, Scalar
+from protocol.errors import UsageError
 
 Indices = int | Iterable[int] | None
 
@@ -72,6 +74,9 @@ class Sb3VecEnv(VecEnv):
     """The SB3 interface of a vector environment whose autoreset mode is `SameStep`."""
 
     def __init__(self, env: ZmqVectorEnv) -> None:
+        """Raises `UsageError` for another autoreset mode."""
+        if env.autoreset_mode is not AutoresetMode.SAME_STEP:
+            raise UsageError(f"Sb3VecEnv: expected autoreset_mode SameStep, got {env.autoreset_mode.value}")
         env.merge_infos = False  # merged infos have one dtype and shape for all copies
         self.env = env
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)

@@ -10,6 +10,8 @@ import gymnasium
 import numpy as np
 import pytest
 
+import millrace
+from protocol.errors import UsageError
 from tests.support.bit_equality import bit_equal
 
 sb3 = pytest.importorskip("stable_baselines3")
@@ -157,6 +159,14 @@ def test_a_list_of_environments_and_callables_are_wrapped() -> None:
     assert ends[0][1].tolist() == [10.0, 10.0]
     assert ends[6][2].tolist() == [False, True]
     env.close()
+
+
+def test_another_autoreset_mode_is_refused() -> None:
+    with (
+        millrace.make_vec("CartPole-v1", 2, transport="inproc") as env,
+        pytest.raises(UsageError, match="expected autoreset_mode SameStep, got NextStep"),
+    ):
+        Sb3VecEnv(env)
 
 
 def test_the_spec_and_the_spaces_are_those_that_a_worker_described() -> None:
