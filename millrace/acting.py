@@ -123,7 +123,10 @@ class LoadedPolicy:
         if self._state.shape[1] != n:
             raise UsageError(f"{self!r}: expected {self._state.shape[1]} observations, as in start, got {n}")
         if first is not None:
-            self._state[0, np.broadcast_to(np.asarray(first, bool), n)] = 0
+            begins = np.asarray(first, bool)
+            if begins.shape not in ((), (n,)):
+                raise UsageError(f"first: expected a bool, or [{n}] of them, got shape {list(begins.shape)}")
+            self._state[0, np.broadcast_to(begins, n)] = 0
         return self._state
 
     def _checked_mask(self, mask: npt.ArrayLike, n: int) -> Bools:

@@ -151,6 +151,8 @@ def test_first_begins_an_episode_in_these_copies_only(tmp_path: Path) -> None:
     policy, obs = millrace.load(folder_of(run, tmp_path)), np.array([[0.5, -0.5, 2.0], [1.0, 0.0, -1.0]], np.float32)
     policy.start(2)
     begun, later = policy(obs), policy(obs)
+    with pytest.raises(millrace.UsageError, match=r"first: expected a bool, or \[2\] of them, got shape \[3\]"):
+        policy(obs, first=[True] * 3)
     third = policy(obs, first=[True, False])
     assert third[0] == begun[0]
     assert third[1] != begun[1]
