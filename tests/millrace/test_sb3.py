@@ -60,8 +60,9 @@ class DifferentInfos(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 def test_infos_are_those_of_each_copy() -> None:
-    makes = [partial(DifferentInfos, 1), partial(DifferentInfos, 0.5)]
-    ours, theirs = make_vec_env(makes, monitor=False, transport="inproc"), DummyVecEnv(makes)
+    makes: list[Any] = [partial(DifferentInfos, 1), partial(DifferentInfos, 0.5)]
+    theirs: Any = DummyVecEnv(makes)
+    ours = make_vec_env(makes, monitor=False, transport="inproc")
     try:
         ours.seed(1), theirs.seed(1)
         assert bit_equal(ours.reset(), theirs.reset())
