@@ -42,7 +42,7 @@ def updates_use_all_cores(config: Config) -> bool:
     """Whether updates use all cores while workers collect; then the workers of this machine should have a lower priority.
 
     Each operation of an update ends when its slowest thread has ended. If a worker holds the core of one, all wait. Updates
-    with one thread leave the workers a core, and there workers decide the speed: a lower priority would cost it. Updates on a
-    GPU leave them all cores.
+    with one thread leave the workers a core, and there workers decide the speed: a lower priority would cost it. Updates on
+    a GPU leave them all cores.
     """
     return config.max_lag > 0 and 1 < usable_cores() <= (config.torch_threads or 1) and torch_device(config) == "cpu"
