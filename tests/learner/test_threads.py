@@ -150,7 +150,7 @@ def test_updates_use_all_cores_while_workers_collect(
 
 def test_updates_on_a_gpu_leave_workers_all_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch_setup, "usable_cores", lambda: 2)
-    monkeypatch.setattr(torch_setup.torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
     for device, all_cores in [("cpu", True), ("cuda", False), ("auto", False)]:
         config = resolve("CartPole-v1", max_lag=1, torch_threads=2, device=device)
         assert torch_setup.updates_use_all_cores(config) is all_cores
