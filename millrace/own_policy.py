@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from protocol.env_spec import PickledCallable, Scalar, check_scalars
+from protocol.env_spec import PickledCallable, Scalar, check_arguments
 from protocol.errors import UsageError
 from protocol.policy.own_policy import LOG_PROB
 from protocol.specs import ActionSpec, ExtraArray, Leaf, NamedShape, OwnPolicySpec, PolicySpec
@@ -83,7 +83,10 @@ class OwnPolicy:
             raise UsageError(f"policy {self.factory}: expected module:factory, as in my_package.policies:make_policy")
         if not (type(self.state_size) is int and self.state_size >= 0):
             raise UsageError(f"policy {self.name}: state_size: expected a whole number from 0, got {self.state_size!r}")
-        check_scalars(f"policy {self.name}", self.kwargs)
+        check_arguments(self.kwargs, f"policy {self.name}")
+        for name in (*self.arrays, *self.extras):
+            if not isinstance(name, str):
+                raise UsageError(f"policy {self.name}: expected text as the name of an array, got {name!r}")
         own = OwnPolicySpec(
             self.name,
             tuple(NamedShape(name, self._shape(name, shape)) for name, shape in self.arrays.items()),

@@ -16,7 +16,7 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from importlib.util import find_spec
-from typing import Any, TypeVar, get_args
+from typing import Any, TypeVar
 
 import gymnasium
 import msgspec
@@ -24,6 +24,7 @@ from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
 from gymnasium.envs.registration import VectorizeMode
 from gymnasium.vector import VectorEnv
 
+from protocol.bounds import one_line
 from protocol.envs.found_names import MAIN, attribute, found_by_others, in_main, last_part, name_of
 from protocol.envs.unknown_ids import is_registered, load_plugins, most_similar, plugin_modules, registers, what_to_write
 from protocol.envs.wrappers import WrapperLike, not_named, wrap, wrapper_name
@@ -96,14 +97,16 @@ class PickledCallable:
         return f"PickledCallable({len(self.data)} bytes)"
 
 
-def check_scalars(what: str, kwargs: Mapping[str, object]) -> None:
-    """Raise `UsageError` unless all these keyword arguments are scalars. `what` they are of, it says."""
-    for name, value in kwargs.items():
-        if type(value) not in get_args(Scalar):
+def check_arguments(arguments: Mapping[str, Any], of: str) -> None:
+    """Raise `UsageError` for a keyword argument that no message can carry. `of`: what takes it, for the error."""
+    for name, value in arguments.items():
+        try:
+            msgspec.msgpack.decode(msgspec.msgpack.encode({name: value}), type=dict[str, Scalar])
+        except (TypeError, ValueError, OverflowError) as error:  # msgspec.ValidationError is a ValueError
             raise UsageError(
-                f"{what}: argument {name}: expected a number, text, True or False, got {type(value).__name__}; to give it "
-                "something else, pass a function without arguments that makes it"
-            )
+                f"{of}: argument {name}: expected a number of at most 64 bits, text, True or False, got "
+                f"{one_line(repr(value))}; to give it something else, pass a function without arguments that makes it"
+            ) from error
 
 
 class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -134,14 +137,14 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Make a spec from what a user gives: an id or a name, gymnasium's `EnvSpec`, or a callable that takes `kwargs`.
 
         `wrappers`: each takes an environment and returns one, or is the name of such a callable. `eval_kwargs`: as the
-        field. Raises `UsageError` for what cannot be found, for a callable that is too large to send, and for other
-        arguments than scalars.
+        field. Raises `UsageError` for what cannot be found, a callable that is too large to send, and arguments that no
+        message can carry.
         """
         if isinstance(env, EnvSpec):
             return env
         name, factory = _given(env)
         name = env if isinstance(env, str) else name
-        check_scalars(f"environment {name}", {**(kwargs or {}), **(eval_kwargs or {})})
+        check_arguments({**(kwargs or {}), **(eval_kwargs or {})}, f"environment {name}")
         names = tuple(map(wrapper_name, wrappers))
         own = [not_named(wrapper) for wrapper in wrappers]
         if any(wrapper is not None for wrapper in own):

@@ -327,3 +327,13 @@ def test_only_a_worker_that_knows_its_learner_calls_what_it_names() -> None:
     assert [bool(by_id.rejection_reason(code)) for code in codes] == [True, False, False]
     assert by_id.called_code == ""
     assert cloudpickle.loads(pickled.factory.data if pickled.factory else b"").__class__.__module__ == "protocol.env_spec"
+
+
+@pytest.mark.parametrize("value", [[1], None, 10**30, np.float32(1)])
+def test_an_argument_that_no_message_can_carry_is_refused(value: Any) -> None:
+    """A worker could not read the message, and the learner waited for a worker."""
+    expected = "environment CartPole-v1: argument k: expected a number of at most 64 bits, text, True or False, got "
+    with pytest.raises(UsageError, match=expected):
+        EnvSpec.of("CartPole-v1", {"k": value})
+    with pytest.raises(UsageError, match=expected):
+        EnvSpec.of("CartPole-v1", eval_kwargs={"k": value})
