@@ -190,7 +190,7 @@ class EvaluationTickets:
         come = self._rows.setdefault(index, {}).setdefault(rows.episode, [])
         if rows.first_step != _end(come):
             return ""
-        if why := reason_to_reject(rows, come[:1], self._policy, self._plan.most_steps, self._plan.send_frames):
+        if why := reason_to_reject(rows, come, self._policy, self._plan.most_steps, self._plan.send_frames):
             return f"rows of ticket {rows.ticket}: {why}"
         come.append(rows)
         return ""

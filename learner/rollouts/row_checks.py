@@ -14,9 +14,11 @@ from protocol.specs import PolicySpec
 
 
 def reason_to_reject(
-    rows: EpisodeRows, first: Sequence[EpisodeRows], policy: PolicySpec, most_steps: int, with_frames: bool
+    rows: EpisodeRows, before: Sequence[EpisodeRows], policy: PolicySpec, most_steps: int, with_frames: bool
 ) -> str:
-    """What is wrong with these rows; empty if they can be used. `first`: the first rows of their episode, if any came."""
+    """What is wrong with these rows; empty if they can be used. `before`: the earlier rows of their episode."""
+    if before and (before[-1].terminated[-1] or before[-1].truncated[-1]):
+        return "expected none after the end of their episode"
     L = len(rows.reward) if rows.reward.ndim == 1 else 0
     if not 1 <= L <= most_steps - rows.first_step:
         return f"expected 1 to {most_steps - rows.first_step} rows, got reward {list(rows.reward.shape)}"
@@ -34,7 +36,7 @@ def reason_to_reject(
     for name, array, shape, dtype in expected:
         if array.shape != shape or array.dtype != np.dtype(dtype):
             return f"{name}: expected {dtype}{list(shape)}, got {array.dtype}{list(array.shape)}"
-        if array.dtype.kind == "b" and array.view(np.uint8).max() > 1:
+        if array.dtype.kind == "b" and array.size and array.view(np.uint8).max() > 1:
             return f"{name}: expected bytes 0 and 1, got {array.view(np.uint8).max()}"
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             return f"{name}: expected finite values"
@@ -45,7 +47,7 @@ def reason_to_reject(
         return f"action: {why}"
     if not np.isfinite(rows.reward).all() or (rows.terminated | rows.truncated)[:-1].any():
         return "expected finite rewards, and an end only in the last row"
-    return _wrong_frames(rows.frames, rows.first_step + L + 1, L, [one.frames for one in first], with_frames)
+    return _wrong_frames(rows.frames, rows.first_step + L + 1, L, [one.frames for one in before[:1]], with_frames)
 
 
 def _wrong_frames(frames: Array | None, end: int, L: int, first: Sequence[Array | None], wanted: bool) -> str:

@@ -11,10 +11,12 @@ import pytest
 
 from learner.members.membership import Outgoing
 from learner.rollouts.evaluation_tickets import EvaluationPlan
+from learner.rollouts.row_checks import reason_to_reject
 from protocol.arrays import Array
 from protocol.bounds import MOST_FRAMES
 from protocol.messages import EpisodeRows, Evaluate, Evaluated, Goodbye
 from protocol.rollout import Episode
+from protocol.specs import ActionSpec, Leaf, PolicySpec
 from tests.learner.rollouts.test_ticket_coordinator import Learner, of
 from tests.support.fake_ends import fake_rows
 
@@ -143,3 +145,19 @@ def test_rows_hold_only_values_that_a_dataset_may_hold(changes: dict[str, object
     played = Played()
     played.learner.says(A, played.rows(0, **changes))
     assert played.strikes() == 1
+
+
+@pytest.mark.parametrize("flag", ["terminated", "truncated"])
+def test_no_row_follows_the_end_of_an_episode(flag: str) -> None:
+    played = Played()
+    played.learner.says(A, played.rows(0, **{flag: np.ones(1, bool)}))
+    played.learner.says(A, played.rows(0))  # a copy of a message that has come is ignored
+    assert played.strikes() == 0
+    played.learner.says(A, played.rows(1))
+    assert played.strikes() == 1
+
+
+def test_rows_may_have_a_part_without_elements() -> None:
+    row, empty = Played().rows(0), np.zeros((2, 0), bool)
+    policy = PolicySpec((Leaf("", "box", (0,), "bool"),), ActionSpec("discrete", (), "int64", (2,), (0,)))
+    assert reason_to_reject(msgspec.structs.replace(row, obs=(empty,)), [], policy, MOST_STEPS, with_frames=False) == ""
