@@ -94,6 +94,15 @@ def own_address(bound: str) -> str:
     return f"tcp://{'[::1]' if host == '[::]' else '127.0.0.1'}:{bound.rpartition(':')[2]}"
 
 
+def check_worker_name(name: str) -> None:
+    """Raise `UsageError` if no worker can have this name."""
+    size = len(name.encode(errors="replace"))
+    if not 1 <= size <= MAX_NAME or one_line(name, MAX_NAME) != name:
+        raise UsageError(
+            f"worker name {name[:40]!r}: expected 1 to {MAX_NAME} bytes without control characters, got {size} bytes"
+        )
+
+
 def worker_name(peer: bytes) -> bytes:
     """The worker's name: its routing id up to the first zero byte. With keys, a zero byte and more follow the name."""
     return peer.partition(b"\0")[0]

@@ -18,8 +18,10 @@ import signal
 import socket
 import sys
 
+from protocol.address import check_worker_name
 from protocol.alive import CallTimeouts
-from protocol.errors import UsageError, UserFacingError
+from protocol.bounds import MAX_NAME, one_line
+from protocol.errors import UsageError, UserFacingError, check_at_least
 from protocol.keys.key_folder import TOKEN_VARIABLE, read_token
 from protocol.keys.keys import Token
 from workers.connection_rules import REJOIN_TIMEOUT_S, checked_token
@@ -33,10 +35,14 @@ log = logging.getLogger("millrace.worker")
 def main(argv: list[str] | None = None, prog: str = "python -m workers") -> int:
     """Run workers, one or with --processes many. Returns the exit code. `prog`: name in the usage text."""
     flags = _parser(prog).parse_args(argv)
-    logging.basicConfig(level=logging.INFO, format=f"%(asctime)s worker {flags.name}: %(message)s", stream=sys.stderr)
+    shown = one_line(flags.name, MAX_NAME)
+    logging.basicConfig(
+        level=logging.INFO, format=f"%(asctime)s worker {shown.replace('%', '%%')}: %(message)s", stream=sys.stderr
+    )
     timeouts = CallTimeouts(flags.construct_timeout_s, flags.reset_timeout_s, flags.step_timeout_s)
     signals = _count_signals()
     try:
+        _check(flags)
         token = checked_token(flags.address, read_token(flags.token), insecure=flags.insecure)
         if flags.parent:
             from workers.program import work
@@ -44,7 +50,7 @@ def main(argv: list[str] | None = None, prog: str = "python -m workers") -> int:
             return work(flags, token, timeouts, signals)
         return _supervise(flags, token, timeouts, signals)
     except UserFacingError as error:
-        sys.stderr.write(f"worker {flags.name}: {error}\n")
+        sys.stderr.write(f"worker {shown}: {error}\n")
         return error.exit_code
 
 
@@ -112,10 +118,19 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     return parser
 
 
+def _check(flags: argparse.Namespace) -> None:
+    """Raise `UsageError` for a flag that no worker can follow."""
+    check_at_least("processes", flags.processes, 1)
+    check_worker_name(flags.name if flags.processes == 1 else f"{flags.name}-w{flags.processes - 1}")
+    for name in ("join_timeout_s", "construct_timeout_s", "reset_timeout_s", "step_timeout_s"):
+        if not getattr(flags, name) >= 0:  # also true for NaN
+            raise UsageError(f"{name}: expected a number of seconds >= 0, got {getattr(flags, name):g}")
+    if flags.core is not None and flags.core not in (allowed := os.sched_getaffinity(0)):
+        raise UsageError(f"core: expected one that this process may use, of {sorted(allowed)}, got {flags.core}")
+
+
 def _supervise(flags: argparse.Namespace, token: Token | None, timeouts: CallTimeouts, signals: list[int]) -> int:
     """Run workers, each in a process of its own, and watch them here. Returns the exit code."""
-    if flags.processes < 1:
-        raise UsageError(f"processes: expected int >= 1, got {flags.processes}")
     cores = sorted(os.sched_getaffinity(0)) if flags.pin else []
     passed = ["--join-timeout-s", str(flags.join_timeout_s), *timeout_flags(timeouts)]
     passed += [flag for flag, is_set in (("--insecure", flags.insecure), ("--no-code", flags.no_code)) if is_set]

@@ -12,13 +12,14 @@ import faulthandler
 import re
 
 FAULTHANDLER_HEADER = "Timeout ("  # first words of its output
+LONGEST_S = 1e9  # faulthandler refuses a longer time, such as infinity
 
 
 class Watchdog:
     """A watchdog timer. One for each process, because faulthandler has only one timer."""
 
     def __init__(self, timeout_s: float) -> None:
-        self._timeout_s = timeout_s
+        self._timeout_s = min(timeout_s, LONGEST_S)
         self._interval_s = min(1.0, timeout_s / 4)
         self._due_s = -self._interval_s
 

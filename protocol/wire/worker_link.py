@@ -12,8 +12,7 @@ from typing import TypeVar
 
 import zmq
 
-from protocol.address import check_address, is_local, resolves
-from protocol.bounds import MAX_NAME, one_line
+from protocol.address import check_address, check_worker_name, is_local, resolves
 from protocol.errors import BadMessage, UsageError
 from protocol.keys.handshake import WORKER_EVENTS, ConnectionProblem, connection_problem
 from protocol.keys.keys import Token
@@ -42,11 +41,7 @@ class WorkerLink:
     ) -> None:
         """With a token (only over tcp) the link connects only to the learner of that token."""
         check_address(address)
-        if not 1 <= len(name.encode()) <= MAX_NAME or one_line(name, MAX_NAME) != name:
-            raise UsageError(
-                f"worker name {name[:40]!r}: expected 1 to {MAX_NAME} bytes without control characters, got "
-                f"{len(name.encode())} bytes"
-            )
+        check_worker_name(name)
         self.address, self.token = address, token
         self.problem: ConnectionProblem | None = None
         """why there is no connection, if known"""

@@ -377,6 +377,23 @@ def test_a_worker_without_a_token_does_not_go_to_another_machine(tmp_path: Path,
     assert "got the token itself" in worker_says(capsys, "tcp://192.0.2.1:5555", "--token", "millrace1.abc")
 
 
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        (["--name", "\udcff"], r"worker name '\udcff': expected 1 to 200 bytes without control characters, got 1 bytes"),
+        (["--name", "x" * 198, "--processes", "2"], "expected 1 to 200 bytes without control characters, got 201 bytes"),
+        (["--core", "-1"], "core: expected one that this process may use, of ["),
+        (["--step-timeout-s", "-5"], "step_timeout_s: expected a number of seconds >= 0, got -5"),
+        (["--join-timeout-s", "nan"], "join_timeout_s: expected a number of seconds >= 0, got nan"),
+        (["--processes", "0"], "processes: expected int >= 1, got 0"),
+    ],
+)
+def test_a_flag_that_no_worker_can_follow_is_refused_before_one_starts(
+    flags: list[str], expected: str, capsys: Captured
+) -> None:
+    assert expected in worker_says(capsys, "ipc:///nobody/listens/here", *flags)
+
+
 # ------------------------------------------------------------------------------------------------- evaluate, plot, help
 
 

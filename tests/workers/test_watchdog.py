@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from workers.watchdog import where_it_hung
+from workers.watchdog import Watchdog, where_it_hung
 
 PROGRAM = """
 import re, sys, threading, time
@@ -54,3 +55,9 @@ def test_a_process_that_feeds_or_stops_the_watchdog_is_not_ended(tmp_path: Path)
 def test_output_without_a_hang_has_no_line() -> None:
     assert where_it_hung("Traceback …\nValueError: no") is None
     assert where_it_hung("said before\nTimeout (0:02:00)!\n") == "an unknown place"
+
+
+def test_a_time_that_is_longer_than_any_timer_is_no_error() -> None:
+    watchdog = Watchdog(math.inf)
+    watchdog.feed(0.0)
+    watchdog.stop()
