@@ -71,6 +71,7 @@ class WorkerProcess:
         self._because = ""  # why the supervisor ends it
         self._kill_at_s = float("inf")
         self._end: Ending | None = None
+        self._was_reaped = False  # by the system: then its exit code is not known
         command = [sys.executable, "-P", "-m", "workers", start.address, "--name", start.name]
         command += ["--parent", str(os.getpid()), "--activity", str(self._page.fd), *start.flags]
         if start.shared_memory is not None:
@@ -161,9 +162,13 @@ class WorkerProcess:
 
     def _has_ended(self) -> bool:
         """Whether it has ended. It is not reaped, where the system can tell without."""
-        if hasattr(os, "waitid"):
+        if not hasattr(os, "waitid"):
+            return self._process.poll() is not None
+        try:
             return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
-        return self._process.poll() is not None
+        except ChildProcessError:  # it was reaped already, because this program ignores SIGCHLD
+            self._was_reaped = True
+            return True
 
     def _kill_group(self) -> None:
         with suppress(ProcessLookupError, PermissionError):
@@ -187,9 +192,11 @@ class WorkerProcess:
         # In `close`, an environment has done its work: that its process ends there does not count against the run.
         failed = page.doing != "closing" and (page.env_calls > 0 or page.doing not in NO_ENVIRONMENT_CODE)
         if code < 0:
-            return Ending(code, f"was killed by {signal.Signals(-code).name}{WHILE[page.doing]}", failed=failed)
+            return Ending(code, f"was killed by {_signal_name(-code)}{WHILE[page.doing]}", failed=failed)
         if (hung := where_it_hung(output)) is not None:
             return Ending(code, one_line(f"was ended: it made no progress, at {hung}"), failed=failed)
+        if self._was_reaped:
+            return Ending(code, f"ended{WHILE[page.doing]}; its exit code is not known", failed=failed)
         last = output.strip().splitlines()[-1:] if code else []
         line = f"ended with exit code {code}{WHILE[page.doing]}{f' ({last[0]})' if last else ''}"
         return Ending(code, one_line(line), failed=failed)
@@ -203,6 +210,11 @@ class WorkerProcess:
             else:
                 with self._log.open("a") as log:
                     log.write(text)
+
+
+def _signal_name(number: int) -> str:
+    """The name of a signal. Most real-time signals have none."""
+    return signal.Signals(number).name if number in set(signal.Signals) else f"signal {number}"
 
 
 def _opened(log: Path | None) -> BinaryIO:

@@ -1,0 +1,55 @@
+"""How a supervisor sees the end of a worker's process."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from workers.supervise import worker_process
+from workers.supervise.ending import Ending
+from workers.supervise.worker_process import WorkerCommand, WorkerProcess
+
+WITHIN_S = 60.0
+
+
+def ending_of(script: str, monkeypatch: pytest.MonkeyPatch) -> Ending | None:
+    """How a worker ends in whose place a shell runs this script."""
+
+    def popen(command: list[str], **how: Any) -> subprocess.Popen[bytes]:
+        return subprocess.Popen(["sh", "-c", script], **how)
+
+    monkeypatch.setattr(worker_process, "popen", popen)
+    worker = WorkerProcess(WorkerCommand("ipc:///nobody/listens/here", "w0"))
+    worker.wait(WITHIN_S)
+    return worker.ended()
+
+
+@contextmanager
+def children_reaped_by_the_system() -> Iterator[None]:
+    """As in a program that ignores SIGCHLD, or was started by one."""
+    before = signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGCHLD, before)
+
+
+def test_the_signal_that_ended_a_process_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    ending = ending_of("kill -9 $$", monkeypatch)
+    assert ending == Ending(-9, "was killed by SIGKILL while it started")
+
+
+def test_a_signal_without_a_name_is_numbered(monkeypatch: pytest.MonkeyPatch) -> None:
+    ending = ending_of(f"kill -{signal.SIGRTMIN + 1} $$", monkeypatch)
+    assert ending == Ending(-signal.SIGRTMIN - 1, f"was killed by signal {signal.SIGRTMIN + 1} while it started")
+
+
+def test_a_process_that_was_reaped_already_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    with children_reaped_by_the_system():
+        ending = ending_of("exit 3", monkeypatch)
+    assert ending == Ending(0, "ended while it started; its exit code is not known")
