@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,12 @@ import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv
 
+from protocol.arrays import Array
 from protocol.errors import UsageError
 from protocol.specs import RunSpec
 from tests.support.collectors import (
     TOY,
+    bits,
     collect,
     loop_over,
     random_collector,
@@ -280,6 +283,19 @@ def test_a_vector_environment_whose_rewards_are_not_one_for_each_copy_is_named()
         LaneFailed, match=r"lane 0, step 0: reward: expected one for each of 2 copies, got an array of shape"
     ):
         collect(random_collector(run, lambda r, lane, pulse: VectorCopies(One([Countdown] * 2))), run)
+
+
+@pytest.mark.parametrize("kind", [list, lambda flags: flags.astype(np.float32)], ids=["lists", "numbers"])
+def test_the_flags_of_a_vector_environment_need_not_be_bool_arrays(kind: Callable[[Array], Any]) -> None:
+    class Converted(SyncVectorEnv):
+        def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+            observation, reward, terminated, truncated, info = super().step(actions)
+            return observation, reward, kind(terminated), kind(truncated), info
+
+    run = run_of(f"{TOY}Countdown-v0")
+    (converted,) = collect(random_collector(run, lambda run, lane, pulse: VectorCopies(Converted([Countdown] * 2))), run)
+    (expected,) = collect(random_collector(run, sync_vector_env_over([Countdown] * 2)), run)
+    assert bits(converted) == bits(expected)
 
 
 def test_a_nan_is_named_even_if_the_environment_then_chokes_on_it() -> None:

@@ -236,7 +236,8 @@ class VectorCopies:
             leaves: Leaves = self._read(observation)
             if self._masks is not None:
                 leaves = [*leaves, self._masks.read_all(observation, infos, terminated, truncated)]
-            return StepResult(leaves, reward, terminated, truncated, facts=self._of_ended(infos, terminated | truncated))
+            ended = np.logical_or(terminated, truncated)  # they may be lists, or numbers
+            return StepResult(leaves, reward, terminated, truncated, facts=self._of_ended(infos, ended))
         except (LookupError, TypeError) as error:
             raise missing_leaf(None, observation, error) from error
 
