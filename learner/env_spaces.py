@@ -32,7 +32,15 @@ class EnvSpaces(NamedTuple):
         masked = action_masks == "info" or (action_masks == "auto" and has_mask(observation, env.action_space))
         if masked:
             observation = without_mask(observation, env.action_space)
-        return EnvSpaces(observation_leaves(observation), action, env.max_episode_steps, masked)
+        leaves = observation_leaves(observation)
+        paths = [leaf.path for leaf in leaves]
+        if not leaves:
+            raise UsageError(
+                f"observation space {env.observation_space}: expected at least one array for the policy, got none"
+            )
+        if twice := sorted({path for path in paths if paths.count(path) > 1}):
+            raise UsageError(f"observation space: expected a name for each array, got two that are called {twice[0]}")
+        return EnvSpaces(leaves, action, env.max_episode_steps, masked)
 
     @staticmethod
     def of_policy(policy: PolicySpec) -> EnvSpaces:

@@ -11,7 +11,7 @@ from learner.run_spec import run_spec
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import read_description
 from protocol.errors import UsageError
-from protocol.space_spec import BoxSpace, DiscreteSpace, EnvDescription, MultiDiscreteSpace, SpaceSpec, check_size
+from protocol.space_spec import BoxSpace, DictSpace, DiscreteSpace, EnvDescription, MultiDiscreteSpace, SpaceSpec, check_size
 from protocol.wire.plain_values import pack
 
 SMALL = DiscreteSpace(2, 0, "int64")
@@ -31,3 +31,19 @@ def test_spaces_that_would_make_a_policy_too_large_are_refused_in_one_line(space
     env = EnvSpaces.of_description(read_description(description))
     with pytest.raises(UsageError, match=r"^environment Any-v0: expected a policy whose weights take at most [\d,]+ bytes"):
         run_spec(Config(env="Any-v0"), EnvSpec("Any-v0"), env)
+
+
+BOX = BoxSpace((1,), "float32", np.array(0, np.float32), np.array(1, np.float32))
+
+
+@pytest.mark.parametrize(
+    ("observation", "expected"),
+    [
+        (DictSpace((), ()), r"^observation space Dict\(\): expected at least one array for the policy, got none$"),
+        (DictSpace(("a/b", "a"), (BOX, DictSpace(("b",), (BOX,)))), "expected a name for each array, .* are called a/b$"),
+    ],
+)
+def test_observations_whose_arrays_cannot_be_named_are_refused(observation: SpaceSpec, expected: str) -> None:
+    description = EnvDescription(observation, SMALL, np.frombuffer(pack({}), np.uint8), "", 0, "")
+    with pytest.raises(UsageError, match=expected):
+        EnvSpaces.of_description(read_description(description))
