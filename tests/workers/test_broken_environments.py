@@ -239,6 +239,29 @@ def test_a_float_may_lose_precision() -> None:
     assert (rollout.obs[0] == np.float32(0.1)).all()
 
 
+class Far(Countdown):
+    """Its observations are finite, and too large for float32."""
+
+    def __init__(self, action_space: gymnasium.Space[Any]) -> None:
+        super().__init__()
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)  # type: ignore[arg-type]
+        self.action_space = action_space
+
+    def _observation(self) -> Any:
+        return np.array([1e39, -1e39])
+
+
+@pytest.mark.parametrize(
+    ("action_space", "name"), [(gymnasium.spaces.Discrete(2), "log_prob"), (gymnasium.spaces.Box(-1, 1, (1,)), "action")]
+)
+def test_an_observation_from_which_no_policy_can_act_is_named(action_space: gymnasium.Space[Any], name: str) -> None:
+    run = run_around(Far(action_space), T=4)
+    with pytest.raises(LaneFailed) as caught:
+        collect(random_collector(run, loop_over([lambda: Far(action_space)])), run)
+    said = f"lane 0, {name} of the policy: expected finite values, got nan at step 0, copy 0, from observations up to 1e+39"
+    assert str(caught.value) == f"{said}; wrap the environment so that they are smaller"
+
+
 @pytest.mark.parametrize("observation", [3, -1])
 def test_a_discrete_observation_outside_its_space_is_named(observation: int) -> None:
     said = answer(3, observation, space=gymnasium.spaces.Discrete(3))

@@ -107,6 +107,14 @@ class CollectedLane:
         if not np.isfinite(reward).all():
             raise LaneFailed(self.number, f"reward: {describe_first_non_finite(reward)}")
 
+    def check_acted(self, action: Array, log_prob: Array, obs: Sequence[Array]) -> None:
+        """Raise if the policy computed no finite numbers from finite observations: some are too large for float32."""
+        for name, array in (("action", action), ("log_prob", log_prob)):
+            if array.dtype.kind == "f" and not np.isfinite(array).all():
+                largest = max((float(np.abs(leaf).max(initial=0)) for leaf in obs if leaf.dtype.kind == "f"), default=0)
+                line = f"{name} of the policy: {describe_first_non_finite(array)}, from observations up to {largest:g}"
+                raise LaneFailed(self.number, f"{line}; wrap the environment so that they are smaller")
+
     def finish(self, reward: Array, done: Bools, step_end_s: Sequence[float]) -> tuple[Bools, tuple[Episode, ...]]:
         """After T steps: which rows are valid [T, N], and the episodes that ended, oldest first.
 

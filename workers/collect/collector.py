@@ -227,6 +227,7 @@ class Collector:
             reward = rows.reward[i].astype(np.float32)
         lane.check_values(obs, reward)
         acted = actions.columns(i)
+        lane.check_acted(acted.action, acted.log_prob, obs)
         lane.obs = tuple(array[-1].copy() for array in obs)
         before, lane.state = lane.state, rows.state[i].copy()
         self.steps += int(np.count_nonzero(valid))
