@@ -172,11 +172,21 @@ def wrong_facts(episode: Episode, count: int) -> str:
 
 def outside_of_space(array: Array, leaf: Leaf) -> str:
     """What is wrong with values [..., *leaf] of an observation; empty if its space has them, as far as it counts them."""
-    if leaf.sizes:
-        counts = array - np.reshape(leaf.start, leaf.shape)
-        if (counts < 0).any() or (counts >= np.reshape(leaf.sizes, leaf.shape)).any():
-            return f"expected values of its space, got {array.min()} to {array.max()}"
+    if not_of_space(array, leaf).any():
+        return f"expected values of its space, got {array.min()} to {array.max()}"
     return ""
+
+
+def not_of_space(array: Array, leaf: Leaf) -> Bools:
+    """Where values [..., *leaf] of an observation are not those of its space; nowhere if that is a Box."""
+    match leaf.kind:
+        case "box":
+            return np.zeros((), bool)
+        case "multibinary":
+            return np.asarray(array != array.astype(bool))
+        case "discrete" | "multidiscrete":
+            counts = array - np.reshape(leaf.start, leaf.shape)
+            return np.asarray((counts < 0) | (counts >= np.reshape(leaf.sizes, leaf.shape)))
 
 
 def outside_of_choices(array: Array, action: ActionSpec) -> str:

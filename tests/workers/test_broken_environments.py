@@ -268,6 +268,12 @@ def test_a_discrete_observation_outside_its_space_is_named(observation: int) -> 
     assert said == f"lane 0, observation: expected a value of its space, got {observation} at step 3, copy 0"
 
 
+@pytest.mark.parametrize("observation", [[0, 2], [-1, 1]])
+def test_a_multi_binary_observation_that_is_neither_0_nor_1_is_named(observation: list[int]) -> None:
+    said = answer(3, np.array(observation), space=gymnasium.spaces.MultiBinary(2))
+    assert said == f"lane 0, observation: expected a value of its space, got {np.array(observation)} at step 3, copy 0"
+
+
 @pytest.mark.parametrize(
     ("reward", "said"),
     [

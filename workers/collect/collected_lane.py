@@ -17,7 +17,7 @@ from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import UsageError
 from protocol.policy.masks import stored_leaves
 from protocol.policy.recurrent import zero_state
-from protocol.rollout import Episode, describe_first_non_finite
+from protocol.rollout import Episode, describe_first_non_finite, not_of_space
 from protocol.specs import Leaf, RunSpec
 from protocol.wire.plain_values import pack, unpack
 from workers.collect.env_copies import EnvCopies, Leaves, copy_seeds
@@ -97,13 +97,10 @@ class CollectedLane:
         for leaf, array in zip(self._stored, obs, strict=True):
             if array.dtype.kind == "f" and not np.isfinite(array).all():
                 raise LaneFailed(self.number, f"{_name(leaf)}: {describe_first_non_finite(array)}")
-            if leaf.sizes:
-                start, size = (np.reshape(values, leaf.shape) for values in (leaf.start, leaf.sizes))
-                wrong = (array < start) | (array >= start + size)
-                if wrong.any():
-                    t, n = np.argwhere(wrong)[0][:2]
-                    line = f"{_name(leaf)}: expected a value of its space, got {array[t, n]} at step {t}, copy {n}"
-                    raise LaneFailed(self.number, line)
+            if (wrong := not_of_space(array, leaf)).any():
+                t, n = np.argwhere(wrong)[0][:2]
+                line = f"{_name(leaf)}: expected a value of its space, got {array[t, n]} at step {t}, copy {n}"
+                raise LaneFailed(self.number, line)
         if not np.isfinite(reward).all():
             raise LaneFailed(self.number, f"reward: {describe_first_non_finite(reward)}")
 

@@ -177,7 +177,7 @@ class Evaluator:
                 n = next(n for n in range(array.shape[1]) if not np.isfinite(array[0, n]).all())
                 where = f"copy {n}, {_moment(when)}: observation {leaf.path}".strip()
                 raise EvaluationFailed(f"{where}: expected finite numbers, got {array[0, n].tolist()}"[:500])
-            if leaf.sizes and outside_of_space(array, leaf):
+            if leaf.kind != "box" and outside_of_space(array, leaf):
                 n, why = next((n, why) for n in range(array.shape[1]) if (why := outside_of_space(array[0, n], leaf)))
                 where = f"copy {n}, {_moment(when)}: observation {leaf.path}".strip()
                 raise EvaluationFailed(f"{where}: {why}")
