@@ -159,7 +159,7 @@ class Keyring:
         self.key, self.allowed, self.folder = key, allowed, folder
         self.read_error = ""
         """Why the list cannot be read now; empty if it can. If not, no client can join; connected clients stay."""
-        self._read_state = self._file_state()
+        self._read_state: tuple[int, ...] = ()  # of the file that was read: `allowed` may be older than the file is now
 
     def refresh(self) -> None:
         """Read the list again if its file has changed. Never raises."""

@@ -318,6 +318,15 @@ def test_a_list_that_changes_is_read_again(folder: KeyFolder) -> None:
     assert "was revoked" in ring.allowed.rejection_reason(lab)
 
 
+def test_a_list_that_changes_before_the_learner_has_begun_is_read_again(folder: KeyFolder) -> None:
+    read = folder.ensure_first_client(NOW)
+    default = Token.from_text(folder.token_path("default").read_text(), "").client.public
+    folder.revoke("default", LATER)
+    ring = Keyring(folder.server(), read, folder)
+    ring.refresh()
+    assert "was revoked" in ring.rejection_reason(default)
+
+
 @pytest.mark.parametrize("how", ["broken", "gone", "open to others", "a folder"])
 def test_a_list_that_cannot_be_read_lets_nobody_in_and_throws_nobody_out(folder: KeyFolder, how: str) -> None:
     ring = Keyring(folder.server(), folder.ensure_first_client(NOW), folder)
