@@ -101,6 +101,26 @@ def test_an_observation_that_does_not_fit_is_refused_at_every_step(nested: bool,
     assert str(caught.value) == f"lane 0, copy 0, step 3: {expected}"
 
 
+class Blind(Countdown):
+    """Its observations have no arrays."""
+
+    def __init__(self) -> None:
+        super().__init__(50)
+        self.observation_space = gymnasium.spaces.Dict({})  # type: ignore[assignment]
+
+    def _observation(self) -> Any:
+        return {}
+
+
+def test_an_observation_may_have_no_arrays() -> None:
+    answers = stepped(Blind, 2)
+    assert [(answer.obs, answer.reward.tolist()) for answer in answers] == [
+        ((), [0.0, 0.0]),
+        ((), [1.0, 1.0]),
+        ((), [1.0, 1.0]),
+    ]
+
+
 class Halves(Countdown):
     """Halves its action in place; the reward is the first number of it."""
 

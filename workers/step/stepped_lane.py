@@ -63,8 +63,8 @@ class SteppedLane:
         """Start episodes in these copies, with a seed for each."""
         infos = self._loop.reset(copies, seeds, self._observations, pulse, {"options": options})
         for n in copies:  # only these: a copy may overwrite the observation that it returned before
-            (values,) = zip(*read_leaves(self._read, [self._observations[n]]), strict=True)
-            for writer, row, value in zip(self._writers, self.rows.obs, values, strict=True):
+            leaves = read_leaves(self._read, [self._observations[n]])
+            for writer, row, (value,) in zip(self._writers, self.rows.obs, leaves, strict=True):
                 writer.write_one(row, n, value)
         self._write_numbers()
         return infos
