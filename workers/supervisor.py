@@ -8,6 +8,7 @@ worker outlives its supervisor.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,6 +16,8 @@ from typing import Protocol
 
 from protocol.alive import NO_TIMEOUTS, CallTimeouts, WorkerActivity, WorkerExit
 from workers.supervise.ending import Ending
+
+log = logging.getLogger("millrace.worker")
 
 BACKOFF_FIRST_S, BACKOFF_MOST_S, HEALTHY_S = 0.5, 30.0, 30.0
 POLL_S = 0.1
@@ -111,7 +114,13 @@ class Supervisor:
         self._stopping = False
         self._low_priority = False
         self._enforce_due_s = 0.0
-        self._slots = [_WorkerSlot(name, start(name), clock()) for name in (f"{prefix}{number}" for number in range(count))]
+        self._slots: list[_WorkerSlot] = []
+        try:
+            for name in (f"{prefix}{number}" for number in range(count)):
+                self._slots.append(_WorkerSlot(name, start(name), clock()))
+        except BaseException:  # of some workers, none is left behind
+            self.stop(0.0)
+            raise
 
     def poll(self) -> list[WorkerExit]:
         """The workers that have ended since the last call. Ends those that hang, and starts those whose restart is due."""
@@ -129,12 +138,20 @@ class Supervisor:
                 ended.append((WorkerExit(slot.running.name, slot.running.process_nonce, end.reason, end.failed), end))
                 self._record_end(slot, end, now)
             if slot.restart_s is not None and now >= slot.restart_s and not self._stopping:
-                slot.restart_s = None
-                slot.started_s = now
-                slot.running = self._start(slot.name)
-                if self._low_priority:
-                    slot.running.lower_priority()
+                self._restart(slot, now)
         return ended
+
+    def _restart(self, slot: _WorkerSlot, now: float) -> None:
+        try:
+            slot.running = self._start(slot.name)
+        except OSError as error:  # the system has no memory, or no process, for it now
+            log.warning("worker %s cannot be started, which is tried again: %s", slot.name, error)
+            self._schedule(slot, now)
+            return
+        slot.restart_s = None
+        slot.started_s = now
+        if self._low_priority:
+            slot.running.lower_priority()
 
     def _record_end(self, slot: _WorkerSlot, end: Ending, now: float) -> None:
         final = end.on_purpose and end.code in (0, 2, EXIT_NO_LEARNER)
@@ -142,8 +159,11 @@ class Supervisor:
         if now - slot.started_s > HEALTHY_S:
             slot.backoff_s = BACKOFF_FIRST_S
         if not final and not self._stopping:
-            slot.restart_s = now + slot.backoff_s
-            slot.backoff_s = min(2 * slot.backoff_s, BACKOFF_MOST_S)
+            self._schedule(slot, now)
+
+    def _schedule(self, slot: _WorkerSlot, now: float) -> None:
+        slot.restart_s = now + slot.backoff_s
+        slot.backoff_s = min(2 * slot.backoff_s, BACKOFF_MOST_S)
 
     def activities(self) -> list[WorkerActivity]:
         """What each running worker does. A stopped process is left out."""

@@ -94,6 +94,35 @@ def test_a_worker_that_died_is_restarted_under_its_name_with_backoff() -> None:
     assert pauses == pytest.approx(expected, abs=0.11)
 
 
+def test_a_worker_that_cannot_be_started_again_now_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    machine = Machine(workers=2)
+    starts = iter([OSError("no memory"), OSError("no memory"), None])
+
+    def start(name: str) -> FakeRunning:
+        if (error := next(starts)) is not None:
+            raise error
+        return machine.start(name)
+
+    monkeypatch.setattr(machine.host, "_start", start)
+    machine.die(1)
+    assert machine.pause_s() == pytest.approx(BACKOFF_FIRST_S * (1 + 2 + 4), abs=0.31)
+    assert machine.host.count == 2
+
+
+def test_if_a_worker_cannot_be_started_at_first_none_is_left_behind() -> None:
+    started: list[FakeRunning] = []
+
+    def start(name: str) -> FakeRunning:
+        if started:
+            raise OSError("no memory")
+        started.append(FakeRunning(name))
+        return started[0]
+
+    with pytest.raises(OSError, match="no memory"):
+        Supervisor(start, 3)
+    assert started[0].requests == ["stop", "wait"]
+
+
 def test_the_backoff_of_a_worker_that_was_healthy_is_reset() -> None:
     machine = Machine()
     for _ in range(4):

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from workers.supervise import worker_process
+from workers.supervise.activity import ActivityReader
 from workers.supervise.ending import Ending
 from workers.supervise.worker_process import WorkerCommand, WorkerProcess
 
@@ -53,3 +54,15 @@ def test_a_process_that_was_reaped_already_has_ended(monkeypatch: pytest.MonkeyP
     with children_reaped_by_the_system():
         ending = ending_of("exit 3", monkeypatch)
     assert ending == Ending(0, "ended while it started; its exit code is not known")
+
+
+def test_a_process_that_cannot_be_started_leaves_no_descriptor_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    def popen(command: list[str], **how: Any) -> subprocess.Popen[bytes]:
+        raise OSError("no memory")
+
+    monkeypatch.setattr(worker_process, "popen", popen)
+    page = ActivityReader()
+    monkeypatch.setattr(worker_process, "ActivityReader", lambda: page)
+    with pytest.raises(OSError, match="no memory"):
+        WorkerProcess(WorkerCommand("ipc:///nobody/listens/here", "w0"))
+    assert page.fd == -1

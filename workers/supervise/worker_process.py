@@ -81,16 +81,20 @@ class WorkerProcess:
         secret = {NONCE_VARIABLE: str(self.process_nonce)}
         if start.token is not None:
             secret[TOKEN_VARIABLE] = start.token.to_text()
-        with _opened(start.log) as stderr:
-            self._process = popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=stderr if start.log else None,
-                stderr=stderr if start.log else None,
-                start_new_session=True,  # only the supervisor gets the Ctrl-C of the terminal
-                env={**os.environ, **SINGLE_THREADED, **secret, "PYTHONPATH": path},
-                pass_fds=(self._page.fd, *(start.shared_memory or ())),
-            )
+        try:
+            with _opened(start.log) as stderr:
+                self._process = popen(
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=stderr if start.log else None,
+                    stderr=stderr if start.log else None,
+                    start_new_session=True,  # only the supervisor gets the Ctrl-C of the terminal
+                    env={**os.environ, **SINGLE_THREADED, **secret, "PYTHONPATH": path},
+                    pass_fds=(self._page.fd, *(start.shared_memory or ())),
+                )
+        except BaseException:
+            self._page.close()
+            raise
 
     @property
     def pid(self) -> int:
