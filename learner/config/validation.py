@@ -18,6 +18,8 @@ from protocol.envs.wrappers import wrapper_name
 from protocol.errors import UsageError
 from protocol.own_module import is_name
 
+MOST_TICKETS = 1 << 15  # that are outstanding: one worker may get them all, in one message
+
 Record = TypeVar("Record", bound=msgspec.Struct)
 
 
@@ -89,6 +91,9 @@ def check_rollout_settings(config: RolloutConfig, at: str = "") -> None:
         raise UsageError(
             f"{at}{config.envs} envs cannot be shared evenly among {config.lanes} lanes; take {near}, or {divisor} lanes"
         )
+    if (tickets := config.lanes * (1 + config.max_lag)) > MOST_TICKETS:
+        expected = f"expected lanes * (1 + max_lag) of at most {MOST_TICKETS}"
+        raise UsageError(f"{at}{config.lanes} lanes with max_lag {config.max_lag}: {expected}, got {tickets}")
     names = config.fact_names()
     if len(names) > MAX_FACTS or len(set(names)) < len(names):
         raise UsageError(f"{at}info_keys: expected at most {MAX_FACTS} different names, got {len(names)}")

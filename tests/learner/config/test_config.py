@@ -127,6 +127,7 @@ def test_workers_without_a_lane_are_named_with_settings_that_use_them(workers: i
         ({"workers": "two"}, "workers: expected int, got 'two'"),
         ({"steps": 0}, "steps: expected int >= 1, got 0"),
         ({"max_lag": -1}, "max_lag: expected int >= 0, got -1"),
+        ({"max_lag": 8192}, "4 lanes with max_lag 8192: expected lanes * (1 + max_lag) of at most 32768, got 32772"),
         ({"envs": 6}, "6 envs cannot be shared evenly among 4 lanes; take 4 or 8, or 3 lanes"),
         ({"envs": 2}, "2 envs cannot be shared evenly among 4 lanes; take 4, or 2 lanes"),
         ({"transport": "udp"}, "transport: expected one of inproc, ipc, tcp, got 'udp'"),

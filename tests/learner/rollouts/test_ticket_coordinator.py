@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from learner.config.validation import MOST_TICKETS
 from learner.members.events import EnvironmentRaised, WorkerJoined, WorkerLeft, WorkerRefused
 from learner.members.membership import Outgoing
 from learner.members.states import TABLE, MemberState, SentUnusable, TimedOut
@@ -43,6 +44,7 @@ from protocol.messages import (
     WorkerActivity,
 )
 from protocol.space_spec import EnvDescription, MultiBinarySpace
+from protocol.wire.codec import decode_to_worker, encode
 from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollout, run_spec
 
 M = TypeVar("M")
@@ -1092,3 +1094,10 @@ def test_why_one_was_silent_is_told_once_it_is_known() -> None:
     learner.coordinator.events.clear()
     learner.balanced(learner.coordinator.remove_worker("b", "ended with exit code 0"))
     assert learner.coordinator.events == []
+
+
+def test_the_most_tickets_that_a_run_may_have_outstanding_fit_one_message() -> None:
+    numbers = range(2**31, 2**31 + MOST_TICKETS)
+    received = tuple(Received(n, 200, 10**5) for n in range(MOST_TICKETS))
+    order = Collect(2**48, 10**6, tuple(Permit(number, n, 200) for n, number in enumerate(numbers)), received)
+    assert decode_to_worker([bytes(frame) for frame in encode(order)]) == order
