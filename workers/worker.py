@@ -23,7 +23,7 @@ from pathlib import Path
 from protocol.bounds import Stages
 from protocol.env_spec import AllowedCode
 from protocol.errors import BadMessage, PolicyFailed, UsageError, UserFacingError, first_line
-from protocol.messages import Order, Stepped, Weights
+from protocol.messages import Order, Stepped, ToLearner, Weights
 from protocol.policy.own_policy import OwnPolicy
 from protocol.policy.policy import make_policy
 from protocol.specs import DescribeSpec, RunSpec, StepSpec
@@ -313,7 +313,7 @@ class Worker:
         for effect in effects:
             match effect:
                 case Send(message):
-                    self._link.send(encode(message, self._packing))
+                    self._send(message)
                 case StartSession(run):
                     self._start_session(run)
                 case CloseLanes(lanes):
@@ -322,6 +322,14 @@ class Worker:
                 case Leave(exit_code, reason):
                     activity().leave(self._options.exit_code(exit_code, reason))
                     self._left = effect
+
+    def _send(self, message: ToLearner) -> None:
+        try:
+            frames = encode(message, self._packing)
+        except ValueError as error:  # a rollout in which so many episodes ended that it fits no message
+            self._fail(error)
+        else:
+            self._link.send(frames)
 
     def _start_session(self, run: DescribeSpec | RunSpec | StepSpec) -> None:
         """Make a new collector or stepper; nothing of the old one is kept."""

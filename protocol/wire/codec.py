@@ -63,7 +63,10 @@ assert sys.byteorder == "little", (
 
 
 def encode(message: ToLearner | Inquire | ToWorker | ToObserver, packing: Packing | None = None) -> list[Buffer]:
-    """Frames of a message. Arrays are not copied: do not change them afterwards. `packing` applies to rollouts only."""
+    """Frames of a message. Arrays are not copied: do not change them afterwards. `packing` applies to rollouts only.
+
+    Raises `ValueError` if its head is too long.
+    """
     frames: list[Buffer] = [b""]
     packing = packing if isinstance(message, Rollout) else None
 
@@ -84,7 +87,10 @@ def encode(message: ToLearner | Inquire | ToWorker | ToObserver, packing: Packin
 
     head = _head(message, hook)
     if len(head) > MAX_HEAD_BYTES:
-        raise ValueError(f"{type(message).__name__}: head expected at most {MAX_HEAD_BYTES} bytes, got {len(head)}")
+        line = f"{type(message).__name__}: head expected at most {MAX_HEAD_BYTES} bytes, got {len(head)}"
+        if isinstance(message, Rollout):
+            line += f", for {len(message.episodes)} episodes ended in it; take fewer rollout_steps, or more lanes"
+        raise ValueError(line)
     frames[0] = head
     return frames
 

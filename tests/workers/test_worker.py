@@ -15,6 +15,7 @@ from protocol.arrays import Array
 from protocol.messages import (
     Collect,
     Drain,
+    Failure,
     Goodbye,
     Inquire,
     Permit,
@@ -28,11 +29,12 @@ from protocol.messages import (
 from protocol.policy.layout import acting_size, buffer_size
 from protocol.rollout import rollout_bytes
 from protocol.specs import RunSpec
+from protocol.wire import codec
 from protocol.wire.codec import Buffer, decode_to_learner, decode_to_worker, encode
 from protocol.wire.compression import Packing
 from protocol.wire.weight_dtypes import WeightsDtype, to_float32, to_wire_dtype
 from protocol.wire.worker_link import WorkerLink
-from tests.support.collectors import bits, collect, random_collector, run_of
+from tests.support.collectors import TOY, bits, collect, random_collector, run_of
 from workers.session import Leave, Session
 from workers.worker import Worker, identity
 
@@ -115,6 +117,20 @@ def test_a_worker_that_cannot_compress_leaves_at_once_and_says_why(monkeypatch: 
     why = "compress zstd needs the package zstandard, which is an extra; pip install 'millrace-rl[compress]'"
     assert work(link) == Leave(2, why)
     assert link.heard()[-1] == Goodbye(1, why, ())
+
+
+def test_a_rollout_with_too_many_episodes_for_a_message_is_a_failure_with_advice(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(codec, "MAX_HEAD_BYTES", 8_000)
+    run = run_of(f"{TOY}Countdown-v0", T=16, N=64, kwargs={"k": 1})
+    *said, drain = said_to_a_worker(run, np.zeros(acting_size(run.policy), np.float32))
+    drained = FakeLink([*said, drain])
+    assert work(drained).exit_code == 0  # it leaves all the same
+    assert isinstance(drained.heard()[-1], Goodbye)
+    link = FakeLink(said)
+    assert work(link).exit_code == 1
+    failure = link.heard()[-1]
+    assert isinstance(failure, Failure)
+    assert failure.error.endswith(", for 512 episodes ended in it; take fewer rollout_steps, or more lanes")
 
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16", "float16"])
