@@ -78,13 +78,20 @@ def _read_layers(command: str, argv: list[str], resumed: Path | None = None) -> 
 
 
 def _none_for_tyro(argv: list[str], algorithm: AlgorithmConfig) -> list[str]:
-    """`--core none`, as it stands in a TOML file, becomes `--core None`; likewise all settings whose default may be None."""
+    """`--core none`, as it stands in a TOML file, becomes `--core None`; likewise all settings whose default may be None.
+
+    Also if they are written with a sign: `--core=none` becomes `--core=None`.
+    """
     records = [Config(), *(kind() for kind in (*HYPERPARAMETERS.values(), type(algorithm)))]
     optional = {f"--{name}" for record in records for name in record.__struct_fields__ if getattr(record, name) is None}
-    return [
-        "None" if word == "none" and before.replace("-", "_").replace("__", "--", 1) in optional else word
-        for before, word in zip(["", *argv], argv, strict=False)
-    ]
+
+    def for_tyro(before: str, word: str) -> str:
+        flag, _, value = f"{before}={word}".rpartition("=") if word == "none" else word.rpartition("=")
+        if value != "none" or flag.replace("-", "_").replace("__", "--", 1) not in optional:
+            return word
+        return f"{word.removesuffix('none')}None"
+
+    return [for_tyro(before, word) for before, word in zip(["", *argv], argv, strict=False)]
 
 
 def _fields(config: Config) -> dict[str, Any]:

@@ -63,3 +63,5 @@ def test_a_setting_that_may_be_none_is_written_so_on_the_command_line_and_in_a_f
     config, _ = read_config("train", flags)
     assert config == read_config("train", ["CartPole-v1"])[0]
     assert read_config("train", ["CartPole-v1", "--core", "None"])[0] == config
+    signs = ["CartPole-v1", "--core=none", "--clip-range-vf=none", "--torch_threads=none", "--compress=none"]
+    assert read_config("train", signs)[0] == config
