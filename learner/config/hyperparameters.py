@@ -60,7 +60,7 @@ class PolicyGradientConfig(AlgorithmConfig, frozen=True):
     """Weight of the value loss in the loss."""
     max_grad_norm: Free[Positive] = 0.5
     """Clip the norm of the gradient to this."""
-    log_std_init: Fixed[float] = 0.0
+    log_std_init: Fixed[Annotated[float, msgspec.Meta(ge=-20, le=20)]] = 0.0
     """Initial logarithm of the standard deviation of continuous (Box) actions."""
     normalize_rewards: Fixed[bool] = False
     """Divide rewards by the running standard deviation of the discounted return."""
@@ -255,7 +255,7 @@ class ContinuousConfig(OffPolicyConfig, frozen=True):
     """Capacity of the replay buffer in transitions; the newest are kept. The final observation of a truncated episode takes
     the place of one.
     """
-    updates_per_step: Free[Positive] = 1.0
+    updates_per_step: Free[Annotated[float, msgspec.Meta(gt=0, le=1e6)]] = 1.0
     """Replay ratio: gradient steps for each env step after learning_starts. It is exact, whatever the rollouts are."""
 
 

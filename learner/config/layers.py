@@ -121,7 +121,8 @@ def override(config: Config, values: Mapping[str, Any], where: str) -> Config:
         elif name in settings and name != "algorithm":
             settings[name] = _coerce(config, name, value)
         else:
-            hint = algorithms_with(name) or did_you_mean(name, [*settings, *algorithm])
+            known = [setting for setting in (*settings, *algorithm) if setting != "algorithm"]
+            hint = algorithms_with(name) or did_you_mean(name, known)
             raise UsageError(f"{where}: unknown setting {name}{hint}")
     return convert(settings, where)
 

@@ -13,13 +13,13 @@ from learner.config.config import TABLES, Config
 from learner.config.hyperparameters import HYPERPARAMETERS, OffPolicyConfig
 from learner.config.rollout_config import RolloutConfig
 from protocol.address import advertised_address, check_address
-from protocol.bounds import MAX_FACTS, MAX_NAME, one_line
+from protocol.bounds import LARGEST, MAX_FACTS, MAX_NAME, one_line
 from protocol.envs.wrappers import wrapper_name
 from protocol.errors import UsageError
 from protocol.own_module import is_name
 
 MOST_TICKETS = 1 << 15  # that are outstanding: one worker may get them all, in one message
-
+LARGEST_SEED = 2**64 - 1  # that PyTorch takes
 Record = TypeVar("Record", bound=msgspec.Struct)
 
 
@@ -48,6 +48,7 @@ def validate(config: Config, where: str = "") -> Config:
     if not config.env:
         raise UsageError(f"{at}which environment? expected one that gymnasium.make takes, as in: millrace train CartPole-v1")
     check_rollout_settings(config, at)
+    _check_numbers(config.algorithm, at)
     _check_env_arguments(config, at)
     match config.algorithm:
         case OffPolicyConfig(replay_size=size, rollout_steps=steps) if size < (
@@ -84,6 +85,7 @@ def convert_rollout_settings(settings: dict[str, Any]) -> RolloutConfig:
 
 def check_rollout_settings(config: RolloutConfig, at: str = "") -> None:
     """Raise `UsageError` if rollouts cannot be collected with these settings. `at` begins the message."""
+    _check_numbers(config, at)
     if config.envs % config.lanes:
         fewer = config.envs - config.envs % config.lanes
         near = f"{fewer} or {fewer + config.lanes}" if fewer else f"{config.lanes}"
@@ -121,6 +123,16 @@ def check_rollout_settings(config: RolloutConfig, at: str = "") -> None:
         raise UsageError(
             f"{at}advertise {config.advertise}: expected a host name or an IP address, without a port"
         ) from None
+
+
+def _check_numbers(record: msgspec.Struct, at: str) -> None:
+    """Raise `UsageError` for NaN, and for a whole number that is too large for a message."""
+    for name, value in msgspec.structs.asdict(record).items():
+        most = LARGEST_SEED if name == "seed" else LARGEST
+        if isinstance(value, int) and value > most:
+            raise UsageError(f"{at}{name}: expected int <= {most}, got {value}")
+        if isinstance(value, float) and math.isnan(value):
+            raise UsageError(f"{at}{name}: expected a number, got {value}")
 
 
 def _check_env_arguments(config: Config, at: str) -> None:

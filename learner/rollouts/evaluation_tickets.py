@@ -20,6 +20,7 @@ import numpy as np
 from learner.members.membership import Member, Outgoing
 from learner.rollouts.row_checks import reason_to_reject
 from learner.run_folder.results import Evaluation, fact_means
+from protocol.bounds import LARGEST
 from protocol.messages import EpisodeRows, Evaluate, Evaluated, Heartbeat
 from protocol.rollout import LARGEST_REWARD, Episode, wrong_facts
 from protocol.specs import PolicySpec
@@ -55,7 +56,7 @@ class EvaluationPlan:
 
         `max_steps`: env steps that the whole evaluation may take. Each episode gets an equal share, at least one step.
         """
-        return EvaluationPlan(episode_seeds(seed, episodes), copies, max(1, max_steps // episodes))
+        return EvaluationPlan(episode_seeds(seed, episodes), copies, min(max(1, max_steps // episodes), LARGEST))
 
 
 def episode_seeds(seed: int, episodes: int) -> tuple[int, ...]:

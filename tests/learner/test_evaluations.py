@@ -15,6 +15,7 @@ from learner.rollouts.evaluation_tickets import EvaluationPlan
 from learner.run_folder.results import Evaluation
 from learner.run_folder.run_folder import RunFolder
 from learner.run_state import RunState
+from protocol.bounds import LARGEST
 from tests.support.fake_ends import run_spec
 
 
@@ -79,3 +80,7 @@ def test_the_final_policy_can_be_the_best_after_a_resume_without_evaluations() -
     assert best is not None
     assert (best.chosen_by, best.env_steps, best.evaluation.return_mean) == (7.0, 4_000, 7.5)
     assert fakes.written == [-1.0, 1.0]
+
+
+def test_a_share_of_steps_fits_the_message() -> None:
+    assert [EvaluationPlan.of(2, 1, 4, steps).most_steps for steps in (1, 7, 10**20)] == [1, 3, LARGEST]

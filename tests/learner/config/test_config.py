@@ -1,5 +1,6 @@
 """The configuration: its layers in order, its one-line refusals, its file."""
 
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -139,6 +140,14 @@ def test_workers_without_a_lane_are_named_with_settings_that_use_them(workers: i
         ({"algo": "reinforce", "core": "gru"}, "unknown setting core; it is one of ppo, a2c, impala alone"),
         ({"core": "rnn"}, "core: expected one of lstm, gru, none, got 'rnn'"),
         ({"algo": "pp0"}, "algo pp0: expected one of ppo"),
+        ({"seed": 2**64}, "seed: expected int <= 18446744073709551615, got 18446744073709551616"),
+        ({"steps": 2**53 + 1}, "steps: expected int <= 9007199254740992, got 9007199254740993"),
+        ({"n_epochs": 10**30}, "n_epochs: expected int <= 9007199254740992, got 1" + "0" * 30),
+        ({"target_return": math.nan}, "target_return: expected a number, got nan"),
+        ({"log_std_init": math.inf}, "log_std_init: expected float <= 20.0, got inf"),
+        ({"log_std_init": math.nan}, "log_std_init: expected float >= -20.0, got nan"),
+        ({"algo": "sac", "target_entropy": math.nan}, "target_entropy: expected a number, got nan"),
+        ({"algo": "sac", "updates_per_step": math.inf}, "updates_per_step: expected float <= 1000000.0, got inf"),
         ({"bind": "0.0.0.0:5555"}, "address 0.0.0.0:5555: expected inproc://NAME, ipc://PATH or tcp://HOST:PORT"),
         ({"file": Path("/no/such.toml")}, "config file /no/such.toml cannot be read: No such file or directory"),
     ],
@@ -157,7 +166,8 @@ def test_bad_values_are_refused_in_one_line(keywords: dict[str, Any], says: str)
         ("ppo = 3", "ppo: expected a table, [ppo], got 3"),
         ("seed = -1", "seed: expected int >= 0, got -1"),
         ("env_kwargs = 3", "env_kwargs: expected table, got 3"),
-        ("algorithm = 3", "unknown setting algorithm"),
+        ("algorithm = 3", "unknown setting algorithm; did you mean algo?"),
+        ("[algorithm]\ngamma = 0.9", "unknown setting algorithm; did you mean algo?"),
         ("a =", "is not TOML"),
     ],
 )
