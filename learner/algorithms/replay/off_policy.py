@@ -89,13 +89,8 @@ class OffPolicy(Algorithm):
         Raises `RunError` when a loss or a gradient is not finite, before it reaches the weights.
         """
         config = self.config
-        done = min(
-            1.0, self.env_steps / self._total_steps
-        )  # fraction of the run: 0 in the first update, below 1 in the last
-        learning_rate = scheduled(config.learning_rate, config.learning_rate_schedule, 1 - done)
-        for optimizer in self.optimizers.values():
-            optimizer.param_groups[0]["lr"] = learning_rate
-        beta = config.priority_beta + (1 - config.priority_beta) * done
+        learning_rate = self._set_learning_rate()
+        beta = config.priority_beta + (1 - config.priority_beta) * self._done()
         self.replay.add(batch)
         if config.normalize_rewards:
             self.rewards.count(batch)
@@ -118,6 +113,17 @@ class OffPolicy(Algorithm):
             metrics["replay/env_steps_per_gradient_step"] = batch.env_steps / len(measured)
         return metrics
 
+    def _done(self) -> float:
+        """The fraction of the run that is done: 0 in the first update, below 1 in the last."""
+        return min(1.0, self.env_steps / self._total_steps)
+
+    def _set_learning_rate(self) -> float:
+        """Set the learning rate that the settings and the schedule say, and return it."""
+        learning_rate = scheduled(self.config.learning_rate, self.config.learning_rate_schedule, 1 - self._done())
+        for optimizer in self.optimizers.values():
+            optimizer.param_groups[0]["lr"] = learning_rate
+        return learning_rate
+
     def add_prior(self, batches: Iterable[Batch], observations: int) -> None:
         """Store the rows of a dataset beside the replay buffer. They count for the observation statistics."""
 
@@ -131,6 +137,7 @@ class OffPolicy(Algorithm):
 
     def learn_from_prior(self, pulse: Callable[[], None]) -> None:
         """Make `prior_steps` gradient steps on prior data alone, less those that were made."""
+        self._set_learning_rate()  # a state that was loaded may have another
         for sample in self.samples(self.config.prior_steps - self.prior_gradient_steps):
             self.step(sample)
             self.prior_gradient_steps += 1

@@ -113,6 +113,19 @@ def same(a: DQN, b: DQN) -> bool:
     return nets and all(map(np.array_equal, a.weights(), b.weights()))
 
 
+def test_a_resumed_run_takes_its_new_learning_rate_for_prior_data_too() -> None:
+    """The optimizer's state has the rate that it was saved with."""
+    interrupted = dqn(changed(PLAIN, prior_steps=2))
+    resumed = dqn(changed(PLAIN, prior_steps=5, learning_rate=10 * PLAIN.learning_rate))
+    for each in (interrupted, resumed):
+        each.add_prior([batch(1)], batch(1).valid.size + LANES * COPIES)
+    interrupted.learn_from_prior(no_pulse)
+    resumed.load_state_dict(interrupted.state_dict())
+    resumed.learn_from_prior(no_pulse)
+    assert resumed.gradient_steps == 5
+    assert resumed.optimizers["optimizer"].param_groups[0]["lr"] == 10 * PLAIN.learning_rate
+
+
 # -------------------------------------------------------------------- a chain of three states, by hand
 
 STATES = np.eye(3, dtype=np.float32)
