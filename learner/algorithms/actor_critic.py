@@ -30,6 +30,7 @@ from learner.algorithms.returns import EpisodeEnds, gae
 from learner.algorithms.updates import check_finite, scheduled
 from learner.config.hyperparameters import ActorCriticConfig, AlgorithmConfig, PolicyGradientConfig, RecurrentConfig
 from protocol.arrays import Array, Bools, Floats
+from protocol.errors import RunError
 from protocol.policy.features import features, normalize
 from protocol.policy.masks import FORBIDDEN
 from protocol.policy.networks import ActorCriticNetwork, RecurrentInput
@@ -41,6 +42,7 @@ Pulse = Callable[[], None]
 Metrics = dict[str, float]
 
 ADVICE = "a lower learning_rate, or normalize_observations and normalize_rewards"
+MAX_LOG_STD = 80.0  # e⁸⁰ times the largest noise of numpy, which is below 14, is finite in float32
 CHUNK_ROWS = 1024  # observations that are evaluated together where no gradient is needed: this bounds memory
 
 
@@ -177,7 +179,8 @@ class ActorCritic(Algorithm):
     def update(self, batch: Batch, pulse: Pulse) -> Metrics:
         """Learn from a batch, calling `pulse` between minibatches. Returns metrics with the names of Stable-Baselines3.
 
-        Raises `RunError` when a loss or a gradient is not finite, before it reaches the weights.
+        Raises `RunError` when a loss or a gradient is not finite, before it reaches the weights; and when the
+        actions of these weights would not be.
         """
         if not batch.valid.any():
             return {}
@@ -193,6 +196,7 @@ class ActorCritic(Algorithm):
             epochs.append(self._epoch(next(minibatches_of_epochs), pulse))
             if epochs[-1] and self.stops(epochs[-1][-1]):
                 break
+        self._check_spread_of_actions()
         self.count_update(batch, observations, len(epochs))
         return self.metrics(epochs, estimates)
 
@@ -263,6 +267,15 @@ class ActorCritic(Algorithm):
             f"{type(self).__name__}.loss: expected a tensor of no dimension that depends on log_prob_now, entropy or value "
             "of its rows, and a dict of numbers to log"
         )
+
+    def _check_spread_of_actions(self) -> None:
+        """Raise `RunError` before Box actions overflow: workers would be refused for them, one after the other."""
+        log_std = self.net.parameters.get("actor.log_std")
+        if log_std is not None and (largest := log_std.detach().max().item()) > MAX_LOG_STD:
+            raise RunError(
+                f"learner: update {self.version}: logarithm of the standard deviation of actions: expected at most "
+                f"{MAX_LOG_STD:g}, got {largest:.3g}; try a lower ent_coef, or a lower learning_rate"
+            )
 
     def count_update(self, batch: Batch, observations: Observations, epochs: int) -> None:
         """Count an update of `epochs` epochs with this batch: steps, versions, observation statistics."""

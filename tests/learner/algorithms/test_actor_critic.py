@@ -180,6 +180,20 @@ def test_a_loss_that_is_not_finite_is_named_and_stops_before_the_weights(name: s
     assert torch.equal(algorithm.net.flat, before)
 
 
+@pytest.mark.parametrize(("log_std", "refused"), [(79.0, False), (81.0, True)])
+def test_a_spread_of_actions_that_no_rollout_can_hold_is_named(log_std: float, refused: bool) -> None:
+    """With an entropy bonus it may grow for ever: the bounds of the Box hide it from the environment."""
+    algorithm = make("a2c", GAUSSIAN, learning_rate=1e-3)
+    rows = batch(algorithm, 0)
+    algorithm.net.parameters["actor.log_std"].detach().fill_(log_std)
+    if not refused:
+        algorithm.update(rows, no_pulse)
+        return
+    expected = "update 0: logarithm of the standard deviation of actions: expected at most 80, got 81; try a lower ent_coef"
+    with pytest.raises(RunError, match=expected):
+        algorithm.update(rows, no_pulse)
+
+
 @pytest.mark.parametrize("spec", [DISCRETE, GAUSSIAN, shared(DISCRETE), shared(GAUSSIAN)])
 @pytest.mark.parametrize("critic", [True, False])
 def test_a_step_follows_the_gradient_of_the_usual_loss(spec: PolicySpec, critic: bool) -> None:
