@@ -10,7 +10,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import msgspec
 
@@ -139,10 +139,12 @@ def _coerce(record: msgspec.Struct, name: str, value: Any) -> Any:
     default = getattr(type(record)(), name)
     if name == "info_keys" and isinstance(value, list | tuple):
         return ",".join(map(str, value))
-    if value == "none" and default is None:
+    if isinstance(value, str) and value == "none" and default is None:
         return None
-    if isinstance(value, float) and type(default) is int and value.is_integer():
-        return int(value)
+    if isinstance(value, float) and value.is_integer():
+        hint = get_type_hints(type(record))[name]
+        options = get_args(hint) or (hint,)
+        return int(value) if int in options and float not in options else value
     return value
 
 

@@ -103,6 +103,8 @@ def test_the_file_of_a_run_repeats_it_also_where_the_preset_has_more_arguments(t
 def test_a_whole_number_may_be_written_in_powers_of_ten(tmp_path: Path) -> None:
     assert resolve("CartPole-v1", steps=1e6).steps == 1_000_000
     assert resolve("CartPole-v1", file=written(tmp_path, "steps = 3e5")).steps == 300_000
+    assert resolve("CartPole-v1", file=written(tmp_path, "eval_episodes = 1e2")).eval_episodes == 100  # which may be none
+    assert isinstance(resolve("CartPole-v1", target_return=5e2).target_return, float)
     assert "steps: expected int" in refusal(steps=1.5)
 
 
