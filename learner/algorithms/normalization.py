@@ -41,10 +41,13 @@ class RunningMoments:
 
     @property
     def std(self) -> Doubles:
-        """Standard deviation [*shape] of the population; 1 where the value never varied."""
+        """Standard deviation [*shape] of the population; 1 where the value never varied by more than rounding.
+
+        If the mean is so large that this rounding may be more than 1, it stands in place of 1.
+        """
         variance = self._squares / max(self.count, 1)
         varied = variance > TINY * self.mean**2 + TINY**2
-        return np.sqrt(np.where(varied, variance, 1.0))
+        return np.where(varied, np.sqrt(variance), np.maximum(TINY**0.5 * abs(self.mean), 1.0))
 
     def state_dict(self) -> dict[str, Any]:
         """Tensors and numbers, copied."""

@@ -177,6 +177,16 @@ def test_what_never_varied_is_divided_by_one() -> None:
     np.testing.assert_allclose(moments.std, [1, 2e-9], rtol=1e-6)  # small is not constant
 
 
+def test_a_large_value_that_varies_little_is_not_clipped() -> None:
+    """The time of day in seconds, during ten minutes: all features were at the bounds of ±10."""
+    moments, seconds = RunningMoments(), 1.7e9 + np.arange(600.0)
+    moments.update(seconds)
+    distance = (seconds - moments.mean) / moments.std
+    rounding = 4 * np.spacing(1.7e9) / 1.7e3  # of the mean
+    np.testing.assert_allclose(distance, (np.arange(600) - 299.5) / (1e-6 * (1.7e9 + 299.5)), rtol=0, atol=rounding)
+    assert len(np.unique(np.clip(distance.astype(np.float32), -10, 10))) == 600
+
+
 @pytest.mark.parametrize("steps", [1, 4])
 def test_the_state_goes_through_a_file(steps: int) -> None:
     reward, ended, valid = lives(8, 2)
