@@ -43,12 +43,15 @@ def algorithms_and_environments() -> list[tuple[str, str]]:
 def origin(config: Config) -> str:
     """Where the settings of a new run come from, as one line for the user.
 
-    The preset is in use if a setting has its value, and that is not the default.
+    The preset is in use if a setting has its value, and that is not the default. Without one, the settings of the algorithm
+    that differ from the defaults are named: they were given, or come from a file or the preset of another environment.
     """
     preset = environment_presets(config.algo).get(config.env)
-    if preset is None:
-        return f"settings: defaults, because {config.algo} has no preset for {config.env}"
     mine, defaults = _settings(config), _settings(type(config)(algorithm=type(config.algorithm)()))
+    if preset is None:
+        given = [name for name in config.algorithm.__struct_fields__ if mine[name] != defaults[name]]
+        found = f"settings: defaults, except {', '.join(given)}" if given else "settings: defaults"
+        return f"{found}, because {config.algo} has no preset for {config.env}"
     changed = [name for name, value in preset.items() if not _agrees(mine[name], value)]
     if all(defaults[name] == preset[name] for name in preset.keys() - changed):
         return f"settings: without the preset of {config.algo} for {config.env}"

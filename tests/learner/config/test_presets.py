@@ -21,6 +21,14 @@ from learner.config.presets import origin
         ({"env": "millrace/Atari-v0", "net": (64,)}, "settings: preset of ppo for millrace/Atari-v0, except net"),
         ({"preset": "none"}, "settings: without the preset of ppo for CartPole-v1"),
         ({"preset": "none", "seed": 2}, "settings: without the preset of ppo for CartPole-v1"),
+        (
+            {"env": "Taxi-v3", "gamma": 0.9, "steps": 7, "net": (64, 64)},
+            "settings: defaults, except gamma, because ppo has no preset for Taxi-v3",
+        ),
+        (
+            {"env": "Taxi-v3", "algo": "a2c", "preset": "CartPole-v1"},
+            "settings: defaults, except normalize_rewards, because a2c has no preset for Taxi-v3",
+        ),
         ({"algo": "reinforce", "env": "Acrobot-v1"}, "settings: defaults, because reinforce has no preset for Acrobot-v1"),
     ],
 )
