@@ -256,6 +256,7 @@ def _plot(argv: list[str]) -> int:
 
 
 def _presets(argv: list[str]) -> int:
+    argv = [flag for flag in argv if flag != "--debug"]
     if argv and argv[0] in HELP_FLAGS:
         _print_usage("presets")
         return 0

@@ -294,6 +294,11 @@ def test_the_workers_own_traceback_stands_beneath(capsys: Captured, monkeypatch:
     assert lines == ["millrace: lane 2 raised too often", "    Traceback of worker w1:", "      step", "    KeyError: 3"]
 
 
+def test_a_command_without_errors_takes_debug_too(capsys: Captured) -> None:
+    assert main(["presets", "--debug"]) == 0
+    assert "--preset cartpole-dqn" in capsys.readouterr().out
+
+
 def test_an_error_in_millrace_hides_its_traceback_until_asked(capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
     failing(monkeypatch, ZeroDivisionError("division\nby zero"))
     line = refusal(capsys, "train", "CartPole-v1", exit_code=1)
