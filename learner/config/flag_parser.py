@@ -11,7 +11,7 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin
 
 import msgspec
 import tyro
-from tyro.conf import OmitArgPrefixes, PositionalMetavarFromFieldName
+from tyro.conf import OmitArgPrefixes, Positional, PositionalMetavarFromFieldName
 
 from protocol.did_you_mean import did_you_mean
 from protocol.errors import UsageError, unexpected_arguments
@@ -66,7 +66,11 @@ def parse_flags(
             one_run = any(field.name == "run" for field in msgspec.structs.fields(kind))
             raise UsageError(f"{command}: {unexpected_arguments(unknown, one_run=one_run)}")
         name = flag.lstrip("-")
-        similar = hint(name.replace("-", "_")) or did_you_mean(name, _flag_names(kind, default), "--")
+        setting = name.replace("-", "_")
+        if setting in {field.name for field in msgspec.structs.fields(kind) if _is_positional(field.type)}:
+            argument = setting.upper()
+            raise UsageError(f"{command}: {argument} has no flag; expected it as in: millrace {command} {argument}")
+        similar = hint(setting) or did_you_mean(name, _flag_names(kind, default), "--")
         raise UsageError(f"{command}: unknown flag {flag}{similar}")
     return record
 
@@ -82,6 +86,11 @@ def _flag_names(kind: type[msgspec.Struct], default: msgspec.Struct | None) -> I
             yield name
             if plain_type(field.type) is bool:
                 yield f"no-{name}"
+
+
+def _is_positional(hint: Any) -> bool:
+    """Whether a field of this type is an argument without a flag."""
+    return get_origin(hint) is Annotated and bool(set(get_args(hint)) & set(get_args(Positional[str])[1:]))
 
 
 def plain_type(hint: Any) -> Any:

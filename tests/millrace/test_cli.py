@@ -81,6 +81,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
             ["train", "CartPole-v1", "--algo", "dqn", "--core", "lstm"],
             "train: unknown flag --core; it is one of ppo, a2c, impala alone",
         ),
+        (["train", "--env", "CartPole-v1"], "train: ENV has no flag; expected it as in: millrace train ENV"),
         (["train", "CartPole-v1", "more"], "train: unexpected argument more"),
         (["evaluate", "runs/a", "runs/b", "runs/c"], "evaluate: expected one run, got 3; name one of them"),
         (["record", "runs/a", "runs/b", "--out", "x"], "record: expected one run, got 2; name one of them"),
