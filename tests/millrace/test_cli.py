@@ -94,6 +94,10 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
             ["train", "CartPole-v1", "--preset", "CartPole"],
             "preset CartPole: ppo has none of this name; did you mean CartPole-v1?",
         ),
+        (
+            ["train", "--preset", "cartpole-dqn", "--algo", "ppo"],
+            "preset cartpole-dqn: unknown setting n_step; it is one of dqn, sac, td3 alone",
+        ),
         (["train", "--config", "/no.toml"], "config file /no.toml cannot be read: No such file or directory"),
         (["plot"], "plot: which runs? expected run folders, as in: millrace plot runs/*"),
         (["plot", "/no"], "run /no: expected a run folder to plot, got no such folder"),
