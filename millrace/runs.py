@@ -259,7 +259,7 @@ def train(
     file, run = (None if path is None else Path(path) for path in (config, resume))
     if run == AUTO:
         run = newest_run(resolve(name, file=file, preset=preset, **keywords))
-        file = None if run else file
+        file, preset = (None, "none") if run else (file, preset)
     settings = resolve(name, file=file, resume=run, preset=preset, **keywords)
     objects = {name: made for name, made in keywords.items() if callable(made)}
     objects |= {} if isinstance(env, str) else {"env": env}

@@ -61,8 +61,9 @@ def _read_layers(command: str, argv: list[str], resumed: Path | None = None) -> 
     except UsageError:  # perhaps because another algorithm has a flag of the same name and another type
         first = parse(without_help, default=RunFlags(algo="", algorithm=AlgorithmConfig()), ignore_unknown=True)
     resume = resumed if first.resume == AUTO else first.resume
-    file = None if resumed else first.config  # a resumed run already contains the settings of its --config
-    below = functools.partial(lower_layers, algo=first.algo or None, file=file, resume=resume, preset=first.preset)
+    # A run that `--resume auto` found already contains the settings of its --config and --preset.
+    file, preset = (None, "none") if resumed else (first.config, first.preset)
+    below = functools.partial(lower_layers, algo=first.algo or None, file=file, resume=resume, preset=preset)
     algorithm = below("").algorithm
     argv, without_help = _none_for_tyro(argv, algorithm), _none_for_tyro(without_help, algorithm)
     if type(algorithm) is not type(first.algorithm):  # then the values of its own flags may have been mistaken for ENV

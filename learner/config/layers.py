@@ -72,6 +72,8 @@ def lower_layers(
     if resume is not None:
         if file is not None:
             raise UsageError(f"a config file ({file}) or a run to resume ({resume}): expected one, got both")
+        if preset not in ("auto", "none"):
+            raise UsageError(f"a preset ({preset}) or a run to resume ({resume}): expected one, got both")
         file, preset = resume / "config.toml", "none"
         if not file.is_file():
             raise UsageError(f"run {resume}: expected a run folder with a config.toml to resume, got none")

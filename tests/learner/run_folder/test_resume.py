@@ -13,6 +13,7 @@ from learner.config.layers import resolve
 from learner.run_folder.resume import newest_run
 from learner.run_folder.run_folder import RunFolder
 from millrace.launch import local_run
+from protocol.errors import UsageError
 
 HOURS = 3_600.0
 
@@ -76,6 +77,8 @@ def test_a_run_by_name_is_found_again(tmp_path: Path) -> None:
     assert (config.algo, resume) == ("dqn", None)
     run = a_run(config, HOURS)
     assert read_config("train", flags) == (config, run)
+    with pytest.raises(UsageError, match=r"a preset \(cartpole-dqn\) or a run to resume \(.*\): expected one, got both"):
+        read_config("train", [*flags[:-1], str(run)])
 
 
 def test_in_python_it_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,5 +92,6 @@ def test_in_python_it_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     millrace.train("CartPole-v1", resume="auto", run_dir=str(tmp_path), gamma=0.5)
     run = a_run(asked[0][0], HOURS)
     millrace.train("CartPole-v1", resume="auto", run_dir=str(tmp_path))
-    assert [resume for _, resume in asked] == [None, run]
-    assert asked[1][0] == asked[0][0]
+    millrace.train("CartPole-v1", resume="auto", run_dir=str(tmp_path), preset="CartPole-v1")
+    assert [resume for _, resume in asked] == [None, run, run]
+    assert asked[2][0] == asked[1][0] == asked[0][0]
