@@ -66,7 +66,9 @@ def test_the_vectorized_form_shows_rewards_and_ends_as_the_loop_does(
         {"fire_on_reset": True},
         {"clip_rewards": True},
         {"terminal_on_life_loss": True},
+        {"fire_after_life_loss": True},
         {"fire_on_reset": True, "clip_rewards": True, "terminal_on_life_loss": True},
+        {"fire_on_reset": True, "fire_after_life_loss": True, "terminal_on_life_loss": True},
     ],
     ids=lambda settings: " ".join(settings),
 )
@@ -99,13 +101,43 @@ def test_settings_mean_the_same_in_the_vectorized_form_as_in_the_loop(game: str,
     [
         ({"mode": 0}, "cannot make it: got an unexpected keyword argument 'mode'; use"),
         ({"noop_max": 0}, "envpool: noop_max: expected at least 1, got 0"),
-        ({"fire_on_reset": True, "terminal_on_life_loss": True}, "envpool: it presses FIRE after each lost life"),
+        ({"fire_on_reset": True, "terminal_on_life_loss": True}, "expected fire_after_life_loss True, got False"),
+        ({"fire_on_reset": True, "fire_after_life_loss": True}, "expected fire_after_life_loss False, got True"),
     ],
 )
 @envpool
 def test_settings_that_mean_something_else_in_envpool_are_refused(settings: dict[str, Any], says: str) -> None:
     with pytest.raises(UsageError, match=says):
         envpool_spec(EnvSpec(BREAKOUT.id, {"game": "Breakout", **settings}))
+
+
+@pytest.mark.parametrize("kind", ["loop", "native"])
+@pytest.mark.parametrize("terminal_on_life_loss", [False, True])
+@pytest.mark.parametrize("fires", [False, True])
+def test_a_policy_that_never_presses_fire_plays_on_only_with_fire_after_life_loss(
+    kind: str, terminal_on_life_loss: bool, fires: bool
+) -> None:
+    settings = {"fire_on_reset": True, "terminal_on_life_loss": terminal_on_life_loss, "fire_after_life_loss": fires}
+    copies = OPEN[kind](EnvSpec(BREAKOUT.id, {**BREAKOUT.kwargs, "noop_max": 0, **settings}), 2)
+    copies.reset([3, 4], no_pulse)
+    ends = np.zeros(2, int)
+    for _ in range(400):
+        ends += copies.step(np.zeros(2, int), no_pulse).terminated
+    copies.close()
+    if terminal_on_life_loss:
+        assert (ends >= 5).all() if fires else (ends == 1).all()
+    else:
+        assert (ends >= 1).all() if fires else (ends == 0).all()
+
+
+def test_fire_is_pressed_only_in_games_that_have_it() -> None:
+    """Freeway's first action after the no-op action is UP."""
+    for game, presses in (("Freeway", False), ("Breakout", True)):
+        settings = {"game": game, "fire_after_life_loss": True}
+        one, several = atari.make_game(**settings), atari.make_games(1, **settings)
+        assert isinstance(one, atari._FiresAfterLives) == isinstance(several, atari._VectorFiresAfterLives) == presses
+        one.close()
+        several.close()
 
 
 def test_after_a_lost_life_the_same_game_goes_on_until_it_has_ended_or_a_seed_is_given() -> None:

@@ -39,7 +39,11 @@ class GameSettings:
     noop_max: int = 30
     """A game starts with up to so many no-op actions, a random number. 0: it always starts in the same state."""
     fire_on_reset: bool = False
-    """A game starts with the action FIRE, where the game has it. After a lost life the policy must press it."""
+    """A game starts with the action FIRE, where the game has it."""
+    fire_after_life_loss: bool = False
+    """The action after each lost life is FIRE, where the game has it, whatever the policy chose. Otherwise the policy must
+    press it in games that wait for it, such as Breakout.
+    """
     terminal_on_life_loss: bool = False
     """An episode ends with each life, and the next one goes on with the same game. Returns are then those of lives:
     evaluate without it. envpool makes no-op actions after each life.
@@ -66,9 +70,12 @@ def make_game(**kwargs: Any) -> gymnasium.Env[Any, Any]:
     env = gymnasium.make(f"ale_py:ALE/{settings.game}-v5", frameskip=1, disable_env_checker=True, **options)
     if settings.fire_on_reset:
         env = _StartsGames(env)
+    has_fire = _has_fire(env)
     env = FrameStackObservation(AtariPreprocessing(env, settings.noop_max, SKIP, SIDE), FRAMES, padding_type="zero")
     if settings.clip_rewards:
         env = ClipReward(env, -1.0, 1.0)
+    if settings.fire_after_life_loss and has_fire:
+        env = _FiresAfterLives(env)
     return _EndsWithLives(env) if settings.terminal_on_life_loss else env
 
 
@@ -90,6 +97,8 @@ def make_games(num_envs: int, **kwargs: Any) -> VectorEnv[Any, Any, Any]:
         num_threads=1,
         **options,
     )
+    if settings.fire_after_life_loss and made.unwrapped.ale.get_action_set()[FIRE].value == FIRE:  # type: ignore[attr-defined]
+        made = _VectorFiresAfterLives(made)
     return _StepAfterLives(made) if settings.terminal_on_life_loss else made
 
 
@@ -98,7 +107,7 @@ class _StartsGames(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
         super().__init__(env)
-        self._has_fire = env.unwrapped.get_action_meanings()[FIRE] == "FIRE"  # type: ignore[attr-defined]
+        self._has_fire = _has_fire(env)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         first = self.env.reset(seed=seed, options=options)
@@ -106,6 +115,47 @@ class _StartsGames(gymnasium.Wrapper[Any, Any, Any, Any]):
             return first
         observation, _, _, _, info = self.env.step(FIRE)
         return observation, info
+
+
+class _FiresAfterLives(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Plays FIRE in the step after a lost life, in place of the action that it is given."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self._lives = 0
+        self._fires = False  # in the next step
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        first = self.env.reset(seed=seed, options=options)
+        self._lives, self._fires = _lives_left(self.env), False
+        return first
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        result = self.env.step(FIRE if self._fires else action)
+        before, self._lives = self._lives, _lives_left(self.env)
+        self._fires = self._lives < before
+        return result
+
+
+class _VectorFiresAfterLives(VectorWrapper):
+    """The same for the emulator's vectorized form. A step that resets a game ignores its action."""
+
+    def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
+        super().__init__(env)
+        self._lives = np.zeros(env.num_envs, int)
+        self._fires = np.zeros(env.num_envs, bool)  # in the next step
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._lives[:], self._fires[:] = info["lives"], False
+        return observation, info
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        result = self.env.step(np.where(self._fires, FIRE, actions))
+        lives = result[-1]["lives"]
+        self._fires = lives < self._lives
+        self._lives[:] = lives
+        return result
 
 
 class _EndsWithLives(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -123,19 +173,15 @@ class _EndsWithLives(gymnasium.Wrapper[Any, Any, Any, Any]):
             goes_on = not (terminated or truncated)
         if not goes_on:
             observation, info = self.env.reset(seed=seed, options=options)
-        self._lives = self._lives_left()
+        self._lives = _lives_left(self.env)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)
-        before, self._lives = self._lives, self._lives_left()
+        before, self._lives = self._lives, _lives_left(self.env)
         life_lost = self._lives < before
         self._goes_on = life_lost and not (terminated or truncated)
         return observation, reward, terminated or life_lost, truncated, info
-
-    def _lives_left(self) -> int:
-        lives: int = self.env.unwrapped.ale.lives()  # type: ignore[attr-defined]
-        return lives
 
 
 class _StepAfterLives(VectorWrapper):
@@ -162,6 +208,15 @@ class _StepAfterLives(VectorWrapper):
         return observation, np.where(plays, reward, 0), terminated, truncated, info
 
 
+def _has_fire(env: gymnasium.Env[Any, Any]) -> bool:
+    return env.unwrapped.get_action_meanings()[FIRE] == "FIRE"  # type: ignore[attr-defined, no-any-return]
+
+
+def _lives_left(env: gymnasium.Env[Any, Any]) -> int:
+    lives: int = env.unwrapped.ale.lives()  # type: ignore[attr-defined]
+    return lives
+
+
 def _silence_emulator() -> None:
     """Otherwise the emulator prints its name and version in every process."""
     import ale_py
@@ -174,10 +229,11 @@ def _envpool(**kwargs: Any) -> tuple[str, dict[str, Any]]:
     settings = GameSettings(**kwargs)
     if settings.noop_max < 1:
         raise UsageError(f"envpool: noop_max: expected at least 1, got {settings.noop_max}; use --vector native or loop")
-    if settings.fire_on_reset and settings.terminal_on_life_loss:
+    fires = settings.fire_on_reset and settings.terminal_on_life_loss
+    if settings.fire_after_life_loss != fires:
         raise UsageError(
-            "envpool: it presses FIRE after each lost life, not at the start of a game only; use --vector native or loop, "
-            "or one of fire_on_reset and terminal_on_life_loss"
+            "envpool: it presses FIRE after each lost life exactly if fire_on_reset and terminal_on_life_loss are True: "
+            f"expected fire_after_life_loss {fires}, got {settings.fire_after_life_loss}; use --vector native or loop"
         )
     options = {
         "noop_max": settings.noop_max,
