@@ -241,7 +241,7 @@ class DQNConfig(OffPolicyConfig, frozen=True):
 
 
 class ContinuousConfig(OffPolicyConfig, frozen=True):
-    """Settings of SAC and TD3: the defaults of Stable-Baselines3."""
+    """Settings of SAC and TD3: the defaults of Stable-Baselines3, except for TD3's network and exploration noise."""
 
     rollout_steps: Free[Count] = 8
     """T, the steps of each env copy in a rollout."""

@@ -53,7 +53,7 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """
     max_lag: Free[Natural] = 0
     """Largest lag of a rollout: how many versions its weights may be older than the learner's. 0: workers and learner take
-    turns, and results are reproducible. Above 0: both run at the same time; impala and dqn are made for that.
+    turns, and results are reproducible. Above 0: both run at the same time; impala, dqn, sac and td3 are made for that.
     """
     vector: Free[Literal["auto", "loop", "native", "envpool"]] = "auto"
     """How the env copies of a lane are stepped. loop: one after another. native: by the environment's own vector version.
