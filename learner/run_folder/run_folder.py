@@ -281,6 +281,11 @@ class RunFolder:
 
         if not (self.path / POLICY_JSON).is_file():
             raise UsageError(f"run {self.path}: expected a {POLICY_JSON}, got none; has the run saved its policy yet?")
+        if which == "best" and not (self.path / POLICY_ARRAYS[which]).is_file():
+            raise UsageError(
+                f"run {self.path}: expected a {POLICY_ARRAYS[which]}, got none; only evaluations while it trains "
+                "(--eval-every) write it"
+            )
         try:
             description = _decode_description((self.path / POLICY_JSON).read_bytes())
             content = (self.path / POLICY_ARRAYS[which]).read_bytes()
