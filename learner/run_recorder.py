@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from learner.algorithms import Algorithm
+from learner.algorithms.updates import check_weights
 from learner.callbacks.callbacks import Callbacks
 from learner.config.config import Config
 from learner.evaluations import Evaluations, warn_on_error
@@ -35,7 +36,7 @@ from learner.run_folder.results import Best, Summary
 from learner.run_folder.run_folder import RunFolder
 from learner.run_folder.versions import versions
 from learner.run_state import RunState
-from protocol.arrays import Array
+from protocol.arrays import Array, Floats
 from protocol.bounds import one_line
 from protocol.errors import RunError, first_line
 from protocol.rollout import Batch
@@ -148,6 +149,12 @@ class RunRecorder:
         if self.version == 1:
             warn_on_error(lambda: self._folder.write_images(image_samples(batch.obs, self._spec.policy.observation)))
 
+    def weights(self) -> tuple[Floats, Floats]:
+        """The parameters and buffers of the algorithm. Raises `UsageError` if no worker could act with them."""
+        weights = self._algorithm.weights()
+        check_weights(weights, self._spec.policy, type(self._algorithm).__name__)
+        return weights
+
     def env_attributes(self) -> Array | None:
         """The attributes of env copies that the weights of this version carry."""
         return self._requests.attributes.table(self.version)
@@ -198,9 +205,7 @@ class RunRecorder:
             return
         warn_on_error(lambda: self._save_checkpoint(state))
         policy, env, facts = self._spec.policy, self._spec.env, self._spec.facts
-        warn_on_error(
-            lambda: self._folder.write_policy(policy, env, *self._algorithm.weights(), facts=facts, masked=self._spec.masked)
-        )
+        warn_on_error(lambda: self._folder.write_policy(policy, env, *self.weights(), facts=facts, masked=self._spec.masked))
         self._took_to_save(time.monotonic() - began_s)
         if self._saved == self._position() and self._callbacks.wants("on_checkpoint"):
             self._requests.closed = "expected it earlier than in on_checkpoint: the checkpoint would lack it"

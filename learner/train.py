@@ -5,8 +5,9 @@ An evaluation belongs to one version: it comes after that version's checkpoint, 
 With `max_lag` 0 the learner publishes weights, gathers rollouts and learns, one after the other. With `max_lag` 1 the
 workers already collect the next rollouts while the learner learns. The loop is the same: only the number of tickets differs.
 
-Rule: whatever ends the run, the state after the last whole update is saved first. An update that raises, or that makes
-weights which are not finite, is taken back; so is one whose rollouts a callback does not accept.
+Rule: whatever ends the run, the state after the last whole update is saved first. An update is taken back if it raises, or
+makes weights that are not finite or that no worker could act with, or returns metrics that are no numbers; so is one whose
+rollouts a callback does not accept.
 """
 
 from __future__ import annotations
@@ -16,9 +17,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from learner.algorithms import Algorithm
+from learner.algorithms.updates import numbers
 from learner.rollout_service.service import RolloutService
 from learner.rollouts.lanes import AcceptedRollout
 from learner.run_recorder import RunRecorder
+from protocol.arrays import Floats
 from protocol.errors import RunError
 from protocol.rollout import stack_rollouts
 
@@ -44,15 +47,15 @@ def train(
         service.pulse()
         check_time()
 
-    def publish() -> None:
-        weights, attributes = algorithm.weights(), recorder.env_attributes()
+    def publish(weights: tuple[Floats, Floats]) -> None:
+        attributes = recorder.env_attributes()
         service.publish(recorder.version, *weights, deal=recorder.training_goes_on(), env_attributes=attributes)
 
     recorder.save()
     try:
         service.wait_for_workers(workers)
         recorder.start()
-        publish()
+        publish(recorder.weights())
         recorder.evaluate_if_due()
         while (reason := recorder.stop_reason()) is None:
             arrived = service.gather()
@@ -62,11 +65,12 @@ def train(
                     service.not_used(arrived)
                     continue
                 batch = stack_rollouts([one.rollout for one in arrived], [one.fresh for one in arrived])
-                metrics = algorithm.update(batch, pulse)
+                metrics = numbers(algorithm.update(batch, pulse), type(algorithm).__name__)
+                weights = recorder.weights()
                 if not algorithm.is_finite():
                     raise RunError(f"learner: update {recorder.version}: the weights are not finite after it; {ADVICE}")
             recorder.count(batch)
-            publish()
+            publish(weights)
             recorder.updated(metrics, time.monotonic() - began_s)
         recorder.save()
         recorder.conclude()

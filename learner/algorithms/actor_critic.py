@@ -30,7 +30,7 @@ from learner.algorithms.returns import EpisodeEnds, gae
 from learner.algorithms.updates import check_finite, scheduled
 from learner.config.hyperparameters import ActorCriticConfig, AlgorithmConfig, PolicyGradientConfig, RecurrentConfig
 from protocol.arrays import Array, Bools, Floats
-from protocol.errors import RunError
+from protocol.errors import RunError, UsageError
 from protocol.policy.features import features, normalize
 from protocol.policy.masks import FORBIDDEN
 from protocol.policy.networks import ActorCriticNetwork, RecurrentInput
@@ -254,8 +254,7 @@ class ActorCritic(Algorithm):
         else:
             loss, logged = self._checked_loss(rows)
             loss.backward()  # type: ignore[no-untyped-call]
-            named = {"loss": loss, **logged}
-            numbers = {name: torch.as_tensor(each, dtype=loss.dtype, device=loss.device) for name, each in named.items()}
+            numbers = {"loss": loss} | {name: self._logged(name, each, loss) for name, each in logged.items()}
         read = torch.stack((*(number.detach() for number in numbers.values()), gradient.norm())).tolist()
         return dict(zip((*numbers, "grad_norm"), read, strict=True))
 
@@ -263,10 +262,22 @@ class ActorCritic(Algorithm):
         match self.loss(rows):
             case (Tensor() as loss, Mapping() as logged) if loss.dim() == 0 and loss.requires_grad:
                 return loss, logged
-        raise TypeError(
+        raise UsageError(
             f"{type(self).__name__}.loss: expected a tensor of no dimension that depends on log_prob_now, entropy or value "
             "of its rows, and a dict of numbers to log"
         )
+
+    def _logged(self, name: str, number: Any, like: Tensor) -> Tensor:
+        """A number that `loss` logs, as a tensor of no dimension. Raises `UsageError` for anything else."""
+        got = type(number).__name__
+        try:
+            found = torch.as_tensor(number, dtype=like.dtype, device=like.device)
+            if found.numel() == 1:
+                return found.reshape(())
+            got = f"{got} {list(found.shape)}; log its mean"
+        except (TypeError, ValueError, RuntimeError):
+            pass
+        raise UsageError(f"{type(self).__name__}.loss: {name}: expected one number to log, got {got}")
 
     def _check_spread_of_actions(self) -> None:
         """Raise `RunError` before Box actions overflow: workers would be refused for them, one after the other."""
@@ -511,5 +522,9 @@ def _explained_variance(estimates: Estimates) -> float:
 
 
 def _means(measured: Sequence[Metrics]) -> Metrics:
-    """The mean of each metric, with the prefix "train/"; nothing if there are no measurements."""
-    return {f"train/{name}": sum(each[name] for each in measured) / len(measured) for name in (measured or [{}])[0]}
+    """The mean of each metric over the measurements that have it, with the prefix "train/"."""
+    by_name: dict[str, list[float]] = {}
+    for each in measured:
+        for name, number in each.items():
+            by_name.setdefault(name, []).append(number)
+    return {f"train/{name}": sum(found) / len(found) for name, found in by_name.items()}

@@ -21,6 +21,7 @@ import numpy as np
 import torch
 
 from learner.algorithms import Algorithm, algorithm_class
+from learner.algorithms.updates import wrong_weights
 from learner.config.algorithm_names import name_of, settings_record
 from learner.config.hyperparameters import AlgorithmConfig
 from learner.conformance.same_bits import first_difference
@@ -37,7 +38,6 @@ from learner.conformance.toy_batches import (
 from protocol.bounds import one_line
 from protocol.errors import UsageError, first_line
 from protocol.policy.encoder import describe_encoder
-from protocol.policy.layout import acting_size, buffer_size
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
 
@@ -155,18 +155,13 @@ def _with_batches(subject: Subject, found: list[str]) -> Subject:
 
 
 def weights_have_the_policy_s_shape(subject: Subject) -> Iterator[str]:
-    """Float32, as many as the policy has, finite, and copies."""
+    """Float32, as many as the policy has, and finite."""
     weights: Any = subject.new().weights()
-    if not isinstance(weights, tuple) or len(weights) != 2:
-        yield f"weights: expected a pair of arrays, got {type(weights).__name__}"
+    if wrong := [*wrong_weights(weights, subject.policy)]:
+        yield from wrong
         return
-    sizes = {"parameters": acting_size(subject.policy), "buffers": buffer_size(subject.policy)}
-    for (name, size), array in zip(sizes.items(), weights, strict=True):
-        if not isinstance(array, np.ndarray):
-            yield f"weights: {name}: expected a numpy array, got {type(array).__name__}"
-        elif array.dtype != np.float32 or array.shape != (size,):
-            yield f"weights: {name}: expected float32[{size}], got {array.dtype}{list(array.shape)}"
-        elif not np.isfinite(array).all():
+    for name, array in zip(("parameters", "buffers"), weights, strict=True):
+        if not np.isfinite(array).all():
             yield f"weights: {name}: expected finite numbers, got {array[~np.isfinite(array)][0]}"
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from learner.run_folder.atomic_write import TEMPORARY, write_atomically
-from protocol.errors import CheckpointError, first_line
+from protocol.errors import CheckpointError, UsageError, first_line
 
 FORMAT = 1
 FOLDER = "checkpoints"
@@ -36,7 +36,7 @@ def save(folder: Path, state: dict[str, Any], env_steps: int, keep: int) -> Path
     """Write a checkpoint into the run folder. Of those up to it, remove all but the newest `keep`.
 
     A later one stays: a resumed run passed over it because it is damaged. Raises `CheckpointError` if it cannot be written;
-    older checkpoints then stay untouched. Raises TypeError if the state contains something that could not be read back.
+    older checkpoints then stay untouched. Raises `UsageError` if the state contains something that could not be read back.
     """
     import torch
 
@@ -122,9 +122,8 @@ def _check_plain(value: object, where: str) -> None:
         case torch.Tensor():
             pass
         case _ if type(value) not in (bool, int, float, str, bytes, type(None)):
-            raise TypeError(
-                f"checkpoint: {where}: expected tensors and plain data, got {type(value).__module__}.{type(value).__name__}"
-            )
+            got = f"{type(value).__module__}.{type(value).__name__}"
+            raise UsageError(f"checkpoint: {where}: expected tensors and plain data, got {got}; mend state_dict")
 
 
 def _why(error: Exception) -> str:

@@ -92,7 +92,7 @@ def test_an_update_gets_what_the_coordinator_says_of_each_rollout() -> None:
     batches: list[Batch] = []
     algorithm = SimpleNamespace(
         weights=lambda: (),
-        update=lambda batch, pulse: batches.append(batch),
+        update=lambda batch, pulse: batches.append(batch) or {},
         remember=lambda: None,
         is_finite=lambda: True,
     )

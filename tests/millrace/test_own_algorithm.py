@@ -11,14 +11,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from safetensors.numpy import load_file
 
 import millrace
 from examples.own_loss import ClippedPlus
 from learner.algorithms import algorithm_class
+from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.run_folder import RunFolder
 from millrace.cli.main import main
 from millrace.testing import check_algorithm
+from protocol.errors import UsageError
 
 NAME = "examples.own_loss:ClippedPlus"
 SMALL: dict[str, Any] = {
@@ -120,3 +123,90 @@ def test_an_error_in_its_code_names_the_place_and_keeps_the_run(
     assert said.startswith("millrace: my_broken_loss.py:7: RuntimeError: The size of tensor a (2) must match"), said
     assert "--resume" in said
     assert said.endswith("--debug shows the traceback")
+
+
+class ScalarsOfLibraries(ClippedPlus):
+    def update(self, batch: Any, pulse: Any) -> Any:
+        return super().update(batch, pulse) | {"one": np.float32(0.5), "two": torch.tensor(0.25), "three": 3}
+
+
+class LogsNowAndThen(ClippedPlus):
+    steps = 0
+
+    def loss(self, rows: Any) -> Any:
+        loss, numbers = super().loss(rows)
+        self.steps += 1
+        return loss, {**numbers, **({"odd": 7.0} if self.steps % 2 else {})}
+
+
+def test_metrics_may_be_scalars_of_numpy_and_torch_and_may_be_missing_in_some_steps(tmp_path: Path) -> None:
+    rows = read_rows(trained(tmp_path / "a", algo=ScalarsOfLibraries) / "metrics.jsonl")
+    assert [(row["train/one"], row["train/two"], row["train/three"]) for row in rows] == [(0.5, 0.25, 3)] * len(rows)
+    assert rows
+    rows = read_rows(trained(tmp_path / "b", algo=LogsNowAndThen, batch_size=16) / "metrics.jsonl")
+    assert [row["train/odd"] for row in rows] == [7.0] * len(rows), "the mean over the steps that logged it"
+
+
+class LogsText(ClippedPlus):
+    def loss(self, rows: Any) -> Any:
+        loss, numbers = super().loss(rows)
+        return loss, {**numbers, "odd": "x"}
+
+
+class LogsRows(ClippedPlus):
+    def loss(self, rows: Any) -> Any:
+        loss, numbers = super().loss(rows)
+        return loss, {**numbers, "odd": torch.zeros(3)}
+
+
+class ReturnsRows(ClippedPlus):
+    def loss(self, rows: Any) -> Any:
+        return rows.value, {}
+
+
+class ReturnsText(ClippedPlus):
+    def update(self, batch: Any, pulse: Any) -> Any:
+        return super().update(batch, pulse) | {"train/odd": "x"}
+
+
+class ReturnsNothing(ClippedPlus):
+    def update(self, batch: Any, pulse: Any) -> Any:
+        super().update(batch, pulse)
+
+
+class TooFewWeights(ClippedPlus):
+    def weights(self) -> Any:
+        parameters, buffers = super().weights()
+        return parameters[:-1], buffers
+
+
+class DoublesAfterAnUpdate(ClippedPlus):
+    def weights(self) -> Any:
+        parameters, buffers = super().weights()
+        return (parameters.astype(np.float64) if self.version else parameters), buffers
+
+
+class SavesAnArray(ClippedPlus):
+    def state_dict(self) -> Any:
+        return super().state_dict() | {"odd": np.zeros(2)}
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "says"),
+    [
+        (LogsText, "LogsText.loss: odd: expected one number to log, got str"),
+        (LogsRows, "LogsRows.loss: odd: expected one number to log, got Tensor [3]; log its mean"),
+        (ReturnsRows, "ReturnsRows.loss: expected a tensor of no dimension that depends on"),
+        (ReturnsText, "ReturnsText.update: metrics: expected a name and a number, got str for 'train/odd'"),
+        (ReturnsNothing, "ReturnsNothing.update: expected a dict of metrics, got NoneType"),
+        (TooFewWeights, "TooFewWeights.weights: parameters: expected float32[58], got float32[57]"),
+        (DoublesAfterAnUpdate, "DoublesAfterAnUpdate.weights: parameters: expected float32[58], got float64[58]"),
+        (SavesAnArray, "state['algorithm']['odd']: expected tensors and plain data, got numpy.ndarray"),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_what_an_algorithm_returns_wrongly_is_said_in_one_line(tmp_path: Path, algorithm: type, says: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        trained(tmp_path, algo=algorithm)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)

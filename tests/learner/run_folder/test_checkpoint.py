@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from learner.run_folder import checkpoint
-from protocol.errors import CheckpointError
+from protocol.errors import CheckpointError, UsageError
 
 
 def state(number: float) -> dict[str, Any]:
@@ -177,6 +177,6 @@ def test_reading_runs_no_code(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("stray", [np.float64(1.0), np.zeros(3), {1, 2}, np.random.default_rng(0)])
 def test_a_state_that_could_not_be_read_back_is_not_written(tmp_path: Path, stray: object) -> None:
-    with pytest.raises(TypeError, match=r"state\['inner'\]\[0\]: expected tensors and plain data, got"):
+    with pytest.raises(UsageError, match=r"state\['inner'\]\[0\]: expected tensors and plain data, got"):
         checkpoint.save(tmp_path, {"inner": [stray]}, 100, keep=3)
     assert not (tmp_path / "checkpoints").exists()
