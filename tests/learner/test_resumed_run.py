@@ -90,9 +90,14 @@ def test_an_update_gets_what_the_coordinator_says_of_each_rollout() -> None:
         for lane, (sequence, fresh) in sequences_and_fresh.items()
     ]
     batches: list[Batch] = []
+
+    def update(batch: Batch, pulse: object) -> dict[str, float]:
+        batches.append(batch)
+        return {}
+
     algorithm = SimpleNamespace(
         weights=lambda: (),
-        update=lambda batch, pulse: batches.append(batch) or {},
+        update=update,
         remember=lambda: None,
         is_finite=lambda: True,
     )
