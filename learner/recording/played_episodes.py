@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -39,9 +39,11 @@ class Played(NamedTuple):
 class PlayedEpisodes:
     """Episodes of a policy, in the order of their seeds."""
 
-    def __init__(self, player: PolicyPlayer, seed: int, *, stochastic: bool = False) -> None:
-        """`stochastic`: draw actions from the policy; otherwise take the most probable ones."""
-        self._player, self._seeds, self._stochastic = player, recording_seeds(seed), stochastic
+    def __init__(self, player: PolicyPlayer, seeds: Iterable[int], *, stochastic: bool = False) -> None:
+        """`seeds`: the reset seed of each episode. `stochastic`: draw actions from the policy; otherwise take the most
+        probable ones.
+        """
+        self._player, self._seeds, self._stochastic = player, iter(seeds), stochastic
         self._to_env_action = action_converter_of(player.policy.spec)
         self._episodes = self._steps = self._bytes = 0  # played so far
 
@@ -61,7 +63,7 @@ class PlayedEpisodes:
                     break
 
     def play(self, count: int, longest: int, *, frames: bool = False) -> list[Played]:
-        """The next episodes, of at most `longest` steps each, with `frames` if wanted."""
+        """The next episodes, of at most `longest` steps each, with `frames` if wanted. There must be so many seeds."""
         seeds = [next(self._seeds) for _ in range(count)]
         rows: list[list[EpisodeRows]] = [[] for _ in seeds]
         plan = EvaluationPlan(

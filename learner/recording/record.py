@@ -16,7 +16,7 @@ import numpy as np
 from learner.policy_player import PolicyPlayer
 from learner.recording.minari import MinariDataset
 from learner.recording.npy_rows import NpyRows
-from learner.recording.played_episodes import PlayedEpisodes
+from learner.recording.played_episodes import PlayedEpisodes, recording_seeds
 from learner.recording.training_recorder import EnvironmentOfDataset
 from protocol.errors import UsageError
 
@@ -67,7 +67,7 @@ def record(
     returns: list[float] = []
     taken = cut = 0
     with NpyRows(npy) as rows, MinariDataset(dataset_id, env, about) as dataset:
-        for episode, was_cut in PlayedEpisodes(player, seed, stochastic=stochastic).until(steps):
+        for episode, was_cut in PlayedEpisodes(player, recording_seeds(seed), stochastic=stochastic).until(steps):
             dataset.add(episode)
             rows.add(episode)
             returns.append(episode.episode_return)

@@ -1,7 +1,7 @@
 """`millrace evaluate --video`: greedy episodes as mp4 files. Workers play and render; this file only encodes.
 
-Rule: a video is in the folder whole or not at all. Its name has the seed and the number of the episode, so the same
-episode overwrites its old video.
+Rule: the episodes are the first ones that `millrace evaluate` plays with the same seed. A video is in the folder whole or
+not at all. Its name has the seed and the number of the episode, so the same episode overwrites its old video.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 
 from learner.policy_player import PolicyPlayer
 from learner.recording.played_episodes import PlayedEpisodes
-from learner.rollouts.evaluation_tickets import PlayedEpisode, evaluation_of
+from learner.rollouts.evaluation_tickets import PlayedEpisode, episode_seeds, evaluation_of
 from learner.run_folder.results import Evaluation
 from protocol.errors import EnvironmentFailed, RunError, UsageError
 
@@ -40,7 +40,8 @@ def record_videos(
 ) -> tuple[Evaluation, list[Path]]:
     """Have the workers of `player` play greedy episodes, and write a video of each.
 
-    `max_steps`: env steps of all episodes together at most; each gets an equal share, and at most `LONGEST_EPISODE`.
+    `seed`: of the episodes, as of `EvaluationPlan.of`. `max_steps`: env steps of all episodes together at most; each gets an
+    equal share, and at most `LONGEST_EPISODE`.
     Returns the evaluation and the paths of the videos. Raises `UserFacingError`, with a one-line message, if videos cannot
     be made.
     """
@@ -53,7 +54,7 @@ def record_videos(
     if not (isinstance(frames_per_s, int | float) and 0 < frames_per_s <= MOST_FRAMES_PER_S):
         frames_per_s = FRAMES_PER_S
     folder = run / FOLDER
-    episodes_played = PlayedEpisodes(player, seed)
+    episodes_played = PlayedEpisodes(player, episode_seeds(seed, episodes))
     longest = min(LONGEST_EPISODE, max(1, max_steps // episodes))
     results: list[PlayedEpisode] = []
     videos: list[Path] = []

@@ -60,7 +60,7 @@ class EvaluationPlan:
 
 
 def episode_seeds(seed: int, episodes: int) -> tuple[int, ...]:
-    """The reset seed of each episode."""
+    """The reset seed of each episode. Fewer episodes have the first of these seeds."""
     return tuple(int(state >> 1) for state in np.random.SeedSequence(seed).generate_state(episodes))
 
 

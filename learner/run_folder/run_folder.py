@@ -282,10 +282,8 @@ class RunFolder:
         if not (self.path / POLICY_JSON).is_file():
             raise UsageError(f"run {self.path}: expected a {POLICY_JSON}, got none; has the run saved its policy yet?")
         if which == "best" and not (self.path / POLICY_ARRAYS[which]).is_file():
-            raise UsageError(
-                f"run {self.path}: expected a {POLICY_ARRAYS[which]}, got none; only evaluations while it trains "
-                "(--eval-every) write it"
-            )
+            expected = f"expected the best policy, {POLICY_ARRAYS[which]}, got none"
+            raise UsageError(f"run {self.path}: {expected}; only a run with eval_every has one: take the final policy")
         try:
             description = _decode_description((self.path / POLICY_JSON).read_bytes())
             content = (self.path / POLICY_ARRAYS[which]).read_bytes()

@@ -18,6 +18,8 @@ from learner.callbacks.callbacks import Callbacks
 from learner.config.config import Config
 from learner.config.hyperparameters import HYPERPARAMETERS
 from learner.config.layers import resolve
+from learner.policy_player import PolicyPlayer
+from learner.rollouts.evaluation_tickets import EvaluationPlan
 from learner.run_folder import checkpoint
 from learner.run_folder.metrics_log import MetricsLog
 from learner.run_folder.progress import Progress
@@ -429,6 +431,12 @@ def test_evaluate_says_mean_and_deviation(tmp_path: Path, capsys: Captured) -> N
     assert not (run / "videos").exists()
 
 
+def test_a_run_without_a_best_policy_is_told_how_one_is_kept(tmp_path: Path, capsys: Captured) -> None:
+    run = a_run_that_acts(tmp_path)
+    why = "expected the best policy, best.safetensors, got none; only a run with eval_every has one: take the final policy"
+    assert refusal(capsys, "evaluate", str(run), "--best") == f"run {run}: {why}"
+
+
 def test_evaluate_films_a_few_episodes(tmp_path: Path, capsys: Captured) -> None:
     run = a_run_that_acts(tmp_path)
     for _ in range(2):  # the same films, over again
@@ -442,6 +450,24 @@ def test_evaluate_films_a_few_episodes(tmp_path: Path, capsys: Captured) -> None
     assert main(["evaluate", str(run), "--video", "--episodes", "2", "--max-steps", "11"]) == 0
     said, *_ = capsys.readouterr().out.splitlines()
     assert said == "return 5.0 ± 0.0 over 2 episodes, 2 of them cut short, score missing"
+
+
+def test_the_films_are_of_the_first_episodes_that_are_evaluated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    played: list[int] = []
+    play = PolicyPlayer.play
+
+    def noted(self: PolicyPlayer, plan: EvaluationPlan, *rest: Any, **more: Any) -> Any:
+        played.extend(plan.seeds)
+        return play(self, plan, *rest, **more)
+
+    monkeypatch.setattr(PolicyPlayer, "play", noted)
+    run, options = str(a_run_that_acts(tmp_path)), ("--seed", "7", "--transport", "inproc", "--workers", "1")
+    assert main(["evaluate", run, "--video", "--episodes", "3", *options]) == 0
+    filmed = played.copy()
+    played.clear()
+    assert main(["evaluate", run, "--episodes", "5", *options]) == 0
+    assert len(set(played)) == 5
+    assert filmed == played[:3]
 
 
 def test_what_cannot_be_filmed_is_said(tmp_path: Path, capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
