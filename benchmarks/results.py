@@ -10,15 +10,16 @@ from __future__ import annotations
 import argparse
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
 
 from benchmarks.programs import flag
-from benchmarks.scores import EPISODES, Score, comparison, merged, read_published, read_scores, table, write_scores
+from benchmarks.scores import EPISODES, Score, all_scores, comparison, merged, read_published, read_scores, write_scores
 from learner.config.config import TABLES, Config
 from learner.config.layers import config_of_run, resolve
+from learner.config.presets import added, environment_name
 from learner.policy_player import saved_policy
 from learner.rollouts.evaluation_tickets import EvaluationPlan, evaluation_of
 from learner.run_folder.results import Evaluation
@@ -47,7 +48,7 @@ def read(path: Path, *, only_final: bool) -> Score | None:
     if final is None:
         return None
     return Score(
-        env=environment(config),
+        env=environment_name(config.env, config.env_kwargs, config.algo),
         algo=config.algo,
         command=command(config, EVALUATION if only_final else ()),
         env_steps=summary.env_steps,
@@ -65,12 +66,6 @@ def _played(path: Path, config: Config, found: Evaluation | None, which: Which) 
         with policy_player(saved_policy(path, which), PlayingWorkers(config.workers), lambda text: None) as player:
             found = evaluation_of(player.play(plan))
     return None if found is None else found.return_mean
-
-
-def environment(config: Config) -> str:
-    """The environment's id, with the keyword arguments that its preset does not set: `millrace/Atari-v0 game Pong`."""
-    preset = resolve(config.env, algo=config.algo)
-    return shlex.join([config.env, *_added(config.env_kwargs, preset.env_kwargs)])
 
 
 def command(config: Config, leave_out: Sequence[str] = ()) -> str:
@@ -94,16 +89,11 @@ def command(config: Config, leave_out: Sequence[str] = ()) -> str:
 def _words(name: str, value: object, default: object) -> list[str]:
     match value:
         case dict():
-            return [*flag(name, True), *_added(value, default if isinstance(default, dict) else {})]
+            return [*flag(name, True), *added(value, default if isinstance(default, dict) else {})]
         case list() | tuple() if name in REPEATED:
             return [word for one in value for word in flag(name, one)]
         case _:
             return flag(name, value)
-
-
-def _added(table: Mapping[str, object], default: Mapping[str, object]) -> list[str]:
-    """Names and values of the entries of a table that its default does not have."""
-    return [str(word) for key, value in table.items() if default.get(key) != value for word in (key, value)]
 
 
 def main() -> None:
@@ -119,7 +109,7 @@ def main() -> None:
             scores[score.command] = merged(scores.get(score.command), score)
     write_scores(scores.values())
     written = read_scores()
-    tables = iter((table(written), comparison(written, read_published())))
+    tables = iter((all_scores(written), comparison(written, read_published())))
     PAGE.write_text(TABLES_OF_PAGE.sub(lambda old: next(tables), PAGE.read_text()))
     print(PAGE)
 

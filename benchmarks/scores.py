@@ -12,6 +12,8 @@ from pathlib import Path
 
 import msgspec
 
+from benchmarks.markdown_tables import table
+
 SCORES, PUBLISHED = (Path(__file__).with_name(name) for name in ("scores.json", "published_scores.toml"))
 EPISODES = 100
 """greedy episodes of every score of ours"""
@@ -107,23 +109,21 @@ def seeds_text(returns: dict[int, float]) -> str:
     return f"{text} (seed {which} only)" if len(returns) == 1 else f"{text} (seeds {which})"
 
 
-def table(scores: Iterable[Score]) -> str:
-    """The table of docs/results.md."""
-    lines = [
-        "| environment | algorithm | env steps | best | final | seconds | command (for each seed) |",
-        "|---|---|---|---|---|---|---|",
-    ]
+def all_scores(scores: Iterable[Score]) -> str:
+    """The first table of docs/results.md: every score, and the command that repeats it."""
+    head = ("environment", "algorithm", "env steps", "best", "final", "seconds", "command (for each seed)")
+    rows = []
     for score in scores:
         seconds = "–" if score.seconds is None else f"{score.seconds:.0f}"
         env = f"{score.env}, {score.note}" if score.note else score.env
-        cells = (env, score.algo, f"{score.env_steps:,}", seeds_text(score.best), seeds_text(score.final), seconds)
-        lines.append(f"| {' | '.join(cells)} | `{score.command}` |")
-    return "\n".join(lines) + "\n"
+        returns = seeds_text(score.best), seeds_text(score.final)
+        rows.append((env, score.algo, f"{score.env_steps:,}", *returns, seconds, f"`{score.command}`"))
+    return table(head, rows)
 
 
 def comparison(scores: Iterable[Score], published: Sequence[PublishedScore]) -> str:
     """The second table of docs/results.md: the scores for which others have published one of the same algorithm."""
-    lines = ["| environment | algorithm | millrace | published |", "|---|---|---|---|"]
+    rows = []
     for score in scores:
         others = [
             f"{other.system} {return_text(other.returns)} ({steps_text(other.env_steps)})"
@@ -132,5 +132,5 @@ def comparison(scores: Iterable[Score], published: Sequence[PublishedScore]) -> 
         ]
         if others:
             ours = f"{return_text(score.mean())} ({steps_text(score.env_steps)})"
-            lines.append(f"| {score.env} | {score.algo} | {ours} | {', '.join(others)} |")
-    return "\n".join(lines) + "\n"
+            rows.append((score.env, score.algo, ours, ", ".join(others)))
+    return table(("environment", "algorithm", "millrace", "published"), rows)

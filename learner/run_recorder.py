@@ -30,7 +30,7 @@ from learner.run_folder import checkpoint
 from learner.run_folder.env_attributes import EnvAttributes
 from learner.run_folder.episode_window import EpisodeWindow
 from learner.run_folder.metrics_log import MetricsLog
-from learner.run_folder.progress import Progress, Row, named
+from learner.run_folder.progress import Progress, Row, named, steps_per_second
 from learner.run_folder.requests import Requests
 from learner.run_folder.results import Best, Summary
 from learner.run_folder.run_folder import RunFolder
@@ -278,7 +278,6 @@ class RunRecorder:
 
     def _progress(self, snapshot: HubSnapshot) -> Progress:
         wall_s = self._wall_s()
-        here_s = wall_s - self._wall_before_s
         lags = snapshot.lags or [0]
         return Progress(
             run=one_line(str(self._folder.path)),
@@ -286,7 +285,7 @@ class RunRecorder:
             total_steps=self._config.steps,
             updates=self.version,
             wall_s=wall_s,
-            steps_per_s=(self.env_steps - self._steps_before) / here_s if here_s else 0.0,
+            steps_per_s=steps_per_second(self.env_steps - self._steps_before, wall_s - self._wall_before_s),
             return_mean=self._window.return_mean,
             length_mean=self._window.length_mean,
             facts=self._window.facts,
@@ -422,7 +421,7 @@ class RunRecorder:
             env_steps=self.env_steps,
             updates=self.version,
             wall_s=wall_s,
-            env_steps_per_s=self.env_steps / wall_s if wall_s else 0.0,
+            env_steps_per_s=steps_per_second(self.env_steps, wall_s),
             stop_reason=reason,
             cut_short=cut_short,
             return_mean_100=self._window.return_mean,

@@ -32,7 +32,7 @@ from learner.rollouts.evaluation_tickets import EvaluationPlan
 from learner.rollouts.lanes import AcceptedRollout
 from learner.rollouts.ledger import Ledger
 from learner.run_folder.episode_window import EpisodeWindow
-from learner.run_folder.progress import Progress
+from learner.run_folder.progress import Progress, steps_per_second
 from learner.run_folder.results import Evaluation
 from millrace.launch.rollouts import start
 from millrace.policies import MLP, PolicyChoice, PolicyParameters
@@ -409,10 +409,9 @@ class RolloutService:
 
     def _progress(self, lags: Ints) -> Progress:
         """What `millrace status` shows after a batch with these lags [N]."""
-        here_s = time.monotonic() - self._began_s
         return Progress(
             env_steps=self.env_steps,
-            steps_per_s=(self.env_steps - self._steps_before) / here_s if here_s else 0.0,
+            steps_per_s=steps_per_second(self.env_steps - self._steps_before, time.monotonic() - self._began_s),
             return_mean=self._window.return_mean,
             length_mean=self._window.length_mean,
             lag_mean=float(lags.mean()),

@@ -34,7 +34,7 @@ LEARNER = {  # what each folder of the learner may import of the learner; train.
     "rollout_service": {"config", "members", "rollouts", "run_folder"},
     "run_folder": set[str](),
     "recording": {"run_folder", "rollouts", "policy_player"},
-    "report": {"run_folder"},
+    "report": {"config", "run_folder"},
 }
 MAY_PRINT = {"millrace/cli/main.py", "millrace/terminal.py"}
 MAY_UNPICKLE = {"protocol/env_spec.py"}

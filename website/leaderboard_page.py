@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from benchmarks.markdown_tables import table
 from benchmarks.scores import PublishedScore, Score, read_published, read_scores, return_text
-from website.tables import table
 
 HEAD = """# Leaderboard
 

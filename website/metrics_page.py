@@ -6,13 +6,14 @@ from collections.abc import Iterator
 
 from prometheus_client.metrics_core import Metric
 
+from benchmarks.markdown_tables import table
 from learner.config.config import Config
 from learner.metric_names import METRICS
 from learner.prometheus import MetricsCollector, MetricsSnapshot
 from learner.rollouts.ledger import Ledger
 from learner.run_folder.progress import Progress
 from learner.run_folder.results import FactMean
-from website.tables import anchored, table
+from website.tables import anchored
 
 HEAD = """# Metrics
 

@@ -10,12 +10,13 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 import msgspec
 
+from benchmarks.markdown_tables import table
 from learner.config.command_line import RunFlags
 from learner.config.config import Config
 from learner.config.flag_help import BASIC, GROUPS, field_texts
 from learner.config.hyperparameters import HYPERPARAMETERS
 from learner.config.on_resume import OnResume, declared
-from website.tables import anchored, table
+from website.tables import anchored
 
 HEAD = """# Settings
 

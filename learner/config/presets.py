@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -38,6 +40,17 @@ def environment_presets(algo: str) -> dict[str, dict[str, Any]]:
 def algorithms_and_environments() -> list[tuple[str, str]]:
     """Algorithm and environment of every preset that applies without --preset."""
     return [(algo, env) for algo, envs in _tables().items() if algo != NAMED for env in envs]
+
+
+def environment_name(env: str, env_kwargs: Mapping[str, Any], algo: str) -> str:
+    """The environment's id, with the keyword arguments that its preset does not set: `millrace/Atari-v0 game Pong`."""
+    preset: dict[str, Any] = environment_presets(algo).get(env, {}).get("env_kwargs", {})
+    return " ".join([env, *map(shlex.quote, added(env_kwargs, preset))])
+
+
+def added(table: Mapping[str, object], default: Mapping[str, object]) -> list[str]:
+    """Names and values of the entries of a table that its default does not have."""
+    return [str(word) for key, value in table.items() if default.get(key) != value for word in (key, value)]
 
 
 def origin(config: Config) -> str:

@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple
 import msgspec
 import numpy as np
 
+from learner.config.presets import environment_name
 from learner.run_folder.metrics_log import METRICS_FILE, read_rows
 from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
 from learner.run_folder.run_format import check_format, check_whole
@@ -36,6 +37,7 @@ class RunFiles(NamedTuple):
     """The configuration (config.toml) and the rows of metrics of one run folder."""
 
     env: str
+    """The environment's name: with keyword arguments that its preset does not set, it is another environment."""
     algo: str
     seed: int
     config: dict[str, Any]
@@ -66,7 +68,8 @@ def read_run_files(run: Path, purpose: Purpose) -> RunFiles:
         text = (run / "config.toml").read_text("utf-8")
         check_whole(text, str(run / "config.toml"))
         config = tomllib.loads(text)
-        env, algo, seed = str(config["env"]), str(config["algo"]), int(config["seed"])
+        algo, seed = str(config["algo"]), int(config["seed"])
+        env = environment_name(str(config["env"]), dict(config.get("env_kwargs", {})), algo)
         return RunFiles(env, algo, seed, config, elsewhere, read_rows(run / METRICS_FILE))
     except FileNotFoundError as error:
         missing = f"no {Path(error.filename).name}" if run.is_dir() else "no such folder"

@@ -1,9 +1,10 @@
 """Draws learning curves of run folders as a PNG. Without global state: matplotlib's pyplot is not used.
 
-There is a panel for each environment and a color for each group of runs. As in the report, runs of a group have the same
-settings, except the seed and the folder. Of a group of several runs, each run is a thin line, their mean is a bold line, and
-a band reaches from the worst to the best. A run that an error or an interrupt ended is a thin line and in no mean; the
-legend says so. If an algorithm has several groups, the legend says in which settings they differ.
+There is a panel for each environment, which its id and its keyword arguments tell apart, and a color for each group of runs.
+As in the report, runs of a group have the same settings, except the seed and the folder. Of a group of several runs, each
+run is a thin line, their mean is a bold line, and a band reaches from the worst to the best. A run that an error or an
+interrupt ended is a thin line and in no mean; the legend says so. If an algorithm has several groups, the legend says in
+which settings they differ.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """The data of the page: the runs, read from their folders, and the groups of runs.
 
-Rule: of a run that has not finished, the page shows what its metrics contain. Runs form a group if all their settings except
-the seed and the folder are the same. A run that an error or an interrupt ended is in its group, and in no mean.
+Rule: of a run that has not finished, the page shows what its metrics contain. Runs with other keyword arguments of the
+environment are runs of another environment. Runs form a group if all their settings except the seed and the folder are the
+same. A run that an error or an interrupt ended is in its group, and in no mean.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from learner.report.curve import Curve, Purpose, algorithm_label, read_run_files
-from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
+from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY, steps_per_second
 from learner.run_folder.results import EVALUATION_KEY, Evaluation, FactMean
 from learner.run_folder.run_folder import RunFolder
 from protocol.arrays import Doubles
@@ -225,7 +226,7 @@ def _results(path: Path, rows: Sequence[dict[str, Any]]) -> RunResults:
         env_steps=env_steps,
         updates=int(last.get("time/iterations") or 0),
         wall_s=wall_s,
-        env_steps_per_s=env_steps / wall_s if wall_s else 0.0,
+        env_steps_per_s=steps_per_second(env_steps, wall_s),
         return_mean_100=last.get(RETURN_KEY),
         evaluation=None,
         stop_reason="not finished",

@@ -131,6 +131,11 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
         return row | named(train)
 
 
+def steps_per_second(env_steps: int, seconds: float) -> float:
+    """Env steps per second; 0 before any time has passed."""
+    return env_steps / seconds if seconds else 0.0
+
+
 def named(train: Row) -> dict[str, float | None]:
     """The metrics of an algorithm or an evaluation under the names by which they are logged."""
     return {name if "/" in name else f"train/{name}": value for name, value in train.items()}

@@ -12,16 +12,17 @@ from benchmarks import results
 from benchmarks.scores import (
     PublishedScore,
     Score,
+    all_scores,
     comparison,
     merged,
     read_published,
     read_scores,
     seeds_text,
-    table,
     write_scores,
 )
 from learner.config.hyperparameters import HYPERPARAMETERS
 from learner.config.layers import resolve
+from learner.config.presets import environment_name
 from millrace.cli.main import main
 
 SCORES = read_scores()
@@ -29,7 +30,7 @@ SCORES = read_scores()
 
 def test_the_page_has_the_tables_of_the_scores() -> None:
     text = results.PAGE.read_text()
-    assert f"\n\n{table(SCORES)}\n" in text
+    assert f"\n\n{all_scores(SCORES)}\n" in text
     assert f"\n\n{comparison(SCORES, read_published())}\n" in text
 
 
@@ -102,7 +103,8 @@ def score(final: dict[int, float], **given: Any) -> Score:
 def test_the_table_names_an_environment_with_the_arguments_that_its_preset_lacks(
     env: str, env_kwargs: dict[str, Any], name: str
 ) -> None:
-    assert results.environment(resolve(env, env_kwargs=env_kwargs)) == name
+    config = resolve(env, env_kwargs=env_kwargs)
+    assert environment_name(config.env, config.env_kwargs, config.algo) == name
 
 
 def test_a_new_run_is_added_to_the_other_seeds_of_its_row() -> None:

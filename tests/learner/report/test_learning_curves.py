@@ -85,6 +85,18 @@ def test_each_environment_has_a_panel_of_its_own(tmp_path: Path) -> None:
     assert share_of(bottom[:, 960:], WHITE) == 1.0  # no empty axes
 
 
+def test_games_of_one_environment_id_have_a_panel_each(tmp_path: Path) -> None:
+    games = [
+        a_run(tmp_path, "millrace/Atari-v0", seed, env_kwargs={"game": game})
+        for seed, game in ((1, "Pong"), (2, "Pong"), (3, "Breakout"))
+    ]
+    panels = curves(games).axes
+    titles = [panel.get_title(loc="left") for panel in panels]
+    assert titles == ["millrace/Atari-v0 game Breakout", "millrace/Atari-v0 game Pong"], "without what the preset sets"
+    assert [panel.get_legend_handles_labels()[1][-1] for panel in panels] == ["PPO, seed 3", "PPO, mean of 2 seeds"]
+    assert group_runs([read_run(run) for run in games]).envs == [titles[1], titles[0]]
+
+
 def test_what_cannot_be_plotted_is_said_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="expected a run folder to plot, got no such folder"):
         read_curve(tmp_path / "nowhere")

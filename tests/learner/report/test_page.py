@@ -172,11 +172,11 @@ def test_the_ledger_balances_or_says_by_how_much_it_does_not(tmp_path: Path) -> 
 
 
 def test_settings_that_differ_come_first_and_the_rest_is_folded(tmp_path: Path) -> None:
-    runs = [a_run(tmp_path, seed=seed) for seed in (1, 2)] + [a_run(tmp_path, seed=3, gamma=0.5, env_kwargs={"g": 1.5})]
+    runs = [a_run(tmp_path, seed=seed) for seed in (1, 2)] + [a_run(tmp_path, seed=3, gamma=0.5, eval_env_kwargs={"g": 1.5})]
     differing, _, folded = sections.settings(report_data(*runs)).partition("<details>")
     said = re.sub(r"<[^>]+>", " ", differing)
     assert " ".join(said.split()) == (
-        "Settings What differs CartPole-v1 PPO A CartPole-v1 PPO B seed 1, 2 3 gamma 0.98 0.5 env_kwargs.g – 1.5"
+        "Settings What differs CartPole-v1 PPO A CartPole-v1 PPO B seed 1, 2 3 gamma 0.98 0.5 eval_env_kwargs.g – 1.5"
     )
     assert "<dt>gae_lambda</dt><dd>0.8</dd>" in folded
     assert "<dt>gamma</dt>" not in folded
@@ -248,13 +248,13 @@ def test_groups_are_told_apart_however_late_the_setting_comes_that_differs(tmp_p
         a_run(tmp_path),
         a_run(tmp_path, **many),
         a_run(tmp_path, **many, workers=1),
-        a_run(tmp_path, **many, env_kwargs={"g": 1.5}),
+        a_run(tmp_path, **many, eval_env_kwargs={"g": 1.5}),
     )
     labels = [group.differences for group in found.groups]
     assert len(set(labels)) == 4, labels
     assert ["workers 1" in label for label in labels] == [False, False, True, False]
-    assert ["env_kwargs.g 1.5" in label for label in labels] == [False, False, False, True]
-    assert "no env_kwargs.g" in labels[1]
+    assert ["eval_env_kwargs.g 1.5" in label for label in labels] == [False, False, False, True]
+    assert "no eval_env_kwargs.g" in labels[1]
 
 
 def test_workers_that_came_from_elsewhere_are_not_a_number(tmp_path: Path) -> None:
