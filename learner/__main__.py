@@ -42,8 +42,7 @@ def _serve(argv: list[str]) -> int:
     def watch(progress: Progress) -> None:
         if time.monotonic() - said_s[0] > LINE_EVERY_S:
             said_s[0] = time.monotonic()
-            steps = f"{progress.env_steps:,} of {progress.total_steps:,} env steps"
-            log.info("%s, return %s, %d workers", steps, progress.return_mean, progress.workers_alive)
+            log.info("%s", line_of(progress))
 
     try:
         config, resume = read_config("learner", argv)
@@ -59,6 +58,13 @@ def _serve(argv: list[str]) -> int:
         sys.stderr.write(last_line("learner", interrupt, RESUME) + "\n")
         return 130
     return 0
+
+
+def line_of(progress: Progress) -> str:
+    """The progress of the run as a line of the log."""
+    mean = "none yet" if progress.return_mean is None else f"{progress.return_mean:.1f}"
+    steps = f"{progress.env_steps:,} of {progress.total_steps:,} env steps"
+    return f"{steps}, return {mean}, {progress.workers_alive} workers"
 
 
 if __name__ == "__main__":
