@@ -119,7 +119,8 @@ class Evaluations:
     def _evaluate(self, what: str, seed: int, size: EvaluationSize) -> Evaluation:
         """Evaluate the weights that were published last."""
         settings = self._settings
-        plan = EvaluationPlan.of(size.episodes, seed + settings.seed, settings.copies, size.max_steps)
+        of_run = settings.seed or -1  # 0 would give the episodes that `millrace evaluate` plays if no seed is given
+        plan = EvaluationPlan.of(size.episodes, seed + of_run, settings.copies, size.max_steps)
 
         def show(played: int) -> None:
             self.doing = f"evaluating{f' {what}' if what else ''}: {played:,} of {size.episodes:,} episodes"

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+import pytest
 
 from learner.algorithms import Algorithm
 from learner.config.config import Config
@@ -15,6 +17,7 @@ from learner.rollouts.evaluation_tickets import EvaluationPlan
 from learner.run_folder.results import Evaluation
 from learner.run_folder.run_folder import RunFolder
 from learner.run_state import RunState
+from millrace.cli.flags import EvaluateFlags
 from protocol.bounds import LARGEST
 from tests.support.fake_ends import run_spec
 
@@ -25,6 +28,8 @@ class Fakes:
     def __init__(self, *returns: float) -> None:
         self.returns: Iterator[float] = iter(returns)
         self.evaluated = 0
+        self.seeds: list[tuple[int, ...]] = []
+        """The seeds of each evaluation."""
         self.written: list[float] = []
         """The weights of each policy that was written as the best."""
 
@@ -33,6 +38,7 @@ class Fakes:
 
     def evaluate(self, plan: EvaluationPlan, watch: Callable[[int], None]) -> Evaluation:
         self.evaluated += 1
+        self.seeds.append(plan.seeds)
         return Evaluation(episodes=len(plan.seeds), return_mean=next(self.returns), return_std=0.0, length_mean=1.0)
 
     def publish(self, version: int, *weights: Any, deal: bool) -> None:
@@ -41,8 +47,8 @@ class Fakes:
     def write_policy(self, policy: Any, env: Any, parameters: Any, *rest: Any) -> None:
         self.written.append(float(parameters[0]))
 
-    def evaluations(self, every: int, state: RunState) -> Evaluations:
-        settings = Config(eval_every=every, eval_episodes=10).evaluation_settings()
+    def evaluations(self, every: int, state: RunState, seed: int = 1) -> Evaluations:
+        settings = Config(eval_every=every, eval_episodes=10, seed=seed).evaluation_settings()
         parts = cast(RunFolder, self), run_spec(), cast(Algorithm, self), cast(RolloutService, self)
         return Evaluations(settings, *parts, state, lambda: None)
 
@@ -80,6 +86,18 @@ def test_the_final_policy_can_be_the_best_after_a_resume_without_evaluations() -
     assert best is not None
     assert (best.chosen_by, best.env_steps, best.evaluation.return_mean) == (7.0, 4_000, 7.5)
     assert fakes.written == [-1.0, 1.0]
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_no_policy_is_chosen_by_the_episodes_that_evaluate_plays(seed: int) -> None:
+    fakes = Fakes(1.0, 2.0, 3.0)
+    evaluations = fakes.evaluations(100, RunState(), seed)
+    assert due(evaluations, 100) == [100]
+    evaluations.conclude(2, 200, 10.0, None)
+    chosen, final, confirmed = fakes.seeds
+    assert chosen == final
+    by_command = EvaluationPlan.of(10, EvaluateFlags(run=Path()).seed, 4, 1000).seeds
+    assert len({chosen, confirmed, by_command}) == 3
 
 
 def test_a_share_of_steps_fits_the_message() -> None:
