@@ -20,6 +20,7 @@ from learner.algorithms import Algorithm
 from learner.callbacks.callbacks import Callbacks, Watch
 from learner.config.algorithm_names import FOR_PRIOR
 from learner.config.config import Config
+from learner.config.validation import unused_target
 from learner.env_spaces import EnvSpaces
 from learner.imports_ahead import ImportsAhead
 from learner.interrupts import Interrupts
@@ -189,6 +190,8 @@ class Run:
 
         config, self.folder = setup.config, setup.folder
         made = Callbacks.of(watch).with_named(config.callback)
+        if line := unused_target(config):
+            log.warning("%s", line)
         spec = run_spec(config, setup.known.env, setup.known.spaces)
         if config.torch_threads is None:
             # Another number changes the last bits, so the run keeps it, wherever it is resumed or repeated.

@@ -76,6 +76,13 @@ def idle_workers(config: Config) -> str:
     )
 
 
+def unused_target(config: Config) -> str:
+    """A line for the user if no evaluation during training can reach `target_return`, or nothing."""
+    if config.target_return is None or config.eval_every:
+        return ""
+    return f"target_return {config.target_return:g} ends no run without evaluations during training; take --eval-every N too"
+
+
 def convert_rollout_settings(settings: dict[str, Any]) -> RolloutConfig:
     """The record of these settings, checked. Raises `UsageError`."""
     config = _converted(settings, RolloutConfig, settings)

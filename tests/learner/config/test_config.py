@@ -13,7 +13,7 @@ from learner.config.config import Config
 from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
 from learner.config.layers import config_from_toml, lower_layers, resolve
 from learner.config.presets import PRESETS, named_presets
-from learner.config.validation import idle_workers
+from learner.config.validation import idle_workers, unused_target
 from protocol.errors import UsageError
 
 
@@ -121,6 +121,14 @@ def test_workers_without_a_lane_are_named_with_settings_that_use_them(workers: i
     assert idle_workers(config) == says
     taken: dict[str, Any] = dict(zip(("lanes", "envs"), map(int, re.findall(r"--\w+ (\d+)", says)), strict=False))
     assert not idle_workers(resolve("CartPole-v1", workers=workers, **({"envs": 8, "lanes": 4} | taken)))
+
+
+def test_a_target_that_no_evaluation_can_reach_is_said() -> None:
+    assert unused_target(resolve("CartPole-v1", preset="none", target_return=475.0)) == (
+        "target_return 475 ends no run without evaluations during training; take --eval-every N too"
+    )
+    assert not unused_target(resolve("CartPole-v1", preset="none", target_return=475.0, eval_every=100))
+    assert not unused_target(resolve("CartPole-v1", preset="none"))
 
 
 @pytest.mark.parametrize(
