@@ -44,7 +44,7 @@ EVERY_S = 0.5  # between snapshots
 SCRAPE_TIMEOUT_S = 5.0  # a scraper that is silent for longer loses its connection, and its thread ends
 LAGS = (0, 1, 2, 4, 8, 16, 32)
 """upper bounds of the histogram's buckets, in versions"""
-STAGES = {"learner": ("wait", "update", "other"), "worker": ("wait", "open", "act", "step")}
+STAGES = {"learner": ("wait", "update", "evaluate", "other"), "worker": ("wait", "open", "act", "step", "evaluate")}
 TICKET_ENDS = ("used", "stale", "lost")
 TRANSITION_ENDS = ("used", "stale", "duplicate", "late", "invalid")
 STATES = ("active", "spare", "draining")

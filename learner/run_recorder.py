@@ -90,6 +90,7 @@ class RunRecorder:
         self._metrics = MetricsLog(folder.path, state.env_steps)
         self._episode_recorder = episodes.recorder
         self._stages_s = {"update": 0.0, "other": 0.0}
+        self._gathered_s = 0.0  # what `gathered` took last
         self._wall_before_s, self._steps_before = state.wall_s, state.env_steps
         self._started_s = self._saved_s = time.monotonic()
         self._episodes_since_save = 0
@@ -128,14 +129,11 @@ class RunRecorder:
 
         Their episodes are recorded, if the run records episodes.
         """
-        if self._callbacks.wants("on_rollouts"):
-            progress = msgspec.structs.replace(self.progress(), rollouts=tuple(one.rollout for one in rollouts))
-            self._callbacks.on_rollouts(progress)
-            if self._callbacks.stop_reason is not None:
-                return False
-        if self._episode_recorder is not None:
-            self._episode_recorder.add(rollouts)
-        return True
+        began_s = time.monotonic()
+        try:
+            return self._tell_rollouts(rollouts)
+        finally:
+            self._gathered_s = time.monotonic() - began_s
 
     def count(self, batch: Batch) -> None:
         """An update was made of this batch."""
@@ -164,10 +162,14 @@ class RunRecorder:
         return not self._evaluations.is_due(self.env_steps) and self.stop_reason() is None
 
     def updated(self, metrics: Mapping[str, float], update_s: float) -> None:
-        """The update that was counted last was published: tell the callbacks, evaluate it and write what is due."""
+        """The update that was counted last was published: tell the callbacks, evaluate it and write what is due.
+
+        `update_s`: seconds since its rollouts had come; those of `gathered` are among them, and do not count as its own.
+        """
         began_s, evaluated_s = time.monotonic(), self._stages_s.get("evaluate", 0.0)
         self._workers_alive = self._service.workers_alive()
-        self._stages_s["update"] += update_s
+        self._stages_s["update"] += update_s - self._gathered_s
+        self._stages_s["other"] += self._gathered_s
         snapshot = self._service.snapshot()
         self._update |= {"metrics": named(metrics), "lags": tuple(snapshot.lags)}
         progress = self._progress(snapshot)
@@ -275,6 +277,17 @@ class RunRecorder:
         return self._progress(self._service.snapshot())
 
     # ---------------------------------------------------------------- inside
+
+    def _tell_rollouts(self, rollouts: Sequence[AcceptedRollout]) -> bool:
+        """Tell the callbacks, and record the episodes. Returns what `gathered` returns."""
+        if self._callbacks.wants("on_rollouts"):
+            progress = msgspec.structs.replace(self.progress(), rollouts=tuple(one.rollout for one in rollouts))
+            self._callbacks.on_rollouts(progress)
+            if self._callbacks.stop_reason is not None:
+                return False
+        if self._episode_recorder is not None:
+            self._episode_recorder.add(rollouts)
+        return True
 
     def _progress(self, snapshot: HubSnapshot) -> Progress:
         wall_s = self._wall_s()

@@ -12,7 +12,7 @@ import threading
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 import pytest
@@ -23,13 +23,14 @@ from prometheus_client.parser import text_string_to_metric_families
 import learner.prometheus
 from learner.config.config import Config
 from learner.config.layers import resolve
+from learner.metric_names import METRICS
 from learner.prometheus import EVERY_S, STAGES, MetricsCollector, metrics_server
 from learner.rollouts.hub import PULSE_S, Hub, HubSettings
 from learner.run import prometheus_observer
 from learner.run_folder.progress import Progress
 from learner.run_folder.results import FactMean
 from millrace.launch import local_run
-from protocol.bounds import MAX_FACTS
+from protocol.bounds import MAX_FACTS, Stage
 from protocol.errors import UsageError
 from protocol.messages import Drain
 from protocol.policy.policy import make_policy
@@ -196,7 +197,10 @@ def test_what_workers_call_themselves_and_their_stages_is_no_label(scraped: Scra
 
 def test_the_stages_are_those_that_workers_and_the_learner_have() -> None:
     run = run_spec()
-    assert {*Collector(run, make_policy(run.policy)).stages, "wait"} == set(STAGES["worker"])
+    assert {*Collector(run, make_policy(run.policy)).stages, "wait", "evaluate"} == set(STAGES["worker"])
+    assert set(STAGES["worker"]) == set(get_args(Stage))
+    logged = {name.removeprefix("stage/learner_") for group in METRICS.values() for name in group if "/learner_" in name}
+    assert logged == set(STAGES["learner"])
 
 
 def test_a_snapshot_is_taken_now_and_then_and_a_scrape_takes_none(scraped: Scraped) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ SMALL: dict[str, Any] = {
 }  # fmt: skip
 
 
+SPIN_S = 0.05
 UPDATES = 13  # of 400 env steps; the rows that reset a copy do not count
 EVALUATED = (5, 9)  # updates, with eval_every 130
 Act = Callable[[Progress], object]
@@ -55,6 +57,19 @@ class Acts(Callback):
 
     def of(self, moment: str) -> list[Progress]:
         return [facts for (each, _), facts in zip(self.told, self.facts, strict=True) if each == moment]
+
+
+def spins(progress: Progress) -> None:
+    """Takes 50 ms."""
+    until_s = time.monotonic() + SPIN_S
+    while time.monotonic() < until_s:
+        pass
+
+
+def test_the_time_of_on_rollouts_is_not_that_of_updates(tmp_path: Path) -> None:
+    folder = run(tmp_path, Acts("on_rollouts", spins, updates=0))
+    stages = summary(folder)["stages"]
+    assert stages["learner_other"] >= UPDATES * SPIN_S
 
 
 def run(tmp_path: Path, *callbacks: object, resume: Path | None = None, **settings: Any) -> Path:
