@@ -114,17 +114,20 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
     ) -> tuple[Any, Infos]:
         """Begin episodes in all copies, or in those that `options["reset_mask"]` selects. Returns observations and infos.
 
-        A single seed s gives the copies s, s + 1, …. Raises `WorkerLost` if each attempt loses a worker.
+        A single seed s gives the copies s, s + 1, …. Raises `WorkerLost` if each attempt loses a worker. With SameStep,
+        copies that were lost with their worker are reset together; raises `UsageError` for a part of them.
         """
         self._check_idle("reset")
         seeds = seed_list(seed, self.num_envs)
         mask, options = take_reset_mask(options, self.num_envs)
+        copies = self._layout.by_lane(np.flatnonzero(mask).tolist())
+        self._parts.check_reset(copies)
         self._seeds[:] = [new if new is not None else old for new, old in zip(seeds, self._seeds, strict=True)]
         if mask.all():
             self._hub.rebalance()
-            self._lost_lanes.forget_unreported()
-            self._hub.take_lost()
-        infos = self._reset_copies(self._layout.by_lane(np.flatnonzero(mask).tolist()), seeds, options)
+        self._lost_lanes.add(self._hub.take_lost())
+        self._lost_lanes.forget(lane for lane, chosen in copies.items() if len(chosen) == self._layout.size(lane))
+        infos = self._reset_copies(copies, seeds, options)
         self._ever_reset |= mask
         return self._batch.observation(copy=self.copy), self._merge_infos(infos)
 
@@ -389,8 +392,11 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._hub.send_orders(orders)
         answers = self._hub.wait_for_answers(self.timeout_s)
         if unanswered := [lane for lane in orders if lane not in answers]:
-            lost = self._hub.take_lost()
-            self._lost_lanes.add(lost)
+            self._lost_lanes.add(self._hub.take_lost())
+            if self.on_worker_loss == "raise":
+                raise worker_lost(self._lost_lanes.report(unanswered), self._layout)
+            # The next step also reports it: a caller that goes on must see that the episodes ended.
+            lost = self._lost_lanes.unreported
             raise worker_lost({lane: lost.get(lane, UNKNOWN_REASON) for lane in unanswered}, self._layout)
         return call_results(name, answers)
 

@@ -53,10 +53,6 @@ class LostLanes:
         for lane in lanes:
             self._unreported.pop(lane, None)
 
-    def forget_unreported(self) -> None:
-        """All lanes begin new episodes: earlier losses no longer matter."""
-        self._unreported.clear()
-
     def report(self, unanswered: Sequence[int]) -> dict[int, str]:
         """Report lanes that have no result for this step, and why. From now on they wait for a reset.
 

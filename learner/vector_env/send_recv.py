@@ -7,7 +7,7 @@ reported by `recv`, as truncated copies or as an error, and costs no other lane 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -54,6 +54,19 @@ class VectorEnvParts:
             ended[self.layout.rows[lane]] = False  # the caller learns it from the result of the next step
         return [n for n in copies if ended[n]]
 
+    def check_reset(self, copies: Mapping[int, Sequence[int]]) -> None:
+        """Raise `UsageError` if a reset of these copies, by lane, leaves out copies of a lane that awaits a reset.
+
+        All copies of such a lane are new. With SameStep no step resets a copy before its first episode.
+        """
+        for lane in self.lost_lanes.awaiting_reset & copies.keys() if self.autoreset == "SameStep" else ():
+            if len(copies[lane]) < self.layout.size(lane):
+                of_lane = self.layout.copies(lane)
+                raise UsageError(
+                    f"reset of copies {[of_lane[n] for n in copies[lane]]}: expected all copies of lane {lane} "
+                    f"({of_lane[0]} to {of_lane[-1]}), which were lost with their worker; reset them together"
+                )
+
     def replacement_seeds(self, lane: int) -> tuple[int | None, ...]:
         """Seeds for the copies that replace those of a lost lane."""
         return replacement_seeds(self.seeds[self.layout.rows[lane]], self.hub.incarnation(lane))
@@ -89,6 +102,7 @@ class SendRecv:
         options_bytes = packed(options)
         by_lane = layout.by_lane(copies)
         self._check_back(by_lane)
+        parts.check_reset(by_lane)
         seed_of = dict(zip(copies, seeds, strict=True))
         whole = [lane for lane, chosen in by_lane.items() if len(chosen) == layout.size(lane)]
         if len(whole) == len(layout.lanes):

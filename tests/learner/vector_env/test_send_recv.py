@@ -361,6 +361,68 @@ def test_also_a_reset_in_lock_step_of_some_copies_does_not_hide_that_the_others_
         assert infos["worker_lost"].tolist() == [True, True]
 
 
+@pytest.mark.parametrize("mode", [NEXT, SAME, DISABLED])
+def test_a_loss_that_was_noticed_before_a_reset_of_some_copies_is_not_hidden_either(mode: str) -> None:
+    with made(copies=2, lanes=1, workers=2, autoreset_mode=mode) as (env, link):
+        env.reset(seed=1), env.step(zeros([0, 1]))
+        link.leave("w0")
+        link.join("w2")
+        link.join("w3")
+        env.wait_for(3, 1.0)  # notices it
+        env.reset(options={"reset_mask": np.array([True, False])})
+        _, reward, _, truncated, infos = env.step(zeros([0, 1]))
+        assert (reward.tolist(), truncated.tolist()) == ([0.0, 0.0], [True, True])
+        assert infos["worker_lost"].tolist() == [True, True]
+
+
+def test_copies_that_were_lost_are_reset_together_with_same_step_autoreset() -> None:
+    with made(copies=2, lanes=1, workers=2, autoreset_mode=SAME, on_worker_loss="raise") as (env, link):
+        env.reset(seed=1), env.step(zeros([0, 1]))
+        link.leave("w0")
+        with pytest.raises(WorkerLost, match=r"lane 0 \(copies 0 to 1\) is lost"):
+            env.step(zeros([0, 1]))
+        expected = r"reset of copies \[1\]: expected all copies of lane 0 \(0 to 1\), which were lost with their worker"
+        with pytest.raises(UsageError, match=expected):
+            env.reset(options={"reset_mask": np.array([False, True])})
+        with pytest.raises(UsageError, match=expected):
+            env.async_reset([1])
+        env.reset(options={"reset_mask": np.array([True, True])})
+        assert env.step(zeros([0, 1]))[1].tolist() == [1.0, 1.0]
+        env.reset(options={"reset_mask": np.array([False, True])})  # of copies that were reset since
+
+
+@contextmanager
+def loses_w0_in_a_call(loss: str) -> Iterator[ZmqVectorEnv]:
+    """Two lanes of one copy; the worker of the first was lost in a `call`, which has raised that."""
+    with made(copies=2, lanes=2, workers=2, on_worker_loss=loss) as (env, link):
+        env.reset(seed=1), env.step(zeros([0, 1]))
+        link.frozen = {"w0"}
+        gone = iter([lambda: link.leave("w0")])
+        env.watch(lambda: next(gone, lambda: None)())
+        with pytest.raises(WorkerLost, match=r"worker w0 \(host\) left: killed: lane 0 \(copies 0 to 0\) is lost"):
+            env.call("render_mode")
+        yield env
+
+
+@pytest.mark.parametrize("loss", ["raise", "truncate"])
+def test_a_loss_that_a_call_has_raised_is_over_when_its_copies_are_reset(loss: str) -> None:
+    with loses_w0_in_a_call(loss) as env:
+        env.reset(options={"reset_mask": np.array([True, False])})
+        _, reward, _, truncated, infos = env.step(zeros([0, 1]))
+        assert (reward.tolist(), truncated.tolist(), infos) == ([1.0, 1.0], [False, False], {})
+
+
+def test_a_loss_that_a_call_has_raised_is_not_raised_anew_by_a_step() -> None:
+    again = r"^lanes \[0\] were lost with their worker; call reset\(\) first$"
+    with loses_w0_in_a_call("raise") as env, pytest.raises(WorkerLost, match=again):
+        env.step(zeros([0, 1]))
+
+
+def test_with_truncate_the_step_after_a_call_that_lost_a_worker_truncates() -> None:
+    with loses_w0_in_a_call("truncate") as env:
+        assert env.step(zeros([0, 1]))[3].tolist() == [True, False]
+
+
 def test_with_raise_recv_names_the_lost_copies_once_and_the_others_can_be_received() -> None:
     with made(on_worker_loss="raise") as (env, link):
         env.async_reset(seed=1)

@@ -84,8 +84,8 @@ class Caller:
         match self.operations[self.at]:
             case "reset":
                 self.hub.rebalance()
-                self.lost_lanes.forget_unreported()
-                self.hub.take_lost()
+                self.lost_lanes.add(self.hub.take_lost())
+                self.lost_lanes.forget(lanes)
                 self.unreset, self.attempt = set(lanes), 0
                 self._order(dict.fromkeys(lanes, ("reset", self.at)))
             case "step":
