@@ -39,7 +39,7 @@ from millrace.policies import MLP, PolicyChoice, PolicyParameters
 from protocol.arrays import Array, Ints
 from protocol.did_you_mean import did_you_mean
 from protocol.env_spec import EnvLike, EnvSpec, remembered_name
-from protocol.envs.wrappers import WrapperLike, wrapper_name
+from protocol.envs.wrappers import WrapperLike, wrapper_names
 from protocol.errors import CheckpointError, UsageError, check_at_least, first_line
 from protocol.rollout import Batch, stack_rollouts
 from protocol.specs import PolicySpec
@@ -435,7 +435,7 @@ def _config(env: EnvLike, wrappers: Sequence[WrapperLike], settings: dict[str, A
     known = RolloutConfig.__struct_fields__
     if unknown := [name for name in settings if name not in known or name in ("env", "wrapper")]:
         raise UsageError(f"rollout service: unknown setting {unknown[0]}{did_you_mean(unknown[0], known)}")
-    given = {**settings, "env": remembered_name(env), "wrapper": tuple(map(wrapper_name, wrappers))}
+    given = {**settings, "env": remembered_name(env), "wrapper": wrapper_names(wrappers)}
     if not given.get("bind"):
         given.pop("bind", None)
     return convert_rollout_settings(given)

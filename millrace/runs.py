@@ -26,7 +26,7 @@ from millrace.playing import RunEvaluateKeywords, RunRecordKeywords, evaluate, r
 from millrace.terminal import shown_progress
 from protocol.arrays import Array
 from protocol.env_spec import EnvLike, EnvSpec, remembered_name
-from protocol.envs.wrappers import WrapperLike, wrapper_name
+from protocol.envs.wrappers import WrapperLike, wrapper_names
 from protocol.errors import UsageError, UserFacingError
 
 if TYPE_CHECKING:
@@ -255,7 +255,7 @@ def train(
 
     name = remembered_name(env)
     if wrappers is not None:
-        keywords["wrapper"] = list(map(wrapper_name, wrappers))
+        keywords["wrapper"] = list(wrapper_names(wrappers))
     file, run = (None if path is None else Path(path) for path in (config, resume))
     if run == AUTO:
         run = newest_run(resolve(name, file=file, preset=preset, **keywords))

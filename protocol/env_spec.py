@@ -27,7 +27,7 @@ from gymnasium.vector import VectorEnv
 from protocol.bounds import one_line
 from protocol.envs.found_names import MAIN, attribute, found_by_others, in_main, last_part, name_of
 from protocol.envs.unknown_ids import is_registered, load_plugins, most_similar, plugin_modules, registers, what_to_write
-from protocol.envs.wrappers import WrapperLike, not_named, wrap, wrapper_name
+from protocol.envs.wrappers import WrapperLike, not_named, wrap, wrapper_names
 from protocol.errors import UsageError, first_line
 
 # By namespace: the module that registers its environments. The id is then passed to gymnasium as `module:id`, so that
@@ -145,7 +145,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         name, factory = _given(env)
         name = env if isinstance(env, str) else name
         check_arguments({**(kwargs or {}), **(eval_kwargs or {})}, f"environment {name}")
-        names = tuple(map(wrapper_name, wrappers))
+        names = wrapper_names(wrappers)
         own = [not_named(wrapper) for wrapper in wrappers]
         if any(wrapper is not None for wrapper in own):
             layers = [name if wrapper is None else wrapper for name, wrapper in zip(names, own, strict=True)]

@@ -8,7 +8,8 @@ from typing import Any
 from learner.vector_env.batch_layout import BatchLayout
 from learner.vector_env.lane_orders import call_order
 from learner.vector_env.order_coordinator import MakeOrder
-from protocol.errors import EnvironmentFailed
+from protocol.bounds import MAX_LINE, one_line
+from protocol.errors import EnvironmentFailed, UsageError
 from protocol.messages import Answer, Returned
 from protocol.wire.plain_values import unpack
 
@@ -19,7 +20,12 @@ USE_INSTEAD = ("reset", "step", "close")
 def call_orders(
     layout: BatchLayout, copies: Sequence[int], name: str, args: tuple[Any, ...], kwargs: dict[str, Any]
 ) -> dict[int, MakeOrder]:
-    """Orders by lane that call, or get, the attribute of these copies. Raises `ValueError` for `reset`, `step`, `close`."""
+    """Orders by lane that call, or get, the attribute of these copies.
+
+    Raises `ValueError` for `reset`, `step`, `close`; `UsageError` for a name and `TypeError` for arguments that no message
+    can carry.
+    """
+    _check_name(name)
     if name in USE_INSTEAD:
         raise ValueError(f"call of {name!r}: use {name}() of the vector environment")
     return {
@@ -29,12 +35,23 @@ def call_orders(
 
 
 def assign_orders(layout: BatchLayout, copies: Sequence[int], name: str, values: Sequence[Any]) -> dict[int, MakeOrder]:
-    """Orders by lane that assign one value to each of these copies, which are in ascending order."""
+    """Orders by lane that assign one value to each of these copies, which are in ascending order.
+
+    Raises `UsageError` for a name and `TypeError` for a value that no message can carry.
+    """
+    _check_name(name)
     by_copy = dict(zip(copies, values, strict=True))
     return {
         lane: call_order(chosen, name, [by_copy[layout.copies(lane)[n]] for n in chosen], assign=True)
         for lane, chosen in layout.by_lane(copies).items()
     }
+
+
+def _check_name(name: object) -> None:
+    """Raise `UsageError` for what is no name of an attribute: a worker could not read the message."""
+    if not isinstance(name, str) or not name or one_line(name) != name:
+        got = one_line(repr(name), 60)
+        raise UsageError(f"call: expected the name of an attribute, text of 1 to {MAX_LINE:,} characters, got {got}")
 
 
 def call_results(name: str, answers: Mapping[int, Answer]) -> tuple[Any, ...]:

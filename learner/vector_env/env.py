@@ -58,8 +58,6 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
 
         `on_close` is called once: by `close`, when this object is garbage collected, or when the interpreter exits.
         """
-        if on_worker_loss not in ("truncate", "raise"):
-            raise UsageError(f"on_worker_loss: expected 'truncate' or 'raise', got {on_worker_loss!r}")
         step = description.step
         self.num_envs = N = len(step.copies)
         self.metadata = description.metadata
@@ -350,6 +348,9 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method of every copy, or get an attribute. Arguments and results must be plain data.
+
+        Raises `UsageError` for a name and `TypeError` for arguments that cannot be sent, `AttributeError` or
+        `EnvironmentFailed` if an environment raised, and `WorkerLost` if a worker is lost.
 
         `spec`, `observation_space` and `action_space` are as a worker described them, for such objects cannot travel.
         """

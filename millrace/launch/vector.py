@@ -168,8 +168,6 @@ def listen(settings: VectorEnvSettings, resources: ExitStack) -> ListeningVector
     where, transport, count = settings.listen, settings.transport, settings.local_workers
     if where.bind and settings.workers:
         raise UsageError(f"workers: expected 0, got {settings.workers}; with a bind address, start the workers yourself")
-    if settings.workers is not None and settings.workers < 0:
-        raise UsageError(f"workers: expected at least 0, got {settings.workers}")
     # Local workers end with this process, and this process notices at once if one of them ends. So no timeout is needed.
     requested = requested_copies(settings, LEARNER_TIMEOUT_S if where.bind else math.inf)
     if where.bind:

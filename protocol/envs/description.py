@@ -86,7 +86,7 @@ def _metadata(metadata: object) -> Array:
     for name, value in metadata.items() if isinstance(metadata, dict) else ():
         try:
             longer = plain_values.pack({**kept, name: value})
-        except (TypeError, ValueError):  # ValueError: text with a lone surrogate
+        except TypeError:
             continue
         if type(name) is str and len(longer) <= MAX_METADATA_BYTES:
             kept[name], packed = value, longer

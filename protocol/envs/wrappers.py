@@ -9,7 +9,7 @@ from __future__ import annotations
 import ast
 import functools
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -79,6 +79,15 @@ def wrapper_name(wrapper: WrapperLike) -> str:
     except (UsageError, ValueError):  # ValueError: arrays cannot be compared
         plain = False
     return named if plain and found_by_others(name) else f"<{last_part(name)}>"
+
+
+def wrapper_names(wrappers: Sequence[WrapperLike]) -> tuple[str, ...]:
+    """The name of each wrapper, as `wrapper_name`. Raises `UsageError`, also for a wrapper that is in no list."""
+    if isinstance(wrappers, str) or not isinstance(wrappers, Iterable):
+        raise UsageError(
+            f"wrappers: expected a list of them, as in wrappers=[MyWrapper], got {one_line(repr(wrappers), 100)}"
+        )
+    return tuple(map(wrapper_name, wrappers))
 
 
 def not_named(wrapper: WrapperLike) -> Wrapper | None:

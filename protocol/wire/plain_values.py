@@ -1,9 +1,10 @@
 """Plain values <-> bytes, for `info` dicts and the results of calls. Types are kept. Pure; no pickle.
 
 Plain is None, bool, int, float, complex, str, bytes, list, tuple, dict, and numpy's scalars and arrays (of these dtypes,
-and of objects that are plain). Anything else raises `TypeError`, or, if the caller asks for it, is sent as its `repr` and
-arrives as a `ReprString`, which cannot be confused with a string. For such a caller, subclasses of dict are plain, too: they
-arrive as dicts.
+and of objects that are plain). Text with a lone surrogate, which UTF-8 cannot encode, and integers with more decimal digits
+than Python converts are not plain. Anything else raises `TypeError`, or, if the caller asks for it, is sent as its `repr`
+and arrives as a `ReprString`, which cannot be confused with a string. For such a caller, subclasses of dict are plain, too:
+they arrive as dicts.
 """
 
 from __future__ import annotations
@@ -61,10 +62,12 @@ def _to_msgpack(value: Any, where: str, use_repr: bool, depth: int) -> Any:
     if depth > MAX_DEPTH:
         raise TypeError(f"{where or 'value'}: expected at most {MAX_DEPTH} levels, got more")
     kind = type(value)
-    if value is None or kind in (bool, float, str, bytes):
+    if value is None or kind in (bool, float, bytes) or (kind is str and _is_encodable(value)):
         return value
-    if kind is int:
-        return value if -(2**63) <= value < 2**64 else msgpack.ExtType(_INT, str(value).encode())
+    if kind is int and -(2**63) <= value < 2**64:
+        return value
+    if kind is int and (digits := _digits(value)) is not None:
+        return msgpack.ExtType(_INT, digits)
     if kind is list:
         return [_to_msgpack(inner, f"{where}[{i}]", use_repr, depth + 1) for i, inner in enumerate(value)]
     if kind is tuple:
@@ -74,7 +77,7 @@ def _to_msgpack(value: Any, where: str, use_repr: bool, depth: int) -> Any:
         inside = [
             _to_msgpack(inner, f"{where}.{key}" if where else str(key), use_repr, depth + 1) for key, inner in value.items()
         ]
-        if all(type(key) is str for key in value):
+        if all(type(key) is str and _is_encodable(key) for key in value):
             return dict(zip(value, inside, strict=True))
         keys = [_to_msgpack(key, f"{where} key", use_repr, depth + 1) for key in value]
         return msgpack.ExtType(_PAIRS, _pack([keys, inside]))
@@ -91,8 +94,36 @@ def _to_msgpack(value: Any, where: str, use_repr: bool, depth: int) -> Any:
     if isinstance(value, np.generic) and value.dtype.kind in DTYPE_KINDS:
         return msgpack.ExtType(_SCALAR, _pack([value.dtype.str, value.tobytes()]))
     if use_repr:
-        return msgpack.ExtType(_REPR, repr(value)[:MAX_REPR].encode())
-    raise TypeError(f"{where or 'value'}: expected plain data (numbers, strings, lists, dicts, arrays), got {kind.__name__}")
+        return msgpack.ExtType(_REPR, _repr(value)[:MAX_REPR].encode(errors="backslashreplace"))
+    got = {str: "text with a lone surrogate", int: "an integer with too many digits"}.get(kind, kind.__name__)
+    raise TypeError(f"{where or 'value'}: expected plain data (numbers, strings, lists, dicts, arrays), got {got}")
+
+
+def _is_encodable(text: str) -> bool:
+    """Whether UTF-8 can encode it."""
+    if text.isascii():
+        return True
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def _digits(value: int) -> bytes | None:
+    """The decimal digits; None if there are more than Python converts (`sys.set_int_max_str_digits`)."""
+    try:
+        return str(value).encode()
+    except ValueError:
+        return None
+
+
+def _repr(value: object) -> str:
+    """The `repr`, or another text if that raises."""
+    try:
+        return repr(value)
+    except Exception as error:  # code of the user's
+        return f"<{type(value).__name__}, whose repr raised {type(error).__name__}>"
 
 
 def _unpack(data: bytes | memoryview, depth: int) -> Any:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from copy import deepcopy
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -242,6 +243,19 @@ def test_a_status_request_is_answered_while_it_steps() -> None:
         ({"workers": None, "bind": "tcp://0.0.0.0:*", "advertise": "host:7"}, "expected an IPv6 address in brackets"),
         ({"autoreset_mode": "Never"}, "autoreset_mode: expected"),
         ({"on_worker_loss": "shrug"}, "on_worker_loss: expected"),
+        ({"num_envs": "2"}, "^num_envs: expected a whole number, got '2'$"),
+        ({"num_envs": 2.0}, "^num_envs: expected a whole number, got 2.0$"),
+        ({"workers": "1"}, "^workers: expected a whole number, got '1'$"),
+        ({"lanes": "1"}, "^lanes: expected a whole number, got '1'$"),
+        ({"timeout": "5"}, "^timeout: expected a number of seconds above 0, got '5'$"),
+        ({"timeout": 0}, "^timeout: expected a number of seconds above 0, got 0$"),
+        ({"timeout": -1.0}, "^timeout: expected a number of seconds above 0, got -1.0$"),
+        ({"timeout": float("nan")}, "^timeout: expected a number of seconds above 0, got nan$"),
+        ({"timeout": None}, "^timeout: expected a number of seconds above 0, got None$"),
+        ({"bind": 5555}, "^bind: expected text, got 5555$"),
+        ({"render_mode": 5}, "^render_mode: expected text or None, got 5$"),
+        ({"wrappers": "gymnasium.wrappers:FlattenObservation"}, r"^wrappers: expected a list of them, as in wrappers=\[MyW"),
+        ({"wrappers": gymnasium.wrappers.FlattenObservation}, "^wrappers: expected a list of them, .*, got <class 'gym"),
         ({"env": "NoSuchEnv-v7"}, "is not registered"),
         ({"env": "FrozenLake-v1", "desc": ["SF", "FG"]}, "FrozenLake-v1: argument desc: expected .*, got .'SF', 'FG'."),
         ({"x_threshold": np.float32(1)}, "environment CartPole-v1: argument x_threshold: expected .*, got np.float32"),
@@ -289,6 +303,13 @@ def test_arguments_that_no_message_can_carry_are_refused_before_anything_is_sent
         for seed in 2**64 - 1, [1, 2**64]:
             with pytest.raises(ValueError, match="seed: expected whole numbers of at most 64 bits, got 184467440737095516"):
                 env.reset(seed=seed)
+        names: list[Any] = ["x" * 1001, "a\nb", "a\udc80", "", 5]
+        for name in names:
+            for use in partial(env.call, name), partial(env.get_attr, name), partial(env.set_attr, name, 1):
+                with pytest.raises(UsageError, match=r"^call: expected the name of an attribute, text of 1 to 1,000 char"):
+                    use()
+        with pytest.raises(TypeError, match=r"got text with a lone surrogate$"):
+            env.call("has_wrapper_attr", "a\udc80")
         with pytest.raises(TypeError, match="actions: expected numbers of at most 64 bits, got float128"):
             env.step(zeros.astype(np.longdouble))
         result = env.step(zeros.astype(">i8"))

@@ -66,6 +66,38 @@ def test_what_is_not_plain_is_shown_if_asked_so_and_can_be_found() -> None:
     assert repr_paths(back) == ["a.b"]
 
 
+class WithoutRepr:
+    def __repr__(self) -> str:
+        raise OSError("no repr")
+
+
+class OddRepr:
+    def __repr__(self) -> str:
+        return "\udc80"
+
+
+@pytest.mark.parametrize(
+    ("value", "got", "shown"),
+    [
+        ("a\udc80", "text with a lone surrogate", "'a\\udc80'"),
+        (10**5000, "an integer with too many digits", "<int, whose repr raised ValueError>"),
+        (WithoutRepr(), "WithoutRepr", "<WithoutRepr, whose repr raised OSError>"),
+        (OddRepr(), "OddRepr", "\\udc80"),
+    ],
+    ids=["surrogate", "digits", "no repr", "repr"],
+)
+def test_what_cannot_be_encoded_is_not_plain(value: object, got: str, shown: str) -> None:
+    with pytest.raises(TypeError, match=rf"^a\[0\]: expected plain data .*, got {got}$"):
+        pack({"a": [value]})
+    assert unpack(pack({"a": [value]}, use_repr=True)) == {"a": [shown]}
+
+
+def test_a_key_that_cannot_be_encoded_is_not_plain() -> None:
+    with pytest.raises(TypeError, match=r"key: expected plain data .*, got text with a lone surrogate$"):
+        pack({"a\udc80": 1})
+    assert unpack(pack({"a\udc80": 1, "b": 2}, use_repr=True)) == {"'a\\udc80'": 1, "b": 2}
+
+
 def test_a_subclass_of_dict_arrives_as_a_dict_if_asked_so() -> None:
     counts = defaultdict(int, {"a": 1})
     assert bit_equal(unpack(pack([OrderedDict(b=counts)], use_repr=True)), [{"b": {"a": 1}}])
