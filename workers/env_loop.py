@@ -32,7 +32,7 @@ from workers.supervise.activity import (
 
 Autoreset = Literal["NextStep", "SameStep", "Disabled"]
 Infos = list[tuple[int, dict[str, Any]]]
-"""(number of the copy, its info), where the info is not empty"""
+"""(number of the copy, its info), where the info is not empty; a copy of its dicts and arrays, see `_kept`"""
 Pulse = Callable[[], None]
 """Called now and then during long work, so that the worker can answer the learner. It may raise to end the work."""
 
@@ -94,7 +94,7 @@ class EnvLoop:
                 raise CopyRaised(n, "reset") from error
             self.reward[n], self.terminated[n], self.truncated[n] = 0.0, False, False
             if info:
-                infos.append((n, info))
+                infos.append((n, _kept(info)))
         return infos
 
     def step(self, actions: Iterable[Any], into: list[Any], pulse: Pulse) -> Infos:
@@ -131,7 +131,7 @@ class EnvLoop:
                 begin(WAITING)
                 raise CopyRaised(n, "reset" if resets else f"step {self.steps}") from error
             if info:
-                infos.append((n, info))
+                infos.append((n, _kept(info)))  # before the next copy may change the same dict
             if (now_s := perf_counter()) > pulse_due_s:
                 numbers[ENV_CALLS] += n + 1 - counted
                 counted = n + 1
@@ -156,5 +156,8 @@ class EnvLoop:
 def _kept(info: Any) -> Any:
     """The info with copies of its dicts and arrays, as gymnasium keeps it. Not every other value can be copied."""
     if isinstance(info, dict):
-        return {key: _kept(value) for key, value in info.items()}
+        return {key: value if type(value) in _IMMUTABLE else _kept(value) for key, value in info.items()}
     return info.copy() if isinstance(info, np.ndarray) else info
+
+
+_IMMUTABLE = frozenset({bool, int, float, str, type(None), np.bool_, np.int64, np.float32, np.float64})

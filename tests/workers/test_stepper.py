@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Callable
 from functools import partial
 from types import ModuleType
-from typing import Any
+from typing import Any, ClassVar, Literal, cast
 
 import gymnasium
 import numpy as np
@@ -165,6 +165,62 @@ def test_the_last_observation_of_an_episode_is_not_that_of_the_reset() -> None:
     ((copy, info),) = loop.step([0], observations, lambda: None)
     assert (copy, info["final_obs"].tolist(), observations[0].tolist()) == (0, [0.0], [2.0])
     loop.close()
+
+
+class SharesInfo(Countdown):
+    """All copies return the same dict as their info."""
+
+    info: ClassVar[dict[str, Any]] = {"deep": {}}
+    made = 0
+
+    def __init__(self) -> None:
+        super().__init__(50)
+        SharesInfo.made += 1
+        self._number = SharesInfo.made
+
+    def _observation(self) -> Any:
+        self.info["number"] = self.info["deep"]["number"] = self._number
+        return super()._observation()
+
+    def reset(self, **keywords: Any) -> Any:
+        return super().reset(**keywords)[0], self.info
+
+    def step(self, action: Any) -> Any:
+        return *super().step(action)[:4], self.info
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+def test_copies_may_return_one_dict_as_their_info(mode: Literal["NextStep", "SameStep", "Disabled"]) -> None:
+    loop, observations = EnvLoop([SharesInfo] * 3, lambda: None, mode), [None] * 3
+    first = SharesInfo.made - 2
+    expected = [(n, {"number": first + n, "deep": {"number": first + n}}) for n in range(3)]
+    assert loop.reset(range(3), [1, 2, 3], observations, lambda: None) == expected
+    assert loop.step([0, 0, 0], observations, lambda: None) == expected
+    loop.close()
+
+
+class OnlyWhileOpen(Countdown):
+    """Raises in a step after `close`."""
+
+    open = True
+
+    def step(self, action: Any) -> Any:
+        assert self.open, "stepped after close"
+        return super().step(action)
+
+    def close(self) -> None:
+        self.open = False
+
+
+def test_a_lane_that_is_released_during_a_step_is_closed_after_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("workers.env_loop.PULSE_S", -1.0)  # a pulse after each copy
+    stepper, envs = Stepper(step_spec(VectorEnvSettings(OnlyWhileOpen, 2, lanes=1))), list[OnlyWhileOpen]()
+    stepper.execute(Reset(1, 1, 0, 0, (0, 1), (0, 1), np.frombuffer(pack(None), np.uint8)), lambda: None)
+    envs += [cast(OnlyWhileOpen, env.unwrapped) for env in stepper._lanes[0]._loop.envs]
+    answer = stepper.execute(Step(1, 2, 0, 0, (np.zeros(2, np.int64),)), lambda: stepper.close([0]))
+    assert isinstance(answer, Stepped)
+    assert answer.reward.tolist() == [1.0, 1.0]
+    assert [env.open for env in envs] == [False, False]
 
 
 class BufferedInfo(Countdown):

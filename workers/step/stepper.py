@@ -7,7 +7,8 @@ then written there, too. Both ways step the same lanes.
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from time import perf_counter
 from typing import Any
 
@@ -44,6 +45,7 @@ class Stepper:
         """seconds spent making and resetting copies, and stepping them"""
         self._spec, self._allow_private_names = spec, allow_private_names
         self._lanes: dict[int, SteppedLane] = {}
+        self._running: SteppedLane | None = None  # its copies are in the middle of an order: a pulse must not close them
         self._executed: dict[int, int] = {}  # lane -> number of the newest order through shared memory that was executed
         self._memory = None if shared_memory is None else SharedMemory(spec, shared_memory.memory)
         self._wake_in = None if shared_memory is None else WakePipe(read_fd=shared_memory.to_worker)
@@ -56,15 +58,16 @@ class Stepper:
         """The answer to the order. Raises `LaneFailed`, and what `pulse` raises; the lane is then closed."""
         try:
             lane = self._lane_for(order.lane, order.incarnation, pulse)
-            match order:
-                case Reset():
-                    began = perf_counter()
-                    infos = lane.reset(order.copies, order.seeds, unpack(order.options.data), pulse)
-                    self.stages["open"] += perf_counter() - began
-                case Step():
-                    infos = self._step(lane, order.actions, pulse)
-                case Call():
-                    return _call(order, lane, self._allow_private_names)
+            with self._runs(order.lane, lane):
+                match order:
+                    case Reset():
+                        began = perf_counter()
+                        infos = lane.reset(order.copies, order.seeds, unpack(order.options.data), pulse)
+                        self.stages["open"] += perf_counter() - began
+                    case Step():
+                        infos = self._step(lane, order.actions, pulse)
+                    case Call():
+                        return _call(order, lane, self._allow_private_names)
         except CopyRaised as error:
             self.close([order.lane])
             raise lane_failed(order.lane, error.doing, error) from error
@@ -83,7 +86,7 @@ class Stepper:
         assert self._wake_in is not None
         until = perf_counter() + timeout_s
         while True:
-            stepped = [self._serve_lane(lane, pulse, session, send) for lane in list(self._lanes)]
+            stepped = [self._serve_lane(lane, pulse, session, send) for lane in list(self._lanes) if lane in self._lanes]
             if any(stepped):
                 if perf_counter() > until:
                     return False
@@ -111,10 +114,13 @@ class Stepper:
             return False
         self._executed[number] = order
         try:
-            infos = pack_infos(self._step(lane, memory.lanes[number].actions, pulse))
+            with self._runs(number, lane):
+                infos = pack_infos(self._step(lane, memory.lanes[number].actions, pulse))
         except CopyRaised as error:
             self.close([number])
             raise lane_failed(number, error.doing, error) from error
+        if number not in self._lanes:
+            return True  # it was released meanwhile, and another worker may answer for it
         if not memory.answer(number, order, infos):
             step = Step(session, -order, number, lane.incarnation, ())
             send(_stepped(step, lane.rows, infos))
@@ -124,6 +130,17 @@ class Stepper:
         finished_before = len(memory.lanes) - len(self._lanes) - pending
         self._spin_s = SPIN_S if finished_before < self._cores - 1 else 0.0
         return True
+
+    @contextmanager
+    def _runs(self, number: int, lane: SteppedLane) -> Iterator[None]:
+        """Within it, the copies of a lane run. If a pulse closes the lane, they are closed afterwards."""
+        self._running = lane
+        try:
+            yield
+        finally:
+            self._running = None
+            if self._lanes.get(number) is not lane:
+                lane.close()
 
     def _step(self, lane: SteppedLane, actions: Iterable[Array], pulse: Pulse) -> Infos:
         began = perf_counter()
@@ -154,11 +171,12 @@ class Stepper:
         return Rows(memory.obs, memory.reward, memory.terminated, memory.truncated)
 
     def close(self, lanes: Iterable[int]) -> None:
-        """Close these lanes, if they are here."""
+        """Close these lanes, if they are here. One whose copies run is closed when they return."""
         for number in lanes:
             if (lane := self._lanes.pop(number, None)) is not None:
-                lane.close()
                 self._executed.pop(number, None)
+                if lane is not self._running:
+                    lane.close()
 
     def close_all(self) -> None:
         """Close every lane."""
