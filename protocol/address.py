@@ -17,6 +17,8 @@ WILDCARDS = {"*", "0.0.0.0", "[::]", "[::ffff:0.0.0.0]"}
 
 def check_address(address: str) -> str:
     """Return the address. Raises `UsageError`, with a one-line message, if it is not valid."""
+    if one_line(address, len(address)) != address:
+        raise UsageError(f"address {one_line(address, 200)}: expected text without control characters")
     scheme, sep, rest = address.partition("://")
     if not sep or scheme not in {"inproc", "ipc", "tcp"} or not rest:
         raise UsageError(f"address {address}: expected inproc://NAME, ipc://PATH or tcp://HOST:PORT")
@@ -132,5 +134,5 @@ def _is_name(host: str) -> bool:
 def _has_address(host: str, family: socket.AddressFamily) -> bool:
     try:
         return bool(socket.getaddrinfo(host, None, family))
-    except OSError:
+    except (OSError, UnicodeError):  # UnicodeError: no name of a host, as one with an empty part between two dots
         return False

@@ -120,6 +120,8 @@ def _parser(prog: str) -> argparse.ArgumentParser:
 
 def _check(flags: argparse.Namespace) -> None:
     """Raise `UsageError` for a flag that no worker can follow."""
+    if flags.address.startswith("inproc://"):
+        raise UsageError(f"address {flags.address}: expected ipc://PATH or tcp://HOST:PORT; inproc reaches no other process")
     check_at_least("processes", flags.processes, 1)
     check_worker_name(flags.name if flags.processes == 1 else f"{flags.name}-w{flags.processes - 1}")
     for name in ("join_timeout_s", "construct_timeout_s", "reset_timeout_s", "step_timeout_s"):

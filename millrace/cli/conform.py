@@ -62,7 +62,7 @@ def run(argv: list[str], write: Callable[[str], None]) -> int:
         raise UsageError(
             "conform: which client? expected its command after --, as in: millrace conform -- ./client {address}"
         )
-    if not (values.copies >= 1 and min(values.patience_s, values.start_s, values.limit_s) > 0):
+    if not (values.copies >= 1 and all(seconds > 0 for seconds in (values.patience_s, values.start_s, values.limit_s))):
         raise UsageError("conform: expected --copies of 1 or more, and seconds above 0")
     checks = _chosen(PROFILES[values.profile], values.only)
     settings = Settings(EnvSpec(values.env), copies=values.copies, patience_s=values.patience_s, start_s=values.start_s)
@@ -79,7 +79,7 @@ def run(argv: list[str], write: Callable[[str], None]) -> int:
     if values.json:
         report = json.dumps(as_data(results, values.profile, command), indent=2, ensure_ascii=False)
         try:
-            Path(values.json).write_text(report + "\n")
+            Path(values.json).write_text(report + "\n", "utf-8", "surrogateescape")
         except OSError as error:
             raise UsageError(f"conform: report {values.json} not written: {error.strerror}") from error
     return int(any(result.outcome == "failed" for result in results))

@@ -13,6 +13,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -49,8 +50,9 @@ class Command(NamedTuple):
 def main(argv: list[str] | None = None) -> int:
     """Run the command line. Returns the exit code."""
     argv = sys.argv[1:] if argv is None else argv
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # last, so that a user's module is found but hides no installed module
+    with suppress(OSError):  # the current folder may have been deleted
+        if os.getcwd() not in sys.path:
+            sys.path.append(os.getcwd())  # last, so that a user's module is found but hides no installed module
     open_closed()
     with unfailing("stderr"):
         return _exit_code(argv)

@@ -69,6 +69,8 @@ def status(argv: list[str], out: TextIO) -> None:
     )  # fmt: skip
     arguments.flag("--insecure", action="store_true", help="ask on another machine without a token, and trust the answer")
     values = arguments.parse(argv)
+    if not values.timeout_s > 0:  # also true for NaN
+        raise UsageError(f"status: --timeout-s: expected a number of seconds above 0, got {values.timeout_s:g}")
     address, token = whom_to_ask(values.address, read_token(values.token), insecure=values.insecure)
     link = WorkerLink(address, observer_name(), token=token)
     try:

@@ -10,10 +10,11 @@ import base64
 import json
 from collections.abc import Sequence
 from datetime import datetime
-from pathlib import Path
 
 from millrace.cli.flags import KubernetesFlags
 from millrace.launch.launcher_flags import METRICS_PORT, learner_flags
+from protocol.errors import UsageError
+from protocol.home_folder import expanded
 from protocol.keys.key_folder import FIRST_CLIENT, KeyFolder
 
 PORT = 5555
@@ -22,7 +23,7 @@ TOKEN = f"{FIRST_CLIENT}.token"
 
 def manifest(flags: KubernetesFlags, rest: Sequence[str], now: datetime) -> str:
     """The manifest: YAML documents. `rest` are the user's flags for the learner. Raises `UsageError`."""
-    keys = [_secret(flags.name, KeyFolder(Path(flags.keys).expanduser()), now)] if flags.keys else []
+    keys = [_secret(flags.name, KeyFolder(expanded(flags.keys, "key folder")), now)] if flags.keys else []
     parts = [*keys, _service(flags), _storage(flags), _learner(flags, rest), _workers(flags), _budget(flags)]
     return _comments(flags) + "---\n" + "---\n".join(parts)
 
@@ -42,6 +43,11 @@ def _comments(flags: KubernetesFlags) -> str:
 def _secret(name: str, folder: KeyFolder, now: datetime) -> str:
     folder.server()
     folder.ensure_first_client(now)
+    if not folder.token_path(FIRST_CLIENT).is_file():
+        raise UsageError(
+            f"key folder {folder.path}: expected {TOKEN}, the token of the workers; `millrace keys new {FIRST_CLIENT} "
+            f"--keys {folder.path}` makes it"
+        )
     files = [folder.path / "server.key", folder.list_path, folder.token_path(FIRST_CLIENT)]
     data = "".join(f"  {file.name}: {base64.b64encode(file.read_bytes()).decode()}\n" for file in files)
     return f"""\

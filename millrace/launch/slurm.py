@@ -12,11 +12,12 @@ from collections.abc import Sequence
 from millrace.cli.flags import SlurmFlags
 from millrace.launch.launcher_flags import learner_flags
 from protocol.errors import UsageError
+from protocol.home_folder import expanded
 
 
 def script(flags: SlurmFlags, rest: Sequence[str]) -> str:
     """The script for sbatch. `rest` are the user's flags for the learner. Raises `UsageError`."""
-    folder = flags.folder.expanduser().absolute()
+    folder = expanded(flags.folder, "folder").absolute()
     for text in (str(folder), flags.time, flags.partition):
         if any(character.isspace() or character in "%\"'\\" for character in text):
             raise UsageError(f"{text!r}: sbatch takes no spaces, quotes or % in its options; choose another name")

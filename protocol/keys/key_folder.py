@@ -20,6 +20,7 @@ from datetime import datetime
 from pathlib import Path
 
 from protocol.errors import UsageError
+from protocol.home_folder import expanded
 from protocol.keys.keys import KEY_BYTES, ClientList, Key, Token, check_name
 
 log = logging.getLogger("millrace.cli.keys")
@@ -33,14 +34,14 @@ OTHERS_MODE = 0o077  # permission bits of group and others
 def chosen_key_folder(flag: str) -> Path | None:
     """The key folder from the flag, or else from the environment variable; None if neither is set."""
     named = flag or os.environ.get(FOLDER_VARIABLE, "")
-    return Path(named).expanduser() if named else None
+    return expanded(named, "key folder") if named else None
 
 
 class KeyFolder:
     """A key folder. It is created at the first write."""
 
     def __init__(self, path: Path | None = None) -> None:
-        self.path = path or Path(DEFAULT_FOLDER).expanduser()
+        self.path = path or expanded(DEFAULT_FOLDER, "key folder")
 
     @property
     def list_path(self) -> Path:
@@ -208,13 +209,13 @@ def read_token(flag: str) -> Token | None:
             f"--token: expected a file, got the token itself, which others can now see; put it in a file or {TOKEN_VARIABLE}"
         )
     if flag:
-        return Token.from_text(_read_secret(Path(flag).expanduser(), "token"), f"token {flag}")
+        return Token.from_text(_read_secret(expanded(flag, "token"), "token"), f"token {flag}")
     if not given:
         return None
     text = (
         given
-        if given.startswith("millrace") and not Path(given).exists()
-        else _read_secret(Path(given).expanduser(), "token")
+        if given.startswith("millrace") and not os.path.exists(given)  # Path.exists raises for a name that is too long
+        else _read_secret(expanded(given, "token"), "token")
     )
     return Token.from_text(text, TOKEN_VARIABLE)
 
@@ -236,17 +237,26 @@ def _error_text(error: Exception) -> str:
 
 
 def _create(path: Path, text: str) -> None:
-    """Create a file. Raises `FileExistsError` if it exists."""
+    """Create a file. Raises `FileExistsError` if it exists, and `UsageError` if it cannot be written."""
     temporary = _write_temporary(path, text)
     try:
         os.link(temporary, path)
+    except FileExistsError:
+        raise
+    except OSError as error:  # some file systems have no hard links
+        raise UsageError(f"key file {path} cannot be written: {_error_text(error)}") from error
     finally:
         temporary.unlink()
 
 
 def _replace(path: Path, text: str) -> None:
-    """Create a file, or replace it."""
-    os.replace(_write_temporary(path, text), path)
+    """Create a file, or replace it. Raises `UsageError` if it cannot be written; then no temporary file is left."""
+    temporary = _write_temporary(path, text)
+    try:
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink()
+        raise UsageError(f"key file {path} cannot be written: {_error_text(error)}") from error
 
 
 def _write_temporary(path: Path, text: str) -> Path:

@@ -398,12 +398,29 @@ def test_a_worker_without_a_token_does_not_go_to_another_machine(tmp_path: Path,
         (["--step-timeout-s", "-5"], "step_timeout_s: expected a number of seconds >= 0, got -5"),
         (["--join-timeout-s", "nan"], "join_timeout_s: expected a number of seconds >= 0, got nan"),
         (["--processes", "0"], "processes: expected int >= 1, got 0"),
+        (["inproc://x"], "address inproc://x: expected ipc://PATH or tcp://HOST:PORT; inproc reaches no other process"),
     ],
 )
 def test_a_flag_that_no_worker_can_follow_is_refused_before_one_starts(
     flags: list[str], expected: str, capsys: Captured
 ) -> None:
-    assert expected in worker_says(capsys, "ipc:///nobody/listens/here", *flags)
+    assert expected in worker_says(capsys, *(flags if flags[0][:2] != "--" else ["ipc:///nobody/listens/here", *flags]))
+
+
+def test_a_command_runs_in_a_folder_that_was_deleted(
+    tmp_path: Path, capsys: Captured, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("millrace ")
+
+
+@pytest.mark.parametrize("seconds", ["-1", "0", "nan"])
+def test_a_status_needs_time_for_the_answer(capsys: Captured, seconds: str) -> None:
+    says = refusal(capsys, "status", "tcp://127.0.0.1:5", "--timeout-s", seconds)
+    assert says == f"status: --timeout-s: expected a number of seconds above 0, got {seconds}"
 
 
 # ------------------------------------------------------------------------------------------------- evaluate, plot, help

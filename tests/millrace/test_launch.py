@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import yaml
 
 from learner.config.command_line import read_config
 from millrace.cli.main import main
+from protocol.keys.key_folder import KeyFolder
 
 ROOT = Path(__file__).parents[2]
 KUBERNETES = ("1.29", "1.31", "1.34", "1.37")
@@ -39,6 +41,10 @@ def launched(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
         (["kubernetes", "CartPole-v1", "--", "--bind=tcp://*:1"], "--bind=tcp://*:1 is the launcher's to set"),
         (["kubernetes", "CartPole-v1", "--", "--metrics-bind", "*:1"], "--metrics-bind is the launcher's to set"),
         (["slurm", "CartPole-v1", "--folder", "/a folder"], "sbatch takes no spaces, quotes or %"),
+        (
+            ["slurm", "CartPole-v1", "--folder", "~nobody.here/x"],
+            "~nobody.here/x: this home folder is not known here",
+        ),
         (["slurm", "CartPole-v1", "--cpus", "0"], "cpus: expected int >= 1, got 0"),
     ],
 )
@@ -141,6 +147,13 @@ def test_the_secret_is_the_key_folder_and_there_only_when_asked_for(
     without = launched(capsys, *DEFAULTS)
     assert "Secret" not in documents(without)
     assert f"kubectl create secret generic {secret['metadata']['name']} --from-file=" in without
+
+
+def test_a_key_folder_without_the_workers_token_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    KeyFolder(tmp_path / "keys").new("alice", datetime.now(UTC))
+    assert main(["launch", *DEFAULTS[:4], "--keys", str(tmp_path / "keys")]) == 2
+    expected = f"keys: expected default.token, the token of the workers; `millrace keys new default --keys {tmp_path}/keys`"
+    assert expected in capsys.readouterr().err
 
 
 def test_a_workers_pod_has_the_token_and_not_the_learners_key(cluster: dict[str, dict[str, Any]]) -> None:

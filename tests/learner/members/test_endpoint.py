@@ -178,6 +178,8 @@ def test_a_worker_runs_as_much_code_as_it_is_sure_of_its_learner() -> None:
         ("tcp://host/path:5555", "expected a host name"),
         ("tcp://[::1]", "expected a port"),
         ("tcp://host:٥", "expected a port"),
+        ("ipc:///tmp/a\0b", r"address ipc:///tmp/a\\x00b: expected text without control characters"),
+        ("tcp://a\udc80:5555", r"address tcp://a\\udc80:5555: expected text without control characters"),
     ],
 )
 def test_an_address_that_is_misspelt_says_how_it_should_be(address: str, says: str) -> None:
@@ -203,6 +205,9 @@ def test_ipv6_is_used_for_addresses_and_not_for_names_that_have_another() -> Non
     for address in ("tcp://127.0.0.1:5555", "tcp://*:5555", "ipc:///tmp/x", "tcp://no.such.host.invalid:1"):
         assert not needs_ipv6(address)
     assert not resolves("tcp://no.such.host.invalid:1")
+    for name in "a..b", "x" * 70 + ".com":  # no names of hosts
+        assert not resolves(f"tcp://{name}:1")
+        assert not needs_ipv6(f"tcp://{name}:1")
     assert resolves("tcp://localhost:1")
     assert resolves("ipc:///tmp/x")
 

@@ -289,6 +289,36 @@ def test_a_file_in_the_way_is_one_line(tmp_path: Path) -> None:
             KeyFolder(path).server()
 
 
+def test_a_folder_in_the_place_of_a_token_is_one_line_and_leaves_no_secret_behind(folder: KeyFolder) -> None:
+    folder.server()
+    folder.token_path("lab").mkdir()
+    with pytest.raises(UsageError, match=r"^key file .*lab.token cannot be written: Is a directory$"):
+        folder.new("lab", NOW)
+    assert sorted(path.name for path in folder.path.iterdir()) == ["lab.token", "server.key"]
+
+
+def test_a_file_system_without_hard_links_is_one_line(folder: KeyFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_links(*_: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", no_links)
+    with pytest.raises(UsageError, match=r"^key file .*server.key cannot be written: Operation not permitted$"):
+        folder.server()
+    assert list(folder.path.iterdir()) == []
+
+
+def test_a_home_folder_that_is_not_known_is_one_line() -> None:
+    for use in (lambda: chosen_key_folder("~nobody.here/keys"), lambda: read_token("~nobody.here/lab.token")):
+        with pytest.raises(UsageError, match=r" ~nobody.here/.*: this home folder is not known here; give the whole path$"):
+            use()
+
+
+def test_a_token_in_the_environment_that_is_too_long_is_named_as_such(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(TOKEN_VARIABLE, TEXT + 300 * "A")
+    with pytest.raises(UsageError, match="the join token is too long: expected 101 characters, got 401"):
+        read_token("")
+
+
 def test_half_a_file_is_never_seen(folder: KeyFolder, monkeypatch: pytest.MonkeyPatch) -> None:
     folder.ensure_first_client(NOW)
     before = folder.list_path.read_text()
