@@ -18,7 +18,7 @@ import numpy.typing as npt
 from learner.policy_player import saved_policy
 from protocol.arrays import Array, Bools, Floats
 from protocol.envs.spaces import action_converter_of
-from protocol.errors import UsageError
+from protocol.errors import UsageError, check_at_least
 from protocol.policy.distributions import distribution
 from protocol.policy.masks import MASK, choices, forbid, masked_distribution, no_choice
 from protocol.policy.policy import make_policy
@@ -68,8 +68,7 @@ class LoadedPolicy:
         >>> policy.start(2, seed=7)
         >>> actions = policy(numpy.zeros((2, 4)))
         """
-        if copies < 1:
-            raise UsageError(f"start: expected at least 1 env copy, got {copies}")
+        check_at_least("start: copies", copies, 1)
         self._state = zero_state(self.spec, 1, copies)
         if seed is not None and self._generator is not None:
             self._generator = np.random.default_rng(seed)

@@ -285,6 +285,6 @@ def _newest_figures(metrics: Metrics) -> dict[str, str]:
 
 
 def _column(values: list[Any]) -> Array:
-    if all(type(value) is int for value in values):
+    if all(type(value) is int and abs(value) < 2**63 for value in values):
         return np.array(values, np.int64)
     return np.array([np.nan if value is None else value for value in values], np.float64)

@@ -385,13 +385,15 @@ def _make_error(env_id: str, error: Exception, plugins_failed: Sequence[str] = (
     `plugins_failed`: lines about installed packages that could not register their environments.
     """
     module, colon, _ = env_id.partition(":")
+    while isinstance(error, ModuleNotFoundError) and isinstance(error.__cause__, ModuleNotFoundError):
+        error = error.__cause__  # gymnasium raises one of its own, which names the module of the id whatever is missing
     says = first_line(error)
     match error:
         case gymnasium.error.NamespaceNotFound() if env_id.startswith("ALE/"):
             return f"environment {env_id}: Atari games are an extra; pip install 'millrace-rl[atari]'"
         case gymnasium.error.DependencyNotInstalled():
             return f"environment {env_id}: {says}"
-        case ModuleNotFoundError() if colon and f"'{module.split('.')[0]}" in says:
+        case ModuleNotFoundError(name=str(missing)) if colon and f"{module}.".startswith(f"{missing}."):
             return f"environment {env_id}: no module named {module}; is it installed, or its folder on PYTHONPATH?"
         case ImportError():
             return f"environment {env_id}: a package it needs is missing ({says}); pip install it, then try again"

@@ -22,11 +22,16 @@ A message is one line: who, what, expected, got, what to do next.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import SupportsIndex
 
 
 def first_line(error: BaseException, otherwise: str = "no message") -> str:
-    """The first line of an exception's message; `otherwise` if it has none."""
-    return (str(error).strip().splitlines() or [otherwise])[0].strip()
+    """The first line of an exception's message; `otherwise` if it has none, or if the user's `__str__` of it raises."""
+    try:
+        text = str(error)
+    except Exception:
+        return otherwise
+    return (text.strip().splitlines() or [otherwise])[0].strip()
 
 
 class MillraceError(Exception):
@@ -200,7 +205,7 @@ def unexpected_arguments(words: Sequence[str], *, one_run: bool) -> str:
     return f"unexpected argument {words[0]}"
 
 
-def check_at_least(name: str, value: int, least: int) -> None:
-    """Raise `UsageError` if a value that the user gave is less."""
-    if value < least:
-        raise UsageError(f"{name}: expected int >= {least}, got {value}")
+def check_at_least(name: str, value: object, least: int) -> None:
+    """Raise `UsageError` if a value that the user gave is less, or no whole number."""
+    if not (isinstance(value, SupportsIndex) and value.__index__() >= least):
+        raise UsageError(f"{name}: expected int >= {least}, got {value!r:.60}")

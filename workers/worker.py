@@ -356,7 +356,7 @@ class Worker:
                 case DescribeSpec():
                     self._describe(run)
             self._loaded = None
-        except (UserFacingError, ImportError, ValueError) as error:
+        except Exception as error:  # torch and the system raise many types
             detail = error.detail if isinstance(error, UserFacingError) else ""
             of_policy = isinstance(error, PolicyFailed)
             self._do(self._session.fail(_line(error), detail or traceback.format_exc(), None, of_policy=of_policy))

@@ -170,7 +170,7 @@ def test_an_evaluation_does_not_disturb_the_rollouts() -> None:
 def test_an_evaluation_that_cannot_be_made_is_refused() -> None:
     with service() as made:
         made.publish(made.policy.initial())
-        for wrong in ({"episodes": 0}, {"seed": -1}, {"max_steps": 0}):
+        for wrong in ({"episodes": 0}, {"episodes": "4"}, {"seed": -1}, {"max_steps": 0.5}):
             (name,) = wrong
             with pytest.raises(UsageError, match=f"evaluate: {name}: expected int >= "):
                 made.evaluate(**wrong)

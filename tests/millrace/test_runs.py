@@ -35,6 +35,12 @@ def run(trained: Path, tmp_path: Path) -> millrace.Run:
     return millrace.Run(shutil.copytree(trained, tmp_path / trained.name))
 
 
+def test_a_number_of_more_than_64_bits_is_a_float() -> None:
+    metrics = millrace.Metrics([{"a": 2**70, "b": -(2**63) + 1}])
+    assert {name: column.dtype.name for name, column in metrics.items()} == {"a": "float64", "b": "int64"}
+    assert metrics["a"].tolist() == [2.0**70]
+
+
 def test_train_returns_a_run_that_is_a_path(run: millrace.Run) -> None:
     assert Path(run) == run.path == Path(os.fspath(run))
     assert json.loads(Path(run, "summary.json").read_text())["env"] == "CartPole-v1"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import cast
+from typing import NoReturn, cast
 
 import msgspec
 import numpy as np
@@ -36,7 +36,7 @@ from protocol.wire.weight_dtypes import WeightsDtype, to_float32, to_wire_dtype
 from protocol.wire.worker_link import WorkerLink
 from tests.support.collectors import TOY, bits, collect, random_collector, run_of
 from workers.session import Leave, Session
-from workers.worker import Worker, identity
+from workers.worker import Worker, WorkerOptions, identity
 
 RUN = msgspec.structs.replace(run_of("CartPole-v1", T=40, N=8), learner_timeout_s=1e9)
 
@@ -131,6 +131,20 @@ def test_a_rollout_with_too_many_episodes_for_a_message_is_a_failure_with_advice
     failure = link.heard()[-1]
     assert isinstance(failure, Failure)
     assert failure.error.endswith(", for 512 episodes ended in it; take fewer rollout_steps, or more lanes")
+
+
+def test_a_collector_that_cannot_be_made_is_a_failure_that_the_learner_hears() -> None:
+    def no_device(run: RunSpec) -> NoReturn:
+        raise RuntimeError("CUDA error: out of memory")
+
+    link = FakeLink(said_to_a_worker(RUN))
+    session = Session(replace(identity("w0"), process_nonce=0), 0.0)
+    options = WorkerOptions(make_collector=no_device)
+    assert Worker(cast(WorkerLink, link), session, options, clock=lambda: 0.0).run().exit_code == 1
+    failure = link.heard()[-1]
+    assert isinstance(failure, Failure)
+    assert failure.error == "RuntimeError: CUDA error: out of memory"
+    assert "in no_device" in failure.traceback
 
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16", "float16"])

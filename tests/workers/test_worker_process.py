@@ -56,6 +56,25 @@ def test_a_process_that_was_reaped_already_has_ended(monkeypatch: pytest.MonkeyP
     assert ending == Ending(0, "ended while it started; its exit code is not known")
 
 
+def test_the_wait_for_a_process_that_no_signal_ends_has_a_deadline(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(
+        worker_process, "popen", lambda command, **how: subprocess.Popen(["sh", "-c", "exec sleep 60"], **how)
+    )
+    worker = WorkerProcess(WorkerCommand("ipc:///nobody/listens/here", "w0"))
+    with monkeypatch.context() as during:
+        during.setattr(worker_process, "KILLED_WITHIN_S", 0.1)
+        during.setattr(worker, "_kill_group", lambda: None)
+        worker.wait(0.0)
+    assert worker.ended() is None
+    assert [record.message for record in caplog.records] == [
+        f"worker w0 (process {worker.pid}) was killed and has not ended; it is left behind"
+    ]
+    worker.wait(0.0)  # with a signal that ends it
+    assert worker.ended() == Ending(-9, "was killed by SIGKILL while it started")
+
+
 def test_a_process_that_cannot_be_started_leaves_no_descriptor_behind(monkeypatch: pytest.MonkeyPatch) -> None:
     def popen(command: list[str], **how: Any) -> subprocess.Popen[bytes]:
         raise OSError("no memory")

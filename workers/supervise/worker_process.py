@@ -7,6 +7,7 @@ purpose says so beforehand: any other end is not on purpose, whatever the exit c
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import subprocess
@@ -26,11 +27,14 @@ from workers.supervise.activity import STACK_SIGNAL, ActivityReader
 from workers.supervise.ending import Ending
 from workers.watchdog import deepest_frame, where_it_hung
 
+log = logging.getLogger("millrace.worker")
+
 popen = subprocess.Popen  # a name of its own: a test may start workers in another way
 
 NONCE_VARIABLE = "MILLRACE_WORKER_NONCE"
 WRITE_STACKS_S = 0.3  # from the signal until the worker is killed
 CLOSE_WITHIN_S = 5.0  # a worker that leaves must have closed its environments and ended within this time
+KILLED_WITHIN_S = 5.0  # from SIGKILL until it is given up
 POLL_S = 0.02
 LOWEST_PRIORITY = 19  # niceness
 SINGLE_THREADED = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -149,13 +153,22 @@ class WorkerProcess:
             self._process.terminate()
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until it has ended; kill it if it is still running after that."""
-        deadline_s = time.monotonic() + timeout_s
-        while self.ended() is None and time.monotonic() < deadline_s:
-            time.sleep(POLL_S)
-        self.kill()
+        """Wait until it has ended; kill it if it is still running after that.
+
+        A process that not even SIGKILL ends, because it waits for a device or a network file system, is left behind.
+        """
+        if not self._ends_within(timeout_s):
+            self.kill()
+            if not self._ends_within(KILLED_WITHIN_S):
+                log.warning("worker %s (process %d) was killed and has not ended; it is left behind", self.name, self.pid)
+
+    def _ends_within(self, seconds: float) -> bool:
+        deadline_s = time.monotonic() + seconds
         while self.ended() is None:
+            if time.monotonic() >= deadline_s:
+                return False
             time.sleep(POLL_S)
+        return True
 
     def kill(self) -> None:
         """SIGKILL to its process group, for a worker that hangs."""

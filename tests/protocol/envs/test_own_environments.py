@@ -316,6 +316,20 @@ def test_what_goes_wrong_with_a_wrapper_is_one_line(wrapper: Any, says: str) -> 
         EnvSpec.of("CartPole-v1", {}, [wrapper]).make()
 
 
+@pytest.mark.parametrize("name", ["Env-v0", "make"])
+def test_a_package_that_the_module_of_an_environment_needs_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    (tmp_path / "has_a_need.py").write_text("import has_a_need_of_this\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    needed = r"a package it needs is missing \(No module named 'has_a_need_of_this'\); pip install it, then try again$"
+    with pytest.raises(UsageError, match=rf"^environment has_a_need:{name}: {needed}"):
+        EnvSpec(f"has_a_need:{name}").make()
+    missing = "no module named has_a_nee; is it installed, or its folder on PYTHONPATH"
+    with pytest.raises(UsageError, match=rf"^environment has_a_nee:{name}: {missing}"):
+        EnvSpec(f"has_a_nee:{name}").make()
+
+
 def test_only_a_worker_that_knows_its_learner_calls_what_it_names() -> None:
     named, pickled = (EnvSpec.of("CartPole-v1", {}, [wrapper]) for wrapper in (Halved, lambda env: env))
     codes = [AllowedCode.REGISTERED, AllowedCode.MODULES, AllowedCode.CALLABLES]
