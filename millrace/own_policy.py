@@ -79,6 +79,11 @@ class OwnPolicy:
 
     def spec(self, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
         """The policy for these spaces. Raises `UsageError` for declarations that cannot be used."""
+        if not (isinstance(self.factory, str) or callable(self.factory)):
+            raise UsageError(f"policy: factory: expected module:callable or a callable, got {self.factory!r:.60}")
+        for name, table in (("arrays", self.arrays), ("extras", self.extras), ("kwargs", self.kwargs)):
+            if not isinstance(table, Mapping):
+                raise UsageError(f"policy {self.name}: {name}: expected a dict, got {table!r:.60}")
         if isinstance(self.factory, str) and not all(self.factory.partition(":")):
             raise UsageError(f"policy {self.factory}: expected module:factory, as in my_package.policies:make_policy")
         if not (type(self.state_size) is int and self.state_size >= 0):

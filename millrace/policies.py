@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol, get_args
+from typing import Any, Literal, NamedTuple, Protocol, get_args
 
 import numpy as np
 
@@ -79,6 +79,10 @@ class MLP:
             raise UsageError(f"policy: expected widths of hidden layers, as in MLP(64, 64), got {self.net}")
         if self.activation not in get_args(Activation):
             raise UsageError(f"policy: activation: expected {' or '.join(get_args(Activation))}, got {self.activation!r}")
+        if type(self.normalize_observations) is not bool:
+            raise UsageError(
+                f"policy: normalize_observations: expected True or False, got {self.normalize_observations!r:.60}"
+            )
         return PolicySpec(
             observation,
             action,
@@ -267,15 +271,27 @@ def _flat(given: Mapping[str, Array] | Array, fields: tuple[Field, ...], what: s
         if missing := [name for name in names if name not in given]:
             raise UsageError(f"{what}: expected {', '.join(names)}; {missing[0]} is missing")
         for name, view in named_views(flat, fields).items():
-            array = np.asarray(given[name])
+            array = _numbers(given[name], f"{what}: {name}")
             if array.shape != view.shape:
                 raise UsageError(f"{what}: {name}: expected shape {list(view.shape)}, got {list(array.shape)}")
             view[...] = array
     else:
-        array = np.asarray(given)
+        array = _numbers(given, what)
         if array.shape != flat.shape:
             raise UsageError(f"{what}: expected a vector of {len(flat)} numbers, got shape {list(array.shape)}")
         flat[:] = array
     if not np.isfinite(flat).all():
         raise UsageError(f"{what}: expected finite numbers, got NaN or infinity; they were not published")
     return flat
+
+
+def _numbers(value: Any, what: str) -> Floats:
+    """The value as a float32 array; a number that is too large for it becomes infinite. Raises `UsageError`."""
+    try:
+        array = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        array = np.asarray(None)
+    if not np.can_cast(array.dtype, np.float32, "same_kind"):
+        raise UsageError(f"{what}: expected real numbers, got an array of {array.dtype}")
+    with np.errstate(over="ignore"):
+        return array.astype(np.float32, copy=False)

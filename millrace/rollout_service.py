@@ -40,7 +40,7 @@ from protocol.arrays import Array, Ints
 from protocol.did_you_mean import did_you_mean
 from protocol.env_spec import EnvLike, EnvSpec, remembered_name
 from protocol.envs.wrappers import WrapperLike, wrapper_names
-from protocol.errors import CheckpointError, UsageError, check_at_least, first_line
+from protocol.errors import CheckpointError, RunError, UsageError, check_at_least, first_line
 from protocol.rollout import Batch, stack_rollouts
 from protocol.specs import PolicySpec
 
@@ -297,6 +297,8 @@ class RolloutService:
         Call it right after `publish`. `RolloutService(..., restore=path)` goes on from it: ledger, versions, lanes
         and moments continue, and `restored` has the arrays. Rollouts that were under way are collected anew.
 
+        Raises `UsageError` for arrays that are not of numbers, and `RunError` if the file cannot be written.
+
         >>> import millrace
         >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:
         ...     _ = service.publish(service.policy.initial())
@@ -317,7 +319,10 @@ class RolloutService:
             incarnations=snapshot.incarnations,
             moments=None if self._moments is None else self._moments.state(),
         )
-        write(Path(path), state, arrays)
+        try:
+            write(Path(path), state, arrays)
+        except OSError as error:
+            raise RunError(f"{path} not written: {error.strerror or first_line(error)}") from error
 
     def ledger(self) -> dict[str, int]:
         """What became of every ticket and every transition: `used`, `stale`, `lost` and so on.

@@ -152,6 +152,10 @@ def test_a_factory_that_raises_is_named() -> None:
     ("wrong", "message"),
     [
         (millrace.OwnPolicy("Policy", ARRAYS), "policy Policy: expected module:factory"),
+        (millrace.OwnPolicy(5, ARRAYS), "^policy: factory: expected module:callable or a callable, got 5$"),  # type: ignore[arg-type]
+        (millrace.OwnPolicy(Linear, 5), "^policy Linear: arrays: expected a dict, got 5$"),  # type: ignore[arg-type]
+        (millrace.OwnPolicy(Linear, ARRAYS, ["a"]), r"^policy Linear: extras: expected a dict, got \['a'\]$"),  # type: ignore[arg-type]
+        (millrace.OwnPolicy(Linear, ARRAYS, kwargs=5), "^policy Linear: kwargs: expected a dict, got 5$"),  # type: ignore[arg-type]
         (millrace.OwnPolicy(Linear, {"w": (4, 0)}), "array w: expected a shape"),
         (millrace.OwnPolicy(Linear, {"w": 4}), "array w: expected a shape"),  # type: ignore[dict-item]
         (millrace.OwnPolicy(Linear, ARRAYS, {"a": "float33"}), "extra a: expected a dtype of numbers"),

@@ -18,7 +18,7 @@ import millrace
 from millrace.cli.status import as_table
 from millrace.policies import PolicyParameters
 from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import CheckpointError, UsageError
+from protocol.errors import CheckpointError, RunError, UsageError
 from protocol.policy.networks import ActorCriticNetwork
 
 SMALL: dict[str, Any] = {"workers": 1, "envs": 4, "lanes": 2, "transport": "inproc"}
@@ -127,6 +127,10 @@ def test_with_a_lag_a_batch_may_be_gathered_before_its_weights_are_published() -
         (np.zeros(3, np.float32), "parameters: expected a vector of 4610 numbers"),
         ({"actor.0.weight": np.zeros((64, 4))}, "actor.0.bias is missing"),
         (np.full(4610, np.nan, np.float32), "expected finite numbers"),
+        (np.full(4610, 1e300), "expected finite numbers"),
+        ([[1.0], [1.0, 2.0]], "parameters: expected real numbers, got an array of object"),
+        (["1"] * 4610, "parameters: expected real numbers, got an array of <U1"),
+        (np.zeros(4610, complex), "parameters: expected real numbers, got an array of complex128"),
     ],
 )
 def test_weights_that_cannot_be_used_are_refused_and_cost_nothing(parameters: Any, message: str) -> None:
@@ -175,6 +179,13 @@ def test_an_evaluation_that_cannot_be_made_is_refused() -> None:
             with pytest.raises(UsageError, match=f"evaluate: {name}: expected int >= "):
                 made.evaluate(**wrong)
         assert made.evaluate(episodes=1).episodes == 1
+
+
+def test_a_service_that_cannot_be_saved_is_one_line(tmp_path: Path) -> None:
+    with service() as made:
+        made.publish(made.policy.initial())
+        with pytest.raises(RunError, match=r"no/state.npz not written: No such file or directory$"):
+            made.save(tmp_path / "no" / "state.npz")
 
 
 def test_a_saved_service_goes_on(tmp_path: Path) -> None:
@@ -261,6 +272,10 @@ def test_calls_from_another_thread_and_after_the_end_are_refused() -> None:
         ({"workers": "two"}, "workers: expected int, got 'two'"),
         ({"policy": millrace.CNN()}, "expected an image"),
         ({"policy": millrace.MLP(0)}, "expected widths of hidden layers"),
+        (
+            {"policy": millrace.MLP(8, normalize_observations="yes")},  # type: ignore[arg-type]
+            "policy: normalize_observations: expected True or False, got 'yes'",
+        ),
         ({"policy": millrace.MLP(8, activation="gelu")}, "policy: activation: expected tanh or relu, got 'gelu'"),  # type: ignore[arg-type]
         ({"policy": millrace.Recurrent(8, core="rnn")}, "policy: core: expected lstm or gru, got 'rnn'"),  # type: ignore[arg-type]
         ({"policy": millrace.Recurrent(8, core_size=0)}, "policy: core_size: expected a whole number above 0, got 0"),
