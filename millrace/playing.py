@@ -7,9 +7,10 @@ the episodes; the caller's process runs no environment code.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypedDict, TypeVar, Unpack
+from typing import Any, Literal, NamedTuple, TypedDict, TypeVar, Unpack, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -62,7 +63,7 @@ class EvaluateKeywords(PlayKeywords, total=False):
 class RecordKeywords(PlayKeywords, total=False):
     """Keywords of `millrace.record`. `RecordFlags` says what they mean."""
 
-    npy: Path | None
+    npy: str | os.PathLike[str] | None
     stochastic: bool
 
 
@@ -158,9 +159,30 @@ def flags_of(kind: type[_Flags], name: str, **keywords: Any) -> _Flags:
         if keyword not in kind.__struct_fields__ or keyword in NOT_KEYWORDS:
             raise UsageError(f"{name}: unknown keyword {keyword}{did_you_mean(keyword, kind.__struct_fields__)}")
     try:
-        return msgspec.convert(keywords, kind)
+        return msgspec.convert(keywords, kind, dec_hook=_path)
     except msgspec.ValidationError as error:
-        raise UsageError(f"{name}: {error}") from error
+        raise UsageError(f"{name}: {_reworded(str(error), kind, keywords)}") from error
+
+
+def _path(kind: type, value: object) -> Path:
+    """A path where a field wants one. Raises `TypeError`, which msgspec reports, for what is none."""
+    if not isinstance(value, str | os.PathLike):
+        raise TypeError("Expected text or a path")
+    return Path(value)
+
+
+def _reworded(message: str, kind: type, keywords: dict[str, Any]) -> str:
+    """Msgspec's message in our words: the keyword, what was expected and what was given."""
+    expected, at, path = message.replace(" | null", " or None").partition(" - at `$.")
+    keyword = re.split(r"[.\[`]", path)[0]
+    if not at or keyword not in keywords:
+        return message
+    hint = get_type_hints(kind)[keyword]
+    if get_origin(hint) is Literal:
+        expected = f"expected one of {', '.join(get_args(hint))}"
+    else:
+        expected = expected.replace("`", "").replace("Expected", "expected").partition(", got ")[0]
+    return f"{keyword}: {expected}, got {keywords[keyword]!r:.60}"
 
 
 def play(flags: EvaluateFlags, watch: Watch, given: Given | None = None) -> tuple[Evaluation, list[Path]]:

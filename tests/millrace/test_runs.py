@@ -145,14 +145,22 @@ def test_record_is_the_command(run: millrace.Run, tmp_path: Path, monkeypatch: p
     ("keywords", "message"),
     [
         ({"episode": 5}, "evaluate: unknown keyword episode; did you mean episodes?"),
-        ({"workers": "two"}, r"evaluate: Expected `int`, got `str` - at `\$.workers`"),
+        ({"workers": "two"}, "^evaluate: workers: expected int, got 'two'$"),
+        ({"episodes": 2.5}, "^evaluate: episodes: expected int or None, got 2.5$"),
         ({"episodes": 0}, "episodes: expected int >= 1, got 0"),
-        ({"transport": "udp"}, "evaluate: Invalid enum value 'udp'"),
+        ({"transport": "udp"}, "^evaluate: transport: expected one of inproc, ipc, tcp, got 'udp'$"),
     ],
 )
 def test_a_wrong_keyword_is_refused_in_one_line(keywords: dict[str, Any], message: str, run: millrace.Run) -> None:
     with pytest.raises(millrace.UsageError, match=message):
         millrace.evaluate(run, **keywords)
+
+
+def test_the_file_of_rows_may_be_named_by_text(run: millrace.Run) -> None:
+    with pytest.raises(millrace.UsageError, match=r"^no/rows.npy cannot be written: no such folder no$"):
+        run.record("cartpole/rows-v0", steps=10, workers=1, npy="no/rows.npy")
+    with pytest.raises(millrace.UsageError, match=r"^record: npy: expected text or a path, got 5$"):
+        run.record("cartpole/rows-v0", steps=10, workers=1, npy=5)  # type: ignore[arg-type]
 
 
 def test_resume_continues_the_same_run(run: millrace.Run) -> None:
