@@ -40,7 +40,8 @@ Stage = Literal["open", "act", "step", "evaluate", "wait"]
 """Stages in which a worker spends its time."""
 Stages = dict[Stage, Seconds]
 
-# Marks of direction (U+202A to U+202E and the like) may be in a message. They are not shown: they turn the line round them.
+# A message may hold marks of text direction (U+202A to U+202E and the like). They are escaped where text is shown, because
+# they change the order in which the rest of the line appears.
 _HIDDEN = r"\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff"
 _CONTROL = re.compile(rf"[\x00-\x0a{_HIDDEN}]")
 _CONTROL_EXCEPT_NEWLINE = re.compile(rf"[\x00-\x08{_HIDDEN}]")

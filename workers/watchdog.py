@@ -2,8 +2,8 @@
 
 Rule: when nobody calls `feed` for `timeout_s`, the process writes the stack of each of its threads to stderr and exits at
 once with exit code 1. Its supervisor ends it before that, unless the supervisor is dead or the worker hangs in our own code.
-The timer is a C thread of Python's faulthandler, which does not
-need the interpreter's lock. Setting it takes about 50 µs, so `feed` does so only now and then.
+The timer is a C thread of Python's faulthandler, which does not need the interpreter's lock. Setting it takes about 50 µs,
+so `feed` does so only now and then.
 """
 
 from __future__ import annotations

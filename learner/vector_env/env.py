@@ -163,7 +163,14 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
     # ---------------------------------------------------------------- step
 
     def step(self, actions: Any) -> StepResult:
-        """Step every copy. Returns observations, rewards, terminated, truncated and infos."""
+        """Step every copy. Returns observations, rewards, terminated, truncated and infos.
+
+        `actions` and observations have a row for each copy, as `action_space` and `observation_space`. Rewards are
+        [num_envs] float64; terminated and truncated are [num_envs] bool; infos are a dict, as gymnasium merges them.
+
+        Raises `UsageError` for copies that must be reset first, `TypeError` and `ValueError` for wrong actions,
+        `EnvironmentFailed`, `NoWorkers`, and with `on_worker_loss="raise"` `WorkerLost`.
+        """
         self.step_async(actions)
         return self.step_wait()
 
@@ -208,9 +215,9 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
             self._hub.send_orders({lane: self._step_order(lane, arrays) for lane in self._stepping})
 
     def step_wait(self, timeout: float | None = None) -> StepResult:
-        """Wait for the pending step. A worker that does not answer within `timeout` seconds is given up.
+        """Wait for the pending step. Returns and raises what `step` does, and `NoAsyncCallError` if there is none.
 
-        `timeout` is `timeout_s` by default.
+        A worker that does not answer within `timeout` seconds (`timeout_s` by default) is given up.
         """
         if self.closed:
             raise ClosedEnvironmentError("step_wait after close()")

@@ -1,9 +1,9 @@
 """The command line: finds the command, runs it, and turns an error into one line and an exit code.
 
 Rule: bad usage is one line on stderr and exit code 2. A run that failed is one line (and the worker's traceback below it,
-if there is one) and exit code 1. Ctrl-C is exit code 130. A traceback of millrace itself is shown with --debug only. What
-standard error does not take is dropped, and so is what standard output does not take of a run: neither ends a run. Each
-command imports what it needs when it runs, so that `--help` answers at once.
+if there is one) and exit code 1. Ctrl-C is exit code 130. A traceback of millrace itself is shown with --debug only. A run
+goes on if standard error or standard output cannot be written; that text is dropped. Each command imports what it needs
+when it runs, so that `--help` answers at once.
 """
 
 from __future__ import annotations

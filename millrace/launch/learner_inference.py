@@ -44,8 +44,8 @@ def train(
 ) -> Path:
     """Train until the run is done. Returns the run folder.
 
-    `elsewhere`: the workers are started elsewhere and join at
-    `config.bind`. Raises `UserFacingError`, or `Interrupted` if the user stopped the run.
+    `elsewhere`: the workers are started elsewhere and join at `config.bind`. Raises `UserFacingError`, or `Interrupted` if
+    the user stopped the run.
     """
     with ExitStack() as stack:
         endpoint = open_endpoint(BindSettings(), "inproc", stack)

@@ -1,1 +1,1 @@
-"""What the logs of both ends have in common: how many lines a peer may cause, and lines that are no warnings."""
+"""Logging on both sides: how many lines a peer may cause, and notices, which are no warnings."""

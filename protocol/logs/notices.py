@@ -1,7 +1,7 @@
-"""Lines of the log that a person must see and that warn of nothing: as the command that starts a worker.
+"""Notices: log lines that a person must see and that are no warnings, such as the command that starts a worker.
 
-Rule: a notice is logged as a warning is, because a program that sets up no logging shows warnings alone. What shows the log
-calls it no warning.
+Rule: a notice has the level WARNING, because a program that sets up no logging shows only warnings. Our own displays of the
+log show it without the word "warning".
 """
 
 from __future__ import annotations

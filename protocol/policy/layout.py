@@ -123,9 +123,9 @@ def hidden_names(spec: PolicySpec, name: str = "") -> list[str]:
 def _hidden(name: str, width: int, sizes: Sequence[int]) -> tuple[list[Field], int]:
     """The fields of the hidden layers, and the width of the last one."""
     fields: list[Field] = []
-    for i, total_size in enumerate(sizes):
-        fields += _linear(f"{name}.{i}", width, total_size, math.sqrt(2))
-        width = total_size
+    for i, size in enumerate(sizes):
+        fields += _linear(f"{name}.{i}", width, size, math.sqrt(2))
+        width = size
     return fields, width
 
 

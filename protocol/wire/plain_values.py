@@ -154,12 +154,12 @@ def _check_depth(value: object, depth: int) -> None:
 
 def _from_extension(code: int, data: bytes, inner: Callable[[bytes], Any]) -> Any:
     match code:
-        case 1:
+        case 1:  # _TUPLE
             return tuple(inner(data))
-        case 2:
+        case 2:  # _PAIRS
             keys, values = inner(data)
             return dict(zip(keys, values, strict=True))
-        case 3:
+        case 3:  # _ARRAY
             dtype, shape, raw = inner(data)
             kind = _dtype(dtype)
             if len(raw) != math.prod(shape) * kind.itemsize:
@@ -168,21 +168,21 @@ def _from_extension(code: int, data: bytes, inner: Callable[[bytes], Any]) -> An
                 raise BadMessage(f"array {dtype}{shape}: expected elements of a byte or more")
             _check_characters(raw, kind)
             return np.frombuffer(raw, kind).reshape(shape).copy() if raw else np.zeros(shape, kind)
-        case 4:
+        case 4:  # _SCALAR
             dtype, raw = inner(data)
             kind = _dtype(dtype)
             _check_characters(raw, kind)
             return np.frombuffer(raw, kind)[0] if kind.itemsize else kind.type()
-        case 5:
+        case 5:  # _OBJECTS
             shape, values = inner(data)
             array = np.empty(len(values), object)
             array[:] = values
             return array.reshape(shape)
-        case 6:
+        case 6:  # _INT
             return int(data)
-        case 7:
+        case 7:  # _COMPLEX
             return complex(*inner(data))
-        case 8:
+        case 8:  # _REPR
             return ReprString(data.decode())
         case _:
             raise BadMessage(f"plain value: expected one of ours, got extension {code}")

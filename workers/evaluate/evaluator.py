@@ -120,7 +120,7 @@ class Evaluator:
                 # A new array at each step, because an environment may keep its action.
                 actions = np.zeros((copies.count, *policy.action.shape), policy.action.dtype)
                 actions[:k] = self._to_env_action(chosen)
-            ended = False
+            ended = set[int]()
             for n, step in zip(running, copies.step(actions, running, pulse), strict=True):
                 reward = _finite_reward(step.reward, n, lengths[n])
                 self._store(obs, n, step.leaves, lengths[n])
@@ -132,11 +132,12 @@ class Evaluator:
                     self._observe(senders[n], obs, n, copies)
                     senders[n].step(chosen[n], reward, bool(step.terminated), bool(step.truncated) or cut[n])
                 if over or cut[n]:
-                    ended, seconds[n], facts[n] = True, perf_counter() - began_s, step.facts or no_facts
+                    ended.add(n)
+                    seconds[n], facts[n] = perf_counter() - began_s, step.facts or no_facts
             self._check_values(obs, lengths[running[0]] - 1)  # all that run have made equally many steps
             self.steps += len(running)
             if ended:
-                running = [n for n in running if not seconds[n]]
+                running = [n for n in running if n not in ended]
         episodes = tuple(Episode(*figures) for figures in zip(returns, lengths, seconds, facts, strict=True))
         return Evaluated(order.session, order.ticket, episodes, tuple(cut))
 

@@ -47,7 +47,9 @@ class Activity:
             faulthandler.register(STACK_SIGNAL, file=fd, all_threads=True)
 
     def begin(self, doing: int) -> None:
-        """From now on, the worker does this. The time is written first: an old time must not stand beside a new deed."""
+        """From now on, the worker does this. The time is written first, so that no reader sees the new activity with the
+        time of the old one.
+        """
         self.seconds[SINCE_S] = perf_counter()
         self.numbers[DOING] = doing
 
