@@ -20,7 +20,7 @@ from learner.algorithms import Algorithm
 from learner.callbacks.callbacks import Callbacks, Watch
 from learner.config.algorithm_names import FOR_PRIOR
 from learner.config.config import Config
-from learner.config.validation import unused_target
+from learner.config.validation import unused_target, workers_to_wait_for
 from learner.env_spaces import EnvSpaces
 from learner.imports_ahead import ImportsAhead
 from learner.interrupts import Interrupts
@@ -310,7 +310,7 @@ def serve(config: Config, resume: Resumption | None, watch: Watch) -> Path:
         folder = folder or stack.enter_context(run_folder(config, None))
         with Interrupts(config.grace_s) as interrupts:
             setup = RunSetup(config, known, folder, resume is not None, interrupts)
-            Run(setup, bound.link, processes, watch, observer).train(config.min_workers or 1)
+            Run(setup, bound.link, processes, watch, observer).train(workers_to_wait_for(config, None))
         return folder.path
 
 

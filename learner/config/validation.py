@@ -76,6 +76,21 @@ def idle_workers(config: Config) -> str:
     )
 
 
+def workers_to_wait_for(config: RolloutConfig, local: int | None) -> int:
+    """How many workers must have joined before collection starts. Raises `UsageError` if so many cannot join.
+
+    `local`: number of workers that this machine starts, if no other worker can join; None: workers are started elsewhere.
+    """
+    if local is None:
+        return config.min_workers or 1
+    if config.min_workers > local:
+        raise UsageError(
+            f"min_workers: expected at most {local}, the number of workers that this run starts, got {config.min_workers}; "
+            "take more --workers, or a learner that workers on other machines can join"
+        )
+    return config.min_workers or local
+
+
 def unused_target(config: Config) -> str:
     """A line for the user if no evaluation during training can reach `target_return`, or nothing."""
     if config.target_return is None or config.eval_every:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from learner.callbacks.callbacks import Watch
 from learner.config.config import Config
+from learner.config.validation import workers_to_wait_for
 from learner.interrupts import Interrupts
 from learner.members.describe_coordinator import Accept
 from learner.members.endpoint import BindSettings
@@ -47,6 +48,7 @@ def train(
     `elsewhere`: the workers are started elsewhere and join at `config.bind`. Raises `UserFacingError`, or `Interrupted` if
     the user stopped the run.
     """
+    workers = workers_to_wait_for(config, None if elsewhere else min(config.workers, config.envs))
     with ExitStack() as stack:
         endpoint = open_endpoint(BindSettings(), "inproc", stack)
         link = endpoint.link
@@ -61,7 +63,6 @@ def train(
         known = known_environment(config, env_spec, resume, describe)
         env = started.vector_env(known.described)
         stack.callback(env.close)
-        workers = config.min_workers or (1 if elsewhere else min(config.workers, config.envs))
         before_wait = BeforeWaits(env, workers, config.no_workers_timeout_s)
         lanes = SplitVectorEnv(
             env, config.lanes, before_wait, env.step_lanes, config.fact_names(), masked=known.spaces.masked

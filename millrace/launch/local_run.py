@@ -11,7 +11,7 @@ from pathlib import Path
 
 from learner.callbacks.callbacks import Watch
 from learner.config.config import Config
-from learner.config.validation import idle_workers
+from learner.config.validation import idle_workers, workers_to_wait_for
 from learner.interrupts import Interrupts
 from learner.members.endpoint import BindSettings
 from learner.members.process_callbacks import ProcessCallbacks
@@ -47,6 +47,7 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
         from millrace.launch import learner_inference as inference
 
         return inference.train(config, resume, watch, env)
+    workers = workers_to_wait_for(config, config.workers)
     if line := idle_workers(config):
         log.warning("%s", line)
     with ExitStack() as stack:
@@ -65,5 +66,5 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
             known = known_environment(config, env, resume, describe_over(endpoint.link, config, processes))
         with interrupts:
             setup = RunSetup(config, known, folder, resume is not None, interrupts)
-            Run(setup, endpoint.link, processes, watch, observer).train(config.min_workers or config.workers)
+            Run(setup, endpoint.link, processes, watch, observer).train(workers)
         return folder.path

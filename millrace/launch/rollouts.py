@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 
 from learner.config.rollout_config import RolloutConfig
+from learner.config.validation import workers_to_wait_for
 from learner.env_spaces import EnvSpaces
 from learner.members.describe import described_by_workers
 from learner.members.endpoint import BindSettings
@@ -50,6 +51,7 @@ def start(
 
     `listens`: wait for workers elsewhere at `config.bind`, and start none. Raises `UserFacingError`.
     """
+    workers = workers_to_wait_for(config, None if listens else config.workers)
     code = env.called_code or ("a policy's callable" if policy.is_code else "")
     where = BindSettings(config.bind if listens else "", config.keys, config.insecure, config.advertise)
     endpoint = open_endpoint(where, config.transport, resources, code)
@@ -73,5 +75,5 @@ def start(
         policy_spec = policy.spec(spaces.observation, spaces.action)
         run = rollout_spec(config, env, policy_spec, rollout_steps, policy.extra_arrays, masked=spaces.masked)
         service = rollout_service(config, run, link, processes, check_interrupt, past=past)
-        service.wait_for_workers(config.min_workers or (1 if listens else config.workers))
+        service.wait_for_workers(workers)
     return StartedService(service, run, described)

@@ -130,6 +130,29 @@ def test_a_policy_that_never_presses_fire_plays_on_only_with_fire_after_life_los
         assert (ends >= 1).all() if fires else (ends == 0).all()
 
 
+@pytest.mark.parametrize("noop_max", [0, 30])
+def test_a_game_with_continuous_actions_is_started_in_both_forms(noop_max: int) -> None:
+    """Also by a policy that never presses FIRE. With random joysticks, both forms show the same."""
+    settings = {"fire_on_reset": True, "fire_after_life_loss": True, "terminal_on_life_loss": True, "noop_max": noop_max}
+    N, env = 2, EnvSpec(BREAKOUT.id, {**BREAKOUT.kwargs, **settings, "continuous": True})
+    one, other = OPEN["native"](env, N), OPEN["loop"](env, N)
+    one.reset([3, 4], no_pulse)
+    other.reset([3, 4], no_pulse)
+    generator, ended, lives = np.random.default_rng(0), np.zeros((N, 1), bool), np.zeros((2, N), int)
+    low, high = [0, -np.pi, 0], [1, np.pi, 0.4]  # FIRE is pressed above 0.5
+    for _ in range(400):
+        actions = np.where(ended, np.float32(0), generator.uniform(low, high, (N, 3)).astype(np.float32))
+        row, looped = one.step(actions, no_pulse), other.step(actions, no_pulse)
+        if not noop_max:  # otherwise the two draw other numbers of no-op actions
+            np.testing.assert_array_equal(row.leaves[0], looped.leaves[0])
+            assert (row.reward.tolist(), row.terminated.tolist()) == (looped.reward, looped.terminated)
+        ended[:, 0] = row.terminated
+        lives += [row.terminated, looped.terminated]
+    assert (lives >= 4).all()
+    for copies in (one, other):
+        copies.close()
+
+
 def test_fire_is_pressed_only_in_games_that_have_it() -> None:
     """Freeway's first action after the no-op action is UP."""
     for game, presses in (("Freeway", False), ("Breakout", True)):

@@ -16,6 +16,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.spaces import Box
 from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.wrappers import AtariPreprocessing, ClipReward, FrameStackObservation
 
@@ -24,6 +25,7 @@ from protocol.errors import UsageError
 FRAMES, SKIP, SIDE = 4, 4, 84
 MAX_FRAMES = 108_000  # in a game: half an hour of play
 NOOP, FIRE = 0, 1  # actions
+JOYSTICK_FIRE = np.array([0, 0, 1], np.float32)  # of a game with continuous actions: radius, angle, fire
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,8 @@ def make_game(**kwargs: Any) -> gymnasium.Env[Any, Any]:
         "max_num_frames_per_episode": MAX_FRAMES,
     }
     env = gymnasium.make(f"ale_py:ALE/{settings.game}-v5", frameskip=1, disable_env_checker=True, **options)
+    if isinstance(env.action_space, Box):
+        env = _Joystick(env)
     if settings.fire_on_reset:
         env = _StartsGames(env)
     has_fire = _has_fire(env)
@@ -100,6 +104,13 @@ def make_games(num_envs: int, **kwargs: Any) -> VectorEnv[Any, Any, Any]:
     if settings.fire_after_life_loss and made.unwrapped.ale.get_action_set()[FIRE].value == FIRE:  # type: ignore[attr-defined]
         made = _VectorFiresAfterLives(made)
     return _StepAfterLives(made) if settings.terminal_on_life_loss else made
+
+
+class _Joystick(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Takes the actions NOOP and FIRE also in a game with continuous actions (`continuous=True`)."""
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        return self.env.step(JOYSTICK_FIRE * action if isinstance(action, int) else action)
 
 
 class _StartsGames(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -144,6 +155,7 @@ class _VectorFiresAfterLives(VectorWrapper):
         super().__init__(env)
         self._lives = np.zeros(env.num_envs, int)
         self._fires = np.zeros(env.num_envs, bool)  # in the next step
+        self._fire = JOYSTICK_FIRE if isinstance(env.single_action_space, Box) else FIRE
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed, options=options)
@@ -151,7 +163,9 @@ class _VectorFiresAfterLives(VectorWrapper):
         return observation, info
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        result = self.env.step(np.where(self._fires, FIRE, actions))
+        actions = np.array(actions)
+        actions[self._fires] = self._fire
+        result = self.env.step(actions)
         lives = result[-1]["lives"]
         self._fires = lives < self._lives
         self._lives[:] = lives

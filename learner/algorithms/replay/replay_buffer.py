@@ -213,8 +213,8 @@ class ReplayBuffer:
     def _continues(self, first: Sequence[Array], newest: Ints | None, room: int) -> tuple[Bools, Ints]:
         """[N] whether a copy's rollout begins with the newest observation that is stored for it; [N] where that was written.
 
-        The observations are compared, because a rollout between the two may have been dropped. The stored observation must
-        also be so new that adding this rollout does not overwrite it.
+        The observations are compared, in case a caller that stacks rollouts itself has left one out. The stored observation
+        must also be so new that adding this rollout does not overwrite it.
         """
         if newest is None:
             newest = np.full(len(first[0]), NO_SLOT)

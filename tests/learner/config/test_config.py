@@ -13,7 +13,7 @@ from learner.config.config import Config
 from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
 from learner.config.layers import config_from_toml, lower_layers, resolve
 from learner.config.presets import PRESETS, named_presets
-from learner.config.validation import idle_workers, unused_target
+from learner.config.validation import idle_workers, unused_target, workers_to_wait_for
 from protocol.errors import UsageError
 
 
@@ -106,6 +106,17 @@ def test_a_whole_number_may_be_written_in_powers_of_ten(tmp_path: Path) -> None:
     assert resolve("CartPole-v1", file=written(tmp_path, "eval_episodes = 1e2")).eval_episodes == 100  # which may be none
     assert isinstance(resolve("CartPole-v1", target_return=5e2).target_return, float)
     assert "steps: expected int" in refusal(steps=1.5)
+
+
+def test_a_run_that_no_other_worker_can_join_waits_for_no_more_workers_than_it_starts() -> None:
+    assert workers_to_wait_for(resolve("CartPole-v1", workers=3), 3) == 3
+    assert workers_to_wait_for(resolve("CartPole-v1", workers=3, min_workers=2), 3) == 2
+    with pytest.raises(
+        UsageError, match=r"^min_workers: expected at most 3, the number .* starts, got 4; take more --workers"
+    ):
+        workers_to_wait_for(resolve("CartPole-v1", workers=3, min_workers=4), 3)
+    assert workers_to_wait_for(resolve("CartPole-v1", workers=3), None) == 1
+    assert workers_to_wait_for(resolve("CartPole-v1", workers=3, min_workers=4), None) == 4
 
 
 @pytest.mark.parametrize(
