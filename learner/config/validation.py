@@ -196,6 +196,7 @@ def _reworded(message: str, settings: dict[str, Any]) -> str:
     name = re.split(r"[.\[`]", path)[0]
     record = settings_record(settings["algo"]) if name in algorithm else Config
     given = algorithm.get(name, settings.get(name))
+    given = list(given) if isinstance(given, tuple) else given
     if expected.startswith("Invalid enum value"):
         return f"{name}: expected one of {', '.join(_choices(get_type_hints(record)[name]))}, got {given!r}"
     return f"{name}: {expected.replace('`', '').replace('Expected', 'expected').partition(', got ')[0]}, got {given!r}"

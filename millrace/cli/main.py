@@ -76,6 +76,9 @@ def _exit_code(argv: list[str]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:  # of a path on the command line
+            _print_error(f"millrace: path {error.filename}: {error.strerror}; choose a shorter one")
+            return _failed(argv, 2)
         if error.filename is not None or error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
             return _internal_error(argv, error)
         _print_error(f"millrace: standard output: {error.strerror}")  # an error of a file has the file's name

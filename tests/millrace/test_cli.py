@@ -306,6 +306,15 @@ def test_a_command_without_errors_takes_debug_too(capsys: Captured) -> None:
     assert "--preset cartpole-dqn" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("flag", ["--run-dir", "--resume"])
+def test_a_path_that_is_too_long_is_bad_usage(capsys: Captured, flag: str) -> None:
+    path = "x" * 300
+    words = ["CartPole-v1", flag, path] if flag == "--run-dir" else [flag, path]
+    line = refusal(capsys, "train", *words)
+    assert line.startswith(f"path {path}")
+    assert line.endswith(": File name too long; choose a shorter one")
+
+
 def test_an_error_in_millrace_hides_its_traceback_until_asked(capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
     failing(monkeypatch, ZeroDivisionError("division\nby zero"))
     line = refusal(capsys, "train", "CartPole-v1", exit_code=1)
