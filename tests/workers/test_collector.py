@@ -286,6 +286,21 @@ def test_a_lane_released_by_a_pulse_is_closed_after_the_collection() -> None:
     assert said == ["b"]
 
 
+def test_a_lane_released_while_its_copies_are_made_is_closed_after_the_collection() -> None:
+    run, said = run_of(f"{TOY}Scripted-v0", T=4, N=1), list[str]()
+
+    def make(lane: int) -> Closable:
+        if lane == 1:
+            collector.close([1])
+        return Closable(said, "ab"[lane])
+
+    collector = random_collector(run, lambda r, n, p: loop_over([partial(make, n)])(r, n, p))
+    collect(collector, run, lanes=(0, 1))
+    assert said == ["b"]
+    collector.close_all()
+    assert said == ["b", "a"]
+
+
 def test_the_pulse_is_called_between_slow_copies(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("workers.env_loop.PULSE_S", -1.0)  # any step is a slow one
     run = run_of(f"{TOY}Countdown-v0", T=3, N=5)

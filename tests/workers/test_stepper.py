@@ -223,6 +223,20 @@ def test_a_lane_that_is_released_during_a_step_is_closed_after_it(monkeypatch: p
     assert [env.open for env in envs] == [False, False]
 
 
+def test_a_lane_that_is_released_while_its_copies_are_made_is_closed_after_the_order(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    closed: list[EnvLoop] = []
+    monkeypatch.setattr(EnvLoop, "close", lambda loop: closed.append(loop))
+    stepper = Stepper(step_spec(VectorEnvSettings(Countdown, 2, lanes=1)))
+    reset = Reset(1, 1, 0, 0, (0, 1), (0, 1), np.frombuffer(pack(None), np.uint8))
+    answer = stepper.execute(reset, lambda: stepper.close([0]) if not closed else None)
+    assert isinstance(answer, Stepped)
+    assert len(closed) == 1
+    stepper.close_all()
+    assert len(closed) == 1
+
+
 class BufferedInfo(Countdown):
     """Returns the same info again and again, as a subclass of dict. Its array is always the same one, too."""
 

@@ -93,6 +93,7 @@ class Collector:
         self._lanes: dict[int, CollectedLane] = {}
         self._to_close: list[CollectedLane] = []  # released by a pulse, when their copies may be in the middle of a step
         self._collecting = False
+        self._opening: int | None = None  # lane whose copies are being made, until it is released
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
         """Use these weights from now on."""
@@ -134,7 +135,11 @@ class Collector:
 
     def close(self, lanes: Iterable[int]) -> None:
         """Close these lanes, if they are here. When a pulse calls this, they are closed after the collection."""
-        self._to_close += [self._lanes.pop(lane) for lane in lanes if lane in self._lanes]
+        for lane in lanes:
+            if lane in self._lanes:
+                self._to_close.append(self._lanes.pop(lane))
+            elif lane == self._opening:
+                self._opening = None
         while self._to_close and not self._collecting:
             self._to_close.pop().copies.close()
 
@@ -149,11 +154,16 @@ class Collector:
             return lane
         began = perf_counter()
         self.close([assignment.lane])
+        self._opening = assignment.lane
         try:
             copies = self._open_copies(self._run, assignment.lane, pulse)
         except CopyRaised as error:
             raise lane_failed(assignment.lane, "made", error) from error
-        lane = self._lanes[assignment.lane] = CollectedLane(self._run, assignment.lane, assignment.incarnation, copies)
+        lane = CollectedLane(self._run, assignment.lane, assignment.incarnation, copies)
+        if self._opening == assignment.lane:
+            self._lanes[assignment.lane] = lane
+        else:
+            self._to_close.append(lane)
         lane.set_attributes(self.env_attributes, pulse)
         lane.reset(pulse)
         self.stages["open"] += perf_counter() - began

@@ -45,6 +45,7 @@ class Stepper:
         """seconds spent making and resetting copies, and stepping them"""
         self._spec, self._allow_private_names = spec, allow_private_names
         self._lanes: dict[int, SteppedLane] = {}
+        self._opening: int | None = None  # lane whose copies are being made, until it is released
         self._running: SteppedLane | None = None  # its copies are in the middle of an order: a pulse must not close them
         self._executed: dict[int, int] = {}  # lane -> number of the newest order through shared memory that was executed
         self._memory = None if shared_memory is None else SharedMemory(spec, shared_memory.memory)
@@ -157,10 +158,12 @@ class Stepper:
             return lane
         began = perf_counter()
         self.close([number])
+        self._opening = number
         lane = SteppedLane(self._spec, number, incarnation, self._rows(number), pulse)
-        self._lanes[number] = lane
-        if self._memory is not None:
-            self._executed[number] = self._memory.ordered(number)
+        if self._opening == number:  # otherwise it is closed after the order
+            self._lanes[number] = lane
+            if self._memory is not None:
+                self._executed[number] = self._memory.ordered(number)
         self.stages["open"] += perf_counter() - began
         return lane
 
@@ -173,6 +176,8 @@ class Stepper:
     def close(self, lanes: Iterable[int]) -> None:
         """Close these lanes, if they are here. One whose copies run is closed when they return."""
         for number in lanes:
+            if number == self._opening:
+                self._opening = None
             if (lane := self._lanes.pop(number, None)) is not None:
                 self._executed.pop(number, None)
                 if lane is not self._running:
