@@ -295,15 +295,19 @@ class RunFolder:
         if description.format != POLICY_FORMAT:
             raise UsageError(f"policy of run {self.path}: expected format {POLICY_FORMAT}, got {description.format}")
         acting, _ = parameter_layout(description.policy)
-        expected_shapes = {field.name: field.shape for field in acting}
-        expected_shapes |= {field.name: field.shape for field in buffer_layout(description.policy)}
+        buffers = buffer_layout(description.policy)
+        names = tuple(field.name for field in buffers)
+        if description.buffers != names:
+            got = one_line(repr(description.buffers))
+            raise UsageError(f"policy of run {self.path}: {POLICY_JSON}: buffers: expected {names}, got {got}")
+        expected_shapes = {field.name: field.shape for field in (*acting, *buffers)}
         for name in sorted(arrays.keys() | expected_shapes.keys()):
             shape = arrays[name].shape if name in arrays else "nothing"
             if name not in expected_shapes or shape != expected_shapes[name] or arrays[name].dtype != np.float32:
                 expected = f"float32 {expected_shapes[name]}" if name in expected_shapes else "no such array"
                 raise UsageError(f"policy of run {self.path}: {name}: expected {expected}, got {shape}")
         parameters = _flat([arrays[field.name] for field in acting])
-        return description, parameters, _flat([arrays[name] for name in description.buffers])
+        return description, parameters, _flat([arrays[name] for name in names])
 
     def policy_spec(self) -> PolicySpec | None:
         """The policy that policy.json describes. None if that file is missing or cannot be read."""
