@@ -81,6 +81,10 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """Start training when this many workers have joined. 0: wait for all local workers (train) or one worker
     (learner).
     """
+    launched_workers: Free[Natural] = 0
+    """Number of workers that a launcher starts for this learner (learner only; `millrace launch` sets it). If so many
+    different workers say that the environment cannot be made, the run ends with their reason. 0: wait for another worker.
+    """
 
     # ----------------------------------------------------------------------------------------------------------- network
 

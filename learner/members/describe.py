@@ -36,6 +36,7 @@ class DescribeSettings:
     stall_timeout_s: float
     max_env_failures: int
     steps: int = 0
+    launched_workers: int = 0
 
 
 def described_by_workers(
@@ -50,15 +51,15 @@ def described_by_workers(
     """The environment as the first worker describes it whose description `accept` takes.
 
     `check_interrupt` is called at least every 0.1 s: what it raises ends the wait. Raises `UsageError` if a worker of this
-    program says that there is no such environment, or describes one that is not accepted; `EnvironmentFailed` if it fails
-    too often; `NoWorkers` or `Stalled` if a deadline passes.
+    program, or each of `settings.launched_workers`, says that there is no such environment, or describes one that is not
+    accepted; `EnvironmentFailed` if it fails too often; `NoWorkers` or `Stalled` if a deadline passes.
     """
     coordinator = DescribeCoordinator(
         spec,
         int.from_bytes(os.urandom(6), "little"),
         worker_timeout_s=settings.worker_timeout_s,
         max_env_failures=settings.max_env_failures,
-        started_here=processes.expected > 0,
+        decliners_to_end=1 if processes.expected else settings.launched_workers,
         accept=accept,
     )
     members = coordinator.membership.members

@@ -1,9 +1,9 @@
 """The conversation before a run: workers describe the environment. Pure: messages and `now` in, messages out.
 
 Rule: the first description that can be read and is accepted is that of the run; other workers are compared with it when they
-open their lanes. A worker of this program that declines, or describes what is not accepted, ends the start with the reason.
-One from elsewhere is refused, and the learner goes on waiting for another. An environment that fails counts; its worker may
-come back.
+open their lanes. A worker that declines, or describes what is not accepted, is refused, and the learner waits for another;
+once `decliners_to_end` different workers did so, the start ends with the reason. An environment that fails counts; its worker
+may come back.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ class DescribeCoordinator:
         *,
         worker_timeout_s: float,
         max_env_failures: int,
-        started_here: bool,
+        decliners_to_end: int,
         accept: Accept = accept_any,
     ) -> None:
-        """`started_here`: whether the workers are processes that this program started."""
+        """`decliners_to_end`: how many different workers must find the environment unsuitable to end the start; 0: no number."""
         self.spec = spec
         self.described: DescribedEnv | None = None
         """What the first usable description says."""
@@ -62,7 +62,8 @@ class DescribeCoordinator:
         """Why the start cannot go on."""
         self.membership: Membership[Member] = Membership(spec, Member, lambda member, why: None, first_session)
         self._worker_timeout_s, self._max_env_failures = worker_timeout_s, max_env_failures
-        self._started_here, self._accept = started_here, accept
+        self._decliners_to_end, self._accept = decliners_to_end, accept
+        self._decliners: set[str] = set()
         self._env_failures = 0
 
     def receive(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
@@ -150,12 +151,13 @@ class DescribeCoordinator:
 
     def _unsuitable(self, member: Member, event: type, reason: str) -> list[Outgoing]:
         """The run cannot be made with this worker's environment."""
-        if not self._started_here:
-            return self.membership.refuse(member, event, reason)
-        self.membership.remove(member, event, f"left: {reason}")
-        self.membership.take_events()  # the reason is the error's text, and need not be logged too
-        self.failure = self.failure or UsageError(reason)
-        return []
+        refusal = self.membership.refuse(member, event, reason)
+        if self._decliners_to_end:
+            self._decliners.add(member.hello.worker)
+            if len(self._decliners) >= self._decliners_to_end:
+                self.membership.take_events()  # the reason is the error's text, and need not be logged too
+                self.failure = self.failure or UsageError(reason)
+        return refusal
 
     def _count_exit(self, worker_exit: WorkerExit) -> None:
         if worker_exit.failed:

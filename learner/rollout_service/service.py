@@ -140,4 +140,5 @@ def describe_settings(config: RolloutConfig, steps: int = 0) -> DescribeSettings
         stall_timeout_s=config.stall_timeout_s,
         max_env_failures=config.max_env_failures,
         steps=steps,
+        launched_workers=config.launched_workers,
     )

@@ -338,7 +338,7 @@ def _launch_ray(argv: list[str]) -> int:
     from millrace.cli.flags import RayFlags
     from millrace.launch.launcher_flags import read_flags
 
-    flags, learner = read_flags(RayFlags, argv, "ray", ("bind", "advertise", "insecure"))
+    flags, learner = read_flags(RayFlags, argv, "ray", ("bind", "advertise", "insecure", "launched-workers"))
     try:
         from millrace.launch.ray import launch
     except ModuleNotFoundError as error:

@@ -90,7 +90,7 @@ spec:
 
 
 def _learner(flags: KubernetesFlags, rest: Sequence[str]) -> str:
-    own = learner_flags(flags.env, rest, f"tcp://0.0.0.0:{PORT}", "/runs")
+    own = learner_flags(flags.env, rest, flags.workers, bind=f"tcp://0.0.0.0:{PORT}", runs="/runs")
     args = ["learner", *own, "--advertise", flags.name, "--metrics-bind", f"0.0.0.0:{METRICS_PORT}"]
     image = json.dumps(flags.learner_image)
     status = json.dumps(["millrace", "status", f"tcp://127.0.0.1:{PORT}", "--json"])

@@ -18,7 +18,7 @@ from protocol.errors import UsageError
 Flags = TypeVar("Flags", bound=LaunchFlags)
 
 METRICS_PORT = 9464
-SET_BY_LAUNCHER = ("bind", "advertise", "run-dir", "resume", "keys", "insecure")
+SET_BY_LAUNCHER = ("bind", "advertise", "run-dir", "resume", "keys", "insecure", "launched-workers")
 """Flags of the learner that a launcher sets. The user must not set them."""
 DNS_LABEL = re.compile(r"[a-z]([-a-z0-9]{0,38}[a-z0-9])?")
 
@@ -37,10 +37,14 @@ def read_flags(
     for flag in rest:
         if flag.partition("=")[0].removeprefix("--").replace("_", "-") in set_by_launcher:
             raise UsageError(f"launch {launcher}: {flag} is the launcher's to set; leave it out")
-    read_config("learner", learner_flags(flags.env, rest, bind="tcp://0.0.0.0:5555", runs=os.devnull))
+    read_config("learner", learner_flags(flags.env, rest, flags.workers, bind="tcp://0.0.0.0:5555", runs=os.devnull))
     return flags, rest
 
 
-def learner_flags(env: str, rest: Sequence[str], bind: str, runs: str) -> list[str]:
-    """The flags of a learner on a cluster. It resumes the newest run, and waits ten minutes for workers to be started."""
-    return [env, "--bind", bind, "--run-dir", runs, "--resume", "auto", "--no-workers-timeout-s", "600", *rest]
+def learner_flags(env: str, rest: Sequence[str], workers: int, *, bind: str, runs: str) -> list[str]:
+    """The flags of a learner on a cluster, for which so many `workers` are started.
+
+    It resumes the newest run, and waits ten minutes for workers to be started.
+    """
+    waits = ["--no-workers-timeout-s", "600", "--launched-workers", str(workers)]
+    return [env, "--bind", bind, "--run-dir", runs, "--resume", "auto", *waits, *rest]

@@ -33,7 +33,8 @@ def launch(flags: RayFlags, rest: Sequence[str], watch: Watch) -> Path:
             raise UsageError(f"{name}: expected int >= 1, got {getattr(flags, name)}")
     with _ray_cluster(flags.address) as host:
         bind = f"tcp://{f'[{host}]' if ':' in host else host}:{flags.port}"
-        config, resume = read_config("learner", learner_flags(flags.env, rest, bind, "runs"))
+        workers = flags.workers * flags.processes
+        config, resume = read_config("learner", learner_flags(flags.env, rest, workers, bind=bind, runs="runs"))
         token = _token_text(keyring_for(config, datetime.now(UTC).replace(microsecond=0)))
         actor = ray.remote(
             num_cpus=flags.processes, max_restarts=-1, max_task_retries=-1, scheduling_strategy="SPREAD"

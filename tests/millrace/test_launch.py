@@ -206,4 +206,4 @@ def test_special_characters_in_a_flag_reach_the_learner_unchanged(
     command, *argv = said.decode().split("\0")[:-1]
     config, _ = read_config(command, [*argv, "--run-dir", str(tmp_path)])
     assert (config.env, config.seed, config.env_kwargs) == ("CartPole-v1", 7, {"render_mode": odd})
-    assert (config.bind, config.keys) == ("tcp://0.0.0.0:5", "f/keys")
+    assert (config.bind, config.keys, config.launched_workers) == ("tcp://0.0.0.0:5", "f/keys", 4)

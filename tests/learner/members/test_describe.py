@@ -49,8 +49,10 @@ BROKEN = msgspec.structs.replace(DESCRIPTION, observation=BoxSpace((2,), "float3
 SETTINGS = DescribeSettings(worker_timeout_s=5, no_workers_timeout_s=60, stall_timeout_s=100, max_env_failures=1)
 
 
-def coordinator(*, started_here: bool = True, accept: Accept = accept_any) -> DescribeCoordinator:
-    return DescribeCoordinator(SPEC, 10, worker_timeout_s=5, max_env_failures=1, started_here=started_here, accept=accept)
+def coordinator(*, decliners_to_end: int = 1, accept: Accept = accept_any) -> DescribeCoordinator:
+    return DescribeCoordinator(
+        SPEC, 10, worker_timeout_s=5, max_env_failures=1, decliners_to_end=decliners_to_end, accept=accept
+    )
 
 
 def of_three(env: DescribedEnv) -> None:
@@ -92,7 +94,7 @@ def test_a_description_of_another_session_is_not_used() -> None:
 
 
 def test_a_description_that_cannot_be_read_gets_its_sender_refused_and_another_is_used() -> None:
-    made = coordinator(started_here=False)
+    made = coordinator(decliners_to_end=0)
     ((peer, refusal),) = made.receive(A, Described(join(made, A), BROKEN), 1.0)
     assert peer == A
     assert isinstance(refusal, Refuse)
@@ -120,7 +122,7 @@ def test_a_worker_of_ours_that_declines_ends_the_start_with_its_reason() -> None
 
 
 def test_a_worker_from_elsewhere_that_declines_is_refused_and_the_learner_waits_on() -> None:
-    made = coordinator(started_here=False)
+    made = coordinator(decliners_to_end=0)
     made.receive(A, Goodbye(join(made, A), "environment Fake-v0 is not registered", ()), 1.0)
     assert made.failure is None
     ((_, refusal),) = made.receive(A, hello(A), 2.0)
@@ -139,7 +141,7 @@ def test_a_description_that_is_not_accepted_ends_the_start_if_the_worker_is_ours
 
 
 def test_a_worker_from_elsewhere_whose_description_is_not_accepted_is_refused_and_another_is_used() -> None:
-    made = coordinator(started_here=False, accept=of_three)
+    made = coordinator(decliners_to_end=0, accept=of_three)
     ((peer, refusal),) = made.receive(A, Described(join(made, A), OF_NINE), 1.0)
     assert (peer, refusal) == (A, Refuse("expected Discrete(3), got Discrete(9)"))
     assert (made.described, made.failure) == (None, None)
@@ -148,9 +150,20 @@ def test_a_worker_from_elsewhere_whose_description_is_not_accepted_is_refused_an
     assert made.failure is None
 
 
-@pytest.mark.parametrize("started_here", [True, False])
-def test_a_worker_that_was_told_to_stop_says_nothing_of_the_environment(started_here: bool) -> None:
-    made = coordinator(started_here=started_here)
+def test_the_start_ends_once_all_workers_of_the_launcher_have_declined() -> None:
+    made = coordinator(decliners_to_end=2)
+    for nonce in (1, 2):  # the first is started again, and counts once
+        answer = made.receive(A, Goodbye(join(made, A, nonce), "environment Fake-v0 is not registered", ()), 1.0)
+        assert answer == [(A, Refuse("environment Fake-v0 is not registered"))]
+        assert made.failure is None
+    made.receive(B, Goodbye(join(made, B), "environment Fake-v0 is not registered", ()), 1.0)
+    assert isinstance(made.failure, UsageError)
+    assert str(made.failure) == "environment Fake-v0 is not registered"
+
+
+@pytest.mark.parametrize("decliners_to_end", [0, 1])
+def test_a_worker_that_was_told_to_stop_says_nothing_of_the_environment(decliners_to_end: int) -> None:
+    made = coordinator(decliners_to_end=decliners_to_end)
     made.receive(A, Goodbye(join(made, A), TOLD_TO_STOP, ()), 1.0)
     assert made.failure is None
     assert isinstance(made.receive(A, hello(A), 2.0)[0][1], Welcome)
