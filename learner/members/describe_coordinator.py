@@ -2,8 +2,8 @@
 
 Rule: the first description that can be read and is accepted is that of the run; other workers are compared with it when they
 open their lanes. A worker that declines, or describes what is not accepted, is refused, and the learner waits for another;
-once `decliners_to_end` different workers did so, the start ends with the reason. An environment that fails counts; its worker
-may come back.
+once `decliners_to_end` different workers have been, the start ends with the reason. An environment that fails counts; its
+worker may come back.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class DescribeCoordinator:
         decliners_to_end: int,
         accept: Accept = accept_any,
     ) -> None:
-        """`decliners_to_end`: how many different workers must find the environment unsuitable to end the start; 0: no number."""
+        """`decliners_to_end`: how many different workers must be unable to describe it until the start ends; 0: never."""
         self.spec = spec
         self.described: DescribedEnv | None = None
         """What the first usable description says."""
