@@ -50,8 +50,10 @@ def save(folder: Path, state: dict[str, Any], env_steps: int, keep: int) -> Path
         write_atomically(path, lambda file: torch.save(record, file))
         for old in sorted(each for each in path.parent.glob(f"*{SUFFIX}") if each <= path)[:-keep]:
             old.unlink()
-    except (OSError, RuntimeError) as error:  # torch raises RuntimeError when it cannot write
-        raise CheckpointError(f"checkpoint {path} not written: {_why(error)}; older checkpoints are untouched") from error
+    except (OSError, RuntimeError) as error:
+        refused = error.__context__  # torch raises a RuntimeError of its own over what the file raised
+        why = _why(refused if isinstance(refused, OSError) and not isinstance(error, OSError) else error)
+        raise CheckpointError(f"checkpoint {path} not written: {why}; older checkpoints are untouched") from error
     return path
 
 
