@@ -397,7 +397,6 @@ class RolloutService:
 
     def _batch(self, arrived: Sequence[AcceptedRollout]) -> RolloutBatch:
         stacked = stack_rollouts([one.rollout for one in arrived], [one.fresh for one in arrived])
-        in_order = sorted((one.rollout for one in arrived), key=lambda rollout: rollout.lane)
         leaves = self.run.policy.observation
         named = {leaf.path: array for leaf, array in zip(leaves, stacked.obs, strict=True)}
         own, extras = self.run.policy.own, zip(self.run.extras, stacked.extras, strict=True)
@@ -408,7 +407,7 @@ class RolloutService:
                 "obs": stacked.obs[0] if not leaves[0].path else named,
                 "log_prob": stacked.log_prob if own is None or own.has_log_prob else None,
                 "extras": {extra.name: array for extra, array in extras},
-                "version": np.repeat(np.array([rollout.version for rollout in in_order]), stacked.copies),
+                "version": np.repeat(np.array([one.rollout.version for one in arrived]), stacked.copies),
             }
         )
 

@@ -231,7 +231,7 @@ class TicketCoordinator:
         return out + self._deal()
 
     def take(self) -> list[AcceptedRollout] | None:
-        """The rollouts of the next update, or None while there are too few. Stale ones are dropped and counted."""
+        """The rollouts of the next update, in lane order, or None while there are too few. Stale ones are dropped."""
         if self.version - self._oldest_ready > self.max_lag:
             self._drop_stale()
         if len(self.ready) < self.rollouts_per_update:
@@ -239,7 +239,7 @@ class TicketCoordinator:
         taken, self.ready = self.ready[: self.rollouts_per_update], self.ready[self.rollouts_per_update :]
         self.ledger.used += len(taken)
         self.ledger.transitions_used += sum(arrived.rollout.env_steps for arrived in taken)
-        return [self._marked(arrived) for arrived in taken]
+        return [self._marked(arrived) for arrived in sorted(taken, key=lambda each: each.rollout.lane)]
 
     def not_used(self, taken: list[AcceptedRollout]) -> None:
         """Count rollouts that `take` returned as lost: no update was made of them."""

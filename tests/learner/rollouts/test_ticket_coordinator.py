@@ -309,6 +309,14 @@ def test_a_rollout_exactly_max_lag_old_is_used() -> None:
     assert learner.coordinator.ledger.stale == 0
 
 
+def test_an_update_takes_its_rollouts_in_the_order_of_lanes_whichever_comes_first() -> None:
+    learner = Learner(lanes=3)
+    learner.joins(A)
+    for number in (2, 0, 1):
+        learner.delivers(number)
+    assert [rollout.lane for rollout in learner.take()] == [0, 1, 2]
+
+
 def test_the_least_advanced_lane_is_dealt_to_first() -> None:
     learner = Learner(lanes=3, max_lag=0, per_update=1)
     learner.joins(A)
