@@ -222,6 +222,8 @@ class Run:
         self.folder.write_config(config, workers_elsewhere=not processes.expected)
         self.folder.remove_summary()
         self.recorder = RunRecorder(config, self.folder, spec, self.algorithm, self.service, state, made, episodes)
+        if setup.resumed:
+            log_notice(log, self.recorder.continues())
         self.folder.keep()
         self.announce(link.address, config.advertise, link.keyring)
 

@@ -235,6 +235,13 @@ class RunRecorder:
                 raise
             log.warning("%s: %s", type(error).__name__, first_line(error))
 
+    def continues(self) -> str:
+        """One line that says where a resumed run continues, and which updates are lost."""
+        line = f"run {self._folder.path} continues at {self.env_steps:,} env steps, after update {self.version:,}"
+        if lost := self._metrics.removed:
+            line += f"; {lost:,} later update{'s were' if lost > 1 else ' was'} not saved, and must be made again"
+        return line
+
     def saved(self) -> str:
         """One line that says what can be resumed, and where; empty if nothing was learned yet."""
         if not self.version:

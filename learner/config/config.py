@@ -89,7 +89,7 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     # -------------------------------------------------------------------------------------------------------------- files
 
     checkpoint_every_s: Free[Seconds] = 60.0
-    """Seconds between checkpoints."""
+    """Seconds between checkpoints. The first one is written after the first update."""
     checkpoint_every_episodes: Free[Natural] = 0
     """Number of training episodes between two additional checkpoints. 0: no additional checkpoints."""
     checkpoint_every_updates: Free[Natural] = 0

@@ -48,10 +48,13 @@ class CheckpointPolicy(msgspec.Struct, frozen=True, kw_only=True):
     """how many of the newest checkpoints stay in the run folder"""
 
     def is_due(self, *, since_last_s: float, episodes_since_last: int, updates: int) -> bool:
-        """Whether to write one now. `since_last_s` and `episodes_since_last`: since the last one; `updates`: in all."""
+        """Whether to write one now. `since_last_s` and `episodes_since_last`: since the last one; `updates`: in all.
+
+        The first update is saved at once: until then a killed run has nothing to resume.
+        """
         by_episodes = self.every_episodes > 0 and episodes_since_last >= self.every_episodes
         by_updates = self.every_updates > 0 and updates % self.every_updates == 0
-        return by_episodes or by_updates or self.is_time(since_last_s)
+        return updates == 1 or by_episodes or by_updates or self.is_time(since_last_s)
 
     def is_time(self, since_last_s: float) -> bool:
         """Whether the last one is so old that the time alone asks for another."""

@@ -44,9 +44,13 @@ class MetricsLog:
         table = folder / METRICS_FILE
         events = folder / "tensorboard" / f"events.out.tfevents.{time.time_ns()}.{socket.gethostname()}.{os.getpid()}"
         kept: list[dict[str, Any]] = []
+        self.removed = 0
+        """The number of rows that were removed."""
         try:
             if table.exists():
-                kept = [row for row in read_rows(table) if row[ENV_STEPS_KEY] <= from_env_steps]
+                rows = read_rows(table)
+                kept = [row for row in rows if row[ENV_STEPS_KEY] <= from_env_steps]
+                self.removed = len(rows) - len(kept)
                 write_atomically(table, lambda file: file.writelines(_json_line(row) for row in kept))
             self._table, self._events = _RecordFile(table), _RecordFile(events)
         except OSError as error:

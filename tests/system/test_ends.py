@@ -164,6 +164,21 @@ def test_weights_that_are_not_finite_are_never_saved(
     assert torch.isfinite(parameters(folder_of(tmp_path / "runs"))).all()
 
 
+def test_a_run_that_is_killed_early_resumes_from_its_first_update_and_says_what_is_lost(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def watch(progress: Progress) -> None:
+        if progress.updates == 4 and not progress.doing:
+            shutil.copytree(progress.run, tmp_path / "killed")  # what a killed process leaves
+
+    run(tmp_path, watch)
+    assert run(tmp_path, resume=tmp_path / "killed") == tmp_path / "killed"
+    rows = read_rows(tmp_path / "killed" / "metrics.jsonl")
+    where = f"run {tmp_path / 'killed'} continues at {rows[0]['time/total_timesteps']} env steps, after update 1"
+    assert f"{where}; 3 later updates were not saved, and must be made again" in caplog.messages
+    assert [row["time/iterations"] for row in rows] == list(range(1, saved(tmp_path / "killed") + 1))
+
+
 def test_a_run_folder_that_is_deleted_is_made_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.WARNING, "millrace")
 

@@ -38,12 +38,13 @@ def test_a_run_ends_when_a_target_is_reached() -> None:
         ({"checkpoint_every_episodes": 10}, {"episodes_since_last": 10}, True),
         ({"checkpoint_every_updates": 3}, {"updates": 8}, False),
         ({"checkpoint_every_updates": 3}, {"updates": 9}, True),
+        ({}, {"updates": 1}, True),
     ],
 )
-def test_a_checkpoint_is_due_by_time_by_episodes_or_by_updates(
+def test_a_checkpoint_is_due_after_the_first_update_and_by_time_episodes_or_updates(
     settings: dict[str, Any], numbers: dict[str, Any], due: bool
 ) -> None:
-    none: dict[str, Any] = {"since_last_s": 0.0, "episodes_since_last": 0, "updates": 1}
+    none: dict[str, Any] = {"since_last_s": 0.0, "episodes_since_last": 0, "updates": 2}
     assert Config(**settings).checkpoint_policy().is_due(**{**none, **numbers}) is due
 
 

@@ -232,6 +232,7 @@ def test_a_resumed_run_takes_back_what_its_checkpoint_does_not_know(tmp_path: Pa
     with (tmp_path / "metrics.jsonl").open("ab") as file:
         file.write(b'{"time/total_timesteps": 50')  # killed in mid-row
     log = MetricsLog(tmp_path, from_env_steps=200, clock=lambda: next(seconds))
+    assert log.removed == 2
     for steps in (250, 350):
         log.write(Progress(env_steps=steps, return_mean=2.0), {})
     log.close()
