@@ -21,6 +21,7 @@ import millrace
 from learner.vector_env.env import ZmqVectorEnv
 from protocol.arrays import Array
 from protocol.env_spec import EnvLike, EnvSpec, Scalar
+from protocol.envs.spaces import make_flatten, make_unflatten
 from protocol.errors import UsageError
 
 Indices = int | Iterable[int] | None
@@ -79,6 +80,9 @@ class Sb3VecEnv(VecEnv):
             raise UsageError(f"Sb3VecEnv: expected autoreset_mode SameStep, got {env.autoreset_mode.value}")
         env.merge_infos = False  # merged infos have one dtype and shape for all copies
         self.env = env
+        space = env.single_action_space
+        self._nested_actions = isinstance(space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple)
+        self._flatten, self._unflatten = make_flatten(space), make_unflatten(space)
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> Any:
@@ -93,8 +97,11 @@ class Sb3VecEnv(VecEnv):
         self._reset_options()
         return observation
 
-    def step_async(self, actions: Array) -> None:
-        """Order every env copy to step."""
+    def step_async(self, actions: Array | Sequence[Any]) -> None:
+        """Order every env copy to step with its element of `actions`, which may be an array or a list."""
+        if self._nested_actions:
+            leaves = zip(*map(self._flatten, actions), strict=True)
+            actions = self._unflatten([np.asarray(leaf) for leaf in leaves])  # gymnasium's batch: an array for each leaf
         self.env.step_async(actions)
 
     def step_wait(self) -> Any:

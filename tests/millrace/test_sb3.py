@@ -47,6 +47,53 @@ def test_it_is_the_dummy_vec_env_to_the_bit(env: str) -> None:
         ours.close(), theirs.close()
 
 
+class RemembersActions(gymnasium.Env[Any, Any]):
+    """Its infos have the action that it got, and the options of its reset."""
+
+    observation_space = gymnasium.spaces.Box(0, 1, (1,))
+
+    def __init__(self, action_space: gymnasium.Space[Any]) -> None:
+        self.action_space = action_space
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        return np.zeros(1, np.float32), {"options": options}
+
+    def step(self, action: Any) -> Any:
+        leaves = action.items() if isinstance(action, dict) else enumerate(action)
+        got = {str(key): np.asarray(value).tolist() for key, value in leaves}
+        return np.zeros(1, np.float32), 0.0, False, False, {"got": got, "is": type(action).__name__}
+
+
+NESTED_ACTIONS = {
+    "as many entries as copies": (
+        gymnasium.spaces.Tuple([gymnasium.spaces.Discrete(4)] * 3),
+        [(0, 1, 2), (3, 3, 3), (1, 0, 0)],
+    ),
+    "fewer entries": (
+        gymnasium.spaces.Tuple([gymnasium.spaces.Discrete(4), gymnasium.spaces.Box(-1, 1, (2,), np.float64)]),
+        [(0, np.array([0.1, 0.2])), (3, np.array([-1.0, 1.0])), (2, np.array([0.0, 0.5]))],
+    ),
+    "a Dict": (
+        gymnasium.spaces.Dict({"b": gymnasium.spaces.Discrete(4), "a": gymnasium.spaces.MultiBinary(2)}),
+        [{"a": np.array([0, 1], np.int8), "b": n} for n in range(3)],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", NESTED_ACTIONS)
+def test_each_copy_gets_its_own_tuple_or_dict_of_actions(case: str) -> None:
+    space, actions = NESTED_ACTIONS[case]
+    makes = [partial(RemembersActions, space)] * 3
+    theirs: Any = DummyVecEnv([partial(RemembersActions, space) for _ in range(3)])
+    ours = make_vec_env(makes, monitor=False, transport="inproc")
+    try:
+        ours.reset(), theirs.reset()
+        (*_, infos), (*_, their_infos) = ours.step(actions), theirs.step(actions)  # type: ignore[arg-type]
+        assert [(info["got"], info["is"]) for info in infos] == [(info["got"], info["is"]) for info in their_infos]
+    finally:
+        ours.close(), theirs.close()
+
+
 class DifferentInfos(gymnasium.Wrapper[Any, Any, Any, Any]):
     """The info of each step has an array that is longer than the last one, and a number of its own type."""
 
