@@ -43,7 +43,7 @@ def make_vec_env(
     Args:
         env_id: as in `millrace.make_vec`.
         n_envs: number of env copies; by default 1, or the length of the list.
-        seed: of the first reset: copy n gets `seed + n`.
+        seed: of the first reset: copy n gets `seed + n`; and of samples of `action_space`.
         monitor: record the return and length of each episode, for `rollout/ep_rew_mean`: those of the environment without
             `wrapper_class`, as SB3 does.
         wrapper_class: called with each env copy, in the workers: a wrapper, or a function that applies several. It is code,
@@ -68,6 +68,7 @@ def make_vec_env(
     env = Sb3VecEnv(millrace.make_vec(envs, n_envs, autoreset_mode="SameStep", **keywords, **(env_kwargs or {})))
     if seed is not None:
         env.seed(seed)
+        env.action_space.seed(seed)
     return VecMonitor(env) if monitor and wrapper_class is None else env
 
 

@@ -19,6 +19,7 @@ from protocol.errors import BadMessage
 
 MAX_LEAVES = 48  # arrays of an observation: a rollout sends each in a frame of its own
 MAX_DEPTH = 8
+MAX_SPACES = 1 << 12  # of an environment, those inside others included, if they have random generators
 MAX_ELEMENTS = 1 << 24  # of all leaves of a space together
 
 Shape = Annotated[tuple[Natural, ...], Meta(max_length=8)]
@@ -84,6 +85,12 @@ class TupleSpace(msgspec.Struct, frozen=True, tag=True, array_like=True):
 SpaceSpec = BoxSpace | DiscreteSpace | MultiDiscreteSpace | MultiBinarySpace | DictSpace | TupleSpace
 
 
+GeneratorState = Annotated[str, Meta(pattern=r"^([0-9a-f]{64}[01][0-9a-f]{8})?\Z")]
+"""State of numpy's PCG64 in hexadecimal digits: 32 of its state, 32 of its increment, 1 if half of a number is left to draw,
+8 of this half. Empty: none.
+"""
+
+
 class EnvDescription(msgspec.Struct, frozen=True, array_like=True):
     """All that the learner knows of the environment."""
 
@@ -96,6 +103,10 @@ class EnvDescription(msgspec.Struct, frozen=True, array_like=True):
     longest_episode: Natural
     """time limit in env steps; 0 if there is none"""
     render_mode: Name
+    generators: Annotated[tuple[GeneratorState, ...], Meta(max_length=MAX_SPACES)] = ()
+    """the random generator of each space, if any is seeded: the observation space, the spaces inside it, depth first, then
+    the action space likewise. So samples that the learner draws are those of the environment
+    """
 
 
 def check_size(description: EnvDescription) -> None:

@@ -15,6 +15,7 @@ from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
 from protocol.arrays import Array
 from protocol.bounds import LARGEST, MAX_NAME, MAX_TEXT, one_line
 from protocol.envs.space_advice import observation_advice
+from protocol.envs.space_generators import generator_states, restore_generators
 from protocol.envs.space_records import describe_space, make_space
 from protocol.errors import BadMessage, UsageError, first_line
 from protocol.space_spec import EnvDescription, check_size
@@ -51,6 +52,7 @@ def describe_env(env: gymnasium.Env[Any, Any]) -> EnvDescription:
         spec=_spec_as_text(env.spec),
         longest_episode=_longest_episode(env.spec),
         render_mode=one_line(env.render_mode or "", MAX_NAME),
+        generators=generator_states(env.observation_space, env.action_space),
     )
     try:
         check_size(description)
@@ -69,9 +71,11 @@ def read_description(description: EnvDescription) -> DescribedEnv:
     metadata = plain_values.unpack(description.metadata.tobytes())
     if type(metadata) is not dict or not all(type(name) is str for name in metadata):
         raise BadMessage(f"metadata: expected a dict with names as keys, got {type(metadata).__name__}")
+    observation_space, action_space = make_space(description.observation), make_space(description.action)
+    restore_generators(description.generators, observation_space, action_space)
     return DescribedEnv(
-        observation_space=make_space(description.observation),
-        action_space=make_space(description.action),
+        observation_space=observation_space,
+        action_space=action_space,
         metadata=metadata,
         spec=_spec_from_text(description.spec),
         max_episode_steps=description.longest_episode or None,

@@ -209,6 +209,14 @@ def test_a_list_of_environments_and_callables_are_wrapped() -> None:
     env.close()
 
 
+def test_samples_of_the_action_space_are_those_of_the_seed() -> None:
+    """DQN, SAC and TD3 of Stable-Baselines3 draw their first actions from it."""
+    ours = make_vec_env("CartPole-v1", 2, seed=4, monitor=False, transport="inproc")
+    theirs = env_util.make_vec_env("CartPole-v1", 2, seed=4)
+    assert [ours.action_space.sample() for _ in range(20)] == [theirs.action_space.sample() for _ in range(20)]
+    ours.close(), theirs.close()
+
+
 def test_another_autoreset_mode_is_refused() -> None:
     with (
         millrace.make_vec("CartPole-v1", 2, transport="inproc") as env,

@@ -122,6 +122,7 @@ LIMITS: Mapping[tuple[ModuleType, str], str] = {
     (bounds, "MOST_FRAMES"): "observations of an episode that come with a frame: the first ones",
     (space_spec, "MAX_LEAVES"): "arrays of an observation or an action",
     (space_spec, "MAX_DEPTH"): "levels of Dict and Tuple spaces",
+    (space_spec, "MAX_SPACES"): "random generators of an environment's spaces",
     (space_spec, "MAX_ELEMENTS"): "elements of all arrays of a space together",
     (env_spec, "MAX_CALLABLE_BYTES"): "bytes of a pickled callable",
     (packing, "MAX_STACK"): "frames of a stack that travels packed",
@@ -277,7 +278,10 @@ def part_types() -> str:
                 base, meta = typing.get_args(kind)
                 told = {"ge": "at least", "le": "at most", "min_length": "length at least", "max_length": "length at most"}
                 limits = [f"{said} {limit}" for key, said in told.items() if (limit := getattr(meta, key)) is not None]
-                limits += ["no control characters"] if meta.pattern else []
+                if meta.pattern:
+                    limits.append(
+                        "no control characters" if kind in (bounds.Name, bounds.Line) else f"matches `{meta.pattern}`"
+                    )
                 lines.append(f"| `{name}` | `{getattr(base, '__name__', base)}` | {', '.join(limits)} |")
             elif typing.get_origin(kind) is Literal:
                 lines.append(f"| `{name}` | `str` | one of {', '.join(f'`{one}`' for one in typing.get_args(kind))} |")

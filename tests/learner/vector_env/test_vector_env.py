@@ -103,6 +103,23 @@ def test_its_attributes_equal_those_of_sync_vector_env() -> None:
         assert ours.unwrapped is ours
 
 
+def seeded(seed: int) -> gymnasium.Env[Any, Any]:
+    """As in the scripts of CleanRL."""
+    env = gymnasium.make("Pendulum-v1")
+    env.action_space.seed(seed)
+    return env
+
+
+def test_a_space_that_a_factory_seeds_has_the_samples_of_sync_vector_env() -> None:
+    makes = [partial(seeded, 3 + n) for n in range(2)]
+    ours, theirs = millrace.make_vec(makes, transport="inproc"), SyncVectorEnv(makes)
+    for space in ("single_action_space", "action_space"):
+        for _ in range(3):
+            assert bit_equal(getattr(ours, space).sample(), getattr(theirs, space).sample())
+    ours.close()
+    theirs.close()
+
+
 def test_calls_and_attributes() -> None:
     with both("workers.envs.toy:Informs-v0", 5, AutoresetMode.NEXT_STEP, "shared") as (ours, theirs):
         assert ours.get_attr("level") == theirs.get_attr("level") == (1,) * 5

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from protocol.envs.description import describe_env, read_description
+from protocol.envs.description import DescribedEnv, describe_env, read_description
 from protocol.envs.space_records import describe_space, make_space
 from protocol.errors import BadMessage, UsageError
 from protocol.messages import Described
@@ -30,6 +30,7 @@ from protocol.space_spec import (
 )
 from protocol.wire.codec import decode_to_learner, encode
 from protocol.wire.plain_values import pack
+from tests.support.bit_equality import bit_equal
 from workers.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_OBSERVATIONS
 
 FLOATS, WHOLE = ("float16", "float32", "float64"), ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64")
@@ -207,6 +208,64 @@ def test_an_environment_is_read_as_it_was_described() -> None:
     assert found.spec == env.spec
     assert (found.max_episode_steps, found.render_mode) == (500, "rgb_array")
     env.close()
+
+
+def with_spaces(observation: gymnasium.Space[Any], action: gymnasium.Space[Any]) -> gymnasium.Env[Any, Any]:
+    env = gymnasium.make("CartPole-v1").unwrapped
+    env.observation_space, env.action_space = observation, action
+    return env
+
+
+def over_the_wire_and_read(env: gymnasium.Env[Any, Any]) -> DescribedEnv:
+    message = decode_to_learner([bytes(frame) for frame in encode(Described(1, describe_env(env)))])
+    assert isinstance(message, Described)
+    return read_description(message.description)
+
+
+def test_a_seeded_space_goes_on_with_its_own_samples() -> None:
+    draw = random.Random(2)
+    for seed in range(100):
+        env = with_spaces(random_space(draw), random_space(draw))
+        env.observation_space.seed(seed)
+        if seed % 2:
+            env.action_space.seed(seed)
+            env.action_space.sample()  # which may leave half of a drawn number behind
+        found = over_the_wire_and_read(env)
+        assert bit_equal(found.observation_space.sample(), env.observation_space.sample())
+        if seed % 2:
+            assert bit_equal([found.action_space.sample() for _ in range(3)], [env.action_space.sample() for _ in range(3)])
+
+
+def test_a_space_that_nobody_seeded_stays_so() -> None:
+    env = with_spaces(spaces.Dict({"a": spaces.Discrete(9), "b": spaces.Discrete(9, seed=3)}), spaces.Discrete(9))
+    found = over_the_wire_and_read(env)
+    for space in (env, found):
+        assert isinstance(space.observation_space, spaces.Dict)
+        assert [inner._np_random is None for inner in space.observation_space.spaces.values()] == [True, False]
+        assert [outer._np_random is None for outer in (space.observation_space, space.action_space)] == [True, True]
+    assert describe_env(gymnasium.make("CartPole-v1")).generators == ()
+
+
+STATE = "0" * 64 + "0" + "0" * 8
+
+
+@pytest.mark.parametrize(
+    "states",
+    [
+        (STATE,),
+        (STATE, STATE, STATE),
+        ("0" * 73 + "0", ""),
+        (STATE[:-1] + "g", ""),
+        (STATE.replace("0", "2"), ""),
+        ("", STATE + "\n"),
+    ],
+)
+def test_generators_that_no_space_has_are_a_bad_message(states: tuple[str, ...]) -> None:
+    description = msgspec.structs.replace(described(DiscreteSpace(2, 0, "int64")), generators=states)
+    with pytest.raises(BadMessage):
+        message = decode_to_learner([bytes(frame) for frame in encode(Described(1, description))])
+        assert isinstance(message, Described)
+        read_description(message.description)
 
 
 def test_an_environment_without_a_spec_is_described_too() -> None:
