@@ -19,11 +19,10 @@ from learner.run_state import RunState
 from protocol.arrays import Floats
 from protocol.errors import RunError, UsageError
 from protocol.logs.notices import log_notice
+from protocol.random_streams import Purpose
 from protocol.specs import RunSpec
 
 log = logging.getLogger("millrace.learner")
-
-EVALUATION_SEED, CONFIRMATION_SEED = 1_000_000, 2_000_000  # far from the seeds of training, and from each other
 
 
 class Evaluations:
@@ -93,7 +92,7 @@ class Evaluations:
             self.best_policy = parameters, buffers
         chosen_by, at_env_steps = self.best
         self._service.publish(version + 1, *self.best_policy, deal=False)  # training is over: no update has this number
-        confirmed = self._evaluate("the best policy", CONFIRMATION_SEED, size)
+        confirmed = self._evaluate("the best policy", Purpose.CONFIRMATION, size)
         return Best(env_steps=int(at_env_steps), chosen_by=chosen_by, evaluation=confirmed)
 
     def write_best(self) -> None:
@@ -111,16 +110,15 @@ class Evaluations:
     def _evaluate_version(self, version: int, env_steps: int, size: EvaluationSize) -> Evaluation:
         """Evaluate the newest policy, which is this version; the same version is not evaluated twice."""
         if self.newest is None or self.version != version or self.newest.episodes != size.episodes:
-            self.newest = self._evaluate("", EVALUATION_SEED, size)
+            self.newest = self._evaluate("", Purpose.EVALUATION, size)
             self.version = version
             self.note = f"{env_steps:,} env steps: greedy {self.newest}"
         return self.newest
 
-    def _evaluate(self, what: str, seed: int, size: EvaluationSize) -> Evaluation:
+    def _evaluate(self, what: str, purpose: Purpose, size: EvaluationSize) -> Evaluation:
         """Evaluate the weights that were published last."""
         settings = self._settings
-        of_run = settings.seed or -1  # 0 would give the episodes that `millrace evaluate` plays if no seed is given
-        plan = EvaluationPlan.of(size.episodes, seed + of_run, settings.copies, size.max_steps)
+        plan = EvaluationPlan.of(size.episodes, settings.seed, settings.copies, size.max_steps, purpose)
 
         def show(played: int) -> None:
             self.doing = f"evaluating{f' {what}' if what else ''}: {played:,} of {size.episodes:,} episodes"

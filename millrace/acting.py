@@ -23,6 +23,7 @@ from protocol.policy.distributions import distribution
 from protocol.policy.masks import MASK, choices, forbid, masked_distribution, no_choice
 from protocol.policy.policy import make_policy
 from protocol.policy.recurrent import zero_state
+from protocol.random_streams import Purpose, generator
 from protocol.rollout import outside_of_space
 from protocol.specs import Leaf, PolicySpec
 
@@ -55,7 +56,7 @@ class LoadedPolicy:
         self._masked_distribution = masked_distribution(saved.spec)
         self._is_masked = saved.masked
         self._to_env_action = action_converter_of(saved.spec)
-        self._generator = None if deterministic else np.random.default_rng(seed)
+        self._generator = None if deterministic else generator(seed, Purpose.PLAYED_ACTIONS)
         self._state: Floats | None = None  # [1, n, S] of a recurrent policy, once it was started
 
     def start(self, copies: int = 1, *, seed: int | None = None) -> None:
@@ -71,7 +72,7 @@ class LoadedPolicy:
         check_at_least("start: copies", copies, 1)
         self._state = zero_state(self.spec, 1, copies)
         if seed is not None and self._generator is not None:
-            self._generator = np.random.default_rng(seed)
+            self._generator = generator(seed, Purpose.PLAYED_ACTIONS)
 
     def __call__(
         self, observation: Observation, *, first: npt.ArrayLike | None = None, mask: npt.ArrayLike | None = None

@@ -46,6 +46,7 @@ Tools:
   arrays of a sample. `ObservationNormalizer` and `RewardScaler`: running statistics of observations and of returns.
 - `features` and `normalize`: observations as these networks take them.
 - `UsageError`: raise it, in one line, for settings or spaces that cannot be used.
+- `torch_seed` of a `Purpose`: the seed of a random stream that is independent of all others of a run.
 - `check_finite` and `scheduled`: the check before a gradient step, and settings that fall over the run.
 """
 
@@ -86,6 +87,7 @@ from protocol.errors import UsageError
 from protocol.policy.features import features, normalize
 from protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork
 from protocol.policy.torch_distributions import log_prob_and_entropy, squashed_sample
+from protocol.random_streams import Purpose, torch_seed
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
@@ -124,6 +126,7 @@ __all__ = [
     "OffPolicyConfig",
     "PPOConfig",
     "PolicySpec",
+    "Purpose",
     "QNetwork",
     "REINFORCEConfig",
     "ReplayBuffer",
@@ -140,5 +143,6 @@ __all__ = [
     "normalize",
     "scheduled",
     "squashed_sample",
+    "torch_seed",
     "vtrace",
 ]

@@ -23,10 +23,9 @@ from millrace.cli.flags import EvaluateFlags, RecordFlags
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
 from millrace.terminal import count_line
 from protocol.bounds import MAX_SEEDS
-from protocol.did_you_mean import did_you_mean
 from protocol.env_spec import EnvLike
 from protocol.envs.wrappers import WrapperLike
-from protocol.errors import UsageError, check_at_least
+from protocol.errors import UsageError, check_at_least, did_you_mean
 
 NOT_KEYWORDS = ("wrapper",)  # in Python they are `wrappers`
 Watch = Callable[[str], None]

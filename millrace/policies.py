@@ -16,6 +16,7 @@ import numpy as np
 from protocol.arrays import Array, Floats
 from protocol.errors import UsageError
 from protocol.policy.layout import Field, acting_size, buffer_layout, named_views, parameter_layout, total_size
+from protocol.random_streams import Purpose, generator
 from protocol.specs import ActionSpec, ExtraArray, Leaf, PolicySpec
 
 Activation = Literal["tanh", "relu"]
@@ -208,12 +209,12 @@ class PolicyParameters:
         """
         if self.spec.own is not None:
             raise UsageError(f"policy {self.spec.own.factory}: expected initial values of your own; publish them")
-        generator = np.random.default_rng(seed)
+        drawn = generator(seed, Purpose.WEIGHTS)
         flat = np.zeros(self.size, np.float32)
         for piece in self.layout:
             if piece.gain:
                 rows, columns = piece.shape[0], math.prod(piece.shape[1:])
-                normal = generator.standard_normal((max(rows, columns), min(rows, columns)))
+                normal = drawn.standard_normal((max(rows, columns), min(rows, columns)))
                 q, r = np.linalg.qr(normal)
                 q = q * np.sign(np.diag(r))
                 weight = piece.gain * (q if rows >= columns else q.T)

@@ -37,10 +37,9 @@ from learner.run_folder.results import Evaluation
 from millrace.launch.rollouts import start
 from millrace.policies import MLP, PolicyChoice, PolicyParameters
 from protocol.arrays import Array, Ints
-from protocol.did_you_mean import did_you_mean
 from protocol.env_spec import EnvLike, EnvSpec, remembered_name
 from protocol.envs.wrappers import WrapperLike, wrapper_names
-from protocol.errors import CheckpointError, RunError, UsageError, check_at_least, first_line
+from protocol.errors import CheckpointError, RunError, UsageError, check_at_least, did_you_mean, first_line
 from protocol.rollout import Batch, stack_rollouts
 from protocol.specs import PolicySpec
 

@@ -21,7 +21,8 @@ A message is one line: who, what, expected, got, what to do next.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import difflib
+from collections.abc import Iterable, Sequence
 from typing import SupportsIndex
 
 
@@ -32,6 +33,12 @@ def first_line(error: BaseException, otherwise: str = "no message") -> str:
     except Exception:
         return otherwise
     return (text.strip().splitlines() or [otherwise])[0].strip()
+
+
+def did_you_mean(name: str, known: Iterable[str], prefix: str = "") -> str:
+    """`; did you mean NAME?` if a known name is similar, else an empty string. `prefix` is put before the suggestion."""
+    similar = difflib.get_close_matches(name, list(known), n=1)
+    return f"; did you mean {prefix}{similar[0]}?" if similar else ""
 
 
 class MillraceError(Exception):

@@ -207,7 +207,8 @@ class Evaluate(Message, frozen=True):
     seeds: Annotated[tuple[Natural, ...], Meta(min_length=1, max_length=MAX_SEEDS)]
     """reset seed of each episode; all are stepped together, and those that ended stay in the batch, unused"""
     greedy: bool
-    """true: take the most probable actions; false: draw them, from a generator that is seeded by the first seed"""
+    """true: take the most probable actions; false: draw them, from random numbers that follow from the first seed and that
+    no environment with this seed draws"""
     most_steps: Count
     """an episode that reaches this number of steps is cut"""
     send_rows: bool

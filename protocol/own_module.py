@@ -13,9 +13,8 @@ from types import ModuleType
 from typing import Any
 
 from protocol.bounds import one_line
-from protocol.did_you_mean import did_you_mean
 from protocol.envs.found_names import attribute
-from protocol.errors import UsageError, first_line
+from protocol.errors import UsageError, did_you_mean, first_line
 
 
 def is_name(text: str) -> bool:

@@ -42,6 +42,8 @@ ENVIRONMENT_CODE = {"make", "make_vec", "make_vectorized", "registered", "make_n
 """functions that run code of the environment: of gymnasium, of `EnvSpec` and of protocol/envs/"""
 TORCH_IN_PROTOCOL = "protocol/policy/"
 TORCH_INTERNALS = "learner/algorithms/kernels/"
+RANDOM_STREAMS = "protocol/random_streams.py"
+HAS_RANDOM_NUMBERS_OF_ITS_OWN = ("learner/conformance/", "workers/envs/toy.py")  # from constants, not from a run's seed
 MOST_FILES = 16  # in a folder
 MOST_PARAMETERS = 8  # of a function; self and cls do not count
 MAY_TAKE_MORE = {"millrace/__init__.py:make_vec"}  # gymnasium's users expect keyword arguments
@@ -235,6 +237,21 @@ def test_no_folder_holds_too_many_files() -> None:
     for source in sources(*PACKAGES):
         found[Path(source).parent] += not source.endswith("__init__.py")
     assert not {str(folder): count for folder, count in found.items() if count > MOST_FILES}
+
+
+def test_one_file_derives_all_random_numbers() -> None:
+    """A stream that is made elsewhere may be another one's, or the environment's."""
+    for source in sources(*PACKAGES):
+        if source == RANDOM_STREAMS or source.startswith(HAS_RANDOM_NUMBERS_OF_ITS_OWN):
+            continue
+        for node in ast.walk(tree(source)):
+            match node:
+                case ast.Attribute(attr="default_rng" | "SeedSequence") | ast.Name(id="default_rng" | "SeedSequence"):
+                    raise AssertionError(f"{source}:{node.lineno} makes random numbers")
+                case ast.Call(func=ast.Attribute(attr="manual_seed"), args=args):
+                    assert [ast.unparse(each).partition("(")[0] for each in args] == ["torch_seed"], (
+                        f"{source}:{node.lineno}"
+                    )
 
 
 def test_no_function_takes_too_many_parameters() -> None:

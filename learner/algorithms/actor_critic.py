@@ -35,6 +35,7 @@ from protocol.policy.features import features, normalize
 from protocol.policy.masks import FORBIDDEN
 from protocol.policy.networks import ActorCriticNetwork, RecurrentInput
 from protocol.policy.torch_distributions import log_prob_and_entropy
+from protocol.random_streams import Purpose, torch_seed
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
@@ -108,7 +109,7 @@ class ActorCritic(Algorithm):
         if policy.action.kind == "box":
             self.net.parameters["actor.log_std"].detach().fill_(config.log_std_init)
         self.optimizer = make_optimizer(getattr(config, "optimizer", "adam"), self.net, config.learning_rate)
-        self.generator = torch.Generator().manual_seed(seed)
+        self.generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.SHUFFLES))
         self.env_steps = 0  # valid rows used so far; schedules depend on it
         self.version = 0  # updates made
         self._total_steps = total_steps

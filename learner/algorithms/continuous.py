@@ -22,6 +22,7 @@ from learner.algorithms.replay.replay_buffer import Sample
 from learner.config.hyperparameters import ContinuousConfig
 from protocol.errors import UsageError
 from protocol.policy.networks import ActorAndCritics
+from protocol.random_streams import Purpose, torch_seed
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
@@ -82,7 +83,7 @@ class Continuous(OffPolicy):
         self.net = ActorAndCritics(policy, device, seed=seed)
         self.target = ActorAndCritics(policy, device, seed=seed)
         self.passes, self.target_passes = (passes_of(net, config.batch_size) for net in (self.net, self.target))
-        self._generator = torch.Generator().manual_seed(seed)
+        self._generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.NOISE))
         self._counted = {"updates_per_step": config.updates_per_step, "env_steps": config.learning_starts, "made": 0}
         self._learning_starts = config.learning_starts
         self.tensors = {"parameters": self.net.flat, "target": self.target.flat}

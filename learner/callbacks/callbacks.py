@@ -14,8 +14,7 @@ from learner.callbacks.callback import Callback
 from learner.callbacks.named import named_callback
 from learner.run_folder.progress import Progress
 from protocol.bounds import one_line
-from protocol.did_you_mean import did_you_mean
-from protocol.errors import UsageError, first_line
+from protocol.errors import UsageError, did_you_mean, first_line
 
 log = logging.getLogger("millrace.learner")
 

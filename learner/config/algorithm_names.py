@@ -19,9 +19,8 @@ from learner.config.config import Config
 from learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig
 from learner.config.on_resume import declared
 from protocol.bounds import one_line
-from protocol.did_you_mean import did_you_mean
 from protocol.envs.found_names import attribute, importable, last_part
-from protocol.errors import UsageError, first_line
+from protocol.errors import UsageError, did_you_mean, first_line
 from protocol.own_module import import_own, is_name
 
 ALGORITHMS = {

@@ -13,8 +13,7 @@ import msgspec
 import tyro
 from tyro.conf import OmitArgPrefixes, Positional, PositionalMetavarFromFieldName
 
-from protocol.did_you_mean import did_you_mean
-from protocol.errors import UsageError, unexpected_arguments
+from protocol.errors import UsageError, did_you_mean, unexpected_arguments
 
 REWORDINGS = {
     r"invalid literal for int\(\) with base 10: ": "expected a whole number, got ",

@@ -20,9 +20,8 @@ from learner.config.hyperparameters import HYPERPARAMETERS, algorithms_with
 from learner.config.presets import PRESETS, environment_presets, named_presets
 from learner.config.validation import convert, validate
 from learner.run_folder.run_format import check_format, check_whole
-from protocol.did_you_mean import did_you_mean
 from protocol.envs.found_names import moved
-from protocol.errors import UsageError
+from protocol.errors import UsageError, did_you_mean
 
 
 def resolve(

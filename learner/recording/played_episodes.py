@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import count
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from learner.rollouts.evaluation_tickets import EvaluationPlan, PlayedEpisode
 from protocol.arrays import Array
 from protocol.envs.spaces import action_converter_of
 from protocol.messages import EpisodeRows
+from protocol.random_streams import Purpose, env_seed
 
 FIRST_EPISODES = 2  # played before their size is known
 CHUNK_BYTES = 256 * 2**20  # about the memory that the episodes of one plan may take
@@ -21,9 +23,7 @@ MOST_EPISODES = 256  # of one plan
 
 def recording_seeds(seed: int) -> Iterator[int]:
     """The reset seeds of a recording's episodes, one after another."""
-    generator = np.random.default_rng([seed, 0])
-    while True:
-        yield int(generator.integers(2**31))
+    return (env_seed(seed, Purpose.RECORDING, episode) for episode in count())
 
 
 class Played(NamedTuple):
@@ -62,9 +62,9 @@ class PlayedEpisodes:
                 if taken >= steps:
                     break
 
-    def play(self, count: int, longest: int, *, frames: bool = False) -> list[Played]:
+    def play(self, number: int, longest: int, *, frames: bool = False) -> list[Played]:
         """The next episodes, of at most `longest` steps each, with `frames` if wanted. There must be so many seeds."""
-        seeds = [next(self._seeds) for _ in range(count)]
+        seeds = [next(self._seeds) for _ in range(number)]
         rows: list[list[EpisodeRows]] = [[] for _ in seeds]
         plan = EvaluationPlan(
             tuple(seeds),
@@ -74,12 +74,12 @@ class PlayedEpisodes:
             send_rows=True,
             send_frames=frames,
         )
-        results = self._player.play(plan, lambda number, some: rows[number].append(some), before=self._episodes)
+        results = self._player.play(plan, lambda n, some: rows[n].append(some), before=self._episodes)
         played = [
             Played(self._whole(some, seed), result, _frames(some))
             for some, seed, result in zip(rows, seeds, results, strict=True)
         ]
-        self._episodes += count
+        self._episodes += number
         self._steps += sum(one.episode.length for one in played)
         self._bytes += sum(leaf.nbytes for one in played for leaf in one.episode.obs)
         return played

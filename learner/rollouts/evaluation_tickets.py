@@ -15,13 +15,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import msgspec
-import numpy as np
 
 from learner.members.membership import Member, Outgoing
 from learner.rollouts.row_checks import reason_to_reject
 from learner.run_folder.results import Evaluation, fact_means
 from protocol.bounds import LARGEST
 from protocol.messages import EpisodeRows, Evaluate, Evaluated, Heartbeat
+from protocol.random_streams import Purpose, env_seed
 from protocol.rollout import LARGEST_REWARD, Episode, wrong_facts
 from protocol.specs import PolicySpec
 
@@ -51,17 +51,17 @@ class EvaluationPlan:
     send_frames: bool = False
 
     @staticmethod
-    def of(episodes: int, seed: int, copies: int, max_steps: int) -> EvaluationPlan:
-        """Greedy episodes with a seed of 31 bits each, because environments pass seeds to C.
+    def of(episodes: int, seed: int, copies: int, max_steps: int, purpose: Purpose = Purpose.EPISODES) -> EvaluationPlan:
+        """Greedy episodes, with reset seeds of this purpose.
 
         `max_steps`: env steps that the whole evaluation may take. Each episode gets an equal share, at least one step.
         """
-        return EvaluationPlan(episode_seeds(seed, episodes), copies, min(max(1, max_steps // episodes), LARGEST))
+        return EvaluationPlan(episode_seeds(seed, episodes, purpose), copies, min(max(1, max_steps // episodes), LARGEST))
 
 
-def episode_seeds(seed: int, episodes: int) -> tuple[int, ...]:
+def episode_seeds(seed: int, episodes: int, purpose: Purpose = Purpose.EPISODES) -> tuple[int, ...]:
     """The reset seed of each episode. Fewer episodes have the first of these seeds."""
-    return tuple(int(state >> 1) for state in np.random.SeedSequence(seed).generate_state(episodes))
+    return tuple(env_seed(seed, purpose, episode) for episode in range(episodes))
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 
-import numpy as np
-
 from learner.vector_env.batch_layout import BatchLayout
 from protocol.errors import WorkerLost
+from protocol.random_streams import Purpose, env_seed
 
 RESET_ATTEMPTS = 3
 """How often a reset is tried while each attempt loses a worker."""
@@ -65,10 +64,7 @@ class LostLanes:
 
 def replacement_seeds(seeds: Iterable[int | None], incarnation: int) -> tuple[int | None, ...]:
     """Seeds for copies that replace lost ones: other than the old seeds, and the same whenever this loss is repeated."""
-    return tuple(
-        None if seed is None else int(np.random.SeedSequence([seed, incarnation]).generate_state(1)[0] >> 1)
-        for seed in seeds
-    )
+    return tuple(None if seed is None else env_seed(seed, Purpose.REPLACEMENT, incarnation) for seed in seeds)
 
 
 def worker_lost(lost: Mapping[int, str], layout: BatchLayout) -> WorkerLost:

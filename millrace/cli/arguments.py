@@ -9,8 +9,7 @@ import argparse
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from protocol.did_you_mean import did_you_mean
-from protocol.errors import UsageError, unexpected_arguments
+from protocol.errors import UsageError, did_you_mean, unexpected_arguments
 
 
 class Arguments(argparse.ArgumentParser):

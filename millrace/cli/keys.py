@@ -11,8 +11,7 @@ from datetime import UTC, datetime
 from typing import NamedTuple
 
 from millrace.cli.arguments import Arguments
-from protocol.did_you_mean import did_you_mean
-from protocol.errors import UsageError
+from protocol.errors import UsageError, did_you_mean
 from protocol.keys.key_folder import DEFAULT_FOLDER, FOLDER_VARIABLE, KeyFolder, chosen_key_folder
 from protocol.keys.keys import public_key
 

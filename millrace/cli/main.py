@@ -106,7 +106,7 @@ def _dispatch(argv: list[str]) -> int:
         return 0
     name, *rest = argv
     if name not in COMMANDS:
-        from protocol.did_you_mean import did_you_mean
+        from protocol.errors import did_you_mean
 
         raise UsageError(f"unknown command {name}{did_you_mean(name, COMMANDS) or '; millrace --help lists them'}")
     return COMMANDS[name].run(rest)

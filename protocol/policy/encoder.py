@@ -18,6 +18,7 @@ import torch
 from protocol.errors import UsageError, first_line
 from protocol.own_module import own_callable
 from protocol.policy.features import feature_size
+from protocol.random_streams import Purpose, torch_seed
 from protocol.specs import ActionSpec, EncoderSpec, Leaf, NamedShape, PolicySpec
 
 
@@ -54,7 +55,7 @@ def _parameter_shapes(module: torch.nn.Module) -> tuple[NamedShape, ...]:
 def _make(factory: str, spec: PolicySpec, seed: int) -> torch.nn.Module:
     images = [leaf.shape for leaf in spec.observation if leaf.is_image]
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+        torch.manual_seed(torch_seed(seed, Purpose.ENCODER))
         try:
             make = own_callable(factory, f"encoder {factory}", "my_package.networks:encoder")
             module = make(feature_size(spec), images)

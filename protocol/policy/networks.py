@@ -26,6 +26,7 @@ from protocol.policy.layout import (
     total_size,
 )
 from protocol.policy.malloc import keep_freed_memory
+from protocol.random_streams import Purpose, torch_seed
 from protocol.specs import PolicySpec
 
 
@@ -384,7 +385,7 @@ def network_of(
 
 
 def _initial(fields: Sequence[Field], seed: int) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.WEIGHTS))
     parts = []
     for field in fields:
         part = torch.zeros(field.shape)

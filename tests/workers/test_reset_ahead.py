@@ -11,10 +11,11 @@ import pytest
 from gymnasium.spaces import Box, Discrete
 
 from protocol.errors import UsageError
+from protocol.random_streams import Purpose, env_seed
 from protocol.wire.plain_values import pack
 from tests.support.collectors import no_pulse
 from workers.collect.env_copies import LoopedCopies
-from workers.envs.reset_ahead import ResetAhead, second_seed
+from workers.envs.reset_ahead import ResetAhead
 
 DEADLINE_S = 20.0
 
@@ -96,9 +97,9 @@ def test_episodes_take_turns_between_two_instances_with_random_numbers_of_their_
     found = [episode(env, 5), *(episode(env) for _ in range(5))]
     env.close()
     assert [instance for instance, _ in found] == [0, 0, 1, 0, 1, 0]
-    first, second = alone(5, 4), alone(second_seed(5), 2)
+    second_seed = env_seed(5, Purpose.SECOND_INSTANCE)
+    first, second = alone(5, 4), alone(second_seed, 2)
     assert [observations for _, observations in found] == [first[0], first[1], second[0], first[2], second[1], first[3]]
-    assert second_seed(5) != second_seed(6)
     assert all(each.closed for each in Traced.made[:2])
 
 

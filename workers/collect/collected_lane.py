@@ -17,6 +17,7 @@ from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import UsageError
 from protocol.policy.masks import stored_leaves
 from protocol.policy.recurrent import zero_state
+from protocol.random_streams import Purpose, generator
 from protocol.rollout import Episode, describe_first_non_finite, not_of_space
 from protocol.specs import Leaf, RunSpec
 from protocol.wire.plain_values import pack, unpack
@@ -34,7 +35,7 @@ class CollectedLane:
         self.number = number
         self.incarnation = incarnation
         self.copies = copies
-        self.generator = np.random.default_rng(np.random.SeedSequence([run.seed, number, incarnation], spawn_key=(0,)))
+        self.generator = generator(run.seed, Purpose.ACTIONS, number, incarnation)
         self.obs = tuple(np.empty((run.copies, *leaf.shape), leaf.dtype) for leaf in stored_leaves(run))  # [N, *leaf] each
         self.state = zero_state(run.policy, run.copies)  # [N, S] recurrent state of the policy
         self.ended = np.zeros(run.copies, bool)  # [N] the next step only resets this copy

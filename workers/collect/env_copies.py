@@ -22,6 +22,7 @@ from protocol.envs.action_masks import without_mask
 from protocol.envs.spaces import make_flatten
 from protocol.envs.vectorized import check_resets_next_step
 from protocol.errors import UsageError
+from protocol.random_streams import Purpose, env_seed
 from protocol.wire.plain_values import unpack
 from workers.collect.facts import Facts, facts_of_copies, facts_of_info, of_ended
 from workers.collect.mask_reader import MaskReader
@@ -75,9 +76,8 @@ class EnvCopies(Protocol):
 
 
 def copy_seeds(seed: int, lane: int, incarnation: int, copies: int) -> list[int]:
-    """A seed of 31 bits for each copy, because environments pass seeds to C. They are all different in practice."""
-    sequences = (np.random.SeedSequence([seed, lane, incarnation, copy]) for copy in range(copies))
-    return [int(sequence.generate_state(1)[0] >> 1) for sequence in sequences]
+    """A reset seed for each copy of a lane."""
+    return [env_seed(seed, Purpose.COPIES, lane, incarnation, copy) for copy in range(copies)]
 
 
 class LoopedCopies:

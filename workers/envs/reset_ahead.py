@@ -14,9 +14,9 @@ from contextlib import suppress
 from typing import Any
 
 import gymnasium
-import numpy as np
 
 from protocol.errors import UsageError
+from protocol.random_streams import Purpose, env_seed
 
 Prepared = tuple[gymnasium.Env[Any, Any], Any, dict[str, Any]]  # an instance, its first observation and its first info
 
@@ -52,7 +52,7 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
         """See `gymnasium.Env.reset`. Raises what the prepared reset raised."""
         if seed is not None or options is not None:
             self._finish()
-            self._second_seed = None if seed is None else second_seed(seed)
+            self._second_seed = None if seed is None else env_seed(seed, Purpose.SECOND_INSTANCE)
             return self.env.reset(seed=seed, options=options)
         if self._prepared is None:
             self._prepare(self._second)
@@ -102,8 +102,3 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
             with suppress(Exception):
                 self._second.close()
         super().close()
-
-
-def second_seed(seed: int) -> int:
-    """The seed of the second instance, 31 bits, where that of the first is this one."""
-    return int(np.random.SeedSequence([seed], spawn_key=(1,)).generate_state(1)[0] >> 1)

@@ -24,6 +24,7 @@ from protocol.policy.masks import stored_leaves
 from protocol.policy.own_policy import OwnPolicy
 from protocol.policy.policy import Policy
 from protocol.policy.recurrent import zero_state
+from protocol.random_streams import Purpose, generator
 from protocol.rollout import LARGEST_REWARD, Episode, outside_of_space
 from protocol.specs import RunSpec
 from workers.collect.acting import acting_of
@@ -101,7 +102,7 @@ class Evaluator:
         k, policy = len(order.seeds), self._run.policy
         copies = self._opened(k, "rgb_array" if order.send_frames else None, pulse)
         obs = tuple(np.empty((1, k, *leaf.shape), leaf.dtype) for leaf in self._stored)
-        state, generator = zero_state(policy, 1, k), np.random.default_rng(order.seeds[0])
+        state, drawn = zero_state(policy, 1, k), generator(order.seeds[0], Purpose.PLAYED_ACTIONS)
         returns, lengths, cut, seconds = [0.0] * k, [0] * k, [False] * k, [0.0] * k
         no_facts = (math.nan,) * len(self._run.facts)
         facts = [no_facts] * k
@@ -116,7 +117,7 @@ class Evaluator:
         while running:
             pulse()
             with np.errstate(all="ignore"):
-                chosen = self._acting.choose(obs, state, generator, greedy=order.greedy)
+                chosen = self._acting.choose(obs, state, drawn, greedy=order.greedy)
                 # A new array at each step, because an environment may keep its action.
                 actions = np.zeros((copies.count, *policy.action.shape), policy.action.dtype)
                 actions[:k] = self._to_env_action(chosen)

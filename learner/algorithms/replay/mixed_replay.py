@@ -15,6 +15,7 @@ from learner.algorithms.replay.available_memory import GIB, available_bytes
 from learner.algorithms.replay.replay_buffer import DISCRETE, ReplayBuffer, Sample, memory_bytes
 from protocol.arrays import Floats, Ints
 from protocol.errors import UsageError
+from protocol.random_streams import Purpose
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf
 
@@ -23,6 +24,8 @@ PRIOR_SLOT = -1  # `Sample.slots` of a prior transition
 
 class PriorTransitions(ReplayBuffer):
     """The transitions of a dataset, which no checkpoint copies."""
+
+    _purpose = Purpose.PRIOR
 
     def _check_memory(self, choices: int = 0) -> None:
         needed, free = memory_bytes(*self._content, choices), available_bytes()
@@ -61,7 +64,7 @@ class MixedReplay(ReplayBuffer):
             size=slots,
             n_step=self._n_step,
             gamma=self._gamma,
-            seed=_other_seed(self._seed),
+            seed=self._seed,
             action=self._stored,
         )
         for batch in batches:
@@ -134,8 +137,3 @@ def _joined(own: Sample, prior: Sample) -> Sample:
 
 def _generator_state(buffer: ReplayBuffer | None) -> Any:
     return None if buffer is None else buffer.generator.bit_generator.state
-
-
-def _other_seed(seed: int) -> int:
-    """A seed for the draws of prior data, which are independent of those of own data."""
-    return int(np.random.SeedSequence(seed, spawn_key=(1,)).generate_state(1, np.uint64)[0])

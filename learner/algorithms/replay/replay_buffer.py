@@ -21,6 +21,7 @@ from learner.algorithms.replay.available_memory import GIB, available_bytes
 from learner.algorithms.replay.sum_tree import SumTree
 from protocol.arrays import Array, Bools, Doubles, Floats, Ints
 from protocol.errors import UsageError
+from protocol.random_streams import Purpose, generator
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf
 
@@ -110,6 +111,8 @@ class Remembered(NamedTuple):
 class ReplayBuffer:
     """The newest transitions of all lanes, drawn uniformly or by priority."""
 
+    _purpose = Purpose.REPLAY
+
     def __init__(
         self,
         observation: tuple[Leaf, ...],
@@ -131,7 +134,7 @@ class ReplayBuffer:
         self.bytes = memory_bytes(*self._content)
         self._transition_bytes = 2 * self.bytes // size  # of a draw: two observations
         self._n_step, self._gamma, self._alpha = n_step, gamma, alpha
-        self.generator = np.random.default_rng(seed)  # decides what is drawn
+        self.generator = generator(seed, self._purpose)  # decides what is drawn
         self._obs = tuple(np.zeros((size, *leaf.shape), leaf.dtype) for leaf in observation)
         self._mask: Bools | None = None  # [size, choices], as `_obs`; made when the first masks come
         self._row = np.zeros(size, row_dtype(action))

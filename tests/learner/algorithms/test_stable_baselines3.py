@@ -105,6 +105,8 @@ def trained(spec: PolicySpec) -> PPO:
     )
     for seed in range(4):
         algorithm.update(batch(algorithm, seed), no_pulse)
+    flat = algorithm.net.flat
+    flat.add_(0.01 * torch.randn(flat.shape, generator=torch.Generator().manual_seed(0)))  # units that never fire, too
     assert all(float(parameter.detach().abs().min()) > 0 for parameter in algorithm.net.parameters.values())
     return algorithm
 

@@ -32,6 +32,7 @@ from protocol.errors import EnvironmentFailed, RunError, UsageError, UserFacingE
 from protocol.policy.distributions import distribution
 from protocol.policy.layout import acting_size, buffer_size
 from protocol.policy.recurrent import zero_state
+from protocol.random_streams import Purpose, generator
 from protocol.rollout import Rollout
 from protocol.specs import PolicySpec
 from tests.support.collectors import TOY, no_pulse, random_policy, run_of
@@ -294,7 +295,7 @@ def played(run: Path, seed: int, stochastic: bool, episodes: int) -> list[Record
     read = make_flatten(env.observation_space)
     found = []
     for _, reset_seed in zip(range(episodes), recording_seeds(seed), strict=False):
-        generator = np.random.default_rng(reset_seed)
+        drawn = generator(reset_seed, Purpose.PLAYED_ACTIONS)
         obs: list[Any] = [env.reset(seed=reset_seed)[0]]
         rows: list[Any] = []
         while not rows or not (rows[-1][2] or rows[-1][3]):
@@ -302,7 +303,7 @@ def played(run: Path, seed: int, stochastic: bool, episodes: int) -> list[Record
                 np.asarray(leaf, own.dtype)[None, None] for leaf, own in zip(read(obs[-1]), spec.observation, strict=True)
             ]
             params = policy(leaves, zero_state(spec, 1, 1))
-            action = chosen.sample(params, chosen.noise(generator, (1, 1))) if stochastic else chosen.mode(params)
+            action = chosen.sample(params, chosen.noise(drawn, (1, 1))) if stochastic else chosen.mode(params)
             taken = write(action[0])[0]
             observation, reward, terminated, truncated, _ = env.step(taken)
             obs.append(observation)

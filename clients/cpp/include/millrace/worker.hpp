@@ -256,7 +256,7 @@ class Worker : public CollectorSession {
       if (!evaluation_env_) evaluation_env_ = make_();
       std::shared_ptr<Env> env = evaluation_env_;
       std::vector<unsigned char> obs(description_.observation.bytes()), stored(description_.action.bytes()), action(stored.size());
-      Random random{evaluation.seeds[0]};
+      Random random{evaluation.seeds[0], 1};  // 1: an environment may draw from Random{seed}
       float log_prob;
       for (std::uint64_t seed : evaluation.seeds) {
         double start_s = now_s();

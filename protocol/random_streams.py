@@ -1,0 +1,66 @@
+"""Where all random numbers come from: each stream is derived from a seed, by its purpose. Pure; imports no torch.
+
+Law: streams of one seed never share a purpose and indices, and none is the stream of the seed itself, because each has a
+spawn key of numpy's `SeedSequence`. gymnasium's environments draw from the seed itself (`np_random`). So what chooses
+actions, or decides what is learned from, is independent of what the environment draws, also where both have the same seed.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+
+
+class Purpose(IntEnum):
+    """What a stream is for, and its indices. The numbers decide the bits of every run: a new purpose takes a new number."""
+
+    WEIGHTS = 1
+    """initial weights, except those of an encoder"""
+    ENCODER = 2
+    """initial weights of an encoder: PyTorch's global generator"""
+    SHUFFLES = 3
+    """which rows make a minibatch"""
+    NOISE = 4
+    """of SAC's actions and TD3's target actions in a gradient step"""
+    REPLAY = 5
+    """what is drawn from a replay buffer"""
+    PRIOR = 6
+    """what is drawn from a dataset of prior data"""
+    COPIES = 7
+    """reset seeds of env copies; lane, incarnation, copy"""
+    ACTIONS = 8
+    """actions of rollouts, with their exploration; lane, incarnation"""
+    EVALUATION = 9
+    """reset seeds of a run's evaluations; episode"""
+    CONFIRMATION = 10
+    """reset seeds of the evaluation of the best policy; episode"""
+    EPISODES = 11
+    """reset seeds of `millrace evaluate` and `RolloutService.evaluate`; episode"""
+    RECORDING = 12
+    """reset seeds of a recording; episode"""
+    PLAYED_ACTIONS = 13
+    """actions of an episode, from its reset seed; and of a loaded policy"""
+    REPLACEMENT = 14
+    """reset seed of an env copy that replaces a lost one, from the lost one's; incarnation"""
+    SECOND_INSTANCE = 15
+    """reset seed of the second instance of `ResetAhead`, from that of the first"""
+
+
+def generator(seed: int, purpose: Purpose, *indices: int) -> np.random.Generator:
+    """The stream, in numpy."""
+    return np.random.default_rng(_sequence(seed, purpose, indices))
+
+
+def env_seed(seed: int, purpose: Purpose, *indices: int) -> int:
+    """A reset seed, 31 bits, because environments pass seeds to C. Those of different indices differ in practice."""
+    return int(_sequence(seed, purpose, indices).generate_state(1)[0] >> 1)
+
+
+def torch_seed(seed: int, purpose: Purpose) -> int:
+    """A seed of 63 bits for PyTorch's `manual_seed`."""
+    return int(_sequence(seed, purpose, ()).generate_state(1, np.uint64)[0] >> 1)
+
+
+def _sequence(seed: int, purpose: Purpose, indices: tuple[int, ...]) -> np.random.SeedSequence:
+    return np.random.SeedSequence(seed, spawn_key=(purpose, *indices))
