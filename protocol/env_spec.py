@@ -4,7 +4,7 @@ Only this file may unpickle, and only in `PickledCallable.load`: a callable that
 `AllowedCode.CALLABLES`. Nothing that a worker sends is ever unpickled.
 
 Rule: what other processes find by name travels by name. What only this process has (a function, a class or a registered id
-of a script or notebook) travels as a pickled callable.
+of a script or notebook) travels as a pickled callable, with the specs of the ids for which it may ask gymnasium.
 """
 
 from __future__ import annotations
@@ -26,7 +26,16 @@ from gymnasium.vector import VectorEnv
 
 from protocol.bounds import one_line
 from protocol.envs.found_names import MAIN, attribute, found_by_others, in_main, last_part, name_of
-from protocol.envs.unknown_ids import is_registered, load_plugins, most_similar, plugin_modules, registers, what_to_write
+from protocol.envs.unknown_ids import (
+    ids_of_gymnasium,
+    is_registered,
+    load_plugins,
+    most_similar,
+    plugin_modules,
+    registered_by_plugins,
+    registers,
+    what_to_write,
+)
 from protocol.envs.wrappers import WrapperLike, not_named, wrap, wrapper_names
 from protocol.errors import UsageError, first_line
 
@@ -121,8 +130,8 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     factory: PickledCallable | None = None
     """a cloudpickled callable that returns one environment; `id` is then only its name"""
     wrappers: tuple[str, ...] = ()
-    """wrappers of every copy, the innermost first: `module:Class`, or `module:Class(key=value)` with plain values. If one of
-    them is in the factory, all are, and these are only their names.
+    """wrappers of every copy, the innermost first: `module:Class`, or `module:Class(key=value)` with plain values. A factory
+    applies them itself, and these are only their names.
     """
     eval_kwargs: dict[str, Scalar] = {}
     """keyword arguments of copies that play evaluations, in addition to `kwargs` or in place of those of the same name"""
@@ -147,10 +156,10 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         check_arguments({**(kwargs or {}), **(eval_kwargs or {})}, f"environment {name}")
         names = wrapper_names(wrappers)
         own = [not_named(wrapper) for wrapper in wrappers]
-        if any(wrapper is not None for wrapper in own):
+        pickled = None
+        if factory is not None or any(wrapper is not None for wrapper in own):
             layers = [name if wrapper is None else wrapper for name, wrapper in zip(names, own, strict=True)]
-            factory = _WrappedFactory(name, factory, tuple(layers))
-        pickled = None if factory is None else PickledCallable.of(factory, f"environment {name}")
+            pickled = _pickled(name, factory, tuple(layers))
         return EnvSpec(name, kwargs or {}, pickled, names, eval_kwargs or {})
 
     def for_evaluation(self) -> EnvSpec:
@@ -196,13 +205,9 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """
         extra: dict[str, Any] = {} if render_mode is None else {"render_mode": render_mode}
         if self.factory is not None:
-            factory = self.factory.load()
-            env = _called(self.id, factory, {**self.kwargs, **extra})
-            if isinstance(factory, _WrappedFactory):
-                return env
-        else:
-            # Without gymnasium's checker: it costs a tenth of a CartPole step, and `protocol.rollout.validate` checks rows.
-            env = self._made(lambda env_id: _make(env_id, {**self.kwargs, **extra}))
+            return _called(self.id, self.factory.load(), {**self.kwargs, **extra})
+        # Without gymnasium's checker: it costs a tenth of a CartPole step, and `protocol.rollout.validate` checks rows.
+        env = self._made(lambda env_id: _make(env_id, {**self.kwargs, **extra}))
         for wrapper in self.wrappers:
             env = wrap(env, wrapper)
         return env
@@ -279,14 +284,25 @@ def _called(name: str, factory: Callable[..., object], kwargs: dict[str, Any]) -
 # -------------------------------------------------------------------------------------------- what only this process has
 
 
-class _WrappedFactory:
-    """Makes an environment and wraps it: one of the wrappers has no name that another process finds."""
+class _Factory:
+    """Makes an environment and wraps it."""
 
-    def __init__(self, name: str, env: Callable[..., object] | None, wrappers: tuple[WrapperLike, ...]) -> None:
-        """`env` returns the environment without wrappers; None: `name` is its id."""
-        self._name, self._env, self._wrappers = name, env, wrappers
+    def __init__(
+        self,
+        name: str,
+        env: Callable[..., object] | None,
+        wrappers: tuple[WrapperLike, ...],
+        specs: tuple[GymnasiumSpec, ...] = (),
+    ) -> None:
+        """`env` returns the environment without wrappers; None: `name` is its id.
+
+        `specs`: of ids that a process may not know that has just started, and for which the code may ask gymnasium.
+        """
+        self._name, self._env, self._wrappers, self._specs = name, env, wrappers, specs
 
     def __call__(self, render_mode: str | None = None, **kwargs: Scalar) -> gymnasium.Env[Any, Any]:
+        for spec in self._specs:
+            gymnasium.registry.setdefault(spec.id, spec)
         if self._env is None:
             env = EnvSpec(self._name, kwargs).make(render_mode)
         else:
@@ -296,16 +312,29 @@ class _WrappedFactory:
         return env
 
 
+def _pickled(name: str, env: Callable[..., object] | None, wrappers: tuple[WrapperLike, ...]) -> PickledCallable:
+    """The factory as it travels: without specs, if they cannot. Raises `UsageError`."""
+    specs = tuple(_sent(spec) for spec in gymnasium.registry.values() if not _is_gymnasiums(spec))
+    try:
+        return PickledCallable.of(_Factory(name, env, wrappers, specs), f"environment {name}")
+    except UsageError:
+        return PickledCallable.of(_Factory(name, env, wrappers), f"environment {name}")
+
+
 class _SpecFactory:
     """Makes the environment of gymnasium's `EnvSpec`, which is not registered where it is made."""
 
     def __init__(self, spec: GymnasiumSpec) -> None:
-        if isinstance(spec.entry_point, str) and callable(own := in_main(spec.entry_point)):
-            spec = dataclasses.replace(spec, entry_point=own)
-        self._spec = spec
+        self._spec = _sent(spec)
 
     def __call__(self, **kwargs: Any) -> gymnasium.Env[Any, Any]:
         return gymnasium.make(self._spec, disable_env_checker=True, **kwargs)
+
+
+def _sent(spec: GymnasiumSpec) -> GymnasiumSpec:
+    """The spec as another process can use it: a class of this script stands in it, in place of its name."""
+    own = in_main(spec.entry_point) if isinstance(spec.entry_point, str) else None
+    return dataclasses.replace(spec, entry_point=own) if callable(own) else spec
 
 
 def remembered_name(env: EnvLike | EnvSpec) -> str:
@@ -363,15 +392,25 @@ def _is_of_everyone(spec: GymnasiumSpec) -> bool:
             return False
     except ValueError:  # arrays among the keyword arguments
         return False
+    if _is_gymnasiums(spec) or spec.namespace in REGISTERING_MODULES:
+        return True
+    return _module_of(spec).partition(".")[0] in plugin_modules() and registered_by_plugins(spec.id)
+
+
+def _is_gymnasiums(spec: GymnasiumSpec) -> bool:
+    """Whether gymnasium itself registers it. Its classes can be registered by anybody, under other ids."""
+    return spec.id in ids_of_gymnasium() and _module_of(spec).partition(".")[0] == "gymnasium"
+
+
+def _module_of(spec: GymnasiumSpec) -> str:
+    """The module of the class or function that makes the environment."""
     where = spec.entry_point if isinstance(spec.entry_point, str) else getattr(spec.entry_point, "__module__", "")
-    package = where.partition(":")[0].partition(".")[0]
-    return package == "gymnasium" or spec.namespace in REGISTERING_MODULES or package in plugin_modules()
+    return where.partition(":")[0]
 
 
 def _registering_module(spec: GymnasiumSpec) -> str:
     """The module that registers it when another process imports it, as far as its source text shows; empty if none does."""
-    where = spec.entry_point if isinstance(spec.entry_point, str) else getattr(spec.entry_point, "__module__", "")
-    parts = where.partition(":")[0].split(".")
+    parts = _module_of(spec).split(".")
     modules = [".".join(parts[:count]) for count in range(1, len(parts) + 1)]
     return next((module for module in modules if module != MAIN and registers(module, spec.id)), "")
 

@@ -14,6 +14,7 @@ import re
 import sys
 import warnings
 from collections.abc import Iterable, Iterator
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
@@ -82,6 +83,16 @@ def plugin_modules() -> set[str]:
     return {plugin.entry_point.module.partition(".")[0] for plugin in _plugins()}
 
 
+def registered_by_plugins(env_id: str) -> bool:
+    """Whether it is a plugin that registers this id, which is registered here. Anybody may have registered it."""
+    here = gymnasium.registry.pop(env_id)
+    try:
+        load_plugins(env_id)
+        return env_id in gymnasium.registry
+    finally:
+        gymnasium.registry[env_id] = here
+
+
 def _plugins() -> Iterator[Plugin]:
     """The plugins. The namespace is the name of the entry point, or stands in the name of its group."""
     found = metadata.entry_points()
@@ -102,13 +113,23 @@ def is_registered(env_id: str) -> bool:
     return version is None and find_highest_version(namespace, name) is not None
 
 
+@cache
+def ids_of_gymnasium() -> frozenset[str]:
+    """The ids that gymnasium itself registers, as they stand in its source text."""
+    return frozenset(_ids([_source("gymnasium.envs")]))
+
+
 def registers(module: str, env_id: str) -> bool:
     """Whether the source text of a module that is imported here registers this id."""
+    return InstalledPackage(module, tuple(_ids([_source(module)]))).registers(env_id)
+
+
+def _source(module: str) -> str:
+    """The source text of a module that is imported here; empty if it has none."""
     try:
-        text = Path(str(getattr(sys.modules.get(module), "__file__", None))).read_text("utf-8", "replace")
+        return Path(str(getattr(sys.modules.get(module), "__file__", None))).read_text("utf-8", "replace")
     except OSError:
-        return False
-    return InstalledPackage(module, tuple(_ids([text]))).registers(env_id)
+        return ""
 
 
 def what_to_write(env_id: str) -> str:

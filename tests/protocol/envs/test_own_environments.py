@@ -13,10 +13,12 @@ import cloudpickle
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.envs.classic_control import CartPoleEnv
 from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
 
 from protocol.env_spec import AllowedCode, EnvSpec, remembered_name
 from protocol.envs.found_names import found_by_others, moved, name_of
+from protocol.envs.unknown_ids import ids_of_gymnasium
 from protocol.envs.wrappers import read_wrapper, wrapper_name
 from protocol.errors import UsageError
 from workers.envs.toy import Countdown
@@ -179,6 +181,44 @@ def test_an_id_that_only_this_process_registered_travels_pickled(registry: None,
         assert type(made.unwrapped).__name__ == "Mine"
         assert made.spec is not None
         assert made.spec.max_episode_steps == limit
+
+
+def made_elsewhere(spec: EnvSpec) -> gymnasium.Env[Any, Any]:
+    """The environment as a process makes it in which none of these tests has registered an id."""
+    for env_id in set(gymnasium.registry) - ids_of_gymnasium():
+        del gymnasium.registry[env_id]
+    return spec.make()
+
+
+@pytest.mark.parametrize("entry_point", ["gymnasium.envs.classic_control:CartPoleEnv", CartPoleEnv])
+def test_an_id_of_one_s_own_for_a_class_of_gymnasium_travels_pickled(registry: None, entry_point: Any) -> None:
+    gymnasium.register("Short-v0", entry_point, max_episode_steps=7)
+    assert remembered_name("Short-v0") == "__main__:Short-v0"
+    made = made_elsewhere(EnvSpec.of("Short-v0"))
+    assert made.spec is not None
+    assert (made.spec.id, made.spec.max_episode_steps) == ("Short-v0", 7)
+
+
+@pytest.mark.parametrize("wrappers", [[], [Halved]], ids=["alone", "in a wrapper"])
+def test_a_callable_may_make_an_id_that_only_this_process_registered(
+    registry: None, script: ModuleType, wrappers: list[Any]
+) -> None:
+    gymnasium.register("Own-v3", script.Mine, max_episode_steps=7)
+    gymnasium.register("ByText-v3", "__main__:Mine", max_episode_steps=8)
+    for env_id, limit in ("Own-v3", 7), ("ByText-v3", 8):
+        spec = EnvSpec.of(partial(gymnasium.make, env_id, disable_env_checker=True), wrappers=wrappers)
+        registered = dict(gymnasium.registry)
+        made = made_elsewhere(spec)
+        gymnasium.registry.update(registered)
+        assert type(made.unwrapped).__name__ == "Mine"
+        assert made.spec is not None
+        assert made.spec.max_episode_steps == limit
+
+
+def test_an_id_that_cannot_be_sent_spoils_no_callable(registry: None) -> None:
+    lock = __import__("threading").Lock()
+    gymnasium.register("Locked-v0", lambda **_: lock)
+    assert isinstance(made_elsewhere(EnvSpec.of(make_countdown)), Countdown)
 
 
 def test_a_spec_that_is_not_the_registered_one_has_no_name(registry: None) -> None:

@@ -146,6 +146,15 @@ def test_the_plugin_of_an_installed_package_registers_its_ids(site: Site, entry_
     assert EnvSpec.of("FakeHighway-v0").factory is None
 
 
+def test_an_id_of_one_s_own_for_a_class_of_a_plugin_is_not_that_of_the_plugin(site: Site) -> None:
+    site.install("fake_highway", REGISTERS_WHEN_CALLED, "[gymnasium.envs]\n__root__ = fake_highway:register_all\n")
+    EnvSpec("FakeHighway-v0").make()
+    gymnasium.register("MyHighway-v0", "fake_highway:Game", max_episode_steps=12)
+    assert remembered_name("FakeHighway-v0") == "FakeHighway-v0"
+    assert remembered_name("MyHighway-v0") == "__main__:MyHighway-v0"
+    assert gymnasium.spec("MyHighway-v0").max_episode_steps == 12, "it is still registered"
+
+
 def test_a_plugin_may_have_a_namespace(site: Site) -> None:
     site.install("fake_highway", REGISTERS_WHEN_CALLED, "[gymnasium.envs]\nFakeSpace = fake_highway:register_all\n")
     assert type(EnvSpec("FakeSpace/FakeHighway-v0").make().unwrapped).__name__ == "Game"
