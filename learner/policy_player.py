@@ -1,23 +1,24 @@
 """A learner that trains nothing: it has workers play episodes of the policy of a run folder.
 
-Rule: the policy is published as version 0, once. The learner's process runs no environment code.
+Rule: the policy is published as version 0, once. The learner's process runs no environment code. Timeouts and the number of
+failures that are allowed are those of a training run.
 """
 
 from __future__ import annotations
 
 import math
-import os
 import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import msgspec
+
 from learner.config.rollout_config import RolloutConfig
-from learner.members.describe import DescribeSettings, described_by_workers
+from learner.members.describe import described_by_workers
 from learner.members.process_callbacks import ProcessCallbacks
+from learner.rollout_service.service import RolloutService, describe_settings, rollout_service
 from learner.rollouts.evaluation_tickets import EvaluationPlan, OnRows, PlayedEpisode
-from learner.rollouts.hub import Hub, HubSettings
-from learner.rollouts.ticket_coordinator import TicketCoordinator
 from learner.run_folder.run_folder import RunFolder, Which
 from protocol.arrays import Floats
 from protocol.env_spec import EnvLike, EnvSpec
@@ -26,9 +27,6 @@ from protocol.envs.wrappers import WrapperLike
 from protocol.policy.policy import Policy, make_policy
 from protocol.specs import DescribeSpec, PolicySpec, RunSpec
 from protocol.wire.learner_link import LearnerLink
-
-WORKER_TIMEOUT_S, NO_WORKERS_TIMEOUT_S, STALL_TIMEOUT_S = 5.0, 60.0, 600.0
-DESCRIBE = DescribeSettings(WORKER_TIMEOUT_S, NO_WORKERS_TIMEOUT_S, STALL_TIMEOUT_S, max_env_failures=0)
 
 
 class SavedPolicy(NamedTuple):
@@ -86,62 +84,66 @@ class PolicyPlayer:
         processes: ProcessCallbacks,
         check_interrupt: Callable[[], None],
         watch: Callable[[str], None],
+        settings: RolloutConfig,
         described: DescribedEnv | None = None,
     ) -> None:
-        """`check_interrupt` is called while it waits: what it raises ends the wait.
+        """`check_interrupt` is called while it waits: what it raises ends the wait. `settings`: timeouts and failures.
 
         `watch` is called several times a second with how far it is, as text. `described`: the environment, if a worker has
         described it.
         """
         self.policy = policy
         self._link, self._processes = link, processes
-        self._check_interrupt, self._watch, self._described = check_interrupt, watch, described
-        self._hub: Hub | None = None
+        self._check_interrupt, self._watch, self._settings, self._described = check_interrupt, watch, settings, described
+        self._service: RolloutService | None = None
 
     @property
     def workers(self) -> int:
         """Number of workers that have joined since the first `play`."""
-        return 0 if self._hub is None else len(self._hub.coordinator.members)
+        return 0 if self._service is None else len(self._service.snapshot().members)
 
     def describe(self, render_mode: str | None = None) -> DescribedEnv:
         """Have a worker describe the environment of evaluations, before the first `play`. Raises `UserFacingError`."""
         if self._described is not None:
             return self._described
         spec = DescribeSpec(self.policy.env.for_evaluation(), render_mode=render_mode)
-        return described_by_workers(self._link, spec, DESCRIBE, self._processes, self._check_interrupt)
+        settings = describe_settings(self._settings)
+        return described_by_workers(self._link, spec, settings, self._processes, self._check_interrupt)
 
     def play(self, plan: EvaluationPlan, on_rows: OnRows | None = None, before: int = 0) -> list[PlayedEpisode]:
         """Play these episodes. Returns them in the order of the seeds. Raises `RunError` if that is not possible.
 
         `before`: the number of episodes that were played in earlier calls, for the text that `watch` gets.
         """
-        if self._hub is None:
-            self._hub = self._published()
+        if self._service is None:
+            self._service = self._published()
         total = before + len(plan.seeds)
-        return self._hub.evaluate(plan, lambda played: self._watch(f"{before + played:,} of {total:,} episodes"), on_rows)
+        return self._service.play(plan, lambda played: self._watch(f"{before + played:,} of {total:,} episodes"), on_rows)
 
     def leave(self, reason: str) -> None:
         """Ask the workers to leave."""
-        if self._hub is not None:
-            self._hub.drain(reason, timeout_s=2.0)
+        if self._service is not None:
+            self._service.drain(reason, timeout_s=2.0)
 
-    def _published(self) -> Hub:
+    def _published(self) -> RolloutService:
         policy = self.policy
+        lanes = max(1, self._processes.expected)  # one for each worker of this program: only then do its failures count
+        settings = msgspec.structs.replace(self._settings, lanes=lanes)
         run = RunSpec(
-            policy.env, policy.spec, rollout_steps=1, copies=1, lanes=1, seed=0, facts=policy.facts, masked=policy.masked
+            policy.env,
+            policy.spec,
+            rollout_steps=1,
+            copies=1,
+            lanes=lanes,
+            seed=0,
+            facts=policy.facts,
+            masked=policy.masked,
+            heartbeat_s=settings.heartbeat_s,
         )
-        coordinator = TicketCoordinator(
-            run,
-            rollouts_per_update=1,
-            max_lag=0,
-            worker_timeout_s=WORKER_TIMEOUT_S,
-            first_session=int.from_bytes(os.urandom(6), "little"),
-        )
-        settings = HubSettings(NO_WORKERS_TIMEOUT_S, STALL_TIMEOUT_S, max_env_failures=0)
-        hub = Hub(self._link, coordinator, settings, self._processes, self._check_interrupt)
-        hub.wait_for(1)
-        hub.publish(0, policy.parameters, policy.buffers, deal=False)
-        return hub
+        service = rollout_service(settings, run, self._link, self._processes, self._check_interrupt)
+        service.wait_for_workers(1)
+        service.publish(0, policy.parameters, policy.buffers, deal=False)
+        return service
 
 
 def useful_workers(workers: int, episodes: int, copies: int) -> int:

@@ -14,6 +14,7 @@ from typing import Any, Literal, NamedTuple, TypedDict, TypeVar, Unpack, get_arg
 
 import msgspec
 
+from learner.config.rollout_config import RolloutConfig
 from learner.policy_player import SavedPolicy, saved_policy, useful_workers
 from learner.recording.record import RecordedDataset
 from learner.recording.record import record as record_dataset
@@ -49,6 +50,7 @@ class PlayKeywords(TypedDict, total=False):
     transport: Literal["inproc", "ipc", "tcp"]
     bind: str
     inference: Literal["workers", "learner"]
+    max_env_failures: int
 
 
 class EvaluateKeywords(PlayKeywords, total=False):
@@ -102,7 +104,8 @@ def evaluate(
         progress: Show how far it is.
         **keywords: The flags of `millrace evaluate`. `seed` of the episodes; `best`, to use the policy with the best
             evaluation during the run in place of the newest; the number of `workers`, and of the `copies` that each plays
-            side by side; `max_steps` of all episodes together; `transport` or `bind`; `inference`; `video`, to film them.
+            side by side; `max_steps` of all episodes together; `transport` or `bind`; `inference`; `max_env_failures`;
+            `video`, to film them.
 
     Returns the `Evaluation`: `return_mean`, `return_std`, `length_mean`, `episodes` and `cut`. It does not depend on the
     number of workers. Raises `UserFacingError` with a message of one line.
@@ -138,7 +141,7 @@ def record(
         wrappers: Likewise the wrappers.
         progress: Show how far it is.
         **keywords: The flags of `millrace record`: `stochastic`, to sample actions; `npy`, a file for rows of observation
-            and action; `seed`, `best`, `workers`, `transport`, `bind` and `inference`.
+            and action; `seed`, `best`, `workers`, `transport`, `bind`, `inference` and `max_env_failures`.
 
     Returns a `RecordedDataset`: `dataset_id`, `episodes`, `steps`, `return_mean`, `return_std` and `cut`. It does not depend
     on the number of workers. Raises `UserFacingError` with a message of one line; then it leaves no files.
@@ -196,6 +199,7 @@ def play(flags: EvaluateFlags, watch: Watch, given: Given | None = None) -> tupl
         ("workers", flags.workers, 1),
         ("copies", flags.copies, 1),
         ("max_steps", flags.max_steps, 1),
+        ("max_env_failures", flags.max_env_failures, 0),
     ):
         check_at_least(name, value, least)
     if flags.copies > MAX_SEEDS:
@@ -209,7 +213,7 @@ def play(flags: EvaluateFlags, watch: Watch, given: Given | None = None) -> tupl
     saved = _saved(flags, given)
     copies = 1 if flags.video else flags.copies
     count = useful_workers(flags.workers, episodes, copies)
-    workers = PlayingWorkers(count, flags.transport, flags.bind, flags.inference, min(copies, episodes))
+    workers = _workers(flags, count, min(copies, episodes))
     with policy_player(saved, workers, watch) as player:
         if flags.video:
             return record_videos(player, flags.run, episodes, flags.seed, flags.max_steps)
@@ -222,11 +226,16 @@ def write_dataset(flags: RecordFlags, watch: Watch, given: Given | None = None) 
     check_at_least("steps", flags.steps, 1)
     check_at_least("seed", flags.seed, 0)
     check_at_least("workers", flags.workers, 1)
-    saved, workers = _saved(flags, given), PlayingWorkers(flags.workers, flags.transport, flags.bind, flags.inference)
-    with policy_player(saved, workers, watch) as player:
+    check_at_least("max_env_failures", flags.max_env_failures, 0)
+    with policy_player(_saved(flags, given), _workers(flags, flags.workers, 1), watch) as player:
         return record_dataset(
             player, flags.run, flags.out, flags.steps, flags.seed, stochastic=flags.stochastic, npy=flags.npy
         )
+
+
+def _workers(flags: EvaluateFlags | RecordFlags, count: int, copies: int) -> PlayingWorkers:
+    settings = RolloutConfig(max_env_failures=flags.max_env_failures)
+    return PlayingWorkers(count, flags.transport, flags.bind, flags.inference, copies, settings)
 
 
 def _saved(flags: EvaluateFlags | RecordFlags, given: Given | None) -> SavedPolicy:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from learner.config.rollout_config import RolloutConfig
 from learner.members.describe import DescribeSettings
 from learner.members.process_callbacks import ProcessCallbacks
-from learner.rollouts.evaluation_tickets import EvaluationPlan, evaluation_of
+from learner.rollouts.evaluation_tickets import EvaluationPlan, OnRows, PlayedEpisode, evaluation_of
 from learner.rollouts.hub import Hub, HubObserver, HubSettings, HubSnapshot
 from learner.rollouts.lanes import AcceptedRollout
 from learner.rollouts.ledger import Ledger
@@ -66,7 +66,11 @@ class RolloutService:
         `watch` is called with the number of episodes that were played, several times a second. Raises `RunError` when the
         run cannot go on.
         """
-        return evaluation_of(self._hub.evaluate(plan, watch), self._hub.coordinator.run.facts)
+        return evaluation_of(self.play(plan, watch), self._hub.coordinator.run.facts)
+
+    def play(self, plan: EvaluationPlan, watch: Callable[[int], None], on_rows: OnRows | None = None) -> list[PlayedEpisode]:
+        """As `evaluate`, but returns the episodes, in the order of their seeds. `on_rows` gets their rows."""
+        return self._hub.evaluate(plan, watch, on_rows)
 
     def drain(self, reason: str, timeout_s: float = 5.0) -> None:
         """Ask every worker to leave, and wait for that at most `timeout_s`."""

@@ -29,6 +29,8 @@ class PlayFlags(msgspec.Struct, frozen=True, kw_only=True):
     """address at which workers from elsewhere can join, such as tcp://0.0.0.0:5555; no workers are then started here"""
     inference: Literal["workers", "learner"] = "workers"
     """where the policy acts: in each worker, or in this process; workers that only step the environment need learner"""
+    max_env_failures: int = 3
+    """give up after more failures than this: an exception of the environment, or a worker process that was killed"""
 
 
 class EvaluateFlags(PlayFlags, frozen=True, kw_only=True):

@@ -8,20 +8,21 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from learner.config.rollout_config import RolloutConfig
 from learner.interrupts import Interrupts
 from learner.members.endpoint import BindSettings
 from learner.members.process_callbacks import ProcessCallbacks
-from learner.policy_player import DESCRIBE, NO_WORKERS_TIMEOUT_S, WORKER_TIMEOUT_S, PolicyPlayer, SavedPolicy
+from learner.policy_player import PolicyPlayer, SavedPolicy
+from learner.rollout_service.service import describe_settings
 from learner.vector_env.settings import VectorEnvSettings
 from millrace.launch.acting_thread import NEVER_S, BeforeWaits, acting_processes, acting_thread
 from millrace.launch.endpoint import open_endpoint
 from millrace.launch.local_worker_options import WorkerFlags
 from millrace.launch.vector import listen
-from protocol.alive import CallTimeouts
 from workers.collect.split_vector_env import SplitVectorEnv
 from workers.evaluate.split_evaluation_copies import SplitEvaluationCopies
 from workers.supervisor import Supervisor
@@ -40,6 +41,8 @@ class PlayingWorkers:
     """Where the policy acts: in each worker, or in this process."""
     copies: int = 1
     """Episodes that are played at the same time, if the policy acts in this process."""
+    settings: RolloutConfig = field(default_factory=RolloutConfig)
+    """Timeouts, and how many failures are allowed."""
 
 
 @contextmanager
@@ -79,10 +82,10 @@ def _player(
         processes = ProcessCallbacks()
         endpoint.announce("")
     else:
-        supervisor = Supervisor(endpoint.starter(_own_logs(stack)), which.workers)
+        supervisor = Supervisor(endpoint.starter(_own_logs(stack)), which.workers, timeouts=which.settings.call_timeouts())
         stack.callback(supervisor.stop, 2.0)
-        processes = ProcessCallbacks(supervisor.poll, expected=which.workers)
-    return PolicyPlayer(policy, endpoint.link, processes, check_interrupt, watch)
+        processes = ProcessCallbacks(supervisor.poll, supervisor.activities, expected=which.workers)
+    return PolicyPlayer(policy, endpoint.link, processes, check_interrupt, watch, which.settings)
 
 
 def _acting_player(
@@ -94,7 +97,7 @@ def _acting_player(
 ) -> PolicyPlayer:
     """A player that acts itself, in a thread: its workers step the copies of a vector environment, each a lane."""
     endpoint = open_endpoint(BindSettings(), "inproc", stack)
-    workers = None if which.bind else min(which.workers, which.copies)
+    workers, settings = None if which.bind else min(which.workers, which.copies), which.settings
     copies = VectorEnvSettings(
         policy.env.for_evaluation(),
         which.copies,
@@ -103,19 +106,19 @@ def _acting_player(
         BindSettings(which.bind),
         which.transport,
         timeout_s=NEVER_S,
-        worker_timeout_s=WORKER_TIMEOUT_S,
+        worker_timeout_s=settings.worker_timeout_s,
         copy=False,
     )
-    started = listen(copies, stack.enter_context(ExitStack())).start(_own_logs(stack), CallTimeouts())
-    described = started.describe(DESCRIBE, check_interrupt)
+    started = listen(copies, stack.enter_context(ExitStack())).start(_own_logs(stack), settings.call_timeouts())
+    described = started.describe(describe_settings(settings), check_interrupt)
     env = started.vector_env(described)
     stack.callback(env.close)
-    before_wait = BeforeWaits(env, workers or 1, NO_WORKERS_TIMEOUT_S)
+    before_wait = BeforeWaits(env, workers or 1, settings.no_workers_timeout_s)
     lanes = SplitVectorEnv(env, 0, before_wait, env.step_lanes, policy.facts, masked=policy.masked)
     thread = acting_thread(endpoint, lanes, SplitEvaluationCopies(lanes, 0, which.copies), lambda: "cpu")
     stack.callback(thread.stop, 2.0)
     processes = acting_processes(thread, lanes, env, workers or 0)
-    return PolicyPlayer(policy, endpoint.link, processes, check_interrupt, watch, described)
+    return PolicyPlayer(policy, endpoint.link, processes, check_interrupt, watch, settings, described)
 
 
 def _own_logs(stack: ExitStack) -> WorkerFlags:

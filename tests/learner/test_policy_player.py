@@ -3,20 +3,31 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
 
 from learner.config.layers import resolve
-from learner.policy_player import load_policy, saved_policy
+from learner.config.rollout_config import RolloutConfig
+from learner.members.process_callbacks import ProcessCallbacks
+from learner.policy_player import PolicyPlayer, SavedPolicy, load_policy, saved_policy
+from learner.rollouts.evaluation_tickets import EvaluationPlan
 from learner.run_folder.run_folder import RunFolder
 from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import UsageError
+from protocol.errors import EnvironmentFailed, UsageError
+from protocol.messages import PROTOCOL_VERSION, Evaluate, Evaluated, Hello, WorkerExit
 from protocol.policy.layout import acting_size, buffer_size
 from protocol.policy.recurrent import zero_state
+from protocol.rollout import Episode
 from protocol.specs import PolicySpec
+from protocol.wire.codec import Buffer, decode_to_worker
+from protocol.wire.learner_link import LearnerLink
+from tests.support.fake_ends import BUFFERS, PARAMETERS, run_spec
+from tests.support.fake_link import FakeLink
 
 
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
@@ -60,3 +71,43 @@ def test_the_numbers_that_a_run_logs_of_its_episodes_stand_in_policy_json(tmp_pa
 def test_a_folder_without_a_policy_is_said(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no such folder"):
         load_policy(tmp_path / "nowhere")
+
+
+class FourWorkers(FakeLink):
+    """Four workers that answer each ticket at once. One of them is killed by its first."""
+
+    def __init__(self, killed: bytes) -> None:
+        super().__init__()
+        self.killed, self.exits = killed, list[WorkerExit]()
+        self.inbox += [(f"w{n}".encode(), Hello(PROTOCOL_VERSION, f"w{n}", "host", n, n, "fake", 1)) for n in range(4)]
+
+    def send(self, peer: bytes, frames: Sequence[Buffer]) -> bool:
+        message = decode_to_worker([bytes(frame) for frame in frames])
+        if isinstance(message, Evaluate) and peer == self.killed:
+            nonce = int(peer[1:])
+            self.exits = [WorkerExit(peer.decode(), nonce, "was killed by SIGKILL", failed=True)]
+        elif isinstance(message, Evaluate):
+            episodes = tuple(Episode(float(seed), 2, 0.0) for seed in message.seeds)
+            self.inbox.append((peer, Evaluated(message.session, message.ticket, episodes, (False,) * len(episodes))))
+        return True
+
+    def ended(self) -> list[WorkerExit]:
+        exits, self.exits = self.exits, []
+        return exits
+
+    def player(self, max_env_failures: int) -> PolicyPlayer:
+        run = run_spec()
+        policy = SavedPolicy(run.policy, run.env, PARAMETERS, BUFFERS)
+        processes, settings = ProcessCallbacks(self.ended, expected=4), RolloutConfig(max_env_failures=max_env_failures)
+        return PolicyPlayer(policy, cast(LearnerLink, self), processes, lambda: None, lambda text: None, settings)
+
+
+@pytest.mark.parametrize("killed", [b"w0", b"w3"])
+def test_a_killed_worker_counts_as_a_failure_and_its_episodes_are_played_by_others(killed: bytes) -> None:
+    plan = EvaluationPlan.of(20, seed=5, copies=2, max_steps=200)
+    played = FourWorkers(killed).player(max_env_failures=1).play(plan)
+    assert [one.episode.reward for one in played] == list(plan.seeds)
+    with pytest.raises(
+        EnvironmentFailed, match="was killed by SIGKILL; failure 1 within an hour; max_env_failures allows 0"
+    ):
+        FourWorkers(killed).player(max_env_failures=0).play(plan)

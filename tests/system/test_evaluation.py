@@ -13,6 +13,7 @@ import pytest
 
 import millrace
 from learner.config.layers import resolve
+from learner.config.rollout_config import RolloutConfig
 from learner.policy_player import SavedPolicy
 from learner.rollouts.evaluation_tickets import EvaluationPlan
 from learner.run_folder.metrics_log import read_rows
@@ -134,11 +135,19 @@ def test_four_workers_take_at_most_two_fifths_of_the_time_of_one() -> None:
     assert seconds[4] <= 0.4 * crowding() * seconds[1]
 
 
+def test_a_worker_in_a_long_step_is_not_silent() -> None:
+    policy = untrained(f"{TOY}Slow-v0", {"seconds": 0.8, "k": 1})
+    which = PlayingWorkers(1, settings=RolloutConfig(worker_timeout_s=0.5, heartbeat_s=0.05))
+    with policy_player(policy, which, silent) as player:
+        played = player.play(EvaluationPlan.of(1, seed=5, copies=1, max_steps=100))
+    assert [one.episode.length for one in played] == [1]
+
+
 def test_an_environment_that_raises_ends_the_evaluation_with_its_traceback() -> None:
     policy = untrained(f"{TOY}Raises-v0", {"after": 3})
     with (
         pytest.raises(EnvironmentFailed, match="while the policy was evaluated: copy 0, step ") as caught,
-        policy_player(policy, PlayingWorkers(1), silent) as player,
+        policy_player(policy, PlayingWorkers(1, settings=RolloutConfig(max_env_failures=0)), silent) as player,
     ):
         player.play(EvaluationPlan.of(4, seed=5, copies=2, max_steps=100))
     assert "in step" in caught.value.detail

@@ -16,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from learner.config.layers import resolve
+from learner.config.rollout_config import RolloutConfig
 from learner.policy_player import load_policy, saved_policy
 from learner.recording import minari as dataset_module
 from learner.recording.episodes import EpisodeAssembler, RecordedEpisode
@@ -284,7 +285,8 @@ def record(
     npy: Path | None = None,
     workers: int = 1,
 ) -> RecordedDataset:
-    with policy_player(saved_policy(run), PlayingWorkers(workers, "inproc"), lambda text: None) as player:
+    playing = PlayingWorkers(workers, "inproc", settings=RolloutConfig(max_env_failures=0))
+    with policy_player(saved_policy(run), playing, lambda text: None) as player:
         return record_with(player, run, dataset_id, steps, seed, stochastic=stochastic, npy=npy)
 
 
