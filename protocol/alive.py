@@ -12,7 +12,10 @@ from protocol.bounds import MAX_WORKERS, Line, Name, Natural, Seconds
 from protocol.message_base import Message
 
 Doing = Literal["starting", "waiting", "describing", "making", "resetting", "stepping", "evaluating", "closing"]
-"""What a worker does, as its supervisor sees it. Environment code runs in all of these except `starting` and `waiting`."""
+"""What a worker does, as its supervisor sees it. Code of the user runs in all of these except `starting` and `waiting`.
+
+`making`: an env copy, or the policy with all that it imports.
+"""
 CLOSE_S = 10.0  # for one env copy; what hangs in `close` has done its work
 NO_ENVIRONMENT_CODE: frozenset[Doing] = frozenset({"starting", "waiting"})
 
@@ -80,7 +83,7 @@ class CallTimeouts:
             return f"was ended: close() of its environment took longer than {CLOSE_S:g} s"
         call, flag = {
             "describing": ("the construction of its environment", "construct"),
-            "making": ("the construction of its environment", "construct"),
+            "making": ("the construction of its environment or policy", "construct"),
             "resetting": ("a reset of its environment", "reset"),
         }.get(doing, ("a step of its environment", "step"))
         return f"was ended: {call} took longer than {self.limit_s(doing):g} s (--{flag}-timeout-s)"

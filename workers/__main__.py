@@ -101,7 +101,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         help="before a learner has accepted this worker: leave when none has answered for S seconds (default: %(default)g); "
         f"a worker that had joined waits {REJOIN_TIMEOUT_S:g} s for its learner to come back",
     )
-    for call, what in (("construct", "making one env copy"), ("reset", "a reset"), ("step", "a step")):
+    for call, what in (("construct", "making one env copy, or the policy"), ("reset", "a reset"), ("step", "a step")):
         faults.add_argument(
             f"--{call}-timeout-s",
             type=float,

@@ -50,7 +50,7 @@ from workers.session import (
 )
 from workers.states import State
 from workers.step.stepper import Stepper
-from workers.supervise.activity import WAITING, activity
+from workers.supervise.activity import MAKING, WAITING, activity
 
 log = logging.getLogger("millrace.worker")
 
@@ -344,7 +344,9 @@ class Worker:
         try:
             match run:
                 case RunSpec():
+                    activity().begin(MAKING)  # the policy may import torch and the user's modules, which takes long
                     self._collector, self._evaluator = self._options.make_collector(run)
+                    activity().begin(WAITING)
                     self._packing = replace(self._link.packing, zstd=run.compress == "zstd")
                 case StepSpec():
                     self._stepper = Stepper(

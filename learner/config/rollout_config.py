@@ -130,7 +130,9 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     no_workers_timeout_s: Free[Seconds] = 600.0
     """Write a checkpoint and end the run if there has been no worker for this many seconds."""
     construct_timeout_s: Free[SecondsOrNever] = 600.0
-    """A local worker process is restarted if making one env copy takes longer than this many seconds. 0: never."""
+    """A local worker process is restarted if making one env copy, or the policy with all that it imports, takes longer than
+    this many seconds. 0: never.
+    """
     reset_timeout_s: Free[SecondsOrNever] = 600.0
     """A local worker process is restarted if a reset of an env copy takes longer than this many seconds. 0: never."""
     step_timeout_s: Free[SecondsOrNever] = 600.0

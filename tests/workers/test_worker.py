@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from protocol.alive import NO_ENVIRONMENT_CODE
 from protocol.arrays import Array
 from protocol.messages import (
     Collect,
@@ -36,6 +37,7 @@ from protocol.wire.weight_dtypes import WeightsDtype, to_float32, to_wire_dtype
 from protocol.wire.worker_link import WorkerLink
 from tests.support.collectors import TOY, bits, collect, random_collector, run_of
 from workers.session import Leave, Session
+from workers.supervise.activity import ActivityReader, activity
 from workers.worker import Worker, WorkerOptions, identity
 
 RUN = msgspec.structs.replace(run_of("CartPole-v1", T=40, N=8), learner_timeout_s=1e9)
@@ -145,6 +147,21 @@ def test_a_collector_that_cannot_be_made_is_a_failure_that_the_learner_hears() -
     assert isinstance(failure, Failure)
     assert failure.error == "RuntimeError: CUDA error: out of memory"
     assert "in no_device" in failure.traceback
+
+
+def test_a_worker_that_makes_its_policy_is_not_silent() -> None:
+    doing = []
+
+    def slow_imports(run: RunSpec) -> NoReturn:
+        doing.append(ActivityReader(activity()).read(0.0).doing)
+        raise ImportError("no module my_encoder")
+
+    link = FakeLink(said_to_a_worker(RUN))
+    options = WorkerOptions(make_collector=slow_imports)
+    session = Session(replace(identity("w0"), process_nonce=0), 0.0)
+    Worker(cast(WorkerLink, link), session, options, clock=lambda: 0.0).run()
+    assert doing == ["making"]
+    assert "making" not in NO_ENVIRONMENT_CODE
 
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16", "float16"])

@@ -42,7 +42,7 @@ WHILE: dict[Doing, str] = {
     "starting": " while it started",
     "waiting": "",
     "describing": " while it described the environment",
-    "making": " while it made its environment",
+    "making": " while it made its environment or policy",
     "resetting": " in a reset of its environment",
     "stepping": " in a step of its environment",
     "evaluating": " in an evaluation",
