@@ -351,8 +351,9 @@ class RunRecorder:
         """Write a row of metrics. A disk that does not take rows is said once a minute, not for each row."""
         if self._metrics.deleted:
             self._make_folder_again()
+        self._metrics.write(progress, metrics)
         try:
-            self._metrics.write(progress, metrics)
+            self._metrics.flush()
         except RunError as error:
             now = time.monotonic()
             if now - self._said_s >= SAY_AGAIN_S:

@@ -1,18 +1,19 @@
 """The metrics of a run on disk: metrics.jsonl and TensorBoard.
 
-Rule: a file ends with a whole row, and there is one row for each update. A resumed run first removes the rows that its
-checkpoint knows nothing of. If it makes the evaluation before which it was interrupted, that update's row gets its metrics.
+Rule: a file ends with a whole row, and there is one row for each update. Rows that the disk refuses are written later. A
+resumed run first removes the rows that its checkpoint knows nothing of. If it makes the evaluation before which it was
+interrupted, that update's row gets its metrics.
 """
 
 from __future__ import annotations
 
-import errno
 import io
 import logging
 import math
 import os
 import socket
 import time
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -27,6 +28,7 @@ from protocol.errors import RunError
 log = logging.getLogger("millrace.learner")
 
 METRICS_FILE = "metrics.jsonl"
+MOST_WAITING = 100_000  # rows that the disk refused: 100 MB of memory
 EVENTS_EVERY_S = 0.2  # a fast run makes a hundred updates in that time, and an event takes as long as a small minibatch
 
 
@@ -56,49 +58,59 @@ class MetricsLog:
         except OSError as error:
             raise RunError(f"{error.filename or table} cannot be written: {error.strerror}") from error
         self._events.append(_first_event(from_env_steps))
+        self._events.flush()
         self._clock, self._last_event_s = clock, -math.inf
         self._newest: Row = kept[-1] if kept else {}
         self._unwritten: tuple[Row, int] | None = None  # the newest row and its env steps, if TensorBoard has not got it
 
     @property
     def deleted(self) -> bool:
-        """Whether metrics.jsonl was deleted since its last row. `write` makes it again."""
+        """Whether metrics.jsonl was deleted since its last row. `flush` makes it again."""
         return self._table.deleted
 
     def write(self, progress: Progress, train: Row) -> None:
-        """Add a row. `train`: the metrics of the algorithm, of an evaluation if there was one, and of callbacks.
+        """Add a row, which `flush` writes. `train`: the metrics of the algorithm, of an evaluation if any, and of callbacks.
 
-        If the newest row is of the same update, these metrics are added to it. Raises `RunError`, with a one-line message,
-        if the disk does not take the row. The rows before it stay readable.
+        If the newest row is of the same update, these metrics are added to it.
         """
-        row, replaced = progress.row(train), b""
-        event: Row = row
-        if all(self._newest.get(key) == row[key] for key in (UPDATES_KEY, ENV_STEPS_KEY)):
-            row, replaced = {**self._newest, **named(train)}, _json_line(self._newest)
+        event: Row = progress.row(train)
+        if all(self._newest.get(key) == event[key] for key in (UPDATES_KEY, ENV_STEPS_KEY)):
+            row = {**self._newest, **named(train)}
+            self._table.replace(_json_line(self._newest), _json_line(row))
             event = row if self._unwritten is not None else named(train)  # TensorBoard would show a number twice
-        self._newest = {}  # unless the disk takes it
-        self._table.append(_json_line(row), len(replaced))
+        else:
+            row = dict(event)
+            self._table.append(_json_line(row))
         self._newest = row
         self._unwritten = event, progress.env_steps
         if self._clock() - self._last_event_s >= EVENTS_EVERY_S or any(name.startswith("eval/") for name in row):
-            self._write_event()
+            self._add_event()
+
+    def flush(self) -> None:
+        """Write the rows that are not written yet. Raises `RunError`, with a one-line message, if the disk refuses them.
+
+        The rows before them stay readable, and the next call tries again.
+        """
+        self._table.flush()
+        self._events.flush()
 
     def close(self) -> None:
         """Close both files."""
-        with suppress(RunError):  # metrics.jsonl has the row
-            self._write_event()
+        self._add_event()
+        with suppress(RunError):
+            self.flush()
         self._table.close()
         self._events.close()
 
-    def _write_event(self) -> None:
+    def _add_event(self) -> None:
         if self._unwritten is not None:
-            unwritten, self._unwritten = self._unwritten, None
+            self._events.append(_event(*self._unwritten))
+            self._unwritten = None
             self._last_event_s = self._clock()
-            self._events.append(_event(*unwritten))
 
 
 class _RecordFile:
-    """A file to which whole records are appended. A record that a full disk cut off is removed.
+    """A file to which whole records are appended. What the disk refuses waits, and a record that it cut off is removed.
 
     If the file was deleted, it is made again, with its folder.
     """
@@ -106,29 +118,46 @@ class _RecordFile:
     def __init__(self, path: Path) -> None:
         """Raises OSError."""
         self._path = path
+        self._waiting: deque[bytes] = deque(maxlen=MOST_WAITING)
+        self._bytes = 0
+        self._cut = 0  # bytes at the end of the file that the first record that waits replaces
         self._open()
 
     @property
     def deleted(self) -> bool:
         return os.fstat(self._number).st_nlink == 0
 
-    def append(self, record: bytes, replaced: int = 0) -> None:
-        """Add a record in place of the last `replaced` bytes. Raises `RunError`."""
+    def append(self, record: bytes) -> None:
+        """Add a record. It waits for `flush`."""
+        self._waiting.append(record)
+
+    def replace(self, newest: bytes, record: bytes) -> None:
+        """Add a record in place of the newest one."""
+        if self._waiting:
+            self._waiting.pop()
+        else:
+            self._cut = len(newest)
+        self._waiting.append(record)
+
+    def flush(self) -> None:
+        """Write the records that wait. Raises `RunError`."""
         try:
             if self.deleted:
                 deleted = self._file
                 self._open()
                 deleted.close()
-            if replaced and replaced <= self._bytes:
-                self._file.truncate(self._bytes - replaced)
-                self._bytes -= replaced
-            if self._file.write(record) != len(record):
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            if self._cut:
+                self._file.truncate(self._bytes - self._cut)
+                self._bytes, self._cut = self._bytes - self._cut, 0
+            while self._waiting:
+                rest = self._waiting[0]
+                while rest:  # a disk that takes a part says why with the next
+                    rest = rest[self._file.write(rest) :]
+                self._bytes += len(self._waiting.popleft())
         except OSError as error:
             with suppress(OSError):
                 self._file.truncate(self._bytes)
-            raise RunError(f"{self._path}: a row was not written: {error.strerror}") from error
-        self._bytes += len(record)
+            raise RunError(f"{self._path}: rows are not written yet: {error.strerror}") from error
 
     def close(self) -> None:
         self._file.close()
@@ -137,7 +166,7 @@ class _RecordFile:
         self._path.parent.mkdir(parents=True, exist_ok=True)
         self._file = self._path.open("ab", buffering=0)
         self._number = self._file.fileno()
-        self._bytes = self._path.stat().st_size
+        self._bytes, self._cut = self._path.stat().st_size, 0
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:

@@ -240,28 +240,42 @@ def test_a_resumed_run_takes_back_what_its_checkpoint_does_not_know(tmp_path: Pa
     assert scalars(tmp_path, "rollout/ep_rew_mean") == [(100, 1.0), (200, 1.0), (250, 2.0), (350, 2.0)]
 
 
-def test_a_row_that_the_disk_cuts_off_is_taken_back(tmp_path: Path) -> None:
+def test_rows_that_the_disk_refuses_are_written_later(tmp_path: Path) -> None:
     log = MetricsLog(tmp_path)
-    log.write(Progress(env_steps=100), {})
+    log.write(Progress(updates=1, env_steps=100), {})
+    log.flush()
     appender = log._table
     file = appender._file
+    took: list[int] = []
 
     class Full:
         """Takes ten bytes and no more."""
 
         def write(self, record: bytes) -> int:
-            return file.write(record[:10])
+            if took:
+                raise OSError(errno.EDQUOT, os.strerror(errno.EDQUOT))
+            took.append(file.write(record[:10]))
+            return took[0]
 
         def truncate(self, length: int) -> None:
+            took.clear()
             file.truncate(length)
 
     appender._file = Full()  # type: ignore[assignment]
-    with pytest.raises(RunError, match=r"metrics\.jsonl: a row was not written: No space left on device"):
-        log.write(Progress(env_steps=200), {})
+    log.write(Progress(updates=1, env_steps=100), {"eval/mean_reward": 3.0})
+    for updates in (2, 3):
+        with pytest.raises(RunError, match=r"metrics\.jsonl: rows are not written yet: Disk quota exceeded$"):
+            log.flush()
+        log.write(Progress(updates=updates, env_steps=100 * updates), {})
+    assert (tmp_path / "metrics.jsonl").read_bytes() == b"", "a part of a row is left"
+    log.write(Progress(updates=3, env_steps=300), {"eval/mean_reward": 5.0})
     appender._file = file
-    log.write(Progress(env_steps=300), {})
+    log.flush()
     log.close()
-    assert [row["time/total_timesteps"] for row in read_rows(tmp_path / "metrics.jsonl")] == [100, 300]
+    rows = read_rows(tmp_path / "metrics.jsonl")
+    assert [row["time/total_timesteps"] for row in rows] == [100, 200, 300]
+    assert [row.get("eval/mean_reward") for row in rows] == [3.0, None, 5.0]
+    assert scalars(tmp_path, "eval/mean_reward") == [(100, 3.0), (300, 5.0)]
 
 
 def test_the_window_holds_the_last_hundred_episodes() -> None:
