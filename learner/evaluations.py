@@ -17,7 +17,7 @@ from learner.run_folder.results import Best, Evaluation
 from learner.run_folder.run_folder import RunFolder
 from learner.run_state import RunState
 from protocol.arrays import Floats
-from protocol.errors import RunError, UsageError
+from protocol.errors import UsageError
 from protocol.logs.notices import log_notice
 from protocol.random_streams import Purpose
 from protocol.specs import RunSpec
@@ -101,7 +101,9 @@ class Evaluations:
             return
         (parameters, buffers), spec = self.best_policy, self._spec
         write = self._folder.write_policy
-        warn_on_error(lambda: write(spec.policy, spec.env, parameters, buffers, "best", spec.facts, spec.masked))
+        self._folder.writes.write(
+            "best policy", lambda: write(spec.policy, spec.env, parameters, buffers, "best", spec.facts, spec.masked)
+        )
 
     def of_version(self, version: int) -> Evaluation | None:
         """The evaluation of this version, if there is one."""
@@ -142,11 +144,3 @@ def _smaller(size: EvaluationSize, usual: EvaluationSize) -> str:
     steps = f" and at most {size.max_steps:,} env steps" if size.max_steps < usual.max_steps else ""
     why = "because the training was short; --eval-episodes sets another number"
     return f"the evaluation has {size.episodes} episodes{steps}, {why}"
-
-
-def warn_on_error(write: Callable[[], object]) -> None:
-    """Write a file; a disk that is full costs a warning, never the run."""
-    try:
-        write()
-    except RunError as error:
-        log.warning("%s", error)

@@ -212,6 +212,8 @@ class Run:
         if setup.resumed:
             state = restore(self.folder, self.algorithm)
         self._interrupts = setup.interrupts
+        # The last save gets half of what is left of the grace time, and the workers need time to leave.
+        self.folder.writes.at_most = lambda seconds: setup.interrupts.at_most(2 * seconds) / 2
         self._learns_from_prior = bool(config.prior)
         past = (state.ledger, state.incarnations)
         self.service = rollout_service(config, spec, link, processes, self._check_interrupt, observer, past)
@@ -284,6 +286,7 @@ class Run:
             self.algorithm.learn_from_prior(pulse)
         except Interrupted:
             self.recorder.save()
+            self.recorder.confirm_saved()
             raise
 
     def _check_interrupt(self) -> None:

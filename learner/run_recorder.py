@@ -2,7 +2,8 @@
 
 Rule: a checkpoint is written between two updates, never during one, and holds everything that the next update depends on.
 It is written after the callbacks of its update, and before an evaluation, which may take long. If the disk is full, the run
-logs a warning and goes on. The seconds of evaluations are a stage of their own and do not count as training.
+logs a warning and goes on; at its end, it fails if the disk does not take its last state. The seconds of evaluations are a
+stage of their own and do not count as training.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from learner.algorithms import Algorithm
 from learner.algorithms.updates import check_weights
 from learner.callbacks.callbacks import Callbacks
 from learner.config.config import Config
-from learner.evaluations import Evaluations, warn_on_error
+from learner.evaluations import Evaluations
 from learner.recording.image_sample import image_samples
 from learner.recording.training_recorder import TrainingRecorder
 from learner.rollout_service.service import RolloutService
@@ -45,7 +46,6 @@ from protocol.specs import RunSpec
 log = logging.getLogger("millrace.learner")
 
 SHOW_EVERY_S = 0.2  # progress of an evaluation
-SAY_AGAIN_S = 60.0  # that rows of metrics are not written
 
 
 class EpisodeSettings(NamedTuple):
@@ -97,12 +97,11 @@ class RunRecorder:
         self.longest_save_s = 0.0
         """How long the longest checkpoint took to write, in this process."""
         self._saved: tuple[int, int, list[float] | None, int] | None = None  # what `_position` was in the newest checkpoint
-        self._saved_env_steps: int | None = None
+        self._saved_env_steps = state.env_steps if state.version else None
+        self._policy_env_steps = self._saved_env_steps
         self._saved_to = ""  # path of the newest checkpoint
         self._finished = False
-        self._said_s = -SAY_AGAIN_S
         self._said_missing = False  # whether facts were looked for in the first episodes
-        self._trouble = ""  # with the folder, as it was said last
         self._workers_alive = 0
         service.report(self.progress())
 
@@ -145,7 +144,8 @@ class RunRecorder:
             self._say_missing_facts()
         self._episodes_since_save += len(batch.episodes)
         if self.version == 1:
-            warn_on_error(lambda: self._folder.write_images(image_samples(batch.obs, self._spec.policy.observation)))
+            images = image_samples(batch.obs, self._spec.policy.observation)
+            self._folder.writes.write("images", lambda: self._folder.write_images(images))
 
     def weights(self) -> tuple[Floats, Floats]:
         """The parameters and buffers of the algorithm. Raises `UsageError` if no worker could act with them."""
@@ -198,23 +198,24 @@ class RunRecorder:
 
     def save(self) -> None:
         """Write a checkpoint and the policy. Raises `RunTakenOver` if another process trains this run now."""
-        if self._folder.lock is not None:
-            self._folder.lock.confirm()
+        self._confirm_lock()
         began_s = self._saved_s = time.monotonic()
-        state = self._state().checkpoint_content(self._algorithm)
         self._episodes_since_save = 0
-        if not self._make_folder_again():
-            return
-        warn_on_error(lambda: self._save_checkpoint(state))
-        policy, env, facts = self._spec.policy, self._spec.env, self._spec.facts
-        warn_on_error(lambda: self._folder.write_policy(policy, env, *self.weights(), facts=facts, masked=self._spec.masked))
+        self._folder.writes.write("state", self._write_state)
         self._took_to_save(time.monotonic() - began_s)
-        if self._saved == self._position() and self._callbacks.wants("on_checkpoint"):
-            self._requests.closed = "expected it earlier than in on_checkpoint: the checkpoint would lack it"
-            try:
-                self._callbacks.on_checkpoint(self.progress())
-            finally:
-                self._requests.closed = ""
+        if self._saved == self._position():
+            self._tell_checkpoint()
+
+    def confirm_saved(self) -> None:
+        """The last save: what the disk has refused is tried again for a while. Raises `RunError` if it stays refused.
+
+        Raises `RunTakenOver`, as `save` does.
+        """
+        self._confirm_lock()
+        before = self._saved
+        self._folder.writes.confirm()
+        if self._saved != before:
+            self._tell_checkpoint()
 
     def save_if_time(self) -> None:
         """Write a checkpoint and the policy if the newest checkpoint is older than `checkpoint_every_s`."""
@@ -226,14 +227,23 @@ class RunRecorder:
         if self._saved != self._position():
             self.save()
 
-    def save_after_error(self) -> None:
-        """As `save_unless_saved`. What a callback raises now is logged: the error that ended the run counts."""
+    def save_after_error(self, error: BaseException) -> None:
+        """As `save_unless_saved` and `confirm_saved`. What a callback raises is logged: `error` ended the run, and counts.
+
+        Raises `RunError` if the disk refuses the state and `error` says no failure, as Ctrl-C.
+        """
         try:
             self.save_unless_saved()
-        except Exception as error:
+        except Exception as raised:
             if self._saved != self._position():
                 raise
-            log.warning("%s: %s", type(error).__name__, first_line(error))
+            log.warning("%s: %s", type(raised).__name__, first_line(raised))
+        try:
+            self.confirm_saved()
+        except RunError as refused:
+            if not isinstance(error, Exception):
+                raise
+            log.warning("%s", refused)
 
     def continues(self) -> str:
         """One line that says where a resumed run continues, and which updates are lost."""
@@ -250,6 +260,8 @@ class RunRecorder:
         if self._saved_env_steps is None:
             return f"no checkpoint could be written to {where}"
         newest = f"{self._saved_env_steps:,} env steps are saved"
+        if self._policy_env_steps not in (None, self._saved_env_steps):
+            newest += f", and the policy of {self._policy_env_steps:,}"
         return f"{newest}; go on with: --resume {where}"
 
     def conclude(self) -> None:
@@ -265,11 +277,13 @@ class RunRecorder:
     def finish(self, reason: str, *, cut_short: bool = False) -> None:
         """Write the summary, and tell the callbacks. Does nothing if that was done.
 
-        `cut_short`: an error or an interrupt ended the run.
+        `cut_short`: an error or an interrupt ended the run. Otherwise raises `RunError` if the summary cannot be written.
         """
         if not self._finished:
+            self._folder.writes.write("summary", lambda: self._folder.write_summary(self._summary(reason, cut_short)))
+            if not cut_short:
+                self._folder.writes.confirm()
             self._finished = True
-            warn_on_error(lambda: self._folder.write_summary(self._summary(reason, cut_short)))
             self._requests.closed = "the run has ended"
             self._callbacks.on_end(msgspec.structs.replace(self.progress(), stop_reason=reason, cut_short=cut_short))
 
@@ -331,34 +345,19 @@ class RunRecorder:
             log.warning("a checkpoint takes %.0f s, but --grace-s %g: a SIGTERM may lose work; allow more", seconds, grace_s)
         self.longest_save_s = max(self.longest_save_s, seconds)
 
-    def _make_folder_again(self) -> bool:
-        """Make the run folder again if it was deleted. False if that is not possible; the run goes on without it."""
-        made = True
-        try:
-            line = self._folder.make_again(self._config)
-        except RunError as error:
-            line, made = str(error), False
-        if line:
-            self._saved = self._saved_env_steps = None
-            if made or line != self._trouble:
-                log.warning("%s", line)
-            if made:
-                self._evaluations.write_best()
-        self._trouble = line
-        return made
+    def _make_folder_again(self) -> None:
+        """Make the run folder again if it was deleted. Raises `RunError` if that is not possible."""
+        if self._folder.is_gone():
+            self._saved = self._saved_env_steps = self._policy_env_steps = None
+            log.warning("%s", self._folder.make_again(self._config))
+            self._evaluations.write_best()
 
     def _write_row(self, progress: Progress, metrics: Row) -> None:
-        """Write a row of metrics. A disk that does not take rows is said once a minute, not for each row."""
+        writes = self._folder.writes
         if self._metrics.deleted:
-            self._make_folder_again()
+            writes.write("folder", self._make_folder_again)
         self._metrics.write(progress, metrics)
-        try:
-            self._metrics.flush()
-        except RunError as error:
-            now = time.monotonic()
-            if now - self._said_s >= SAY_AGAIN_S:
-                self._said_s = now
-                log.warning("%s; the run goes on, and says so at most once a minute", error)
+        writes.write("metrics", self._metrics.flush)
 
     def _say_missing_facts(self) -> None:
         """Say once which facts no episode had: perhaps they are called otherwise."""
@@ -367,10 +366,29 @@ class RunRecorder:
             last = "none of the last 100 episodes had it in the info of its last step"
             log.warning("info_keys %s: %s; is it called so?", ", ".join(names), last)
 
-    def _save_checkpoint(self, state: dict[str, Any]) -> None:
-        path = checkpoint.save(self._folder.path, state, self.env_steps, self._checkpoints.keep)
-        self._saved_to = one_line(str(path))
-        self._saved, self._saved_env_steps = self._position(), self.env_steps
+    def _write_state(self) -> None:
+        """Write the policy and a checkpoint. Raises `RunError` if the disk refuses one of them; the other one is written."""
+        self._make_folder_again()
+        spec, state = self._spec, self._state().checkpoint_content(self._algorithm)
+        try:
+            self._folder.write_policy(spec.policy, spec.env, *self.weights(), facts=spec.facts, masked=spec.masked)
+            self._policy_env_steps = self.env_steps
+        finally:
+            path = checkpoint.save(self._folder.path, state, self.env_steps, self._checkpoints.keep)
+            self._saved_to = one_line(str(path))
+            self._saved, self._saved_env_steps = self._position(), self.env_steps
+
+    def _confirm_lock(self) -> None:
+        if self._folder.lock is not None:
+            self._folder.lock.confirm()
+
+    def _tell_checkpoint(self) -> None:
+        if self._callbacks.wants("on_checkpoint"):
+            self._requests.closed = "expected it earlier than in on_checkpoint: the checkpoint would lack it"
+            try:
+                self._callbacks.on_checkpoint(self.progress())
+            finally:
+                self._requests.closed = ""
 
     def _position(self) -> tuple[int, int, list[float] | None, int]:
         """What of the state changes when the run goes on: version, next evaluation, best policy, set attributes."""

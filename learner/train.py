@@ -5,9 +5,9 @@ An evaluation belongs to one version: it comes after that version's checkpoint, 
 With `max_lag` 0 the learner publishes weights, gathers rollouts and learns, one after the other. With `max_lag` 1 the
 workers already collect the next rollouts while the learner learns. The loop is the same: only the number of tickets differs.
 
-Rule: whatever ends the run, the state after the last whole update is saved first. An update is taken back if it raises, or
-makes weights that are not finite or that no worker could act with, or returns metrics that are no numbers; so is one whose
-rollouts a callback does not accept.
+Rule: whatever ends the run, the state after the last whole update is saved first, and the run fails if the disk refuses it.
+An update is taken back if it raises, or makes weights that are not finite or that no worker could act with, or returns
+metrics that are no numbers; so is one whose rollouts a callback does not accept.
 """
 
 from __future__ import annotations
@@ -75,10 +75,11 @@ def train(
         recorder.save()
         recorder.conclude()
         recorder.save_unless_saved()  # the final policy may be the best
-    except BaseException:
-        recorder.save_after_error()
+    except BaseException as error:
+        recorder.save_after_error(error)
         raise
     service.drain(reason)
+    recorder.confirm_saved()  # before the summary: with one, a run counts as finished
     recorder.finish(reason)
     return reason
 

@@ -1,17 +1,31 @@
-"""Writes files that are there whole or not at all.
+"""Writes files that are there whole or not at all, and again what a disk refused.
 
 Rule: a file is written beside the target under a name that ends with `.tmp`, flushed to the disk, and then renamed to the
-target; the folder is flushed too. If anything fails, the target stays as it was and the temporary file is removed.
+target; the folder is flushed too. If anything fails, the target stays as it was and the temporary file is removed. What the
+disk of a run refuses costs a warning while the run trains, and the run if it is still refused at the end.
 """
 
 from __future__ import annotations
 
+import logging
+import math
 import os
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
+from protocol.errors import RunError
+
+log = logging.getLogger("millrace.learner")
+
 TEMPORARY = ".tmp"
+SAY_AGAIN_S = 60.0  # that something is refused for the same reason
+TRY_FOR_S, TRY_EVERY_S = 10.0, 0.5  # at the end of a run: somebody may make space
+
+Write = Callable[[], object]
+"""Writes the present state of something. Raises `RunError` if the disk refuses it."""
 
 
 def write_atomically(target: Path, write: Callable[[BinaryIO], object]) -> None:
@@ -36,3 +50,50 @@ def _flush_folder(folder: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+class Writes:
+    """What a run writes, by name, and what of it the disk has refused."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep) -> None:
+        self._clock, self._sleep = clock, sleep
+        self._refused: dict[str, tuple[Write, RunError]] = {}
+        self._said: dict[str, tuple[str, float]] = {}
+        self.at_most: Callable[[float], float] = lambda seconds: seconds
+        """How long `confirm` may try, of so many seconds: less once a signal ends the run."""
+
+    def write(self, name: str, write: Write) -> None:
+        """Call `write`. If the disk refuses it, a warning says so, and `confirm` calls it again."""
+        if self._is_written(name, write):
+            return
+        line, now = str(self._refused[name][1]), self._clock()
+        said, since_s = self._said.get(name, ("", -math.inf))
+        if line != said or now - since_s >= SAY_AGAIN_S:
+            self._said[name] = line, now
+            log.warning("%s", line)
+
+    def confirm(self) -> None:
+        """Return once the disk has everything. Tries for a while, and ends that at Ctrl-C. Raises `RunError`."""
+        if not self._refused:
+            return
+        for_s = self.at_most(TRY_FOR_S)
+        end_s = self._clock() + for_s
+        log.warning("the run ends, and not everything is saved: trying again for %.0f s", for_s)
+        with suppress(KeyboardInterrupt):
+            while True:
+                for name, (write, _) in [*self._refused.items()]:
+                    self._is_written(name, write)
+                if not self._refused or self._clock() >= end_s:
+                    break
+                self._sleep(TRY_EVERY_S)
+        if self._refused:
+            raise RunError("; ".join(dict.fromkeys(str(error) for _, error in self._refused.values())))
+
+    def _is_written(self, name: str, write: Write) -> bool:
+        try:
+            write()
+        except RunError as error:
+            self._refused[name] = write, error
+            return False
+        self._refused.pop(name, None)
+        return True

@@ -34,7 +34,7 @@ from typing import Any, Literal, Protocol
 import msgspec
 import numpy as np
 
-from learner.run_folder.atomic_write import TEMPORARY, write_atomically
+from learner.run_folder.atomic_write import TEMPORARY, Writes, write_atomically
 from learner.run_folder.results import Summary
 from learner.run_folder.run_format import END, HEAD, RUN_FILE, check_format, write_format
 from learner.run_folder.run_lock import RunLock
@@ -125,6 +125,8 @@ class RunFolder:
         """`made`: if the folder is new, the topmost folder that was made for it."""
         self.path, self._made = path, made
         self._workers_elsewhere = False  # as `write_config` was told last
+        self.writes = Writes()
+        """What the run writes into the folder, and the disk may refuse."""
         self.lock: RunLock | None = None
         """Held while this process trains the run."""
 
@@ -206,13 +208,12 @@ class RunFolder:
         """The run has begun: `remove` does nothing from now on."""
         self._made = None
 
-    def make_again(self, config: RunSettings) -> str:
-        """If the folder or its config.toml was deleted, make it again. Returns one line that says so, or nothing.
+    def is_gone(self) -> bool:
+        """Whether the folder or its config.toml was deleted."""
+        return not (self.path / "config.toml").is_file()
 
-        Raises `RunError` if it cannot be made.
-        """
-        if (self.path / "config.toml").is_file():
-            return ""
+    def make_again(self, config: RunSettings) -> str:
+        """Make the folder or its config.toml again. Returns one line that says so. Raises `RunError` if that fails."""
         line = f"{self.path / 'config.toml'} was deleted; it is written again"
         if not self.path.is_dir():
             line = f"run folder {self.path} was deleted; it is made again, without what was in it"

@@ -14,6 +14,7 @@ from learner.config.config import Config
 from learner.evaluations import Evaluations
 from learner.rollout_service.service import RolloutService
 from learner.rollouts.evaluation_tickets import EvaluationPlan
+from learner.run_folder.atomic_write import Writes
 from learner.run_folder.results import Evaluation
 from learner.run_folder.run_folder import RunFolder
 from learner.run_state import RunState
@@ -30,6 +31,7 @@ class Fakes:
         self.evaluated = 0
         self.seeds: list[tuple[int, ...]] = []
         """The seeds of each evaluation."""
+        self.writes = Writes()
         self.written: list[float] = []
         """The weights of each policy that was written as the best."""
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import logging
+import math
 import os
 import shlex
 import shutil
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,8 +17,9 @@ import pytest
 import torch
 
 from learner.algorithms.ppo import PPO
+from learner.callbacks.callbacks import Callbacks
 from learner.config.layers import resolve
-from learner.run_folder import checkpoint
+from learner.run_folder import atomic_write, checkpoint
 from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.progress import Progress
 from millrace.launch.local_run import train
@@ -27,7 +31,7 @@ SMALL: dict[str, Any] = {
     "transport": "inproc", "workers": 1, "lanes": 2, "envs": 2, "rollout_steps": 16, "n_epochs": 2, "batch_size": 16,
     "net": (8,), "steps": 400, "eval_episodes": 2, "checkpoint_every_s": 1000.0,
 }  # fmt: skip
-Watch = Callable[[Progress], None]
+Watch = Callable[[Progress], None] | Callbacks
 
 
 class UsersError(Exception):
@@ -210,8 +214,8 @@ def test_a_run_folder_that_is_made_again_has_the_best_policy(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("what", ["checkpoints", "metrics.jsonl", "tensorboard", "policy.safetensors", "all"])
-def test_a_part_of_the_folder_that_is_deleted_or_cannot_be_written(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, what: str
+def test_a_part_of_the_folder_that_cannot_be_written_costs_warnings_and_then_the_run(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
     """What is deleted stands in the way as something else: a file where a folder was, or a folder where a file was."""
     caplog.set_level(logging.WARNING, "millrace")
@@ -230,16 +234,88 @@ def test_a_part_of_the_folder_that_is_deleted_or_cannot_be_written(
                 (folder / what).unlink()
                 (folder / what).mkdir()
 
-    folder = run(tmp_path, watch, checkpoint_every_updates=2)
+    monkeypatch.setattr(atomic_write, "TRY_FOR_S", 0.0)
+    with pytest.raises(RunError) as caught:
+        run(tmp_path, watch, checkpoint_every_updates=2)
+    (folder,) = (tmp_path / "runs").iterdir()
     said = [record.getMessage() for record in caplog.records]
-    assert all("\n" not in line for line in said)
-    assert len(said) < 12, f"said too often: {said}"
-    if what == "all":
-        assert any(str(folder) in line for line in said)
-    else:
-        assert summary(folder)["stop_reason"] == "all steps done"
-    if what in ("checkpoints", "policy.safetensors"):
-        assert any(what in line and "not written" in line for line in said)
+    assert all("\n" not in line for line in (*said, str(caught.value)))
+    assert len(said) < 24, f"said too often: {said}"
+    expected = f"run folder {folder} was deleted, and cannot be made again: " if what == "all" else str(folder / what)
+    assert expected in str(caught.value)
+    if what != "all":
+        assert summary(folder)["cut_short"], "it would count as finished"
+
+
+class FullDisk:
+    """A disk that is full from one update on, or until it has refused so many files."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, from_update: int, refuses: float = math.inf) -> None:
+        self._full, self._from_update, self._refuses, self._fsync = False, from_update, refuses, os.fsync
+        monkeypatch.setattr("learner.run_folder.atomic_write.os.fsync", self._flush)
+
+    def watch(self, progress: Progress) -> None:
+        self._full = self._full or progress.updates >= self._from_update
+
+    def _flush(self, number: int) -> None:
+        if self._full and self._refuses > 0:
+            self._refuses -= 1
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        self._fsync(number)
+
+
+def test_a_disk_that_is_full_at_the_end_fails_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(atomic_write, "TRY_FOR_S", 0.0)
+    with monkeypatch.context() as then, pytest.raises(RunError) as caught:
+        run(tmp_path, FullDisk(then, 3).watch)
+    folder = folder_of(tmp_path / "runs")
+    steps = read_rows(folder / "metrics.jsonl")[-1]["time/total_timesteps"]
+    path = folder / "checkpoints" / f"{steps:012d}.pt"
+    assert str(caught.value) == f"checkpoint {path} not written: No space left on device; older checkpoints are untouched"
+    assert saved(folder) == 1
+    assert caught.value.__notes__ == how_to_go_on(folder)
+    assert not (folder / "summary.json").exists()
+    resumed = run(tmp_path, resume=folder)
+    assert summary(resumed)["stop_reason"] == "all steps done"
+    assert saved(resumed) == len(read_rows(folder / "metrics.jsonl"))
+
+
+def test_the_last_save_waits_for_space(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(atomic_write, "TRY_EVERY_S", 0.0)
+    told: list[str] = []
+
+    class Uploads:
+        def on_checkpoint(self, progress: Progress) -> None:
+            told.append(progress.checkpoint)
+
+    disk = FullDisk(monkeypatch, 3, refuses=9)
+    folder = run(tmp_path, Callbacks([Uploads()], disk.watch))
+    assert summary(folder)["stop_reason"] == "all steps done"
+    assert saved(folder) == summary(folder)["updates"]
+    assert told[-1] == str(checkpoint.newest(folder)[0].path)
+
+
+@pytest.mark.parametrize("how", ["SIGTERM", "user code"])
+def test_a_run_that_is_cut_short_while_the_disk_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
+    """An interrupt would say that the run is saved. An error that says what went wrong stays the error of the run."""
+    monkeypatch.setattr(atomic_write, "TRY_FOR_S", 1000.0 if how == "SIGTERM" else 0.0)  # the grace time is shorter
+    error = UsersError("in a callback")
+
+    def watch(progress: Progress) -> None:
+        disk.watch(progress)
+        if progress.updates == 5:
+            if how != "SIGTERM":
+                raise error
+            signal.raise_signal(signal.SIGTERM)
+
+    with monkeypatch.context() as then:
+        disk = FullDisk(then, 3)
+        with pytest.raises(RunError if how == "SIGTERM" else UsersError) as caught:
+            run(tmp_path, watch, grace_s=0.5)
+    if how == "SIGTERM":
+        assert "not written: No space left on device" in str(caught.value)
+    assert saved(folder_of(tmp_path / "runs")) == 1
+    assert caught.value.__notes__ == how_to_go_on(folder_of(tmp_path / "runs"))
 
 
 NAMES = ["[red]x[/red]", "with space", "öäü ✓ 学", "%s{0}", "a'b\"c", "-dash", "[0-9]*?"]
