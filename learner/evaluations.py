@@ -122,8 +122,9 @@ class Evaluations:
         settings = self._settings
         plan = EvaluationPlan.of(size.episodes, settings.seed, settings.copies, size.max_steps, purpose)
 
-        def show(played: int) -> None:
-            self.doing = f"evaluating{f' {what}' if what else ''}: {played:,} of {size.episodes:,} episodes"
+        def show(played: int, env_steps: int) -> None:
+            far = plan.how_far(played, env_steps, "--eval-max-steps:")
+            self.doing = f"evaluating{f' {what}' if what else ''}: {far}"
             self._watch()
 
         try:

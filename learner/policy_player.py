@@ -110,15 +110,22 @@ class PolicyPlayer:
         settings = describe_settings(self._settings)
         return described_by_workers(self._link, spec, settings, self._processes, self._check_interrupt)
 
-    def play(self, plan: EvaluationPlan, on_rows: OnRows | None = None, before: int = 0) -> list[PlayedEpisode]:
+    def play(
+        self,
+        plan: EvaluationPlan,
+        on_rows: OnRows | None = None,
+        *,
+        bound: str = "at most",
+        before: tuple[int, int] = (0, 0),
+    ) -> list[PlayedEpisode]:
         """Play these episodes. Returns them in the order of the seeds. Raises `RunError` if that is not possible.
 
-        `before`: the number of episodes that were played in earlier calls, for the text that `watch` gets.
+        `bound` and `before` are those of `EvaluationPlan.how_far`, which makes the text that `watch` gets.
         """
         if self._service is None:
             self._service = self._published()
-        total = before + len(plan.seeds)
-        return self._service.play(plan, lambda played: self._watch(f"{before + played:,} of {total:,} episodes"), on_rows)
+        show = self._watch
+        return self._service.play(plan, lambda played, steps: show(plan.how_far(played, steps, bound, before)), on_rows)
 
     def leave(self, reason: str) -> None:
         """Ask the workers to leave."""

@@ -217,7 +217,7 @@ def play(flags: EvaluateFlags, watch: Watch, given: Given | None = None) -> tupl
     with policy_player(saved, workers, watch) as player:
         if flags.video:
             return record_videos(player, flags.run, episodes, flags.seed, flags.max_steps)
-        played = player.play(EvaluationPlan.of(episodes, flags.seed, copies, flags.max_steps))
+        played = player.play(EvaluationPlan.of(episodes, flags.seed, copies, flags.max_steps), bound="--max-steps:")
         return evaluation_of(played, saved.facts), []
 
 

@@ -286,7 +286,7 @@ class RolloutService:
             check_at_least(f"evaluate: {name}", value, least)
         plan = EvaluationPlan.of(episodes, seed, EVALUATION_COPIES, max_steps)
         with self._lock, self._interrupts:
-            return self._service.evaluate(plan, lambda played: None)
+            return self._service.evaluate(plan, lambda played, env_steps: None)
 
     # ---------------------------------------------------------------- saving, and what else there is to know
 

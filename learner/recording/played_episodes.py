@@ -74,7 +74,7 @@ class PlayedEpisodes:
             send_rows=True,
             send_frames=frames,
         )
-        results = self._player.play(plan, lambda n, some: rows[n].append(some), before=self._episodes)
+        results = self._player.play(plan, lambda n, some: rows[n].append(some), before=(self._episodes, self._steps))
         played = [
             Played(self._whole(some, seed), result, _frames(some))
             for some, seed, result in zip(rows, seeds, results, strict=True)

@@ -60,15 +60,17 @@ class RolloutService:
         """Answer the workers, during a long computation. Never waits, never raises."""
         self._hub.pulse()
 
-    def evaluate(self, plan: EvaluationPlan, watch: Callable[[int], None]) -> Evaluation:
+    def evaluate(self, plan: EvaluationPlan, watch: Callable[[int, int], None]) -> Evaluation:
         """Let the workers play these episodes under the newest weights, which must be published with `deal` False.
 
-        `watch` is called with the number of episodes that were played, several times a second. Raises `RunError` when the
-        run cannot go on.
+        `watch` is called with the numbers of episodes that were played and of env steps, several times a second. Raises
+        `RunError` when the run cannot go on.
         """
         return evaluation_of(self.play(plan, watch), self._hub.coordinator.run.facts)
 
-    def play(self, plan: EvaluationPlan, watch: Callable[[int], None], on_rows: OnRows | None = None) -> list[PlayedEpisode]:
+    def play(
+        self, plan: EvaluationPlan, watch: Callable[[int, int], None], on_rows: OnRows | None = None
+    ) -> list[PlayedEpisode]:
         """As `evaluate`, but returns the episodes, in the order of their seeds. `on_rows` gets their rows."""
         return self._hub.evaluate(plan, watch, on_rows)
 

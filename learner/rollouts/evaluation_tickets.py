@@ -58,6 +58,15 @@ class EvaluationPlan:
         """
         return EvaluationPlan(episode_seeds(seed, episodes, purpose), copies, min(max(1, max_steps // episodes), LARGEST))
 
+    def how_far(self, played: int, env_steps: int, bound: str = "at most", before: tuple[int, int] = (0, 0)) -> str:
+        """How far it is, for people: `played` episodes, and `env_steps` of these and of those that are being played.
+
+        `bound`: what limits an episode, such as the name of a flag. `before`: episodes and env steps of earlier plans.
+        """
+        episodes, steps = before
+        counted = f"{episodes + played:,} of {episodes + len(self.seeds):,} episodes, {steps + env_steps:,} env steps"
+        return f"{counted} ({bound} {self.most_steps:,} each)"
+
 
 def episode_seeds(seed: int, episodes: int, purpose: Purpose = Purpose.EPISODES) -> tuple[int, ...]:
     """The reset seed of each episode. Fewer episodes have the first of these seeds."""

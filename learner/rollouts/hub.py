@@ -184,13 +184,14 @@ class Hub:
         self._weight_age.not_used(self._lags)
 
     def evaluate(
-        self, plan: EvaluationPlan, watch: Callable[[int], None], on_rows: OnRows | None = None
+        self, plan: EvaluationPlan, watch: Callable[[int, int], None], on_rows: OnRows | None = None
     ) -> list[PlayedEpisode]:
         """Let the workers play these episodes under the newest weights. Returns them in the order of their seeds.
 
-        `watch` is called with the number of episodes played, at least every `POLL_S`. Raises as `gather` does.
+        `watch` is called with the numbers of episodes played and of env steps, at least every `POLL_S`. Raises as `gather`
+        does.
         """
-        evaluation = self.coordinator.evaluation
+        evaluation, steps_before = self.coordinator.evaluation, self._worker_steps()
         logged_s = self._clock()
         self._stall_watch.begin(logged_s)
         self._server.send(self.coordinator.begin_evaluation(plan, on_rows))
@@ -198,8 +199,9 @@ class Hub:
             while not evaluation.done:
                 self._turn(POLL_S)
                 now = self._clock()
-                watch(evaluation.episodes_played)
-                if not self._goes_on(now, self._worker_steps() + evaluation.episodes_played):
+                env_steps = self._worker_steps()
+                watch(evaluation.episodes_played, max(0, env_steps - steps_before))  # less, if a worker was lost
+                if not self._goes_on(now, env_steps + evaluation.episodes_played):
                     stall_timeout_s, waiting = self.settings.stall_timeout_s, self._waiting_for_episodes()
                     raise Stalled(f"no env step of an evaluation was made for {stall_timeout_s:.0f} s; {waiting}")
                 if now - logged_s > LOG_WAITING_EVERY_S:

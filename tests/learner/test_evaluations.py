@@ -38,7 +38,7 @@ class Fakes:
     def weights(self) -> Any:
         return np.array([self.evaluated], np.float32), np.zeros(0, np.float32)
 
-    def evaluate(self, plan: EvaluationPlan, watch: Callable[[int], None]) -> Evaluation:
+    def evaluate(self, plan: EvaluationPlan, watch: Callable[[int, int], None]) -> Evaluation:
         self.evaluated += 1
         self.seeds.append(plan.seeds)
         return Evaluation(episodes=len(plan.seeds), return_mean=next(self.returns), return_std=0.0, length_mean=1.0)

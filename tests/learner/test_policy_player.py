@@ -19,7 +19,7 @@ from learner.run_folder.run_folder import RunFolder
 from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import EnvironmentFailed, UsageError
-from protocol.messages import PROTOCOL_VERSION, Evaluate, Evaluated, Hello, WorkerExit
+from protocol.messages import PROTOCOL_VERSION, Evaluate, Evaluated, Heartbeat, Hello, WorkerExit
 from protocol.policy.layout import acting_size, buffer_size
 from protocol.policy.recurrent import zero_state
 from protocol.rollout import Episode
@@ -111,3 +111,31 @@ def test_a_killed_worker_counts_as_a_failure_and_its_episodes_are_played_by_othe
         EnvironmentFailed, match="was killed by SIGKILL; failure 1 within an hour; max_env_failures allows 0"
     ):
         FourWorkers(killed).player(max_env_failures=0).play(plan)
+
+
+class Endless(FakeLink):
+    """A worker whose first episode does not end: it says only how many env steps it has made."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.inbox.append((b"w0", Hello(PROTOCOL_VERSION, "w0", "host", 1, 1, "fake", 1)))
+
+    def send(self, peer: bytes, frames: Sequence[Buffer]) -> bool:
+        message = decode_to_worker([bytes(frame) for frame in frames])
+        if isinstance(message, Evaluate):
+            self.inbox.append((peer, Heartbeat(message.session, 0, 0, (message.ticket,), 31_000, {}, 0)))
+        return True
+
+
+def test_an_episode_that_does_not_end_is_shown_with_its_env_steps_and_their_bound() -> None:
+    run, shown = run_spec(), list[str]()
+
+    def stop() -> None:
+        if len(shown) == 5:
+            raise KeyboardInterrupt
+
+    policy = SavedPolicy(run.policy, run.env, PARAMETERS, BUFFERS)
+    player = PolicyPlayer(policy, cast(LearnerLink, Endless()), ProcessCallbacks(), stop, shown.append, RolloutConfig())
+    with pytest.raises(KeyboardInterrupt):
+        player.play(EvaluationPlan.of(2, seed=5, copies=2, max_steps=100_000), bound="--max-steps:", before=(3, 500))
+    assert shown[-1] == "3 of 5 episodes, 31,500 env steps (--max-steps: 50,000 each)"
