@@ -9,6 +9,7 @@ stage of their own and do not count as training.
 from __future__ import annotations
 
 import logging
+import math
 import shlex
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -199,9 +200,9 @@ class RunRecorder:
     def save(self) -> None:
         """Write a checkpoint and the policy. Raises `RunTakenOver` if another process trains this run now."""
         self._confirm_lock()
-        began_s = self._saved_s = time.monotonic()
-        self._episodes_since_save = 0
+        began_s = time.monotonic()
         self._folder.writes.write("state", self._write_state)
+        self._saved_s, self._episodes_since_save = began_s, 0
         self._took_to_save(time.monotonic() - began_s)
         if self._saved == self._position():
             self._tell_checkpoint()
@@ -346,15 +347,16 @@ class RunRecorder:
         self.longest_save_s = max(self.longest_save_s, seconds)
 
     def _make_folder_again(self) -> None:
-        """Make the run folder again if it was deleted. Raises `RunError` if that is not possible."""
+        """Make the run folder again if it was deleted or renamed. Raises `RunError` if that is not possible."""
         if self._folder.is_gone():
             self._saved = self._saved_env_steps = self._policy_env_steps = None
+            self._saved_s = -math.inf  # so that a checkpoint is due now
             log.warning("%s", self._folder.make_again(self._config))
             self._evaluations.write_best()
 
     def _write_row(self, progress: Progress, metrics: Row) -> None:
         writes = self._folder.writes
-        if self._metrics.deleted:
+        if self._metrics.gone:
             writes.write("folder", self._make_folder_again)
         self._metrics.write(progress, metrics)
         writes.write("metrics", self._metrics.flush)

@@ -64,9 +64,9 @@ class MetricsLog:
         self._unwritten: tuple[Row, int] | None = None  # the newest row and its env steps, if TensorBoard has not got it
 
     @property
-    def deleted(self) -> bool:
-        """Whether metrics.jsonl was deleted since its last row. `flush` makes it again."""
-        return self._table.deleted
+    def gone(self) -> bool:
+        """Whether metrics.jsonl was deleted, or its folder renamed, since its last row. `flush` makes it again."""
+        return self._table.gone
 
     def write(self, progress: Progress, train: Row) -> None:
         """Add a row, which `flush` writes. `train`: the metrics of the algorithm, of an evaluation if any, and of callbacks.
@@ -112,7 +112,7 @@ class MetricsLog:
 class _RecordFile:
     """A file to which whole records are appended. What the disk refuses waits, and a record that it cut off is removed.
 
-    If the file was deleted, it is made again, with its folder.
+    If the file is no longer at its path, it is made again there, with its folder.
     """
 
     def __init__(self, path: Path) -> None:
@@ -124,8 +124,12 @@ class _RecordFile:
         self._open()
 
     @property
-    def deleted(self) -> bool:
-        return os.fstat(self._number).st_nlink == 0
+    def gone(self) -> bool:
+        """Whether its path names another file now, or none."""
+        try:
+            return not os.path.samestat(os.stat(self._path), os.fstat(self._number))
+        except OSError:
+            return True
 
     def append(self, record: bytes) -> None:
         """Add a record. It waits for `flush`."""
@@ -142,10 +146,10 @@ class _RecordFile:
     def flush(self) -> None:
         """Write the records that wait. Raises `RunError`."""
         try:
-            if self.deleted:
-                deleted = self._file
+            if self.gone:
+                gone = self._file
                 self._open()
-                deleted.close()
+                gone.close()
             if self._cut:
                 self._file.truncate(self._bytes - self._cut)
                 self._bytes, self._cut = self._bytes - self._cut, 0

@@ -209,18 +209,18 @@ class RunFolder:
         self._made = None
 
     def is_gone(self) -> bool:
-        """Whether the folder or its config.toml was deleted."""
+        """Whether the folder or its config.toml is not at the path of the run: it was deleted or renamed."""
         return not (self.path / "config.toml").is_file()
 
     def make_again(self, config: RunSettings) -> str:
         """Make the folder or its config.toml again. Returns one line that says so. Raises `RunError` if that fails."""
         line = f"{self.path / 'config.toml'} was deleted; it is written again"
         if not self.path.is_dir():
-            line = f"run folder {self.path} was deleted; it is made again, without what was in it"
+            line = f"run folder {self.path} was deleted or renamed; the run continues there in a new folder"
             try:
                 self.path.mkdir(parents=True)
             except OSError as error:
-                raise RunError(f"run folder {self.path} was deleted, and cannot be made again: {error.strerror}") from error
+                raise RunError(f"run folder {self.path} is gone, and cannot be made again: {error.strerror}") from error
         self.write_config(config, workers_elsewhere=self._workers_elsewhere)
         return line
 

@@ -183,19 +183,33 @@ def test_a_run_that_is_killed_early_resumes_from_its_first_update_and_says_what_
     assert [row["time/iterations"] for row in rows] == list(range(1, saved(tmp_path / "killed") + 1))
 
 
-def test_a_run_folder_that_is_deleted_is_made_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize("how", ["deleted", "renamed"])
+def test_a_run_whose_folder_is_gone_continues_in_a_new_one(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, how: str
+) -> None:
+    """Everything that is written from then on is in one folder, at the path of the run."""
     caplog.set_level(logging.WARNING, "millrace")
+    elsewhere = tmp_path / "elsewhere"
 
     def watch(progress: Progress) -> None:
         if progress.updates == 3 and not progress.doing:
-            shutil.rmtree(progress.run)
+            Path(progress.run).rename(elsewhere)
+            if how == "deleted":
+                shutil.rmtree(elsewhere)
+        if progress.updates == 6:
+            shutil.copytree(progress.run, tmp_path / "killed", dirs_exist_ok=True)
 
-    folder = run(tmp_path, watch, checkpoint_every_updates=2)
+    folder = run(tmp_path, watch)
     said = [record.getMessage() for record in caplog.records if "run folder" in record.getMessage()]
-    assert said == [f"run folder {folder} was deleted; it is made again, without what was in it"]
+    line = "was deleted or renamed; the run continues there in a new folder"
+    assert said == [f"run folder {folder} {line}"]
     assert summary(folder)["stop_reason"] == "all steps done"
     rows = read_rows(folder / "metrics.jsonl")
     assert [row["time/iterations"] for row in rows] == list(range(4, saved(folder) + 1)), "rows after it are missing"
+    assert saved(tmp_path / "killed") == 4, "the new folder had no checkpoint at once"
+    if how == "renamed":
+        assert [row["time/iterations"] for row in read_rows(elsewhere / "metrics.jsonl")] == [1, 2, 3]
+        assert saved(elsewhere) == 1
     before = saved(folder)
     assert run(tmp_path, resume=folder, steps=600) == folder
     assert saved(folder) > before
@@ -241,7 +255,7 @@ def test_a_part_of_the_folder_that_cannot_be_written_costs_warnings_and_then_the
     said = [record.getMessage() for record in caplog.records]
     assert all("\n" not in line for line in (*said, str(caught.value)))
     assert len(said) < 24, f"said too often: {said}"
-    expected = f"run folder {folder} was deleted, and cannot be made again: " if what == "all" else str(folder / what)
+    expected = f"run folder {folder} is gone, and cannot be made again: " if what == "all" else str(folder / what)
     assert expected in str(caught.value)
     if what != "all":
         assert summary(folder)["cut_short"], "it would count as finished"
