@@ -177,7 +177,7 @@ def make_vec(
     Raises:
         UsageError: an argument is wrong.
         NoWorkers: too few workers joined in time.
-        EnvironmentFailed: an environment raised; the error has the worker's traceback.
+        EnvironmentFailed: an environment raised, and the error has the worker's traceback; or env copies have different spaces.
         WorkerLost: see `on_worker_loss`.
 
     >>> import millrace

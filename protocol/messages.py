@@ -277,6 +277,10 @@ class Step(Message, frozen=True):
     """one array [N, *leaf] for each leaf of the action"""
 
 
+DESCRIPTION = "<description>"
+"""Name in a `Call` that asks what each copy is. A client that cannot say it answers as for an unknown name."""
+
+
 class Call(Message, frozen=True):
     """Call, read or set an attribute of these copies of the lane. Answered by `Returned`."""
 
@@ -287,7 +291,9 @@ class Call(Message, frozen=True):
     copies: tuple[Natural, ...]
     """which of the lane's copies, from 0"""
     name: Line
-    """name of the attribute, which any of the wrappers may have; an attribute that is not callable is read"""
+    """name of the attribute, which any of the wrappers may have; an attribute that is not callable is read. With
+    `<description>`, the result for each copy is a list of the frames of a `Described`
+    """
     assign: bool
     """true: set the attribute"""
     given: Array

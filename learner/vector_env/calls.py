@@ -1,4 +1,4 @@
-"""`call`, `get_attr` and `set_attr`: what to send to each lane, and what its answer means. Pure."""
+"""`call`, `get_attr`, `set_attr` and descriptions of copies: what to send to each lane, and what its answer means. Pure."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from learner.vector_env.batch_layout import BatchLayout
 from learner.vector_env.lane_orders import call_order
 from learner.vector_env.order_coordinator import MakeOrder
 from protocol.bounds import MAX_LINE, one_line
-from protocol.errors import EnvironmentFailed, UsageError
-from protocol.messages import Answer, Returned
+from protocol.envs.description import DescribedEnv, read_description
+from protocol.errors import BadMessage, EnvironmentFailed, UsageError
+from protocol.messages import Answer, Described, Returned
+from protocol.wire.codec import decode_to_learner
 from protocol.wire.plain_values import unpack
 
 USE_INSTEAD = ("reset", "step", "close")
@@ -64,6 +66,23 @@ def call_results(name: str, answers: Mapping[int, Answer]) -> tuple[Any, ...]:
             raise call_error(name, lane, answer)
         results += unpack(answer.results.data)
     return tuple(results)
+
+
+def described_copies(answer: Answer, count: int) -> list[DescribedEnv | None]:
+    """What each of a lane's `count` copies is; None where the client cannot say it. Raises `BadMessage`."""
+    assert isinstance(answer, Returned)
+    if answer.error:
+        return [None] * count
+    sent, found = unpack(answer.results.data), dict[tuple[bytes, ...], DescribedEnv]()
+    for frames in sent:
+        if not isinstance(frames, list) or not all(type(frame) is bytes for frame in frames):
+            raise BadMessage(f"expected the frames of a message, got {type(frames).__name__}")
+        if tuple(frames) not in found:
+            message = decode_to_learner(frames)
+            if not isinstance(message, Described):
+                raise BadMessage(f"expected Described, got {type(message).__name__}")
+            found[tuple(frames)] = read_description(message.description)
+    return [found[tuple(frames)] for frames in sent]
 
 
 def call_error(name: str, lane: int, answer: Returned) -> Exception:

@@ -20,7 +20,7 @@ from gymnasium.vector.utils import batch_space
 from learner.vector_env.arguments import action_arrays, seed_list, take_reset_mask
 from learner.vector_env.batch_arrays import BatchArrays
 from learner.vector_env.batch_layout import BatchLayout
-from learner.vector_env.calls import assign_orders, call_orders, call_results
+from learner.vector_env.calls import assign_orders, call_orders, call_results, described_copies
 from learner.vector_env.infos import Infos, OfSomeCopies, unpack_infos
 from learner.vector_env.lane_orders import packed, reset_order, step_order
 from learner.vector_env.lost_lanes import RESET_ATTEMPTS, UNKNOWN_REASON, LostLanes, worker_lost
@@ -29,9 +29,10 @@ from learner.vector_env.send_recv import SendRecv, VectorEnvParts, WaitSettings,
 from learner.vector_env.spec import VectorEnvDescription
 from learner.vector_env.step_hub import StepHub
 from protocol.arrays import Array
+from protocol.envs.description import DescribedEnv
 from protocol.envs.spaces import make_flatten
-from protocol.errors import BadMessage, NoWorkers, UsageError, WorkerLost
-from protocol.messages import Answer, Status, Stepped
+from protocol.errors import BadMessage, EnvironmentFailed, NoWorkers, UsageError, WorkerLost
+from protocol.messages import DESCRIPTION, Answer, Status, Stepped
 from protocol.wire.plain_values import repr_paths
 from protocol.wire.shared_memory import SharedMemory
 
@@ -396,7 +397,43 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         """The seed of each copy's random generator, as `SyncVectorEnv` shows it."""
         return self.get_attr("np_random_seed")
 
+    def describe_copies(self, copies: Sequence[int]) -> list[DescribedEnv | None]:
+        """What each of these copies is, in ascending order; None where a client cannot say it. Raises as `call`."""
+        self._check_idle("describe_copies")
+        orders = call_orders(self._layout, copies, DESCRIPTION, (), {})
+        described: list[DescribedEnv | None] = []
+        for lane, answer in sorted(self._answers_of_call(orders).items()):
+            count = len(self._layout.by_lane(copies)[lane])
+            try:
+                described += described_copies(answer, count)
+            except BadMessage as error:
+                self._hub.refuse_owner(lane, f"lane {lane}: description cannot be read: {error}")
+                described += [None] * count
+        return described
+
+    def make_copies(self) -> None:
+        """Make all copies now, before they are reset. Raises `EnvironmentFailed`, also if their spaces differ, and as `reset`."""
+        expected = self.single_observation_space, self.single_action_space
+        described: list[DescribedEnv | None] = []
+        for attempt in range(RESET_ATTEMPTS):
+            try:
+                described = self.describe_copies(range(self.num_envs))
+                break
+            except WorkerLost:  # another worker may make them
+                if attempt == RESET_ATTEMPTS - 1:
+                    raise
+        for n, copy in enumerate(described):
+            if copy is not None and (copy.observation_space, copy.action_space) != expected:
+                raise EnvironmentFailed(
+                    f"copy {n}: its observations {copy.observation_space} and actions {copy.action_space} are not those of "
+                    f"copy 0, {expected[0]} and {expected[1]}; all copies must have the same, and each machine the same "
+                    "version of the environment"
+                )
+
     def _results_of_call(self, name: str, orders: Mapping[int, MakeOrder]) -> tuple[Any, ...]:
+        return call_results(name, self._answers_of_call(orders))
+
+    def _answers_of_call(self, orders: Mapping[int, MakeOrder]) -> dict[int, Answer]:
         self._hub.send_orders(orders)
         answers = self._hub.wait_for_answers(self.timeout_s)
         if unanswered := [lane for lane in orders if lane not in answers]:
@@ -406,7 +443,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
             # The next step also reports it: a caller that goes on must see that the episodes ended.
             lost = self._lost_lanes.unreported
             raise worker_lost({lane: lost.get(lane, UNKNOWN_REASON) for lane in unanswered}, self._layout)
-        return call_results(name, answers)
+        return answers
 
     # ---------------------------------------------------------------- workers
 

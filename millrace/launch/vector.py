@@ -55,6 +55,7 @@ def make_vec(settings: VectorEnvSettings) -> ZmqVectorEnv:
         started = listen(settings, resources).start(lambda name: (flags, None), timeouts)
         env = started.vector_env(started.describe(describe))
         env.wait_for(local_workers or settings.lane_count, join_timeout_s)
+        env.make_copies()
         return env
     except BaseException as error:
         resources.close()

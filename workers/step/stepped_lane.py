@@ -15,8 +15,10 @@ import gymnasium
 import numpy as np
 
 from protocol.arrays import Array
+from protocol.envs.description import describe_env
 from protocol.envs.spaces import leaves_with_own_dtype, make_flatten, make_unflatten
 from protocol.errors import UsageError
+from protocol.space_spec import EnvDescription
 from protocol.specs import StepSpec
 from workers.env_errors import Unusable
 from workers.env_loop import EnvLoop, Infos, Pulse
@@ -47,7 +49,7 @@ class SteppedLane:
         self.incarnation = incarnation
         self.rows = rows
         first = spec.first_copy(lane)
-        makes = [partial(_make_copy, spec, first + copy, copy) for copy in range(spec.lanes[lane])]
+        makes = [partial(_make_copy, spec, first + copy) for copy in range(spec.lanes[lane])]
         # Copies of a later incarnation replace lost ones, whose episodes have ended: a step resets them unless `reset` did.
         self._loop = EnvLoop(makes, pulse, spec.autoreset, ended=incarnation > 0)
         env = self._loop.envs[0]
@@ -96,6 +98,10 @@ class SteppedLane:
             results.append(attribute(*args, **kwargs) if callable(attribute) else attribute)
         return results
 
+    def describe(self, copies: Sequence[int]) -> list[EnvDescription]:
+        """What each of these copies is."""
+        return [describe_env(self._loop.envs[n]) for n in copies]
+
     def assign(self, copies: Sequence[int], name: str, values: Sequence[Any]) -> None:
         """Set the attribute, to one value for each of these copies."""
         for n, value in zip(copies, values, strict=True):
@@ -106,8 +112,8 @@ class SteppedLane:
         self._loop.close()
 
 
-def _make_copy(spec: StepSpec, number: int, copy: int) -> gymnasium.Env[Any, Any]:
-    """Copy `number` of the vector environment, which is `copy` of its lane. Raises `UsageError` if its spaces are others."""
+def _make_copy(spec: StepSpec, number: int) -> gymnasium.Env[Any, Any]:
+    """Copy `number` of the vector environment. Raises `UsageError` if its spaces are others."""
     env = spec.envs[spec.copies[number]].make(spec.render_mode)
     try:
         fits = (leaves_with_own_dtype(env.observation_space), leaves_with_own_dtype(env.action_space)) == (
@@ -121,7 +127,7 @@ def _make_copy(spec: StepSpec, number: int, copy: int) -> gymnasium.Env[Any, Any
     with suppress(BaseException):
         env.close()
     raise UsageError(
-        f"copy {copy}: its observations {env.observation_space} and actions {env.action_space} are not those of the "
+        f"copy {number}: its observations {env.observation_space} and actions {env.action_space} are not those of the "
         "vector environment; all copies must have the same, and each machine the same version of the environment"
     )
 

@@ -18,8 +18,9 @@ import numpy.typing as npt
 from protocol.bounds import Stages, last_text, one_line
 from protocol.cpu_cores import usable_cores
 from protocol.errors import UsageError, first_line
-from protocol.messages import Answer, Array, Call, Order, Reset, Returned, Step, Stepped
+from protocol.messages import DESCRIPTION, Answer, Array, Call, Described, Order, Reset, Returned, Step, Stepped
 from protocol.specs import StepSpec
+from protocol.wire.codec import encode
 from protocol.wire.plain_values import pack, unpack
 from protocol.wire.shared_memory import InheritedDescriptors, SharedMemory
 from protocol.wire.wake_up import CAN_SPIN, SPIN_S, SpinWait, WakePipe, WakeReason
@@ -224,7 +225,10 @@ def _call(order: Call, lane: SteppedLane, allow_private_names: bool) -> Returned
             )
         arguments = unpack(order.given.data)
         with activity().during(STEPPING):
-            if order.assign:
+            if order.name == DESCRIPTION:
+                described = [Described(order.session, each) for each in lane.describe(order.copies)]
+                results = [[bytes(frame) for frame in encode(each)] for each in described]
+            elif order.assign:
                 lane.assign(order.copies, order.name, arguments)
             else:
                 results = lane.call(order.copies, order.name, *arguments)

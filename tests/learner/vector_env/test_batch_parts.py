@@ -5,14 +5,20 @@ from __future__ import annotations
 import dataclasses
 import inspect
 
+import gymnasium
+import numpy as np
 import pytest
 
 import millrace
 from learner.vector_env.batch_layout import BatchLayout
+from learner.vector_env.calls import described_copies
 from learner.vector_env.infos import unpack_infos
 from learner.vector_env.lost_lanes import UNKNOWN_REASON, LostLanes, replacement_seeds
 from learner.vector_env.settings import VectorEnvSettings
+from protocol.envs.description import describe_env
 from protocol.errors import BadMessage
+from protocol.messages import Described, Goodbye, Returned, ToLearner
+from protocol.wire.codec import encode
 from protocol.wire.plain_values import pack
 
 
@@ -35,6 +41,29 @@ def test_infos_get_the_number_of_their_env_copy() -> None:
 def test_what_is_not_infos_is_refused(value: object) -> None:
     with pytest.raises(BadMessage):
         unpack_infos(pack(value), range(2))
+
+
+def returned(results: bytes, error: str = "") -> Returned:
+    return Returned(1, 2, 0, 0, np.frombuffer(results, np.uint8), error, "")
+
+
+def frames(message: ToLearner) -> list[bytes]:
+    return [bytes(frame) for frame in encode(message)]
+
+
+def test_copies_are_what_their_worker_describes_or_unknown_where_it_cannot() -> None:
+    env = gymnasium.make("CartPole-v1")
+    found = described_copies(returned(pack([frames(Described(1, describe_env(env)))] * 2)), 2)
+    assert [copy and (copy.observation_space, copy.action_space) for copy in found] == [
+        (env.observation_space, env.action_space)
+    ] * 2
+    assert described_copies(returned(b"", "no attributes"), 2) == [None, None]
+
+
+@pytest.mark.parametrize("sent", [7, "frames", [], [7], [b"\xc1"], frames(Goodbye(1, "left", ()))])
+def test_what_describes_no_copy_is_refused(sent: object) -> None:
+    with pytest.raises(BadMessage):
+        described_copies(returned(pack([sent])), 1)
 
 
 def test_each_loss_is_reported_once_and_then_the_lane_awaits_a_reset() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -15,7 +16,7 @@ from gymnasium.vector.utils import batch_space
 
 import millrace
 from learner.vector_env.env import ZmqVectorEnv
-from protocol.errors import EnvironmentFailed, UsageError, UserFacingError
+from protocol.errors import EnvironmentFailed, UsageError
 from tests.support.bit_equality import bit_equal
 from workers.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_ACTIONS, UNSUPPORTED_OBSERVATIONS
 
@@ -91,10 +92,44 @@ def test_a_custom_space_is_refused_in_one_line() -> None:
     assert "\n" not in str(raised.value)
 
 
-def test_copies_of_different_spaces_are_refused() -> None:
-    envs = ["CartPole-v1", "FrozenLake-v1"]
-    with inproc(envs, None) as env, pytest.raises(UserFacingError, match="all copies must have the same"):
-        env.reset()
+def with_spaces(observation: spaces.Space[Any], action: spaces.Space[Any]) -> gymnasium.Env[Any, Any]:
+    env = gymnasium.make("CartPole-v1").unwrapped
+    env.observation_space, env.action_space = observation, action
+    return env
+
+
+BOX, DISCRETE = spaces.Box(-1, 1, (2,), np.float64), spaces.Discrete(2)
+
+
+@pytest.mark.parametrize(
+    ("observation", "action"),
+    [
+        (spaces.Box(-1, 5, (2,), np.float64), DISCRETE),
+        (spaces.Box(-1, 1, (3,), np.float64), DISCRETE),
+        (spaces.Box(-1, 1, (2,), np.float32), DISCRETE),
+        (spaces.Dict({"a": BOX}), DISCRETE),
+        (BOX, spaces.Discrete(3)),
+        (BOX, spaces.Box(-1, 1, (1,))),
+    ],
+    ids=["bounds", "shape", "dtype", "keys", "n", "kind"],
+)
+def test_copies_of_different_spaces_are_refused_before_the_first_reset(
+    observation: spaces.Space[Any], action: spaces.Space[Any]
+) -> None:
+    makes = [partial(with_spaces, BOX, DISCRETE)] * 3 + [partial(with_spaces, observation, action)]
+    with pytest.raises(EnvironmentFailed, match=r"copy 3: its observations .*all copies must have the same") as raised:
+        inproc(makes, None, lanes=2)
+    assert "\n" not in str(raised.value)
+    with pytest.raises(RuntimeError):
+        SyncVectorEnv(makes)
+
+
+def test_bounds_that_differ_by_rounding_are_the_same() -> None:
+    """As for gymnasium: another processor may round them otherwise."""
+    near = spaces.Box(-1, np.nextafter(1, 2), (2,), np.float64)
+    makes = [partial(with_spaces, BOX, DISCRETE), partial(with_spaces, near, DISCRETE)]
+    inproc(makes, None).close()
+    SyncVectorEnv(makes).close()
 
 
 def test_the_metadata_of_the_environment_is_not_changed() -> None:

@@ -318,6 +318,20 @@ def test_a_reset_is_repeated_when_its_worker_is_lost() -> None:
         assert received(env)[1].observation == np.float32(0.8)
 
 
+def test_copies_are_made_again_when_a_worker_is_lost_over_it() -> None:
+    with made() as (env, link):
+        link.frozen, leaving = {"w1"}, ["w1"]
+
+        def watch() -> None:
+            while leaving:
+                link.leave(leaving.pop())
+
+        env.watch(watch)
+        env.make_copies()
+        env.reset(seed=7)
+        assert not env.step(np.zeros((3, 1), np.float32))[3].any(), "no episode had begun"
+
+
 def test_after_three_lost_resets_the_loss_is_raised() -> None:
     with made(copies=1, lanes=1, workers=4) as (env, link):
         link.frozen = {f"w{n}" for n in range(4)}
