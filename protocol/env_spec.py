@@ -20,6 +20,7 @@ from typing import Any, TypeVar
 
 import gymnasium
 import msgspec
+from gymnasium.envs import registration
 from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
 from gymnasium.envs.registration import VectorizeMode
 from gymnasium.vector import VectorEnv
@@ -206,7 +207,6 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         extra: dict[str, Any] = {} if render_mode is None else {"render_mode": render_mode}
         if self.factory is not None:
             return _called(self.id, self.factory.load(), {**self.kwargs, **extra})
-        # Without gymnasium's checker: it costs a tenth of a CartPole step, and `protocol.rollout.validate` checks rows.
         env = self._made(lambda env_id: _make(env_id, {**self.kwargs, **extra}))
         for wrapper in self.wrappers:
             env = wrap(env, wrapper)
@@ -257,7 +257,19 @@ def _make(env_id: str, kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
         function = attribute(importlib.import_module(module_name), name)
         if callable(function) and name not in gymnasium.registry:
             return _called(env_id, function, kwargs)
-    return gymnasium.make(env_id, disable_env_checker=True, **kwargs)
+    return _unchecked(env_id, kwargs)
+
+
+def _unchecked(env: str | GymnasiumSpec, kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
+    """Made without gymnasium's checker: it costs a tenth of a CartPole step, and `protocol.rollout.validate` checks rows.
+
+    Its spec says what was registered, so that a dataset's environment equals the one that gymnasium makes.
+    """
+    made = gymnasium.make(env, disable_env_checker=True, **kwargs)
+    if (spec := made.spec) is not None:
+        registered = registration.registry.get(spec.id, spec) if isinstance(env, str) else env
+        spec.disable_env_checker = registered.disable_env_checker
+    return made
 
 
 def _called(name: str, factory: Callable[..., object], kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
@@ -328,7 +340,7 @@ class _SpecFactory:
         self._spec = _sent(spec)
 
     def __call__(self, **kwargs: Any) -> gymnasium.Env[Any, Any]:
-        return gymnasium.make(self._spec, disable_env_checker=True, **kwargs)
+        return _unchecked(self._spec, kwargs)
 
 
 def _sent(spec: GymnasiumSpec) -> GymnasiumSpec:

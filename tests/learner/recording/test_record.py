@@ -360,7 +360,7 @@ def test_the_environment_comes_back_with_the_dataset_and_each_episode_can_be_rep
     assert str(record(run, "cartpole/greedy-v0", 60, seed=1)).startswith("dataset cartpole/greedy-v0: ")
     dataset = read("cartpole/greedy-v0")
     env = dataset.recover_environment()
-    assert env.spec.id == "CartPole-v1"
+    assert env.spec == gymnasium.make("CartPole-v1", **eval_kwargs).spec, "what Minari's own tests compare"
     for episode, metadata in zip(dataset, dataset.storage.get_episode_metadata(range(len(dataset))), strict=True):
         obs, _ = env.reset(seed=metadata["seed"])
         for t, action in enumerate(episode.actions):
