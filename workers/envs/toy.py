@@ -35,8 +35,10 @@ class Scripted(gymnasium.Env[Floats, Any]):
         self._episode = -1
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Floats, Info]:
-        """Start the next episode. The script goes on where it was."""
+        """Start the next episode. The script goes on where it was; with a seed, all begins anew."""
         super().reset(seed=seed)
+        if seed is not None:
+            self._played, self._episode = 0, -1
         self._episode += 1
         self._steps = 0
         return self._observation(), {}
@@ -166,12 +168,12 @@ class Frames(gymnasium.Env[npt.NDArray[np.uint8], Any]):
         """Start at the first frame."""
         super().reset(seed=seed)
         self._steps = 0
-        return self._frames[0], {}
+        return self._frames[0].copy(), {}
 
     def step(self, action: Any) -> tuple[npt.NDArray[np.uint8], float, bool, bool, Info]:
         """Show the next frame."""
         self._steps += 1
-        return self._frames[self._steps % 8], 0.0, False, self._steps >= 100, {}
+        return self._frames[self._steps % 8].copy(), 0.0, False, self._steps >= 100, {}
 
 
 class Faulty(Countdown):

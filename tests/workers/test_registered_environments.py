@@ -1,0 +1,24 @@
+"""Every environment that millrace registers passes gymnasium's checker, but for the toys that fail on purpose."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+import gymnasium
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from workers.envs import toy
+
+FAIL_ON_PURPOSE = {f"{kind.__name__}-v0" for kind in (*toy.Faulty.__subclasses__(), toy.OneStep)}  # "truncates after 1 step"
+REGISTERED = [name for name, spec in gymnasium.registry.items() if str(spec.entry_point).startswith("workers.envs.")]
+
+
+@pytest.mark.filterwarnings("ignore:.*maximum value is infinity")  # Scripted counts without end
+@pytest.mark.parametrize("name", sorted({*REGISTERED} - FAIL_ON_PURPOSE))
+def test_gymnasiums_checker_finds_no_mistake(name: str) -> None:
+    if "Atari" in name and (find_spec("ale_py") is None or find_spec("cv2") is None):
+        pytest.skip("no emulator: pip install 'millrace-rl[atari]'")
+    env = gymnasium.make(name, disable_env_checker=True)
+    check_env(env.unwrapped, skip_render_check=True)
+    env.close()
