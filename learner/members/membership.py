@@ -4,8 +4,9 @@ Rule: what is kept of a worker ends with its session, beside totals and a limite
 members is limited.
 
 Rule: one process has one session at a time. A repeated Hello is answered by the same Welcome. A Hello of a new attempt,
-or of another process under the same name, ends the session before it. A process that was refused stays refused. A worker
-that is silent for too long is removed.
+or of another process under the same name, ends the session before it. A process that lost its name in this way may join
+again; of processes that take a name from each other, the one that loses it the third time is refused. A process that was
+refused stays refused. A worker that is silent for too long is removed.
 """
 
 from __future__ import annotations
@@ -52,6 +53,7 @@ from protocol.specs import DescribeSpec, RunSpec, StepSpec
 MEASURE_S = 0.5  # at least, between the two heartbeats that a worker's speed is measured by
 REMEMBERED = 1_000  # refused processes, and names of silent workers; a peer with many names must not fill the memory
 MAX_MEMBERS = 4_096
+MOST_TAKEOVERS = 3  # of one name, by one live process from another
 MAX_LATE_ACTIONS = 1_000_000  # between two heartbeats
 SUPERVISOR_WORD_S = 5.0  # what a supervisor said is shown for this long
 
@@ -73,6 +75,8 @@ class Member:
     """Time of the worker's last message."""
     joined_s: float = 0.0
     """Time when it joined."""
+    takeovers: int = 0
+    """How often processes have taken this name from each other, without a time in which nobody had it."""
     state: MemberState = MemberState.ACTIVE
     lanes: set[int] = field(default_factory=set)
     tickets: dict[int, int] = field(default_factory=dict)
@@ -257,7 +261,7 @@ class Membership(Generic[M]):
             return [(peer, Refuse(one_line(why)))], None
         if self.draining is not None:
             return [(peer, Drain(one_line(self.draining)))], None
-        member = self.members.get(peer)
+        member, takeovers = self.members.get(peer), 0
         if member is None and len(self.members) >= MAX_MEMBERS:
             why = f"workers: expected at most {MAX_MEMBERS} at one learner"
             self.events.append(WorkerRefused(hello.worker, why))
@@ -269,11 +273,12 @@ class Membership(Generic[M]):
                 return [(peer, Welcome(member.session, hello.attempt, self._run))], None
             if same_process and hello.attempt < member.hello.attempt:
                 return [], None
-            if not same_process:
+            takeovers = member.takeovers + (not same_process)
+            if not same_process and takeovers >= MOST_TAKEOVERS:
                 why = f"another process, on {hello.host}, joined as {hello.worker}; give each worker a name of its own"
                 self._remember_refusal(member, why)
             self.remove(member, TimedOut, "began again" if same_process else f"replaced by process {hello.pid}")
-        member = self._member_class(peer, hello, self._next_session, self._joins, now, joined_s=now)
+        member = self._member_class(peer, hello, self._next_session, self._joins, now, joined_s=now, takeovers=takeovers)
         self._next_session += 1
         self._joins += 1
         self.members[peer] = member

@@ -35,7 +35,7 @@ SAVED: dict[type, set[str]] = {
     | {"_oldest_ready", "_weights"},
     Membership: {"members", "_next_session", "_joins", "_none_silent_before_s", "_of_process", "_refused"},
     CollectingMember: {"peer", "hello", "session", "join_number", "heard_s", "lanes", "tickets", "replies", "acknowledged"}
-    | {"sending", "sending_since", "strikes"},
+    | {"sending", "sending_since", "strikes", "takeovers"},
     TicketedLane: {"number", "incarnation", "owner", "moving", "progress", "started", "outstanding", "next_sequence"}
     | {"out_of_order"},
     Ticket: {"number", "lane", "incarnation", "version", "peer"},
@@ -290,6 +290,7 @@ def _member(member: CollectingMember, now: float) -> Content:
         member.acknowledged,
         None if member.sending is None else (member.sending, replies(member.sending_since)),
         member.strikes,
+        member.takeovers,
     )
 
 
@@ -341,12 +342,13 @@ def loaded(content: Content, settings: Settings) -> Learner:
 
 def _load_members(membership: Membership[CollectingMember], members: Content) -> None:
     for join_number, fields in enumerate(members):
-        worker, nonce, attempt, number, heard, lanes, tickets, replies, acknowledged, sending, strikes = fields
+        worker, nonce, attempt, number, heard, lanes, tickets, replies, acknowledged, sending, strikes, takeovers = fields
         said = hello(worker.value, nonce.value, attempt.value)
         member = CollectingMember(peer_of(worker.value), said, number.value, join_number, heard)
         member.lanes = set(lanes)
         member.tickets = {each.value: sent_at.value for each, sent_at in tickets}
         member.replies, member.acknowledged, member.strikes = replies.value, acknowledged, strikes
+        member.takeovers = takeovers
         if sending is not None:
             member.sending, member.sending_since = sending[0], sending[1].value
         membership.members[member.peer] = member

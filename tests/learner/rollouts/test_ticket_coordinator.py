@@ -222,12 +222,11 @@ def test_the_same_name_from_another_process_replaces_the_old_one(pid: int, host:
     assert WorkerLeft("a", f"replaced by process {pid}", 2, False) in learner.coordinator.events
 
 
-def test_the_one_that_was_replaced_is_told_why_when_it_comes_back() -> None:
-    """Two live processes under one name must not take it from each other for ever."""
-    learner = Learner(lanes=2)
-    learner.joins(A)
-    learner.joins(A, pid=2)
-    (refuse,) = of(learner.joins(A, pid=1, attempt=2), Refuse)
+def test_a_process_that_was_replaced_joins_again_but_two_do_not_take_a_name_from_each_other_for_ever() -> None:
+    learner = Learner(lanes=1)
+    for pid, attempt in ((1, 1), (2, 1), (1, 2), (2, 2)):
+        assert kinds(learner.joins(A, pid=pid, attempt=attempt), A) == [Welcome, Weights, Collect]
+    (refuse,) = of(learner.joins(A, pid=1, attempt=3), Refuse)
     assert "give each worker a name of its own" in refuse.reason
     assert learner.coordinator.members[A].hello.pid == 2
 

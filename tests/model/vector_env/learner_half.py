@@ -126,6 +126,7 @@ def _member(member: Member, now: float) -> Content:
         tuple(sorted(member.lanes)),
         tuple((ticket(each), name(Kind.REPLIES, at, member.session)) for each, at in sorted(member.tickets.items())),
         name(Kind.REPLIES, member.replies, member.session),
+        member.takeovers,
     )
 
 
@@ -152,10 +153,11 @@ def loaded(content: Content, settings: Stepping, now: float) -> Learner:
     coordinator, caller = learner.coordinator, learner.caller
     membership = coordinator.membership
     for join_number, fields in enumerate(members):
-        worker, nonce, attempt, number, heard, of_lanes, held, replies = fields
+        worker, nonce, attempt, number, heard, of_lanes, held, replies, takeovers = fields
         said = hello(worker.value, nonce.value, attempt.value)
         member = Member(peer_of(worker.value), said, number.value, join_number, heard, lanes=set(of_lanes))
         member.tickets, member.replies = {each.value: at.value for each, at in held}, replies.value
+        member.takeovers = takeovers
         membership.members[member.peer] = member
         membership._of_process[said.worker, said.process_nonce] = member
     membership._joins, membership._none_silent_before_s = len(members), none_silent
