@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from learner.policy_player import saved_policy
+from millrace.arguments import checked
 from protocol.arrays import Array, Bools, Floats
 from protocol.envs.spaces import action_converter_of
 from protocol.errors import UsageError, check_at_least
@@ -44,6 +45,7 @@ class LoadedPolicy:
     """
 
     def __init__(self, run: Path, *, best: bool, deterministic: bool, seed: int) -> None:
+        check_at_least("load: seed", seed, 0)
         self.run = run
         """The run folder."""
         saved = saved_policy(run, "best" if best else "final")
@@ -59,6 +61,7 @@ class LoadedPolicy:
         self._generator = None if deterministic else generator(seed, Purpose.PLAYED_ACTIONS)
         self._state: Floats | None = None  # [1, n, S] of a recurrent policy, once it was started
 
+    @checked
     def start(self, copies: int = 1, *, seed: int | None = None) -> None:
         """Begin new episodes in this number of env copies. A policy with a recurrent core needs it; others do not.
 
@@ -70,7 +73,11 @@ class LoadedPolicy:
         >>> actions = policy(numpy.zeros((2, 4)))
         """
         check_at_least("start: copies", copies, 1)
-        self._state = zero_state(self.spec, 1, copies)
+        check_at_least("start: seed", seed or 0, 0)
+        try:
+            self._state = zero_state(self.spec, 1, copies)
+        except (MemoryError, ValueError) as error:  # ValueError: no array can be so long
+            raise UsageError(f"start: copies: expected a number whose states fit into memory, got {copies}") from error
         if seed is not None and self._generator is not None:
             self._generator = generator(seed, Purpose.PLAYED_ACTIONS)
 
@@ -163,6 +170,7 @@ class LoadedPolicy:
         return tuple(array.reshape(1, n, *leaf.shape) for array, leaf in zip(arrays, leaves, strict=True)), number is None
 
 
+@checked
 def load(run: str | os.PathLike[str], *, best: bool = False, deterministic: bool = True, seed: int = 0) -> LoadedPolicy:
     """Load a policy of a run folder, to act with it: `policy(observation)` gives the action.
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from millrace.arguments import plain
 from protocol.env_spec import PickledCallable, Scalar, check_arguments
 from protocol.errors import UsageError
 from protocol.policy.own_policy import LOG_PROB
@@ -59,6 +60,10 @@ class OwnPolicy:
     """S, how many numbers the state of one env copy has"""
     kwargs: Mapping[str, Scalar] = field(default_factory=dict)
     """keyword arguments of the factory"""
+
+    def __post_init__(self) -> None:
+        for name in ("arrays", "extras", "state_size", "kwargs"):
+            object.__setattr__(self, name, plain(getattr(self, name)))
 
     @property
     def name(self) -> str:

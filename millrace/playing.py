@@ -7,12 +7,9 @@ the episodes; the caller's process runs no environment code.
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypedDict, TypeVar, Unpack, get_args, get_origin, get_type_hints
-
-import msgspec
+from typing import Any, Literal, NamedTuple, TypedDict, TypeVar, Unpack
 
 from learner.config.rollout_config import RolloutConfig
 from learner.policy_player import SavedPolicy, saved_policy, useful_workers
@@ -20,6 +17,7 @@ from learner.recording.record import RecordedDataset
 from learner.recording.record import record as record_dataset
 from learner.rollouts.evaluation_tickets import EvaluationPlan, evaluation_of
 from learner.run_folder.results import Evaluation
+from millrace.arguments import checked
 from millrace.cli.flags import EvaluateFlags, RecordFlags
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
 from millrace.terminal import count_line
@@ -84,6 +82,7 @@ class RunRecordKeywords(RecordKeywords, ShownKeywords, total=False):
     """Keywords of `Run.record`."""
 
 
+@checked
 def evaluate(
     run: str | os.PathLike[str],
     episodes: int | None = None,
@@ -120,6 +119,7 @@ def evaluate(
         return play(flags, watch, Given(env, wrappers))[0]
 
 
+@checked
 def record(
     run: str | os.PathLike[str],
     out: str,
@@ -160,31 +160,9 @@ def flags_of(kind: type[_Flags], name: str, **keywords: Any) -> _Flags:
     for keyword in keywords:
         if keyword not in kind.__struct_fields__ or keyword in NOT_KEYWORDS:
             raise UsageError(f"{name}: unknown keyword {keyword}{did_you_mean(keyword, kind.__struct_fields__)}")
-    try:
-        return msgspec.convert(keywords, kind, dec_hook=_path)
-    except msgspec.ValidationError as error:
-        raise UsageError(f"{name}: {_reworded(str(error), kind, keywords)}") from error
-
-
-def _path(kind: type, value: object) -> Path:
-    """A path where a field wants one. Raises `TypeError`, which msgspec reports, for what is none."""
-    if not isinstance(value, str | os.PathLike):
-        raise TypeError("Expected text or a path")
-    return Path(value)
-
-
-def _reworded(message: str, kind: type, keywords: dict[str, Any]) -> str:
-    """Msgspec's message in our words: the keyword, what was expected and what was given."""
-    expected, at, path = message.replace(" | null", " or None").partition(" - at `$.")
-    keyword = re.split(r"[.\[`]", path)[0]
-    if not at or keyword not in keywords:
-        return message
-    hint = get_type_hints(kind)[keyword]
-    if get_origin(hint) is Literal:
-        expected = f"expected one of {', '.join(get_args(hint))}"
-    else:
-        expected = expected.replace("`", "").replace("Expected", "expected").partition(", got ")[0]
-    return f"{keyword}: {expected}, got {keywords[keyword]!r:.60}"
+    if (npy := keywords.get("npy")) is not None:
+        keywords["npy"] = Path(npy)
+    return kind(**keywords)
 
 
 def play(flags: EvaluateFlags, watch: Watch, given: Given | None = None) -> tuple[Evaluation, list[Path]]:

@@ -9,12 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Protocol, get_args
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
+from millrace.arguments import checked
 from protocol.arrays import Array, Floats
-from protocol.errors import UsageError
+from protocol.errors import UsageError, check_at_least
 from protocol.policy.layout import Field, acting_size, buffer_layout, named_views, parameter_layout, total_size
 from protocol.random_streams import Purpose, generator
 from protocol.specs import ActionSpec, ExtraArray, Leaf, PolicySpec
@@ -59,6 +60,7 @@ class MLP:
     normalize_observations: bool
     """subtract a mean and divide by a standard deviation, which are published as buffers; clip to ±10"""
 
+    @checked
     def __init__(self, *net: int, activation: Activation = "tanh", normalize_observations: bool = False) -> None:
         object.__setattr__(self, "net", net or (64, 64))
         object.__setattr__(self, "activation", activation)
@@ -76,14 +78,8 @@ class MLP:
 
     def spec(self, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
         """The policy for these spaces."""
-        if not all(type(width) is int and width > 0 for width in self.net):
+        if not all(width > 0 for width in self.net):
             raise UsageError(f"policy: expected widths of hidden layers, as in MLP(64, 64), got {self.net}")
-        if self.activation not in get_args(Activation):
-            raise UsageError(f"policy: activation: expected {' or '.join(get_args(Activation))}, got {self.activation!r}")
-        if type(self.normalize_observations) is not bool:
-            raise UsageError(
-                f"policy: normalize_observations: expected True or False, got {self.normalize_observations!r:.60}"
-            )
         return PolicySpec(
             observation,
             action,
@@ -102,6 +98,7 @@ class CNN(MLP):
     (128,)
     """
 
+    @checked
     def __init__(self, *net: int, activation: Activation = "relu", normalize_observations: bool = False) -> None:
         super().__init__(*(net or (512,)), activation=activation, normalize_observations=normalize_observations)
 
@@ -132,6 +129,7 @@ class Recurrent(MLP):
     core_size: int
     """number of units of the core"""
 
+    @checked
     def __init__(
         self,
         *net: int,
@@ -148,10 +146,7 @@ class Recurrent(MLP):
         """The policy for these spaces."""
         from msgspec.structs import replace
 
-        if self.core not in get_args(Core):
-            raise UsageError(f"policy: core: expected {' or '.join(get_args(Core))}, got {self.core!r}")
-        if not (type(self.core_size) is int and self.core_size > 0):
-            raise UsageError(f"policy: core_size: expected a whole number above 0, got {self.core_size!r}")
+        check_at_least("policy: core_size", self.core_size, 1)
         return replace(super().spec(observation, action), core=self.core, core_size=self.core_size)
 
 
@@ -197,6 +192,7 @@ class PolicyParameters:
         self.buffers = _pieces(self._buffer_fields)
         """The pieces of the buffers: `observation_mean` and `observation_std` if observations are normalized."""
 
+    @checked
     def initial(self, seed: int = 1) -> Floats:
         """Initial parameters [P] float32: orthogonal weights with the gains of the layout, biases 0.
 
@@ -207,6 +203,7 @@ class PolicyParameters:
         >>> parameters.initial(seed=3).shape == (parameters.size,)
         True
         """
+        check_at_least("initial: seed", seed, 0)
         if self.spec.own is not None:
             raise UsageError(f"policy {self.spec.own.factory}: expected initial values of your own; publish them")
         drawn = generator(seed, Purpose.WEIGHTS)

@@ -13,6 +13,7 @@ those of `millrace train`. Imports no torch.
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -34,6 +35,7 @@ from learner.rollouts.ledger import Ledger
 from learner.run_folder.episode_window import EpisodeWindow
 from learner.run_folder.progress import Progress, steps_per_second
 from learner.run_folder.results import Evaluation
+from millrace.arguments import checked
 from millrace.launch.rollouts import start
 from millrace.policies import MLP, PolicyChoice, PolicyParameters
 from protocol.arrays import Array, Ints
@@ -102,6 +104,7 @@ class RolloutService:
     0
     """
 
+    @checked
     def __init__(
         self,
         env: EnvLike,
@@ -109,7 +112,7 @@ class RolloutService:
         *,
         wrappers: Sequence[WrapperLike] = (),
         rollout_steps: int = 128,
-        restore: str | Path | None = None,
+        restore: str | os.PathLike[str] | None = None,
         **settings: Any,
     ) -> None:
         """Start the workers and wait until they have joined.
@@ -135,8 +138,7 @@ class RolloutService:
         policy = MLP() if policy is None else policy
         if isinstance(policy, type) or not hasattr(policy, "spec"):
             raise UsageError(f"policy: expected MLP, CNN, Recurrent or OwnPolicy, as in MLP(64, 64), got {policy!r}")
-        if not (type(rollout_steps) is int and rollout_steps > 0):
-            raise UsageError(f"rollout_steps: expected a whole number above 0, got {rollout_steps!r}")
+        check_at_least("rollout_steps", rollout_steps, 1)
         self.restored: dict[str, Array] = {}
         """The arrays of the file that was restored, by name."""
         past: tuple[Ledger, Sequence[int]] | None = None
@@ -267,6 +269,7 @@ class RolloutService:
         while True:
             yield self.gather()
 
+    @checked
     def evaluate(self, episodes: int = 100, *, seed: int = 1_000_000, max_steps: int = 1_000_000) -> Evaluation:
         """Let the workers play greedy episodes under the newest weights, on env copies apart from those of the rollouts.
 
@@ -290,7 +293,8 @@ class RolloutService:
 
     # ---------------------------------------------------------------- saving, and what else there is to know
 
-    def save(self, path: str | Path, **arrays: Any) -> None:
+    @checked
+    def save(self, path: str | os.PathLike[str], **arrays: Any) -> None:
         """Write the service's state and your arrays into one .npz file, which is there whole or not at all.
 
         Call it right after `publish`. `RolloutService(..., restore=path)` goes on from it: ledger, versions, lanes

@@ -22,6 +22,7 @@ from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY, Progress
 from learner.run_folder.results import Evaluation, Summary
 from learner.run_folder.resume import AUTO, newest_run
 from learner.run_folder.run_folder import RunFolder
+from millrace.arguments import checked
 from millrace.playing import RunEvaluateKeywords, RunRecordKeywords, evaluate, record
 from millrace.terminal import shown_progress
 from protocol.arrays import Array
@@ -77,6 +78,7 @@ class Run(os.PathLike[str]):
     'CartPole-v1'
     """
 
+    @checked
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = RunFolder.open(Path(path)).path
         """The run folder."""
@@ -155,6 +157,7 @@ class Run(os.PathLike[str]):
         """
         return train(resume=self, **{**self._given, **keywords})
 
+    @checked
     def plot(self, out: str | os.PathLike[str] | None = None) -> PngFigure:
         """Draw the learning curve, as `millrace plot` does. Returns a matplotlib figure, which a notebook shows.
 
@@ -213,6 +216,7 @@ class Run(os.PathLike[str]):
         return {**facts, "ended": summary.stop_reason}
 
 
+@checked
 def train(
     env: EnvLike = "",
     *,

@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 import millrace
 from learner.vector_env.env import ZmqVectorEnv
+from millrace.arguments import checked
 from protocol.arrays import Array
 from protocol.env_spec import EnvLike, EnvSpec, Scalar
 from protocol.envs.spaces import make_flatten, make_unflatten
@@ -27,6 +28,7 @@ from protocol.errors import UsageError
 Indices = int | Iterable[int] | None
 
 
+@checked
 def make_vec_env(
     env_id: EnvLike | Sequence[EnvLike],
     n_envs: int | None = None,

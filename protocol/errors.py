@@ -23,7 +23,8 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Sequence
-from typing import SupportsIndex
+
+from protocol.bounds import one_line
 
 
 def first_line(error: BaseException, otherwise: str = "no message") -> str:
@@ -67,8 +68,8 @@ class UserFacingError(MillraceError):
     exit_code = 1
 
     def __init__(self, line: str, detail: str = "") -> None:
-        """`line` is the whole message, in one line; `detail` (a traceback, as text) is shown below it."""
-        super().__init__(line)
+        """`line` is the whole message: what it quotes is escaped, so it stays one line. `detail` is shown below it."""
+        super().__init__(one_line(line))
         self.detail = detail
 
 
@@ -212,7 +213,7 @@ def unexpected_arguments(words: Sequence[str], *, one_run: bool) -> str:
     return f"unexpected argument {words[0]}"
 
 
-def check_at_least(name: str, value: object, least: int) -> None:
-    """Raise `UsageError` if a value that the user gave is less, or no whole number."""
-    if not (isinstance(value, SupportsIndex) and value.__index__() >= least):
-        raise UsageError(f"{name}: expected int >= {least}, got {value!r:.60}")
+def check_at_least(name: str, value: int, least: int) -> None:
+    """Raise `UsageError` if a number that the user gave is less."""
+    if value < least:
+        raise UsageError(f"{name}: expected int >= {least}, got {value}")

@@ -35,8 +35,10 @@ def resolve(
     `preset`: "auto" (that of the environment, if there is one), "none", the environment whose preset to take, or a whole run
     by name. `algo` may be a class (`algorithm_names.name_of`).
     """
-    if isinstance(keywords.get("algo"), type):
-        keywords["algo"] = name_of(keywords["algo"])
+    if isinstance(algo := keywords.get("algo", ""), type):
+        keywords["algo"] = name_of(algo)
+    elif not isinstance(algo, str):
+        raise UsageError(f"algo: expected text or a class, got {algo!r:.60}")
     below = lower_layers(env, algo=keywords.get("algo"), file=file, resume=resume, preset=preset)
     return validate(override(below, keywords, "keyword argument"))
 

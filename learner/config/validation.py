@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from typing import Any, TypeVar, get_args, get_type_hints
 
 import msgspec
@@ -35,6 +36,9 @@ def convert(settings: dict[str, Any], where: str) -> Config:
 
 def _converted(values: Any, kind: type[Record], settings: dict[str, Any], where: str = "") -> Record:
     """These values, which are among the settings, as a record. Raises `UsageError`."""
+    for table in TABLES:
+        if not isinstance(settings.get(table, {}), Mapping):
+            raise UsageError(f"{where}: {table}: expected table, got {settings[table]!r:.60}".removeprefix(": "))
     try:
         return msgspec.convert(values, kind)
     except msgspec.ValidationError as error:

@@ -68,8 +68,8 @@ def write(figure: PngFigure, out: Path) -> None:
     """Write the figure as a PNG. Raises `RunError`."""
     try:
         write_atomically(out, lambda file: figure.savefig(file, format="png", dpi=DPI))
-    except OSError as error:
-        raise RunError(f"{out} not written: {error.strerror}") from error
+    except (OSError, ValueError) as error:  # ValueError: no name of a file
+        raise RunError(f"{out} not written: {getattr(error, 'strerror', None) or error}") from error
 
 
 def curves(runs: Sequence[Path]) -> PngFigure:

@@ -7,26 +7,31 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from typing import Literal
 
 import msgspec
+from gymnasium.vector import AutoresetMode
 
 from learner.members.describe import DescribeSettings, described_by_workers
 from learner.members.describe_coordinator import Accept, accept_any
+from learner.members.endpoint import BindSettings
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.vector_env.env import ZmqVectorEnv
 from learner.vector_env.settings import VectorEnvSettings
 from learner.vector_env.spec import RequestedCopies, requested_copies
 from learner.vector_env.step_hub import SharedSteps, StepHub
+from millrace.arguments import checked
 from millrace.launch.endpoint import Endpoint, open_endpoint
 from millrace.launch.local_worker_options import LEAVE_AT_ONCE_S, WorkerFlags
 from protocol.address import advertised_address, check_address
 from protocol.alive import CallTimeouts
 from protocol.cpu_cores import usable_cores
-from protocol.env_spec import EnvSpec
+from protocol.env_spec import EnvLike, EnvSpec
 from protocol.envs.description import DescribedEnv
+from protocol.envs.wrappers import WrapperLike
 from protocol.errors import EnvironmentFailed, UsageError
 from protocol.wire.shared_memory import SUPPORTED, InheritedDescriptors, SharedMemory, new_memory
 from protocol.wire.wake_up import SPIN_S, WakePipe
@@ -38,8 +43,91 @@ LEARNER_TIMEOUT_S = 600.0  # a worker elsewhere joins again if it hears nothing 
 STEP_TIMEOUT_LEAST_S, STEP_TIMEOUT_MOST_S = 60.0, 1e6
 
 
-def make_vec(settings: VectorEnvSettings) -> ZmqVectorEnv:
-    """See `millrace.make_vec`."""
+@checked
+def make_vec(
+    env: EnvLike | Sequence[EnvLike],
+    num_envs: int | None = None,
+    *,
+    workers: int | None = None,
+    lanes: int | None = None,
+    bind: str = "",
+    keys: str = "",
+    insecure: bool = False,
+    advertise: str = "",
+    transport: Literal["ipc", "tcp", "inproc"] = "ipc",
+    shared_memory: bool = True,
+    autoreset_mode: AutoresetMode | str = "NextStep",
+    on_worker_loss: Literal["truncate", "raise"] = "truncate",
+    timeout: float = 60.0,
+    copy: bool = True,
+    render_mode: str | None = None,
+    wrappers: Sequence[WrapperLike] = (),
+    **kwargs: bool | int | float | str,
+) -> ZmqVectorEnv:
+    """Make a `gymnasium.vector.VectorEnv` whose env copies live in worker processes.
+
+    Its results are, bit for bit, those of `gymnasium.vector.SyncVectorEnv` for the same seeds and actions.
+
+    Args:
+        env: anything `gymnasium.make` takes, a callable that returns an environment, or a list with one of these for each
+            env copy. What only your script or notebook has (a callable, an id that it registers) is code: it is sent over
+            TCP only to workers that have a key.
+        num_envs: number of env copies; by default 1, or the length of the list.
+        workers: number of worker processes to start on this machine; by default one for each core, at most `num_envs`.
+            They end with the vector environment.
+        lanes: number of groups of env copies. A group lives in one worker. By default there is one for each worker.
+        bind: an address for workers that are started elsewhere with `millrace worker ADDRESS`. The default is local workers.
+        keys: the folder of the keys. An address that other machines can reach needs keys; they are made if there are none.
+        insecure: use no keys.
+        advertise: the host name by which other machines reach this one.
+        transport: how messages travel to local workers. With `inproc` the worker is a thread of this process,
+            which then runs the environment. Otherwise only workers do.
+        shared_memory: local workers get actions and return results through shared memory. It is faster; results are equal.
+        autoreset_mode: as in gymnasium: "NextStep", "SameStep" or "Disabled".
+        on_worker_loss: "truncate" returns the env copies of a lost worker as truncated, with `worker_lost` in their infos,
+            and continues with new copies on another worker. "raise" raises `WorkerLost`.
+        timeout: seconds that a worker may take to answer; then it is given up.
+        copy: return copies of the observations. Without it the next step overwrites them.
+        render_mode: passed on to the environment.
+        wrappers: applied to every env copy in its worker, the first one innermost: classes, functions, or names as
+            "gymnasium.wrappers:FlattenObservation".
+        kwargs: passed on to the environment.
+
+    A worker elsewhere is also given up if it sends no heartbeat for 5 s while this process waits for it. A long step does
+    not stop heartbeats, unless it holds Python's global interpreter lock. The time between two calls is not limited for
+    local workers. Workers elsewhere wait for ten minutes; then they join again, and their env copies are lost.
+
+    Raises:
+        UsageError: an argument is wrong.
+        NoWorkers: too few workers joined in time.
+        EnvironmentFailed: an environment raised, and the error has the worker's traceback; or env copies differ in their
+            spaces.
+        WorkerLost: see `on_worker_loss`.
+
+    >>> import millrace
+    >>> envs = millrace.make_vec("CartPole-v1", 4, workers=2)
+    >>> observations, infos = envs.reset(seed=1)
+    >>> observations, rewards, terminated, truncated, infos = envs.step([0, 1, 0, 1])
+    >>> observations.shape
+    (4, 4)
+    >>> envs.close()
+    """
+    settings = VectorEnvSettings(
+        env,
+        num_envs,
+        workers=workers,
+        lanes=lanes,
+        listen=BindSettings(bind, keys, insecure, advertise),
+        transport=transport,
+        shared_memory=shared_memory,
+        autoreset_mode=autoreset_mode,
+        on_worker_loss=on_worker_loss,
+        timeout_s=timeout,
+        copy=copy,
+        render_mode=render_mode,
+        kwargs=kwargs,
+        wrappers=wrappers,
+    )
     timeouts = _call_timeouts(settings.timeout_s)
     flags = timeout_flags(timeouts)
     local_workers = settings.local_workers
@@ -53,10 +141,10 @@ def make_vec(settings: VectorEnvSettings) -> ZmqVectorEnv:
     resources = ExitStack()
     try:
         started = listen(settings, resources).start(lambda name: (flags, None), timeouts)
-        env = started.vector_env(started.describe(describe))
-        env.wait_for(local_workers or settings.lane_count, join_timeout_s)
-        env.make_copies()
-        return env
+        made = started.vector_env(started.describe(describe))
+        made.wait_for(local_workers or settings.lane_count, join_timeout_s)
+        made.make_copies()
+        return made
     except BaseException as error:
         resources.close()
         if isinstance(error, EnvironmentFailed) and error.detail:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import ast
 import functools
 import traceback
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -82,11 +82,7 @@ def wrapper_name(wrapper: WrapperLike) -> str:
 
 
 def wrapper_names(wrappers: Sequence[WrapperLike]) -> tuple[str, ...]:
-    """The name of each wrapper, as `wrapper_name`. Raises `UsageError`, also for a wrapper that is in no list."""
-    if isinstance(wrappers, str) or not isinstance(wrappers, Iterable):
-        raise UsageError(
-            f"wrappers: expected a list of them, as in wrappers=[MyWrapper], got {one_line(repr(wrappers), 100)}"
-        )
+    """The name of each wrapper, as `wrapper_name`. Raises `UsageError`."""
     return tuple(map(wrapper_name, wrappers))
 
 

@@ -176,7 +176,7 @@ def test_an_evaluation_that_cannot_be_made_is_refused() -> None:
         made.publish(made.policy.initial())
         for wrong in ({"episodes": 0}, {"episodes": "4"}, {"seed": -1}, {"max_steps": 0.5}):
             (name,) = wrong
-            with pytest.raises(UsageError, match=f"evaluate: {name}: expected int >= "):
+            with pytest.raises(UsageError, match=f"evaluate: {name}: expected int"):
                 made.evaluate(**wrong)
         assert made.evaluate(episodes=1).episodes == 1
 
@@ -268,17 +268,11 @@ def test_calls_from_another_thread_and_after_the_end_are_refused() -> None:
     [
         ({"worker": 2}, "unknown setting worker; did you mean workers"),
         ({"envs": 5}, "5 envs cannot be shared evenly among 2 lanes"),
-        ({"rollout_steps": 0}, "rollout_steps: expected a whole number above 0, got 0"),
+        ({"rollout_steps": 0}, "rollout_steps: expected int >= 1, got 0"),
         ({"workers": "two"}, "workers: expected int, got 'two'"),
         ({"policy": millrace.CNN()}, "expected an image"),
         ({"policy": millrace.MLP(0)}, "expected widths of hidden layers"),
-        (
-            {"policy": millrace.MLP(8, normalize_observations="yes")},  # type: ignore[arg-type]
-            "policy: normalize_observations: expected True or False, got 'yes'",
-        ),
-        ({"policy": millrace.MLP(8, activation="gelu")}, "policy: activation: expected tanh or relu, got 'gelu'"),  # type: ignore[arg-type]
-        ({"policy": millrace.Recurrent(8, core="rnn")}, "policy: core: expected lstm or gru, got 'rnn'"),  # type: ignore[arg-type]
-        ({"policy": millrace.Recurrent(8, core_size=0)}, "policy: core_size: expected a whole number above 0, got 0"),
+        ({"policy": millrace.Recurrent(8, core_size=0)}, "policy: core_size: expected int >= 1, got 0"),
         ({"policy": millrace.OwnPolicy(dict, {"w": (2,)}, kwargs={"a": [1]})}, "policy dict: argument a: expected a number"),  # type: ignore[dict-item]
         ({"policy": millrace.MLP}, "policy: expected MLP, CNN, Recurrent or OwnPolicy, as in MLP(64, 64), got <class"),
     ],

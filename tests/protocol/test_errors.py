@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
 from protocol.errors import UsageError, check_at_least, first_line
@@ -21,12 +20,11 @@ def test_the_first_line_of_an_exception_is_its_message_or_says_that_there_is_non
     assert first_line(WithoutText(), "nothing") == "nothing"
 
 
-@pytest.mark.parametrize("value", [0, -1, "4", 2.5, None, float("nan"), np.float64(3)])
-def test_what_is_less_or_no_whole_number_is_refused(value: object) -> None:
-    with pytest.raises(UsageError, match=r"^episodes: expected int >= 1, got "):
-        check_at_least("episodes", value, 1)
+def test_what_is_less_is_refused() -> None:
+    check_at_least("episodes", 1, 1)
+    with pytest.raises(UsageError, match=r"^episodes: expected int >= 1, got 0$"):
+        check_at_least("episodes", 0, 1)
 
 
-def test_whole_numbers_of_any_type_pass() -> None:
-    check_at_least("episodes", np.int32(1), 1)
-    check_at_least("episodes", 2**70, 1)
+def test_an_error_is_one_line_whatever_it_quotes() -> None:
+    assert str(UsageError("run a\nb\x1b[2J: no such folder")) == r"run a\nb\x1b[2J: no such folder"

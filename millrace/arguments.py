@@ -1,0 +1,130 @@
+"""The door of the public functions: their arguments are checked against their annotations before anything starts.
+
+Rule: what comes in is plain. numpy's scalars become Python's; a whole number has at most 64 bits, and text can be written to
+a file; True and False are no numbers. What is otherwise is refused in one line, in the function's name.
+"""
+
+from __future__ import annotations
+
+import errno
+import functools
+import inspect
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import UnionType
+from typing import Any, Literal, ParamSpec, TypeVar, Union, Unpack, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from protocol.errors import UsageError
+
+WORDS: dict[Any, str] = {
+    str: "text",
+    type(None): "None",
+    Callable: "a function",
+    os.PathLike: "a path",
+    Sequence: "a list",
+    Mapping: "a dict",
+}
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
+
+
+def checked(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """The same function, which raises `UsageError` for arguments that its annotations do not allow."""
+    signature, who = inspect.signature(function), function.__qualname__.removesuffix(".__init__").rpartition(".")[2]
+
+    @functools.cache
+    def hints() -> dict[str, Any]:
+        texts = {name: text for name, text in function.__annotations__.items() if name != "return"}
+        found = {name: eval(text, function.__globals__) for name, text in texts.items()}
+        for hint in list(found.values()):
+            if get_origin(hint) is Unpack:
+                found |= get_type_hints(get_args(hint)[0])
+        return found
+
+    def fitting(name: str, value: Any, hint: Any) -> Any:
+        value = plain(value)
+        if why := next(unusable(value), "") or ("" if fits(value, hint) else f"expected {words(hint)}"):
+            raise UsageError(f"{who}: {name}: {why}, got {value!r:.60}")
+        return value
+
+    @functools.wraps(function)
+    def door(*args: _Arguments.args, **keywords: _Arguments.kwargs) -> _Result:
+        try:
+            given = signature.bind(*args, **keywords)
+        except TypeError:
+            return function(*args, **keywords)  # raises it with the function's name
+        for name, value in given.arguments.items():
+            match signature.parameters[name].kind:
+                case inspect.Parameter.VAR_KEYWORD:
+                    given.arguments[name] = {key: fitting(key, one, hints().get(key, Any)) for key, one in value.items()}
+                case inspect.Parameter.VAR_POSITIONAL:
+                    given.arguments[name] = tuple(fitting(name, one, hints()[name]) for one in value)
+                case _ if name in hints():  # all but self
+                    given.arguments[name] = fitting(name, value, hints()[name])
+        try:
+            return function(*given.args, **given.kwargs)
+        except OSError as error:
+            if error.errno != errno.ENAMETOOLONG:
+                raise
+            raise UsageError(f"{who}: path {error.filename}: {error.strerror}; choose a shorter one") from error
+
+    return door
+
+
+def plain(value: Any) -> Any:
+    """The value with Python's scalars in place of numpy's, also in lists, tuples and dicts."""
+    match value:
+        case np.generic():
+            return value.item()
+        case list() | tuple() if type(value) in (list, tuple):
+            return type(value)(map(plain, value))
+        case dict() if type(value) is dict:
+            return {plain(key): plain(one) for key, one in value.items()}
+    return value
+
+
+def unusable(value: Any) -> Iterator[str]:
+    """What was expected in place of text or a number that no message and no file can hold."""
+    match value:
+        case int() if not -(2**63) <= value < 2**64:
+            yield "expected a number of at most 64 bits"
+        case str() | os.PathLike():
+            try:
+                value.encode() if isinstance(value, str) else os.fsencode(value)
+            except UnicodeEncodeError:
+                yield "expected text that can be encoded"
+        case list() | tuple():
+            for one in value:
+                yield from unusable(one)
+        case dict():
+            yield from unusable([*value, *value.values()])
+
+
+def fits(value: Any, hint: Any) -> bool:
+    """Whether an annotation allows this value."""
+    origin, parts = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):
+        return any(fits(value, part) for part in parts)
+    if origin is Literal:
+        return isinstance(value, str) and value in parts
+    if origin is Callable:
+        return callable(value)
+    if origin is Sequence:
+        listed = isinstance(value, Sequence) and not isinstance(value, str | bytes)
+        return listed and all(fits(one, parts[0]) for one in value)
+    if hint in (int, float):
+        return isinstance(value, int | hint) and not isinstance(value, bool)
+    return hint is Any or getattr(hint, "_is_protocol", False) or isinstance(value, origin or hint)
+
+
+def words(hint: Any) -> str:
+    """An annotation in words."""
+    origin, parts = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):
+        return " or ".join(dict.fromkeys(map(words, parts)))
+    if origin is Literal:
+        return f"one of {', '.join(parts)}"
+    found = WORDS.get(origin or hint, getattr(hint, "__name__", str(hint)))
+    return f"{found} of {words(parts[0])}" if origin is Sequence and parts[0] is not object else found

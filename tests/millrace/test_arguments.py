@@ -1,0 +1,215 @@
+"""Arguments of any kind: a public function takes them, or says in one line what is wrong before anything starts."""
+
+from __future__ import annotations
+
+import inspect
+import random
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import gymnasium
+import numpy as np
+import pytest
+
+import millrace
+from learner.config.config import Config
+from learner.config.hyperparameters import PPOConfig
+from learner.config.rollout_config import RolloutConfig
+from millrace.launch import learner_inference, local_run, policy_workers, rollouts, vector
+from millrace.playing import EvaluateKeywords, RecordKeywords
+from tests.support import own_policies
+
+CALLS = 500
+Door = tuple[Callable[..., Any], set[str], dict[str, Any]]
+"""A public function, the names of its arguments, and arguments that it takes."""
+
+
+class Started(BaseException):
+    """All arguments were taken: the address for the workers would be opened now."""
+
+
+@pytest.fixture(autouse=True)
+def nothing_starts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def started(*arguments: object) -> None:
+        raise Started
+
+    for module in (learner_inference, local_run, policy_workers, rollouts, vector):
+        monkeypatch.setattr(module, "open_endpoint", started)
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> millrace.Run:
+    small: dict[str, Any] = {"steps": 32, "envs": 2, "lanes": 1, "rollout_steps": 16, "eval_episodes": 1}
+    folder = str(tmp_path_factory.mktemp("runs"))
+    return millrace.train("CartPole-v1", run_dir=folder, transport="inproc", progress=False, **small)
+
+
+class TwoLines:
+    """What no function expects, and is hard to show."""
+
+    def __repr__(self) -> str:
+        return "two\nlines"
+
+
+ODD_VALUES: tuple[Any, ...] = (
+    None, True, False, 0, 1, -1, 3.5, 2.0, 10**30, -(10**30), 2**53, 2**63, 2**64, float("nan"), float("inf"), 1e300, 1j,
+    "", "x", "2", "none", "auto", "\ud800", "CartPole-v1\udfff", "a\nb", "a\0b", "\x1b[2J", "x" * 10_000, b"x",
+    np.int64(2), np.int8(-1), np.uint64(2**64 - 1), np.float32(0.5), np.float64("nan"), np.bool_(True), np.str_("x"),
+    np.str_("\ud800"), np.array(2), np.array([1, 2]), np.array(["a"]), np.datetime64("2020"), [], [1], ["x"], ["\ud800"],
+    [None], (), (64, 64), (np.int64(8),), (True,), {}, {"a": 1}, {1: 2}, {"a": 10**30}, {"a": "\ud800"}, {"\ud800": 1},
+    {"a": np.int64(1)}, {"a": None}, {1}, object(), TwoLines(), int, len, lambda: None, Path("x"), Path("\udc80"), range(2),
+    iter(()), gymnasium.spec("CartPole-v1"), Ellipsis, ValueError("x"), slice(2),
+)  # fmt: skip
+
+
+def doors(run: millrace.Run) -> list[Door]:
+    policy = millrace.load(run)
+    cartpole = policy.spec.observation, policy.spec.action
+    settings = set(Config.__struct_fields__) | set(PPOConfig.__struct_fields__) - {"algorithm", "wrapper", "run_dir"}
+    of_rollouts = set(RolloutConfig.__struct_fields__) - {"wrapper"}
+    evaluates, records = set(get_type_hints(EvaluateKeywords)), set(get_type_hints(RecordKeywords))
+    env: dict[str, Any] = {"env": "CartPole-v1"}
+    dataset: dict[str, Any] = {"out": "cartpole/fuzz-v0"}
+
+    def names(function: Callable[..., Any]) -> set[str]:
+        kinds = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
+        return {name for name, each in inspect.signature(function).parameters.items() if each.kind not in kinds}
+
+    def mlp(width: object = 64, **keywords: Any) -> object:
+        return millrace.MLP(width, **keywords).spec(*cartpole)  # type: ignore[arg-type]
+
+    def recurrent(width: object = 64, **keywords: Any) -> object:
+        return millrace.Recurrent(width, **keywords).spec(*cartpole)  # type: ignore[arg-type]
+
+    def own(factory: Any = own_policies.__name__, arrays: Any = None, **keywords: Any) -> object:
+        return millrace.OwnPolicy(factory, arrays, **keywords).spec(*cartpole)
+
+    quiet = {"progress": False}
+    return [
+        (millrace.train, names(millrace.train) | settings, env | quiet),
+        (run.resume, {"steps", "workers", "env", "wrappers", "callbacks", "watch", "preset"}, {"steps": 64} | quiet),
+        (millrace.RolloutService, names(millrace.RolloutService) | of_rollouts, env),
+        (millrace.make_vec, names(millrace.make_vec) | {"an_argument"}, env),
+        (millrace.evaluate, names(millrace.evaluate) | evaluates, {"run": run} | quiet),
+        (run.evaluate, names(millrace.evaluate) - {"run"} | evaluates, quiet),
+        (millrace.record, names(millrace.record) | records, {"run": run} | dataset | quiet),
+        (run.record, names(millrace.record) - {"run"} | records, dataset | quiet),
+        (run.plot, {"out"}, {}),
+        (millrace.Run, {"path"}, {}),
+        (millrace.load, names(millrace.load), {"run": run}),
+        (policy.start, {"copies", "seed"}, {}),
+        (millrace.PolicyParameters(policy.spec).initial, {"seed"}, {}),
+        (mlp, {"width", "activation", "normalize_observations"}, {}),
+        (recurrent, {"width", "core", "core_size"}, {}),
+        (own, {"factory", "arrays", "extras", "state_size", "kwargs"}, {"arrays": {"w": (4, 2)}}),
+    ]
+
+
+def outcome(function: Callable[..., Any], given: dict[str, Any]) -> str:
+    """Started, returned, refused in one line, or what was raised."""
+    try:
+        function(**given)
+    except Started:
+        return "started"
+    except millrace.UserFacingError as error:
+        return "refused" if str(error).isprintable() and len(str(error)) < 1100 else f"not one short line: {error!r}"
+    except Exception as error:
+        return repr(error)
+    return "returned"
+
+
+def test_any_argument_is_taken_or_refused_in_one_line(run: millrace.Run) -> None:
+    generator, all_doors = random.Random(1), doors(run)
+    raw = []
+    for _ in range(CALLS):
+        function, names, taken = generator.choice(all_doors)
+        chosen = generator.sample(sorted(names), k=min(len(names), generator.choice([1, 1, 2])))
+        odd = {name: generator.choice(ODD_VALUES) for name in chosen}
+        found = outcome(function, taken | odd)
+        if found not in ("started", "returned", "refused"):
+            raw.append(f"{function.__name__}({odd!a:.200}): {found:.200}")
+    assert not raw, f"{len(raw)} of {CALLS}:\n" + "\n".join(raw)
+
+
+NUMPY = {"workers": np.int64(1), "lanes": np.int32(2)}
+
+
+@pytest.mark.parametrize(
+    ("function", "given"),
+    [
+        (millrace.train, {"env": np.str_("CartPole-v1"), "envs": np.int64(4), "learning_rate": np.float32(0.5), **NUMPY}),
+        (millrace.train, {"env": "CartPole-v1", "net": (np.int64(8),), "normalize_rewards": np.bool_(True)}),
+        (
+            millrace.RolloutService,
+            {"env": np.str_("CartPole-v1"), "rollout_steps": np.int64(8), "envs": np.uint8(4), **NUMPY},
+        ),
+        (
+            millrace.RolloutService,
+            {"env": "CartPole-v1", "policy": millrace.MLP(8), "env_kwargs": {"a": np.int64(1)}},
+        ),
+        (millrace.make_vec, {"env": np.str_("CartPole-v1"), "num_envs": np.int64(4), "timeout": np.float64(5), **NUMPY}),
+        (millrace.make_vec, {"env": [np.str_("CartPole-v1")] * 2, "sutton_barto_reward": np.bool_(True)}),
+    ],
+)
+def test_numpys_scalars_are_numbers_and_text(function: Callable[..., Any], given: dict[str, Any]) -> None:
+    assert outcome(function, given) == "started"
+
+
+def test_numpys_scalars_arrive_as_pythons(run: millrace.Run) -> None:
+    policy = millrace.MLP(np.int64(8), activation=np.str_("relu"))  # type: ignore[arg-type]
+    assert [type(each) for each in (policy.net[0], policy.activation)] == [int, str]
+    shapes: Any = {"w": (np.int64(4), 2)}
+    own = millrace.OwnPolicy("m:f", shapes, state_size=np.int64(3))  # type: ignore[arg-type]
+    assert [type(each) for each in (own.arrays["w"][0], own.state_size)] == [int, int]
+    assert outcome(run.evaluate, {"episodes": np.int64(2), "seed": np.int64(1), "best": np.bool_(False)}) == "started"
+
+
+SURROGATE = "CartPole-v1\ud800"
+
+
+@pytest.mark.parametrize(
+    ("function", "given", "line"),
+    [
+        (millrace.train, {"env": SURROGATE}, r"train: env: expected text that can be encoded, got 'CartPole-v1\ud800'"),
+        (millrace.train, {"env": "CartPole-v1", "workers": False}, "keyword argument: workers: expected int, got False"),
+        (millrace.train, {"env": "CartPole-v1", "preset": True}, "train: preset: expected text, got True"),
+        (millrace.train, {"env": "CartPole-v1", "callbacks": 2}, "train: callbacks: expected a list, got 2"),
+        (millrace.train, {"env": "CartPole-v1", "watch": 2}, "train: watch: expected a function or None, got 2"),
+        (millrace.train, {"env": "CartPole-v1", "algo": 2}, "algo: expected text or a class, got 2"),
+        (millrace.train, {"resume": 2}, "train: resume: expected text or a path or None, got 2"),
+        (millrace.load, {"run": 2}, "load: run: expected text or a path, got 2"),
+        (millrace.load, {"run": "x", "best": 1}, "load: best: expected bool, got 1"),
+        (millrace.Run, {"path": None}, "Run: path: expected text or a path, got None"),
+        (millrace.Run, {"path": "a\nb"}, r"run a\nb: no such folder"),
+        (
+            millrace.RolloutService,
+            {"env": "CartPole-v1", "rollout_steps": 10**30},
+            f"RolloutService: rollout_steps: expected a number of at most 64 bits, got {10**30}",
+        ),
+        (
+            millrace.RolloutService,
+            {"env": "CartPole-v1", "rollout_steps": True},
+            "RolloutService: rollout_steps: expected int, got True",
+        ),
+        (
+            millrace.make_vec,
+            {"env": SURROGATE},
+            r"make_vec: env: expected text that can be encoded, got 'CartPole-v1\ud800'",
+        ),
+        (millrace.make_vec, {"env": "CartPole-v1", "workers": False}, "make_vec: workers: expected int or None, got False"),
+        (millrace.make_vec, {"env": "CartPole-v1", "copy": 1}, "make_vec: copy: expected bool, got 1"),
+        (millrace.MLP, {"activation": "sin"}, "MLP: activation: expected one of tanh, relu, got 'sin'"),
+        (millrace.Recurrent, {"core_size": True}, "Recurrent: core_size: expected int, got True"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(function: Callable[..., Any], given: dict[str, Any], line: str) -> None:
+    with pytest.raises(millrace.UsageError) as caught:
+        function(**given)
+    assert str(caught.value) == line
+
+
+def test_a_call_with_another_signature_is_a_type_error_as_of_any_function() -> None:
+    with pytest.raises(TypeError, match=r"load\(\) got an unexpected keyword argument 'bset'"):
+        millrace.load("x", bset=True)  # type: ignore[call-arg]
