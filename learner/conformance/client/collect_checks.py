@@ -443,11 +443,14 @@ def ignores_what_it_cannot_read(learner: Learner) -> Script[None]:
     """A Collect with an extra field, Weights with a missing frame, and one for another session."""
     session = yield from collecting(learner)
     yield from session.collect(session.permit())
-    message = Collect(learner.session, 1, (session.permit(),), learner.of_lanes())
-    head = msgpack.unpackb(bytes(encode(message)[0]))
-    learner.send_frames([msgpack.packb([*head, "one field too many"])])
-    learner.send_frames([msgpack.packb(head[:-1])])
-    learner.send_frames([encode(session.weights(9))[0]])
+    permit = session.permit()
+    head = msgpack.unpackb(bytes(encode(Collect(learner.session, 1, (permit,), learner.of_lanes()))[0]))
+    learner.send_unreadable(
+        permit.ticket,
+        [msgpack.packb([*head, "one field too many"])],
+        [msgpack.packb(head[:-1])],
+        [encode(session.weights(9))[0]],
+    )
     other = Collect(learner.session + 1000, 1, (session.permit(),), ())
     learner.send(other)
     text = "no rollout for a Collect with a field too many or too few, or of another session"

@@ -129,6 +129,13 @@ class Learner:
         """Send these frames, whatever they are."""
         self.effects.append(Send(self.peer, frames))
 
+    def send_unreadable(self, ticket: int, *messages: list[Buffer]) -> None:
+        """Send frames that cannot be read, some of them with this ticket, which the client must not answer."""
+        assert self.watch is not None
+        self.watch.unreadable(ticket)
+        for frames in messages:
+            self.send_frames(frames)
+
     def reply(self) -> None:
         """Send the next HeartbeatReply."""
         assert self.watch is not None

@@ -13,6 +13,7 @@ import numpy as np
 
 from learner.conformance.client import rules
 from learner.conformance.client.lane_rows import LaneRows
+from learner.conformance.client.rules import Rule
 from learner.conformance.client.script import Broken, brief
 from protocol.arrays import Array
 from protocol.errors import BadRollout
@@ -41,6 +42,8 @@ from protocol.specs import DescribeSpec, Leaf, RunSpec, StepSpec
 
 HEARTBEATS_LATE = 2.0  # of these may be missing,
 LATE_S = 1.5  # and a busy machine may add so many seconds
+OTHER_SESSION = rules.OTHER_SESSION, "its session was another"
+UNREADABLE = rules.IGNORE_UNREADABLE, "no message that names it can be read"
 
 
 class Dealt(NamedTuple):
@@ -72,7 +75,7 @@ class Watch:
         self.rollouts: dict[int, Rollout] = {}
         """the first rollout of each ticket"""
         self.said_goodbye = False
-        self._foreign = set[int]()  # tickets that were sent under the number of another session
+        self._ignored: dict[int, tuple[Rule, str]] = {}  # tickets that must not be answered: the rule, and why
         self._incarnations: dict[int, int] = {}  # the highest dealt, by lane
         self._outdated = set[int]()  # tickets that were dealt for a lower one
         self._asked, self._answered = Counter[int](), Counter[int]()
@@ -89,12 +92,12 @@ class Watch:
             case Weights(version):
                 self.versions[version] = message
             case Reset() | Step() | Call() | Evaluate() if message.session != self.session:
-                self._foreign.add(message.ticket)
+                self._ignored[message.ticket] = OTHER_SESSION
             case Reset() | Step() | Call() | Evaluate():
                 self.orders[message.ticket] = message
                 self._asked[message.ticket] += 1
             case Collect(session, _, permits) if session != self.session:
-                self._foreign |= {permit.ticket for permit in permits}
+                self._ignored |= {permit.ticket: OTHER_SESSION for permit in permits}
             case Collect(_, version, permits):
                 for permit in permits:
                     newest = max(permit.incarnation, self._incarnations.get(permit.lane, 0))
@@ -105,6 +108,10 @@ class Watch:
                     self._asked[permit.ticket] += 1
             case HeartbeatReply(session, number) if session == self.session:
                 self.replies = max(self.replies, number)
+
+    def unreadable(self, ticket: int) -> None:
+        """The learner sends this ticket in messages that cannot be read."""
+        self._ignored[ticket] = UNREADABLE
 
     # --------------------------------------------------------------------------------------------- what the client says
 
@@ -176,14 +183,13 @@ class Watch:
                 rules.HEARTBEAT_TICKETS, "only tickets that are not finished", f"ticket {finished[0]}, which was answered"
             )
 
-    def _see_foreign(self, message: Stepped | Returned | Rollout) -> None:
-        if message.ticket in self._foreign:
-            raise Broken(
-                rules.OTHER_SESSION, f"ticket {message.ticket} to be ignored: its session was another", brief(message)
-            )
+    def _see_ignored(self, message: Stepped | Returned | Rollout) -> None:
+        if message.ticket in self._ignored:
+            rule, why = self._ignored[message.ticket]
+            raise Broken(rule, f"ticket {message.ticket} to be ignored: {why}", brief(message))
 
     def _see_answer(self, message: Stepped | Returned) -> None:
-        self._see_foreign(message)
+        self._see_ignored(message)
         order = self.orders.get(message.ticket)
         if order is None or isinstance(order, Evaluate):
             last = f"ticket {max(self.orders)} was the last order" if self.orders else "no order was sent in this session"
@@ -223,9 +229,9 @@ class Watch:
                 )
 
     def _see_rollout(self, message: Rollout) -> None:
+        self._see_ignored(message)
         if not isinstance(self.run, RunSpec):
             raise Broken(rules.TICKETS, "no rollout in a session whose copies are stepped on order", brief(message))
-        self._see_foreign(message)
         dealt = self.permits.get(message.ticket)
         if dealt is None:
             raise Broken(rules.TICKETS, f"a ticket that was dealt: {sorted(self.permits) or 'none yet'}", brief(message))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -27,7 +28,7 @@ from learner.conformance.client.script import (
 )
 from protocol.env_spec import EnvSpec
 from protocol.errors import BadMessage
-from protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello, Welcome
+from protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello, Rollout, Stepped, Welcome
 from protocol.wire.codec import decode_to_worker
 from tests.protocol.test_wire_document import DOCUMENT
 
@@ -105,10 +106,19 @@ def test_what_is_not_checked_within_the_limit_has_failed() -> None:
     assert test.results[2].got == "no time left"
 
 
-def welcomed() -> tuple[Examiner, int]:
-    test = examiner(in_a_session)
+def sends_what_cannot_be_read(learner: Learner) -> Script[None]:
+    from learner.conformance.client.join_checks import describe_spec
+
+    yield from learner.newly_started()
+    learner.welcome(describe_spec(learner))
+    learner.send_unreadable(7, [b"\xc1"])
+    yield from learner.let_pass(30.0)
+
+
+def welcomed(script: Callable[[Learner], Script[None]] = in_a_session) -> tuple[Examiner, int]:
+    test = examiner(script)
     test.tick(0.0)
-    (sent,) = test.handle(Heard(b"w", HELLO), 0.1)
+    sent, *_ = test.handle(Heard(b"w", HELLO), 0.1)
     assert isinstance(sent, Send)
     welcome = decode_to_worker(list(sent.frames))
     assert isinstance(welcome, Welcome)
@@ -146,6 +156,15 @@ def test_what_breaks_a_rule_of_every_session_fails_the_check_at_once(event: Hear
     assert test.results[0].rule == rule
     if isinstance(event, Ended):
         assert "Segmentation fault" in test.results[0].got
+
+
+@pytest.mark.parametrize("kind", [Stepped, Rollout])
+def test_an_answer_to_what_cannot_be_read_breaks_the_rule_for_that(kind: type[Stepped | Rollout]) -> None:
+    test, session = welcomed(sends_what_cannot_be_read)
+    none: Any = None
+    fields = dict.fromkeys(kind.__struct_fields__, none) | {"session": session, "ticket": 7}
+    test.handle(Heard(b"w", kind(**fields)), 0.2)
+    assert test.results[0].rule == rules.IGNORE_UNREADABLE
 
 
 def test_a_reply_that_was_never_sent_is_noticed() -> None:
