@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -146,6 +147,14 @@ def test_an_action_space_that_is_not_supported_is_one_line(name: str) -> None:
 def test_observations_without_a_fixed_array_are_refused(space: gymnasium.Space[object]) -> None:
     with pytest.raises(UsageError, match="is not supported"):
         observation_leaves(space)
+
+
+@pytest.mark.parametrize("page", ["how-to/environments.md", "how-to/vector_env.md", "explanation/limits.md"])
+def test_a_page_names_every_space_of_gymnasium_that_is_not_supported(page: str) -> None:
+    found = {name for name, kind in vars(spaces).items() if isinstance(kind, type) and issubclass(kind, gymnasium.Space)}
+    refused = found - {"Space", "Box", "Discrete", "MultiDiscrete", "MultiBinary", "Dict", "Tuple"}
+    text = (Path(__file__).parents[3] / "docs" / page).read_text(encoding="utf-8")
+    assert [name for name in sorted(refused) if f"`{name}`" not in text] == []
 
 
 # ------------------------------------------------------------------------------------------------ what the learner refuses
