@@ -57,6 +57,11 @@ RECORDS: tuple[type, ...] = (
     specs.Leaf,
     specs.ActionSpec,
 )
+EXAMPLES = (
+    Hello(PROTOCOL_VERSION, "w0", "host", 7, 77, "millrace", 78),
+    Collect(1234605616436508, 3, (Permit(40, 0, 1),), (Received(0, 1, 9, (10,)),)),
+    Weights(3, np.arange(6, dtype=np.float32), np.zeros(0, np.float32)),
+)
 # Fields that mean the same wherever they stand, or whose name says it all: used where the code adds nothing to the name.
 WORDS: Mapping[str, str] = {
     "session": "number of the session",
@@ -229,11 +234,8 @@ def part_version() -> str:
 
 
 def part_example() -> str:
-    weights = Weights(3, np.arange(6, dtype=np.float32), np.zeros(0, np.float32))
-    collect = Collect(81985529216486895, 3, (Permit(40, 0, 1),), (Received(0, 1, 9, (10,)),))
-    hello = Hello(PROTOCOL_VERSION, "w0", "host", 7, 77, "millrace", 78)
     lines = ["```"]
-    for message in (hello, collect, weights):
+    for message in EXAMPLES:
         head, *arrays = codec.encode(message)
         lines.append(f"frame 0  {shown(bytes(head))}")
         lines += [f"         {row}" for row in textwrap.wrap(bytes(head).hex(" "), 3 * 32)]
@@ -384,6 +386,19 @@ def test_a_worker_is_told_by_its_table_what_to_do_with_every_message() -> None:
 def test_a_difference_is_noticed() -> None:
     text = DOCUMENT.read_text(encoding="utf-8").replace("| `sequence` | `Natural`", "| `sequence` | `str`")
     assert rewritten(text) != text
+
+
+@pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
+def test_an_example_is_within_its_bounds(message: Hello | Collect | Weights) -> None:
+    decode = codec.decode_to_learner if isinstance(message, Hello) else codec.decode_to_worker
+    assert type(decode(codec.encode(message))) is type(message)
+
+
+def test_a_factory_stands_in_the_head_as_the_document_says() -> None:
+    env = env_spec.EnvSpec("mine", factory=env_spec.PickledCallable(b"abc"))
+    head, frame = codec.encode(messages.Welcome(1, 78, specs.DescribeSpec(env)))
+    assert msgspec.msgpack.decode(head)[3]["env"]["factory"] == ["|u1", [3], 1]
+    assert (bytes(frame), '`["|u1", [bytes], frame]`' in DOCUMENT.read_text(encoding="utf-8")) == (b"abc", True)
 
 
 def test_rollouts_fields_stand_in_the_order_of_the_code() -> None:

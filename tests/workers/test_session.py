@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from protocol.env_spec import EnvSpec
 from protocol.messages import (
     PROTOCOL_VERSION,
     Call,
@@ -36,6 +37,7 @@ from protocol.messages import (
     Weights,
     Welcome,
 )
+from protocol.specs import StepSpec
 from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollouts, run_spec
 from workers.collect.held_rollouts import REMEMBERED_TICKETS
 from workers.session import (
@@ -440,6 +442,17 @@ def test_a_late_copy_of_a_message_closes_no_lane_that_came_after_it(copy: ToWork
     session = ready(HeartbeatReply(SESSION, 1, ()), collect((0, 0)), collect((1, 1), received=lanes(0, 1)))
     assert session.handle(copy, 0.2) == []
     assert session.held_count() == 2
+
+
+def test_a_late_copy_of_an_order_opens_its_released_lane_until_the_next_reply() -> None:
+    lane, order = LaneIncarnation(0, 0), Reset(SESSION, 60, 0, 0, (0,), (None,), np.zeros(0, np.uint8))
+    session = joining()
+    session.handle(Welcome(SESSION, FIRST, StepSpec((EnvSpec("Any-v0"),), (0,), (1,), (), ())), 0.0)
+    session.handle(order, 0.1)
+    assert session.handle(Release(SESSION, (lane,)), 0.2) == [CloseLanes((lane,))]
+    assert session.handle(order, 0.3) == []
+    assert session.next_order() == order
+    assert session.handle(HeartbeatReply(SESSION, 1, ()), 0.4) == [CloseLanes((lane,))]
 
 
 def test_a_rollout_of_a_lane_that_was_released_while_it_was_collected_is_not_sent() -> None:

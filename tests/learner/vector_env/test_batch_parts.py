@@ -34,7 +34,7 @@ def test_lanes_have_consecutive_rows() -> None:
 
 
 def test_infos_get_the_number_of_their_env_copy() -> None:
-    assert unpack_infos(pack([[0, {"a": 1}], [1, {}], [2, {"b": 1}]]), range(4, 6)) == {4: {"a": 1}, 5: {}}
+    assert unpack_infos(pack([(0, {"a": 1}), [1, {}], [2, {"b": 1}]]), range(4, 6)) == {4: {"a": 1}, 5: {}}
 
 
 @pytest.mark.parametrize("value", [7, [7], [[0]], [[0, 1, 2]], [[0, "text"]], [[0.0, {}]], [[True, {}]]])
