@@ -11,7 +11,7 @@ import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
-from protocol.bounds import escaped
+from protocol.bounds import MAX_TEXT, one_line
 from protocol.errors import UserFacingError, first_line
 
 OURS = {"learner", "millrace", "protocol", "workers"}
@@ -30,7 +30,7 @@ def last_line(program: str, error: BaseException, command: str, hints: Sequence[
             why = str(error)
         case _:
             why = f"{users_code(error) or 'internal error'}: {type(error).__name__}: {first_line(error)}"
-    return escaped("; ".join([f"{program}: {why}", *more, *hints]))  # it may quote what a worker said
+    return one_line("; ".join([f"{program}: {why}", *more, *hints]), MAX_TEXT)  # it may quote a worker, or a file
 
 
 def users_code(error: BaseException) -> str:

@@ -7,10 +7,13 @@ its own how long the content stays the same.
 from __future__ import annotations
 
 from enum import Enum
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import msgspec
+from msgspec import Meta
 from msgspec.structs import replace
+
+from protocol.bounds import Line, Natural
 
 WIDTH = 1024  # bytes: every rewrite has the same length, so that one of them replaces the whole
 HIGHEST_COUNT = 10**12
@@ -39,23 +42,23 @@ class Listens(NamedTuple):
 class Owner(msgspec.Struct, frozen=True, kw_only=True):
     """The content of the lock file."""
 
-    host: str
-    pid: int
-    boot: str
+    host: Line
+    pid: Annotated[int, Meta(ge=1, le=2**31 - 1)]
+    boot: Line
     """Which running kernel the process is on: processes with the same one are on one machine."""
-    token: str
+    token: Line
     """Random: two locks never have the same."""
-    network: str = ""
+    network: Line = ""
     """Which network it is in: a container on the same machine may be in another one."""
-    address: str = ""
+    address: Line = ""
     """Where its learner listens, for other machines; empty if nobody can ask it, or it does not listen yet."""
-    here: str = ""
+    here: Line = ""
     """The same for processes on its machine and in its network."""
-    keys: str = ""
+    keys: Line = ""
     """The key folder of its learner; empty if it needs no key."""
     closed: Closed | None = None
     """Why nobody can ask it, where that is known."""
-    count: int = 0
+    count: Natural = 0
     """How often the owner has rewritten the file."""
 
     def __str__(self) -> str:
@@ -78,7 +81,7 @@ def decoded(content: bytes) -> Owner | None:
     """The owner that this content names. None if it names none: it was cut, or is being written."""
     try:
         return msgspec.json.decode(content.strip(), type=Owner)
-    except msgspec.MsgspecError:
+    except (msgspec.MsgspecError, UnicodeError, RecursionError):
         return None
 
 

@@ -11,6 +11,7 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from msgspec.structs import replace
@@ -292,4 +293,16 @@ def test_a_process_that_is_gone_trains_nothing(tmp_path: Path) -> None:
         mine = owner_of(tmp_path)
     (tmp_path / LOCK_FILE).write_bytes(replace(mine, pid=ended.pid, address="ipc:///tmp/x").encoded())
     with pytest.raises(UsageError, match=rf"no process trains it now; process {ended.pid} on \S+ did, and is gone"):
+        learner_of_run(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"host": "here\nmillrace: all is well"}, {"host": "\x1b[2J"}, {"pid": 2**31}, {"pid": 0}, {"pid": -1}, {"count": -1}],
+)
+def test_a_lock_file_that_no_owner_wrote_names_no_process(tmp_path: Path, wrong: dict[str, Any]) -> None:
+    """What it says reaches a terminal, and its process id the system."""
+    (tmp_path / LOCK_FILE).write_bytes(replace(ELSEWHERE, **wrong).encoded())
+    assert decoded((tmp_path / LOCK_FILE).read_bytes()) is None
+    with pytest.raises(UsageError, match="names no process"):
         learner_of_run(tmp_path)
