@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from learner.report.learning_curves import COLORS, DPI, GREY
-from learner.run_folder.versions import versions
+from learner.run_folder.run_format import versions
 
 RESULTS = Path(__file__).parent / "results"
 Bars = tuple[str, Mapping[str, float]]

@@ -7,7 +7,6 @@ failures that are allowed are those of a training run.
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -53,17 +52,7 @@ def saved_policy(
     card, parameters, buffers = RunFolder.open_policy(run).read_policy(which)
     outer = card.wrappers if wrappers is None else wrappers
     spec = EnvSpec.of(card.env if env is None else env, card.env_kwargs, outer, card.eval_env_kwargs)
-    facts = _facts_of_older(run) if card.facts is None else card.facts
-    return SavedPolicy(card.policy, spec, parameters, buffers, facts, card.masked)
-
-
-def _facts_of_older(run: Path) -> tuple[str, ...]:
-    """The `info_keys` of a run whose policy.json does not say them; none if its config.toml cannot be read."""
-    try:
-        keys = tomllib.loads((run / "config.toml").read_text("utf-8")).get("info_keys", "")
-        return RolloutConfig(info_keys=keys).fact_names() if isinstance(keys, str) else ()
-    except (OSError, ValueError):
-        return ()
+    return SavedPolicy(card.policy, spec, parameters, buffers, card.facts, card.masked)
 
 
 def load_policy(run: Path, which: Which = "final") -> tuple[Policy, PolicySpec, EnvSpec]:

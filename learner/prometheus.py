@@ -33,7 +33,7 @@ from learner.config.config import Config
 from learner.rollouts.hub import Hub, HubObserver
 from learner.run_folder.progress import Progress
 from learner.run_folder.results import FactMean
-from learner.run_folder.versions import versions
+from learner.run_folder.run_format import versions
 from protocol.address import WILDCARDS, is_local
 from protocol.bounds import MAX_FACTS
 from protocol.errors import UsageError

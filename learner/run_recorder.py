@@ -36,7 +36,7 @@ from learner.run_folder.progress import Progress, Row, named, steps_per_second
 from learner.run_folder.requests import Requests
 from learner.run_folder.results import Best, Summary
 from learner.run_folder.run_folder import RunFolder
-from learner.run_folder.versions import versions
+from learner.run_folder.run_format import versions
 from learner.run_state import RunState
 from protocol.arrays import Array, Floats
 from protocol.bounds import one_line

@@ -7,7 +7,6 @@ keyword arguments. A setting has one name everywhere: the field `learning_rate` 
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -19,7 +18,7 @@ from learner.config.config import TABLES, Config
 from learner.config.hyperparameters import HYPERPARAMETERS, algorithms_with
 from learner.config.presets import PRESETS, environment_presets, named_presets
 from learner.config.validation import convert, validate
-from learner.run_folder.run_format import check_format, check_whole
+from learner.run_folder.run_format import check_format, parse_toml, read_config
 from protocol.envs.found_names import moved
 from protocol.errors import UsageError, did_you_mean
 
@@ -48,7 +47,7 @@ def config_from_toml(text: str, where: str = "config.toml") -> Config:
 
     `where`: the file's name for error messages.
     """
-    return validate(_override_from_toml(Config(), _parse_toml(text, where), where), where)
+    return validate(_override_from_toml(Config(), parse_toml(text, where), where), where)
 
 
 def config_of_run(run: Path, algo: str | None = None) -> Config:
@@ -57,7 +56,10 @@ def config_of_run(run: Path, algo: str | None = None) -> Config:
     `algo`: the name that its algorithm has now, if it may be another one (`algorithm_names.moved`).
     """
     where = run / "config.toml"
-    table = with_algorithm(_read_toml(where, of_run=True), algo)
+    try:
+        table = with_algorithm(read_config(run), algo)
+    except FileNotFoundError:
+        raise UsageError(f"run {run}: expected a run folder with a config.toml, got none") from None
     return validate(_override_from_toml(Config(), table, str(where)), str(where))
 
 
@@ -80,8 +82,7 @@ def lower_layers(
             raise UsageError(f"run {resume}: expected a run folder with a config.toml to resume, got none")
         check_format(resume)
     where = str(file)
-    table = {} if file is None else _read_toml(file, of_run=resume is not None)
-    table = table if resume is None else with_algorithm(table, algo)
+    table = {} if file is None else _read_toml(file) if resume is None else with_algorithm(read_config(resume), algo)
     if resume is not None and env and not moved(str(table.get("env")), env):
         raise UsageError(f"run {resume} is of {table.get('env')}, not of {env}; resume it without naming an environment")
     named = named_presets()
@@ -151,25 +152,13 @@ def _coerce(record: msgspec.Struct, name: str, value: Any) -> Any:
     return value
 
 
-def _read_toml(file: Path, *, of_run: bool = False) -> dict[str, Any]:
-    """Read a TOML file of settings; `of_run`: the config.toml of a run folder, which must be whole."""
+def _read_toml(file: Path) -> dict[str, Any]:
+    """Read a TOML file of settings."""
     try:
-        text = file.read_text("utf-8")
-        check_whole(text, str(file))
-        table = _parse_toml(text, str(file))
-        if of_run and not table.keys() >= {"env", "algo", "seed"}:
-            raise UsageError(f"{file} has no env, algo or seed: it is damaged; restore it, or start a new run")
-        return table
+        return parse_toml(file.read_text("utf-8"), str(file))
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "it is not text"
         raise UsageError(f"config file {file} cannot be read: {why}") from error
-
-
-def _parse_toml(text: str, where: str) -> dict[str, Any]:
-    try:
-        return tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise UsageError(f"{where} is not TOML: {error}") from error
 
 
 def _override_from_toml(config: Config, table: dict[str, Any], where: str) -> Config:

@@ -16,6 +16,7 @@ from typing import Any
 from learner.policy_player import PolicyPlayer
 from learner.recording.played_episodes import PlayedEpisodes
 from learner.rollouts.evaluation_tickets import PlayedEpisode, episode_seeds, evaluation_of
+from learner.run_folder.regular_files import subfolder
 from learner.run_folder.results import Evaluation
 from protocol.errors import EnvironmentFailed, RunError, UsageError
 
@@ -59,7 +60,7 @@ def record_videos(
     results: list[PlayedEpisode] = []
     videos: list[Path] = []
     try:
-        folder.mkdir(exist_ok=True)
+        subfolder(run, FOLDER)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".new-") as new:
             while len(results) < episodes:
                 count = min(AT_ONCE, episodes - len(results))

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-import msgspec
 import numpy as np
 
 from learner.config.presets import environment_name
 from learner.run_folder.metrics_log import METRICS_FILE, read_rows
 from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
-from learner.run_folder.run_format import check_format, check_whole
+from learner.run_folder.regular_files import reason
+from learner.run_folder.run_format import CONFIG_FILE, check_format, read_config
 from protocol.arrays import Doubles
 from protocol.errors import UsageError
 
 GRID_POINTS = 400
+LARGEST_DRAWN = 1e300
 
 Purpose = Literal["plot", "report on"]
 """What a run folder is read for; error messages say so."""
@@ -46,8 +46,9 @@ class RunFiles(NamedTuple):
     rows: list[dict[str, Any]]
 
     def points(self, key: str) -> list[tuple[float, float]]:
-        """Env steps and value of this metric, for each row that has it."""
-        return [(row[ENV_STEPS_KEY], row[key]) for row in self.rows if row.get(key) is not None]
+        """Env steps and value of this metric, for each row that has it. Values are cut to ±1e300: axes are longer."""
+        found = ((row[ENV_STEPS_KEY], row.get(key)) for row in self.rows)
+        return [(steps, min(max(value, -LARGEST_DRAWN), LARGEST_DRAWN)) for steps, value in found if value is not None]
 
     def curve(self) -> Curve | None:
         """The learning curve, or None before the first episode has ended."""
@@ -63,19 +64,17 @@ def algorithm_label(algo: str) -> str:
 
 def read_run_files(run: Path, purpose: Purpose) -> RunFiles:
     """Read a run folder. Raises `UsageError`, with a one-line message that names `purpose`, if it cannot be read."""
+    if not (run / CONFIG_FILE).is_file():
+        missing = f"no {CONFIG_FILE}" if run.is_dir() else "no such folder"
+        raise UsageError(f"run {run}: expected a run folder to {purpose}, got {missing}")
     elsewhere = check_format(run).workers_elsewhere
+    config = read_config(run)
+    env = environment_name(config["env"], config.get("env_kwargs", {}), config["algo"])
     try:
-        text = (run / "config.toml").read_text("utf-8")
-        check_whole(text, str(run / "config.toml"))
-        config = tomllib.loads(text)
-        algo, seed = str(config["algo"]), int(config["seed"])
-        env = environment_name(str(config["env"]), dict(config.get("env_kwargs", {})), algo)
-        return RunFiles(env, algo, seed, config, elsewhere, read_rows(run / METRICS_FILE))
-    except FileNotFoundError as error:
-        missing = f"no {Path(error.filename).name}" if run.is_dir() else "no such folder"
-        raise UsageError(f"run {run}: expected a run folder to {purpose}, got {missing}") from error
-    except (OSError, ValueError, KeyError, TypeError, RecursionError, msgspec.MsgspecError) as error:
-        raise UsageError(f"run {run}: it is damaged, there is nothing to {purpose}: {error}") from error
+        rows = read_rows(run / METRICS_FILE)
+    except OSError as error:
+        raise UsageError(f"run {run}: nothing to {purpose}: {METRICS_FILE} cannot be read: {reason(error)}") from error
+    return RunFiles(env, config["algo"], config["seed"], config, elsewhere, rows)
 
 
 def common_grid(curves: Sequence[Curve]) -> tuple[Doubles, Doubles]:

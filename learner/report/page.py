@@ -27,7 +27,7 @@ def write_page(runs: Sequence[Path], out: Path) -> Path:
         raise UsageError(f"{out} is a folder; expected the file to write, as in: --out report.html")
     text = page(runs)
     try:
-        write_atomically(out, lambda file: file.write(text.encode()))
+        write_atomically(out, lambda file: file.write(text.encode(errors="replace")))  # a name of a file may not be UTF-8
     except OSError as error:
         raise RunError(f"{out} not written: {error.strerror}") from error
     return out

@@ -13,13 +13,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 
 from learner.report.curve import Curve, Purpose, algorithm_label, read_run_files
-from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY, steps_per_second
+from learner.run_folder.metrics_log import METRICS_FILE
+from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY, UPDATES_KEY, steps_per_second
+from learner.run_folder.regular_files import regular_files
 from learner.run_folder.results import EVALUATION_KEY, Evaluation, FactMean
 from learner.run_folder.run_folder import RunFolder
 from protocol.arrays import Doubles
+from protocol.bounds import Natural, Real, Seconds
+from protocol.errors import UsageError
 
 MAY_DIFFER_IN_A_GROUP = ("seed", "run_dir")
 MOST_DIFFERENCES = 3  # settings that are listed after the name of a group, if no more are needed to tell groups apart
@@ -30,19 +35,19 @@ ELSEWHERE = "started elsewhere"
 class RunResults(NamedTuple):
     """The numbers of one run."""
 
-    env_steps: int
-    updates: int
-    wall_s: float
-    env_steps_per_s: float
-    return_mean_100: float | None
+    env_steps: Natural
+    updates: Natural
+    wall_s: Seconds
+    env_steps_per_s: Real
+    return_mean_100: Real | None
     """mean return of the last 100 training episodes"""
     evaluation: Evaluation | None
     stop_reason: str
     """why the run stopped, or that it has not stopped"""
     cut_short: bool
     """whether an error or an interrupt ended it"""
-    ledger: dict[str, int]
-    stages: dict[str, float]
+    ledger: dict[str, Natural]
+    stages: dict[str, Seconds]
     facts: dict[str, FactMean] = {}
     """of each name in `info_keys`: mean over the last training episodes"""
 
@@ -144,18 +149,19 @@ class ReportData:
 def read_run(path: Path, purpose: Purpose = "report on") -> Run:
     """Read a run folder. Raises `UsageError`, with a one-line message that names `purpose`, if it cannot be read."""
     files = read_run_files(path, purpose)
+    of_algorithm = files.config.get(files.algo)
     return Run(
         path=path,
         env=files.env,
         algo=files.algo,
         seed=files.seed,
         settings=_flatten(files.config, files.algo) | ({"workers": ELSEWHERE} if files.workers_elsewhere else {}),
-        algorithm_settings=frozenset(files.config.get(files.algo) or ()),
+        algorithm_settings=frozenset(of_algorithm if isinstance(of_algorithm, dict) else ()),
         results=_results(path, files.rows),
         curve=files.curve(),
         evaluations=np.asarray(files.points(EVALUATION_KEY), np.float64).reshape(-1, 2),
-        videos=tuple(sorted((path / "videos").glob("*.mp4"))),
-        images=tuple(sorted(path.glob("observation*.png"))),
+        videos=tuple(regular_files(path, "videos/*.mp4")),
+        images=tuple(regular_files(path, "observation*.png")),
     )
 
 
@@ -221,19 +227,23 @@ def _results(path: Path, rows: Sequence[dict[str, Any]]) -> RunResults:
             summary.evaluation, summary.stop_reason, summary.cut_short, summary.ledger, summary.stages, summary.facts_100,
         )  # fmt: skip
     last = rows[-1] if rows else {}
-    env_steps, wall_s = int(last.get(ENV_STEPS_KEY) or 0), float(last.get("time/time_elapsed") or 0)
-    return RunResults(
+    env_steps, wall_s = last.get(ENV_STEPS_KEY, 0), last.get("time/time_elapsed") or 0.0
+    results = RunResults(
         env_steps=env_steps,
-        updates=int(last.get("time/iterations") or 0),
+        updates=last.get(UPDATES_KEY) or 0,
         wall_s=wall_s,
         env_steps_per_s=steps_per_second(env_steps, wall_s),
         return_mean_100=last.get(RETURN_KEY),
         evaluation=None,
         stop_reason="not finished",
         cut_short=False,
-        ledger={name.removeprefix("ledger/"): int(last[name]) for name in last if name.startswith("ledger/")},
-        stages={name.removeprefix("stage/"): float(last[name]) for name in last if name.startswith("stage/")},
+        ledger={name.removeprefix("ledger/"): last[name] for name in last if name.startswith("ledger/")},
+        stages={name.removeprefix("stage/"): last[name] for name in last if name.startswith("stage/")},
     )
+    try:
+        return msgspec.convert(tuple(results), RunResults)
+    except msgspec.ValidationError as error:
+        raise UsageError(f"run {path}: the last row of {METRICS_FILE} is damaged: {error}; remove it") from error
 
 
 def _flatten(config: dict[str, Any], algo: str) -> dict[str, str]:

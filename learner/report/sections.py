@@ -1,4 +1,4 @@
-"""The sections of the page, as HTML text: results, curves, videos, settings. Pure, except that it reads the videos.
+"""The sections of the page, as HTML text: results, curves, videos, settings. Pure, except that it reads films and pictures.
 
 Rule: text from run folders is escaped.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Iterable, Mapping
 from html import escape
+from pathlib import Path
 
 import numpy as np
 
@@ -16,10 +17,11 @@ from learner.report.curve import common_grid
 from learner.report.html_parts import color_dot, return_text, section, time_text
 from learner.report.runs import ReportData, RunGroup, differing_settings
 from learner.run_folder.episode_window import WINDOW_EPISODES
+from learner.run_folder.regular_files import read
 from learner.run_folder.results import FactMean
 
 WIDE, NARROW = (1080, 360), (540, 320)
-MOST_VIDEO_BYTES, MOST_BYTES_OF_ALL_VIDEOS = 4 * 2**20, 24 * 2**20
+MOST_BYTES_OF_ONE, MOST_BYTES_OF_ALL = 4 * 2**20, 24 * 2**20  # films or pictures
 
 
 def title(report: ReportData) -> str:
@@ -141,15 +143,15 @@ def _series(group: RunGroup) -> Iterable[Series]:
 
 def images(report: ReportData) -> str:
     """What the policy sees: of each environment with images, the picture of its first run that has one."""
-    figures = []
+    figures, room = [], [MOST_BYTES_OF_ALL]
     for env in report.envs:
         runs = [run for group, run in report.runs if group.env == env and run.images]
         for path in runs[0].images if runs else ():
             name = path.stem.removeprefix("observation").lstrip("-")
-            data = base64.b64encode(path.read_bytes()).decode()
-            alt = f"Image observations of {env}"
+            alt = escape(f"Image observations of {env}")
+            shown = _shown(path, room, f'<img alt="{alt}" src="data:image/png;base64,', '">')
             caption = f"<figcaption>{escape(env)}<span>{escape(name)}</span></figcaption>"
-            figures.append(f'<figure><img alt="{escape(alt)}" src="data:image/png;base64,{data}">{caption}</figure>')
+            figures.append(f"<figure>{shown}{caption}</figure>")
     if not figures:
         return ""
     about = "Image observations at four steps of the first rollout, from above. Stacked frames are side by side."
@@ -158,23 +160,26 @@ def images(report: ReportData) -> str:
 
 def videos(report: ReportData) -> str:
     """The newest video of each run. Large ones are named instead of shown."""
-    figures, bytes_left = [], MOST_BYTES_OF_ALL_VIDEOS
+    figures, room = [], [MOST_BYTES_OF_ALL]
     for name, (group, run) in zip(report.short_names(), report.runs, strict=True):
         if not run.videos:
             continue
         newest = max(run.videos, key=lambda path: (path.stat().st_mtime_ns, path.name))
-        size = newest.stat().st_size
+        shown = _shown(newest, room, '<video controls muted loop playsinline src="data:video/mp4;base64,', '"></video>')
         caption = f"<figcaption>{color_dot(group)}{escape(name)}<span>{escape(newest.name)}</span></figcaption>"
-        if size > min(MOST_VIDEO_BYTES, bytes_left):
-            shown = f'<p class="none">{size / 2**20:.1f} MiB, too large for this page:<br>{escape(str(newest))}</p>'
-        else:
-            bytes_left -= size
-            data = base64.b64encode(newest.read_bytes()).decode()
-            shown = f'<video controls muted loop playsinline src="data:video/mp4;base64,{data}"></video>'
         figures.append(f"<figure>{shown}{caption}</figure>")
     if not figures:
         return ""
     return section("Videos", "Greedy episodes.", f'<div class="films">{"".join(figures)}</div>')
+
+
+def _shown(path: Path, room: list[int], before: str, after: str) -> str:
+    """A film or picture as part of the page, or why it is not. `room`: how many bytes the section has left."""
+    size = path.stat().st_size
+    if size > min(MOST_BYTES_OF_ONE, room[0]):
+        return f'<p class="none">{size / 2**20:.1f} MiB, too large for this page:<br>{escape(str(path))}</p>'
+    room[0] -= size
+    return f"{before}{base64.b64encode(read(path, MOST_BYTES_OF_ONE)).decode()}{after}"
 
 
 def settings(report: ReportData) -> str:

@@ -16,6 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
+from learner.run_folder.regular_files import open_regular
 from protocol.errors import RunError
 
 log = logging.getLogger("millrace.learner")
@@ -31,8 +32,9 @@ Write = Callable[[], object]
 def write_atomically(target: Path, write: Callable[[BinaryIO], object]) -> None:
     """Let `write` fill the file and replace the target by it. Raises what `write` or the file system raises."""
     temporary = target.with_name(target.name + TEMPORARY)
+    temporary.unlink(missing_ok=True)  # from a process that was killed, or a link
     try:
-        with temporary.open("wb") as file:
+        with os.fdopen(open_regular(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "wb") as file:
             write(file)
             file.flush()
             os.fsync(file.fileno())

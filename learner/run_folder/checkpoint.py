@@ -8,12 +8,14 @@ first.
 
 from __future__ import annotations
 
+import os
 import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from learner.run_folder.atomic_write import TEMPORARY, write_atomically
-from protocol.errors import CheckpointError, UsageError, first_line
+from learner.run_folder.regular_files import open_regular, reason, regular_files, subfolder
+from protocol.errors import CheckpointError, UsageError
 
 FORMAT = 1
 FOLDER = "checkpoints"
@@ -44,15 +46,15 @@ def save(folder: Path, state: dict[str, Any], env_steps: int, keep: int) -> Path
     path = folder / FOLDER / f"{env_steps:012d}{SUFFIX}"
     record = {"format": FORMAT, "env_steps": env_steps, "state": state}
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        for left in path.parent.glob(f"*{TEMPORARY}"):  # from a process that was killed
+        subfolder(folder, FOLDER)
+        for left in regular_files(folder, f"{FOLDER}/*{TEMPORARY}"):  # from a process that was killed
             left.unlink()
         write_atomically(path, lambda file: torch.save(record, file))
-        for old in sorted(each for each in path.parent.glob(f"*{SUFFIX}") if each <= path)[:-keep]:
+        for old in [each for each in regular_files(folder, f"{FOLDER}/*{SUFFIX}") if each <= path][:-keep]:
             old.unlink()
     except (OSError, RuntimeError) as error:
         refused = error.__context__  # torch raises a RuntimeError of its own over what the file raised
-        why = _why(refused if isinstance(refused, OSError) and not isinstance(error, OSError) else error)
+        why = reason(refused if isinstance(refused, OSError) and not isinstance(error, OSError) else error)
         raise CheckpointError(f"checkpoint {path} not written: {why}; older checkpoints are untouched") from error
     return path
 
@@ -62,7 +64,7 @@ def newest(folder: Path) -> tuple[Checkpoint, list[str]]:
 
     Raises `CheckpointError` if there is none, or if the newest whole one is of another format.
     """
-    paths = sorted((folder / FOLDER).glob(f"*{SUFFIX}"), reverse=True)
+    paths = regular_files(folder, f"{FOLDER}/*{SUFFIX}")[::-1]
     if not paths:
         raise CheckpointError(f"run {folder}: expected a checkpoint in {FOLDER}/, got none; start afresh without --resume")
     warnings: list[str] = []
@@ -88,15 +90,19 @@ def _read(path: Path) -> Checkpoint:
     import torch
 
     try:
-        with zipfile.ZipFile(path) as archive:
-            damaged = archive.testzip()
-        if damaged is not None:
-            raise _Unreadable(f"checksum of {damaged} does not match")
-        record = torch.load(path, map_location="cpu", weights_only=True)
+        with os.fdopen(open_regular(path), "rb") as file:
+            with zipfile.ZipFile(file) as archive:
+                if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
+                    raise _Unreadable("it is compressed, and torch writes none that is")  # a few bytes could fill the memory
+                damaged = archive.testzip()
+            if damaged is not None:
+                raise _Unreadable(f"checksum of {damaged} does not match")
+            file.seek(0)
+            record = torch.load(file, map_location="cpu", weights_only=True)
     except _Unreadable:
         raise
     except Exception as error:  # zipfile and torch raise a dozen types for damaged files
-        raise _Unreadable(_why(error)) from error
+        raise _Unreadable(reason(error)) from error
     if not isinstance(record, dict) or "format" not in record:
         raise CheckpointError(f"checkpoint {path}: expected one of millrace, got another program's file")
     if record["format"] != FORMAT:
@@ -126,9 +132,3 @@ def _check_plain(value: object, where: str) -> None:
         case _ if type(value) not in (bool, int, float, str, bytes, type(None)):
             got = f"{type(value).__module__}.{type(value).__name__}"
             raise UsageError(f"checkpoint: {where}: expected tensors and plain data, got {got}; mend state_dict")
-
-
-def _why(error: Exception) -> str:
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror
-    return first_line(error, type(error).__name__).rstrip(".")

@@ -23,6 +23,8 @@ import msgspec
 
 from learner.run_folder.atomic_write import write_atomically
 from learner.run_folder.progress import ENV_STEPS_KEY, UPDATES_KEY, Progress, Row, named
+from learner.run_folder.regular_files import MOST_BYTES, open_regular, read, subfolder
+from protocol.bounds import Natural
 from protocol.errors import RunError
 
 log = logging.getLogger("millrace.learner")
@@ -44,7 +46,7 @@ class MetricsLog:
         Raises `RunError`, with a one-line message, if the files cannot be written.
         """
         table = folder / METRICS_FILE
-        events = folder / "tensorboard" / f"events.out.tfevents.{time.time_ns()}.{socket.gethostname()}.{os.getpid()}"
+        events = f"tensorboard/events.out.tfevents.{time.time_ns()}.{socket.gethostname()}.{os.getpid()}"
         kept: list[dict[str, Any]] = []
         self.removed = 0
         """The number of rows that were removed."""
@@ -54,7 +56,12 @@ class MetricsLog:
                 kept = [row for row in rows if row[ENV_STEPS_KEY] <= from_env_steps]
                 self.removed = len(rows) - len(kept)
                 write_atomically(table, lambda file: file.writelines(_json_line(row) for row in kept))
-            self._table, self._events = _RecordFile(table), _RecordFile(events)
+            self._table = _RecordFile(folder, METRICS_FILE)
+            try:
+                self._events = _RecordFile(folder, events)
+            except OSError:
+                self._table.close()
+                raise
         except OSError as error:
             raise RunError(f"{error.filename or table} cannot be written: {error.strerror}") from error
         self._events.append(_first_event(from_env_steps))
@@ -115,9 +122,9 @@ class _RecordFile:
     If the file is no longer at its path, it is made again there, with its folder.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, run: Path, name: str) -> None:
         """Raises OSError."""
-        self._path = path
+        self._run, self._path = run, run / name
         self._waiting: deque[bytes] = deque(maxlen=MOST_WAITING)
         self._bytes = 0
         self._cut = 0  # bytes at the end of the file that the first record that waits replaces
@@ -167,8 +174,11 @@ class _RecordFile:
         self._file.close()
 
     def _open(self) -> None:
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        self._file = self._path.open("ab", buffering=0)
+        if self._path.parent == self._run:
+            self._run.mkdir(parents=True, exist_ok=True)
+        else:
+            subfolder(self._run, self._path.parent.name)
+        self._file = os.fdopen(open_regular(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "ab", buffering=0)
         self._number = self._file.fileno()
         self._bytes, self._cut = self._path.stat().st_size, 0
 
@@ -186,7 +196,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 
 def read_and_count_rows(path: Path) -> tuple[list[dict[str, Any]], int]:
     """The rows that can be read, and the number of others. A last line that was cut off does not count. Raises OSError."""
-    *lines, _ = path.read_bytes().split(b"\n")
+    *lines, _ = read(path, MOST_BYTES).split(b"\n")
     rows = [row for line in lines if (row := _row(line)) is not None]
     return rows, len(lines) - len(rows)
 
@@ -195,9 +205,10 @@ def _row(line: bytes) -> dict[str, Any] | None:
     """A row: finite numbers, or null, by name; None if it cannot be read."""
     try:
         row = msgspec.json.decode(line, type=dict[str, int | float | None])
-        if row[ENV_STEPS_KEY] is None or not all(number is None or math.isfinite(number) for number in row.values()):
+        msgspec.convert(row[ENV_STEPS_KEY], Natural)
+        if not all(number is None or math.isfinite(number) for number in row.values()):
             return None
-    except (msgspec.MsgspecError, UnicodeError, KeyError, OverflowError):
+    except (msgspec.MsgspecError, UnicodeError, KeyError, OverflowError, RecursionError):
         return None
     return row
 

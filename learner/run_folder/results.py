@@ -9,15 +9,17 @@ from itertools import zip_longest
 import msgspec
 import numpy as np
 
+from protocol.bounds import Natural, Real, Seconds
+
 EVALUATION_KEY = "eval/mean_reward"
 
 
 class FactMean(msgspec.Struct, frozen=True):
     """The mean of a number that the environment reports at the ends of episodes."""
 
-    mean: float | None
+    mean: Real | None
     """over the episodes that have the number; None if none has it"""
-    missing: int
+    missing: Natural
     """how many episodes do not have it"""
 
     def __str__(self) -> str:
@@ -55,13 +57,13 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
     (True, True)
     """
 
-    episodes: int
-    return_mean: float
-    return_std: float
+    episodes: Natural
+    return_mean: Real
+    return_std: Real
     """population standard deviation over the episodes"""
-    length_mean: float
+    length_mean: Real
     """mean length of an episode in env steps"""
-    cut: int = 0
+    cut: Natural = 0
     """episodes that were stopped because they were too long; they count with the return they had by then"""
     facts: dict[str, FactMean] = {}
     """of each name in `info_keys`: what the environment reported at the ends of the episodes"""
@@ -91,9 +93,9 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
 class Best(msgspec.Struct, frozen=True, kw_only=True):
     """The policy with the highest mean return in the run's own evaluations."""
 
-    env_steps: int
+    env_steps: Natural
     """env steps of training when it was evaluated"""
-    chosen_by: float
+    chosen_by: Real
     """the mean return by which it was chosen; as the maximum of several means it is biased upwards"""
     evaluation: Evaluation
     """a second evaluation of the same policy, on other episodes"""
@@ -111,14 +113,14 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     env: str
     algo: str
     seed: int
-    env_steps: int
-    updates: int
-    wall_s: float
-    env_steps_per_s: float
+    env_steps: Natural
+    updates: Natural
+    wall_s: Seconds
+    env_steps_per_s: Real
     stop_reason: str
     cut_short: bool = False
     """an error or an interrupt ended the run"""
-    return_mean_100: float | None
+    return_mean_100: Real | None
     """mean return of the last 100 training episodes"""
     facts_100: dict[str, FactMean] = {}
     """of each name in `info_keys`: what the environment reported at the ends of these episodes"""
@@ -126,13 +128,13 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """evaluation of the final policy"""
     best: Best | None = None
     """the best policy of the run's own evaluations, if there were any"""
-    ledger: dict[str, int] = {}
+    ledger: dict[str, Natural] = {}
     """number of tickets and transitions in each state"""
-    lags: dict[str, int] = {}
+    lags: dict[str, Natural] = {}
     """number of rollouts that updates used, by lag, since this process started"""
-    first_use_s: dict[str, float] = {}
+    first_use_s: dict[str, Real] = {}
     """by worker: median seconds from publishing new weights to the arrival of the first rollout under them"""
-    stages: dict[str, float] = {}
+    stages: dict[str, Seconds] = {}
     """seconds spent in each stage"""
     versions: dict[str, str] = {}
     """versions of millrace and of the packages that decide its results"""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 import re
-import tomllib
 from pathlib import Path
 
 from learner.run_folder.checkpoint import FOLDER, SUFFIX
+from learner.run_folder.regular_files import regular_files
 from learner.run_folder.run_folder import RunSettings, as_folder_name
-from learner.run_folder.run_format import check_whole
+from learner.run_folder.run_format import read_config
 from protocol.bounds import one_line
 from protocol.errors import UsageError
 from protocol.logs.notices import log_notice
@@ -38,15 +38,11 @@ def newest_run(config: RunSettings) -> Path | None:
 def _can_be_resumed(path: Path, config: RunSettings) -> bool:
     """Whether this is a run of the same environment and algorithm that can be resumed: it has a checkpoint."""
     try:
-        text = (path / "config.toml").read_text("utf-8")
-        check_whole(text, "it")
-        table = tomllib.loads(text)
-        if "env" not in table:
-            raise UsageError("it has no env")
+        table = read_config(path)
     except FileNotFoundError:
         return False
-    except (OSError, ValueError, RecursionError, UsageError) as error:
-        log.warning("run %s is passed over: its config.toml cannot be read: %s", path, one_line(str(error)))
+    except UsageError as error:
+        log.warning("run %s is passed over: %s", path, one_line(str(error)))
         return False
-    same = (table.get("env"), table.get("algo")) == (config.env, config.algo)
-    return same and any((path / FOLDER).glob(f"*{SUFFIX}"))
+    same = (table["env"], table["algo"]) == (config.env, config.algo)
+    return same and bool(regular_files(path, f"{FOLDER}/*{SUFFIX}"))

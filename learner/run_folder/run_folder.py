@@ -29,26 +29,36 @@ from collections.abc import Mapping
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 
 from learner.run_folder.atomic_write import TEMPORARY, Writes, write_atomically
+from learner.run_folder.regular_files import MOST_BYTES, read, reason
 from learner.run_folder.results import Summary
-from learner.run_folder.run_format import END, HEAD, RUN_FILE, check_format, write_format
+from learner.run_folder.run_format import (
+    CONFIG_FILE,
+    END,
+    HEAD,
+    POLICY_ARRAYS,
+    POLICY_JSON,
+    RUN_FILE,
+    check_format,
+    write_format,
+)
 from learner.run_folder.run_lock import RunLock
 from protocol.arrays import Floats
-from protocol.bounds import one_line
+from protocol.bounds import MAX_FACTS, Line, Name, one_line
 from protocol.env_spec import EnvSpec, Scalar
 from protocol.errors import RunError, UsageError
 from protocol.policy.layout import Field, buffer_layout, named_views, parameter_layout, total_size
+from protocol.policy.possible import why_impossible
 from protocol.specs import PolicySpec
 
 POLICY_FORMAT = 1
 Which = Literal["final", "best"]
-POLICY_ARRAYS = {"final": "policy.safetensors", "best": "best.safetensors"}
-POLICY_JSON = "policy.json"
 UNREADABLE = (OSError, msgspec.MsgspecError, ValueError, RecursionError)  # what reading a damaged file raises
 
 log = logging.getLogger("millrace.learner")
@@ -74,16 +84,16 @@ class PolicyDescription(msgspec.Struct, frozen=True, kw_only=True):
     """policy.json: the meaning of the arrays in policy.safetensors."""
 
     format: int
-    env: str
+    env: Line
     env_kwargs: dict[str, Scalar]
     policy: PolicySpec
     arrays: tuple[ArrayPosition, ...]
     buffers: tuple[str, ...]
     """names of arrays that are not parameters: mean and standard deviation for observation normalization"""
-    wrappers: tuple[str, ...] = ()
+    wrappers: tuple[Line, ...] = ()
     """wrappers of every env copy, the innermost first"""
-    facts: tuple[str, ...] | None = None
-    """names of the numbers that the run logs of each episode; None: an older millrace wrote it, which did not say"""
+    facts: Annotated[tuple[Name, ...], Meta(max_length=MAX_FACTS)] = ()
+    """names of the numbers that the run logs of each episode"""
     masked: bool = False
     """whether the environment says which actions are allowed"""
     eval_env_kwargs: dict[str, Scalar] = {}
@@ -164,9 +174,9 @@ class RunFolder:
         """
         if not path.is_dir():
             raise UsageError(f"run {path}: no such folder")
+        if not (path / CONFIG_FILE).is_file():
+            raise UsageError(f"run {path}: expected a run folder, got one without {CONFIG_FILE}")
         check_format(path)
-        if not (path / "config.toml").is_file():
-            raise UsageError(f"run {path}: expected a run folder, got one without config.toml")
         return RunFolder(path)
 
     @staticmethod
@@ -177,7 +187,8 @@ class RunFolder:
         """
         if not (path / POLICY_JSON).is_file():
             return RunFolder.open(path)
-        check_format(path)
+        if (path / RUN_FILE).exists():
+            check_format(path)
         return RunFolder(path)
 
     def remove(self) -> None:
@@ -232,7 +243,7 @@ class RunFolder:
         except OSError as error:
             raise RunError(f"{self.path / RUN_FILE} not written: {error.strerror}") from error
         self._write(
-            "config.toml",
+            CONFIG_FILE,
             f"{HEAD}{config.to_toml()}{END}".encode("utf-8", "surrogateescape"),
         )
 
@@ -286,13 +297,13 @@ class RunFolder:
             expected = f"expected the best policy, {POLICY_ARRAYS[which]}, got none"
             raise UsageError(f"run {self.path}: {expected}; only a run with eval_every has one: take the final policy")
         try:
-            description = _decode_description((self.path / POLICY_JSON).read_bytes())
-            content = (self.path / POLICY_ARRAYS[which]).read_bytes()
+            description = _decode_description(read(self.path / POLICY_JSON))
+            content = read(self.path / POLICY_ARRAYS[which], MOST_BYTES)
             arrays = load(content)
             if not _checksum_matches(content):
                 raise ValueError(f"{POLICY_ARRAYS[which]}: its checksum does not match")
         except (*UNREADABLE, SafetensorError) as error:
-            raise UsageError(f"policy of run {self.path} cannot be read: {one_line(str(error))}") from error
+            raise UsageError(f"policy of run {self.path} cannot be read: {one_line(reason(error))}") from error
         if description.format != POLICY_FORMAT:
             raise UsageError(f"policy of run {self.path}: expected format {POLICY_FORMAT}, got {description.format}")
         acting, _ = parameter_layout(description.policy)
@@ -313,7 +324,7 @@ class RunFolder:
     def policy_spec(self) -> PolicySpec | None:
         """The policy that policy.json describes. None if that file is missing or cannot be read."""
         try:
-            return _decode_description((self.path / POLICY_JSON).read_bytes()).policy
+            return _decode_description(read(self.path / POLICY_JSON)).policy
         except UNREADABLE:
             return None
 
@@ -324,12 +335,12 @@ class RunFolder:
     def summary(self) -> Summary | None:
         """Read summary.json. None if it is missing, or damaged, which is said."""
         try:
-            return msgspec.json.decode((self.path / "summary.json").read_bytes(), type=Summary)
+            return msgspec.json.decode(read(self.path / "summary.json"), type=Summary)
         except FileNotFoundError:
             return None
         except UNREADABLE as error:
             log.warning(
-                "%s cannot be read: %s; the run counts as not finished", self.path / "summary.json", one_line(str(error))
+                "%s cannot be read: %s; the run counts as not finished", self.path / "summary.json", one_line(reason(error))
             )
             return None
 
@@ -361,13 +372,16 @@ def _checksum_matches(content: bytes) -> bool:
 
 
 def _decode_description(text: bytes) -> PolicyDescription:
-    """Decode policy.json. JSON has no infinity, so a missing bound is null there."""
+    """Decode policy.json. JSON has no infinity, so a missing bound is null there. Raises as `UNREADABLE`."""
     fields = msgspec.json.decode(text, type=dict[str, Any])
     match fields:
         case {"policy": {"action": {"low": list(low), "high": list(high)} as action}}:
             action["low"] = [-np.inf if bound is None else bound for bound in low]
             action["high"] = [np.inf if bound is None else bound for bound in high]
-    return msgspec.convert(fields, PolicyDescription)
+    description = msgspec.convert(fields, PolicyDescription)
+    if why := why_impossible(description.policy):
+        raise ValueError(f"{POLICY_JSON}: {why}")
+    return description
 
 
 def as_folder_name(env: str) -> str:

@@ -1,23 +1,33 @@
-"""The format version of a run folder: run.json, written when the folder is made.
+"""What tells which run a folder holds: its settings (config.toml), and its format (run.json), written when it is made.
 
 Rule: a folder of the current format or an older one can be evaluated, reported and resumed; a newer one is rejected in
-one line. Format 1 had no run.json. Raise `RUN_FORMAT` when older code could not read a folder of the new one.
+one line. Raise `RUN_FORMAT` when older code could not read a folder of the new one.
 """
 
 from __future__ import annotations
 
+import platform
+import tomllib
+from contextlib import suppress
+from functools import cache
+from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from learner.run_folder.atomic_write import write_atomically
-from learner.run_folder.versions import versions
+from learner.run_folder.regular_files import read, reason
+from protocol.bounds import one_line
 from protocol.errors import UsageError
 
 RUN_FORMAT = 2
 RUN_FILE = "run.json"
+CONFIG_FILE = "config.toml"
 HEAD = "# Repeat this run: millrace train --config THIS_FILE (it is whole if it ends with # end)\n"
 END = "# end\n"
+POLICY_JSON = "policy.json"
+POLICY_ARRAYS = {"final": "policy.safetensors", "best": "best.safetensors"}
 """The first and the last line of config.toml. A file that was cut off may still be TOML, with other settings."""
 
 
@@ -31,6 +41,29 @@ class RunFormat(msgspec.Struct, frozen=True, kw_only=True):
     """Whether the run's workers were started elsewhere. Its setting `workers` then means nothing."""
 
 
+DISTRIBUTIONS = {"millrace": "millrace-rl", "torch": "torch", "gymnasium": "gymnasium", "numpy": "numpy"}
+"""Name of the installed distribution, by import name."""
+
+
+class _Identity(msgspec.Struct):
+    """What every config.toml has."""
+
+    env: str
+    algo: str
+    seed: int
+    env_kwargs: dict[str, Any] = {}
+
+
+@cache
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that decide results, by import name; without those not installed."""
+    found = {"python": platform.python_version()}
+    for name, distribution in DISTRIBUTIONS.items():
+        with suppress(metadata.PackageNotFoundError):
+            found[name] = metadata.version(distribution)
+    return found
+
+
 def write_format(folder: Path, *, workers_elsewhere: bool = False) -> None:
     """Write run.json with the current format. Raises OSError."""
     version = versions().get("millrace", "")
@@ -38,21 +71,47 @@ def write_format(folder: Path, *, workers_elsewhere: bool = False) -> None:
     write_atomically(folder / RUN_FILE, lambda file: file.write(content + b"\n"))
 
 
-def check_whole(text: str, where: str) -> None:
-    """Raise `UsageError` if this config.toml has the first line and not the last."""
+def read_config(run: Path) -> dict[str, Any]:
+    """The settings in the config.toml of a run folder, as it has them; among them are env, algo and seed.
+
+    Raises `FileNotFoundError`, and `UsageError` for a file that cannot be read.
+    """
+    where = run / CONFIG_FILE
+    try:
+        table = parse_toml(read(where).decode(), str(where))
+        msgspec.convert(table, _Identity)
+    except FileNotFoundError:
+        raise
+    except UnicodeDecodeError as error:
+        raise UsageError(f"{where} cannot be read: it is not text") from error
+    except OSError as error:
+        raise UsageError(f"{where} cannot be read: {reason(error)}") from error
+    except msgspec.ValidationError as error:
+        raise UsageError(f"{where} is damaged: {error}; restore it, or start a new run") from error
+    return table
+
+
+def parse_toml(text: str, where: str) -> dict[str, Any]:
+    """The content of a TOML file. Raises `UsageError`, also for a config.toml that has the first line and not the last."""
     if text.startswith(HEAD) and not text.rstrip().endswith(END.strip()):
         raise UsageError(f"{where} is cut off: expected {END.strip()!r} as its last line; restore it, or start a new run")
+    try:
+        table = tomllib.loads(text)
+        msgspec.json.encode(table)  # raises for a whole number of more digits than Python writes
+    except (ValueError, OverflowError, RecursionError) as error:
+        raise UsageError(f"{where} is not TOML: {one_line(str(error))}") from error
+    return table
 
 
 def check_format(folder: Path) -> RunFormat:
     """The run.json of a run folder. Raises `UsageError`, with a one-line message, if this millrace cannot read it."""
     try:
-        found = msgspec.json.decode((folder / RUN_FILE).read_bytes(), type=RunFormat)
-    except (FileNotFoundError, NotADirectoryError):
-        return RunFormat(format=1, millrace="")
+        found = msgspec.json.decode(read(folder / RUN_FILE), type=RunFormat)
+    except FileNotFoundError:
+        raise UsageError(f"run {folder}: expected a run folder, got one without {RUN_FILE}") from None
     except (OSError, msgspec.MsgspecError, UnicodeError, RecursionError) as error:
         raise UsageError(
-            f"run {folder}: {RUN_FILE} cannot be read: {error}; if this millrace wrote the run, delete that file"
+            f"run {folder}: {RUN_FILE} cannot be read: {reason(error)}; restore it, or start a new run"
         ) from error
     if found.format > RUN_FORMAT:
         raise UsageError(

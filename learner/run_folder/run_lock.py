@@ -24,6 +24,7 @@ from typing import NamedTuple, Self
 from msgspec.structs import replace
 
 from learner.run_folder.lease import Closed, LeaseWatch, Listens, Owner, Verdict, decoded
+from learner.run_folder.regular_files import open_regular, read, reason
 from protocol.address import is_local
 from protocol.errors import RunError, RunTakenOver, UsageError
 
@@ -120,10 +121,10 @@ class RunLock:
     def _take(self) -> None:
         while True:
             try:
-                self._file, made = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644), True
+                self._file, made = open_regular(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL), True
             except FileExistsError:
                 try:
-                    self._file, made = os.open(self._path, os.O_RDWR), False
+                    self._file, made = open_regular(self._path, os.O_RDWR), False
                 except FileNotFoundError:
                     continue  # it was released between the two
             try:
@@ -181,7 +182,7 @@ class RunLock:
         while True:
             self._sleep(pace.look_every)
             try:
-                content = self._path.read_bytes()  # by its name: a file system may keep the content of an open file
+                content = read(self._path)  # by its name: a file system may keep the content of an open file
             except FileNotFoundError:
                 return  # its owner has released it
             match watch.judge(content, self._clock()):
@@ -207,7 +208,7 @@ class RunLock:
             if self._other is not None:
                 return
             try:
-                found = decoded(self._path.read_bytes())
+                found = decoded(read(self._path))
             except FileNotFoundError:
                 self._make_again()
                 return
@@ -221,7 +222,7 @@ class RunLock:
         """Someone removed the file, perhaps with the whole folder: make it again if the folder is there."""
         if not self._folder.is_dir():
             return
-        file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
+        file = open_regular(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL)
         self._close()
         self._file = file
         with suppress(OSError, UsageError):
@@ -236,13 +237,13 @@ class RunLock:
         return os.pread(self._file, 1 << 16, 0)
 
     def _is_ours(self) -> bool:
-        found = decoded(self._path.read_bytes())
+        found = decoded(read(self._path))
         return found is not None and found.token == self._owner.token
 
     def _is_open_file(self) -> bool:
         """Whether the open file is the one of this name: its owner may have removed it."""
         with suppress(FileNotFoundError):
-            return os.path.samestat(os.fstat(self._file), os.stat(self._path))
+            return os.path.samestat(os.fstat(self._file), os.lstat(self._path))
         return False
 
     def _close(self) -> None:
@@ -269,11 +270,11 @@ def learner_of_run(folder: Path) -> LearnerOfRun:
     if not folder.is_dir():
         raise UsageError(f"run {folder}: no such folder")
     try:
-        owner = decoded((folder / LOCK_FILE).read_bytes())
+        owner = decoded(read(folder / LOCK_FILE))
     except FileNotFoundError:
         raise UsageError(f"run {folder}: no process trains it now") from None
     except OSError as error:
-        raise UsageError(f"run {folder}: {LOCK_FILE} cannot be read: {error.strerror}") from error
+        raise UsageError(f"run {folder}: {LOCK_FILE} cannot be read: {reason(error)}") from error
     if owner is None:
         raise UsageError(f"run {folder}: {LOCK_FILE} names no process; it is being written, or damaged: try again")
     here = owner.boot == _boot()

@@ -17,6 +17,7 @@ from pathlib import Path
 from learner.config.config import Config
 from learner.config.rollout_config import RolloutConfig
 from learner.members.endpoint import generate_run_keys
+from learner.run_folder.regular_files import open_regular, reason, subfolder
 from protocol.errors import UsageError
 from protocol.keys.key_folder import Keyring, chosen_key_folder
 from protocol.keys.keys import Token
@@ -65,9 +66,13 @@ def no_flags(name: str) -> tuple[list[str], Path | None]:
 
 
 def worker_flags(config: Config, run: Path) -> WorkerFlags:
-    """The flags of a run's workers. Their logs are in the run folder."""
-    logs = run / "workers"
-    logs.mkdir(exist_ok=True)
+    """The flags of a run's workers. Their logs are in the run folder. Raises `UsageError` if they cannot be there."""
+    try:
+        logs = subfolder(run, "workers")
+        for log in logs.glob("*.log"):
+            os.close(open_regular(log))
+    except OSError as error:
+        raise UsageError(f"{error.filename}: {reason(error)}; the workers' logs go there: remove it") from error
     cores, timeouts = worker_cores(config), timeout_flags(config.call_timeouts())
 
     def flags(name: str) -> tuple[list[str], Path]:

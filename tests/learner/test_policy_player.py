@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
@@ -50,22 +49,13 @@ def test_a_run_folder_is_enough_to_act_again(tmp_path: Path, env_id: str) -> Non
     assert not np.array_equal(first, load_policy(folder.path)[0](seen, zero_state(spec, 1, 3)))
 
 
-@pytest.mark.parametrize("older", [False, True])
-def test_the_numbers_that_a_run_logs_of_its_episodes_stand_in_policy_json(tmp_path: Path, older: bool) -> None:
-    """An older run folder has them in its config.toml alone."""
+def test_the_numbers_that_a_run_logs_of_its_episodes_stand_in_policy_json(tmp_path: Path) -> None:
     env = EnvSpec("CartPole-v1")
     made = env.make()
     spec = PolicySpec(observation_leaves(made.observation_space), action_spec(made.action_space), net=(8,))
     folder = RunFolder.create(resolve("CartPole-v1", run_dir=str(tmp_path), info_keys="of_config"))
     folder.write_policy(spec, env, np.zeros(acting_size(spec), np.float32), np.zeros(0, np.float32), facts=("of_card",))
-    card = folder.path / "policy.json"
-    if older:
-        fields = json.loads(card.read_text())
-        del fields["facts"]
-        card.write_text(json.dumps(fields))
-    assert saved_policy(folder.path).facts == (("of_config",) if older else ("of_card",))
-    (folder.path / "config.toml").write_text("no TOML")
-    assert saved_policy(folder.path).facts == (() if older else ("of_card",))
+    assert saved_policy(folder.path).facts == ("of_card",)
 
 
 def test_a_folder_without_a_policy_is_said(tmp_path: Path) -> None:

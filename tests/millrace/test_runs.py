@@ -104,7 +104,7 @@ def test_its_repr_says_how_it_went_and_never_raises(run: millrace.Run) -> None:
     (run.path / "config.toml").write_text("[")
     assert "is not TOML" in repr(run)
     shutil.rmtree(run.path)
-    assert "cannot be read" in repr(run)
+    assert "expected a run folder with a config.toml, got none" in repr(run)
 
 
 def test_html_shows_text_of_the_folder_as_text(run: millrace.Run) -> None:

@@ -14,6 +14,7 @@ from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
 from learner.config.layers import config_from_toml, lower_layers, resolve
 from learner.config.presets import PRESETS, named_presets
 from learner.config.validation import idle_workers, unused_target, workers_to_wait_for
+from learner.run_folder.run_format import write_format
 from protocol.errors import UsageError
 
 
@@ -217,6 +218,7 @@ def test_lower_layers_are_not_yet_judged_as_a_whole(tmp_path: Path) -> None:
 def test_a_resumed_run_keeps_its_settings_but_for_those_given(tmp_path: Path) -> None:
     config = resolve("CartPole-v1", preset="none", gamma=0.5)
     (tmp_path / "config.toml").write_text(config.to_toml())
+    write_format(tmp_path)
     assert resolve(resume=tmp_path) == resolve("CartPole-v1", resume=tmp_path) == config
     assert resolve(resume=tmp_path, steps=5).steps == 5
     assert f"run {tmp_path} is of CartPole-v1, not of Pendulum-v1" in refusal("Pendulum-v1", resume=tmp_path)

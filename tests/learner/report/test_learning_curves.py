@@ -1,5 +1,6 @@
 """Learning curves: what is drawn is what was measured."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import pytest
 from learner.config.layers import resolve
 from learner.report.curve import Curve, common_grid
 from learner.report.learning_curves import curves, plot, read_curve
+from learner.report.page import page
 from learner.report.runs import group_runs, read_run
 from learner.run_folder.metrics_log import MetricsLog
 from learner.run_folder.progress import Progress
@@ -171,3 +173,14 @@ def test_the_groups_are_those_of_the_report(tmp_path: Path) -> None:
     assert legend(runs) == [f"{group.name} ({group.differences}), seed 1" for group in groups]
     colors = {line.get_color() for line in curves(runs).axes[0].get_lines()}
     assert len(colors) == len(runs)
+
+
+def test_returns_of_any_size_are_drawn(tmp_path: Path) -> None:
+    """Without a warning of numpy, which would fail this test."""
+    run = a_run(tmp_path)
+    rows = [{"time/total_timesteps": n * 100, "rollout/ep_rew_mean": (-1) ** n * 1.7e308} for n in range(5)]
+    (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    plot([run], tmp_path / "curves.png")
+    shown = page([run])
+    assert "nan" not in shown
+    assert shown.count("<path") == 1

@@ -323,7 +323,7 @@ def test_the_newest_film_is_on_the_page_if_it_is_small(tmp_path: Path, monkeypat
     shown = sections.videos(report_data(run))
     assert "base64,YS5tcDQ=" in shown
     assert shown.count("<video") == 1
-    monkeypatch.setattr(sections, "MOST_VIDEO_BYTES", 3)
+    monkeypatch.setattr(sections, "MOST_BYTES_OF_ONE", 3)
     assert "<video" not in sections.videos(report_data(run))
     assert "too large for this page" in sections.videos(report_data(run))
 
@@ -339,7 +339,7 @@ def test_what_cannot_be_reported_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"is a folder; expected the file to write"):
         write_page([run], tmp_path)
     (run / "config.toml").write_text("env = ")
-    with pytest.raises(UsageError, match="it is damaged, there is nothing to report on"):
+    with pytest.raises(UsageError, match=r"config\.toml is not TOML"):
         page([run])
 
 

@@ -6,6 +6,7 @@ import json
 import os
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -180,7 +181,7 @@ def test_a_full_disk_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.Mon
     def fails(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("learner.run_folder.atomic_write.os.fsync", fails)
+    monkeypatch.setattr("learner.run_folder.regular_files.os.fsync", fails)
     with pytest.raises(RunError, match=r"summary\.json not written: No space left on device"):
         folder.write_summary(summary)
     assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["summary.json"]
@@ -305,3 +306,36 @@ def test_a_resumed_run_adds_an_evaluation_to_the_row_of_its_update(tmp_path: Pat
     assert (second["time/iterations"], second["train/loss"], second["lag/max"], second["eval/mean_reward"]) == (2, 0.5, 2, 7)
     assert (third["time/iterations"], third["train/loss"]) == (3, 0.25)
     assert "eval/mean_reward" not in first | third
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"facts": [f"f{n}" for n in range(33)]}, "length <= 32"),
+        ({"env": "a\nb"}, "matching regex"),
+        ({"policy": {"action": {"dtype": "object"}}}, "action: expected a dtype"),
+        ({"policy": {"action": {"dtype": "int64"}}}, "action: expected a dtype"),
+        ({"policy": {"action": {"low": []}}}, "expected 2 lower and upper bounds, got 0 and 2"),
+        ({"policy": {"action": {"shape": [-1]}}}, "action: expected a shape"),
+        ({"policy": {"action": {"shape": [2**40]}}}, "action: expected a shape"),
+        ({"policy": {"action": {"kind": "multidiscrete", "dtype": "int64"}}}, "expected 2 sizes and starts, got 0 and 0"),
+        ({"policy": {"head": "q"}}, "expected a discrete action, got box"),
+        ({"policy": {"observation": []}}, "expected 1 to 48 arrays"),
+        ({"policy": {"net": [0]}}, "expected a network"),
+        ({"policy": {"net": [1 << 30]}}, "expected weights of at most"),
+        ({"policy": {"core": "lstm", "core_size": -1}}, "expected a network"),
+        ({"policy": {"own": {"factory": "os:system", "arrays": []}}}, "expected a network"),
+    ],
+)
+def test_a_description_of_which_no_policy_can_be_made_is_one_line(tmp_path: Path, wrong: dict[str, Any], said: str) -> None:
+    spec = pendulum_like(2.0)
+    RunFolder(tmp_path).write_policy(spec, EnvSpec("Mine-v0"), *weights(spec))
+    card = json.loads((tmp_path / "policy.json").read_text())
+
+    def changed(whole: dict[str, Any], part: dict[str, Any]) -> dict[str, Any]:
+        deeper = {key: isinstance(value, dict) and bool(whole[key]) for key, value in part.items()}
+        return whole | {key: changed(whole[key], value) if deeper[key] else value for key, value in part.items()}
+
+    (tmp_path / "policy.json").write_text(json.dumps(changed(card, wrong)))
+    with pytest.raises(UsageError, match=f"cannot be read: .*{said}"):
+        RunFolder(tmp_path).read_policy()

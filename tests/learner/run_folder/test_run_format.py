@@ -1,4 +1,4 @@
-"""The format version: a folder without one is of format 1 and still read; a newer one is rejected wherever it is read."""
+"""What tells which run a folder holds: without run.json it holds none, a newer format is rejected."""
 
 import json
 from collections.abc import Callable
@@ -53,11 +53,12 @@ def test_a_new_folder_carries_the_format_and_the_version_that_wrote_it(run: Path
     assert written.keys() == {"format", "millrace", "workers_elsewhere"}
 
 
-@pytest.mark.parametrize("read", READERS)
-def test_a_folder_without_a_format_is_of_the_first_and_is_read(run: Path, read: Callable[[Path], object]) -> None:
+@pytest.mark.parametrize("read", READERS[1:])
+def test_a_folder_without_a_format_is_no_run_folder(run: Path, read: Callable[[Path], object]) -> None:
     (run / RUN_FILE).unlink()
-    assert check_format(run).format == 1
-    read(run)
+    with pytest.raises(UsageError, match=r"expected a run folder, got one without run\.json"):
+        read(run)
+    assert load_policy(run)[2].id == "CartPole-v1", "the files of the policy are enough to act"
 
 
 @pytest.mark.parametrize("read", READERS)
@@ -80,7 +81,7 @@ def test_a_damaged_format_is_said_in_one_line(run: Path) -> None:
 
 
 def test_a_resumed_folder_gets_the_current_format(run: Path) -> None:
-    (run / RUN_FILE).unlink()
+    (run / RUN_FILE).write_text('{"format": 1, "millrace": "0.1"}')
     folder = RunFolder.open(run)
     folder.write_config(config_of_run(run))
     assert check_format(run).format == RUN_FORMAT
@@ -92,3 +93,21 @@ def test_a_folder_that_is_made_again_knows_where_its_workers_were_started(run: P
     (run / "config.toml").unlink()
     assert folder.make_again(config) == f"{run / 'config.toml'} was deleted; it is written again"
     assert check_format(run).workers_elsewhere
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ("seed = inf", "seed"), ("seed = 1.5", "seed"), (f"seed = {'1' * 5000}", "is not TOML"),
+        (f"seed = 0x{'1' * 5000}", "is not TOML"), ("env = 1", "env"),
+        ("algo = []", "algo"), ("env_kwargs = 3", "env_kwargs"), (f"deep = {'[' * 2000}{']' * 2000}", "is not TOML"),
+    ],
+)  # fmt: skip
+def test_settings_of_the_wrong_kind_are_one_line_for_every_reader(run: Path, wrong: str, said: str) -> None:
+    text = (run / "config.toml").read_text()
+    name = wrong.partition(" = ")[0]
+    kept = [line for line in text.splitlines() if not line.startswith((f"{name} =", f"[{name}"))]
+    (run / "config.toml").write_text("\n".join([kept[0], wrong, *kept[1:]]) + "\n")
+    for read in READERS[1:]:
+        with pytest.raises(UsageError, match=rf"config\.toml.*{said}"):
+            read(run)

@@ -1,0 +1,100 @@
+"""Opens and lists the files of a run folder.
+
+Rule: a run folder may come from a stranger, so only regular files inside it are read and written. No link is followed, and
+a FIFO, a device or a folder in the place of a file is refused: an `OSError` says what is there. What other packages write
+goes into a `subfolder`, which is none of these either.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import stat
+from contextlib import suppress
+from pathlib import Path
+
+from protocol.errors import first_line
+
+MOST_TEXT_BYTES = 1 << 26  # of a file of settings or results
+MOST_BYTES = 1 << 31  # of metrics, and of the arrays of a policy
+
+log = logging.getLogger("millrace.learner")
+
+
+def open_regular(path: Path, flags: int = os.O_RDONLY) -> int:
+    """Open a file as `os.open` does, and return its descriptor. Raises `OSError`, also for anything but a regular file."""
+    try:
+        file = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+    except OSError:
+        with suppress(FileNotFoundError):
+            _expect(stat.S_IFREG, path.lstat().st_mode, path)
+        raise
+    try:
+        _expect(stat.S_IFREG, os.fstat(file).st_mode, path)
+    except OSError:
+        os.close(file)
+        raise
+    return file
+
+
+def read(path: Path, most_bytes: int = MOST_TEXT_BYTES) -> bytes:
+    """The content of a file. Raises `OSError`, also if it has more bytes."""
+    with os.fdopen(open_regular(path), "rb") as file:
+        if (size := os.fstat(file.fileno()).st_size) > most_bytes:
+            raise OSError(errno.EFBIG, f"expected at most {most_bytes:,} bytes, got {size:,}", str(path))
+        return file.read()
+
+
+def regular_files(run: Path, pattern: str) -> list[Path]:
+    """The regular files of a run folder with such names, as `videos/*.mp4`, in the order of their names.
+
+    What else has such a name is left out, and the log says so.
+    """
+    folder, _, name = pattern.rpartition("/")
+    if folder and not _is(stat.S_IFDIR, run / folder):
+        return []
+    return [path for path in sorted((run / folder).glob(name)) if _is(stat.S_IFREG, path)]
+
+
+def subfolder(run: Path, name: str) -> Path:
+    """A folder inside a run folder, made if it is not there. Raises `OSError`, also if it is a link."""
+    folder = run / name
+    folder.mkdir(parents=True, exist_ok=True)
+    _expect(stat.S_IFDIR, folder.lstat().st_mode, folder)
+    return folder
+
+
+def reason(error: Exception) -> str:
+    """Why a file cannot be read or written, in one line."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return first_line(error, type(error).__name__).rstrip(".")
+
+
+def _expect(kind: int, mode: int, path: Path) -> None:
+    """Raise `OSError` unless the kind of file is this one."""
+    if stat.S_IFMT(mode) != kind:
+        expected, got = (KINDS.get(each, "a device") for each in (kind, stat.S_IFMT(mode)))
+        raise OSError(errno.EINVAL, f"expected {expected}, got {got}", str(path))
+
+
+def _is(kind: int, path: Path) -> bool:
+    """Whether the kind of file is this one; the log says what it is instead."""
+    try:
+        _expect(kind, path.lstat().st_mode, path)
+    except FileNotFoundError:
+        return False
+    except OSError as error:
+        log.warning("%s: %s; it is left out", path, reason(error))
+        return False
+    return True
+
+
+KINDS = {
+    stat.S_IFREG: "a file",
+    stat.S_IFDIR: "a folder",
+    stat.S_IFLNK: "a link",
+    stat.S_IFIFO: "a FIFO",
+    stat.S_IFSOCK: "a socket",
+}

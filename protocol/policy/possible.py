@@ -1,0 +1,64 @@
+"""Whether a policy can be made of a specification that a file holds. Pure; imports no torch.
+
+Rule: what a worker may not say of an environment (`protocol/space_spec.py`), a file may not say either, and weights that no
+message could carry are refused before anything of their size is allocated.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import get_args
+
+from protocol.bounds import LARGEST, one_line
+from protocol.policy.layout import acting_size
+from protocol.space_spec import MAX_ELEMENTS, MAX_LEAVES, Dtype
+from protocol.specs import ActionSpec, Leaf, PolicySpec
+from protocol.wire.socket_options import MAX_FRAME_BYTES
+
+MOST_DIMENSIONS = 8
+MOST_LAYERS = 64
+
+
+def why_impossible(spec: PolicySpec) -> str:
+    """Why no policy can be made of this, in one line; empty if one can."""
+    leaves, action = spec.observation, spec.action
+    paths = {leaf.path for leaf in leaves}
+    if not leaves or len(leaves) > MAX_LEAVES or len(paths) < len(leaves):
+        return f"observation: expected 1 to {MAX_LEAVES} arrays of different names, got {len(leaves)}"
+    if why := _why_no_space(action):
+        return f"action: {why}"
+    for leaf in leaves:
+        if why := _why_no_space(leaf):
+            return f"{one_line(f'observation {leaf.path}', 80)}: {why}"
+    bounds = math.prod(action.shape) if action.kind == "box" else 0
+    if (len(action.low), len(action.high)) != (bounds, bounds) or any(map(math.isnan, (*action.low, *action.high))):
+        return f"action: expected {bounds} lower and upper bounds, got {len(action.low)} and {len(action.high)}"
+    if spec.head == "q" and action.kind != "discrete":
+        return f"head q: expected a discrete action, got {action.kind}"
+    if spec.stores_scaled_actions and not (action.kind == "box" and all(map(math.isfinite, (*action.low, *action.high)))):
+        return f"head {spec.head}: expected a box action with finite bounds, got another"
+    arrays = () if spec.encoder is None else spec.encoder.arrays
+    layers = (*spec.net, spec.core_size, 1 if spec.encoder is None else spec.encoder.size)
+    if spec.own is not None or len(layers) > MOST_LAYERS or not all(0 < width <= LARGEST for width in layers):
+        return "expected a network of layers with 1 or more units, got another"
+    if any(min(array.shape, default=0) < 0 for array in arrays) or 4 * acting_size(spec) > MAX_FRAME_BYTES:
+        return f"expected weights of at most {MAX_FRAME_BYTES:,} bytes, got more"
+    return ""
+
+
+def _why_no_space(space: Leaf | ActionSpec) -> str:
+    if _wrong_shape(space.shape) or (space.kind == "discrete" and space.shape):
+        return f"expected a shape of at most {MAX_ELEMENTS:,} elements, got {one_line(str(space.shape), 80)}"
+    is_float = isinstance(space, ActionSpec) and space.kind == "box"
+    if space.dtype not in get_args(Dtype) or (is_float and not space.dtype.startswith("float")):
+        return f"expected a dtype of its space, got {one_line(space.dtype, 80)}"
+    counts = math.prod(space.shape) if space.kind in ("discrete", "multidiscrete") else 0
+    if (len(space.sizes), len(space.start)) != (counts, counts):
+        return f"expected {counts} sizes and starts, got {len(space.sizes)} and {len(space.start)}"
+    if not all(0 < size <= LARGEST for size in space.sizes) or not all(abs(start) <= LARGEST for start in space.start):
+        return f"expected sizes above 0 and starts, both up to {LARGEST:,}"
+    return ""
+
+
+def _wrong_shape(shape: tuple[int, ...]) -> bool:
+    return len(shape) > MOST_DIMENSIONS or any(side < 0 for side in shape) or math.prod(shape) > MAX_ELEMENTS
