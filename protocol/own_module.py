@@ -7,8 +7,10 @@ package that is missing needs none.
 from __future__ import annotations
 
 import importlib
+import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -43,6 +45,27 @@ def import_own(module: str, what: str) -> ModuleType:
         raise UsageError(f"{what}: the import of {module} failed: {_why(error)}; is that package installed?") from error
     except (Exception, SystemExit) as error:
         raise own_code_failed(f"{what}: the import of {module}", error) from error
+
+
+def refuse_modules_in(folder: Path, names: Iterable[str]) -> None:
+    """Raise `UsageError` if one of these names, as `module:name`, would be imported from this folder, a run folder.
+
+    Such a folder may come from a stranger, and what it names is imported; so nothing is imported from the folder itself.
+    """
+    inside = folder.resolve()
+    for name in names:
+        module, colon, _ = name.partition(":")
+        first, *_ = parts = module.split(".")
+        for entry in (Path(entry).resolve() for entry in sys.path if colon and first):
+            if entry.is_relative_to(inside):
+                found = entry.is_dir() and any(path.name.partition(".")[0] == first for path in entry.iterdir())
+            else:
+                found = entry.joinpath(*parts).is_relative_to(inside)
+            if found:
+                raise UsageError(
+                    f"run {folder}: {one_line(name, 200)} would be imported from the run folder, and nothing is; if you "
+                    "trust that module, put it into a folder of your own"
+                )
 
 
 def callable_of(module: ModuleType, qualname: str, what: str) -> Callable[..., Any]:

@@ -53,6 +53,7 @@ from protocol.arrays import Floats
 from protocol.bounds import MAX_FACTS, Line, Name, one_line
 from protocol.env_spec import EnvSpec, Scalar
 from protocol.errors import RunError, UsageError
+from protocol.own_module import refuse_modules_in
 from protocol.policy.layout import Field, buffer_layout, named_views, parameter_layout, total_size
 from protocol.policy.possible import why_impossible
 from protocol.specs import PolicySpec
@@ -304,6 +305,8 @@ class RunFolder:
                 raise ValueError(f"{POLICY_ARRAYS[which]}: its checksum does not match")
         except (*UNREADABLE, SafetensorError) as error:
             raise UsageError(f"policy of run {self.path} cannot be read: {one_line(reason(error))}") from error
+        encoder = description.policy.encoder
+        refuse_modules_in(self.path, (description.env, *description.wrappers, encoder.factory if encoder else ""))
         if description.format != POLICY_FORMAT:
             raise UsageError(f"policy of run {self.path}: expected format {POLICY_FORMAT}, got {description.format}")
         acting, _ = parameter_layout(description.policy)

@@ -1,13 +1,16 @@
 """What tells which run a folder holds: its settings (config.toml), and its format (run.json), written when it is made.
 
-Rule: a folder of the current format or an older one can be evaluated, reported and resumed; a newer one is rejected in
-one line. Raise `RUN_FORMAT` when older code could not read a folder of the new one.
+Rules: a folder of the current format or an older one can be evaluated, reported and resumed; a newer one is rejected in
+one line. Raise `RUN_FORMAT` when older code could not read a folder of the new one. Nothing is imported from a run folder:
+it may come from a stranger, and it names modules.
 """
 
 from __future__ import annotations
 
+import os
 import platform
 import tomllib
+from collections.abc import Iterator
 from contextlib import suppress
 from functools import cache
 from importlib import metadata
@@ -20,6 +23,7 @@ from learner.run_folder.atomic_write import write_atomically
 from learner.run_folder.regular_files import read, reason
 from protocol.bounds import one_line
 from protocol.errors import UsageError
+from protocol.own_module import refuse_modules_in
 
 RUN_FORMAT = 2
 RUN_FILE = "run.json"
@@ -74,7 +78,7 @@ def write_format(folder: Path, *, workers_elsewhere: bool = False) -> None:
 def read_config(run: Path) -> dict[str, Any]:
     """The settings in the config.toml of a run folder, as it has them; among them are env, algo and seed.
 
-    Raises `FileNotFoundError`, and `UsageError` for a file that cannot be read.
+    Raises `FileNotFoundError`, and `UsageError` for a file that cannot be read, or names a module in the run folder.
     """
     where = run / CONFIG_FILE
     try:
@@ -88,6 +92,7 @@ def read_config(run: Path) -> dict[str, Any]:
         raise UsageError(f"{where} cannot be read: {reason(error)}") from error
     except msgspec.ValidationError as error:
         raise UsageError(f"{where} is damaged: {error}; restore it, or start a new run") from error
+    refuse_modules_in(run, _texts(table))
     return table
 
 
@@ -101,6 +106,28 @@ def parse_toml(text: str, where: str) -> dict[str, Any]:
     except (ValueError, OverflowError, RecursionError) as error:
         raise UsageError(f"{where} is not TOML: {one_line(str(error))}") from error
     return table
+
+
+def is_run_folder(folder: Path) -> bool:
+    """Whether this is a run folder, or has a policy as one has it."""
+
+    def has(name: str) -> bool:
+        return os.path.lexists(folder / name)
+
+    return (has(CONFIG_FILE) and has(RUN_FILE)) or (has(POLICY_JSON) and any(map(has, POLICY_ARRAYS.values())))
+
+
+def _texts(value: Any) -> Iterator[str]:
+    """Every text in nested tables and lists."""
+    match value:
+        case str():
+            yield value
+        case list():
+            for inner in value:
+                yield from _texts(inner)
+        case dict():
+            for key, inner in value.items():
+                yield from (key, *_texts(inner))
 
 
 def check_format(folder: Path) -> RunFormat:

@@ -21,6 +21,7 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # before numpy; --torch-threads sets the learner's
 
 from learner.run_folder.last_line import last_line
+from learner.run_folder.run_format import is_run_folder
 from learner.standard_streams import open_closed, unfailing
 from protocol.bounds import escaped, indented
 from protocol.errors import UsageError, UserFacingError
@@ -51,8 +52,11 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line. Returns the exit code."""
     argv = sys.argv[1:] if argv is None else argv
     with suppress(OSError):  # the current folder may have been deleted
-        if os.getcwd() not in sys.path:
-            sys.path.append(os.getcwd())  # last, so that a user's module is found but hides no installed module
+        here = Path.cwd()
+        if any(map(is_run_folder, (here, *here.parents))):
+            sys.path[:] = [entry for entry in sys.path if entry not in ("", str(here))]  # nothing is imported from there
+        elif str(here) not in sys.path:
+            sys.path.append(str(here))  # last, so that a user's module is found but hides no installed module
     open_closed()
     with unfailing("stderr"):
         return _exit_code(argv)

@@ -108,6 +108,32 @@ def test_the_help_shows_its_settings(capsys: pytest.CaptureFixture[str]) -> None
     assert os.getcwd() in sys.path
 
 
+@pytest.mark.parametrize("files", [("config.toml", "run.json"), ("policy.json", "best.safetensors")])
+@pytest.mark.parametrize("inside", ["", "videos"])
+def test_the_current_folder_is_no_place_of_modules_if_it_is_in_a_run_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, files: tuple[str, ...], inside: str
+) -> None:
+    for name in files:
+        (tmp_path / name).touch()
+    (tmp_path / "videos").mkdir()
+    monkeypatch.chdir(tmp_path / inside)
+    monkeypatch.setattr(sys, "path", ["", str(tmp_path / inside), *sys.path])
+    main(["--version"])
+    assert not {"", str(tmp_path / inside)} & {*sys.path}
+
+
+@pytest.mark.parametrize("files", [("config.toml",), ("policy.json",), ("run.json", "policy.json")])
+def test_a_folder_with_some_files_of_such_names_is_the_user_s_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, files: tuple[str, ...]
+) -> None:
+    for name in files:
+        (tmp_path / name).touch()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    main(["--version"])
+    assert sys.path[-1] == str(tmp_path)
+
+
 def test_an_error_in_its_code_names_the_place_and_keeps_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,4 +1,4 @@
-"""What tells which run a folder holds: without run.json it holds none, a newer format is rejected."""
+"""What tells which run a folder holds: without run.json it holds none, a newer format is rejected, nothing is imported."""
 
 import json
 from collections.abc import Callable
@@ -19,6 +19,7 @@ from learner.run_folder.run_format import RUN_FILE, RUN_FORMAT, check_format
 from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.errors import UsageError
+from protocol.own_module import refuse_modules_in
 from protocol.policy.layout import acting_size
 from protocol.specs import PolicySpec
 
@@ -59,6 +60,52 @@ def test_a_folder_without_a_format_is_no_run_folder(run: Path, read: Callable[[P
     with pytest.raises(UsageError, match=r"expected a run folder, got one without run\.json"):
         read(run)
     assert load_policy(run)[2].id == "CartPole-v1", "the files of the policy are enough to act"
+
+
+@pytest.mark.parametrize(
+    ("found_from", "module"),
+    [
+        ("run", "evil"), ("run", "package.evil"), ("run/package", "evil"), ("", "run.evil"), ("", "run"),
+        ("", "run.package.evil"), ("link", "evil"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("named", ["env", "wrapper", "algo", "callback"])
+def test_a_module_in_a_run_folder_is_not_imported(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, named: str, found_from: str, module: str
+) -> None:
+    """Whatever of the search path leads there, and whatever names it."""
+    run = run.rename(tmp_path / "run")
+    (tmp_path / "link").symlink_to(run)
+    (run / "package").mkdir()
+    for folder in (run, run / "package"):
+        (folder / "evil.py").write_text("raise AssertionError('it was imported')")
+    monkeypatch.syspath_prepend(str(tmp_path / found_from))
+    name = f"{module}:Evil"
+    text = (run / "config.toml").read_text()
+    given = {"env": "CartPole-v1", "algo": "ppo", "wrapper": [], "callback": []} | {named: name}
+    for key, old in {"env": '"CartPole-v1"', "algo": '"ppo"', "wrapper": "[]", "callback": "[]"}.items():
+        new = json.dumps([given[key]] if old == "[]" and given[key] else given[key])
+        assert text.count(f"\n{key} = {old}\n") == 1
+        text = text.replace(f"\n{key} = {old}\n", f"\n{key} = {new}\n")
+    (run / "config.toml").write_text(text)
+    readers: list[Callable[[Path], object]] = [
+        config_of_run,
+        lambda run: resolve(resume=run),
+        lambda run: write_page([run], run / "report.html"),
+    ]
+    if named in ("env", "wrapper"):
+        card = json.loads((run / "policy.json").read_text())
+        (run / "policy.json").write_text(json.dumps(card | ({"env": name} if named == "env" else {"wrappers": [name]})))
+        readers.append(load_policy)
+    for read in readers:
+        with pytest.raises(UsageError, match=f"{name} would be imported from the run folder, and nothing is"):
+            read(run)
+
+
+def test_a_module_beside_a_run_folder_is_the_user_s_own(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (run.parent / "mine.py").write_text("")
+    monkeypatch.syspath_prepend(str(run.parent))
+    refuse_modules_in(run, ["mine:Env-v0", "gymnasium.wrappers:FlattenObservation", "CartPole-v1", "ALE/Pong-v5", ":", ""])
 
 
 @pytest.mark.parametrize("read", READERS)
