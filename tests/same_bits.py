@@ -36,6 +36,7 @@ COMMON = "--preset none --seed 3 --lanes 4 --envs 8 --device cpu --torch-threads
 ON_POLICY = "--rollout-steps 32 --steps 1500 --eval-every 700 --eval-episodes 4"
 REPLAY = "--rollout-steps 8 --learning-starts 200 --batch-size 32 --net 32 --steps 900 --eval-every 400 --eval-episodes 4"
 NORMALIZED = "--normalize-observations --normalize-rewards"
+IMAGES = "--env-kwargs observation nested action multibinary"
 RECORDED = "same/training-v0"
 RUNS: dict[str, tuple[str, ...]] = {
     "ppo": (f"train CartPole-v1 --algo ppo {ON_POLICY}",),
