@@ -18,6 +18,8 @@ from protocol.errors import UsageError, first_line
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
 
+NO_LANE = -1  # `Batch.lane` of prior data
+
 
 class PriorDataset:
     """A Minari dataset from the folder that MINARI_DATASETS_PATH names, checked against the policy of a run."""
@@ -75,7 +77,7 @@ class PriorDataset:
             truncated=truncated,
             valid=np.ones((T, 1), bool),
             state=np.zeros((1, self._policy.state_size), np.float32),
-            lane=np.array([number]),
+            lane=np.array([NO_LANE]),
             fresh=np.array([True]),
             copies=1,
             episodes=(),

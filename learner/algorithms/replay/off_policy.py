@@ -68,7 +68,7 @@ class OffPolicy(Algorithm):
         # The buffers of the policy also hold what exploration needs: so the normalizer gets the policy with another head.
         self.normalizer = ObservationNormalizer(msgspec.structs.replace(policy, head="actor_critic"))
         self.statistics: Floats = self.normalizer.buffers()
-        self.rewards = RewardScaler(config.gamma)  # counts own rewards, not those of prior data
+        self.rewards = RewardScaler(config.gamma)
         self._remembered: dict[str, Any] = {}
 
     @abstractmethod
@@ -92,9 +92,7 @@ class OffPolicy(Algorithm):
         learning_rate = self._set_learning_rate()
         beta = config.priority_beta + (1 - config.priority_beta) * self._done()
         self.replay.add(batch)
-        if config.normalize_rewards:
-            self.rewards.count(batch)
-        self.normalizer.update(features(self.policy, batch.obs)[:-1], batch.valid)
+        self._count(batch)
         self.statistics = self.normalizer.buffers()
         self.env_steps += batch.env_steps
         self.version += 1
@@ -113,6 +111,12 @@ class OffPolicy(Algorithm):
             metrics["replay/env_steps_per_gradient_step"] = batch.env_steps / len(measured)
         return metrics
 
+    def _count(self, batch: Batch) -> None:
+        """Count a batch for the statistics."""
+        if self.config.normalize_rewards:
+            self.rewards.count(batch)
+        self.normalizer.update(features(self.policy, batch.obs)[:-1], batch.valid)
+
     def _done(self) -> float:
         """The fraction of the run that is done: 0 in the first update, below 1 in the last."""
         return min(1.0, self.env_steps / self._total_steps)
@@ -125,11 +129,11 @@ class OffPolicy(Algorithm):
         return learning_rate
 
     def add_prior(self, batches: Iterable[Batch], observations: int) -> None:
-        """Store the rows of a dataset beside the replay buffer. They count for the observation statistics."""
+        """Store the rows of a dataset beside the replay buffer. They count for all statistics."""
 
         def counted() -> Iterator[Batch]:
             for batch in batches:
-                self.normalizer.update(features(self.policy, batch.obs)[:-1], batch.valid)
+                self._count(batch)
                 yield batch
 
         self.replay.add_prior(counted(), observations)

@@ -14,6 +14,7 @@ import torch
 
 from learner.algorithms import Algorithm, algorithm_class
 from learner.algorithms.dqn import DQN, LOSSES, exploration_rate
+from learner.algorithms.normalization import RewardScaler
 from learner.algorithms.replay import replay_buffer as replay_module
 from learner.algorithms.replay.replay_buffer import Sample
 from learner.config.hyperparameters import DQNConfig
@@ -111,6 +112,19 @@ def batch(seed: int, observation: tuple[Leaf, ...] = (BOX,), fresh: bool = False
 def same(a: DQN, b: DQN) -> bool:
     nets = torch.equal(a.net.flat, b.net.flat) and torch.equal(a.target.flat, b.target.flat)
     return nets and all(map(np.array_equal, a.weights(), b.weights()))
+
+
+def test_rewards_of_prior_data_count_for_the_scale_of_all_rewards() -> None:
+    algorithm, scaler = dqn(changed(PLAIN, normalize_rewards=True)), RewardScaler(PLAIN.gamma)
+    prior, own = batch(1), batch(2)
+    algorithm.add_prior([prior], prior.valid.size + LANES * COPIES)
+    scaler.count(prior)
+    assert scaler.std > 2
+    (drawn,) = algorithm.samples(1)
+    assert np.isin(drawn.reward, (prior.reward / scaler.std).astype(np.float32)).all()
+    algorithm.update(own, no_pulse)
+    scaler.count(own)
+    assert algorithm.rewards.std == scaler.std
 
 
 def test_a_resumed_run_takes_its_new_learning_rate_for_prior_data_too() -> None:
