@@ -14,7 +14,7 @@ import torch
 from learner.algorithms.normalization import ObservationNormalizer, RewardScaler
 from protocol.arrays import Array, Floats
 from protocol.errors import UsageError
-from protocol.policy.features import box_feature_mask, features, normalize
+from protocol.policy.features import feature_size, features, normalize
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
 
@@ -45,7 +45,7 @@ class Moments:
             policy, normalize_observations=True, own=None, encoder=None, head="actor_critic"
         )
         self._observations = ObservationNormalizer(self._policy)
-        self._size = len(box_feature_mask(self._policy))
+        self._size = feature_size(self._policy)
         self._rewards: tuple[float, RewardScaler] | None = None
 
     @property
@@ -55,7 +55,7 @@ class Moments:
 
     @property
     def std(self) -> Floats:
-        """[D] float32 standard deviation; 1 where a feature never varied or is of a discrete value."""
+        """[D] float32 standard deviation about `mean`; 1 where a feature never varied or is of a discrete value."""
         return self.buffers()[self._size :]
 
     def buffers(self) -> Floats:

@@ -13,19 +13,22 @@ import torch
 
 from learner.algorithms.returns import EpisodeEnds, discounted_return
 from protocol.arrays import Doubles, Floats
-from protocol.policy.features import box_feature_mask
+from protocol.policy.features import leaf_of_features
 from protocol.policy.layout import buffer_size
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
 
-TINY = 1e-12  # a variance below this fraction of the squared mean is rounding: the value did not vary
+TINY = 1e-12  # a smaller standard deviation is rounding: the value did not vary
+ROUNDING_32, ROUNDING_64 = 1e-6, 1e-12  # of float32 and float64: the same, as a fraction of the mean
 
 
 class RunningMoments:
     """Mean and variance [*shape] of all rows so far, updated batch by batch (Chan, Golub and LeVeque 1979)."""
 
-    def __init__(self, shape: tuple[int, ...] = ()) -> None:
+    def __init__(self, shape: tuple[int, ...] = (), rounding: float | Doubles = ROUNDING_32) -> None:
+        """`rounding` [*shape]: that of the dtype of the values."""
         self.count = 0
+        self._rounding = rounding
         self.mean: Doubles = np.zeros(shape)
         self._squares: Doubles = np.zeros(shape)  # summed squared distances from the mean
 
@@ -45,9 +48,8 @@ class RunningMoments:
 
         If the mean is so large that this rounding may be more than 1, it stands in place of 1.
         """
-        variance = self._squares / max(self.count, 1)
-        varied = variance > TINY * self.mean**2 + TINY**2
-        return np.where(varied, np.sqrt(variance), np.maximum(TINY**0.5 * abs(self.mean), 1.0))
+        variance, rounding = self._squares / max(self.count, 1), self._rounding * abs(self.mean)
+        return np.where(variance > rounding**2 + TINY**2, np.sqrt(variance), np.maximum(rounding, 1.0))
 
     def state_dict(self) -> dict[str, Any]:
         """Tensors and numbers, copied."""
@@ -64,9 +66,11 @@ class ObservationNormalizer:
 
     def __init__(self, spec: PolicySpec) -> None:
         self._enabled = spec.normalize_observations
-        self._box_features = box_feature_mask(spec)
-        self._moments = RunningMoments(self._box_features.shape)
-        assert not self._enabled or buffer_size(spec) == 2 * len(self._box_features)
+        leaves = leaf_of_features(spec)
+        self._box_features = np.array([leaf.kind == "box" for leaf in leaves], bool)
+        self._is_float64 = np.array([leaf.dtype == "float64" for leaf in leaves], bool)
+        self._moments = RunningMoments((len(leaves),), np.where(self._is_float64, ROUNDING_64, ROUNDING_32))
+        assert not self._enabled or buffer_size(spec) == 2 * len(leaves)
 
     def update(self, features: Floats | Doubles, valid: npt.NDArray[np.bool_]) -> None:
         """Count features [T, N, D], not yet normalized, of the rows [T, N] that are valid."""
@@ -74,12 +78,17 @@ class ObservationNormalizer:
             self._moments.update(features[valid])
 
     def buffers(self) -> Floats:
-        """D means, then D standard deviations, float32, as published; empty if the policy does not normalize."""
+        """D means, then D standard deviations, float32, as published; empty if the policy does not normalize.
+
+        A float64 feature may vary by less than its mean is rounded by, such as a time in seconds: its standard deviation is
+        that about the rounded mean, so that normalized values have a mean square of 1 and are not at the bounds.
+        """
         if not self._enabled:
             return np.empty(0, np.float32)
-        mean = np.where(self._box_features, self._moments.mean, 0)
-        std = np.where(self._box_features, self._moments.std, 1)
-        return np.concatenate([mean, std]).astype(np.float32)
+        mean = np.where(self._box_features, self._moments.mean, 0).astype(np.float32)
+        off = np.where(self._is_float64, mean - self._moments.mean, 0)
+        std = np.where(self._box_features, np.hypot(self._moments.std, off), 1)
+        return np.concatenate([mean, std.astype(np.float32)])
 
     def state_dict(self) -> dict[str, Any]:
         """Tensors and numbers, copied."""

@@ -11,7 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from protocol.arrays import Array, Bools, Doubles, Floats
+from protocol.arrays import Array, Doubles, Floats
 from protocol.specs import Leaf, PolicySpec
 
 CLIP = np.float32(10.0)  # normalized observations are clipped to ±10
@@ -61,10 +61,9 @@ def _one_hot_values(leaf: Leaf) -> Array:
     return np.concatenate([np.arange(start, start + n) for start, n in zip(leaf.start, leaf.sizes, strict=True)])
 
 
-def box_feature_mask(spec: PolicySpec) -> Bools:
-    """[D] True for features of a Box. Only these are normalized."""
-    plain = [leaf for leaf in spec.observation if not leaf.is_image]
-    return np.concatenate([np.full(_leaf_features(leaf), leaf.kind == "box") for leaf in plain] or [np.zeros(0, bool)])
+def leaf_of_features(spec: PolicySpec) -> list[Leaf]:
+    """The leaf that each of the D features belongs to. Only features of a Box are normalized."""
+    return [leaf for leaf in spec.observation if not leaf.is_image for _ in range(_leaf_features(leaf))]
 
 
 def normalize(x: Floats | Doubles, mean: Floats, std: Floats) -> Floats:

@@ -12,8 +12,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from learner.algorithms.normalization import ObservationNormalizer, RewardScaler, RunningMoments
+from learner.algorithms.normalization import ROUNDING_64, ObservationNormalizer, RewardScaler, RunningMoments
 from protocol.arrays import Array
+from protocol.policy.features import normalize
 from protocol.policy.layout import buffer_size
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
@@ -179,12 +180,27 @@ def test_what_never_varied_is_divided_by_one() -> None:
 
 def test_a_large_value_that_varies_little_is_not_clipped() -> None:
     """The time of day in seconds, during ten minutes: all features were at the bounds of ±10."""
-    moments, seconds = RunningMoments(), 1.7e9 + np.arange(600.0)
-    moments.update(seconds)
-    distance = (seconds - moments.mean) / moments.std
-    rounding = 4 * np.spacing(1.7e9) / 1.7e3  # of the mean
-    np.testing.assert_allclose(distance, (np.arange(600) - 299.5) / (1e-6 * (1.7e9 + 299.5)), rtol=0, atol=rounding)
-    assert len(np.unique(np.clip(distance.astype(np.float32), -10, 10))) == 600
+    normalizer, seconds = ObservationNormalizer(CLOCK), (1.7e9 + np.arange(600.0)).reshape(600, 1, 1)
+    normalizer.update(seconds, np.ones((600, 1), bool))
+    normalized = normalize(seconds, *np.split(normalizer.buffers(), 2))
+    np.testing.assert_allclose(np.square(normalized, dtype=np.float64).mean(), 1, rtol=1e-5)
+    assert len(np.unique(normalized)) == 600
+
+
+CLOCK = PolicySpec((Leaf("", "box", (1,), "float64"),), SPEC.action, normalize_observations=True)
+
+
+def test_a_float64_feature_has_its_own_spread_however_small_beside_its_mean() -> None:
+    normalizer, rows = ObservationNormalizer(CLOCK), 1e7 + np.random.default_rng(0).normal(size=(20, 100, 1))
+    for some in np.split(rows, 4):
+        normalizer.update(some, np.ones((5, 100), bool))
+    mean, std = normalizer.buffers().astype(np.float64)
+    np.testing.assert_allclose(std, np.sqrt(np.square(rows - mean).mean()), rtol=1e-5)
+    assert abs(std - 1) < 0.1
+    never = RunningMoments((), ROUNDING_64)
+    for _ in range(10):
+        never.update(np.full(5_000, 1e7 / 3))
+    assert never.std == 1
 
 
 @pytest.mark.parametrize("steps", [1, 4])
