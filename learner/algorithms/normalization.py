@@ -1,6 +1,11 @@
 """Running mean and variance of observation features and of the discounted return: float64, numpy; tensors only in the state.
 
 Only valid rows count. The learner alone updates these; workers act with the float32 buffers that it publishes.
+
+Rule: no single observation may hide the others. A value that is more than `FAR` standard deviations from the mean counts as
+one that is `CLIP` from it, which is what the policy sees of it. So failures of a sensor, below one row in a hundred, change
+the standard deviation little. A feature whose scale grows for good soon sets a new one, because its many far values count.
+Values that are not far count as they are, bit for bit.
 """
 
 from __future__ import annotations
@@ -13,12 +18,14 @@ import torch
 
 from learner.algorithms.returns import EpisodeEnds, discounted_return
 from protocol.arrays import Doubles, Floats
-from protocol.policy.features import leaf_of_features
+from protocol.policy.features import CLIP, leaf_of_features
 from protocol.policy.layout import buffer_size
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
 
 TINY = 1e-12  # a smaller standard deviation is rounding: the value did not vary
+FAR = 100.0  # standard deviations
+FEW = 100  # rows: before there are so many, the scale is not known, and no value is far
 ROUNDING_32, ROUNDING_64 = 1e-6, 1e-12  # of float32 and float64: the same, as a fraction of the mean
 
 
@@ -75,7 +82,23 @@ class ObservationNormalizer:
     def update(self, features: Floats | Doubles, valid: npt.NDArray[np.bool_]) -> None:
         """Count features [T, N, D], not yet normalized, of the rows [T, N] that are valid."""
         if self._enabled:
-            self._moments.update(features[valid])
+            self._moments.update(self._bounded(features[valid]))
+
+    def _bounded(self, rows: Floats | Doubles) -> Floats | Doubles:
+        """The rows [B, D], with far values replaced. In the first batch, 99 in 100 rows set the scale."""
+        if self._moments.count >= FEW:
+            center, spread = self._moments.mean, self._moments.std
+        elif len(rows) >= FEW:
+            center = np.median(rows, 0)
+            spread = np.quantile(abs(rows - center), 0.99, axis=0, method="lower")
+            spread = np.where(spread > 0, spread, 1)
+        else:
+            return rows
+        distance = rows - center.astype(rows.dtype)
+        if (np.einsum("bd,bd->d", distance, distance) <= (FAR * spread) ** 2).all():
+            return rows  # most batches: the squares of all rows together are less than that of one far value
+        far = abs(distance) > FAR * spread
+        return np.where(far, center + np.copysign(CLIP * spread, distance), rows) if far.any() else rows
 
     def buffers(self) -> Floats:
         """D means, then D standard deviations, float32, as published; empty if the policy does not normalize.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterable
 from typing import Any
 
 import hypothesis.extra.numpy as hnp
@@ -76,6 +77,58 @@ def test_only_measured_features_of_valid_rows_are_counted() -> None:
     np.testing.assert_allclose(buffers[6:][measured], x[valid].std(0)[measured], rtol=1e-5)
     assert buffers[[2, 3, 4]].tolist() == [0.0] * 3
     assert buffers[[8, 9, 10]].tolist() == [1.0] * 3
+
+
+NUMBER = PolicySpec((Leaf("", "box", (1,), "float32"),), SPEC.action, normalize_observations=True)
+
+
+def counted(batches: Iterable[Array]) -> tuple[Array, Array]:
+    """The buffers after these batches [rows] of one feature, and what they were if each value counted as it is."""
+    normalizer, moments = ObservationNormalizer(NUMBER), RunningMoments((1,))
+    for rows in batches:
+        normalizer.update(rows.astype(np.float32)[:, None, None], np.ones((len(rows), 1), bool))
+        moments.update(rows.astype(np.float32)[:, None])
+    return normalizer.buffers(), np.concatenate([moments.mean, moments.std]).astype(np.float32)
+
+
+def noise(batches: int, rows: int = 500, scale: float = 1.0) -> list[Array]:
+    generator = np.random.default_rng(batches)
+    return [scale * generator.normal(size=rows) for _ in range(batches)]
+
+
+@pytest.mark.parametrize("rows", [1, 500])
+def test_values_that_are_not_far_count_as_they_are(rows: int) -> None:
+    tails = [np.random.default_rng(n).standard_t(3, rows) for n in range(40)]
+    growing = [(1 + n) * each for n, each in enumerate(noise(40, rows))]
+    for batches in (tails, growing, [np.abs(each) // 3 for each in growing]):
+        found, exact = counted(batches)
+        assert found.tobytes() == exact.tobytes()
+
+
+@pytest.mark.parametrize(("batch", "rows"), [(0, 500), (1, 500), (30, 500), (30, 8)])
+def test_one_value_does_not_hide_the_others(batch: int, rows: int) -> None:
+    batches = noise(20_000 // rows, rows)
+    batches[batch][3] = 1e6
+    (mean, std), exact = counted(batches)
+    assert exact[1] > 5_000
+    assert abs(mean) < 0.05
+    assert 0.95 < std < 1.05
+
+
+def test_nor_do_values_that_come_once_in_two_hundred_rows() -> None:
+    batches = noise(40)
+    for each in batches:
+        each[:: len(each) // 2] = -1e6
+    (_, std), exact = counted(batches)
+    assert exact[1] > 50_000
+    assert 0.9 < std < 2
+
+
+@pytest.mark.parametrize(("grows", "updates"), [(1e2, 2), (1e4, 10)])
+def test_a_feature_that_grows_for_good_is_followed(grows: float, updates: int) -> None:
+    """Twenty thousand rows, and then others: within so many updates the spread is half of what it is if nothing is far."""
+    found, exact = counted(noise(40) + noise(updates, scale=grows))
+    assert found[1] > exact[1] / 2
 
 
 def batch(
