@@ -75,7 +75,8 @@ class Moments:
         return normalize(self._features(batch), self.mean, self.std)
 
     def scaled_rewards(self, batch: Batch, gamma: float) -> Floats:
-        """Count a batch, and return its rewards [T, N] divided by the standard deviation of the discounted return.
+        """Count a batch, and return its rewards [T, N] divided by the standard deviation of the discounted return,
+        clipped to ±10.
 
         Call it once for each batch. `gamma` is the discount, the same each time. Raises `UsageError` for another.
         """

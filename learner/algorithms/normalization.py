@@ -135,9 +135,14 @@ class RewardScaler:
         self._returns: dict[int, Doubles] = {}  # lane -> [copies]
 
     def scale(self, batch: Batch) -> Floats:
-        """Count the batch, then return its scaled rewards [T, ΣN]."""
+        """Count the batch, then return its scaled rewards [T, ΣN], clipped to ±10."""
         self.count(batch)
-        return (batch.reward / self.std).astype(np.float32)
+        return self.scaled(batch.reward)
+
+    def scaled(self, reward: Floats) -> Floats:
+        """These rewards, scaled and clipped to ±10 as VecNormalize of Stable-Baselines3 does, float32."""
+        clipped: Floats = np.clip(reward / self.std, -CLIP, CLIP).astype(np.float32)
+        return clipped
 
     @property
     def std(self) -> float:

@@ -63,7 +63,7 @@ class PolicyGradientConfig(AlgorithmConfig, frozen=True):
     log_std_init: Fixed[Annotated[float, msgspec.Meta(ge=-20, le=20)]] = 0.0
     """Initial logarithm of the standard deviation of continuous (Box) actions."""
     normalize_rewards: Fixed[bool] = False
-    """Divide rewards by the running standard deviation of the discounted return."""
+    """Divide rewards by the running standard deviation of the discounted return, and clip them to ±10."""
 
 
 class RecurrentConfig(PolicyGradientConfig, frozen=True):
@@ -98,7 +98,7 @@ class PPOConfig(ActorCriticConfig, frozen=True):
     ±10. docs/explanation/defaults.md shows why PPO does by default.
     """
     normalize_rewards: Fixed[bool] = True
-    """Divide rewards by the running standard deviation of the discounted return."""
+    """Divide rewards by the running standard deviation of the discounted return, and clip them to ±10."""
     clip_range: Free[Positive] = 0.2
     """ε of the clipped objective: the ratio of new to old action probability is clipped to 1 ± ε."""
     clip_range_schedule: Free[Schedule] = "constant"
@@ -155,8 +155,8 @@ class REINFORCEConfig(PolicyGradientConfig, frozen=True):
     learning_rate: Free[Positive] = 2e-3
     """Learning rate of the optimizer."""
     normalize_rewards: Fixed[bool] = True
-    """Divide rewards by the running standard deviation of the discounted return. Otherwise the loss of the baseline
-    dominates the gradient.
+    """Divide rewards by the running standard deviation of the discounted return, and clip them to ±10. Otherwise the loss of
+    the baseline dominates the gradient.
     """
     optimizer: Fixed[Optimizer] = "adam"
     """Optimizer: rmsprop (α = 0.99) or adam, each with ε = 1e-5."""
@@ -200,7 +200,9 @@ class OffPolicyConfig(AlgorithmConfig, frozen=True):
     tau: Free[Annotated[float, msgspec.Meta(gt=0, le=1)]] = 0.005
     """τ of the polyak update: the fraction by which the target network moves in each gradient step."""
     normalize_rewards: Fixed[bool] = False
-    """Divide rewards by the running standard deviation of the discounted return, when they are drawn from the buffer."""
+    """Divide rewards by the running standard deviation of the discounted return, when they are drawn from the buffer, and
+    clip them to ±10; with n_step, the sum of n rewards.
+    """
 
 
 class DQNConfig(OffPolicyConfig, frozen=True):

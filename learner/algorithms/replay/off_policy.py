@@ -151,7 +151,7 @@ class OffPolicy(Algorithm):
         """Minibatches from the replay buffer and from prior data. `beta`: see `ReplayBuffer.sample`."""
         for drawn in self.replay.samples(number, self.config.batch_size, beta):
             if self.config.normalize_rewards:
-                drawn = drawn._replace(reward=(drawn.reward / self.rewards.std).astype(np.float32))
+                drawn = drawn._replace(reward=self.rewards.scaled(drawn.reward))
             yield drawn
 
     def inputs(self, leaves: Sequence[Array]) -> tuple[Array, list[Array]]:

@@ -222,6 +222,15 @@ def test_the_reward_of_a_row_that_is_not_valid_changes_nothing() -> None:
     np.testing.assert_array_equal(scaled[0][valid], scaled[1][valid])
 
 
+def test_a_scaled_reward_is_clipped() -> None:
+    reward = np.zeros((2_000, 2))
+    reward[50] = 1e6, -1e6
+    scaler = RewardScaler(GAMMA)
+    scaled = scaler.scale(batch(reward, [0, 0], [True, True]))
+    assert 1e6 / scaler.std > 15
+    assert sorted(set(scaled.ravel().tolist())) == [-10, 0, 10]
+
+
 def test_what_never_varied_is_divided_by_one() -> None:
     constant = batch(np.full((1, 3), 0.3), [0, 0, 0], [True] * 3, copies=3)
     np.testing.assert_array_equal(RewardScaler(GAMMA).scale(constant), constant.reward)
