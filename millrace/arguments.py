@@ -6,7 +6,6 @@ a file; True and False are no numbers. What is otherwise is refused in one line,
 
 from __future__ import annotations
 
-import errno
 import functools
 import inspect
 import os
@@ -16,7 +15,7 @@ from typing import Any, Literal, ParamSpec, TypeVar, Union, Unpack, get_args, ge
 
 import numpy as np
 
-from protocol.errors import UsageError
+from protocol.errors import UsageError, usage_error
 
 WORDS: dict[Any, str] = {
     str: "text",
@@ -66,9 +65,9 @@ def checked(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Re
         try:
             return function(*given.args, **given.kwargs)
         except OSError as error:
-            if error.errno != errno.ENAMETOOLONG:
+            if (ours := usage_error(error)) is None:
                 raise
-            raise UsageError(f"{who}: path {error.filename}: {error.strerror}; choose a shorter one") from error
+            raise UsageError(f"{who}: {ours}") from error
 
     return door
 

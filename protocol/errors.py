@@ -22,6 +22,8 @@ A message is one line: who, what, expected, got, what to do next.
 from __future__ import annotations
 
 import difflib
+import errno
+import resource
 from collections.abc import Iterable, Sequence
 
 from protocol.bounds import one_line
@@ -83,6 +85,19 @@ class UsageError(UserFacingError):
     """
 
     exit_code = 2
+
+
+def usage_error(error: OSError) -> UsageError | None:
+    """The line for an error of the system that follows from what the user asked for; None for any other."""
+    match error.errno:
+        case errno.ENAMETOOLONG:
+            return UsageError(f"path {error.filename}: {error.strerror}; choose a shorter one")
+        case errno.EMFILE:
+            most, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+            return UsageError(
+                f"a process may have {most} files open here, which is too few: `ulimit -n 4096`, or fewer workers"
+            )
+    return None
 
 
 class Refused(UserFacingError):

@@ -24,7 +24,7 @@ from learner.run_folder.last_line import last_line
 from learner.run_folder.run_format import is_run_folder
 from learner.standard_streams import open_closed, unfailing
 from protocol.bounds import escaped, indented
-from protocol.errors import UsageError, UserFacingError
+from protocol.errors import UsageError, UserFacingError, usage_error
 from protocol.logs.notices import log_notice
 
 if TYPE_CHECKING:
@@ -80,9 +80,9 @@ def _exit_code(argv: list[str]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
-        if error.errno == errno.ENAMETOOLONG:  # of a path on the command line
-            _print_error(f"millrace: path {error.filename}: {error.strerror}; choose a shorter one")
-            return _failed(argv, 2)
+        if (ours := usage_error(error)) is not None:
+            _print_error(f"millrace: {ours}")
+            return _failed(argv, ours.exit_code)
         if error.filename is not None or error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
             return _internal_error(argv, error)
         _print_error(f"millrace: standard output: {error.strerror}")  # an error of a file has the file's name

@@ -23,6 +23,7 @@ from protocol.keys.key_folder import Keyring, chosen_key_folder
 from protocol.keys.keys import Token
 from workers.supervisor import Supervisor, core_flags, timeout_flags
 
+LONGEST_FOLDER = 80  # bytes of its path: that of a socket file in it has 107 at most
 LEAVE_AT_ONCE_S = 0.5  # after a start that failed: a worker in the constructor of its environment hears nothing
 
 WorkerFlags = Callable[[str], tuple[list[str], Path | None]]
@@ -37,7 +38,9 @@ def private_address(transport: str, stack: ExitStack) -> str:
         case "tcp":
             return "tcp://127.0.0.1:*"
         case "ipc":
-            folder = tempfile.mkdtemp(prefix="millrace-")  # 0700: the operating system decides who may connect
+            room = len(os.fsencode(tempfile.gettempdir())) <= LONGEST_FOLDER
+            # 0700: the operating system decides who may connect
+            folder = tempfile.mkdtemp(prefix="millrace-", dir=None if room else "/tmp")
             stack.callback(shutil.rmtree, folder, ignore_errors=True)
             return f"ipc://{folder}/learner"
         case _:

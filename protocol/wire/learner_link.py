@@ -11,6 +11,7 @@ routing id ends in a tag that only the holder of its key can make.
 
 from __future__ import annotations
 
+import errno
 import logging
 import time
 from collections.abc import Iterator, Sequence
@@ -180,6 +181,8 @@ def _bind_error(address: str, error: zmq.ZMQError) -> str:
     match error.errno:
         case zmq.EADDRINUSE:
             return f"address {address} is in use; choose another port, or tcp://127.0.0.1:* for any free one"
+        case errno.ENAMETOOLONG:
+            return f"address {address}: expected a path of at most {zmq.IPC_PATH_MAX_LEN} bytes"
         case _:
             return (
                 f"address {address}: cannot bind ({error.strerror}); expected one of this machine, as tcp://127.0.0.1:5555"

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import inspect
 import random
+import tempfile
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -16,7 +19,9 @@ import millrace
 from learner.config.config import Config
 from learner.config.hyperparameters import PPOConfig
 from learner.config.rollout_config import RolloutConfig
+from learner.members.bound import bind
 from millrace.launch import learner_inference, local_run, policy_workers, rollouts, vector
+from millrace.launch.local_worker_options import private_address
 from millrace.playing import EvaluateKeywords, RecordKeywords
 from tests.support import own_policies
 
@@ -213,3 +218,28 @@ def test_what_is_wrong_is_said_in_one_line(function: Callable[..., Any], given: 
 def test_a_call_with_another_signature_is_a_type_error_as_of_any_function() -> None:
     with pytest.raises(TypeError, match=r"load\(\) got an unexpected keyword argument 'bset'"):
         millrace.load("x", bset=True)  # type: ignore[call-arg]
+
+
+def test_a_limit_of_the_system_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def too_many_files(*arguments: object) -> None:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(vector, "open_endpoint", too_many_files)
+    with pytest.raises(millrace.UsageError, match=r"^make_vec: a process may have [0-9]+ files open here, which is too few"):
+        millrace.make_vec("CartPole-v1", workers=8)
+
+
+def test_workers_find_a_learner_whose_temporary_folder_has_a_long_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / ("x" * 90)
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    with ExitStack() as resources:
+        address = private_address("ipc", resources)
+        bind(address, None, resources)
+        made = Path(address.removeprefix("ipc://")).parent
+        assert made.stat().st_mode & 0o777 == 0o700
+    assert not made.exists()
+    with ExitStack() as resources, pytest.raises(millrace.UsageError, match=r": expected a path of at most 107 bytes$"):
+        bind(f"ipc://{folder}/{'y' * 20}", None, resources)

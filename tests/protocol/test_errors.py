@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import resource
+
 import pytest
 
-from protocol.errors import UsageError, check_at_least, first_line
+from protocol.errors import UsageError, check_at_least, first_line, usage_error
 
 
 class WithoutText(Exception):
@@ -28,3 +31,10 @@ def test_what_is_less_is_refused() -> None:
 
 def test_an_error_is_one_line_whatever_it_quotes() -> None:
     assert str(UsageError("run a\nb\x1b[2J: no such folder")) == r"run a\nb\x1b[2J: no such folder"
+
+
+def test_the_limit_of_open_files_is_named() -> None:
+    most, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    line = f"a process may have {most} files open here, which is too few: `ulimit -n 4096`, or fewer workers"
+    assert str(usage_error(OSError(errno.EMFILE, "Too many open files"))) == line
+    assert usage_error(OSError(errno.ENOSPC, "No space left on device")) is None
