@@ -91,9 +91,7 @@ class Sb3VecEnv(VecEnv):
     def reset(self) -> Any:
         """Begin episodes in all env copies, with the seeds and options that were set. Returns the observations."""
         seeds = self._seeds if any(seed is not None for seed in self._seeds) else None
-        options = self._options[0] or None
-        if any(options_of_copy != self._options[0] for options_of_copy in self._options):
-            raise ValueError("set_options: expected the same options for every copy, got different ones")
+        options = [each or None for each in self._options] if any(self._options) else None
         observation, _ = self.env.reset(seed=seeds, options=options)
         self.reset_infos = self._info_list()
         self._reset_seeds()

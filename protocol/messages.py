@@ -263,7 +263,7 @@ class Reset(Message, frozen=True):
     seeds: tuple[int | None, ...]
     """one seed for each of `copies`; null: go on with the random numbers that the copy has"""
     options: Array
-    """[bytes] uint8, `protocol.wire.plain_values`: the options of `Env.reset`, or None"""
+    """[bytes] uint8, `protocol.wire.plain_values`: the options of `Env.reset`, or None; a list has those of each copy"""
 
 
 class Step(Message, frozen=True):

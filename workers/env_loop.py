@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from copy import deepcopy
+from itertools import repeat
 from time import perf_counter
 from typing import Any, Literal
 
@@ -81,15 +82,16 @@ class EnvLoop:
         seeds: Sequence[int | None],
         into: list[Any],
         pulse: Pulse,
-        keywords: Mapping[str, Any] | None = None,
+        options: Sequence[Any] = (),
     ) -> Infos:
-        """Start episodes in these copies, a seed for each. `keywords` are further arguments of `gymnasium.Env.reset`."""
+        """Start episodes in these copies, with a seed for each, and options for each if any are given."""
         infos: Infos = []
-        for n, seed in zip(copies, seeds, strict=True):
+        keywords: Iterable[Mapping[str, Any]] = [{"options": each} for each in options] or repeat({}, len(seeds))
+        for n, seed, further in zip(copies, seeds, keywords, strict=True):
             pulse()
             try:
                 with self._activity.during(RESETTING):
-                    into[n], info = self.envs[n].reset(seed=seed, **(keywords or {}))
+                    into[n], info = self.envs[n].reset(seed=seed, **further)
             except BaseException as error:
                 raise CopyRaised(n, "reset") from error
             self.reward[n], self.terminated[n], self.truncated[n] = 0.0, False, False

@@ -36,12 +36,19 @@ def seed_list(seed: int | Sequence[int | None] | None, num_envs: int) -> list[in
     return seeds
 
 
-def take_reset_mask(options: dict[str, Any] | None, num_envs: int) -> tuple[Bools, dict[str, Any] | None]:
+Options = dict[str, Any] | list[dict[str, Any] | None] | None
+"""Options of a reset: the same for all env copies, or a list with those of each."""
+
+
+def take_reset_mask(options: Options, num_envs: int) -> tuple[Bools, Options]:
     """The env copies to reset, and the options without the mask. Without a mask all copies are reset.
 
-    Raises `TypeError` for a mask that is no bool array, `ValueError` for a wrong shape or a mask without True.
+    Raises `TypeError` for a mask that is no bool array, `ValueError` for a wrong shape, a mask without True, and a list of
+    another length.
     """
-    if options is None or "reset_mask" not in options:
+    if isinstance(options, list) and len(options) != num_envs:
+        raise ValueError(f"options: expected one for each of {num_envs} copies, got {len(options)}")
+    if not isinstance(options, dict) or "reset_mask" not in options:
         return np.ones(num_envs, bool), options
     mask = options["reset_mask"]
     if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:

@@ -17,7 +17,7 @@ from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoA
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from learner.vector_env.arguments import action_arrays, seed_list, take_reset_mask
+from learner.vector_env.arguments import Options, action_arrays, seed_list, take_reset_mask
 from learner.vector_env.batch_arrays import BatchArrays
 from learner.vector_env.batch_layout import BatchLayout
 from learner.vector_env.calls import assign_orders, call_orders, call_results, described_copies
@@ -108,13 +108,12 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
 
     # ---------------------------------------------------------------- reset
 
-    def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, Infos]:
+    def reset(self, *, seed: int | Sequence[int | None] | None = None, options: Options = None) -> tuple[Any, Infos]:
         """Begin episodes in all copies, or in those that `options["reset_mask"]` selects. Returns observations and infos.
 
-        A single seed s gives the copies s, s + 1, …. Raises `WorkerLost` if each attempt loses a worker. With SameStep,
-        copies that were lost with their worker are reset together; raises `UsageError` for a part of them.
+        A single seed s gives the copies s, s + 1, …. A list of options has those of each copy. Raises `WorkerLost` if each
+        attempt loses a worker. With SameStep, copies that were lost with their worker are reset together; raises
+        `UsageError` for a part of them.
         """
         self._check_idle("reset")
         seeds = seed_list(seed, self.num_envs)
@@ -131,17 +130,18 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         return self._batch.observation(copy=self.copy), self._merge_infos(infos)
 
     def _reset_copies(
-        self, copies: Mapping[int, list[int]], seeds: Sequence[int | None], options: dict[str, Any] | None
+        self, copies: Mapping[int, list[int]], seeds: Sequence[int | None], options: Options
     ) -> dict[int, bytes]:
         """Begin episodes in these copies of these lanes, and again wherever a worker is lost. Packed infos by lane."""
-        packed_options = packed(options)
         infos: dict[int, bytes] = {}
         waiting = dict(copies)
         for attempt in range(RESET_ATTEMPTS):
             orders = {}
             for lane, chosen in waiting.items():
-                lane_seeds = seeds[self._layout.rows[lane]]
-                orders[lane] = reset_order(chosen, [lane_seeds[n] for n in chosen], packed_options)
+                rows = self._layout.rows[lane]
+                lane_seeds = seeds[rows]
+                lane_options = [options[rows][n] for n in chosen] if isinstance(options, list) else options
+                orders[lane] = reset_order(chosen, [lane_seeds[n] for n in chosen], packed(lane_options))
             self._hub.send_orders(orders)
             answers = self._hub.wait_for_answers(self.timeout_s)
             infos |= self._store(answers)
@@ -412,7 +412,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         return described
 
     def make_copies(self) -> None:
-        """Make all copies now, before they are reset. Raises `EnvironmentFailed`, also if their spaces differ, and as `reset`."""
+        """Make all copies, before they are reset. Raises as `reset`, and `EnvironmentFailed` also if their spaces differ."""
         expected = self.single_observation_space, self.single_action_space
         described: list[DescribedEnv | None] = []
         for attempt in range(RESET_ATTEMPTS):

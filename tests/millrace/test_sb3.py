@@ -142,6 +142,26 @@ def test_attributes_and_methods_by_index() -> None:
     env.close()
 
 
+def test_each_copy_may_have_options_of_its_own() -> None:
+    space = gymnasium.spaces.Discrete(2)
+    theirs: Any = DummyVecEnv([partial(RemembersActions, space) for _ in range(3)])
+    ours = make_vec_env([partial(RemembersActions, space)] * 3, monitor=False, transport="inproc", lanes=2)
+    try:
+        each: tuple[Any, ...] = [{"a": 1}, {}, {"b": np.arange(2)}], {"c": 3}, None
+        for options in each:
+            ours.set_options(options)
+            theirs.set_options(options)
+            ours.reset(), theirs.reset()
+            assert bit_equal(ours.reset_infos, theirs.reset_infos)
+            ours.reset(), theirs.reset()
+            assert ours.reset_infos == theirs.reset_infos == [{"options": None}] * 3, "they hold for one reset"
+        ours.set_options([{"a": 1}] * 2)
+        with pytest.raises(ValueError, match="options: expected one for each of 3 copies, got 2"):
+            ours.reset()
+    finally:
+        ours.close(), theirs.close()
+
+
 def test_ppo_learns_on_it() -> None:
     env = make_vec_env("CartPole-v1", 4, seed=1, workers=2)
     model = sb3.PPO("MlpPolicy", env, n_steps=32, batch_size=64, n_epochs=1, device="cpu", seed=1)

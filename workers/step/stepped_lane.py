@@ -62,8 +62,9 @@ class SteppedLane:
         self._joined = [writer.joined(array) for writer, array in zip(self._writers, rows.obs, strict=True)]
 
     def reset(self, copies: Sequence[int], seeds: Sequence[int | None], options: Any, pulse: Pulse) -> Infos:
-        """Start episodes in these copies, with a seed for each."""
-        infos = self._loop.reset(copies, seeds, self._observations, pulse, {"options": options})
+        """Start episodes in these copies, with a seed for each. `options`: a list with those of each, or those of all."""
+        each = options if isinstance(options, list) else [options] * len(copies)
+        infos = self._loop.reset(copies, seeds, self._observations, pulse, each)
         for n in copies:  # only these: a copy may overwrite the observation that it returned before
             leaves = read_leaves(self._read, [self._observations[n]])
             for writer, row, (value,) in zip(self._writers, self.rows.obs, leaves, strict=True):
