@@ -15,6 +15,7 @@ import gymnasium
 import msgspec
 import numpy as np
 from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 import millrace
@@ -22,6 +23,7 @@ from learner.vector_env.env import ZmqVectorEnv
 from millrace.arguments import checked
 from protocol.arrays import Array
 from protocol.env_spec import EnvLike, EnvSpec, Scalar
+from protocol.envs.description import class_name
 from protocol.envs.spaces import make_flatten, make_unflatten
 from protocol.errors import UsageError
 
@@ -67,7 +69,8 @@ def make_vec_env(
             envs = [wrap(each) for each in env_id]
         else:
             envs = wrap(env_id)
-    env = Sb3VecEnv(millrace.make_vec(envs, n_envs, autoreset_mode="SameStep", **keywords, **(env_kwargs or {})))
+    made = millrace.make_vec(envs, n_envs, autoreset_mode="SameStep", **keywords, **(env_kwargs or {}))
+    env = Sb3VecEnv(made, monitored=monitor and wrapper_class is not None)
     if seed is not None:
         env.seed(seed)
         env.action_space.seed(seed)
@@ -77,12 +80,12 @@ def make_vec_env(
 class Sb3VecEnv(VecEnv):
     """The SB3 interface of a vector environment whose autoreset mode is `SameStep`."""
 
-    def __init__(self, env: ZmqVectorEnv) -> None:
-        """Raises `UsageError` for another autoreset mode."""
+    def __init__(self, env: ZmqVectorEnv, *, monitored: bool = False) -> None:
+        """`monitored`: the workers record episodes as `Monitor` does. Raises `UsageError` for another autoreset mode."""
         if env.autoreset_mode is not AutoresetMode.SAME_STEP:
             raise UsageError(f"Sb3VecEnv: expected autoreset_mode SameStep, got {env.autoreset_mode.value}")
         env.merge_infos = False  # merged infos have one dtype and shape for all copies
-        self.env = env
+        self.env, self._monitored = env, monitored
         space = env.single_action_space
         self._nested_actions = isinstance(space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple)
         self._flatten, self._unflatten = make_flatten(space), make_unflatten(space)
@@ -144,8 +147,13 @@ class Sb3VecEnv(VecEnv):
         return self._call_each(indices, method_name, *method_args, **method_kwargs)
 
     def env_is_wrapped(self, wrapper_class: type, indices: Indices = None) -> list[bool]:
-        """Always False: this process does not see the wrappers, which are in the workers."""
-        return [False for _ in self._get_indices(indices)]
+        """Whether each env copy is in such a wrapper, by the name of its class."""
+        copies = self._copies(indices)
+        if self._monitored and issubclass(Monitor, wrapper_class):
+            return [True for _ in copies]
+        ascending, name = sorted(set(copies)), class_name(wrapper_class)
+        found = dict(zip(ascending, self.env.describe_copies(ascending), strict=True))
+        return [(copy := found[n]) is not None and name in copy.wrappers for n in copies]
 
     def get_images(self) -> Sequence[Array | None]:
         """A rendered frame of each env copy, or None."""

@@ -14,11 +14,12 @@ import msgspec
 from msgspec import Meta
 
 from protocol.arrays import Array
-from protocol.bounds import Count, Name, Natural, Text, Whole
+from protocol.bounds import Count, Line, Name, Natural, Text, Whole
 from protocol.errors import BadMessage
 
 MAX_LEAVES = 48  # arrays of an observation: a rollout sends each in a frame of its own
 MAX_DEPTH = 8
+MAX_WRAPPERS = 1 << 8  # classes of an environment's wrappers
 MAX_SPACES = 1 << 12  # of an environment, those inside others included, if they have random generators
 MAX_ELEMENTS = 1 << 24  # of all leaves of a space together
 
@@ -107,6 +108,8 @@ class EnvDescription(msgspec.Struct, frozen=True, array_like=True):
     """the random generator of each space, if any is seeded: the observation space, the spaces inside it, depth first, then
     the action space likewise. So samples that the learner draws are those of the environment
     """
+    wrappers: Annotated[tuple[Line, ...], Meta(max_length=MAX_WRAPPERS)] = ()
+    """the classes of the copy's gymnasium wrappers, as `module:Class`, and the wrappers from which these classes derive"""
 
 
 def check_size(description: EnvDescription) -> None:

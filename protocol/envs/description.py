@@ -18,7 +18,7 @@ from protocol.envs.space_advice import observation_advice
 from protocol.envs.space_generators import generator_states, restore_generators
 from protocol.envs.space_records import describe_space, make_space
 from protocol.errors import BadMessage, UsageError, first_line
-from protocol.space_spec import EnvDescription, check_size
+from protocol.space_spec import MAX_WRAPPERS, EnvDescription, check_size
 from protocol.wire import plain_values
 
 MAX_METADATA_BYTES = 1 << 16
@@ -37,6 +37,8 @@ class DescribedEnv:
     max_episode_steps: int | None = None
     """time limit of an episode in env steps; None if there is none"""
     render_mode: str | None = None
+    wrappers: frozenset[str] = frozenset()
+    """as `class_name`, the classes of which its wrappers are instances"""
 
 
 def describe_env(env: gymnasium.Env[Any, Any]) -> EnvDescription:
@@ -53,6 +55,7 @@ def describe_env(env: gymnasium.Env[Any, Any]) -> EnvDescription:
         longest_episode=_longest_episode(env.spec),
         render_mode=one_line(env.render_mode or "", MAX_NAME),
         generators=generator_states(env.observation_space, env.action_space),
+        wrappers=_wrappers(env)[:MAX_WRAPPERS],
     )
     try:
         check_size(description)
@@ -80,7 +83,21 @@ def read_description(description: EnvDescription) -> DescribedEnv:
         spec=_spec_from_text(description.spec),
         max_episode_steps=description.longest_episode or None,
         render_mode=description.render_mode or None,
+        wrappers=frozenset(description.wrappers),
     )
+
+
+def class_name(kind: type) -> str:
+    """The name of a class of wrappers in a description."""
+    return one_line(f"{kind.__module__}:{kind.__qualname__}")
+
+
+def _wrappers(env: gymnasium.Env[Any, Any]) -> tuple[str, ...]:
+    kinds: dict[type, None] = {}
+    while isinstance(env, gymnasium.Wrapper):
+        kinds |= dict.fromkeys(kind for kind in type(env).__mro__ if issubclass(kind, gymnasium.Wrapper))
+        env = env.env
+    return tuple(map(class_name, kinds))
 
 
 def _metadata(metadata: object) -> Array:

@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.envs.classic_control import CartPoleEnv
 
 import millrace
 from protocol.errors import UsageError
@@ -17,6 +18,8 @@ from tests.support.bit_equality import bit_equal
 sb3 = pytest.importorskip("stable_baselines3")
 
 from stable_baselines3.common import env_util  # noqa: E402
+from stable_baselines3.common.evaluation import evaluate_policy  # noqa: E402
+from stable_baselines3.common.monitor import Monitor  # noqa: E402
 from stable_baselines3.common.vec_env import DummyVecEnv  # noqa: E402
 
 from millrace.sb3 import Sb3VecEnv, make_vec_env  # noqa: E402
@@ -138,8 +141,41 @@ def test_attributes_and_methods_by_index() -> None:
     assert env.has_attr("level")
     assert env.has_attr("shout")  # which needs an argument
     assert not env.has_attr("no_such_thing")
-    assert env.env_is_wrapped(gymnasium.Wrapper) == [False] * 3
     env.close()
+
+
+def ten_times_within() -> gymnasium.Env[Any, Any]:
+    return TenTimes(gymnasium.wrappers.TransformReward(gymnasium.make("CartPole-v1"), float))
+
+
+def test_env_copies_know_their_wrappers() -> None:
+    makes: list[Any] = [ten_times_within, partial(gymnasium.make, "CartPole-v1"), CartPoleEnv]
+    theirs: Any = DummyVecEnv(makes)
+    ours = make_vec_env(makes, monitor=False, transport="inproc", lanes=2)
+    try:
+        for kind in (TenTimes, gymnasium.wrappers.TransformReward, gymnasium.RewardWrapper, gymnasium.wrappers.TimeLimit,
+                     gymnasium.Wrapper, Monitor, gymnasium.wrappers.RecordVideo):  # fmt: skip
+            assert ours.env_is_wrapped(kind) == theirs.env_is_wrapped(kind)
+        assert ours.env_is_wrapped(TenTimes, indices=[2, 0, 0]) == [False, True, True]
+    finally:
+        ours.close(), theirs.close()
+
+
+class Still:
+    """A model whose actions are zeros."""
+
+    def predict(self, observations: Any, **keywords: Any) -> tuple[Any, None]:
+        return np.zeros(len(observations), np.int64), None
+
+
+def test_an_evaluation_has_the_rewards_of_the_environment_also_in_a_wrapper() -> None:
+    """Stable-Baselines3's `evaluate_policy` asks whether a `Monitor` records the episodes."""
+    keywords: dict[str, Any] = {"seed": 3, "wrapper_class": TenTimes}
+    ours = make_vec_env("CartPole-v1", 2, transport="inproc", **keywords)
+    theirs = env_util.make_vec_env("CartPole-v1", 2, **keywords)
+    found, wanted = (evaluate_policy(Still(), env, n_eval_episodes=6) for env in (ours, theirs))  # type: ignore[arg-type]
+    assert found == wanted
+    ours.close(), theirs.close()
 
 
 def test_each_copy_may_have_options_of_its_own() -> None:

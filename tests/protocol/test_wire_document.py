@@ -127,6 +127,7 @@ LIMITS: Mapping[tuple[ModuleType, str], str] = {
     (bounds, "MOST_FRAMES"): "observations of an episode that come with a frame: the first ones",
     (space_spec, "MAX_LEAVES"): "arrays of an observation or an action",
     (space_spec, "MAX_DEPTH"): "levels of Dict and Tuple spaces",
+    (space_spec, "MAX_WRAPPERS"): "classes of an environment's wrappers",
     (space_spec, "MAX_SPACES"): "random generators of an environment's spaces",
     (space_spec, "MAX_ELEMENTS"): "elements of all arrays of a space together",
     (env_spec, "MAX_CALLABLE_BYTES"): "bytes of a pickled callable",

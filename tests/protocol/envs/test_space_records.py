@@ -207,6 +207,7 @@ def test_an_environment_is_read_as_it_was_described() -> None:
     assert found.metadata == {name: value for name, value in env.metadata.items() if name != "odd"}
     assert found.spec == env.spec
     assert (found.max_episode_steps, found.render_mode) == (500, "rgb_array")
+    assert {f"gymnasium.wrappers.common:{name}" for name in ("TimeLimit", "OrderEnforcing")} < found.wrappers
     env.close()
 
 
