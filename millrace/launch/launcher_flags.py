@@ -5,7 +5,6 @@ Rule: settings that a cluster would refuse later are refused here, before anythi
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Sequence
 from typing import TypeVar
@@ -37,7 +36,7 @@ def read_flags(
     for flag in rest:
         if flag.partition("=")[0].removeprefix("--").replace("_", "-") in set_by_launcher:
             raise UsageError(f"launch {launcher}: {flag} is the launcher's to set; leave it out")
-    read_config("learner", learner_flags(flags.env, rest, flags.workers, bind="tcp://0.0.0.0:5555", runs=os.devnull))
+    read_config("learner", [flags.env, "--bind", "tcp://0.0.0.0:5555", *rest])  # without --resume
     return flags, rest
 
 

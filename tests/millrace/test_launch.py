@@ -57,6 +57,13 @@ def test_what_a_cluster_would_refuse_later_is_refused_at_once(
     assert (out, err.count("\n")) == ("", 1)
 
 
+@pytest.mark.parametrize("launcher", ["kubernetes", "slurm"])
+def test_what_is_written_is_all_that_a_launcher_says(caplog: pytest.LogCaptureFixture, launcher: str) -> None:
+    """Nothing of a run to resume: which that is, the learner finds out on the cluster."""
+    assert main(["launch", launcher, "CartPole-v1"]) == 0
+    assert not caplog.messages
+
+
 # --------------------------------------------------------------------------------------------------------- Kubernetes
 
 
