@@ -17,7 +17,7 @@ import pytest
 import zmq
 
 from learner.run_folder.metrics_log import read_rows
-from protocol.messages import Drain, Hello, Refuse
+from protocol.messages import PROTOCOL_VERSION, Drain, Hello, Refuse
 from protocol.wire.codec import decode_to_learner, encode
 from tests.clients.messages_to_clients import corpus
 from tests.system.processes import START_S, Running, Stage, free_port, wait_for
@@ -265,11 +265,15 @@ def test_another_environment_is_declined_with_the_reason(stage: Stage, cpp: Path
 
 
 class FalseLearner:
-    """A ROUTER socket at which a client says Hello."""
+    """A ROUTER socket at which a client says Hello. A context manager."""
 
-    def __init__(self) -> None:
+    def __enter__(self) -> FalseLearner:
         self.socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.ROUTER)
         self.address = f"tcp://127.0.0.1:{self.socket.bind_to_random_port('tcp://127.0.0.1')}"
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.socket.close(linger=0)
 
     def hello(self) -> tuple[bytes, Hello]:
         assert self.socket.poll(10_000), "no Hello within 10 s"
@@ -279,13 +283,15 @@ class FalseLearner:
         return peer, hello
 
 
-def test_a_refusal_and_a_drain_are_printed(stage: Stage, cpp: Path) -> None:
+@pytest.mark.parametrize(
+    ("answer", "code"), [(Refuse("protocol: expected 5, got 4; install version 5"), 2), (Drain("the run is over"), 0)]
+)
+def test_a_refusal_and_a_drain_are_printed(stage: Stage, cpp: Path, answer: Refuse | Drain, code: int) -> None:
     """Refuse: exit code 2 with the learner's reason. Drain while it joins: exit code 0. An unreadable message: no harm."""
-    for answer, code in ((Refuse("protocol: expected 5, got 4; install version 5"), 2), (Drain("the run is over"), 0)):
-        false = FalseLearner()
+    with FalseLearner() as false:
         client = stage.start([str(cpp / "cartpole"), false.address, "--name", "cpp0"], "cpp0")
         peer, hello = false.hello()
-        assert (peer, hello.worker, hello.protocol) == (b"cpp0", "cpp0", 4)
+        assert (peer, hello.worker, hello.protocol) == (b"cpp0", "cpp0", PROTOCOL_VERSION)
         assert hello.attempt == hello.process_nonce + 1
         assert false.hello()[1] == hello  # repeated, with the same number
         false.socket.send_multipart([peer, b"\x92\xa4Nope\x01"])
@@ -293,7 +299,6 @@ def test_a_refusal_and_a_drain_are_printed(stage: Stage, cpp: Path) -> None:
         assert client.ends() == code
         assert answer.reason in client.said()
         assert "cannot be used" in client.said()
-        false.socket.close(linger=0)
 
 
 @pytest.mark.parametrize("profile", ["workers", "learner"])

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from learner.config.layers import resolve
-from learner.run_folder.metrics_log import read_rows
 from millrace.launch.local_run import train
 from tests.clients.programs import IN_LEARNER, Clients, ends_well, last_line, learner, loopback, millrace
 from tests.system.processes import START_S, Learner, Stage
@@ -19,7 +18,8 @@ pytestmark = [pytest.mark.clients, pytest.mark.timeout(600)]
 
 ROBOT = ("--hz", 1_000, "--deadline-ms", 1e6)
 """of control_50hz: faster than a robot, and no action is late"""
-ONE_COPY = ("--lanes", 1, "--envs", 1, "--rollout-steps", 64)
+SHORT = ("--rollout-steps", 64)
+ONE_COPY = ("--lanes", 1, "--envs", 1, *SHORT)
 
 
 @pytest.fixture
@@ -30,10 +30,15 @@ def run(tmp_path: Path) -> Path:
     return train(config, None, lambda progress: None)
 
 
-def evaluations(runs: Learner) -> list[float]:
-    """The mean returns of the evaluations of a run, oldest first."""
-    rows = read_rows(runs.folder / "metrics.jsonl")
-    return [row["eval/mean_reward"] for row in rows if "eval/mean_reward" in row]
+def evaluations(runs: Learner, every: int) -> list[float]:
+    """The mean returns of the evaluations of a run, oldest first: after each update that reaches a multiple of `every`."""
+    found, before = [], 0
+    for row in runs.rows():
+        is_due = row["time/total_timesteps"] // every > before // every
+        assert ("eval/mean_reward" in row) is is_due, row
+        found += [row["eval/mean_reward"]] if is_due else []
+        before = row["time/total_timesteps"]
+    return found
 
 
 def wrong_steps(observations: Any) -> int:
@@ -65,9 +70,9 @@ def whole_episodes(dataset: str) -> list[int]:
 @pytest.mark.parametrize(
     ("program", "flags", "of_client"),
     [
-        ("cpp cartpole", (), ()),
-        ("cpp cartpole", IN_LEARNER, ()),
-        ("js cartpole", IN_LEARNER, ()),
+        ("cpp cartpole", SHORT, ()),
+        ("cpp cartpole", (*SHORT, *IN_LEARNER), ()),
+        ("js cartpole", (*SHORT, *IN_LEARNER), ()),
         ("cpp cartpole", ONE_COPY, ()),
         ("cpp control_50hz", ONE_COPY, ROBOT),
         ("cpp control_50hz", (*ONE_COPY, "--max-lag", 1), ROBOT),
@@ -91,7 +96,7 @@ def test_a_run_evaluates_on_its_clients_between_rollouts(
     client = owner.start(address, "client", *of_client)
     ends_well(runs)
     ends_well(client)
-    found = evaluations(runs)
+    found = evaluations(runs, steps // 4)
     assert len(found) >= 3
     assert all(1 <= each <= 500 for each in found)
     ledger = runs.summary()["ledger"]
