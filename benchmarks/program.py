@@ -51,6 +51,11 @@ BENCHMARKS = {
     "slow": Benchmark(
         "slow", "PPO on an environment whose steps sleep 5 ms, compared with Stable-Baselines3", brief=("--rounds", "1")
     ),
+    "python": Benchmark(
+        "from_python",
+        "training from a script and a notebook, compared with the command line, alone and beside busy processes",
+        brief=("--rounds", "1"),
+    ),
     "service": Benchmark(
         "rollout_service",
         "the rollout service, compared with the built-in trainer's collecting rate",

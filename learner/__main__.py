@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(_variable, "1")  # before numpy; --torch-threads sets the learner's
-
 import logging
 import sys
 import time

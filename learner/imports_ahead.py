@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from learner.algorithms import ALGORITHMS
 
-MODULES = ("torch", "learner.run_spec", "learner.run_recorder", "learner.torch_setup")
+MODULES = ("threadpoolctl", "torch", "learner.run_spec", "learner.run_recorder")
 POLL_S = 0.05
 THREAD = "imports"
 

@@ -35,6 +35,7 @@ from learner.rollouts.hub import HubObserver
 from learner.run_folder.lease import Closed, Listens
 from learner.run_folder.run_folder import Interrupted, RunFolder
 from learner.run_folder.run_lock import RunLock
+from learner.torch_setup import one_thread, threads, torch_device, updates_use_all_cores
 from protocol.address import advertised_address, own_address
 from protocol.bounds import one_line
 from protocol.env_spec import EnvSpec
@@ -186,7 +187,6 @@ class Run:
         from learner.run_recorder import EpisodeSettings, RunRecorder
         from learner.run_spec import run_spec
         from learner.run_state import RunState, restore
-        from learner.torch_setup import threads, torch_device, updates_use_all_cores
 
         config, self.folder = setup.config, setup.folder
         made = Callbacks.of(watch).with_named(config.callback)
@@ -313,7 +313,7 @@ def serve(config: Config, resume: Resumption | None, watch: Watch) -> Path:
         env, processes = named_environment(config), ProcessCallbacks()
         known = known_environment(config, env, resume, describe_over(bound.link, config, processes))
         folder = folder or stack.enter_context(run_folder(config, None))
-        with Interrupts(config.grace_s) as interrupts:
+        with Interrupts(config.grace_s) as interrupts, one_thread():
             setup = RunSetup(config, known, folder, resume is not None, interrupts)
             Run(setup, bound.link, processes, watch, observer).train(workers_to_wait_for(config, None))
         return folder.path

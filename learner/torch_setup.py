@@ -1,10 +1,15 @@
-"""Device and number of threads that PyTorch uses in the learner."""
+"""The device of PyTorch, and how many threads PyTorch and numpy have while this process learns or acts.
+
+Rule: the numbers of threads do not depend on who imported the two first: a script, a notebook or the command line. numpy's
+matrices are so small that more threads of its BLAS gain nothing, and beside other busy processes they wait for one another:
+an update takes up to thirty times as long. Afterwards the program that called has the threads that it had.
+"""
 
 from __future__ import annotations
 
 import math
-
-import torch
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from learner.config.config import Config
 from protocol.cpu_cores import usable_cores
@@ -15,8 +20,32 @@ from protocol.specs import PolicySpec
 MANY_WEIGHTS = 1 << 18  # 512 x 512
 
 
+@contextmanager
+def one_thread(*, uses_torch: bool = True) -> Iterator[None]:
+    """One thread for numpy's BLAS, and for PyTorch until `torch.set_num_threads` is called; later as many as before.
+
+    PyTorch is imported only if it `uses_torch`.
+    """
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(1, "blas"):
+        if not uses_torch:
+            yield
+            return
+        import torch
+
+        before = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            yield
+        finally:
+            torch.set_num_threads(before)
+
+
 def torch_device(config: Config) -> str:
     """Device that the settings ask for: cpu or cuda. Raises `UsageError` if there is no such device."""
+    import torch
+
     if config.device == "cuda" and not torch.cuda.is_available():
         raise UsageError("device cuda: PyTorch sees no GPU here; use --device cpu")
     return ("cuda" if torch.cuda.is_available() else "cpu") if config.device == "auto" else config.device

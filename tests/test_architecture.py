@@ -27,7 +27,7 @@ LEARNER = {  # what each folder of the learner may import of the learner; train.
     "config": {"run_folder"},
     "algorithms": {"config"},
     "callbacks": {"config", "run_folder"},
-    "conformance": {"algorithms", "config"},
+    "conformance": {"algorithms", "config", "torch_setup"},
     "members": set[str](),
     "rollouts": {"members", "run_folder"},
     "vector_env": {"members"},

@@ -7,13 +7,9 @@ Exit codes: 0 drained or asked to leave; 1 failed, or no learner answered; 2 ref
 
 from __future__ import annotations
 
-import os
-
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(_variable, "1")  # before numpy is imported: there is a worker for each core
-
 import argparse
 import logging
+import os
 import signal
 import socket
 import sys

@@ -35,6 +35,7 @@ from learner.conformance.toy_batches import (
     with_other_invalid_rows,
     with_rewards,
 )
+from learner.torch_setup import one_thread
 from protocol.bounds import one_line
 from protocol.errors import UsageError, first_line
 from protocol.policy.encoder import describe_encoder
@@ -395,18 +396,12 @@ def _seed_everything(seed: int) -> None:
 
 @contextmanager
 def _undisturbed() -> Iterator[None]:
-    """One PyTorch thread; afterwards that number and all global random numbers are what they were."""
-    threads, of_torch, of_numpy, of_python = (
-        torch.get_num_threads(),
-        torch.get_rng_state(),
-        np.random.get_state(),
-        random.getstate(),
-    )
-    torch.set_num_threads(1)
+    """One thread; afterwards the number of threads and all global random numbers are what they were."""
+    of_torch, of_numpy, of_python = torch.get_rng_state(), np.random.get_state(), random.getstate()
     try:
-        yield
+        with one_thread():
+            yield
     finally:
-        torch.set_num_threads(threads)
         torch.set_rng_state(of_torch)
         np.random.set_state(of_numpy)
         random.setstate(of_python)

@@ -17,9 +17,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(_variable, "1")  # before numpy; --torch-threads sets the learner's
-
 from learner.run_folder.last_line import last_line
 from learner.run_folder.run_format import is_run_folder
 from learner.standard_streams import open_closed, unfailing
@@ -36,7 +33,17 @@ log = logging.getLogger("millrace.learner")
 
 ABOUT = "Worker processes step copies of a gymnasium environment; one learner trains a policy in PyTorch."
 HELP_FLAGS = ("-h", "--help")
-NOT_IN_WORKERS = {"matplotlib", "prometheus_client", "rich", "safetensors", "tensorboard", "tomli_w", "torch", "tyro"}
+NOT_IN_WORKERS = {
+    "matplotlib",
+    "prometheus_client",
+    "rich",
+    "safetensors",
+    "tensorboard",
+    "threadpoolctl",
+    "tomli_w",
+    "torch",
+    "tyro",
+}
 """Packages that the learner needs and a worker does not. An installation only for workers lacks them."""
 
 

@@ -22,6 +22,7 @@ from learner.members.endpoint import BindSettings
 from learner.resumption import Resumption
 from learner.rollout_service.service import describe_settings
 from learner.run import Run, RunSetup, known_environment, prometheus_observer, run_folder
+from learner.torch_setup import one_thread, torch_device
 from learner.vector_env.settings import VectorEnvSettings
 from millrace.launch.acting_thread import NEVER_S, BeforeWaits, acting_processes, acting_thread
 from millrace.launch.endpoint import open_endpoint
@@ -69,17 +70,12 @@ def train(
         )
         evaluation_copies = SplitEvaluationCopies(lanes, config.lanes, config.eval_copies)
 
-        def device() -> str:
-            from learner.torch_setup import torch_device
-
-            return torch_device(config)
-
-        thread = acting_thread(endpoint, lanes, evaluation_copies, device)
+        thread = acting_thread(endpoint, lanes, evaluation_copies, lambda: torch_device(config))
         interrupts = Interrupts(config.grace_s)
         stack.callback(lambda: thread.stop(interrupts.at_most(STOP_WITHIN_S)))
         stack.callback(thread.ask_to_leave)  # if it is asked a second time, the worker leaves at once
         processes = acting_processes(thread, lanes, env, 0 if elsewhere else config.workers)
-        with interrupts:
+        with interrupts, one_thread():
             run = Run(RunSetup(config, known, folder, resume is not None, interrupts), link, processes, watch, observer)
             env.answer_for(run.status)  # the learner's own endpoint is inproc: `millrace status` asks where the workers join
             run.announce(env.address, config.advertise, listening.endpoint.keyring)

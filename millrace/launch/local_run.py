@@ -25,6 +25,7 @@ from learner.run import (
     prometheus_observer,
     run_folder,
 )
+from learner.torch_setup import one_thread
 from millrace.launch.endpoint import open_endpoint
 from millrace.launch.local_worker_options import no_flags, stopped_on_error, worker_flags
 from protocol.env_spec import EnvSpec
@@ -64,7 +65,7 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
         )
         with stopped_on_error(supervisor):
             known = known_environment(config, env, resume, describe_over(endpoint.link, config, processes))
-        with interrupts:
+        with interrupts, one_thread():
             setup = RunSetup(config, known, folder, resume is not None, interrupts)
             Run(setup, endpoint.link, processes, watch, observer).train(workers)
         return folder.path

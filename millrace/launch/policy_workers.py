@@ -18,6 +18,7 @@ from learner.members.endpoint import BindSettings
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.policy_player import PolicyPlayer, SavedPolicy
 from learner.rollout_service.service import describe_settings
+from learner.torch_setup import one_thread
 from learner.vector_env.settings import VectorEnvSettings
 from millrace.launch.acting_thread import NEVER_S, BeforeWaits, acting_processes, acting_thread
 from millrace.launch.endpoint import open_endpoint
@@ -50,6 +51,8 @@ def policy_player(policy: SavedPolicy, which: PlayingWorkers, watch: Callable[[s
     """A player with its workers. `watch` gets how far it is. Raises `UserFacingError`, or `KeyboardInterrupt`."""
     with ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts())
+        if which.inference == "learner" or which.transport == "inproc":
+            stack.enter_context(one_thread(uses_torch=policy.spec.needs_torch))
 
         def check_interrupt() -> None:
             if interrupts.received:

@@ -72,6 +72,7 @@ def test_a_worker_starts_with_the_packages_of_its_image_alone() -> None:
         "rich",
         "safetensors",
         "tensorboard",
+        "threadpoolctl",
         "tomli_w",
         "torch",
         "tyro",

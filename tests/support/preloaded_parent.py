@@ -39,7 +39,7 @@ LEARNER = (
     "learner.run",
     "learner.run_recorder",
     "learner.run_spec",
-    "learner.torch_setup",
+    "threadpoolctl",
     "learner.train",
     "learner.algorithms.a2c",
     "learner.algorithms.dqn",
