@@ -1,19 +1,21 @@
 """`millrace bench [NAME [flags]]`, or `python -m benchmarks.program`: runs one benchmark, or all of them in turn.
 
 Rule: each benchmark is a module with a `main` and runs in its own process, so it does not inherit threads, imports or
-memory of another. It prints its results and writes them to `benchmarks/results`.
+memory of another. It prints its results and writes them to `benchmarks/results`. An interrupt ends all its processes.
 """
 
 from __future__ import annotations
 
 import importlib.util
 import os
+import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 from typing import NamedTuple
 
+from learner.interrupts import stopped_by_signals
 from protocol.errors import UsageError
 
 ROOT = Path(__file__).parents[1]
@@ -98,7 +100,7 @@ def main(argv: list[str]) -> int:
             *(flags if name else BENCHMARKS[each].brief),
         ]
         path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-        if subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, check=False).returncode:
+        if _run(command, os.environ | {"PYTHONPATH": path}):
             failed.append(each)
         elif not name:
             print(f"{each}: {time.monotonic() - began_s:.0f} s\n", flush=True)
@@ -111,9 +113,21 @@ def main(argv: list[str]) -> int:
     return 1 if failed else 0
 
 
+def _run(command: list[str], env: dict[str, str]) -> int:
+    """Run the benchmark in a process group of its own, which an interrupt kills: its processes need not clean up."""
+    with subprocess.Popen(command, env=env, start_new_session=True) as process:
+        try:
+            return process.wait()
+        except KeyboardInterrupt:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            raise
+
+
 if __name__ == "__main__":
     try:
-        sys.exit(main(sys.argv[1:]))
+        with stopped_by_signals():
+            sys.exit(main(sys.argv[1:]))
     except UsageError as error:
         print(f"millrace: {error}", file=sys.stderr)
         sys.exit(error.exit_code)

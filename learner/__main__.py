@@ -7,6 +7,7 @@ import sys
 import time
 
 from learner.config.command_line import read_config
+from learner.interrupts import stopped_by_signals
 from learner.run_folder.json_log import JsonLines
 from learner.run_folder.last_line import last_line
 from learner.run_folder.progress import Progress
@@ -63,7 +64,8 @@ def line_of(progress: Progress) -> str:
 
 
 if __name__ == "__main__":
-    exit_code = main(sys.argv[1:])
+    with stopped_by_signals():
+        exit_code = main(sys.argv[1:])
     if "learner.imports_ahead" in sys.modules:
         from learner.imports_ahead import exit_if_importing
 

@@ -4,18 +4,63 @@ Rule: the first signal lets the current update end; `time_is_up` says when it mu
 grace time is enough to save. A second SIGINT (Ctrl-C) ends the run at once. If there is a grace time, SIGTERM and SIGHUP may
 come again and change nothing: they often go to a process and to its group, and the time is limited already. SIGHUP says that
 the terminal is gone. A learner that was told to ignore it (`nohup`) goes on ignoring it.
+
+Rule: where there is nothing to save, a signal ends the program too, with the same exit code (`stopped_by_signals`).
 """
 
 from __future__ import annotations
 
 import math
 import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from time import monotonic
 from types import FrameType, TracebackType
 from typing import Any, Self
 
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 FOR_SAVING = 0.5  # the part of the grace time that an update must leave
 SAVE_TAKES = 1.5  # times as long as the longest so far, at most
+
+_stopped = False  # whether `Stopped` was raised: code of others may have swallowed it, as in an import or a finalizer
+Handler = Callable[[int, FrameType | None], None] | signal.Handlers
+
+
+class Stopped(KeyboardInterrupt):
+    """A signal has stopped the program.
+
+    A class of its own: after a plain KeyboardInterrupt has passed through `exec`, as of a dataclass that is being made,
+    Python ends as if the signal had killed it, whatever the program does with the exception.
+    """
+
+
+@contextmanager
+def stopped_by_signals() -> Iterator[None]:
+    """Within it, the first signal raises `Stopped`. More would only cut the clean-up short, and do nothing.
+
+    Signals that were blocked come now. Afterwards they are ignored: when Python ends, it would take away any other handler.
+    """
+    global _stopped
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        global _stopped
+        if not _stopped:
+            _stopped = True
+            raise Stopped
+
+    _set(stop)
+    try:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+        yield
+    finally:
+        _set(signal.SIG_IGN)
+        _stopped = False
+
+
+def _set(handler: Handler) -> dict[int, Any]:
+    """Set the handler of the signals that are not ignored. Returns those before."""
+    heeded = [each for each in SIGNALS if each != signal.SIGHUP or signal.getsignal(each) != signal.SIG_IGN]
+    return {each: signal.signal(each, handler) for each in heeded}
 
 
 class Interrupts:
@@ -29,12 +74,10 @@ class Interrupts:
         self._handlers_before: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
-        try:
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-                if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
-                    self._handlers_before[number] = signal.signal(number, self._note)
-        except ValueError:  # not in the main thread, which handles signals itself
-            self._handlers_before.clear()
+        with suppress(ValueError):  # not in the main thread, which handles signals itself
+            self._handlers_before = _set(self._note)
+        if _stopped:
+            self._note(0, None)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:

@@ -1,17 +1,30 @@
-"""`python -m millrace` and the command `millrace`: run the command line and end the process."""
+"""`python -m millrace` and the command `millrace`: run the command line and end the process.
+
+Rule: a signal that ends the process gives exit code 130 and no traceback, from the first line of `command` on. So all that
+takes long to import is imported there. Signals wait meanwhile: an extension module whose import is interrupted may crash.
+"""
 
 from __future__ import annotations
 
 import gc
+import signal
 import sys
 from typing import NoReturn
 
-from millrace.cli.main import main
+from learner.interrupts import SIGNALS, stopped_by_signals
 
 
 def command() -> NoReturn:
     """Run the command line and exit."""
-    code = main()
+    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    from millrace.cli.main import main
+
+    try:
+        with stopped_by_signals():
+            code = main()
+    except KeyboardInterrupt:  # it came during the imports, or while `main` printed another error
+        sys.stderr.write("millrace: interrupted\n")
+        code = 130
     if "learner.imports_ahead" in sys.modules:
         from learner.imports_ahead import exit_if_importing
 

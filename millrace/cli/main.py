@@ -373,7 +373,13 @@ def _bench(argv: list[str]) -> int:
         raise UsageError("bench: not part of the installed package; run it in a clone of the repository (make bench)")
     path = os.pathsep.join(filter(None, [str(clone), os.environ.get("PYTHONPATH")]))
     command = [sys.executable, "-P", "-m", "benchmarks.program", *(flag for flag in argv if flag != "--debug")]
-    return subprocess.run(command, env={**os.environ, "PYTHONPATH": path}, check=False).returncode
+    with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": path}) as process:
+        try:
+            return process.wait()
+        except KeyboardInterrupt:
+            process.terminate()  # it ends its benchmark
+            process.wait()
+            raise
 
 
 GROUPS = {

@@ -1,0 +1,90 @@
+"""Signals at any time end the command with exit code 130 and without a traceback, and end what it has started."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from benchmarks.program import _run
+from learner.interrupts import SIGNALS, Interrupts, Stopped, stopped_by_signals
+
+INTERRUPTED = """
+import os, signal, sys, types
+from millrace.__main__ import command
+
+def main():
+    try:
+        os.kill(os.getpid(), signal.{signal})
+    finally:
+        for _ in range(30):
+            os.kill(os.getpid(), signal.SIGINT)
+        sys.stderr.write("cleaned up\\n")
+
+sys.modules["millrace.cli.main"] = types.SimpleNamespace(main=main)
+command()
+"""
+
+
+@pytest.fixture(autouse=True)
+def handlers() -> Iterator[None]:
+    before = {each: signal.getsignal(each) for each in SIGNALS}
+    yield
+    for each, handler in before.items():
+        signal.signal(each, handler)
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_where_nothing_is_to_be_saved_ends_the_command_as_later(number: signal.Signals) -> None:
+    """So do thirty Ctrl-C during its clean-up."""
+    command = [sys.executable, "-c", INTERRUPTED.format(signal=number.name)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (130, "cleaned up\nmillrace: interrupted\n")
+
+
+def test_only_the_first_signal_raises_and_at_the_end_they_are_ignored() -> None:
+    with pytest.raises(Stopped), stopped_by_signals():
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+        finally:
+            os.kill(os.getpid(), signal.SIGINT)
+    assert [signal.getsignal(each) for each in SIGNALS] == [signal.SIG_IGN] * 3
+
+
+def test_a_run_notices_a_signal_before_it_whose_exception_was_swallowed() -> None:
+    with stopped_by_signals():
+        with Interrupts() as before:
+            pass
+        with pytest.raises(Stopped):
+            os.kill(os.getpid(), signal.SIGTERM)
+        with Interrupts() as after:
+            pass
+    assert (before.received, after.received) == (False, True)
+
+
+def test_an_interrupted_benchmark_ends_with_its_processes(tmp_path: Path) -> None:
+    fifo = tmp_path / "fifo"
+    os.mkfifo(fifo)
+    waits = f"import time; file = open({str(fifo)!r}, 'w'); print('x', file=file, flush=True); time.sleep(600)"
+    starts = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {waits!r}])"
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    heard = []
+
+    def interrupt() -> None:
+        with fifo.open() as file:
+            heard.append(file.readline())
+            os.kill(os.getpid(), signal.SIGINT)
+            heard.append(file.readline())
+
+    listener = threading.Thread(target=interrupt, daemon=True)
+    listener.start()
+    with pytest.raises(KeyboardInterrupt):
+        _run([sys.executable, "-c", starts], dict(os.environ))
+    listener.join(10.0)
+    assert heard == ["x\n", ""], "a process of the benchmark is left"
