@@ -74,8 +74,8 @@ class OwnPolicy:
 
     @property
     def is_code(self) -> bool:
-        """Whether it travels as a pickled callable."""
-        return not isinstance(self.factory, str)
+        """True: workers call the factory."""
+        return True
 
     @property
     def extra_arrays(self) -> tuple[ExtraArray, ...]:

@@ -34,7 +34,7 @@ class PolicyChoice(Protocol):
 
     @property
     def is_code(self) -> bool:
-        """Whether it travels as a pickled callable."""
+        """Whether workers call a factory of the user's for it."""
         ...
 
     def spec(self, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:

@@ -60,7 +60,21 @@ class AllowedCode(Enum):
     MODULES = 1
     """also `module:EnvId`, which imports the module: the learner runs on this machine"""
     CALLABLES = 2
-    """also pickled callables: the learner's key is known, or only this user can have started it"""
+    """also pickled callables, and functions and classes that the learner names: its key is known, or only this user can
+    have started it
+    """
+
+    def refuses_to_call(self, what: str) -> str:
+        """Why a worker that allows only this code does not call `what`, by name or pickled; empty if it does.
+
+        Any function of any module can be named, with any arguments: that is as much as a pickled callable can do.
+        """
+        if self is AllowedCode.CALLABLES:
+            return ""
+        return (
+            f"{what} is a function or a class to call, which this worker does not do for a learner it is not sure of; "
+            "it may come over ipc, inproc or with a token (and not with --no-code)"
+        )
 
 
 class PickledCallable:
@@ -181,20 +195,13 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 f"environment {self.id} imports a module, which this worker does not do for a learner it is not sure of; "
                 "give it a token (and not --no-code)"
             )
-        if self.called_code and code is not AllowedCode.CALLABLES:
-            what = f"wrapper {self.wrappers[0]}" if self.wrappers else f"environment {self.id}"
-            return (
-                f"{what} is a function or a class to call, which this worker does not do for a learner it is not sure of; "
-                "it may come over ipc, inproc or with a token (and not with --no-code)"
-            )
+        if self.called_code:
+            return code.refuses_to_call(f"wrapper {self.wrappers[0]}" if self.wrappers else f"environment {self.id}")
         return ""
 
     @property
     def called_code(self) -> str:
-        """What a worker calls that the learner names or sends, in words: a factory, or a wrapper. Empty for an id alone.
-
-        Any function of any module can be named, with any arguments: that is as much as a pickled callable can do.
-        """
+        """What a worker calls that the learner names or sends, in words: a factory, or a wrapper. Empty for an id alone."""
         if self.factory is not None or _names_a_function(self.id):
             return "an environment factory"
         return "a wrapper" if self.wrappers else ""

@@ -100,20 +100,6 @@ class OwnPolicySpec(msgspec.Struct, frozen=True):
     code: PickledCallable | None = None
     """the callable, pickled by cloudpickle"""
 
-    def rejection_reason(self, code: AllowedCode) -> str:
-        """Why a worker that allows only this code cannot make it; empty if it can."""
-        if self.code is not None and code is not AllowedCode.CALLABLES:
-            return (
-                f"policy {self.factory} is a callable, which this worker does not unpickle; it may come over ipc, inproc or "
-                "with a token (and not with --no-code), else name it as my_module:make_policy"
-            )
-        if self.code is None and code is AllowedCode.REGISTERED:
-            return (
-                f"policy {self.factory} imports a module, which this worker does not do for a learner it cannot be sure of; "
-                "give it a token (and not --no-code)"
-            )
-        return ""
-
 
 ImagesDtype = Literal["float32", "bfloat16"]
 
@@ -229,13 +215,9 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
         """Why a worker that allows only this code cannot take part; empty if it can."""
         if self.compress == "zstd" and (why := why_no_zstd()):
             return why
-        if self.policy.encoder is not None and code is AllowedCode.REGISTERED:
-            return (
-                f"encoder {self.policy.encoder.factory} imports a module, which this worker does not do for a learner it "
-                "cannot be sure of; give it a token (and not --no-code)"
-            )
-        if self.policy.own is not None and (why := self.policy.own.rejection_reason(code)):
-            return why
+        for what, called in (("encoder", self.policy.encoder), ("policy", self.policy.own)):
+            if called is not None and (why := code.refuses_to_call(f"{what} {called.factory}")):
+                return why
         return self.env.rejection_reason(code)
 
 

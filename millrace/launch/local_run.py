@@ -53,7 +53,8 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
         log.warning("%s", line)
     with ExitStack() as stack:
         where = BindSettings(keys=config.keys, insecure=config.insecure)
-        endpoint = open_endpoint(where, config.transport, stack, env.called_code)
+        code = env.called_code or ("an encoder" if config.algorithm.encoder else "")
+        endpoint = open_endpoint(where, config.transport, stack, code)
         observer = stack.enter_context(prometheus_observer(config))
         folder = stack.enter_context(run_folder(config, resume))
         flags = no_flags if config.transport == "inproc" else worker_flags(config, folder.path)

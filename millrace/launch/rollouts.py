@@ -52,7 +52,7 @@ def start(
     `listens`: wait for workers elsewhere at `config.bind`, and start none. Raises `UserFacingError`.
     """
     workers = workers_to_wait_for(config, None if listens else config.workers)
-    code = env.called_code or ("a policy's callable" if policy.is_code else "")
+    code = env.called_code or ("a policy's factory" if policy.is_code else "")
     where = BindSettings(config.bind if listens else "", config.keys, config.insecure, config.advertise)
     endpoint = open_endpoint(where, config.transport, resources, code)
     link = endpoint.link

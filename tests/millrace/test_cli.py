@@ -661,6 +661,12 @@ def test_help_answers_at_once() -> None:
     assert min(took_s) < 0.3 + 0.1 * os.getloadavg()[0]
 
 
+def test_an_encoder_does_not_travel_over_tcp_without_keys(capsys: Captured, tmp_path: Path) -> None:
+    argv = ("--encoder", "mine:encoder", "--transport", "tcp", "--run-dir", str(tmp_path))
+    assert "an encoder is code: it travels over ipc" in refusal(capsys, "train", "CartPole-v1", *argv)
+    assert not list(tmp_path.iterdir())
+
+
 def test_modules_of_the_users_own_are_found_where_the_command_is_given(tmp_path: Path) -> None:
     """An environment and an encoder that lie in the working directory, which an installed command does not search."""
     (tmp_path / "mine.py").write_text(

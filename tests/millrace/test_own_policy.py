@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import re
 from pathlib import Path
@@ -176,6 +177,8 @@ def test_declarations_that_cannot_be_used_are_refused(wrong: millrace.OwnPolicy,
         millrace.RolloutService("CartPole-v1", wrong, workers=1, **SMALL)
 
 
-def test_a_callable_does_not_travel_over_tcp_without_keys() -> None:
-    with pytest.raises(millrace.UsageError, match="a policy's callable is code: it travels over ipc or inproc only"):
-        millrace.RolloutService("CartPole-v1", OWN, workers=1, **{**SMALL, "transport": "tcp"})
+@pytest.mark.parametrize("factory", [OWN.factory, "tests.support.own_policies:Linear"])
+def test_a_factory_does_not_travel_over_tcp_without_keys(factory: Any) -> None:
+    own = dataclasses.replace(OWN, factory=factory)
+    with pytest.raises(millrace.UsageError, match="a policy's factory is code: it travels over ipc or inproc only"):
+        millrace.RolloutService("CartPole-v1", own, workers=1, **{**SMALL, "transport": "tcp"})

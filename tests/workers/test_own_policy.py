@@ -197,9 +197,9 @@ def test_a_factory_that_cannot_be_used_is_named(factory: str, message: str) -> N
     assert str(raised.value) == f"policy {factory}: {message}"
 
 
-def test_whose_code_it_is_decides_whether_it_is_run() -> None:
-    named, pickled = run_with(HERE + "Linear"), run_with(Linear)
-    assert "imports a module" in named.rejection_reason(AllowedCode.REGISTERED)
-    assert not named.rejection_reason(AllowedCode.MODULES)
-    assert "is a callable" in pickled.rejection_reason(AllowedCode.MODULES)
-    assert not pickled.rejection_reason(AllowedCode.CALLABLES)
+def test_only_a_worker_that_knows_its_learner_calls_its_factory() -> None:
+    function = run_with("subprocess:getoutput", kwargs={"cmd": "touch /tmp/never"})
+    for run in (function, run_with(HERE + "Linear"), run_with(Linear)):
+        for code in (AllowedCode.REGISTERED, AllowedCode.MODULES):
+            assert "is a function or a class to call" in run.rejection_reason(code)
+        assert not run.rejection_reason(AllowedCode.CALLABLES)

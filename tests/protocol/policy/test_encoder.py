@@ -146,8 +146,9 @@ def test_a_setting_names_it_and_a_run_folder_keeps_it(tmp_path: Path) -> None:
     expected.assert_is(policy([obs])[0, :, :2])
 
 
-def test_a_worker_that_cannot_be_sure_of_the_learner_imports_no_encoder() -> None:
+def test_only_a_worker_that_knows_its_learner_calls_an_encoder() -> None:
     run = run_spec(resolve("CartPole-v1", encoder=f"{HERE}:mixer"), EnvSpec("CartPole-v1"))
-    assert "imports a module" in run.rejection_reason(AllowedCode.REGISTERED)
-    assert run.rejection_reason(AllowedCode.MODULES) == ""
+    for code in (AllowedCode.REGISTERED, AllowedCode.MODULES):
+        assert run.rejection_reason(code).startswith(f"encoder {HERE}:mixer is a function or a class to call")
+    assert run.rejection_reason(AllowedCode.CALLABLES) == ""
     assert msgspec.structs.replace(run, policy=DISCRETE).rejection_reason(AllowedCode.REGISTERED) == ""
