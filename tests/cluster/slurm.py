@@ -50,7 +50,7 @@ def why_not() -> str:
     if os.geteuid() != 0:
         return "slurmd takes root"
     missing = [name for name in DAEMONS if shutil.which(name) is None]
-    return f"{' and '.join(missing)} not found: apt-get install slurm-wlm munge" if missing else ""
+    return f"{', '.join(missing)} missing: make packages" if missing else ""
 
 
 class Slurm:
@@ -63,6 +63,22 @@ class Slurm:
         self._variables = {**os.environ, "SLURM_CONF": str(self._folder / "slurm.conf"), "PYTHONPATH": str(ROOT)}
 
     def __enter__(self) -> Slurm:
+        try:
+            self._begin()
+        except BaseException:
+            self._end()
+            raise
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        try:
+            self._ask("scancel", "--user=root", check=False)
+            wait_for(lambda: not self._ask("squeue", "-h"), 60, "the end of all jobs")
+        finally:
+            self._end()
+
+    def _begin(self) -> None:
+        """Start the daemons, and wait until the nodes take jobs."""
         munge = self._folder / "munge"
         munge.mkdir(mode=0o700)
         (munge / "key").write_bytes(os.urandom(128))
@@ -79,19 +95,15 @@ class Slurm:
         for name in NODES:
             self._start("slurmd", "-D", "-N", name)
         wait_for(lambda: self._ask("sinfo", "-h", "-o", "%T %D", check=False).strip() == f"idle {len(NODES)}", DEADLINE_S)
-        return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        try:
-            self._ask("scancel", "--user=root", check=False)
-            wait_for(lambda: not self._ask("squeue", "-h"), 60, "the end of all jobs")
-        finally:
-            for process in self._ours():
-                process.kill()
-            for daemon in self._daemons:
-                daemon.process.wait(10)
-            wait_for(lambda: not self._ours(), DEADLINE_S, "the end of all of Slurm's processes")
-            shutil.rmtree(self._folder)
+    def _end(self) -> None:
+        """Kill all that runs, and delete the files."""
+        for process in self._ours():
+            process.kill()
+        for daemon in self._daemons:
+            daemon.process.wait(10)
+        wait_for(lambda: not self._ours(), DEADLINE_S, "the end of all of Slurm's processes")
+        shutil.rmtree(self._folder)
 
     def submit(self, script: Path) -> str:
         """Submit a script with sbatch; the job id."""

@@ -20,6 +20,7 @@ from tests.system.runs import accounted
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(600)]
 CORES = {"head": 1, "second": 2}
 ACTORS = sum(CORES.values())
+ENDS_S = 90.0  # a node first waits for its actors, for up to 30 s
 
 
 @pytest.fixture
@@ -65,16 +66,28 @@ class Ray:
                     found.add(process.pid)
         return found
 
+    def kill(self, actor: int) -> None:
+        """Send SIGKILL to an actor and its worker, as if their host failed. They are stopped before: a worker says Goodbye
+        if its actor alone is dead.
+        """
+        both = [psutil.Process(actor), *psutil.Process(actor).children(recursive=True)]
+        for process in both:
+            process.suspend()
+        for process in both:
+            process.kill()
+
     def close(self) -> None:
         """End both nodes; fail if one of their processes remains."""
         theirs = self._processes()
-        for node in reversed(self._nodes):
-            node.signal(signal.SIGTERM)
-        for node in self._nodes:
-            node.ends()
-        _, left = psutil.wait_procs(theirs, timeout=30)
-        for process in left:
-            process.kill()
+        try:
+            for node in reversed(self._nodes):
+                node.signal(signal.SIGTERM)
+            for node in self._nodes:
+                node.ends(ENDS_S)
+        finally:
+            _, left = psutil.wait_procs(theirs, timeout=30)
+            for process in left:
+                process.kill()
         assert not left, f"processes were left behind: {left}"
 
     def _processes(self) -> list[psutil.Process]:
@@ -92,9 +105,11 @@ def ray(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> Iterator[Ray]:
         made = Ray(stage, folder)
         yield made
     finally:
-        if made is not None:
-            made.close()
-        shutil.rmtree(folder)
+        try:
+            if made is not None:
+                made.close()
+        finally:
+            shutil.rmtree(folder)
 
 
 def launched(stage: Stage, ray: Ray, **settings: object) -> Learner:
@@ -113,7 +128,7 @@ def test_an_actor_that_is_killed_comes_back_and_the_run_goes_on(ray: Ray, stage:
     learner.trains(3)
     before = wait_for(lambda: len(found := ray.actors()) == ACTORS and found, START_S, "an actor for each core")
     assert before
-    psutil.Process(min(before)).kill()
+    ray.kill(min(before))
     after = wait_for(lambda: len(found := ray.actors()) == ACTORS and found != before and found, 60, "another in its place")
     assert after
     assert before - after == {min(before)}
