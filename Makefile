@@ -10,8 +10,8 @@ BIN := .venv/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: train test lint type unit docs site dist bench bench-peers test-learning test-cluster test-clients test-model test-processors test-versions \
-	test-kill soak clean
+.PHONY: train test lint type unit docs site dist bench bench-peers test-learning packages test-cluster test-clients test-model test-processors \
+	test-versions test-kill soak clean
 
 train: .venv/installed  ## train CartPole-v1 on two worker processes until a greedy evaluation averages 475
 	$(BIN)/millrace train CartPole-v1 --workers 2 --target-return 475 --eval-episodes 20 --eval-every 5000
@@ -32,14 +32,19 @@ unit: .venv/installed-dev
 test-learning: .venv/installed-dev  ## published scores, three seeds each; ten minutes
 	$(BIN)/python -m pytest -m learning --timeout 3600 tests/learning
 
+packages:  ## install Debian's packages for test-clients and test-cluster. Needs root
+	apt-get -qq update
+	DEBIAN_FRONTEND=noninteractive apt-get -qq install --no-install-recommends $$(grep -v '^#' tests/packages.txt) \
+		$$(command -v npm > /dev/null || echo nodejs npm) > /dev/null
+
 test-model: .venv/installed-dev  ## every interleaving of messages, faults and time in small runs, and mistakes made on purpose; five minutes on two cores
-	$(BIN)/python -m pytest -m model -rP --numprocesses 2 tests/model
+	$(BIN)/python -m pytest -m model -rP --numprocesses $(TEST_PROCESSES) tests/model
 
-test-cluster: .venv/installed-dev  ## Docker, Prometheus, Slurm and Ray, for real. Needs root, Debian's packages, the extra `ray`; says which
-	$(BIN)/python -m pytest -m cluster -rs -o log_cli=true -o log_cli_level=INFO tests/cluster
+test-cluster: .venv/installed-ray  ## Docker, Prometheus, Slurm and Ray, for real. Needs root and `make packages`
+	$(BIN)/python -m pytest -m cluster -rs -o log_level=INFO --numprocesses $(TEST_PROCESSES) --dist loadfile tests/cluster
 
-test-clients: .venv/installed-dev  ## the clients in C++ and other languages, built and run. Needs Debian's packages; says which
-	$(BIN)/python -m pytest -m clients -rs tests/clients
+test-clients: .venv/installed-dev  ## the clients in C++ and other languages, built and run. Needs `make packages`
+	$(BIN)/python -m pytest -m clients -rs --numprocesses $(TEST_PROCESSES) --dist worksteal tests/clients
 
 test-processors: .venv/installed-dev  ## the tests that compare floats, with the code that PyTorch and numpy run on other processors
 	$(BIN)/python -m tests.processors
@@ -80,6 +85,10 @@ bench-peers: .venv/installed-dev  ## training beside seven other systems, each i
 
 .venv/installed-dev: .venv/installed
 	$(PIP_INSTALL) --editable '.[dev]'
+	touch $@
+
+.venv/installed-ray: .venv/installed-dev
+	$(PIP_INSTALL) --editable '.[ray]'
 	touch $@
 
 .venv/installed-docs: .venv/installed-dev

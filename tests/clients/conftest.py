@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
 import shutil
 import subprocess
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -26,28 +29,33 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
 
 @pytest.fixture(scope="session")
 def compiler() -> None:
-    """Skips, naming the package, without what the C++ client is built with."""
-    for program, package in (("g++", "g++"), ("cmake", "cmake")):
+    """Skips, saying what is missing, without what the C++ client is built with."""
+    for program in ("g++", "cmake"):
         if shutil.which(program) is None:
-            pytest.skip(f"{program} is missing: apt-get install {package}")
+            pytest.skip(f"{program} is missing: make packages")
     headers = subprocess.run(["g++", "-fsyntax-only", "-xc++", "-"], input=PROBE.encode(), capture_output=True, timeout=60)
     if headers.returncode:
-        pytest.skip("zmq.h or sodium.h is missing: apt-get install libzmq3-dev libsodium-dev")
+        pytest.skip("zmq.h or sodium.h is missing: make packages")
+
+
+@contextmanager
+def shared(factory: pytest.TempPathFactory, name: str) -> Iterator[Path]:
+    """A folder of all processes of this run of pytest, which take turns: what one builds there, the others find."""
+    mine = factory.getbasetemp()
+    folder = (mine.parent if "PYTEST_XDIST_WORKER" in os.environ else mine) / name
+    folder.mkdir(exist_ok=True)
+    with folder.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield folder
 
 
 @pytest.fixture(scope="session")
-def cpp_build(compiler: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A build folder of `clients/cpp`, configured."""
-    build = tmp_path_factory.mktemp("cpp")
-    no_warning("cmake", "-S", str(CPP), "-B", str(build), "-DTESTS=ON")
-    return build
-
-
-@pytest.fixture(scope="session")
-def cpp(cpp_build: Path) -> Path:
+def cpp(compiler: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder with the programs of `clients/cpp`, built with its tests."""
-    no_warning("cmake", "--build", str(cpp_build), "-j2")
-    return cpp_build
+    with shared(tmp_path_factory, "cpp") as build:
+        no_warning("cmake", "-S", str(CPP), "-B", str(build), "-DTESTS=ON")
+        no_warning("cmake", "--build", str(build), "-j2")
+        return build
 
 
 @pytest.fixture(scope="session")
@@ -55,14 +63,17 @@ def js(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of `clients/js` with its packages. Skips, with the reason, without Node or if a package cannot be installed."""
     for program in ("node", "npm"):
         if shutil.which(program) is None:
-            pytest.skip(f"{program} is missing: apt-get install nodejs npm")
-    copy = tmp_path_factory.mktemp("js") / "js"
-    shutil.copytree(JS, copy, ignore=shutil.ignore_patterns("node_modules", "package-lock.json"))
-    for command in ("npm install --no-audit --no-fund", "npm rebuild zeromq", "node --eval require('zeromq')"):
-        done = subprocess.run(command.split(), cwd=copy, capture_output=True, text=True, timeout=600)
-        if done.returncode:
-            pytest.skip(f"{command}: {done.stderr[-300:]}")
-    return copy
+            pytest.skip(f"{program} is missing: make packages")
+    with shared(tmp_path_factory, "js") as folder:
+        copy, half = folder / "js", folder / "half"
+        if not copy.exists():
+            shutil.copytree(JS, half, ignore=shutil.ignore_patterns("node_modules", "package-lock.json"), dirs_exist_ok=True)
+            for command in ("npm install --no-audit --no-fund", "npm rebuild zeromq", "node --eval require('zeromq')"):
+                done = subprocess.run(command.split(), cwd=half, capture_output=True, text=True, timeout=600)
+                if done.returncode:
+                    pytest.skip(f"{command}: {done.stderr[-300:]}")
+            half.rename(copy)
+        return copy
 
 
 @pytest.fixture

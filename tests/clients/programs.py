@@ -68,8 +68,7 @@ class Clients:
         """`cpp cartpole`, `js corridor` and so on. Skips the test if it cannot be built."""
         language, _, file = program.partition(" ")
         if language == "cpp":
-            build: Path = self._request.getfixturevalue("cpp_build")
-            no_warning("cmake", "--build", str(build), "--target", file)
+            build: Path = self._request.getfixturevalue("cpp")
             return Client(self._stage, [str(build / file)])
         folder: Path = self._request.getfixturevalue("js")
         (script,) = folder.glob(f"*/{file}.js")

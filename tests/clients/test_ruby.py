@@ -29,10 +29,10 @@ exit Worker.new(ARGV[0], Other, ARGV[1] || "other").run
 
 @pytest.fixture(autouse=True)
 def _with_ruby() -> None:
-    """Skips, naming the packages, without Ruby or its libraries."""
+    """Skips, saying so, without Ruby or its libraries."""
     command = ["ruby", "-e", 'require "ffi-rzmq"; require "msgpack"']
     if shutil.which("ruby") is None or subprocess.run(command, capture_output=True, timeout=60).returncode:
-        pytest.skip("ruby or a library of it is missing: apt-get install ruby ruby-ffi-rzmq ruby-msgpack")
+        pytest.skip("ruby or a library of it is missing: make packages")
 
 
 def learner(stage: Stage, address: str, *flags: str) -> Learner:

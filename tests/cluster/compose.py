@@ -48,18 +48,19 @@ WGET = "#!/usr/bin/python3\nimport sys, urllib.request\nurllib.request.urlopen(s
 class Program(Enum):
     """A program that reads compose.yaml."""
 
-    V1 = ("docker-compose",)
     V2 = ("docker", "compose")
+    V1 = ("docker-compose",)
 
-    def why_not(self) -> str:
-        """The reason why it cannot run here; empty if it can."""
-        if shutil.which(self.value[0]) is None:
-            return f"{' '.join(self.value)} is not installed"
-        done = subprocess.run([*self.value, "version"], capture_output=True, text=True, timeout=60, check=False)
-        found = re.search(r"\bv?(\d+)\.\d+\.\d+", done.stdout)
-        if done.returncode or found is None:
-            return f"{' '.join(self.value)} is not installed"
-        return "" if (found[1] == "1") is (self is Program.V1) else f"{' '.join(self.value)} is version {found[1]}"
+
+def program() -> Program | None:
+    """The newest that is installed; None without one."""
+    return next((each for each in Program if shutil.which(each.value[0]) and _is_installed(each)), None)
+
+
+def _is_installed(what: Program) -> bool:
+    done = subprocess.run([*what.value, "version"], capture_output=True, text=True, timeout=60, check=False)
+    found = re.search(r"\bv?(\d+)\.\d+\.\d+", done.stdout)
+    return done.returncode == 0 and found is not None and (found[1] == "1") is (what is Program.V1)
 
 
 def prepare(engine: Engine, folder: Path) -> None:

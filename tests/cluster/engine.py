@@ -27,12 +27,8 @@ log = logging.getLogger("millrace.cluster")
 START_S = 60.0
 STOP_S = 60.0
 CGROUPS = Path("/sys/fs/cgroup")
-TOOLS = {
-    "dockerd": "docker.io", "docker": "docker.io", "docker-init": "docker.io",
-    "iptables": "iptables", "ip": "iproute2",
-    "unshare": "util-linux", "nsenter": "util-linux", "setpriv": "util-linux",
-}  # fmt: skip
-"""the programs that it needs, and the Debian package of each"""
+TOOLS = ("dockerd", "docker", "docker-init", "iptables", "ip", "unshare", "nsenter", "setpriv")
+"""the programs that it needs"""
 
 # A separate /run keeps its sockets and pid files apart; the first process reaps orphans of containers.
 START = """
@@ -44,12 +40,12 @@ exec docker-init -s -- dockerd --data-root "$1/data" --exec-root /run/docker --p
 """
 
 
-def why_not(tools: Mapping[str, str] = TOOLS) -> str:
+def why_not(tools: Sequence[str] = TOOLS) -> str:
     """The reason why no engine can run here; empty if one can."""
     if os.geteuid() != 0:
         return "a Docker Engine takes root"
-    missing = sorted({package for tool, package in tools.items() if shutil.which(tool) is None})
-    return f"not installed: apt-get install {' '.join(missing)}" if missing else ""
+    missing = [tool for tool in tools if shutil.which(tool) is None]
+    return f"{', '.join(missing)} missing: make packages" if missing else ""
 
 
 def run(

@@ -16,8 +16,7 @@ from typing import Any
 import pytest
 
 from learner.run_folder.metrics_log import read_rows
-from tests.cluster import stock
-from tests.cluster.compose import BASE, LOOK_EVERY_S, USER, Cluster, Program, prepare
+from tests.cluster.compose import BASE, LOOK_EVERY_S, USER, Cluster, Program, prepare, program
 from tests.cluster.engine import TOOLS, Engine, why_not
 from tests.system.processes import ROOT, wait_for
 
@@ -34,31 +33,22 @@ OBSERVE = ("--profile", "observe")
 WORKERS = "sum(millrace_workers)"
 
 
-@pytest.fixture(autouse=True)
-def nothing_is_left_behind() -> None:
-    """Not after each test, as elsewhere: the engine outlives it, and `engine` itself sees to what it leaves."""
-
-
-@pytest.fixture(scope="module")
+@pytest.fixture
 def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Engine]:
-    tools = {**TOOLS, "prometheus": "prometheus", "promtool": "prometheus", "git": "git"}
-    if not (stock.STOCK / f"{stock.SUITE}.tar").exists():
-        tools["debootstrap"] = "debootstrap"
-    if why := why_not(tools):
+    if why := why_not((*TOOLS, "prometheus", "promtool", "git", "debootstrap")):
         pytest.skip(why)
-    folder = tmp_path_factory.mktemp("engine")
+    folder = tmp_path_factory.mktemp("engine")  # the path of a socket must be short
     with Engine(folder) as made:
         prepare(made, folder / "prometheus")
         yield made
     assert not (folder / "data").exists()
 
 
-@pytest.fixture(params=Program, ids=lambda program: " ".join(program.value))
-def cluster(engine: Engine, request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Cluster]:
-    program: Program = request.param
-    if why := program.why_not():
-        pytest.skip(why)
-    made = Cluster(engine, program, tmp_path)
+@pytest.fixture
+def cluster(engine: Engine, tmp_path: Path) -> Iterator[Cluster]:
+    if (found := program()) is None:
+        pytest.skip("neither docker compose nor docker-compose is installed: make packages")
+    made = Cluster(engine, found, tmp_path)
     try:
         yield made
     finally:
