@@ -78,4 +78,8 @@ class EnvAttributes:
 
 
 def _unpacked(packed: bytes) -> dict[str, Any]:
-    return unpack(packed) if packed else {}
+    """Raises `BadMessage` or `ValueError` for what was not packed here."""
+    found = unpack(packed) if packed else {}
+    if not isinstance(found, dict):
+        raise ValueError(f"attributes: expected a dict, got {type(found).__name__}")
+    return found

@@ -165,3 +165,24 @@ def test_a_run_is_finished_while_its_reason_to_stop_holds(tmp_path: Path) -> Non
     for unfinished in ({"evaluation": None}, {"stop_reason": "interrupted"}, {"env_steps": 1000 - per_update}):
         folder.write_summary(summary(**unfinished))
         assert not is_finished(config, folder.path), unfinished
+
+
+@pytest.mark.parametrize(
+    ("part", "wrong"),
+    [
+        ("past", {"version": -1}), ("past", {"env_steps": 2**64}), ("past", {"wall_s": float("inf")}),
+        ("past", {"episodes": [[]]}), ("past", {"facts": ["a"], "episodes": [[1.0, 2, 3.0, [4.0]], [1.0, 2, 3.0, []]]}),
+        ("past", {"env_attributes": {"sent": b"\xc1"}}), ("past", {"env_attributes": {"waiting": b"\x01"}}),
+        ("best_policy", ["x"]), ("best_policy", 1), ("algorithm", []), ("algorithm", {"observations": []}),
+        ("algorithm", {"rewards": {"moments": "x"}}),
+    ],
+)  # fmt: skip
+def test_a_checkpoint_of_another_structure_is_one_line(tmp_path: Path, part: str, wrong: Any) -> None:
+    config = resolve("CartPole-v1", run_dir=str(tmp_path), normalize_observations=True)
+    algorithm = PPO(ppo(config), run_spec(config, EnvSpec("CartPole-v1")).policy, total_steps=100, seed=1)
+    content = RunState().checkpoint_content(algorithm)
+    content[part] = content[part] | wrong if isinstance(wrong, dict) else wrong
+    folder = RunFolder.create(config)
+    checkpoint.save(folder.path, content, env_steps=0, keep=3)
+    with pytest.raises(CheckpointError, match="expected the state of this configuration, got another"):
+        restore(folder, algorithm)
