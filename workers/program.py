@@ -7,8 +7,10 @@ refused, or bad usage. The code is also written to the page that the supervisor 
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 import signal
+import socket
 import sys
 import threading
 import time
@@ -90,9 +92,15 @@ def _kill_own_group() -> None:
 
 
 def _remove_socket_of_killed_parent(address: str) -> None:
-    """Remove the socket, and the folder that the learner made for it: a killed learner could not."""
+    """Remove the socket, and the folder that the learner made for it: a killed learner could not.
+
+    The parent may have been the supervisor of a `millrace worker`: then the learner lives, and the next worker needs it.
+    """
     scheme, _, path = address.partition("://")
     if scheme == "ipc" and Path(path).parent.name.startswith("millrace-"):
+        with socket.socket(socket.AF_UNIX) as caller:
+            if caller.connect_ex(path) not in (errno.ECONNREFUSED, errno.ENOENT):
+                return
         Path(path).unlink(missing_ok=True)
         with suppress(OSError):
             Path(path).parent.rmdir()

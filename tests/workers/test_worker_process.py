@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import signal
+import socket
 import subprocess
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from workers import program
 from workers.supervise import worker_process
 from workers.supervise.activity import ActivityReader
 from workers.supervise.ending import Ending
@@ -85,3 +89,14 @@ def test_a_process_that_cannot_be_started_leaves_no_descriptor_behind(monkeypatc
     with pytest.raises(OSError, match="no memory"):
         WorkerProcess(WorkerCommand("ipc:///nobody/listens/here", "w0"))
     assert page.fd == -1
+
+
+@pytest.mark.parametrize("learner_lives", [True, False])
+def test_a_worker_whose_supervisor_was_killed_removes_the_socket_of_a_dead_learner_only(*, learner_lives: bool) -> None:
+    with tempfile.TemporaryDirectory(prefix="millrace-") as folder, socket.socket(socket.AF_UNIX) as learner:
+        path = Path(folder) / "learner"
+        learner.bind(str(path))
+        if learner_lives:
+            learner.listen()
+        program._remove_socket_of_killed_parent(f"ipc://{path}")
+        assert (path.exists(), Path(folder).exists()) == (learner_lives, learner_lives)
