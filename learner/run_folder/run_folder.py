@@ -23,6 +23,7 @@ import logging
 import os
 import re
 import shutil
+import stat
 import time
 import zlib
 from collections.abc import Mapping
@@ -221,8 +222,13 @@ class RunFolder:
         self._made = None
 
     def is_gone(self) -> bool:
-        """Whether the folder or its config.toml is not at the path of the run: it was deleted or renamed."""
-        return not (self.path / "config.toml").is_file()
+        """Whether the folder or its config.toml is not at the path of the run: deleted or renamed. Raises `RunError`."""
+        try:
+            return not stat.S_ISREG((self.path / CONFIG_FILE).stat().st_mode)
+        except (FileNotFoundError, NotADirectoryError):
+            return True
+        except OSError as error:
+            raise RunError(f"run folder {self.path} cannot be read: {error.strerror}") from error
 
     def make_again(self, config: RunSettings) -> str:
         """Make the folder or its config.toml again. Returns one line that says so. Raises `RunError` if that fails."""

@@ -1,5 +1,6 @@
 """What tells which run a folder holds: without run.json it holds none, a newer format is rejected, nothing is imported."""
 
+import errno
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +19,7 @@ from learner.run_folder.run_folder import RunFolder
 from learner.run_folder.run_format import RUN_FILE, RUN_FORMAT, check_format
 from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import UsageError
+from protocol.errors import RunError, UsageError
 from protocol.own_module import refuse_modules_in
 from protocol.policy.layout import acting_size
 from protocol.specs import PolicySpec
@@ -140,6 +141,18 @@ def test_a_folder_that_is_made_again_knows_where_its_workers_were_started(run: P
     (run / "config.toml").unlink()
     assert folder.make_again(config) == f"{run / 'config.toml'} was deleted; it is written again"
     assert check_format(run).workers_elsewhere
+
+
+def test_a_folder_that_the_system_does_not_show_is_not_gone(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As after `chmod 000`, or with a network file system whose ticket has expired: a line, which costs no training."""
+    folder = RunFolder.open(run)
+
+    def refuse(path: Path, **_: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "stat", refuse)
+    with pytest.raises(RunError, match=f"run folder {run} cannot be read: Permission denied"):
+        folder.is_gone()
 
 
 @pytest.mark.parametrize(
