@@ -43,6 +43,8 @@ def checked(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Re
         return found
 
     def fitting(name: str, value: Any, hint: Any) -> Any:
+        if hint is object:
+            return value
         value = plain(value)
         if why := next(unusable(value), "") or ("" if fits(value, hint) else f"expected {words(hint)}"):
             raise UsageError(f"{who}: {name}: {why}, got {value!r:.60}")
@@ -56,7 +58,7 @@ def checked(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Re
             return function(*args, **keywords)  # raises it with the function's name
         for name, value in given.arguments.items():
             match signature.parameters[name].kind:
-                case inspect.Parameter.VAR_KEYWORD:
+                case inspect.Parameter.VAR_KEYWORD if hints()[name] is not object:
                     given.arguments[name] = {key: fitting(key, one, hints().get(key, Any)) for key, one in value.items()}
                 case inspect.Parameter.VAR_POSITIONAL:
                     given.arguments[name] = tuple(fitting(name, one, hints()[name]) for one in value)

@@ -294,7 +294,7 @@ class RolloutService:
     # ---------------------------------------------------------------- saving, and what else there is to know
 
     @checked
-    def save(self, path: str | os.PathLike[str], **arrays: Any) -> None:
+    def save(self, path: str | os.PathLike[str], **arrays: object) -> None:
         """Write the service's state and your arrays into one .npz file, which is there whole or not at all.
 
         Call it right after `publish`. `RolloutService(..., restore=path)` goes on from it: ledger, versions, lanes

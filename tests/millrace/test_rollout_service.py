@@ -194,11 +194,11 @@ def test_a_saved_service_goes_on(tmp_path: Path) -> None:
         made.publish(made.policy.initial(seed=3))
         made.gather()
         made.publish(made.policy.initial(seed=4))
-        made.save(file, parameters=made.policy.initial(seed=4), step=np.int64(7))
+        made.save(file, parameters=made.policy.initial(seed=4), step=np.int32(7))
         issued, env_steps = made.ledger()["issued"], made.env_steps
     with service(restore=file) as made:
         assert made.env_steps == env_steps
-        assert set(made.restored) == {"parameters", "step"}
+        assert {name: array.dtype for name, array in made.restored.items()} == {"parameters": np.float32, "step": np.int32}
         assert made.publish(made.restored["parameters"]) == 1
         batch = made.gather()
         assert batch.version.tolist() == [1] * 4
