@@ -1,7 +1,8 @@
 """The door of the public functions: their arguments are checked against their annotations before anything starts.
 
-Rule: what comes in is plain. numpy's scalars become Python's; a whole number has at most 64 bits, and text can be written to
-a file; True and False are no numbers. What is otherwise is refused in one line, in the function's name.
+Rule: what comes in is plain. numpy's scalars and members of enums become Python's numbers and text; a whole number has at
+most 64 bits, and text can be written to a file; True and False are no numbers. What is otherwise is refused in one line, in
+the function's name. Only what is annotated as `object` is the user's own, and goes through as it is.
 """
 
 from __future__ import annotations
@@ -75,10 +76,16 @@ def checked(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Re
 
 
 def plain(value: Any) -> Any:
-    """The value with Python's scalars in place of numpy's, also in lists, tuples and dicts."""
+    """The value with Python's scalars in place of numpy's and of subclasses, also in lists, tuples and dicts."""
     match value:
         case np.generic():
             return value.item()
+        case bool():
+            return value
+        case str():
+            return str.__str__(value)  # `str` would give the name of a member of an enum
+        case int() | float():
+            return (int if isinstance(value, int) else float)(value)
         case list() | tuple() if type(value) in (list, tuple):
             return type(value)(map(plain, value))
         case dict() if type(value) is dict:

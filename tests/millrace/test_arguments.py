@@ -8,6 +8,7 @@ import random
 import tempfile
 from collections.abc import Callable
 from contextlib import ExitStack
+from enum import IntEnum, StrEnum
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -20,6 +21,7 @@ from learner.config.config import Config
 from learner.config.hyperparameters import PPOConfig
 from learner.config.rollout_config import RolloutConfig
 from learner.members.bound import bind
+from millrace.arguments import plain
 from millrace.launch import learner_inference, local_run, policy_workers, rollouts, vector
 from millrace.launch.local_worker_options import private_address
 from millrace.playing import EvaluateKeywords, RecordKeywords
@@ -160,6 +162,24 @@ NUMPY = {"workers": np.int64(1), "lanes": np.int32(2)}
 )
 def test_numpys_scalars_are_numbers_and_text(function: Callable[..., Any], given: dict[str, Any]) -> None:
     assert outcome(function, given) == "started"
+
+
+class Word(StrEnum):
+    CARTPOLE = "CartPole-v1"
+    RELU = "relu"
+
+
+class Number(IntEnum):
+    TWO = 2
+
+
+def test_members_of_enums_and_subclasses_arrive_as_pythons() -> None:
+    class Text(str):
+        __slots__ = ()
+
+    given = [Word.CARTPOLE, (Number.TWO, {Text("a"): True}), type("Real", (float,), {})(0.5)]
+    assert repr(plain(given)) == "['CartPole-v1', (2, {'a': True}), 0.5]"
+    assert repr(millrace.MLP(Number.TWO, activation=Word.RELU).net) == "(2,)"  # type: ignore[arg-type]
 
 
 def test_numpys_scalars_arrive_as_pythons(run: millrace.Run) -> None:
