@@ -41,7 +41,7 @@ from millrace.policies import MLP, PolicyChoice, PolicyParameters
 from protocol.arrays import Array, Ints
 from protocol.env_spec import EnvLike, EnvSpec, remembered_name
 from protocol.envs.wrappers import WrapperLike, wrapper_names
-from protocol.errors import CheckpointError, RunError, UsageError, check_at_least, did_you_mean, first_line
+from protocol.errors import CheckpointError, UsageError, check_at_least, did_you_mean, first_line
 from protocol.rollout import Batch, stack_rollouts
 from protocol.specs import PolicySpec
 
@@ -322,10 +322,7 @@ class RolloutService:
             incarnations=snapshot.incarnations,
             moments=None if self._moments is None else self._moments.state(),
         )
-        try:
-            write(Path(path), state, arrays)
-        except OSError as error:
-            raise RunError(f"{path} not written: {error.strerror or first_line(error)}") from error
+        write(Path(path), state, arrays)
 
     def ledger(self) -> dict[str, int]:
         """What became of every ticket and every transition: `used`, `stale`, `lost` and so on.

@@ -18,7 +18,7 @@ from learner.config.config import TABLES, Config
 from learner.config.hyperparameters import HYPERPARAMETERS, algorithms_with
 from learner.config.presets import PRESETS, environment_presets, named_presets
 from learner.config.validation import convert, validate
-from learner.run_folder.run_format import check_format, parse_toml, read_config
+from learner.run_folder.run_format import CONFIG_FILE, check_format, parse_toml, read_config
 from protocol.envs.found_names import moved
 from protocol.errors import UsageError, did_you_mean
 
@@ -56,10 +56,7 @@ def config_of_run(run: Path, algo: str | None = None) -> Config:
     `algo`: the name that its algorithm has now, if it may be another one (`algorithm_names.moved`).
     """
     where = run / "config.toml"
-    try:
-        table = with_algorithm(read_config(run), algo)
-    except FileNotFoundError:
-        raise UsageError(f"run {run}: expected a run folder with a config.toml, got none") from None
+    table = with_algorithm(read_config(run), algo)
     return validate(_override_from_toml(Config(), table, str(where)), str(where))
 
 
@@ -77,12 +74,14 @@ def lower_layers(
             raise UsageError(f"a config file ({file}) or a run to resume ({resume}): expected one, got both")
         if preset not in ("auto", "none"):
             raise UsageError(f"a preset ({preset}) or a run to resume ({resume}): expected one, got both")
-        file, preset = resume / "config.toml", "none"
+        file, preset = resume / CONFIG_FILE, "none"
         if not file.is_file():
-            raise UsageError(f"run {resume}: expected a run folder with a config.toml to resume, got none")
+            raise UsageError(f"run {resume}: expected a run folder with a {CONFIG_FILE} to resume, got none")
         check_format(resume)
+        table = with_algorithm(read_config(resume), algo)
+    else:
+        table = {} if file is None else _read_toml(file)
     where = str(file)
-    table = {} if file is None else _read_toml(file) if resume is None else with_algorithm(read_config(resume), algo)
     if resume is not None and env and not moved(str(table.get("env")), env):
         raise UsageError(f"run {resume} is of {table.get('env')}, not of {env}; resume it without naming an environment")
     named = named_presets()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,15 +12,13 @@ from learner.config.presets import environment_name
 from learner.run_folder.metrics_log import METRICS_FILE, read_rows
 from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
 from learner.run_folder.regular_files import reason
-from learner.run_folder.run_format import CONFIG_FILE, check_format, read_config
+from learner.run_folder.run_folder import RunFolder
+from learner.run_folder.run_format import check_format, read_config
 from protocol.arrays import Doubles
 from protocol.errors import UsageError
 
 GRID_POINTS = 400
 LARGEST_DRAWN = 1e300
-
-Purpose = Literal["plot", "report on"]
-"""What a run folder is read for; error messages say so."""
 
 
 class Curve(NamedTuple):
@@ -62,18 +60,16 @@ def algorithm_label(algo: str) -> str:
     return name if own else algo.upper()
 
 
-def read_run_files(run: Path, purpose: Purpose) -> RunFiles:
-    """Read a run folder. Raises `UsageError`, with a one-line message that names `purpose`, if it cannot be read."""
-    if not (run / CONFIG_FILE).is_file():
-        missing = f"no {CONFIG_FILE}" if run.is_dir() else "no such folder"
-        raise UsageError(f"run {run}: expected a run folder to {purpose}, got {missing}")
+def read_run_files(run: Path) -> RunFiles:
+    """Read a run folder. Raises `UsageError`, with a one-line message, if it cannot be read."""
+    RunFolder.open(run)
     elsewhere = check_format(run).workers_elsewhere
     config = read_config(run)
     env = environment_name(config["env"], config.get("env_kwargs", {}), config["algo"])
     try:
         rows = read_rows(run / METRICS_FILE)
     except OSError as error:
-        raise UsageError(f"run {run}: nothing to {purpose}: {METRICS_FILE} cannot be read: {reason(error)}") from error
+        raise UsageError(f"run {run}: {METRICS_FILE} cannot be read: {reason(error)}") from error
     return RunFiles(env, config["algo"], config["seed"], config, elsewhere, rows)
 
 

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 
 from learner.report.curve import Curve, common_grid, read_run_files
 from learner.report.runs import RunGroup, group_runs, read_run
-from learner.run_folder.atomic_write import write_atomically
+from learner.run_folder.atomic_write import write_file
 from learner.run_folder.episode_window import WINDOW_EPISODES
-from protocol.errors import RunError, UsageError
+from protocol.errors import UsageError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,7 +47,7 @@ log = logging.getLogger("millrace.learner")
 
 def read_curve(run: Path) -> Curve:
     """The learning curve of a run folder. Raises `UsageError`, with a one-line message, if the folder has none."""
-    curve = read_run_files(run, "plot").curve()
+    curve = read_run_files(run).curve()
     if curve is None:
         raise UsageError(nothing_to_plot(run))
     return curve
@@ -66,10 +66,7 @@ def plot(runs: Sequence[Path], out: Path) -> Path:
 
 def write(figure: PngFigure, out: Path) -> None:
     """Write the figure as a PNG. Raises `RunError`."""
-    try:
-        write_atomically(out, lambda file: figure.savefig(file, format="png", dpi=DPI))
-    except (OSError, ValueError) as error:  # ValueError: no name of a file
-        raise RunError(f"{out} not written: {getattr(error, 'strerror', None) or error}") from error
+    write_file(out, lambda file: figure.savefig(file, format="png", dpi=DPI))
 
 
 def curves(runs: Sequence[Path]) -> PngFigure:
@@ -81,7 +78,7 @@ def curves(runs: Sequence[Path]) -> PngFigure:
 
     from learner.report.figure import PngFigure
 
-    found = [read_run(run, "plot") for run in dict.fromkeys(runs)]
+    found = [read_run(run) for run in dict.fromkeys(runs)]
     read = [run for run in found if run.curve is not None]
     empty = [nothing_to_plot(run.path) for run in found if run.curve is None]
     if not read:

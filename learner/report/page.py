@@ -12,8 +12,8 @@ from pathlib import Path
 
 from learner.report import ledger_and_stages, sections
 from learner.report.runs import group_runs, read_run
-from learner.run_folder.atomic_write import write_atomically
-from protocol.errors import RunError, UsageError
+from learner.run_folder.atomic_write import write_file
+from protocol.errors import UsageError
 
 CONTENT_SECURITY_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; media-src data:"
 
@@ -26,10 +26,7 @@ def write_page(runs: Sequence[Path], out: Path) -> Path:
     if out.is_dir():
         raise UsageError(f"{out} is a folder; expected the file to write, as in: --out report.html")
     text = page(runs)
-    try:
-        write_atomically(out, lambda file: file.write(text.encode(errors="replace")))  # a name of a file may not be UTF-8
-    except OSError as error:
-        raise RunError(f"{out} not written: {error.strerror}") from error
+    write_file(out, lambda file: file.write(text.encode(errors="replace")))  # a name of a file may not be UTF-8
     return out
 
 

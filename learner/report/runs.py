@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from learner.report.curve import Curve, Purpose, algorithm_label, read_run_files
+from learner.report.curve import Curve, algorithm_label, read_run_files
 from learner.run_folder.metrics_log import METRICS_FILE
 from learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY, UPDATES_KEY, steps_per_second
 from learner.run_folder.regular_files import regular_files
@@ -146,9 +146,9 @@ class ReportData:
         return [f"{name} ({names[:i].count(name) + 1})" if names.count(name) > 1 else name for i, name in enumerate(names)]
 
 
-def read_run(path: Path, purpose: Purpose = "report on") -> Run:
-    """Read a run folder. Raises `UsageError`, with a one-line message that names `purpose`, if it cannot be read."""
-    files = read_run_files(path, purpose)
+def read_run(path: Path) -> Run:
+    """Read a run folder. Raises `UsageError`, with a one-line message, if it cannot be read."""
+    files = read_run_files(path)
     of_algorithm = files.config.get(files.algo)
     return Run(
         path=path,

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from learner.rollouts.ledger import Ledger
-from learner.run_folder.atomic_write import write_atomically
+from learner.run_folder.atomic_write import write_file
 from protocol.arrays import Array
 from protocol.errors import CheckpointError, UsageError
 from protocol.specs import PolicySpec
@@ -48,7 +48,7 @@ def digest(policy: PolicySpec) -> str:
 
 
 def write(path: Path, state: ServiceState, arrays: Mapping[str, Any]) -> None:
-    """Write the state and the user's arrays. Raises `UsageError` for arrays that cannot be kept, and OSError."""
+    """Write the state and the user's arrays. Raises `UsageError` for arrays that cannot be kept, and `RunError`."""
     kept = {}
     for name, value in arrays.items():
         array = np.asarray(value)
@@ -57,7 +57,7 @@ def write(path: Path, state: ServiceState, arrays: Mapping[str, Any]) -> None:
             raise UsageError(f"save: {name}: expected an array of numbers, not called {taken}; got {array.dtype}")
         kept[name] = array
     ours = np.frombuffer(msgspec.json.encode(state), np.uint8)
-    write_atomically(path, lambda file: np.savez(file, **{OURS: ours}, **kept))  # type: ignore[arg-type]
+    write_file(path, lambda file: np.savez(file, **{OURS: ours}, **kept))  # type: ignore[arg-type]
 
 
 def read(path: Path) -> tuple[ServiceState, dict[str, Array]]:

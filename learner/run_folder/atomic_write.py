@@ -16,7 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from learner.run_folder.regular_files import open_regular
+from learner.run_folder.regular_files import open_regular, reason
 from protocol.errors import RunError
 
 log = logging.getLogger("millrace.learner")
@@ -43,6 +43,14 @@ def write_atomically(target: Path, write: Callable[[BinaryIO], object]) -> None:
         temporary.unlink(missing_ok=True)
         raise
     _flush_folder(target.parent)
+
+
+def write_file(target: Path, write: Callable[[BinaryIO], object]) -> None:
+    """As `write_atomically`. Raises `RunError`, in one line, for what the file system refuses."""
+    try:
+        write_atomically(target, write)
+    except (OSError, ValueError) as error:  # ValueError: no name of a file
+        raise RunError(f"{target} not written: {reason(error)}") from error
 
 
 def _flush_folder(folder: Path) -> None:

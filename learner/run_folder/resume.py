@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 from pathlib import Path
 
 from learner.run_folder.checkpoint import FOLDER, SUFFIX
 from learner.run_folder.regular_files import regular_files
 from learner.run_folder.run_folder import RunSettings, as_folder_name
-from learner.run_folder.run_format import read_config
+from learner.run_folder.run_format import CONFIG_FILE, read_config
 from protocol.bounds import one_line
 from protocol.errors import UsageError
 from protocol.logs.notices import log_notice
@@ -37,10 +38,10 @@ def newest_run(config: RunSettings) -> Path | None:
 
 def _can_be_resumed(path: Path, config: RunSettings) -> bool:
     """Whether this is a run of the same environment and algorithm that can be resumed: it has a checkpoint."""
+    if not os.path.lexists(path / CONFIG_FILE):
+        return False
     try:
         table = read_config(path)
-    except FileNotFoundError:
-        return False
     except UsageError as error:
         log.warning("run %s is passed over: %s", path, one_line(str(error)))
         return False

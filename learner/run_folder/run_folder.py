@@ -36,7 +36,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from learner.run_folder.atomic_write import TEMPORARY, Writes, write_atomically
+from learner.run_folder.atomic_write import TEMPORARY, Writes, write_file
 from learner.run_folder.regular_files import MOST_BYTES, read, reason
 from learner.run_folder.results import Summary
 from learner.run_folder.run_format import (
@@ -245,14 +245,8 @@ class RunFolder:
     def write_config(self, config: RunSettings, *, workers_elsewhere: bool = False) -> None:
         """Write config.toml and run.json: at the start, and again when a run is resumed, perhaps with other settings."""
         self._workers_elsewhere = workers_elsewhere
-        try:
-            write_format(self.path, workers_elsewhere=workers_elsewhere)
-        except OSError as error:
-            raise RunError(f"{self.path / RUN_FILE} not written: {error.strerror}") from error
-        self._write(
-            CONFIG_FILE,
-            f"{HEAD}{config.to_toml()}{END}".encode("utf-8", "surrogateescape"),
-        )
+        write_format(self.path, workers_elsewhere=workers_elsewhere)
+        self._write(CONFIG_FILE, f"{HEAD}{config.to_toml()}{END}".encode("utf-8", "surrogateescape"))
 
     def write_policy(
         self,
@@ -359,10 +353,7 @@ class RunFolder:
             self._write(name, content)
 
     def _write(self, name: str, content: bytes) -> None:
-        try:
-            write_atomically(self.path / name, lambda file: file.write(content))
-        except OSError as error:
-            raise RunError(f"{self.path / name} not written: {error.strerror}") from error
+        write_file(self.path / name, lambda file: file.write(content))
 
 
 def _split(content: bytes) -> tuple[bytes, bytes]:

@@ -19,7 +19,7 @@ from typing import Any
 
 import msgspec
 
-from learner.run_folder.atomic_write import write_atomically
+from learner.run_folder.atomic_write import write_file
 from learner.run_folder.regular_files import read, reason
 from protocol.bounds import one_line
 from protocol.errors import UsageError
@@ -28,10 +28,10 @@ from protocol.own_module import refuse_modules_in
 RUN_FORMAT = 2
 RUN_FILE = "run.json"
 CONFIG_FILE = "config.toml"
-HEAD = "# Repeat this run: millrace train --config THIS_FILE (it is whole if it ends with # end)\n"
-END = "# end\n"
 POLICY_JSON = "policy.json"
 POLICY_ARRAYS = {"final": "policy.safetensors", "best": "best.safetensors"}
+HEAD = "# Repeat this run: millrace train --config THIS_FILE (it is whole if it ends with # end)\n"
+END = "# end\n"
 """The first and the last line of config.toml. A file that was cut off may still be TOML, with other settings."""
 
 
@@ -69,23 +69,23 @@ def versions() -> dict[str, str]:
 
 
 def write_format(folder: Path, *, workers_elsewhere: bool = False) -> None:
-    """Write run.json with the current format. Raises OSError."""
+    """Write run.json with the current format. Raises `RunError`."""
     version = versions().get("millrace", "")
     content = msgspec.json.encode(RunFormat(format=RUN_FORMAT, millrace=version, workers_elsewhere=workers_elsewhere))
-    write_atomically(folder / RUN_FILE, lambda file: file.write(content + b"\n"))
+    write_file(folder / RUN_FILE, lambda file: file.write(content + b"\n"))
 
 
 def read_config(run: Path) -> dict[str, Any]:
     """The settings in the config.toml of a run folder, as it has them; among them are env, algo and seed.
 
-    Raises `FileNotFoundError`, and `UsageError` for a file that cannot be read, or names a module in the run folder.
+    Raises `UsageError` for a file that is missing or cannot be read, or names a module in the run folder.
     """
     where = run / CONFIG_FILE
     try:
         table = parse_toml(read(where).decode(), str(where))
         msgspec.convert(table, _Identity)
     except FileNotFoundError:
-        raise
+        raise UsageError(f"run {run}: expected a run folder with a {CONFIG_FILE}, got none") from None
     except UnicodeDecodeError as error:
         raise UsageError(f"{where} cannot be read: it is not text") from error
     except OSError as error:
