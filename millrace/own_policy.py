@@ -73,11 +73,6 @@ class OwnPolicy:
         )
 
     @property
-    def is_code(self) -> bool:
-        """True: workers call the factory."""
-        return True
-
-    @property
     def extra_arrays(self) -> tuple[ExtraArray, ...]:
         """The declared extras but `log_prob`. Raises `UsageError`."""
         return tuple(extra for extra in self._declared() if extra != LOG_PROB)

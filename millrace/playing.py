@@ -27,6 +27,8 @@ from protocol.envs.wrappers import WrapperLike
 from protocol.errors import UsageError, check_at_least, did_you_mean
 
 NOT_KEYWORDS = ("wrapper",)  # in Python they are `wrappers`
+LEAST = {"steps": 1, "episodes": 1, "seed": 0, "workers": 1, "copies": 1, "max_steps": 1, "max_env_failures": 0}
+"""The smallest value of each flag that is a number."""
 Watch = Callable[[str], None]
 """Gets how far it is, as text."""
 _Flags = TypeVar("_Flags", EvaluateFlags, RecordFlags)
@@ -171,15 +173,7 @@ def play(flags: EvaluateFlags, watch: Watch, given: Given | None = None) -> tupl
     Raises `UserFacingError`, or `KeyboardInterrupt` if the user stops it.
     """
     episodes = flags.episodes if flags.episodes is not None else 3 if flags.video else 100
-    for name, value, least in (
-        ("episodes", episodes, 1),
-        ("seed", flags.seed, 0),
-        ("workers", flags.workers, 1),
-        ("copies", flags.copies, 1),
-        ("max_steps", flags.max_steps, 1),
-        ("max_env_failures", flags.max_env_failures, 0),
-    ):
-        check_at_least(name, value, least)
+    _check_least(flags)
     if flags.copies > MAX_SEEDS:
         raise UsageError(f"copies: expected int <= {MAX_SEEDS}, got {flags.copies}")
     if flags.video:
@@ -201,14 +195,17 @@ def play(flags: EvaluateFlags, watch: Watch, given: Given | None = None) -> tupl
 
 def write_dataset(flags: RecordFlags, watch: Watch, given: Given | None = None) -> RecordedDataset:
     """Write a dataset. Raises `UserFacingError`, or `KeyboardInterrupt` if the user stops it; then it leaves no files."""
-    check_at_least("steps", flags.steps, 1)
-    check_at_least("seed", flags.seed, 0)
-    check_at_least("workers", flags.workers, 1)
-    check_at_least("max_env_failures", flags.max_env_failures, 0)
+    _check_least(flags)
     with policy_player(_saved(flags, given), _workers(flags, flags.workers, 1), watch) as player:
         return record_dataset(
             player, flags.run, flags.out, flags.steps, flags.seed, stochastic=flags.stochastic, npy=flags.npy
         )
+
+
+def _check_least(flags: EvaluateFlags | RecordFlags) -> None:
+    for name, least in LEAST.items():
+        if (value := getattr(flags, name, None)) is not None:
+            check_at_least(name, value, least)
 
 
 def _workers(flags: EvaluateFlags | RecordFlags, count: int, copies: int) -> PlayingWorkers:

@@ -32,11 +32,6 @@ class PolicyChoice(Protocol):
         """Further arrays that it returns with its actions."""
         ...
 
-    @property
-    def is_code(self) -> bool:
-        """Whether workers call a factory of the user's for it."""
-        ...
-
     def spec(self, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
         """The policy for these spaces. Raises `UsageError` if there is none."""
         ...
@@ -70,11 +65,6 @@ class MLP:
     def extra_arrays(self) -> tuple[ExtraArray, ...]:
         """None: a batch has its log-probabilities."""
         return ()
-
-    @property
-    def is_code(self) -> bool:
-        """False: it travels as plain data."""
-        return False
 
     def spec(self, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
         """The policy for these spaces."""

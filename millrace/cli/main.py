@@ -21,7 +21,7 @@ from learner.run_folder.last_line import last_line
 from learner.run_folder.run_format import is_run_folder
 from learner.standard_streams import open_closed, unfailing
 from protocol.bounds import escaped, indented
-from protocol.errors import UsageError, UserFacingError, usage_error
+from protocol.errors import UsageError, UserFacingError, did_you_mean, usage_error
 from protocol.logs.notices import log_notice
 
 if TYPE_CHECKING:
@@ -117,8 +117,6 @@ def _dispatch(argv: list[str]) -> int:
         return 0
     name, *rest = argv
     if name not in COMMANDS:
-        from protocol.errors import did_you_mean
-
         raise UsageError(f"unknown command {name}{did_you_mean(name, COMMANDS) or '; millrace --help lists them'}")
     return COMMANDS[name].run(rest)
 

@@ -20,6 +20,7 @@ from learner.rollout_service.spec import rollout_spec
 from learner.rollouts.ledger import Ledger
 from millrace.launch.endpoint import open_endpoint
 from millrace.launch.local_worker_options import stopped_on_error, worker_cores
+from millrace.own_policy import OwnPolicy
 from millrace.policies import PolicyChoice
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
@@ -52,7 +53,7 @@ def start(
     `listens`: wait for workers elsewhere at `config.bind`, and start none. Raises `UserFacingError`.
     """
     workers = workers_to_wait_for(config, None if listens else config.workers)
-    code = env.called_code or ("a policy's factory" if policy.is_code else "")
+    code = env.called_code or ("a policy's factory" if isinstance(policy, OwnPolicy) else "")
     where = BindSettings(config.bind if listens else "", config.keys, config.insecure, config.advertise)
     endpoint = open_endpoint(where, config.transport, resources, code)
     link = endpoint.link

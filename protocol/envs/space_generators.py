@@ -34,15 +34,9 @@ def restore_generators(states: Sequence[str], *given: gymnasium.Space[Any]) -> N
 
 def _with_inner(space: gymnasium.Space[Any]) -> Iterator[gymnasium.Space[Any]]:
     yield space
-    match space:
-        case spaces.Dict():
-            inside = list(space.spaces.values())
-        case spaces.Tuple():
-            inside = list(space.spaces)
-        case _:
-            inside = []
-    for inner in inside:
-        yield from _with_inner(inner)
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        for inner in space.values() if isinstance(space, spaces.Dict) else space:
+            yield from _with_inner(inner)
 
 
 def _state(space: gymnasium.Space[Any]) -> str:
