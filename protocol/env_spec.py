@@ -351,9 +351,16 @@ class _SpecFactory:
 
 
 def _sent(spec: GymnasiumSpec) -> GymnasiumSpec:
-    """The spec as another process can use it: a class of this script stands in it, in place of its name."""
-    own = in_main(spec.entry_point) if isinstance(spec.entry_point, str) else None
-    return dataclasses.replace(spec, entry_point=own) if callable(own) else spec
+    """The spec as another process can use it: a class of this script stands in it, in place of its name.
+
+    What has a name that gymnasium imports is named, so that only who makes this environment needs the module.
+    """
+    point = spec.entry_point
+    name = point if isinstance(point, str) else name_of(point)
+    module, _, qualname = name.partition(":")
+    if callable(own := in_main(name)):
+        return dataclasses.replace(spec, entry_point=own)
+    return dataclasses.replace(spec, entry_point=name) if module == _module_of(spec) and "." not in qualname else spec
 
 
 def remembered_name(env: EnvLike | EnvSpec) -> str:

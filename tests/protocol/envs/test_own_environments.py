@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 from collections.abc import Iterator
 from functools import partial
@@ -213,6 +214,18 @@ def test_a_callable_may_make_an_id_that_only_this_process_registered(
         assert type(made.unwrapped).__name__ == "Mine"
         assert made.spec is not None
         assert made.spec.max_episode_steps == limit
+
+
+def test_a_callable_needs_no_module_of_an_id_that_it_does_not_make(
+    registry: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "only_here.py").write_text("import gymnasium\nclass Mine(gymnasium.Env): pass\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    gymnasium.register("Other-v0", importlib.import_module("only_here").Mine)
+    spec = EnvSpec.of(make_countdown)
+    monkeypatch.undo()  # as on another machine
+    del sys.modules["only_here"]
+    assert isinstance(made_elsewhere(spec), Countdown)
 
 
 def test_an_id_that_cannot_be_sent_spoils_no_callable(registry: None) -> None:
