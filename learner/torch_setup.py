@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from threading import Lock
 
 from learner.config.config import Config
 from protocol.cpu_cores import usable_cores
@@ -20,26 +21,39 @@ from protocol.specs import PolicySpec
 MANY_WEIGHTS = 1 << 18  # 512 x 512
 
 
+_lock = Lock()
+_inside: list[list[ExitStack]] = []
+"""For each `one_thread` that was entered and not left, in this order: what restores the numbers of threads before it."""
+
+
 @contextmanager
 def one_thread(*, uses_torch: bool = True) -> Iterator[None]:
     """One thread for numpy's BLAS, and for PyTorch until `torch.set_num_threads` is called; later as many as before.
 
-    PyTorch is imported only if it `uses_torch`.
+    PyTorch is imported only if it `uses_torch`. Threads of the program may leave in another order than they entered.
     """
     from threadpoolctl import threadpool_limits
 
-    with threadpool_limits(1, "blas"):
-        if not uses_torch:
-            yield
-            return
-        import torch
+    own = [ExitStack()]
+    with _lock:
+        own[0].enter_context(threadpool_limits(1, "blas"))
+        if uses_torch:
+            import torch
 
-        before = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
-            yield
-        finally:
-            torch.set_num_threads(before)
+            own[0].callback(torch.set_num_threads, torch.get_num_threads())
+            torch.set_num_threads(1)
+        _inside.append(own)
+    try:
+        yield
+    finally:
+        with _lock:
+            later = _inside[_inside.index(own) + 1 :]
+            _inside.remove(own)
+            if later:  # the next to leave restores what was before this one, too
+                own[0].callback(later[0][0].close)
+                later[0][0] = own[0]
+            else:
+                own[0].close()
 
 
 def torch_device(config: Config) -> str:

@@ -15,7 +15,7 @@ import millrace
 from learner import torch_setup
 from learner.config.layers import resolve
 from learner.run_folder.run_format import POLICY_ARRAYS
-from learner.torch_setup import threads
+from learner.torch_setup import one_thread, threads
 from millrace.launch.local_worker_options import worker_cores
 from protocol import cpu_cores as counting
 from protocol.cpu_cores import usable_cores
@@ -29,6 +29,21 @@ CORES = {2, 3}
 def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: CORES, raising=False)
     monkeypatch.setattr(os, "sched_setaffinity", lambda pid, mask: None, raising=False)
+
+
+def test_a_program_has_its_threads_again_whichever_run_ends_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    numbers = [4]
+    monkeypatch.setattr(torch, "get_num_threads", lambda: numbers[-1])
+    monkeypatch.setattr(torch, "set_num_threads", numbers.append)
+    runs = [one_thread() for _ in range(3)]
+    for run, of_run in zip(runs, (2, 3, 5), strict=True):
+        run.__enter__()
+        torch.set_num_threads(of_run)
+    found = []
+    for run in (runs[1], runs[0], runs[2]):
+        run.__exit__(None, None, None)
+        found.append(torch.get_num_threads())
+    assert found == [5, 5, 4]
 
 
 @pytest.mark.parametrize(
