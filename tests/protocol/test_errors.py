@@ -38,3 +38,8 @@ def test_the_limit_of_open_files_is_named() -> None:
     line = f"a process may have {most} files open here, which is too few: `ulimit -n 4096`, or fewer workers"
     assert str(usage_error(OSError(errno.EMFILE, "Too many open files"))) == line
     assert usage_error(OSError(errno.ENOSPC, "No space left on device")) is None
+
+
+def test_a_path_that_is_too_long_is_cut_and_what_to_do_is_said() -> None:
+    error = usage_error(OSError(errno.ENAMETOOLONG, "File name too long", "x" * 5000))
+    assert str(error) == f"path {'x' * 199}…: File name too long; choose a shorter one"
