@@ -225,6 +225,13 @@ SURROGATE = "CartPole-v1\ud800"
         ),
         (millrace.make_vec, {"env": "CartPole-v1", "workers": False}, "make_vec: workers: expected int or None, got False"),
         (millrace.make_vec, {"env": "CartPole-v1", "copy": 1}, "make_vec: copy: expected bool, got 1"),
+        (millrace.make_vec, {"env": "CartPole-v1", "num_envs": 2.0}, "make_vec: num_envs: expected int or None, got 2.0"),
+        (millrace.make_vec, {"env": "CartPole-v1", "timeout": "5"}, "make_vec: timeout: expected float, got '5'"),
+        (
+            millrace.make_vec,
+            {"env": "CartPole-v1", "wrappers": "m:Wrapper"},
+            "make_vec: wrappers: expected a list of text or a function, got 'm:Wrapper'",
+        ),
         (millrace.MLP, {"activation": "sin"}, "MLP: activation: expected one of tanh, relu, got 'sin'"),
         (millrace.Recurrent, {"core_size": True}, "Recurrent: core_size: expected int, got True"),
     ],

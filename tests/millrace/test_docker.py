@@ -24,6 +24,7 @@ from learner.config.config import Config
 from learner.prometheus import MetricsCollector, MetricsSnapshot
 from learner.rollouts.ledger import Ledger
 from learner.run_folder.progress import Progress
+from millrace.cli.main import NOT_IN_WORKERS
 from protocol.keys.key_folder import KeyFolder
 from tests.test_architecture import imported, sources
 
@@ -66,18 +67,7 @@ sys.exit(main(["worker", "tcp://127.0.0.1:1", "--join-timeout-s", "0.01"]))
 
 
 def test_a_worker_starts_with_the_packages_of_its_image_alone() -> None:
-    missing = {
-        "matplotlib",
-        "prometheus_client",
-        "rich",
-        "safetensors",
-        "tensorboard",
-        "threadpoolctl",
-        "tomli_w",
-        "torch",
-        "tyro",
-        "zstandard",
-    }
+    missing = NOT_IN_WORKERS | {"zstandard"}
     done = subprocess.run(
         [sys.executable, "-c", IN_A_WORKER_IMAGE.format(missing=missing)],
         cwd=ROOT, capture_output=True, text=True, timeout=60, check=False,

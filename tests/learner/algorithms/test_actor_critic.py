@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
 from typing import Any
 
 import msgspec
@@ -42,14 +41,6 @@ from tests.support.steps import gradient_tolerance, usual_rows
 NAMES = ["a2c", "impala", "reinforce"]
 Any3 = A2C | Impala | REINFORCE
 EVERYTHING = {"normalize_rewards": True, "learning_rate_schedule": "linear", "learning_rate": 0.01}
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def make(name: str, spec: PolicySpec = DISCRETE, seed: int = 0, **settings: Any) -> Any3:

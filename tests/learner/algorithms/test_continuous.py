@@ -39,14 +39,6 @@ SMALL: dict[str, Any] = {"net": (16, 16), "batch_size": 32, "replay_size": 2000,
 BOTH = pytest.mark.parametrize("algo", ["sac", "td3"])
 
 
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 def made(algo: str, action: ActionSpec = ACTION, seed: int = 0, **settings: Any) -> Any:
     kind: Any = algorithm_class(algo)
     config = msgspec.convert(SMALL | settings, HYPERPARAMETERS[algo])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import msgspec
@@ -58,14 +57,6 @@ EVERYTHING = DQNConfig(
     gradient_steps=5,
 )
 PLAIN = DQNConfig(net=(16,), replay_size=1000, learning_starts=0, gradient_steps=5, target_every=7)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def changed(config: DQNConfig, **settings: Any) -> DQNConfig:

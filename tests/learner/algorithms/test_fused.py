@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
 from typing import Any
 from unittest.mock import patch
 
@@ -38,14 +37,6 @@ from tests.support.rounding import (
 from tests.support.steps import gradient_tolerance
 
 BOX = (Leaf("", "box", (4,), "float32"),)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def some_actions(spec: ActionSpec, rows: int, generator: np.random.Generator) -> Array:

@@ -33,12 +33,10 @@ RELATIVE = 1e-9  # float64 has 1e-16; a few thousand additions, and gradients th
 
 
 @pytest.fixture(autouse=True)
-def _one_thread_and_float64() -> Iterator[None]:
-    before, dtype = torch.get_num_threads(), torch.get_default_dtype()
-    torch.set_num_threads(1)
+def _float64() -> Iterator[None]:
+    dtype = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
     yield
-    torch.set_num_threads(before)
     torch.set_default_dtype(dtype)
 
 

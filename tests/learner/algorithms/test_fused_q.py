@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 from unittest.mock import patch
 
@@ -35,14 +35,6 @@ from tests.support.rounding import (
     q_gradient_tolerance,
     tolerance_of,
 )
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def policy(net: tuple[int, ...], activation: Any = "tanh", dueling: bool = False) -> PolicySpec:

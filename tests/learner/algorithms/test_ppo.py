@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
 
 import msgspec
 import numpy as np
@@ -34,14 +33,6 @@ from tests.support.rounding import ELEMENTWISE, UNIT, assert_within
 from tests.support.steps import Errors, gradient_tolerance, usual_rows
 
 EVERYTHING = PPOConfig(normalize_rewards=True, learning_rate_schedule="linear", clip_range_schedule="linear", n_epochs=3)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def ppo(config: PPOConfig | None = None, spec: PolicySpec = DISCRETE, seed: int = 0) -> PPO:

@@ -15,6 +15,7 @@ from learner.algorithms.actor_critic import Estimates
 from learner.algorithms.minibatches import Minibatch
 from learner.algorithms.ppo import PPO
 from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
+from learner.torch_setup import one_thread
 from protocol.arrays import Array
 from protocol.env_spec import EnvSpec
 from protocol.errors import BadRollout
@@ -43,10 +44,8 @@ CORES: tuple[Core, Core] = ("lstm", "gru")
 
 @pytest.fixture(autouse=True, scope="module")
 def _one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+    with one_thread():
+        yield
 
 
 def random_net(spec: PolicySpec, seed: int = 0) -> ActorCriticNetwork:
