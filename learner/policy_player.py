@@ -23,7 +23,6 @@ from protocol.arrays import Floats
 from protocol.env_spec import EnvLike, EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.envs.wrappers import WrapperLike
-from protocol.policy.policy import Policy, make_policy
 from protocol.specs import DescribeSpec, PolicySpec, RunSpec
 from protocol.wire.learner_link import LearnerLink
 
@@ -53,14 +52,6 @@ def saved_policy(
     outer = card.wrappers if wrappers is None else wrappers
     spec = EnvSpec.of(card.env if env is None else env, card.env_kwargs, outer, card.eval_env_kwargs)
     return SavedPolicy(card.policy, spec, parameters, buffers, card.facts, card.masked)
-
-
-def load_policy(run: Path, which: Which = "final") -> tuple[Policy, PolicySpec, EnvSpec]:
-    """A policy of a run folder that can act, its spec, and the environment for which it was trained. Raises `UsageError`."""
-    saved = saved_policy(run, which)
-    policy = make_policy(saved.spec)
-    policy.load(saved.parameters, saved.buffers)
-    return policy, saved.spec, saved.env
 
 
 class PolicyPlayer:

@@ -369,7 +369,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         if name in self._described:
             return (self._described[name],) * len(copies)
         self._check_idle("call")
-        return self._results_of_call(name, call_orders(self._layout, copies, name, args, kwargs))
+        return call_results(name, self._answers_of_call(call_orders(self._layout, copies, name, args, kwargs)))
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """An attribute of every copy; see `call`."""
@@ -386,7 +386,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
     def assign_some(self, copies: Sequence[int], name: str, values: Sequence[Any]) -> None:
         """Set an attribute of some copies, in ascending order, to one value each."""
         self._check_idle("call")
-        self._results_of_call(name, assign_orders(self._layout, copies, name, values))
+        call_results(name, self._answers_of_call(assign_orders(self._layout, copies, name, values)))
 
     def render(self) -> tuple[Any, ...]:
         """What `render` of every copy returns."""
@@ -429,9 +429,6 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
                     f"copy 0, {expected[0]} and {expected[1]}; all copies must have the same, and each machine the same "
                     "version of the environment"
                 )
-
-    def _results_of_call(self, name: str, orders: Mapping[int, MakeOrder]) -> tuple[Any, ...]:
-        return call_results(name, self._answers_of_call(orders))
 
     def _answers_of_call(self, orders: Mapping[int, MakeOrder]) -> dict[int, Answer]:
         self._hub.send_orders(orders)

@@ -12,12 +12,12 @@ import pytest
 from learner.config.layers import resolve
 from learner.config.rollout_config import RolloutConfig
 from learner.members.process_callbacks import ProcessCallbacks
-from learner.policy_player import PolicyPlayer, SavedPolicy, load_policy, saved_policy
+from learner.policy_player import PolicyPlayer, SavedPolicy, saved_policy
 from learner.rollouts.evaluation_tickets import EvaluationPlan
 from learner.run_folder.run_folder import RunFolder
 from protocol.env_spec import EnvSpec
 from protocol.envs.spaces import action_spec, observation_leaves
-from protocol.errors import EnvironmentFailed, UsageError
+from protocol.errors import EnvironmentFailed
 from protocol.messages import PROTOCOL_VERSION, Evaluate, Evaluated, Heartbeat, Hello, WorkerExit
 from protocol.policy.layout import acting_size, buffer_size
 from protocol.policy.recurrent import zero_state
@@ -27,6 +27,7 @@ from protocol.wire.codec import Buffer, decode_to_worker
 from protocol.wire.learner_link import LearnerLink
 from tests.support.fake_ends import BUFFERS, PARAMETERS, run_spec
 from tests.support.fake_link import FakeLink
+from tests.support.saved_policies import load_policy
 
 
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
@@ -56,11 +57,6 @@ def test_the_numbers_that_a_run_logs_of_its_episodes_stand_in_policy_json(tmp_pa
     folder = RunFolder.create(resolve("CartPole-v1", run_dir=str(tmp_path), info_keys="of_config"))
     folder.write_policy(spec, env, np.zeros(acting_size(spec), np.float32), np.zeros(0, np.float32), facts=("of_card",))
     assert saved_policy(folder.path).facts == ("of_card",)
-
-
-def test_a_folder_without_a_policy_is_said(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="no such folder"):
-        load_policy(tmp_path / "nowhere")
 
 
 class FourWorkers(FakeLink):

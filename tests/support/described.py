@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import gymnasium
+
 from learner.config.config import Config
 from learner.env_spaces import EnvSpaces
 from learner.run_spec import run_spec as spec_of_run
@@ -21,6 +25,13 @@ def described(env: EnvSpec, vector: Vector = "loop", render_mode: str | None = N
         message = decode_to_learner([bytes(frame) for frame in encode(Described(1, description))])
     assert isinstance(message, Described)
     return read_description(message.description)
+
+
+def with_spaces(observation: gymnasium.Space[Any], action: gymnasium.Space[Any]) -> gymnasium.Env[Any, Any]:
+    """An environment of which only the spaces matter."""
+    env = gymnasium.make("CartPole-v1").unwrapped
+    env.observation_space, env.action_space = observation, action
+    return env
 
 
 def run_spec(config: Config, env: EnvSpec) -> RunSpec:

@@ -22,7 +22,6 @@ import pytest
 
 import millrace
 from learner.config.layers import config_from_toml, resolve
-from learner.policy_player import load_policy
 from learner.report.runs import read_run
 from learner.run_folder.metrics_log import read_rows
 from learner.run_folder.progress import Progress
@@ -30,6 +29,7 @@ from learner.run_folder.run_format import check_format
 from millrace.launch.local_run import train
 from protocol.errors import EnvironmentFailed, NoWorkers, RunError, UsageError
 from tests.support import preloaded
+from tests.support.saved_policies import load_policy
 from tests.system.run_folders import summary
 
 SMALL: dict[str, Any] = {"n_epochs": 2, "eval_episodes": 2}  # these tests do not need a run that learns much

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from learner.config.layers import resolve
 from learner.config.rollout_config import RolloutConfig
-from learner.policy_player import load_policy, saved_policy
+from learner.policy_player import saved_policy
 from learner.recording import minari as dataset_module
 from learner.recording.episodes import EpisodeAssembler, RecordedEpisode
 from learner.recording.played_episodes import recording_seeds
@@ -38,6 +38,7 @@ from protocol.rollout import Rollout
 from protocol.specs import PolicySpec
 from tests.support.collectors import TOY, no_pulse, random_policy, run_of
 from tests.support.described import described
+from tests.support.saved_policies import load_policy
 from workers.collect.collector import Collector
 from workers.collect.held_rollouts import Assignment
 

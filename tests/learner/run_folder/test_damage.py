@@ -35,7 +35,6 @@ import millrace
 from learner.algorithms import algorithm_class
 from learner.config.layers import resolve
 from learner.env_spaces import EnvSpaces
-from learner.policy_player import load_policy
 from learner.report.learning_curves import read_curve
 from learner.report.page import page
 from learner.resumption import unless_finished
@@ -51,6 +50,7 @@ from millrace.launch.local_run import train
 from protocol.env_spec import EnvSpec
 from protocol.errors import UsageError, UserFacingError
 from tests.support.described import described
+from tests.support.saved_policies import load_policy
 
 ENV = "workers.envs.toy:Identity-v0"
 SETTINGS: dict[str, Any] = {

@@ -10,7 +10,6 @@ import pytest
 
 from learner.config.command_line import read_config
 from learner.config.layers import config_of_run, resolve
-from learner.policy_player import load_policy
 from learner.report.learning_curves import plot
 from learner.report.page import write_page
 from learner.run_folder.metrics_log import MetricsLog
@@ -23,6 +22,7 @@ from protocol.errors import RunError, UsageError
 from protocol.own_module import refuse_modules_in
 from protocol.policy.layout import acting_size
 from protocol.specs import PolicySpec
+from tests.support.saved_policies import load_policy
 
 
 @pytest.fixture

@@ -18,6 +18,7 @@ import millrace
 from learner.vector_env.env import ZmqVectorEnv
 from protocol.errors import EnvironmentFailed, UsageError
 from tests.support.bit_equality import bit_equal
+from tests.support.described import with_spaces
 from workers.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_ACTIONS, UNSUPPORTED_OBSERVATIONS
 
 SPACES = "workers.envs.toy:Spaces-v0"
@@ -90,12 +91,6 @@ def test_a_custom_space_is_refused_in_one_line() -> None:
     with pytest.raises(UsageError, match=r"observation space .* is not supported") as raised:
         inproc(with_custom_space)
     assert "\n" not in str(raised.value)
-
-
-def with_spaces(observation: spaces.Space[Any], action: spaces.Space[Any]) -> gymnasium.Env[Any, Any]:
-    env = gymnasium.make("CartPole-v1").unwrapped
-    env.observation_space, env.action_space = observation, action
-    return env
 
 
 BOX, DISCRETE = spaces.Box(-1, 1, (2,), np.float64), spaces.Discrete(2)

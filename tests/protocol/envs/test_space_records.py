@@ -31,6 +31,7 @@ from protocol.space_spec import (
 from protocol.wire.codec import decode_to_learner, encode
 from protocol.wire.plain_values import pack
 from tests.support.bit_equality import bit_equal
+from tests.support.described import with_spaces
 from workers.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_OBSERVATIONS
 
 FLOATS, WHOLE = ("float16", "float32", "float64"), ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64")
@@ -209,12 +210,6 @@ def test_an_environment_is_read_as_it_was_described() -> None:
     assert (found.max_episode_steps, found.render_mode) == (500, "rgb_array")
     assert {f"gymnasium.wrappers.common:{name}" for name in ("TimeLimit", "OrderEnforcing")} < found.wrappers
     env.close()
-
-
-def with_spaces(observation: gymnasium.Space[Any], action: gymnasium.Space[Any]) -> gymnasium.Env[Any, Any]:
-    env = gymnasium.make("CartPole-v1").unwrapped
-    env.observation_space, env.action_space = observation, action
-    return env
 
 
 def over_the_wire_and_read(env: gymnasium.Env[Any, Any]) -> DescribedEnv:

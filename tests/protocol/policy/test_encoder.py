@@ -14,7 +14,6 @@ from torch import Tensor
 from learner.algorithms import algorithm_class
 from learner.config.hyperparameters import HYPERPARAMETERS
 from learner.config.layers import resolve
-from learner.policy_player import load_policy
 from learner.run_folder.run_folder import RunFolder
 from protocol.env_spec import AllowedCode, EnvSpec
 from protocol.errors import UsageError
@@ -27,6 +26,7 @@ from protocol.specs import NamedShape, PolicySpec
 from tests.support.batches import DISCRETE, IMAGE, batch, no_pulse, recurrent
 from tests.support.described import run_spec
 from tests.support.sampled_rounding import in_float64, sampled
+from tests.support.saved_policies import load_policy
 
 HERE = "tests.support.custom_encoders"
 

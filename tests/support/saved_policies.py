@@ -1,0 +1,19 @@
+"""A policy of a run folder that acts without workers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from learner.policy_player import saved_policy
+from learner.run_folder.run_folder import Which
+from protocol.env_spec import EnvSpec
+from protocol.policy.policy import Policy, make_policy
+from protocol.specs import PolicySpec
+
+
+def load_policy(run: Path, which: Which = "final") -> tuple[Policy, PolicySpec, EnvSpec]:
+    """The policy, its spec, and the environment for which it was trained. Raises `UsageError`."""
+    saved = saved_policy(run, which)
+    policy = make_policy(saved.spec)
+    policy.load(saved.parameters, saved.buffers)
+    return policy, saved.spec, saved.env
