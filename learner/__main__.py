@@ -11,7 +11,7 @@ from learner.interrupts import stopped_by_signals
 from learner.run_folder.json_log import JsonLines
 from learner.run_folder.last_line import last_line
 from learner.run_folder.progress import Progress
-from learner.standard_streams import open_closed, unfailing
+from learner.standard_streams import prepare_streams, unfailing
 from protocol.bounds import indented
 from protocol.errors import UserFacingError
 
@@ -23,7 +23,7 @@ RESUME = "python -m learner"
 
 def main(argv: list[str]) -> int:
     """Serve until the run is over. Returns the exit code."""
-    open_closed()
+    prepare_streams()
     with unfailing("stderr"):
         return _serve(argv)
 

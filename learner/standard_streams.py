@@ -1,9 +1,9 @@
 """Standard output and error of a program: what cannot be written never ends it.
 
-Rule: a program opens what was closed at its start (`open_closed`), before it opens any file: else a file would get number 1
-or 2, and what a library prints would go into it. Then `never_fails` takes the place of a stream. What a full disk, a closed
-pipe or a terminal that is gone does not take is dropped, and counted; a character that the encoding lacks is escaped. Each
-write is tried again, so a disk that has room again gets the next line.
+Rule: a program opens what was closed at its start (`prepare_streams`), before it opens any file: else a file would get
+number 1 or 2, and what a library prints would go into it. Then `never_fails` takes the place of a stream. What a full disk,
+a closed pipe or a terminal that is gone does not take is dropped, and counted; a character that the encoding lacks is
+escaped. Each write is tried again, so a disk that has room again gets the next line.
 """
 
 from __future__ import annotations
@@ -16,16 +16,22 @@ from contextlib import contextmanager
 from typing import Literal, TextIO
 
 
-def open_closed() -> None:
-    """Open what is closed of standard input, output and error, on a device that takes everything and gives nothing."""
+def prepare_streams() -> None:
+    """Open what is closed of standard input, output and error, on a device that takes everything and gives nothing.
+
+    From now on characters that the encoding of output or error lacks are escaped.
+    """
     for number in (0, 1, 2):
         try:
             os.fstat(number)
         except OSError:
             os.open(os.devnull, os.O_RDWR)  # the lowest number that is free: this one
     for number, name in ((1, "stdout"), (2, "stderr")):
-        if getattr(sys, name) is None:
+        stream = getattr(sys, name)
+        if stream is None:
             setattr(sys, name, _writer(number, "utf-8"))
+        elif isinstance(stream, io.TextIOWrapper):  # no stream of a notebook
+            stream.reconfigure(errors="backslashreplace")
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from learner.run_folder.last_line import last_line
 from learner.run_folder.run_format import is_run_folder
-from learner.standard_streams import open_closed, unfailing
+from learner.standard_streams import prepare_streams, unfailing
 from protocol.bounds import escaped, indented
 from protocol.errors import UsageError, UserFacingError, did_you_mean, usage_error
 from protocol.logs.notices import log_notice
@@ -64,7 +64,7 @@ def main(argv: list[str] | None = None) -> int:
             sys.path[:] = [entry for entry in sys.path if entry not in ("", str(here))]  # nothing is imported from there
         elif str(here) not in sys.path:
             sys.path.append(str(here))  # last, so that a user's module is found but hides no installed module
-    open_closed()
+    prepare_streams()
     with unfailing("stderr"):
         return _exit_code(argv)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import pty
 import signal
@@ -17,6 +18,7 @@ import pytest
 
 from learner.run_folder import checkpoint
 from learner.run_folder.metrics_log import read_rows
+from learner.standard_streams import prepare_streams
 from tests.support import preloaded
 
 COMMAND = [sys.executable, "-m", "millrace"]
@@ -104,6 +106,15 @@ def test_a_locale_that_has_only_ascii(tmp_path: Path) -> None:
     assert is_whole(tmp_path / "öä ✓")
     with pytest.raises(UnicodeDecodeError):
         "±".encode().decode("ascii")
+
+
+def test_every_command_escapes_what_an_encoding_lacks(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(shown, "ascii"))
+    prepare_streams()
+    sys.stdout.write("return 500 ± 0\n")
+    sys.stdout.flush()
+    assert shown.getvalue() == b"return 500 \\xb1 0\n"
 
 
 def test_sighup_ends_a_run_as_sigterm_does(tmp_path: Path) -> None:
