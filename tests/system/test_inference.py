@@ -261,72 +261,47 @@ def test_ctrl_c_while_an_environment_hangs_drains_saves_and_ends_all_workers(tmp
 # ---------------------------------------------------------------- workers elsewhere, refusals
 
 
-def test_workers_elsewhere_step_while_the_policy_acts_in_the_learner(tmp_path: Path) -> None:
-    stage = Stage(tmp_path / "stage")
+def acting_learner(stage: Stage, *flags: str) -> tuple[Learner, str]:
+    """A learner that acts itself and waits for workers; and its address."""
     address = f"tcp://127.0.0.1:{free_port()}"
-    flags = [
-        "CartPole-v1",
-        "--bind",
-        address,
-        "--inference",
-        "learner",
-        "--min-workers",
-        "2",
-        "--steps",
-        "2500",
-        "--seed",
-        "3",
-    ]
-    flags += ["--eval-episodes", "2", "--n-epochs", "2", "--run-dir", str(stage.runs)]
-    try:
-        learner = stage.start([sys.executable, "-m", "millrace", "learner", *flags], "learner")
-        learner.hears("waiting for workers; start one with", 60)
-        for name in ("here", "there"):
-            stage.worker(address, name)
-        assert learner.ends(60) == 0
-        (folder,) = stage.runs.iterdir()
-        alone = run(tmp_path, "CartPole-v1", seed=3, steps=2_500, **SMALL)
-        assert policy_of(folder) == policy_of(alone)
-    finally:
-        stage.close()
+    command = [sys.executable, "-m", "millrace", "learner", "CartPole-v1", "--bind", address, "--inference", "learner"]
+    learner = Learner([*command, "--run-dir", str(stage.runs), *flags], stage.tmp_path / "learner.log", stage.runs)
+    stage.started.append(learner)
+    return learner, address
 
 
-def test_a_worker_elsewhere_may_be_silent_for_as_long_as_the_setting_says(tmp_path: Path) -> None:
-    stage = Stage(tmp_path / "stage")
-    address = f"tcp://127.0.0.1:{free_port()}"
-    flags = ["--steps", "1000000", "--inference", "learner", "--worker-timeout-s", "1", "--run-dir", str(stage.runs)]
-    command = [sys.executable, "-m", "millrace", "learner", "CartPole-v1", "--bind", address, *flags]
-    try:
-        learner = Learner(command, stage.tmp_path / "learner.log", stage.runs)
-        stage.started.append(learner)
-        worker = stage.worker(address, "w0")
-        learner.trains(1)
-        worker.kill()
-        learner.hears("worker w0 .*silent for 1 s")
-    finally:
-        stage.close()
+def test_workers_elsewhere_step_while_the_policy_acts_in_the_learner(stage: Stage, tmp_path: Path) -> None:
+    flags = ["--min-workers", "2", "--steps", "2500", "--seed", "3", "--eval-episodes", "2", "--n-epochs", "2"]
+    learner, address = acting_learner(stage, *flags)
+    learner.hears("waiting for workers; start one with", 60)
+    for name in ("here", "there"):
+        stage.worker(address, name)
+    assert learner.ends(60) == 0
+    (folder,) = stage.runs.iterdir()
+    alone = run(tmp_path, "CartPole-v1", seed=3, steps=2_500, **SMALL)
+    assert policy_of(folder) == policy_of(alone)
 
 
-def test_the_run_ends_when_the_workers_elsewhere_have_left(tmp_path: Path) -> None:
+def test_a_worker_elsewhere_may_be_silent_for_as_long_as_the_setting_says(stage: Stage) -> None:
+    learner, address = acting_learner(stage, "--steps", "1000000", "--worker-timeout-s", "1")
+    worker = stage.worker(address, "w0")
+    learner.trains(1)
+    worker.kill()
+    learner.hears("worker w0 .*silent for 1 s")
+
+
+def test_the_run_ends_when_the_workers_elsewhere_have_left(stage: Stage) -> None:
     """After --no-workers-timeout-s, although an order may take --step-timeout-s. It says why the last one left."""
-    stage = Stage(tmp_path / "stage")
-    address = f"tcp://127.0.0.1:{free_port()}"
-    flags = ["--steps", "1000000", "--inference", "learner", "--no-workers-timeout-s", "5", "--run-dir", str(stage.runs)]
-    command = [sys.executable, "-m", "millrace", "learner", "CartPole-v1", "--bind", address, *flags]
-    try:
-        learner = Learner(command, stage.tmp_path / "learner.log", stage.runs)
-        stage.started.append(learner)
-        worker = stage.worker(address, "w0")
-        learner.trains(2)
-        worker.signal(signal.SIGTERM)
-        assert worker.ends() == 0
-        assert learner.ends(60) == 1
-        last = learner.said().splitlines()[-1]
-        assert "waited 5 s for 1 worker" in last
-        assert "(the last one left: told to stop)" in last
-        assert "env steps are saved" in last
-    finally:
-        stage.close()
+    learner, address = acting_learner(stage, "--steps", "1000000", "--no-workers-timeout-s", "5")
+    worker = stage.worker(address, "w0")
+    learner.trains(2)
+    worker.signal(signal.SIGTERM)
+    assert worker.ends() == 0
+    assert learner.ends(60) == 1
+    last = learner.said().splitlines()[-1]
+    assert "waited 5 s for 1 worker" in last
+    assert "(the last one left: told to stop)" in last
+    assert "env steps are saved" in last
 
 
 def test_an_occupied_port_leaves_no_folder(tmp_path: Path) -> None:

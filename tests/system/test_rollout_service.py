@@ -63,18 +63,15 @@ def test_a_killed_worker_is_replaced_and_no_batch_is_missing() -> None:
     assert not children()
 
 
-def test_workers_elsewhere_join_with_a_token(tmp_path: Path) -> None:
-    stage, address = Stage(tmp_path), f"tcp://127.0.0.1:{free_port()}"
-    try:
-        keys, token = stage.keys()
-        worker = stage.worker(address, "far", "--token", str(token))
-        with millrace.RolloutService("CartPole-v1", bind=address, keys=str(keys), **SMALL) as service:
-            service.publish(service.policy.initial())
-            assert service.gather().lane.tolist() == [0, 0, 1, 1]
-            assert service.workers() == ["far"]
-        assert worker.ends() == 0
-    finally:
-        stage.close()
+def test_workers_elsewhere_join_with_a_token(stage: Stage) -> None:
+    address = f"tcp://127.0.0.1:{free_port()}"
+    keys, token = stage.keys()
+    worker = stage.worker(address, "far", "--token", str(token))
+    with millrace.RolloutService("CartPole-v1", bind=address, keys=str(keys), **SMALL) as service:
+        service.publish(service.policy.initial())
+        assert service.gather().lane.tolist() == [0, 0, 1, 1]
+        assert service.workers() == ["far"]
+    assert worker.ends() == 0
 
 
 def test_ctrl_c_ends_a_wait_and_the_workers(tmp_path: Path) -> None:
