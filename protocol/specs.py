@@ -7,6 +7,7 @@ from typing import Literal
 import msgspec
 
 from protocol.env_spec import AllowedCode, EnvSpec, PickledCallable, Scalar
+from protocol.space_spec import Shape
 from protocol.wire.compression import why_no_zstd
 
 MIN_IMAGE_SIDE = 5  # pixels: a 3 x 3 convolution, then one with stride 2
@@ -18,7 +19,7 @@ class Leaf(msgspec.Struct, frozen=True):
     path: str
     """where it stands in the observation, `camera/left`; empty when the observation is one array"""
     kind: Literal["box", "discrete", "multidiscrete", "multibinary"]
-    shape: tuple[int, ...]
+    shape: Shape
     dtype: str
     """numpy's name of the stored dtype, `float32`"""
     sizes: tuple[int, ...] = ()
@@ -46,7 +47,7 @@ class ActionSpec(msgspec.Struct, frozen=True):
     """The action space of the policy."""
 
     kind: Literal["discrete", "multidiscrete", "multibinary", "box"]
-    shape: tuple[int, ...]
+    shape: Shape
     dtype: str
     """dtype that the environment takes; a Box action is stored as float32, unclipped or in [-1, 1] (`PolicySpec.head`)"""
     sizes: tuple[int, ...] = ()

@@ -15,7 +15,6 @@ from protocol.space_spec import MAX_ELEMENTS, MAX_LEAVES, Dtype
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 from protocol.wire.socket_options import MAX_FRAME_BYTES
 
-MOST_DIMENSIONS = 8
 MOST_LAYERS = 64
 
 
@@ -47,7 +46,7 @@ def why_impossible(spec: PolicySpec) -> str:
 
 
 def _why_no_space(space: Leaf | ActionSpec) -> str:
-    if _wrong_shape(space.shape) or (space.kind == "discrete" and space.shape):
+    if math.prod(space.shape) > MAX_ELEMENTS or (space.kind == "discrete" and space.shape):
         return f"expected a shape of at most {MAX_ELEMENTS:,} elements, got {one_line(str(space.shape), 80)}"
     is_float = isinstance(space, ActionSpec) and space.kind == "box"
     if space.dtype not in get_args(Dtype) or (is_float and not space.dtype.startswith("float")):
@@ -58,7 +57,3 @@ def _why_no_space(space: Leaf | ActionSpec) -> str:
     if not all(0 < size <= LARGEST for size in space.sizes) or not all(abs(start) <= LARGEST for start in space.start):
         return f"expected sizes above 0 and starts, both up to {LARGEST:,}"
     return ""
-
-
-def _wrong_shape(shape: tuple[int, ...]) -> bool:
-    return len(shape) > MOST_DIMENSIONS or any(side < 0 for side in shape) or math.prod(shape) > MAX_ELEMENTS
