@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn.functional import linear, log_softmax
 
 import millrace
+from millrace.algorithms import Purpose, torch_seed
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class ActorCritic:
         shapes = [(piece.name, piece.shape, piece.gain) for piece in actor]
         for name, rows, columns, gain in [*critic, ("critic.out", 1, widths[-1], 1.0)]:
             shapes += [(f"{name}.weight", (rows, columns), gain), (f"{name}.bias", (rows,), 0.0)]
-        generator = torch.Generator().manual_seed(settings.seed)
+        generator = torch.Generator().manual_seed(torch_seed(settings.seed, Purpose.WEIGHTS))
         parts = []
         for _, shape, gain in shapes:
             part = torch.zeros(shape)
@@ -133,7 +134,7 @@ def train(settings: Settings) -> np.ndarray:
         inputs = service.policy.layout[0].shape[1]
         agent = ActorCritic(service.policy.layout, inputs, settings)
         optimizer = torch.optim.Adam([agent.flat], lr=settings.learning_rate, eps=1e-5, fused=True)
-        generator = torch.Generator().manual_seed(settings.seed)
+        generator = torch.Generator().manual_seed(torch_seed(settings.seed, Purpose.SHUFFLES))
         service.publish(agent.flat[: agent.actor_size].numpy())
         for batch in service:
             learn(agent, optimizer, generator, batch, settings)

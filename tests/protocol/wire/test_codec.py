@@ -34,7 +34,7 @@ from protocol.messages import (
     Weights,
     Welcome,
 )
-from protocol.space_spec import DictSpace, Shape, SpaceSpec, TupleSpace
+from protocol.space_spec import DictSpace, GeneratorState, Shape, SpaceSpec, TupleSpace
 from protocol.wire.codec import DTYPES, MAX_FRAMES, MAX_HEAD_BYTES, decode_to_learner, decode_to_worker, encode
 from tests.support.fake_ends import fake_rollout, run_spec
 
@@ -67,6 +67,8 @@ def values(wanted: Any, bounds: msgspec.Meta = UNBOUNDED) -> st.SearchStrategy[A
         SpaceSpec: st.one_of([values(kind) for kind in SPACES]) if wanted is SpaceSpec else st.nothing(),
     }
     origin, inner = typing.get_origin(wanted), typing.get_args(wanted)
+    if wanted == GeneratorState:
+        return st.from_regex(inner[1].pattern)
     if wanted in plain:
         return plain[wanted]
     if origin is typing.Annotated:
