@@ -53,7 +53,7 @@ def test_the_outermost_that_has_the_attribute_gets_it(vector: bool) -> None:
 
 
 @pytest.mark.parametrize("vector", [False, True])
-@pytest.mark.parametrize(("name", "what"), [("levle", "none"), ("step", "a method")])
+@pytest.mark.parametrize(("name", "what"), [("levle", "none"), ("step", "a method"), ("__dict__", "a private one")])
 def test_an_attribute_that_is_not_there_is_refused(vector: bool, name: str, what: str) -> None:
     copies, _ = made(vector)
     with pytest.raises(Unusable) as caught:

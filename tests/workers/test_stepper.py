@@ -46,6 +46,22 @@ def test_private_attributes_are_not_given_to_a_learner_that_is_not_trusted(name:
     stepper.close_all()
 
 
+@pytest.mark.parametrize(
+    ("method", "arguments"),
+    [
+        ("get_wrapper_attr", (("_k",), {})),
+        ("has_wrapper_attr", (("_k",), {})),
+        ("set_wrapper_attr", (("_k", 9), {})),
+        ("set_wrapper_attr", ((), {"name": "_k", "value": 9})),
+    ],
+)
+def test_nor_by_a_method_that_takes_their_name(method: str, arguments: Any) -> None:
+    step = step_spec(VectorEnvSettings("workers.envs.toy:Countdown-v0", 2, lanes=1, kwargs={"k": 3}))
+    stepper = Stepper(step, allow_private_names=False)
+    assert call(stepper, method, arguments).error.startswith("UsageError: '_k' begins with an underscore")
+    stepper.close_all()
+
+
 def test_private_attributes_are_given_to_a_learner_that_may_run_code() -> None:
     stepper = Stepper(step_spec(VectorEnvSettings("workers.envs.toy:Countdown-v0", 2, lanes=1, kwargs={"k": 3})))
     assert call(stepper, "_k", [4, 5], assign=True).error == ""

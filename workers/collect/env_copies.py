@@ -157,7 +157,7 @@ def _without_order_check(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any
 
 
 def set_attribute(copy: int | None, env: Any, name: str, value: Any) -> None:
-    """Set an attribute that the environment, or one of its wrappers, has. Raises `CopyRaised`."""
+    """Set a public attribute that the environment, or one of its wrappers, has. Raises `CopyRaised`."""
     owner = env
     while not hasattr(owner, name) and isinstance(owner, gymnasium.Wrapper | VectorWrapper):
         if isinstance(owner, ResetAhead):
@@ -165,8 +165,8 @@ def set_attribute(copy: int | None, env: Any, name: str, value: Any) -> None:
                 set_attribute(copy, instance, name, deepcopy(value))  # each its own value: they may change it
             return
         owner = owner.env
-    if not hasattr(owner, name) or callable(getattr(owner, name)):
-        what = "a method" if hasattr(owner, name) else "none"
+    if name.startswith("_") or not hasattr(owner, name) or callable(getattr(owner, name)):
+        what = "a private one" if name.startswith("_") else "a method" if hasattr(owner, name) else "none"
         raise Unusable(copy, f"expected an attribute of the environment that is called {name}, got {what}")
     try:
         setattr(owner, name, value)

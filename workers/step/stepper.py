@@ -213,17 +213,26 @@ def _stepped(order: Reset | Step, rows: Rows, infos: bytes) -> Stepped:
     )
 
 
+def _private_name(order: Call, arguments: Any) -> str:
+    """The private name that a call is about: its own, or one that a method of gymnasium's takes. Empty if none is."""
+    names = [order.name]
+    if order.name in ("get_wrapper_attr", "has_wrapper_attr", "set_wrapper_attr") and not order.assign:
+        args, kwargs = arguments
+        names += [str(name) for name in (*args[:1], kwargs.get("name", ""))]
+    return next((name for name in names if name.startswith("_")), "")
+
+
 def _call(order: Call, lane: SteppedLane, allow_private_names: bool) -> Returned:
     """The attribute's values or results. If it raises, the answer holds the exception."""
     results: list[Any] = []
     error = detail = ""
     try:
-        if order.name.startswith("_") and not allow_private_names:
+        arguments = unpack(order.given.data)
+        if (private := _private_name(order, arguments)) and not allow_private_names:
             raise UsageError(
-                f"{order.name[:40]!r} begins with an underscore: this worker gives private attributes only to a learner "
+                f"{private[:40]!r} begins with an underscore: this worker gives private attributes only to a learner "
                 "that it trusts; start the worker with a token, and without --no-code"
             )
-        arguments = unpack(order.given.data)
         with activity().during(STEPPING):
             if order.name == DESCRIPTION:
                 described = [Described(order.session, each) for each in lane.describe(order.copies)]
