@@ -331,13 +331,30 @@ class _Factory:
         return env
 
 
+class _UnpickledLater:
+    """A class or function that is unpickled when it is called: who does not need it need not have its modules."""
+
+    def __init__(self, point: Callable[..., object]) -> None:
+        """Raises `UsageError` for one that cannot be sent."""
+        self._point = PickledCallable.of(point, "environment")
+
+    def __call__(self, **kwargs: Any) -> Any:
+        return self._point.load()(**kwargs)
+
+
 def _pickled(name: str, env: Callable[..., object] | None, wrappers: tuple[WrapperLike, ...]) -> PickledCallable:
     """The factory as it travels: without specs, if they cannot. Raises `UsageError`."""
-    specs = tuple(_sent(spec) for spec in gymnasium.registry.values() if not _is_gymnasiums(spec))
     try:
+        specs = tuple(_perhaps_needed(spec) for spec in gymnasium.registry.values() if not _is_gymnasiums(spec))
         return PickledCallable.of(_Factory(name, env, wrappers, specs), f"environment {name}")
     except UsageError:
         return PickledCallable.of(_Factory(name, env, wrappers), f"environment {name}")
+
+
+def _perhaps_needed(spec: GymnasiumSpec) -> GymnasiumSpec:
+    """As `_sent`, without what only its environment needs."""
+    sent = _sent(spec)
+    return dataclasses.replace(sent, entry_point=_UnpickledLater(sent.entry_point)) if callable(sent.entry_point) else sent
 
 
 class _SpecFactory:

@@ -91,7 +91,7 @@ def usage_error(error: OSError) -> UsageError | None:
     """The line for an error of the system that follows from what the user asked for; None for any other."""
     match error.errno:
         case errno.ENAMETOOLONG:
-            return UsageError(f"path {one_line(str(error.filename), 200)}: {error.strerror}; choose a shorter one")
+            return UsageError(f"path {one_line(str(error.filename), 500)}: {error.strerror}; choose a shorter one")
         case errno.EMFILE:
             most, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
             return UsageError(

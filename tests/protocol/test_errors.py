@@ -42,4 +42,4 @@ def test_the_limit_of_open_files_is_named() -> None:
 
 def test_a_path_that_is_too_long_is_cut_and_what_to_do_is_said() -> None:
     error = usage_error(OSError(errno.ENAMETOOLONG, "File name too long", "x" * 5000))
-    assert str(error) == f"path {'x' * 199}…: File name too long; choose a shorter one"
+    assert str(error) == f"path {'x' * 499}…: File name too long; choose a shorter one"

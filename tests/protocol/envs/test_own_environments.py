@@ -221,7 +221,9 @@ def test_a_callable_needs_no_module_of_an_id_that_it_does_not_make(
 ) -> None:
     (tmp_path / "only_here.py").write_text("import gymnasium\nclass Mine(gymnasium.Env): pass\n")
     monkeypatch.syspath_prepend(tmp_path)
-    gymnasium.register("Other-v0", importlib.import_module("only_here").Mine)
+    only_here = importlib.import_module("only_here")
+    gymnasium.register("Other-v0", only_here.Mine)
+    gymnasium.register("Another-v0", lambda **_: only_here.Mine())
     spec = EnvSpec.of(make_countdown)
     monkeypatch.undo()  # as on another machine
     del sys.modules["only_here"]
