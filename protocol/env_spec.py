@@ -20,7 +20,6 @@ from typing import Any, TypeVar
 
 import gymnasium
 import msgspec
-from gymnasium.envs import registration
 from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
 from gymnasium.envs.registration import VectorizeMode
 from gymnasium.vector import VectorEnv
@@ -274,7 +273,7 @@ def _unchecked(env: str | GymnasiumSpec, kwargs: dict[str, Any]) -> gymnasium.En
     """
     made = gymnasium.make(env, disable_env_checker=True, **kwargs)
     if (spec := made.spec) is not None:
-        registered = registration.registry.get(spec.id, spec) if isinstance(env, str) else env
+        registered = gymnasium.registry.get(spec.id, spec) if isinstance(env, str) else env
         spec.disable_env_checker = registered.disable_env_checker
     return made
 
