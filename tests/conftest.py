@@ -27,6 +27,7 @@ import psutil
 import pytest
 
 from tests.support import preloaded
+from workers.slots import FILE_VARIABLE
 from workers.supervise import worker_process
 
 worker_process.popen = preloaded.start_worker  # type: ignore[assignment]
@@ -92,6 +93,7 @@ def nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
     temporary.mkdir()
     monkeypatch.setenv("TMPDIR", str(temporary))
     monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setenv(FILE_VARIABLE, str(temporary / "slots"))
     threads = set(threading.enumerate())
     yield
     deadline = time.monotonic() + LEAVE_WITHIN_S

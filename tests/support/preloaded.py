@@ -32,8 +32,9 @@ LEARNERS = (["learner"], ["millrace", "train"], ["millrace", "learner"], ["millr
 WITHOUT_PYTORCH = (["workers"], ["millrace", "worker"], ["millrace", "status"], ["millrace", "keys"])
 WORKER = ["-P", "-m", "workers"]  # as a supervisor starts it
 PER_COMMAND = {
-    "COLUMNS", "HOME", "MILLRACE_KEYS", "MILLRACE_TOKEN", "MILLRACE_TOY_SLEEPS_S", "MINARI_DATASETS_PATH", "MPLBACKEND",
-    "PYTEST_CURRENT_TEST", "PYTHONPATH", "PYTHONUNBUFFERED", "TERM", "TMPDIR", "WANDB_MODE", NONCE_VARIABLE,
+    "COLUMNS", "HOME", "MILLRACE_KEYS", "MILLRACE_SLOTS", "MILLRACE_TOKEN", "MILLRACE_TOY_SLEEPS_S",
+    "MINARI_DATASETS_PATH", "MPLBACKEND", "PYTEST_CURRENT_TEST", "PYTHONPATH", "PYTHONUNBUFFERED",
+    "TERM", "TMPDIR", "WANDB_MODE", NONCE_VARIABLE,
 }  # fmt: skip
 """Variables that a child may have otherwise than its parent: nobody reads them before the command runs, or `become` does."""
 BY_IMPORTS = {

@@ -1,0 +1,142 @@
+"""The slots of a machine: the lowest number that is free, and never one that another process holds."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import signal
+import socket
+import stat
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from protocol.errors import UsageError
+from workers.slots import FILE_VARIABLE, Slots, free_all, open_slots, slots
+
+
+@pytest.fixture
+def own_file() -> Path:
+    """A file of the test's own."""
+    return Path(os.environ[FILE_VARIABLE])
+
+
+@contextmanager
+def other_process(code: str, *fds: int) -> Iterator[subprocess.Popen[str]]:
+    """A process that runs this code and then waits, with these descriptors; it has printed a line when this returns."""
+    program = f"import sys, time; from workers.slots import *; {code}; print(flush=True); time.sleep(100)"
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True, pass_fds=fds) as process:
+        try:
+            assert process.stdout is not None
+            process.stdout.readline()
+            yield process
+        finally:
+            process.kill()
+
+
+def test_a_copy_gets_the_lowest_number_that_is_free() -> None:
+    first, second = Slots(), Slots()
+    assert [first.take(), first.take(), second.take(), first.take()] == [0, 1, 2, 3]
+    first.give_back(1)
+    assert [second.take(), second.take()] == [1, 4]
+
+
+def test_the_kernel_frees_the_slots_of_a_killed_process() -> None:
+    with other_process("slots().take(); slots().take()") as process:
+        own = Slots()
+        assert own.take() == 2
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        assert [own.take(), own.take(), own.take()] == [0, 1, 3]
+
+
+def test_a_supervisor_holds_the_slots_of_a_killed_worker_until_it_frees_them() -> None:
+    fd = open_slots()
+    with other_process(f"Slots({fd}).take()", fd) as worker:
+        worker.send_signal(signal.SIGKILL)
+        worker.wait()
+    own = Slots()
+    assert own.take() == 1
+    free_all(fd)
+    assert own.take() == 0
+
+
+def test_a_supervisor_frees_slots_that_a_fork_elsewhere_still_holds_open() -> None:
+    fd, own = open_slots(), Slots()
+    Slots(fd).take()
+    with other_process("pass", fd):
+        free_all(fd)
+        assert own.take() == 0
+
+
+def test_threads_never_share_a_slot() -> None:
+    own = Slots()
+    with ThreadPoolExecutor(8) as threads:
+        assert sorted(threads.map(lambda _: own.take(), range(400))) == list(range(400))
+
+
+def test_a_process_and_its_fork_never_share_a_slot() -> None:
+    ours, theirs = socket.socketpair()
+    slots()  # opens the file, which the fork shares
+    with ours, theirs:
+        if (pid := os.fork()) == 0:
+            theirs.send(bytes([slots().take()]))
+            theirs.recv(1)
+            os._exit(0)
+        try:
+            held = slots().take()
+            assert ours.recv(1)[0] != held
+            slots().give_back(held)
+        finally:
+            ours.send(b" ")
+            os.waitpid(pid, 0)
+
+
+def test_every_user_may_use_the_file_whatever_the_umask(own_file: Path) -> None:
+    before = os.umask(0o077)
+    try:
+        Slots()
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(own_file.stat().st_mode) == 0o666
+
+
+def test_the_file_stays_empty_and_looks_used_so_that_nothing_that_cleans_tmp_deletes_it(own_file: Path) -> None:
+    own = Slots()
+    os.utime(own_file, (0, 0))
+    own.take()
+    assert own_file.stat().st_mtime > 0
+    assert own_file.stat().st_size == 0
+
+
+@pytest.mark.parametrize("found", ["link", "fifo", "folder", "no folder"])
+def test_what_is_no_file_of_slots_is_refused_in_one_line(
+    found: str, own_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    match found:
+        case "link":
+            (tmp_path / "precious").touch()
+            own_file.symlink_to(tmp_path / "precious")
+        case "fifo":
+            os.mkfifo(own_file)
+        case "folder":
+            own_file.mkdir()
+        case "no folder":
+            monkeypatch.setenv(FILE_VARIABLE, str(tmp_path / "none" / "slots"))
+    with pytest.raises(UsageError, match=r"slots: .*; set MILLRACE_SLOTS to another path"):
+        Slots()
+
+
+def test_without_open_file_locks_processes_still_share_no_slot(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(fcntl, "F_OFD_SETLK")
+    own = Slots()
+    assert own.take() == 0
+    with other_process("import fcntl; del fcntl.F_OFD_SETLK; slots().take(); slots().take()"):
+        assert own.take() == 3
+    own.give_back(0)
+    assert [own.take(), own.take()] == [0, 1]

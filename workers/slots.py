@@ -1,0 +1,113 @@
+"""The slots of this machine: each env copy holds the lowest number that is free, for its port, folder or display.
+
+Rule: no two live env copies on a machine have the same slot. A slot is a lock on one byte of a file that all users of the
+machine share and that stays empty. The lock belongs to an open file and not to a process, so a worker and its supervisor
+hold it together, and the kernel frees it when both are gone.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import stat
+import struct
+import threading
+from contextlib import suppress
+from pathlib import Path
+
+from protocol.errors import UsageError
+
+FILE_VARIABLE = "MILLRACE_SLOTS"
+FILE = "/tmp/millrace-slots"  # not of $TMPDIR, which may differ between the users of a machine
+FLAGS = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # a link is not followed, a FIFO does not block
+MODE = 0o666
+FLOCK = "hhqqi4x"  # struct flock on Linux: type, whence, start, length, process
+
+
+class Slots:
+    """The slots that one process holds. Its threads may use it at the same time."""
+
+    def __init__(self, fd: int | None = None) -> None:
+        """`fd`: the file, as the supervisor opened it. None: open it. Raises `UsageError` if that is not possible."""
+        self.fd, self.pid = open_slots() if fd is None else fd, os.getpid()
+        self._taken: set[int] = set()
+        self._lock = threading.Lock()
+
+    def take(self) -> int:
+        """Hold the lowest number that is free on this machine, from 0. Give it back when the env copy is closed."""
+        with self._lock:
+            slot = 0
+            while slot in self._taken or not _is_locked_by(self.fd, slot):
+                slot += 1
+            self._taken.add(slot)
+            os.utime(self.fd)  # what cleans /tmp deletes what is old
+            return slot
+
+    def give_back(self, slot: int) -> None:
+        """Free a slot that `take` returned."""
+        with self._lock:
+            self._taken.remove(slot)
+            _lock(self.fd, fcntl.F_UNLCK, slot, 1)
+
+
+_of_process: Slots | None = None
+
+
+def slots() -> Slots:
+    """The slots of this process."""
+    global _of_process
+    if _of_process is None or _of_process.pid != os.getpid():  # a fork shares the open file, and so the locks
+        _of_process = Slots()
+    return _of_process
+
+
+def open_slots() -> int:
+    """A descriptor whose locks belong to it and its copies. Raises `UsageError` if the file cannot be used."""
+    path = Path(os.environ.get(FILE_VARIABLE, FILE))
+    try:
+        with suppress(FileExistsError):
+            fd = os.open(path, FLAGS | os.O_CREAT | os.O_EXCL, MODE)
+            os.fchmod(fd, MODE)  # for every user, whatever the umask
+            return fd
+        fd = os.open(path, FLAGS)
+    except OSError as error:
+        raise _unusable(path, os.strerror(error.errno or 0)) from error
+    if not stat.S_ISREG(os.fstat(fd).st_mode):
+        os.close(fd)
+        raise _unusable(path, "not a regular file")
+    return fd
+
+
+def free_all(fd: int) -> None:
+    """Free every slot that is held through this descriptor, also for those who share it, and close it."""
+    _lock(fd, fcntl.F_UNLCK, 0, 0)
+    os.close(fd)
+
+
+def _unusable(path: Path, why: str) -> UsageError:
+    line = f"{path}: {why}; it holds the slots of this machine's env copies, so expected a file that every user may write"
+    return UsageError(f"{line}; set {FILE_VARIABLE} to another path, the same for all processes of this machine")
+
+
+def _is_locked_by(fd: int, slot: int) -> bool:
+    """Lock this slot, unless somebody else holds it."""
+    try:
+        _lock(fd, fcntl.F_WRLCK, slot, 1)
+    except OSError as error:
+        if error.errno in (errno.EAGAIN, errno.EACCES):
+            return False
+        raise
+    return True
+
+
+def _lock(fd: int, kind: int, start: int, length: int) -> None:
+    """Lock or free this range without waiting. Without open file locks (macOS, gVisor), the locks are the process's own."""
+    if hasattr(fcntl, "F_OFD_SETLK"):
+        try:
+            fcntl.fcntl(fd, fcntl.F_OFD_SETLK, struct.pack(FLOCK, kind, os.SEEK_SET, start, length, 0))
+            return
+        except OSError as error:
+            if error.errno != errno.EINVAL:
+                raise
+    fcntl.lockf(fd, fcntl.LOCK_UN if kind == fcntl.F_UNLCK else fcntl.LOCK_EX | fcntl.LOCK_NB, length, start)
