@@ -44,6 +44,8 @@ if TYPE_CHECKING:
     from millrace.policies import CNN, MLP, Piece, PolicyParameters, Recurrent
     from millrace.rollout_service import RolloutBatch, RolloutService
     from millrace.runs import Metrics, Run, train
+    from protocol.envs.env_copy import EnvCopy
+    from workers.env_copy import env_copy
     from workers.envs.reset_ahead import ResetAhead
 
 __all__ = [
@@ -51,6 +53,7 @@ __all__ = [
     "MLP",
     "Callback",
     "CheckpointError",
+    "EnvCopy",
     "EnvironmentFailed",
     "Evaluation",
     "LoadedPolicy",
@@ -77,6 +80,7 @@ __all__ = [
     "WorkerLost",
     "__version__",
     "algorithms",
+    "env_copy",
     "evaluate",
     "integrations",
     "load",
@@ -89,6 +93,7 @@ __all__ = [
 _IMPORTED_WHEN_USED = {
     "CNN": "millrace.policies",
     "Callback": "learner.callbacks.callback",
+    "EnvCopy": "protocol.envs.env_copy",
     "Evaluation": "learner.run_folder.results",
     "LoadedPolicy": "millrace.acting",
     "MLP": "millrace.policies",
@@ -105,6 +110,7 @@ _IMPORTED_WHEN_USED = {
     "RolloutService": "millrace.rollout_service",
     "Run": "millrace.runs",
     "Summary": "learner.run_folder.results",
+    "env_copy": "workers.env_copy",
     "evaluate": "millrace.playing",
     "load": "millrace.acting",
     "make_vec": "millrace.launch.vector",

@@ -35,7 +35,6 @@ What it learns from:
 
 - `Batch`: rollouts side by side, numpy arrays [T, ΣN, …]. `LossInput`: the rows of a minibatch that `ActorCritic.loss` gets.
 - `Observations` and `Estimates`: argument and result of `ActorCritic.estimate`.
-- `Start`: what a run with `--from` takes from another one; `Algorithm.start_from` gets it.
 - `PolicySpec`, `ActionSpec` and `Leaf`: the policy and the spaces, as plain data.
 
 Tools:
@@ -55,7 +54,7 @@ from __future__ import annotations
 
 from learner.algorithms.a2c import A2C
 from learner.algorithms.actor_critic import ActorCritic, Estimates
-from learner.algorithms.algorithm import Algorithm, Start
+from learner.algorithms.algorithm import Algorithm
 from learner.algorithms.continuous import Continuous, Transitions
 from learner.algorithms.dqn import DQN
 from learner.algorithms.impala import Impala
@@ -134,7 +133,6 @@ __all__ = [
     "RewardScaler",
     "SACConfig",
     "Sample",
-    "Start",
     "TD3Config",
     "Transitions",
     "UsageError",

@@ -25,6 +25,7 @@ from gymnasium.envs.registration import VectorizeMode
 from gymnasium.vector import VectorEnv
 
 from protocol.bounds import one_line
+from protocol.envs.env_copy import FIRST_COPY, EnvCopy, being_made, filled, takes_copy
 from protocol.envs.found_names import MAIN, attribute, found_by_others, in_main, last_part, name_of
 from protocol.envs.unknown_ids import (
     ids_of_gymnasium,
@@ -140,7 +141,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     `my_package.envs:MyEnv`, that returns an environment
     """
     kwargs: dict[str, Scalar] = {}
-    """keyword arguments of `gymnasium.make`"""
+    """keyword arguments of `gymnasium.make`; what texts have in braces is computed for each copy, as in `{5000 + slot}`"""
     factory: PickledCallable | None = None
     """a cloudpickled callable that returns one environment; `id` is then only its name"""
     wrappers: tuple[str, ...] = ()
@@ -205,22 +206,26 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             return "an environment factory"
         return "a wrapper" if self.wrappers else ""
 
+    def kwargs_of_copy(self) -> dict[str, Any]:
+        """The keyword arguments of the copy that is being made. Raises `UsageError`."""
+        return filled(self.kwargs, self.id)
+
     def make(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
         """Make one env copy, in its wrappers. Raises `UsageError`, with advice, if it or a package cannot be found.
 
         `detail` of the error is the traceback if a constructor raised.
         """
-        extra: dict[str, Any] = {} if render_mode is None else {"render_mode": render_mode}
+        kwargs = self.kwargs_of_copy() | ({} if render_mode is None else {"render_mode": render_mode})
         if self.factory is not None:
-            return _called(self.id, self.factory.load(), {**self.kwargs, **extra})
-        env = self._made(lambda env_id: _make(env_id, {**self.kwargs, **extra}))
+            return _called(self.id, self.factory.load(), kwargs)
+        env = self._made(lambda env_id: _make(env_id, kwargs))
         for wrapper in self.wrappers:
             env = wrap(env, wrapper)
         return env
 
     def make_vectorized(self, copies: int) -> VectorEnv[Any, Any, Any]:
         """Make `copies` copies in the environment's own vectorized form; `protocol.envs.vectorized` checks it."""
-        own, kwargs = VectorizeMode.VECTOR_ENTRY_POINT, dict[str, Any](self.kwargs)
+        own, kwargs = VectorizeMode.VECTOR_ENTRY_POINT, self.kwargs_of_copy()
         return self._made(lambda env_id: gymnasium.make_vec(env_id, copies, own, **kwargs))
 
     def registered(self) -> gymnasium.envs.registration.EnvSpec:
@@ -280,8 +285,17 @@ def _unchecked(env: str | GymnasiumSpec, kwargs: dict[str, Any]) -> gymnasium.En
 
 def _called(name: str, factory: Callable[..., object], kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
     """What a user's callable returns. Raises `UsageError` if that is no environment, or it asks for an unknown id."""
+    parameter = takes_copy(factory, kwargs)
+    copy = [being_made.get() or FIRST_COPY] if parameter else []
     try:
-        made = factory(**kwargs)
+        made = factory(*copy, **kwargs)
+    except TypeError as error:
+        if not parameter or EnvCopy.__name__ not in str(error):
+            raise
+        raise UsageError(
+            f"environment {name}: {first_line(error)}: its argument {parameter}, which has no default, got the EnvCopy; "
+            f"if it is something else, give it: --env-kwargs {parameter} VALUE"
+        ) from error
     except gymnasium.error.UnregisteredEnv as error:
         raise UsageError(
             f"environment {name}: it asks gymnasium for an id that is not registered in the worker ({first_line(error)}); "

@@ -238,6 +238,8 @@ class StepSpec(msgspec.Struct, frozen=True, tag=True):
     """what happens when an episode ends, by the names of gymnasium's `AutoresetMode`"""
     render_mode: str | None = None
     """passed to each copy"""
+    evaluation_copies: int = 0
+    """so many of the last copies play evaluations; the number of such a copy counts from the first of them"""
     heartbeat_s: float = 1.0
     learner_timeout_s: float = 600.0
     """a worker that received nothing from the learner for so long says Hello again. The caller may compute for long between

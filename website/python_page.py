@@ -15,6 +15,7 @@ GROUPS = {
     "Use a policy": ("load", "LoadedPolicy"),
     "Callbacks": ("Callback", "Progress"),
     "Vector environment": ("make_vec",),
+    "Env copies": ("EnvCopy", "env_copy"),
     "Wrappers": ("ResetAhead",),
     "Rollouts for a learner of your own": ("RolloutService", "RolloutBatch", "Moments"),
     "Policies that act in workers": ("MLP", "CNN", "Recurrent", "OwnPolicy", "PolicyParameters", "Piece"),

@@ -14,12 +14,14 @@ import gymnasium
 
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import describe_env
+from protocol.envs.env_copy import FIRST_COPY
 from protocol.envs.envpool import envpool_spec
 from protocol.envs.spaces import action_spec, observation_leaves
 from protocol.envs.vectorized import make_native, vector_alternative
 from protocol.errors import EnvironmentFailed, UsageError, first_line
 from protocol.space_spec import EnvDescription
 from protocol.specs import DescribeSpec
+from workers.env_copy import CopySlots
 from workers.supervise.activity import CLOSING, DESCRIBING, activity
 
 
@@ -31,17 +33,18 @@ def describing(spec: DescribeSpec) -> Iterator[EnvDescription]:
     is missing, or its spaces are not supported. Raises `EnvironmentFailed` for any exception of its own code, and for an
     exit of the process that its code asks for.
     """
-    page = activity()
-    with _failures_of(spec.env), page.during(DESCRIBING):
+    page, held = activity(), CopySlots()
+    with _failures_of(spec.env), page.during(DESCRIBING), held.making(FIRST_COPY):
         env = spec.env.make(spec.render_mode)
     try:
         with _failures_of(spec.env), page.during(DESCRIBING):
-            _check_vectorized(spec, env)
+            _check_vectorized(spec, env, held)
             description = describe_env(env)
         yield description
     finally:
         with suppress(BaseException), page.during(CLOSING):
             env.close()
+        held.give_back()
 
 
 @contextmanager
@@ -57,13 +60,17 @@ def _failures_of(env: EnvSpec) -> Iterator[None]:
         raise EnvironmentFailed(line, traceback.format_exc()) from error
 
 
-def _check_vectorized(spec: DescribeSpec, env: gymnasium.Env[object, object]) -> None:
-    """Raise `UsageError` unless the vectorized form that the learner asks for has the spaces of one env copy."""
+def _check_vectorized(spec: DescribeSpec, env: gymnasium.Env[object, object], held: CopySlots) -> None:
+    """Raise `UsageError` unless the vectorized form that the learner asks for has the spaces of one env copy.
+
+    `held` gets its slot, if it is made.
+    """
     match spec.vector:
         case "loop":
             return
         case "native":
-            whose, made = "its vectorized form", make_native(spec.env, 1)
+            with held.making(FIRST_COPY):
+                whose, made = "its vectorized form", make_native(spec.env, 1)
             observed, acted = made.single_observation_space, made.single_action_space
             with suppress(BaseException):
                 made.close()

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from copy import deepcopy
+from dataclasses import replace
 from itertools import repeat
 from time import perf_counter
 from typing import Any, Literal
@@ -17,7 +18,9 @@ from typing import Any, Literal
 import gymnasium
 import numpy as np
 
+from protocol.envs.env_copy import FIRST_COPY, EnvCopy
 from protocol.errors import UsageError
+from workers.env_copy import CopySlots
 from workers.env_errors import CopyRaised
 from workers.supervise.activity import (
     CLOSING,
@@ -50,14 +53,19 @@ class EnvLoop:
         autoreset: Autoreset = "NextStep",
         *,
         ended: bool = False,
+        first: EnvCopy = FIRST_COPY,
     ) -> None:
-        """Make the copies, and reset none. `ended`: they count as truncated, so the first step with NextStep resets them."""
+        """Make the copies, and reset none. `ended`: they count as truncated, so the first step with NextStep resets them.
+
+        `first` says which copy the first one is; the others follow it.
+        """
         self.envs: list[gymnasium.Env[Any, Any]] = []
-        self._activity = activity()
+        self._activity, self._slots = activity(), CopySlots()
         for n, make in enumerate(makes):
             pulse()
             try:
-                with self._activity.during(MAKING):
+                which = replace(first, number=first.number + n, copy=first.copy + n)
+                with self._activity.during(MAKING), self._slots.making(which):
                     self.envs.append(make())
             except UsageError:
                 self.close()
@@ -153,6 +161,7 @@ class EnvLoop:
         for env in self.envs:
             with suppress(BaseException), self._activity.during(CLOSING):
                 env.close()
+        self._slots.give_back()
 
 
 def _kept(info: Any) -> Any:

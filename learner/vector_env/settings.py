@@ -45,6 +45,8 @@ class VectorEnvSettings:
     """Number of further copies for evaluations, after the others: each is a lane of its own, which `ZmqVectorEnv.step_lanes`
     steps.
     """
+    evaluates: bool = False
+    """Whether all copies play evaluations."""
 
     def __post_init__(self) -> None:
         if not self.timeout_s > 0:  # also true for NaN

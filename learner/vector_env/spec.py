@@ -44,6 +44,8 @@ class RequestedCopies:
     autoreset: Literal["NextStep", "SameStep", "Disabled"]
     render_mode: str | None
     learner_timeout_s: float
+    evaluation_copies: int
+    """so many of the last copies play evaluations"""
 
     @property
     def to_describe(self) -> DescribeSpec:
@@ -61,6 +63,7 @@ class RequestedCopies:
             autoreset=self.autoreset,
             render_mode=self.render_mode,
             learner_timeout_s=self.learner_timeout_s,
+            evaluation_copies=self.evaluation_copies,
         )
         check_can_be_sent(self.envs[0].id, step)
         metadata = {**env.metadata, "autoreset_mode": AutoresetMode(step.autoreset)}
@@ -99,6 +102,7 @@ def requested_copies(settings: VectorEnvSettings, learner_timeout_s: float = mat
         autoreset=_autoreset_mode(settings.autoreset_mode),
         render_mode=settings.render_mode,
         learner_timeout_s=learner_timeout_s,
+        evaluation_copies=N if settings.evaluates else settings.single_lanes,
     )
 
 

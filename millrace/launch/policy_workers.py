@@ -111,6 +111,7 @@ def _acting_player(
         timeout_s=NEVER_S,
         worker_timeout_s=settings.worker_timeout_s,
         copy=False,
+        evaluates=True,
     )
     started = listen(copies, stack.enter_context(ExitStack())).start(_own_logs(stack), settings.call_timeouts())
     described = started.describe(describe_settings(settings), check_interrupt)

@@ -91,7 +91,7 @@ def _task_and_options(env: EnvSpec, known: gymnasium.envs.registration.EnvSpec) 
     """
     creator = load_env_creator(known.entry_point) if isinstance(known.entry_point, str) else known.entry_point
     if (translate := getattr(creator, "envpool", None)) is not None:
-        task, options = translate(**{**known.kwargs, **env.kwargs})
+        task, options = translate(**{**known.kwargs, **env.kwargs_of_copy()})
         return task, options
     of_gymnasium = str(getattr(creator, "__module__", "")).startswith("gymnasium.")
-    return known.id if of_gymnasium else "", dict(env.kwargs)
+    return known.id if of_gymnasium else "", env.kwargs_of_copy()

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from protocol.arrays import Array, Floats
 from protocol.bounds import Stages
+from protocol.envs.env_copy import EnvCopy
 from protocol.envs.envpool import envpool_spec
 from protocol.envs.spaces import action_converter_of
 from protocol.envs.vectorized import make_native
@@ -30,6 +31,7 @@ from workers.collect.collected_lane import CollectedLane
 from workers.collect.env_copies import EnvCopies, LoopedCopies, VectorCopies
 from workers.collect.envpool_copies import EnvpoolCopies
 from workers.collect.held_rollouts import Assignment
+from workers.env_copy import CopySlots
 from workers.env_errors import CopyRaised, LaneFailed, lane_failed
 from workers.env_loop import Pulse
 from workers.env_results import write_numbers
@@ -43,15 +45,17 @@ StepAll = Callable[[Sequence[int], Array, Pulse], None]
 
 def open_env_copies(run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
     """The env copies of a lane in this process, of the kind that the run asks for."""
+    first, held = EnvCopy(lane * run.copies, lane), CopySlots()
     match run.vector:
         case "native":
-            with activity().during(MAKING):
+            with activity().during(MAKING), held.making(first):
                 env = make_native(run.env, run.copies)
-            return VectorCopies(env, run.facts, masked=run.masked)
+            return VectorCopies(env, run.facts, masked=run.masked, held=held)
         case "envpool":
-            return EnvpoolCopies(envpool_spec(run.env), run.copies, run.facts)
+            with held.making(first):
+                return EnvpoolCopies(envpool_spec(run.env), run.copies, run.facts, held)
         case "loop":
-            return LoopedCopies([run.env.make] * run.copies, pulse, run.facts, masked=run.masked)
+            return LoopedCopies([run.env.make] * run.copies, pulse, run.facts, masked=run.masked, first=first)
 
 
 def no_step_for_all(lanes: Sequence[int], actions: Array, pulse: Pulse) -> None:

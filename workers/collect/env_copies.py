@@ -19,6 +19,7 @@ from gymnasium.wrappers import OrderEnforcing
 
 from protocol.arrays import Array
 from protocol.envs.action_masks import without_mask
+from protocol.envs.env_copy import FIRST_COPY, EnvCopy
 from protocol.envs.spaces import make_flatten
 from protocol.envs.vectorized import check_resets_next_step
 from protocol.errors import UsageError
@@ -26,6 +27,7 @@ from protocol.random_streams import Purpose, env_seed
 from protocol.wire.plain_values import unpack
 from workers.collect.facts import Facts, facts_of_copies, facts_of_info, of_ended
 from workers.collect.mask_reader import MaskReader
+from workers.env_copy import CopySlots
 from workers.env_errors import CopyRaised, Unusable
 from workers.env_loop import EnvLoop, Infos, Pulse
 from workers.env_results import missing_leaf, read_leaves
@@ -90,10 +92,14 @@ class LoopedCopies:
         facts: Sequence[str] = (),
         *,
         masked: bool = False,
+        first: EnvCopy = FIRST_COPY,
     ) -> None:
-        """`facts`: names of the numbers in `info` that belong to an episode. `masked`: read masks of the allowed actions."""
+        """`facts`: names of the numbers in `info` that belong to an episode. `masked`: read masks of the allowed actions.
+
+        `first`: which copy the first one is.
+        """
         self._facts = facts
-        self._loop = EnvLoop((partial(made_without_order_check, make) for make in makes), pulse)
+        self._loop = EnvLoop((partial(made_without_order_check, make) for make in makes), pulse, first=first)
         self.observation_space = self._loop.envs[0].observation_space
         self.action_space = self._loop.envs[0].action_space
         self._masks = MaskReader(self.observation_space, self.action_space) if masked else None
@@ -177,12 +183,20 @@ def set_attribute(copy: int | None, env: Any, name: str, value: Any) -> None:
 class VectorCopies:
     """Any `gymnasium.vector.VectorEnv` with NextStep autoreset."""
 
-    def __init__(self, env: VectorEnv[Any, Any, Any], facts: Sequence[str] = (), *, masked: bool = False) -> None:
+    def __init__(
+        self,
+        env: VectorEnv[Any, Any, Any],
+        facts: Sequence[str] = (),
+        *,
+        masked: bool = False,
+        held: CopySlots | None = None,
+    ) -> None:
         """`facts`: names of the numbers in `info` that belong to an episode. `masked`: read masks of the allowed actions.
 
-        Raises `UsageError` for another autoreset mode.
+        `held`: the slots to give back when it is closed. Raises `UsageError` for another autoreset mode.
         """
         check_resets_next_step(env)
+        self._slots = held or CopySlots()
         self._env, self._activity, self._facts = env, activity(), facts
         self._per_copy = (env.num_envs,)
         self.observation_space = env.single_observation_space
@@ -259,3 +273,4 @@ class VectorCopies:
         """Close it. What it raises is ignored."""
         with suppress(BaseException), self._activity.during(CLOSING):
             self._env.close()
+        self._slots.give_back()

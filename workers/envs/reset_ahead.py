@@ -8,15 +8,16 @@ instance in a thread. From then on the two take turns: one plays, and the thread
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
 from typing import Any
 
 import gymnasium
 
+from protocol.envs.env_copy import FIRST_COPY, being_made
 from protocol.errors import UsageError
 from protocol.random_streams import Purpose, env_seed
+from workers.env_copy import CopySlots
 
 Prepared = tuple[gymnasium.Env[Any, Any], Any, dict[str, Any]]  # an instance, its first observation and its first info
 
@@ -26,6 +27,9 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     Use it as the innermost wrapper, so that other wrappers see one environment. It takes the memory of two instances. A
     reset overlaps with steps where either waits or computes without Python's global interpreter lock, as most simulators do.
+
+    Both are made with the same arguments. For a port or a folder, let the constructor ask `millrace.env_copy()`: the second
+    instance has a slot of its own.
 
     Attributes that a run sets in its environment reach both instances. The next episode was reset before that.
 
@@ -43,7 +47,7 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
             raise UsageError(
                 f"ResetAhead: expected an environment of gymnasium.make, got {type(env).__name__} without a spec"
             )
-        self._make: Callable[[], gymnasium.Env[Any, Any]] = lambda: gymnasium.make(env.spec)  # type: ignore[arg-type]
+        self._spec, self._copy, self._slots = env.spec, being_made.get() or FIRST_COPY, CopySlots()
         self._second: gymnasium.Env[Any, Any] | None = None
         self._second_seed: int | None = None  # of the second instance's next reset
         self._prepared: Future[Prepared] | None = None
@@ -62,6 +66,10 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._second = played
         self._prepare(played)
         return observation, info
+
+    def _make(self) -> gymnasium.Env[Any, Any]:
+        with self._slots.making(self._copy):
+            return gymnasium.make(self._spec)
 
     def _prepare(self, instance: gymnasium.Env[Any, Any] | None) -> None:
         """Reset the second instance in a thread; make it first if there is none."""
@@ -102,3 +110,4 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
             with suppress(Exception):
                 self._second.close()
         super().close()
+        self._slots.give_back()

@@ -16,6 +16,7 @@ import gymnasium
 from protocol.arrays import Array
 from protocol.env_spec import EnvSpec
 from protocol.envs.action_masks import without_mask
+from protocol.envs.env_copy import EnvCopy
 from protocol.envs.spaces import make_flatten
 from protocol.errors import UsageError
 from workers.collect.env_copies import made_without_order_check
@@ -92,7 +93,7 @@ class LoopedEvaluationCopies:
         with warnings.catch_warnings():
             if render_mode is not None:
                 warnings.simplefilter("ignore")  # gymnasium's, about a render mode that is refused below
-            self._loop = EnvLoop([make] * count, pulse, "Disabled")
+            self._loop = EnvLoop([make] * count, pulse, "Disabled", first=EnvCopy(evaluation=True))
         self._steps = [0] * count
         first = self._loop.envs[0]
         self.observation_space, self.action_space = first.observation_space, first.action_space

@@ -16,6 +16,7 @@ import numpy as np
 
 from protocol.arrays import Array
 from protocol.envs.description import describe_env
+from protocol.envs.env_copy import EnvCopy
 from protocol.envs.spaces import leaves_with_own_dtype, make_flatten, make_unflatten
 from protocol.errors import UsageError
 from protocol.space_spec import EnvDescription
@@ -51,7 +52,7 @@ class SteppedLane:
         first = spec.first_copy(lane)
         makes = [partial(_make_copy, spec, first + copy) for copy in range(spec.lanes[lane])]
         # Copies of a later incarnation replace lost ones, whose episodes have ended: a step resets them unless `reset` did.
-        self._loop = EnvLoop(makes, pulse, spec.autoreset, ended=incarnation > 0)
+        self._loop = EnvLoop(makes, pulse, spec.autoreset, ended=incarnation > 0, first=_first_copy(spec, lane))
         env = self._loop.envs[0]
         self._nested_actions = _is_nested(env.action_space)
         self._nest = make_unflatten(env.action_space)
@@ -111,6 +112,13 @@ class SteppedLane:
     def close(self) -> None:
         """Close every copy. What a copy raises is ignored."""
         self._loop.close()
+
+
+def _first_copy(spec: StepSpec, lane: int) -> EnvCopy:
+    """Which copy the first one of a lane is."""
+    number = spec.first_copy(lane)
+    position = number - (len(spec.copies) - spec.evaluation_copies)
+    return EnvCopy(number, lane) if position < 0 else EnvCopy(position, copy=position, evaluation=True)
 
 
 def _make_copy(spec: StepSpec, number: int) -> gymnasium.Env[Any, Any]:

@@ -167,8 +167,7 @@ class Watch:
             )
             raise Broken(rules.HEARTBEAT_VERSION, expected, f"{message.version}")
         if before is not None and message.version < before.version:
-            expected = f"a Heartbeat with version {before.version} or newer, as before"
-            raise Broken(rules.WEIGHTS_NEW_ENOUGH, expected, f"version {message.version}")
+            raise Broken(rules.HEARTBEAT_VERSION, f"{before.version} or newer, as before", f"{message.version}")
         self._see_tickets(message.tickets)
 
     def _see_tickets(self, tickets: Sequence[int]) -> None:

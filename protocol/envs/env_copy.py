@@ -1,0 +1,113 @@
+"""Which env copy is being made, and the arguments and factories that depend on it.
+
+Rule: all but the slot is the same in every run, on every machine and after a resume, so results may depend on it.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import operator
+import re
+from collections.abc import Callable, Mapping
+from contextvars import ContextVar
+from dataclasses import dataclass
+from typing import Any
+
+from protocol.errors import UsageError
+
+_EXPRESSION = re.compile(r"\{([\w\s()+*/%-]{1,100})\}")
+_OPERATORS: dict[type[ast.operator], Callable[[int, int], int]] = {
+    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.FloorDiv: operator.floordiv,
+    ast.Mod: operator.mod,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class EnvCopy:
+    """One copy of the environment: which one it is in the run, and which place it takes on its machine.
+
+    A factory with one argument gets it, `millrace.env_copy()` returns it, and texts among the keyword arguments of the
+    environment may use its integers, as in `{5000 + slot}`.
+
+    >>> import gymnasium, millrace
+    >>> def make_env(copy: millrace.EnvCopy) -> gymnasium.Env:
+    ...     return gymnasium.make("Pendulum-v1", g=[8.0, 10.0][copy.number % 2])
+    >>> make_env(millrace.EnvCopy(number=3)).unwrapped.g
+    10.0
+    """
+
+    number: int = 0
+    """The copy's place among all copies of the run, from 0: `lane` times the copies of a lane, plus `copy`. A copy that
+    plays evaluations counts among `--eval-copies` instead, and one that is only described has 0."""
+    lane: int = 0
+    """The lane to which it belongs; 0 for a copy that plays evaluations."""
+    copy: int = 0
+    """Its place within the lane, from 0; for a copy that plays evaluations its `number`."""
+    evaluation: bool = False
+    """Whether it plays evaluations or recordings."""
+    slot: int = 0
+    """The lowest number, from 0, that no other live copy on this machine has: for ports, folders and displays. It may be
+    another one after a resume, and is free again when the copy is closed or its process has ended."""
+
+
+FIRST_COPY = EnvCopy()
+"""The first copy of a run, and the one that is described. Its slot is not taken."""
+being_made: ContextVar[EnvCopy | None] = ContextVar("being_made", default=None)
+"""The copy that this thread makes now, if it does."""
+
+
+def filled(kwargs: Mapping[str, Any], env: str) -> dict[str, Any]:
+    """The keyword arguments for the copy that is being made: what its texts have in braces is computed.
+
+    A text that is one expression becomes an integer. Braces around anything but integers, `+ - * // %` and at least one of
+    the names stay as they are. `env` names the environment in the `UsageError` for a division by zero.
+    """
+    copy = being_made.get() or FIRST_COPY
+    names = {"number": copy.number, "lane": copy.lane, "copy": copy.copy, "slot": copy.slot}
+
+    def in_braces(match: re.Match[str]) -> str:
+        try:
+            tree = ast.parse(match[1].strip(), mode="eval").body
+            named = any(isinstance(node, ast.Name) for node in ast.walk(tree))
+            return str(_value(tree, names)) if named else match[0]
+        except (SyntaxError, LookupError):
+            return match[0]
+        except ZeroDivisionError as error:
+            raise UsageError(f"environment {env}: argument {match[0]}: it divides by zero for {copy}") from error
+
+    def of_copy(value: Any) -> Any:
+        if not isinstance(value, str):
+            return value
+        text = _EXPRESSION.sub(in_braces, value)
+        return int(text) if text != value and _EXPRESSION.fullmatch(value) else text
+
+    return {name: of_copy(value) for name, value in kwargs.items()}
+
+
+def _value(node: ast.expr, names: Mapping[str, int]) -> int:
+    """The value of an expression. Raises `LookupError` for one that has anything else in it."""
+    match node:
+        case ast.Name(name):
+            return names[name]
+        case ast.Constant(int(value)):
+            return int(value)
+        case ast.UnaryOp(ast.USub(), operand):
+            return -_value(operand, names)
+        case ast.BinOp(left, sign, right):
+            return _OPERATORS[type(sign)](_value(left, names), _value(right, names))
+    raise LookupError(ast.unparse(node))
+
+
+def takes_copy(factory: Callable[..., object], kwargs: Mapping[str, Any]) -> str:
+    """The parameter of a factory that gets the copy: its first one, if it alone must still be given. Empty if none is."""
+    try:
+        parameters = list(inspect.signature(factory).parameters.values())
+    except (TypeError, ValueError):  # a callable that has no signature
+        return ""
+    variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    needed = [each for each in parameters if each.default is each.empty and each.kind not in variable]
+    match [each for each in needed if each.name not in kwargs]:
+        case [only] if only is parameters[0] and only.kind is not only.KEYWORD_ONLY and only.name != "render_mode":
+            return only.name
+    return ""
