@@ -6,7 +6,7 @@ gets a `Resumption`, which only `unless_finished` makes, so no launcher can skip
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +17,8 @@ from learner.config.hyperparameters import DQNConfig
 from learner.config.layers import config_of_run
 from learner.config.on_resume import Change, OnResume, changes, refusal
 from learner.env_spaces import EnvSpaces
-from learner.run_folder.run_folder import RunFolder
+from learner.run_folder.run_folder import PolicyDescription, RunFolder
+from protocol.arrays import Floats
 from protocol.bounds import one_line
 from protocol.envs.found_names import moved
 from protocol.errors import UsageError
@@ -38,9 +39,16 @@ def unless_finished(config: Config, resume: Path | None, train: Callable[[Resump
     cannot be resumed with these settings, and what `train` raises.
     """
     if resume is None:
+        if config.start_from:
+            policy_to_start_from(config)  # a folder that is wrong is found before anything starts
         return train(None)
     lines = check_settings(config, resume)
     return resume if _is_finished(config, RunFolder.open(resume)) else train(Resumption(resume, tuple(lines)))
+
+
+def policy_to_start_from(config: Config) -> tuple[PolicyDescription, Floats, Floats]:
+    """The policy that a new run starts from, as `RunFolder.read_policy` reads it. Raises `UsageError`."""
+    return RunFolder.open_policy(Path(config.start_from)).read_policy("best" if config.from_parts == "best" else "final")
 
 
 def check_settings(config: Config, run: Path) -> list[str]:
@@ -64,16 +72,20 @@ def check_spaces(run: Path, made_for: EnvSpaces, now: EnvSpaces) -> None:
         ("observations", made_for.observation, now.observation),
         ("actions", (made_for.action,), (now.action,)),
     ):
-        if expected == got:
-            continue
-        pairs = [
-            (one_line(str(one)), one_line(str(other))) for one, other in zip(expected, got, strict=False) if one != other
-        ]
-        one, other = pairs[0] if pairs else (f"{len(expected)} arrays", f"{len(got)} arrays")
-        raise UsageError(
-            f"run {run}: the environment's {what} have changed: expected {one}, got {other}; "
-            "install the version of the environment that the run was started with, or start a new run"
-        )
+        if found := first_difference(expected, got):
+            raise UsageError(
+                f"run {run}: the environment's {what} have changed: expected {found[0]}, got {found[1]}; "
+                "install the version of the environment that the run was started with, or start a new run"
+            )
+
+
+def first_difference(expected: Iterable[object], got: Iterable[object]) -> tuple[str, str] | None:
+    """The first two that differ, as text in one line; or their numbers; None if all are equal."""
+    expected, got = [*expected], [*got]
+    for one, other in zip(expected, got, strict=False):
+        if one != other:
+            return one_line(str(one)), one_line(str(other))
+    return None if len(expected) == len(got) else (f"{len(expected)} arrays", f"{len(got)} arrays")
 
 
 def _with_present_names(before: Config, now: Config) -> Config:

@@ -186,7 +186,7 @@ class Run:
         from learner.algorithms import algorithm_class
         from learner.run_recorder import EpisodeSettings, RunRecorder
         from learner.run_spec import run_spec
-        from learner.run_state import RunState, restore
+        from learner.run_state import RunState, restore, start_from
 
         config, self.folder = setup.config, setup.folder
         made = Callbacks.of(watch).with_named(config.callback)
@@ -202,6 +202,9 @@ class Run:
         self.algorithm = algorithm_class(config.algo)(
             config.algorithm, spec.policy, total_steps=config.steps, seed=config.seed, device=torch_device(config)
         )
+        # A fresh algorithm gets its start here: from another run, then from prior data. A resumed one has its own state.
+        if config.start_from and not setup.resumed:
+            log_notice(log, start_from(config, spec.policy, self.algorithm))
         if config.prior:
             if spec.masked:
                 raise UsageError(

@@ -1,24 +1,39 @@
-"""The state of a run: what a checkpoint holds besides the algorithm's own state, and how a resumed run reads it back."""
+"""The state of a run: what a checkpoint holds besides the algorithm's own state, and how it is read back.
+
+A run that is resumed takes all of it (`restore`). A new run may take a part of another run's (`start_from`): numbers alone,
+for a policy that its own settings describe. Nothing that the other folder names is imported.
+"""
 
 from __future__ import annotations
 
 import logging
+from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from learner.algorithms import Algorithm
+from learner.algorithms.algorithm import Start
+from learner.config.config import Config
+from learner.resumption import first_difference, policy_to_start_from
 from learner.rollouts.ledger import Ledger
 from learner.run_folder import checkpoint
 from learner.run_folder.env_attributes import AttributesState, EnvAttributes
 from learner.run_folder.episode_window import EpisodeWindow
 from learner.run_folder.results import Evaluation
 from learner.run_folder.run_folder import RunFolder
+from protocol.arrays import Floats
 from protocol.bounds import Natural, Real, Seconds, Version
-from protocol.errors import BadMessage, CheckpointError
+from protocol.errors import BadMessage, CheckpointError, UsageError
+from protocol.policy.layout import buffer_layout, named_views
 from protocol.rollout import Episode
+from protocol.specs import PolicySpec
 
 log = logging.getLogger("millrace.learner")
+
+MISFITS = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RuntimeError, BadMessage)
+"""What loading a state of another form raises."""
+BESIDES = {"policy": "", "critic": ", critic", "all": ", critic, optimizers"}
 
 
 class RunState(msgspec.Struct, kw_only=True):
@@ -59,19 +74,67 @@ class RunState(msgspec.Struct, kw_only=True):
 
 def restore(folder: RunFolder, algorithm: Algorithm) -> RunState:
     """Load the newest whole checkpoint into the algorithm. Raises `CheckpointError` if there is none or it does not fit."""
-    found, warnings = checkpoint.newest(folder.path)
-    for line in warnings:
-        log.warning("%s", line)
+    found = _newest(folder.path)
     try:
         state = msgspec.convert(found.state["past"], RunState)
         EnvAttributes(state.env_attributes), EpisodeWindow(state.episodes, state.facts)  # they raise for what no run has
         if (best := found.state.get("best_policy")) is not None:
             state.best_policy = tuple(array.numpy() for array in best)
         algorithm.load_state_dict(found.state["algorithm"])
-    except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RuntimeError, BadMessage) as error:
+    except MISFITS as error:
         raise CheckpointError(
             f"checkpoint {found.path}: expected the state of this configuration, got another ({error}); "
             "resume it with the settings it was made with"
         ) from error
     state.ledger.end_outstanding()
     return state
+
+
+def start_from(config: Config, policy: PolicySpec, algorithm: Algorithm) -> str:
+    """Let a new algorithm start from the run or the policy that `config.start_from` names. Returns a line that says so.
+
+    `policy` is the one to train. Raises `UserFacingError` if the other one is different, or cannot be read.
+    """
+    card, parameters, buffers = policy_to_start_from(config)
+    parts, run, where = config.from_parts, Path(config.start_from), f"start_from {config.start_from}"
+    for name in dict.fromkeys(("observation", "action", "head", *PolicySpec.__struct_fields__)):
+        both = getattr(policy, name), getattr(card.policy, name)
+        if found := first_difference(*(both if name == "observation" else ((one,) for one in both))):
+            wrong = f"{name} of its policy: expected {found[0]} as in this run, got {found[1]}"
+            raise UsageError(f"{where}: {wrong}; take the algorithm and the settings of that policy, or another one")
+    if parts != "best" and checkpoint.has_any(run):
+        saved = _newest(run)
+        state, taken = saved.state["algorithm"], f"policy, statistics{BESIDES[parts]}, after {saved.env_steps:,} env steps"
+    elif parts in ("policy", "best"):
+        state, taken = _of_policy_alone(config, policy, parameters, buffers), f"{'best ' * (parts == 'best')}policy"
+    else:
+        raise UsageError(f"{where}: from_parts {parts}: expected a run with a checkpoint, got a policy alone")
+    try:
+        algorithm.start_from(Start(state, len(parameters), critic=parts in ("critic", "all"), optimizer=parts == "all"))
+    except MISFITS as error:
+        raise UsageError(
+            f"{where}: from_parts {parts}: expected the state of {config.algo}, got another ({error})"
+        ) from error
+    if not algorithm.is_finite():
+        raise UsageError(f"{where}: expected finite weights and statistics, got NaN or infinity; start from another run")
+    return f"starts from {run} ({card.env}): {taken}"
+
+
+def _of_policy_alone(config: Config, policy: PolicySpec, parameters: Floats, buffers: Floats) -> dict[str, Any]:
+    """What `Start.state` has of a policy. Its statistics count as much as all observations of the new run will."""
+    import torch
+
+    state: dict[str, Any] = {"parameters": torch.from_numpy(parameters)}
+    if policy.normalize_observations:
+        found = {name: torch.from_numpy(each).double() for name, each in named_views(buffers, buffer_layout(policy)).items()}
+        squares = config.steps * found["observation_std"] ** 2
+        state["observations"] = {"count": config.steps, "mean": found["observation_mean"], "squares": squares}
+    return state
+
+
+def _newest(run: Path) -> checkpoint.Checkpoint:
+    """The newest whole checkpoint. Raises `CheckpointError`."""
+    found, warnings = checkpoint.newest(run)
+    for line in warnings:
+        log.warning("%s", line)
+    return found

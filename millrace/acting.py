@@ -51,6 +51,8 @@ class LoadedPolicy:
         saved = saved_policy(run, "best" if best else "final")
         self.spec: PolicySpec = saved.spec
         """The observations, the actions and the network, as plain data."""
+        self.parameters, self.buffers = saved.parameters, saved.buffers
+        """Flat float32 vectors, as `RolloutService.publish` takes them: a learner of your own can start from this policy."""
         self._name = f"{saved.env.id}, {'best' if best else 'newest'} policy"
         self._policy = make_policy(saved.spec)
         self._policy.load(saved.parameters, saved.buffers)

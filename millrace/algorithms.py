@@ -35,6 +35,7 @@ What it learns from:
 
 - `Batch`: rollouts side by side, numpy arrays [T, ΣN, …]. `LossInput`: the rows of a minibatch that `ActorCritic.loss` gets.
 - `Observations` and `Estimates`: argument and result of `ActorCritic.estimate`.
+- `Start`: what a run with `--from` takes from another one; `Algorithm.start_from` gets it.
 - `PolicySpec`, `ActionSpec` and `Leaf`: the policy and the spaces, as plain data.
 
 Tools:
@@ -54,7 +55,7 @@ from __future__ import annotations
 
 from learner.algorithms.a2c import A2C
 from learner.algorithms.actor_critic import ActorCritic, Estimates
-from learner.algorithms.algorithm import Algorithm
+from learner.algorithms.algorithm import Algorithm, Start
 from learner.algorithms.continuous import Continuous, Transitions
 from learner.algorithms.dqn import DQN
 from learner.algorithms.impala import Impala
@@ -133,6 +134,7 @@ __all__ = [
     "RewardScaler",
     "SACConfig",
     "Sample",
+    "Start",
     "TD3Config",
     "Transitions",
     "UsageError",

@@ -2,7 +2,8 @@
 
 The supervisor imports neither numpy nor gymnasium. The same program with `--parent` is a worker (`workers/program.py`).
 
-Exit codes: 0 drained or asked to leave; 1 failed, or no learner answered; 2 refused, or bad usage.
+Exit codes: 0 drained or asked to leave; 1 failed, or no learner answered; 2 refused, or bad usage. With --stay, only being
+asked to leave or refused ends it.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from protocol.keys.keys import Token
 from workers.connection_rules import REJOIN_TIMEOUT_S, checked_token
 from workers.supervise.learner_notice import AliveSender
 from workers.supervise.worker_process import WorkerCommand, WorkerProcess
-from workers.supervisor import Supervisor, core_flags, timeout_flags
+from workers.supervisor import Supervisor, core_flags, serve_runs, timeout_flags
 
 log = logging.getLogger("millrace.worker")
 
@@ -69,6 +70,11 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         default=f"{socket.gethostname()}-{os.getpid()}",
         help="name of this worker, unique in the run (default: host name and process id)",
     )
+    basic.add_argument(
+        "--stay",
+        action="store_true",
+        help="after a run, wait for the next learner at ADDRESS, until SIGTERM or Ctrl-C; every run gets new processes",
+    )
 
     network = parser.add_argument_group("workers and network")
     network.add_argument(
@@ -94,8 +100,8 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         type=float,
         default=60.0,
         metavar="S",
-        help="before a learner has accepted this worker: leave when none has answered for S seconds (default: %(default)g); "
-        f"a worker that had joined waits {REJOIN_TIMEOUT_S:g} s for its learner to come back",
+        help="leave when no learner has answered for S seconds (default: %(default)g; with --stay: never); a worker that "
+        f"had joined waits for its learner to come back, {REJOIN_TIMEOUT_S:g} s or S if that is longer",
     )
     for call, what in (("construct", "making one env copy, or the policy"), ("reset", "a reset"), ("step", "a step")):
         faults.add_argument(
@@ -131,7 +137,7 @@ def _supervise(flags: argparse.Namespace, token: Token | None, timeouts: CallTim
     """Run workers, each in a process of its own, and watch them here. Returns the exit code."""
     cores = sorted(os.sched_getaffinity(0)) if flags.pin else []
     passed = ["--join-timeout-s", str(flags.join_timeout_s), *timeout_flags(timeouts)]
-    passed += [flag for flag, is_set in (("--insecure", flags.insecure), ("--no-code", flags.no_code)) if is_set]
+    passed += [f"--{flag.replace('_', '-')}" for flag in ("stay", "insecure", "no_code") if getattr(flags, flag)]
     passed += [] if flags.core is None else ["--core", str(flags.core)]
 
     def start(slot: str) -> WorkerProcess:
@@ -139,12 +145,17 @@ def _supervise(flags: argparse.Namespace, token: Token | None, timeouts: CallTim
         own_flags = [*passed, *core_flags(cores, slot)]
         return WorkerProcess(WorkerCommand(flags.address, name, token=token, flags=own_flags))
 
-    notice = AliveSender(flags.address, token)
-    try:
-        supervisor = Supervisor(start, flags.processes, timeouts=timeouts)
-        return supervisor.run(lambda: len(signals), lambda line: log.warning("%s", line), notice)
-    finally:
-        notice.close()
+    def serve() -> int:
+        if flags.stay:
+            log.info("waiting for a learner at %s", flags.address)
+        notice = AliveSender(flags.address, token)
+        try:
+            supervisor = Supervisor(start, flags.processes, timeouts=timeouts, stay=flags.stay)
+            return supervisor.run(lambda: len(signals), lambda line: log.warning("%s", line), notice)
+        finally:
+            notice.close()
+
+    return serve_runs(serve, lambda: len(signals), stay=flags.stay)
 
 
 def _count_signals() -> list[int]:

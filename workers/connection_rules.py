@@ -5,13 +5,20 @@ Rule: over TCP to another machine, a worker connects without a token only with -
 
 from __future__ import annotations
 
+import math
+
 from protocol.address import check_address, is_local
 from protocol.errors import UsageError
 from protocol.keys.key_folder import TOKEN_VARIABLE
 from protocol.keys.keys import Token
 
 REJOIN_TIMEOUT_S = 600.0
-"""How long a worker that had joined waits for its learner to come back."""
+"""How long, at least, a worker that had joined waits for its learner to come back."""
+
+
+def wait_limits_s(join_timeout_s: float, *, stay: bool) -> tuple[float, float]:
+    """How long a worker waits for its first learner, and for one that it had joined. With `stay`, another follows it."""
+    return math.inf if stay else join_timeout_s, max(join_timeout_s, REJOIN_TIMEOUT_S)
 
 
 def checked_token(address: str, token: Token | None, *, insecure: bool) -> Token | None:

@@ -1,7 +1,8 @@
 """One worker in this process. Its supervisor starts it. Imports torch only for an image policy.
 
-Exit codes: 0 drained, asked to leave, or its supervisor has ended; EXIT_NO_LEARNER if no learner answered; 1 failed; 2
-refused, or bad usage. The code is also written to the page that the supervisor reads: an end without that is a failure.
+Exit codes: 0 drained, asked to leave, or its supervisor has ended; EXIT_NO_LEARNER if no learner answered, EXIT_UNSUITABLE
+if it cannot take part in this run; 1 failed; 2 refused, or bad usage. The code is also written to the page that the
+supervisor reads: an end without that is a failure.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from protocol.errors import UserFacingError
 from protocol.keys.keys import Token
 from protocol.wire.shared_memory import InheritedDescriptors
 from protocol.wire.worker_link import WorkerLink
+from workers.connection_rules import wait_limits_s
 from workers.security import allowed_code
 from workers.session import NO_LEARNER, Session
 from workers.supervise.activity import Activity, activity, share_activity
@@ -51,7 +53,13 @@ def work(flags: argparse.Namespace, token: Token | None, timeouts: CallTimeouts,
     limits = (timeouts.construct_s, timeouts.reset_s, timeouts.step_s)
     watchdog = Watchdog(max(limits) + AFTER_SUPERVISOR_S) if all(limits) else None
     threading.Thread(target=_end_after_supervisor, args=(flags.parent, flags.address), daemon=True).start()
-    session = Session(identity(flags.name, nonce), time.monotonic(), join_timeout_s=flags.join_timeout_s)
+    join_timeout_s, rejoin_timeout_s = wait_limits_s(flags.join_timeout_s, stay=flags.stay)
+    session = Session(
+        identity(flags.name, nonce),
+        time.monotonic(),
+        join_timeout_s=join_timeout_s,
+        rejoin_timeout_s=rejoin_timeout_s,
+    )
     options = WorkerOptions(
         code=AllowedCode.REGISTERED if flags.no_code else allowed_code(flags.address, token),
         stop_requests=lambda: LEAVE_AT_ONCE if parent_is_gone(flags.parent) else len(signals),

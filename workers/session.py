@@ -47,6 +47,7 @@ from workers.connection_rules import REJOIN_TIMEOUT_S
 from workers.evaluate.held_evaluations import HeldEvaluations
 from workers.states import TABLE, LearnerSilent, State, StopRequested, WorkerFailed, WorkFinished
 from workers.step.held_orders import HeldOrders
+from workers.supervisor import EXIT_UNSUITABLE
 
 HELLO_FIRST_S, HELLO_MOST_S = 0.25, 4.0
 NO_LEARNER = "no learner answered"
@@ -277,7 +278,8 @@ class Session:
 
     def decline(self, reason: str) -> list[Effect]:
         """Leave a run in which this worker cannot take part."""
-        return [Send(Goodbye(self.session, one_line(reason), ())), *self._leave(WorkerFailed(), 2, reason)]
+        goodbye = Send(Goodbye(self.session, one_line(reason), ()))
+        return [goodbye, *self._leave(WorkerFailed(), EXIT_UNSUITABLE, reason)]
 
     def refused(self, reason: str) -> list[Effect]:
         """Leave, because the learner's endpoint rejects this worker for good."""

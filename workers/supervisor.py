@@ -1,14 +1,18 @@
 """Starts, watches, restarts and stops the workers of this machine. Of their conversation it knows only when the run is over.
 
-Rule: a worker that left on purpose with exit code 0, was refused (2) or found no learner (EXIT_NO_LEARNER) is not started
-again. Any other is restarted with backoff: the pause doubles with each death, and is reset once a worker has run for
-`HEALTHY_S`. A worker is on purpose only if it said so beforehand: the exit codes that an environment makes are failures. No
-worker outlives its supervisor.
+Rule: a worker that left on purpose with exit code 0, was refused (2), found no learner (EXIT_NO_LEARNER) or cannot take part
+in this run (EXIT_UNSUITABLE) is not started again. Any other is restarted with backoff: the pause doubles with each death,
+and is reset once a worker has run for `HEALTHY_S`. A worker is on purpose only if it said so beforehand: the exit codes that
+an environment makes are failures. No worker outlives its supervisor.
+
+With `stay`, only a refusal is final: after the end of a run, new workers wait for the next. One that found no learner, or an
+unsuitable run, is started again as after a failure, because the next learner may be another.
 """
 
 from __future__ import annotations
 
 import logging
+import signal
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -25,7 +29,10 @@ ENFORCE_EVERY_S = 0.2
 STOP_WITHIN_S = 3.0  # at the end of a local run, after the workers were asked to leave
 LEAVE_WITHIN_S = 30.0  # after the request to leave, as long as calls of the environment return: a rollout may take long
 HANGS_AFTER_S = 8.0  # after the request to leave, or the end of the run: how long one call of the environment may take
-EXIT_NO_LEARNER = 69  # EX_UNAVAILABLE of sysexits: no learner answered. A supervisor gets this code, others get 1
+EXIT_REFUSED = 2
+# As in sysexits: no learner answered; this worker cannot take part in the run. Others than the supervisor get 1, and 2.
+EXIT_NO_LEARNER, EXIT_UNSUITABLE = 69, 65
+AFTER_RUN_S = 1.0  # a learner tells a worker that comes while it ends to leave, too
 
 
 class Running(Protocol):
@@ -105,12 +112,15 @@ class Supervisor:
         *,
         prefix: str = "w",
         timeouts: CallTimeouts = NO_TIMEOUTS,
+        stay: bool = False,
     ) -> None:
         """`start` starts the worker of a name; the names are `prefix` and a number.
 
-        `timeouts`: how long a call of the environment may take before the worker's process is killed.
+        `timeouts`: how long a call of the environment may take before the worker's process is killed. `stay`: workers that
+        find no learner, or an unsuitable run, are started again.
         """
         self._start, self._clock, self._timeouts = start, clock, timeouts
+        self._final = {0, EXIT_REFUSED} if stay else {0, EXIT_REFUSED, EXIT_NO_LEARNER, EXIT_UNSUITABLE}
         self._stopping = False
         self._low_priority = False
         self._enforce_due_s = 0.0
@@ -154,8 +164,9 @@ class Supervisor:
             slot.running.lower_priority()
 
     def _record_end(self, slot: _WorkerSlot, end: Ending, now: float) -> None:
-        final = end.on_purpose and end.code in (0, 2, EXIT_NO_LEARNER)
-        slot.running, slot.exit_code = None, end.code if final else 1
+        final = end.on_purpose and end.code in self._final
+        told_early = self._stopping and end.code == -signal.SIGTERM  # to leave, before it could listen to signals
+        slot.running, slot.exit_code = None, end.code if final else 0 if told_early else 1
         if now - slot.started_s > HEALTHY_S:
             slot.backoff_s = BACKOFF_FIRST_S
         if not final and not self._stopping:
@@ -180,7 +191,7 @@ class Supervisor:
     def exit_code(self) -> int:
         """2 if a worker was refused, 1 if one failed, else 0."""
         codes = {slot.exit_code for slot in self._slots}
-        return 2 if 2 in codes else 1 if codes - {0} else 0
+        return 2 if codes & {EXIT_REFUSED, EXIT_UNSUITABLE} else 1 if codes - {0} else 0
 
     def ask_to_leave(self) -> None:
         """Ask all workers to leave after the rollout in progress, or at once when asked again. Restart none."""
@@ -249,6 +260,15 @@ class Supervisor:
             doing = None if slot.running is None else slot.running.activity(now)
             if slot.running is not None and doing is not None and doing.for_s > longer_than_s:
                 slot.running.kill()
+
+
+def serve_runs(serve: Callable[[], int], stop_requests: Callable[[], int], *, stay: bool) -> int:
+    """Call `serve`, which serves one run and returns an exit code; with `stay` again, until refused or asked to stop."""
+    code = serve()
+    while stay and code != EXIT_REFUSED and not stop_requests():
+        time.sleep(AFTER_RUN_S)
+        code = 0 if stop_requests() else serve()
+    return code
 
 
 def core_flags(cores: Sequence[int], name: str) -> list[str]:

@@ -178,12 +178,16 @@ class Worker:
                 self._do(self._session.handle(message, self._clock()))
 
     def _connect_again_if_unheard(self) -> None:
-        """Something on the way (a proxy, a tunnel) may keep a connection open whose other end is gone."""
+        """Something on the way (a proxy, a tunnel) may keep a connection open whose other end is gone.
+
+        Without a connection, this drops the Hellos that have piled up for a learner that is not there yet.
+        """
         now = self._clock()
-        if self._session.state is State.JOINING and self._link.connected and now - self._heard_s > CONNECT_AGAIN_S:
-            log.warning(
-                "no answer over the connection to %s for %.0f s; connecting again", self._link.address, CONNECT_AGAIN_S
-            )
+        if self._session.state is State.JOINING and now - self._heard_s > CONNECT_AGAIN_S:
+            if self._link.connected:
+                log.warning(
+                    "no answer over the connection to %s for %.0f s; connecting again", self._link.address, CONNECT_AGAIN_S
+                )
             self._heard_s = now
             self._link.connect_again()
 

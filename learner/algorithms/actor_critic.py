@@ -8,7 +8,6 @@ clock.
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -19,11 +18,11 @@ from msgspec.structs import replace
 from torch import Tensor
 
 from learner.algorithms import losses
-from learner.algorithms.algorithm import Algorithm
+from learner.algorithms.algorithm import Algorithm, Start
 from learner.algorithms.kernels import loss_gradients
 from learner.algorithms.kernels.fused import MAX_ROWS, FusedActorCritic, can_fuse
 from learner.algorithms.kernels.loss_gradients import Numbers, OutputGradients
-from learner.algorithms.kernels.optimizer_step import avoid_compiler_import, state_of, take_step
+from learner.algorithms.kernels.optimizer_step import avoid_compiler_import, load_state, state_of, take_step
 from learner.algorithms.minibatches import Index, LossInput, Minibatch, NetworkInput, Observations, rows_of_columns
 from learner.algorithms.normalization import ObservationNormalizer, RewardScaler
 from learner.algorithms.returns import EpisodeEnds, gae
@@ -478,12 +477,16 @@ class ActorCritic(Algorithm):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`: the next update is the one that would have followed it, bit for bit."""
         self.net.flat.copy_(state["parameters"])
-        self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
+        load_state(self.optimizer, state["optimizer"])
         self.generator.set_state(state["generator"])
         self._normalizer.load_state_dict(state["observations"])
         self._reward_scaler.load_state_dict(state["rewards"])
         self._buffers = self._normalizer.buffers()
         self.env_steps, self.version = state["env_steps"], state["version"]
+
+    def start_from(self, start: Start) -> None:
+        """See `Algorithm.start_from`. The spread of actions is part of the policy."""
+        self.load_state_dict(start.into(self.state_dict(), ("parameters",), ("optimizer",)))
 
     def remember(self) -> None:
         """Remember this state, for `roll_back`."""

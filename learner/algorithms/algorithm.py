@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,43 @@ from protocol.arrays import Floats
 from protocol.errors import UsageError
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
+
+
+class Start(NamedTuple):
+    """What a new run takes from an earlier one, whose policy has the same `PolicySpec`."""
+
+    state: dict[str, Any]
+    """The `state_dict` of the earlier run's algorithm. Where only its policy is known: `parameters`, and perhaps
+    `observations`, the statistics.
+    """
+    acting: int
+    """P: of the `parameters`, the first P act."""
+    critic: bool = False
+    """Take all weights, not only those that act."""
+    optimizer: bool = False
+    """Take the moments of the optimizers, too."""
+
+    def into(self, fresh: dict[str, Any], weights: Iterable[str], optimizers: Iterable[str]) -> dict[str, Any]:
+        """The state of a new algorithm, with what is taken in the place of its own; all else starts anew.
+
+        `weights` and `optimizers`: their names in the state. Of `parameters` and `target`, the first P act. Raises
+        `ValueError` if a tensor has another shape or dtype than in the new algorithm.
+        """
+        state = self.state
+        taken = {name: state[name] for name in ("observations",) if name in state}
+        if "rewards" in state and "rewards" in fresh:
+            taken["rewards"] = {"moments": state["rewards"]["moments"], "returns": {}}
+        for name in weights if self.critic else {"parameters", "target"}.intersection(weights):
+            own = taken[name] = fresh[name].clone()
+            found = state[name if self.critic else "parameters"]
+            if not self.critic:
+                own, found = own[: self.acting], found[: self.acting]
+            if (found.shape, found.dtype) != (own.shape, own.dtype):
+                raise ValueError(f"{name}: expected {own.dtype} {list(own.shape)}, got {found.dtype} {list(found.shape)}")
+            own.copy_(found)
+        for name in optimizers if self.optimizer else ():
+            taken[name] = fresh[name] | {"state": state[name]["state"]}
+        return fresh | taken
 
 
 class Algorithm(ABC):
@@ -74,6 +111,13 @@ class Algorithm(ABC):
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`: the next update is the one that would have followed it, bit for bit."""
+
+    def start_from(self, start: Start) -> None:
+        """Take the policy of an earlier run (`--from`), its statistics, and what else `start` says.
+
+        Called once, on a new algorithm, before `add_prior`; a resumed run does not call it. By default raises `UsageError`.
+        """
+        raise UsageError(f"{type(self).__name__} does not start from another run: it has no method start_from")
 
     def add_prior(self, batches: Iterable[Batch], observations: int) -> None:
         """Take the rows of a dataset (`--prior`): batches of one column each, with this number of observations in all.

@@ -15,6 +15,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from learner.algorithms.algorithm import Start
 from learner.algorithms.kernels.actor_and_critics import passes_of
 from learner.algorithms.kernels.optimizer_step import avoid_compiler_import
 from learner.algorithms.replay.off_policy import OffPolicy
@@ -86,6 +87,7 @@ class Continuous(OffPolicy):
         self._generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.NOISE))
         self._counted = {"updates_per_step": config.updates_per_step, "env_steps": config.learning_starts, "made": 0}
         self._learning_starts = config.learning_starts
+        self._acts_at_once = False  # with a policy that is not from nothing, no uniform actions come first
         self.tensors = {"parameters": self.net.flat, "target": self.target.flat}
         self.optimizers = {name: adam(part, config) for name, part in self.parts().items()}
 
@@ -105,7 +107,7 @@ class Continuous(OffPolicy):
 
     def weights(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
         """Copies of the actor's parameters [P], and of the buffers: observation statistics, and what exploration needs."""
-        warm_up = float(self.env_steps < self.config.learning_starts)
+        warm_up = float(self.env_steps < self.config.learning_starts and not self._acts_at_once)
         exploration = np.array([*self.exploration(), warm_up], np.float32)
         return self.net.actor.cpu().numpy().copy(), np.concatenate((self.statistics, exploration))
 
@@ -116,12 +118,19 @@ class Continuous(OffPolicy):
     def numbers(self) -> dict[str, Any]:
         """See `OffPolicy.numbers`."""
         counted = self._counted | {"learning_starts": self._learning_starts}
-        return super().numbers() | {"counted": counted, "noise": self._generator.get_state()}
+        more = {"counted": counted, "noise": self._generator.get_state(), "acts_at_once": self._acts_at_once}
+        return super().numbers() | more
+
+    def start_from(self, start: Start) -> None:
+        """See `Algorithm.start_from`. The policy acts from the first env step."""
+        super().start_from(start)
+        self._acts_at_once = True
 
     def load_numbers(self, state: dict[str, Any]) -> None:
         """See `OffPolicy.load_numbers`."""
         super().load_numbers(state)
         self._generator.set_state(state["noise"].clone())
+        self._acts_at_once = state["acts_at_once"]
         counted, config = dict(state["counted"]), self.config
         self._learning_starts = counted.pop("learning_starts")
         self._counted = counted

@@ -64,8 +64,8 @@ class RunningMoments:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
-        self.count = int(state["count"])
-        self.mean, self._squares = state["mean"].numpy().copy(), state["squares"].numpy().copy()
+        self.count, shape = int(state["count"]), self.mean.shape
+        self.mean, self._squares = (np.broadcast_to(state[name].numpy(), shape).copy() for name in ("mean", "squares"))
 
 
 class ObservationNormalizer:

@@ -52,7 +52,8 @@ class SAC(Continuous):
         self.log_temperature = torch.full((1,), math.log(1.0 if config.ent_coef is None else config.ent_coef), device=device)
         self.log_temperature.grad = torch.zeros_like(self.log_temperature)
         super().__init__(config, policy, total_steps=total_steps, seed=seed, device=device)
-        self.tensors["log_temperature"] = self.log_temperature
+        if config.ent_coef is None:
+            self.tensors["log_temperature"] = self.log_temperature
         self.target_entropy = -math.prod(policy.action.shape) if config.target_entropy is None else config.target_entropy
 
     def parts(self) -> dict[str, Tensor]:

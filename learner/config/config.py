@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 import tomli_w
 from msgspec import Meta
-from tyro.conf import UseAppendAction
+from tyro.conf import UseAppendAction, arg
 
 from learner.config.hyperparameters import AlgorithmConfig, PPOConfig
 from learner.config.on_resume import Fixed, Free
@@ -37,6 +37,15 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Settings of the algorithm."""
     steps: Free[Count] = 100_000
     """Env steps to train for, summed over all env copies. Training ends before an update that would exceed them."""
+    start_from: Annotated[Fixed[str], arg(aliases=["--from"])] = ""
+    """Start from the policy of this run folder in place of random weights, with its statistics of observations and rewards.
+    A folder with policy.json and policy.safetensors alone does as well. All other settings are those of the new run, and
+    schedules start anew. A resumed run does not read the folder again: see docs/how-to/start_from.md.
+    """
+    from_parts: Fixed[Literal["policy", "best", "critic", "all"]] = "policy"
+    """What `--from` takes. policy: the newest policy and the statistics. best: the policy of the best evaluation. critic:
+    also the critic, the target networks and the temperature. all: also the optimizers. A replay buffer is never taken.
+    """
     device: Free[Literal["auto", "cpu", "cuda"]] = "auto"
     """Device of the learner. auto: cuda if PyTorch finds a GPU, else cpu."""
     run_dir: Free[str] = "runs"

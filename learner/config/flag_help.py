@@ -23,8 +23,8 @@ from learner.config.flag_parser import parse_flags, plain_type
 from learner.config.hyperparameters import HYPERPARAMETERS
 
 BASIC = (
-    "env", "algo", "steps", "seed", "workers", "envs", "env_kwargs", "wrapper", "device", "preset", "config", "resume",
-    "run_dir", "eval_episodes", "eval_every", "target_return", "target_mean_return",
+    "env", "algo", "steps", "seed", "workers", "envs", "env_kwargs", "wrapper", "start_from", "from_parts", "device",
+    "preset", "config", "resume", "run_dir", "eval_episodes", "eval_every", "target_return", "target_mean_return",
 )  # fmt: skip
 GROUPS = {
     "evaluation": ("eval_env_kwargs", "eval_copies", "eval_max_steps", "info_keys"),
@@ -52,6 +52,7 @@ METAVARS = {
     "callback": "MODULE:FACTORY",
     "config": "PATH",
     "resume": "PATH",
+    "start_from": "PATH",
 }
 """How the help shows the values of a flag, where tyro's own way is hard to read."""
 DESCRIPTIONS = {

@@ -7,6 +7,7 @@ keyword arguments. A setting has one name everywhere: the field `learning_rate` 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -140,6 +141,8 @@ def _defaults_of(algo: str, where: str = "") -> Config:
 def _coerce(record: msgspec.Struct, name: str, value: Any) -> Any:
     """1e5 becomes an integer where the field is one, and "none" becomes None where the default is None."""
     default = getattr(type(record)(), name)
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
     if name == "info_keys" and isinstance(value, list | tuple):
         return ",".join(map(str, value))
     if isinstance(value, str) and value == "none" and default is None:

@@ -66,16 +66,19 @@ def newest(folder: Path) -> tuple[Checkpoint, list[str]]:
     """
     paths = regular_files(folder, f"{FOLDER}/*{SUFFIX}")[::-1]
     if not paths:
-        raise CheckpointError(f"run {folder}: expected a checkpoint in {FOLDER}/, got none; start afresh without --resume")
+        raise CheckpointError(f"run {folder}: expected a checkpoint in {FOLDER}/, got none; start afresh without it")
     warnings: list[str] = []
     for path in paths:
         try:
             return _read(path), warnings
         except _Unreadable as error:
             warnings.append(f"checkpoint {path} is broken ({error}); trying the one before")
-    raise CheckpointError(
-        f"run {folder}: expected a whole checkpoint, got {len(paths)} broken; start afresh without --resume"
-    )
+    raise CheckpointError(f"run {folder}: expected a whole checkpoint, got {len(paths)} broken; start afresh without it")
+
+
+def has_any(folder: Path) -> bool:
+    """Whether a folder has checkpoints, whole or not."""
+    return bool(regular_files(folder, f"{FOLDER}/*{SUFFIX}"))
 
 
 def load(path: Path) -> Checkpoint:

@@ -7,8 +7,7 @@ import os
 import re
 from pathlib import Path
 
-from learner.run_folder.checkpoint import FOLDER, SUFFIX
-from learner.run_folder.regular_files import regular_files
+from learner.run_folder.checkpoint import has_any
 from learner.run_folder.run_folder import RunSettings, as_folder_name
 from learner.run_folder.run_format import CONFIG_FILE, read_config
 from protocol.bounds import one_line
@@ -46,4 +45,4 @@ def _can_be_resumed(path: Path, config: RunSettings) -> bool:
         log.warning("run %s is passed over: %s", path, one_line(str(error)))
         return False
     same = (table["env"], table["algo"]) == (config.env, config.algo)
-    return same and bool(regular_files(path, f"{FOLDER}/*{SUFFIX}"))
+    return same and has_any(path)

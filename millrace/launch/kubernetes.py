@@ -1,7 +1,8 @@
 """`millrace launch kubernetes`: a manifest with a learner and workers. Pure, except that it reads a key folder.
 
 The learner is a Job, which ends with the run. If its pod is lost, another resumes from the newest checkpoint. The workers
-are a Deployment, whose size may change at any time. The manifest contains secrets only if a key folder was named.
+are a Deployment, whose size may change at any time, and which stays for the next learner. The manifest contains secrets only
+if a key folder was named.
 """
 
 from __future__ import annotations
@@ -153,7 +154,7 @@ spec:
 
 
 def _workers(flags: KubernetesFlags) -> str:
-    args = [f"tcp://{flags.name}:{PORT}", "--join-timeout-s", "600"]
+    args = [f"tcp://{flags.name}:{PORT}", "--stay"]
     return f"""\
 apiVersion: apps/v1
 kind: Deployment
@@ -171,7 +172,7 @@ spec:
       terminationGracePeriodSeconds: 30  # for the current rollout
 {_pod()}
       containers:
-        - name: worker  # no probe: its supervisor ends a worker whose step hangs; it ends itself when no learner answers
+        - name: worker  # no probe: its supervisor ends a worker whose step hangs; after a run it waits for the next learner
           image: {json.dumps(flags.worker_image)}
           imagePullPolicy: IfNotPresent
           args: {_args(args)}

@@ -97,6 +97,15 @@ def test_it_acts_as_an_evaluation_does_bit_for_bit(name: str, copies: int, tmp_p
     assert compared > 2 * copies
 
 
+def test_its_vectors_are_those_that_a_rollout_service_publishes(tmp_path: Path) -> None:
+    run = run_of("Pendulum-v1", normalize_observations=True)
+    policy = millrace.load(folder_of(run, tmp_path))
+    service = millrace.PolicyParameters(policy.spec)
+    parameters, buffers = random_weights(run.policy)
+    assert np.array_equal(service.flat(policy.parameters), parameters)
+    assert np.array_equal(service.flat_buffers(policy.buffers), buffers)
+
+
 def test_one_observation_gives_one_action_that_the_environment_takes(tmp_path: Path) -> None:
     run = run_of("Pendulum-v1")
     folder = folder_of(run, tmp_path)

@@ -208,3 +208,21 @@ def test_the_caller_s_process_runs_no_environment_code(tmp_path: Path) -> None:
 
 def dies() -> gymnasium.Env[Any, Any]:
     os._exit(3)
+
+
+def test_a_run_from_another_takes_it_once_and_gives_the_same_bits_for_any_number_of_workers(
+    run: millrace.Run, tmp_path: Path
+) -> None:
+    """A resumed run does not read the other folder again: whether that is there or gone, it continues the same."""
+
+    def policy_of(run: millrace.Run) -> bytes:
+        return (run.path / "policy.safetensors").read_bytes()
+
+    more: dict[str, Any] = {"start_from": run, "run_dir": tmp_path / "new", "seed": 2, "steps": 128}
+    one, two = (millrace.train("CartPole-v1", **more, **SMALL | {"workers": workers}) for workers in (1, 2))
+    assert policy_of(one) == policy_of(two)
+    assert (one.config.start_from, one.config.from_parts) == (str(run.path), "policy")
+    one.resume(steps=192, progress=False)
+    shutil.rmtree(run.path)
+    two.resume(steps=192, workers=1, progress=False)
+    assert policy_of(one) == policy_of(two)

@@ -67,7 +67,7 @@ def test_a_revoked_worker_leaves_with_the_reason_and_the_run_goes_on_without_it(
     assert "was revoked" in revoked.said().splitlines()[-1]
     learner.hears("worker revoked was shut out: its key lab")
 
-    late = stage.start([*worker, "late"], "late")
+    late = stage.start([*worker, "late", "--stay"], "late")  # waiting would not heal this
     assert late.ends() == 2
     assert "refused this worker's key" in late.said().splitlines()[-1]
     learner.hears("was not let in: its key lab")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -73,6 +74,9 @@ def test_the_commands_of_the_manifest_train(capsys: pytest.CaptureFixture[str], 
     command = [*with_variables(worker, secret), sys.executable, "-m", "workers", *worker["args"]]
     workers = [stage.start(command, f"w{number}") for number in range(found["Deployment"]["spec"]["replicas"])]
     assert started.ends(START_S) == 0, started.said()
+    for each in workers:
+        each.hears("waiting for a learner", times=2)
+        each.signal(signal.SIGTERM)  # as Kubernetes does when the Deployment is deleted
     assert [each.ends() for each in workers] == [0, 0]
     summary = started.summary()
     assert summary["stop_reason"] == "all steps done", summary

@@ -40,9 +40,11 @@ from protocol.messages import (
 from protocol.specs import StepSpec
 from tests.support.fake_ends import BUFFERS, PARAMETERS, fake_rollouts, run_spec
 from workers.collect.held_rollouts import REMEMBERED_TICKETS
+from workers.connection_rules import wait_limits_s
 from workers.session import (
     HELLO_FIRST_S,
     HELLO_MOST_S,
+    NO_LEARNER,
     CloseLanes,
     Effect,
     Identity,
@@ -54,6 +56,7 @@ from workers.session import (
     Task,
 )
 from workers.states import TABLE, State
+from workers.supervisor import EXIT_UNSUITABLE
 
 M = TypeVar("M")
 
@@ -216,6 +219,22 @@ def test_a_worker_that_had_joined_waits_longer_for_the_learner() -> None:
     assert sent(session.tick(1.0 + REJOIN_S), Hello)
     (leave,) = session.tick(1.0 + REJOIN_S + 0.1)
     assert isinstance(leave, Leave)
+
+
+def test_a_worker_waits_as_long_for_a_learner_that_it_had_joined_or_longer() -> None:
+    assert wait_limits_s(60.0, stay=False) == (60.0, REJOIN_S)
+    assert wait_limits_s(3600.0, stay=False) == (3600.0, 3600.0)
+
+
+def test_a_worker_that_stays_waits_without_a_limit_until_it_has_joined() -> None:
+    join_timeout_s, rejoin_timeout_s = wait_limits_s(60.0, stay=True)
+    session = Session(WHO, 0.0, join_timeout_s=join_timeout_s, rejoin_timeout_s=rejoin_timeout_s)
+    assert sent(session.tick(1e9), Hello)
+    session.handle(Welcome(SESSION, FIRST, RUN), 1e9)
+    session.handle(Rejoin(SESSION), 1e9)
+    (leave,) = session.tick(1e9 + REJOIN_S + 0.1)
+    assert isinstance(leave, Leave)
+    assert leave.reason.startswith(NO_LEARNER)
 
 
 # -------------------------------------------------------------------- tickets
@@ -661,8 +680,8 @@ def test_a_failure_before_any_session_is_not_reported() -> None:
     assert joining().fail("no such environment", "", None) == [Leave(1, "no such environment")]
 
 
-def test_a_declined_run_is_left_with_exit_code_2_and_a_goodbye() -> None:
-    assert ready().decline("no code") == [Send(Goodbye(SESSION, "no code", ())), Leave(2, "no code")]
+def test_a_declined_run_is_left_with_an_exit_code_of_its_own_and_a_goodbye() -> None:
+    assert ready().decline("no code") == [Send(Goodbye(SESSION, "no code", ())), Leave(EXIT_UNSUITABLE, "no code")]
 
 
 def test_a_worker_whose_key_is_refused_leaves_with_exit_code_2_in_every_state() -> None:

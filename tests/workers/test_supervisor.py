@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -10,15 +11,18 @@ import pytest
 from protocol.alive import CallTimeouts, Doing, WorkerActivity, WorkerExit
 from workers.supervise.ending import Ending
 from workers.supervisor import (
+    AFTER_RUN_S,
     BACKOFF_FIRST_S,
     BACKOFF_MOST_S,
     ENFORCE_EVERY_S,
     EXIT_NO_LEARNER,
+    EXIT_UNSUITABLE,
     HANGS_AFTER_S,
     HEALTHY_S,
     LEAVE_WITHIN_S,
     POLL_S,
     Supervisor,
+    serve_runs,
 )
 
 NONCE = 7
@@ -59,10 +63,10 @@ class FakeRunning:
 class Machine:
     """Starts fake workers and has a clock."""
 
-    def __init__(self, workers: int = 1) -> None:
+    def __init__(self, workers: int = 1, *, stay: bool = False) -> None:
         self.now = 0.0
         self.started: list[tuple[str, FakeRunning]] = []
-        self.host = Supervisor(self.start, workers, lambda: self.now)
+        self.host = Supervisor(self.start, workers, lambda: self.now, stay=stay)
 
     def start(self, name: str) -> FakeRunning:
         self.started.append((name, FakeRunning(name)))
@@ -132,13 +136,65 @@ def test_the_backoff_of_a_worker_that_was_healthy_is_reset() -> None:
     assert machine.pause_s() == pytest.approx(BACKOFF_FIRST_S, abs=0.11)
 
 
-@pytest.mark.parametrize("code", [0, 2, EXIT_NO_LEARNER])
+@pytest.mark.parametrize("code", [0, 2, EXIT_NO_LEARNER, EXIT_UNSUITABLE])
 def test_a_worker_that_left_on_purpose_or_was_refused_is_not_restarted(code: int) -> None:
     machine = Machine()
     assert machine.die(code, on_purpose=True) == [WorkerExit("w0", NONCE, "why", False)]
     machine.now += 10 * BACKOFF_MOST_S
     assert machine.host.poll() == []
     assert len(machine.started) == 1
+
+
+@pytest.mark.parametrize("code", [EXIT_NO_LEARNER, EXIT_UNSUITABLE])
+def test_one_that_stays_is_followed_by_another_if_its_learner_is_gone_or_its_run_unsuitable(code: int) -> None:
+    machine = Machine(stay=True)
+    machine.die(code, on_purpose=True)
+    assert machine.pause_s() == pytest.approx(BACKOFF_FIRST_S, abs=0.11)
+
+
+@pytest.mark.parametrize("code", [0, 2])
+def test_one_that_stays_is_not_restarted_within_a_run_that_is_over_or_refused_it(code: int) -> None:
+    machine = Machine(stay=True)
+    machine.die(code, on_purpose=True)
+    assert (machine.host.count, machine.host.exit_code) == (0, code)
+
+
+@pytest.mark.parametrize(
+    ("stay", "runs", "stopped_after", "expected"),
+    [
+        (False, [0], 9, 0),
+        (False, [1], 9, 1),
+        (True, [0, 1, 0, 2], 9, 2),  # refused
+        (True, [0, 1], 2, 1),  # stopped while it served the second
+        (True, [0, 1], 2.5, 0),  # stopped in the pause after the second
+    ],
+)
+def test_runs_are_served_one_after_another_until_one_refuses_or_it_is_told_to_stop(
+    monkeypatch: pytest.MonkeyPatch, stay: bool, runs: list[int], stopped_after: float, expected: int
+) -> None:
+    codes, at = iter(runs), 0.0
+
+    def serve() -> int:
+        nonlocal at
+        at = int(at) + 1
+        return next(codes)
+
+    def sleeps(seconds: float) -> None:
+        nonlocal at
+        at += 0.5
+        assert seconds == AFTER_RUN_S
+
+    monkeypatch.setattr("workers.supervisor.time.sleep", sleeps)
+    assert serve_runs(serve, lambda: int(at >= stopped_after), stay=stay) == expected
+    assert next(codes, None) is None
+
+
+def test_a_worker_that_sigterm_ends_before_it_can_listen_has_left_as_asked() -> None:
+    machine = Machine(workers=2)
+    machine.host.ask_to_leave()
+    machine.started[0][1].end = Ending(0, "left", on_purpose=True)
+    machine.die(-signal.SIGTERM)
+    assert (machine.host.count, machine.host.exit_code) == (0, 0)
 
 
 @pytest.mark.parametrize("code", [0, 2, EXIT_NO_LEARNER])
@@ -200,6 +256,7 @@ def test_stop_asks_all_waits_for_all_and_restarts_none() -> None:
         ([0, 0], 0),
         ([0, EXIT_NO_LEARNER], 1),
         ([2, EXIT_NO_LEARNER], 2),
+        ([EXIT_UNSUITABLE, 0], 2),
         ([0, 2], 2),
         ([EXIT_NO_LEARNER, EXIT_NO_LEARNER], 1),
     ],

@@ -16,6 +16,7 @@ torch lacks such a function, or its function takes other arguments or does somet
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from functools import cache, partial
 from typing import Any
@@ -69,6 +70,17 @@ def state_of(optimizer: Optimizer) -> dict[str, Any]:
     }
     groups = [{**group, "params": [numbers[flat] for flat in group["params"]]} for group in optimizer.param_groups]
     return {"state": state, "param_groups": groups}
+
+
+def load_state(optimizer: Optimizer, state: dict[str, Any]) -> None:
+    """`optimizer.load_state_dict` of a copy. Raises ValueError for the state of another kind of optimizer, or network."""
+    optimizer.load_state_dict(copy.deepcopy(state))
+    (group,) = optimizer.param_groups
+    (flat,) = group["params"]
+    if _step_of(optimizer) is not None and (kept := optimizer.state.get(flat)):
+        own = _initial_state(optimizer, flat, group)
+        if {name: each.shape for name, each in own.items()} != {name: each.shape for name, each in kept.items()}:
+            raise ValueError(f"optimizer: expected {', '.join(own)} of {len(flat)} numbers, got {', '.join(kept)}")
 
 
 def _step_of(optimizer: Optimizer) -> Callable[[Tensor, dict[str, Any], State], None] | None:

@@ -7,7 +7,6 @@ drawn, with the current statistics. With one torch thread on a CPU the same batc
 
 from __future__ import annotations
 
-import copy
 import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -18,8 +17,8 @@ import numpy as np
 from torch import Tensor
 from torch.optim import Optimizer
 
-from learner.algorithms.algorithm import Algorithm
-from learner.algorithms.kernels.optimizer_step import state_of
+from learner.algorithms.algorithm import Algorithm, Start
+from learner.algorithms.kernels.optimizer_step import load_state, state_of
 from learner.algorithms.normalization import ObservationNormalizer, RewardScaler
 from learner.algorithms.replay.mixed_replay import MixedReplay
 from learner.algorithms.replay.replay_buffer import Sample
@@ -197,6 +196,10 @@ class OffPolicy(Algorithm):
         self._load_small_state(state)
         self.replay.load_state_dict(state["replay"])
 
+    def start_from(self, start: Start) -> None:
+        """See `Algorithm.start_from`. The target network starts as the network; the replay buffer is empty."""
+        self._load_small_state(start.into(self._small_state(), self.tensors, self.optimizers))
+
     def remember(self) -> None:
         """Remember this state, for `roll_back`. Of the replay buffer, only what changes from now on is copied."""
         self._remembered = self._small_state()
@@ -211,7 +214,7 @@ class OffPolicy(Algorithm):
         for name, tensor in self.tensors.items():
             tensor.copy_(state[name])
         for name, optimizer in self.optimizers.items():
-            optimizer.load_state_dict(copy.deepcopy(state[name]))
+            load_state(optimizer, state[name])
         self.normalizer.load_state_dict(state["observations"])
         self.statistics = self.normalizer.buffers()
         if self.config.normalize_rewards:

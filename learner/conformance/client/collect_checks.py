@@ -399,7 +399,6 @@ def ignores_a_late_reply(learner: Learner) -> Script[None]:
     yield from learner.let_pass(0.3)
     learner.send(session.weights(2))
     learner.answers_heartbeats = True
-    yield Wait(0.0)
     text = f"the rollout of ticket {permit.ticket}: late copies of replies 6 and 2 close no lane"
     yield from learner.expect(Rollout, rules.HEARTBEAT_REPLIES, text, ticket=permit.ticket)
 

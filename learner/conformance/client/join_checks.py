@@ -265,15 +265,9 @@ def leaves_when_refused_later(learner: Learner) -> Script[None]:
     """Refuse while ready."""
     yield from in_any_session(learner)
     learner.send(Refuse("the test refuses this worker: expected exit code 2"))
-    yield from _left_quietly(learner)
-    yield from learner.left(rules.REFUSE, 2, "Refuse while ready")
-
-
-def _left_quietly(learner: Learner) -> Script[None]:
-    """Whatever was on its way may still arrive, and no Heartbeat is expected."""
     assert learner.watch is not None
-    learner.watch.heard_heartbeat_s = learner.now + learner.settings.patience_s
-    yield Wait(0.0)
+    learner.watch.heard_heartbeat_s = learner.now + learner.settings.patience_s  # no Heartbeat is due any more
+    yield from learner.left(rules.REFUSE, 2, "Refuse while ready")
 
 
 def drains_while_joining(learner: Learner) -> Script[None]:

@@ -85,7 +85,7 @@ class Learner:
         """whether the client was started and has never said Hello"""
         self.peer = b""
         self.hello: Hello | None = None
-        """the newest, of the process that runs"""
+        """the newest, of the process that runs; what comes before it was said by the process before"""
         self.watch: Watch | None = None
         """of the current session; None while there is none"""
         self.hears = True
@@ -199,7 +199,7 @@ class Learner:
                 return False
             case Heard(peer, Hello() as hello):
                 return self._take_hello(peer, hello, event, wanted)
-            case Heard(peer, message) if peer == self.peer and self.hears:
+            case Heard(peer, message) if peer == self.peer and self.hello is not None and self.hears:
                 return self._take_message(message, event, wanted)
         return False
 

@@ -167,7 +167,8 @@ class Watch:
             )
             raise Broken(rules.HEARTBEAT_VERSION, expected, f"{message.version}")
         if before is not None and message.version < before.version:
-            raise Broken(rules.HEARTBEAT_VERSION, f"{before.version} or newer, as before", f"{message.version}")
+            expected = f"a Heartbeat with version {before.version} or newer, as before"
+            raise Broken(rules.WEIGHTS_NEW_ENOUGH, expected, f"version {message.version}")
         self._see_tickets(message.tickets)
 
     def _see_tickets(self, tickets: Sequence[int]) -> None:

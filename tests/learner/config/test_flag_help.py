@@ -18,7 +18,7 @@ def help_text(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
 
 
 def flags_in(text: str) -> list[str]:
-    return re.findall(r"^  (?:--|\[)([\w-]+)", text, re.M)
+    return re.findall(r"^  (?:--[\w-]+ PATH, )?(?:--|\[)([\w-]+)", text, re.M)
 
 
 def test_every_setting_is_in_one_group() -> None:

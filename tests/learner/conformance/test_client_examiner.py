@@ -6,10 +6,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
-from learner.conformance.client import rules
+from learner.conformance.client import collect_checks, rules
 from learner.conformance.client.examiner import CHECK_S, Check, Examiner
+from learner.conformance.client.join_checks import describe_spec, leaves_when_refused_later
 from learner.conformance.client.learner import Learner, Settings
 from learner.conformance.client.profiles import PROFILES
 from learner.conformance.client.report import as_data, explanation, line_of, summary
@@ -26,11 +28,24 @@ from learner.conformance.client.script import (
     StartClient,
     Wait,
 )
+from learner.conformance.client.watch import Watch
 from protocol.env_spec import EnvSpec
 from protocol.errors import BadMessage
-from protocol.messages import PROTOCOL_VERSION, Heartbeat, Hello, Rollout, Stepped, Welcome
+from protocol.messages import (
+    PROTOCOL_VERSION,
+    Collect,
+    Described,
+    Goodbye,
+    Heartbeat,
+    Hello,
+    Rollout,
+    Stepped,
+    Weights,
+    Welcome,
+)
 from protocol.wire.codec import decode_to_worker
 from tests.protocol.test_wire_document import DOCUMENT
+from tests.support.fake_ends import fake_rollout, run_spec
 
 SETTINGS = Settings(EnvSpec("CartPole-v1"))
 HELLO = Hello(PROTOCOL_VERSION, "w", "host", 1, 70, "test", 71)
@@ -60,8 +75,6 @@ def waits_for_ever(learner: Learner) -> Script[None]:
 
 
 def in_a_session(learner: Learner) -> Script[None]:
-    from learner.conformance.client.join_checks import describe_spec
-
     yield from learner.newly_started()
     learner.welcome(describe_spec(learner))
     yield from learner.let_pass(30.0)
@@ -107,8 +120,6 @@ def test_what_is_not_checked_within_the_limit_has_failed() -> None:
 
 
 def sends_what_cannot_be_read(learner: Learner) -> Script[None]:
-    from learner.conformance.client.join_checks import describe_spec
-
     yield from learner.newly_started()
     learner.welcome(describe_spec(learner))
     learner.send_unreadable(7, [b"\xc1"])
@@ -165,6 +176,56 @@ def test_an_answer_to_what_cannot_be_read_breaks_the_rule_for_that(kind: type[St
     fields = dict.fromkeys(kind.__struct_fields__, none) | {"session": session, "ticket": 7}
     test.handle(Heard(b"w", kind(**fields)), 0.2)
     assert test.results[0].rule == rules.IGNORE_UNREADABLE
+
+
+def test_a_rollout_that_answers_the_last_word_of_a_check_at_once_is_heard(monkeypatch: pytest.MonkeyPatch) -> None:
+    def in_a_run(learner: Learner) -> Script[collect_checks.Collecting]:
+        yield from learner.newly_started()
+        learner.welcome(run_spec())
+        return collect_checks.Collecting(learner, run_spec())
+
+    monkeypatch.setattr(collect_checks, "collecting", in_a_run)
+    monkeypatch.setattr(Watch, "see", lambda *seen: None)  # what is in the rollout does not matter here
+    test, session = welcomed(collect_checks.ignores_a_late_reply)
+    collect = test.handle(Heard(b"w", beat(session)), 0.2)[1]
+    assert isinstance(collect, Send)
+    dealt = decode_to_worker(list(collect.frames))
+    assert isinstance(dealt, Collect)
+    test.tick(0.6)
+    test.handle(Heard(b"w", fake_rollout(session, 0, dealt.permits[0].ticket, 2, 0)), 0.6)
+    assert [each.outcome for each in test.results] == ["passed"]
+
+
+def test_a_client_may_end_at_once_when_it_is_refused() -> None:
+    test, session = welcomed(leaves_when_refused_later)
+    description: Any = None
+    test.handle(Heard(b"w", Described(session, description)), 0.2)
+    test.handle(Ended(2, ""), 0.2)
+    assert [each.outcome for each in test.results] == ["passed"]
+
+
+def test_old_weights_break_the_same_rule_in_a_heartbeat_as_in_a_rollout() -> None:
+    watch = Watch(1, run_spec(), 0.0)
+    for version in (5, 3):
+        watch.sent(Weights(version, np.zeros(1, np.float32), np.zeros(0, np.float32)))
+    watch.see(Heartbeat(1, 0, 5, (), 0, {}, 0), 0.1)
+    with pytest.raises(Broken) as broken:
+        watch.see(Heartbeat(1, 0, 3, (), 0, {}, 0), 0.2)
+    assert (broken.value.rule, broken.value.got) == (rules.WEIGHTS_NEW_ENOUGH, "version 3")
+
+
+def test_last_words_of_a_process_that_was_ended_do_not_count_for_the_next() -> None:
+    def starts_again(learner: Learner) -> Script[None]:
+        yield from learner.newly_started()
+        learner.welcome(run_spec())
+        yield from learner.let_pass(0.5)
+        yield from learner.newly_started()
+
+    test, session = welcomed(starts_again)
+    test.tick(0.6)
+    test.handle(Heard(b"w", Goodbye(session, "it was told to stop", ())), 0.7)
+    test.handle(Heard(b"w", HELLO), 0.8)
+    assert [each.outcome for each in test.results] == ["passed"]
 
 
 def test_a_reply_that_was_never_sent_is_noticed() -> None:
