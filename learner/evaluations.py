@@ -49,8 +49,6 @@ class Evaluations:
         """Parameters and buffers of the best policy."""
         self.note = ""
         """The newest evaluation as one line of text for the user."""
-        self.doing = ""
-        """How far the evaluation in progress is, as text for the user; empty if there is none."""
         self._settings, self._folder, self._spec = settings, folder, spec
         self._algorithm, self._service, self._watch = algorithm, service, watch
         due_at = state.env_steps + settings.every_env_steps
@@ -92,7 +90,7 @@ class Evaluations:
             self.best_policy = parameters, buffers
         chosen_by, at_env_steps = self.best
         self._service.publish(version + 1, *self.best_policy, deal=False)  # training is over: no update has this number
-        confirmed = self._evaluate("the best policy", Purpose.CONFIRMATION, size)
+        confirmed = self._evaluate(Purpose.CONFIRMATION, size)
         return Best(env_steps=int(at_env_steps), chosen_by=chosen_by, evaluation=confirmed)
 
     def write_best(self) -> None:
@@ -112,25 +110,16 @@ class Evaluations:
     def _evaluate_version(self, version: int, env_steps: int, size: EvaluationSize) -> Evaluation:
         """Evaluate the newest policy, which is this version; the same version is not evaluated twice."""
         if self.newest is None or self.version != version or self.newest.episodes != size.episodes:
-            self.newest = self._evaluate("", Purpose.EVALUATION, size)
+            self.newest = self._evaluate(Purpose.EVALUATION, size)
             self.version = version
             self.note = f"{env_steps:,} env steps: greedy {self.newest}"
         return self.newest
 
-    def _evaluate(self, what: str, purpose: Purpose, size: EvaluationSize) -> Evaluation:
+    def _evaluate(self, purpose: Purpose, size: EvaluationSize) -> Evaluation:
         """Evaluate the weights that were published last."""
         settings = self._settings
         plan = EvaluationPlan.of(size.episodes, settings.seed, settings.copies, size.max_steps, purpose)
-
-        def show(played: int, env_steps: int) -> None:
-            far = plan.how_far(played, env_steps, "--eval-max-steps:")
-            self.doing = f"evaluating{f' {what}' if what else ''}: {far}"
-            self._watch()
-
-        try:
-            return self._service.evaluate(plan, show)
-        finally:
-            self.doing = ""
+        return self._service.evaluate(plan, lambda played, env_steps: self._watch())
 
     def _keep_if_best(self, found: Evaluation, env_steps: int) -> None:
         """Keep the evaluation if it is the best. A tie keeps the earlier one, which needed fewer steps."""

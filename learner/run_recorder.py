@@ -12,8 +12,7 @@ import logging
 import math
 import shlex
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import msgspec
@@ -46,7 +45,7 @@ from protocol.specs import RunSpec
 
 log = logging.getLogger("millrace.learner")
 
-SHOW_EVERY_S = 0.2  # progress of an evaluation
+SHOW_EVERY_S = 0.2  # progress between two updates
 
 
 class EpisodeSettings(NamedTuple):
@@ -78,8 +77,7 @@ class RunRecorder:
         self._algorithm, self._service, self._callbacks = algorithm, service, callbacks
         self._stop_rule, self._checkpoints = config.stop_rule(), config.checkpoint_policy()
         settings = config.evaluation_settings()
-        self._evaluations = Evaluations(settings, folder, spec, algorithm, service, state, self._show_evaluation)
-        self._evaluating_since_s: float | None = None
+        self._evaluations = Evaluations(settings, folder, spec, algorithm, service, state, self.show_now)
         self._shown_s = 0.0
         self._confirmed: Best | None = None
         refusal = "envpool's env copies have no attributes" if spec.vector == "envpool" else ""
@@ -162,16 +160,24 @@ class RunRecorder:
         """Whether the next rollouts may be collected now: no evaluation is due, and the run does not end."""
         return not self._evaluations.is_due(self.env_steps) and self.stop_reason() is None
 
+    def show_now(self) -> None:
+        """Show how far an evaluation is, or what a long wait is for, now and then."""
+        now = time.monotonic()
+        if now - self._shown_s >= SHOW_EVERY_S:
+            self._shown_s = now
+            self._callbacks.meanwhile(self.progress())
+
     def updated(self, metrics: Mapping[str, float], update_s: float) -> None:
         """The update that was counted last was published: tell the callbacks, evaluate it and write what is due.
 
         `update_s`: seconds since its rollouts had come; those of `gathered` are among them, and do not count as its own.
         """
-        began_s, evaluated_s = time.monotonic(), self._stages_s.get("evaluate", 0.0)
+        began_s = time.monotonic()
         self._workers_alive = self._service.workers_alive()
         self._stages_s["update"] += update_s - self._gathered_s
         self._stages_s["other"] += self._gathered_s
         snapshot = self._service.snapshot()
+        evaluated_s = snapshot.evaluate_s
         self._update |= {"metrics": named(metrics), "lags": tuple(snapshot.lags)}
         progress = self._progress(snapshot)
         self._write_row(progress, metrics)
@@ -188,8 +194,7 @@ class RunRecorder:
             since_last_s=began_s - self._saved_s, episodes_since_last=self._episodes_since_save, updates=self.version
         ):
             self.save()
-        evaluated_s = self._stages_s.get("evaluate", 0.0) - evaluated_s
-        self._stages_s["other"] += time.monotonic() - began_s - evaluated_s
+        self._stages_s["other"] += time.monotonic() - began_s - (self._service.snapshot().evaluate_s - evaluated_s)
 
     def evaluate_if_due(self) -> None:
         """Make the evaluation before which the run was interrupted, if there is one. The weights must be published."""
@@ -268,10 +273,9 @@ class RunRecorder:
     def conclude(self) -> None:
         """Evaluate the final policy, which must be published, and the best one."""
         before = self._evaluations.of_version(self.version)
-        with self._evaluation_time():
-            self._confirmed = self._evaluations.conclude(
-                self.version, self.env_steps, self._window.length_mean, self._evaluation_limit
-            )
+        self._confirmed = self._evaluations.conclude(
+            self.version, self.env_steps, self._window.length_mean, self._evaluation_limit
+        )
         if self._evaluations.of_version(self.version) is not before:
             self._tell_evaluation(self.progress())
 
@@ -312,7 +316,7 @@ class RunRecorder:
         return True
 
     def _progress(self, snapshot: HubSnapshot) -> Progress:
-        wall_s = self._wall_s()
+        wall_s = self._wall_s(snapshot)
         lags = snapshot.lags or [0]
         return Progress(
             run=one_line(str(self._folder.path)),
@@ -331,7 +335,8 @@ class RunRecorder:
             ledger=snapshot.ledger.counts(),
             stages=self._stages(snapshot),
             note=self._evaluations.note,
-            doing=self._evaluations.doing,
+            doing=snapshot.waiting if snapshot.evaluating else "",
+            waiting=snapshot.waiting,
             settings=self._settings,
             evaluation=self._evaluations.newest,
             checkpoint=self._saved_to,
@@ -403,8 +408,7 @@ class RunRecorder:
 
     def _evaluate(self) -> None:
         """Evaluate the newest policy, add the metrics to the row of its update, and tell the callbacks."""
-        with self._evaluation_time():
-            metrics = self._evaluations.evaluate_newest(self.version, self.env_steps)
+        metrics = self._evaluations.evaluate_newest(self.version, self.env_steps)
         progress = self.progress()
         self._write_row(progress, metrics)
         self._service.report(progress)
@@ -417,30 +421,12 @@ class RunRecorder:
         finally:
             self._write_logged()
 
-    @contextmanager
-    def _evaluation_time(self) -> Iterator[None]:
-        """Count the seconds as those of an evaluation."""
-        self._evaluating_since_s = time.monotonic()
-        try:
-            yield
-        finally:
-            seconds = time.monotonic() - self._evaluating_since_s
-            self._evaluating_since_s = None
-            self._stages_s["evaluate"] = self._stages_s.get("evaluate", 0.0) + seconds
-
-    def _show_evaluation(self) -> None:
-        """Show how far an evaluation is, now and then."""
-        now = time.monotonic()
-        if now - self._shown_s >= SHOW_EVERY_S:
-            self._shown_s = now
-            self._callbacks.evaluating(self.progress())
-
     def _state(self) -> RunState:
         snapshot = self._service.snapshot()
         return RunState(
             version=self.version,
             env_steps=self.env_steps,
-            wall_s=self._wall_s(),
+            wall_s=self._wall_s(snapshot),
             ledger=snapshot.ledger,
             incarnations=snapshot.incarnations,
             episodes=self._window.state(),
@@ -454,7 +440,8 @@ class RunRecorder:
         )
 
     def _summary(self, reason: str, cut_short: bool) -> Summary:
-        wall_s, snapshot = self._wall_s(), self._service.snapshot()
+        snapshot = self._service.snapshot()
+        wall_s = self._wall_s(snapshot)
         return Summary(
             env=self._config.env,
             algo=self._config.algo,
@@ -479,10 +466,9 @@ class RunRecorder:
     def _stages(self, snapshot: HubSnapshot) -> dict[str, float]:
         """Seconds in each stage: of the learner, and of all workers together, from their last heartbeats."""
         stages = {"learner_wait": snapshot.wait_s} | {f"learner_{name}": s for name, s in self._stages_s.items()}
+        stages |= {"learner_evaluate": snapshot.evaluate_s} if snapshot.evaluate_s else {}
         return stages | {f"worker_{name}": s for name, s in snapshot.worker_stages.items()}
 
-    def _wall_s(self) -> float:
+    def _wall_s(self, snapshot: HubSnapshot) -> float:
         """Seconds of training: without evaluations."""
-        now = time.monotonic()
-        evaluating_s = 0.0 if self._evaluating_since_s is None else now - self._evaluating_since_s
-        return self._wall_before_s + now - self._started_s - self._stages_s.get("evaluate", 0.0) - evaluating_s
+        return self._wall_before_s + time.monotonic() - self._started_s - snapshot.evaluate_s

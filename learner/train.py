@@ -58,7 +58,7 @@ def train(
         publish(recorder.weights())
         recorder.evaluate_if_due()
         while (reason := recorder.stop_reason()) is None:
-            arrived = service.gather()
+            arrived = service.gather(recorder.show_now)
             began_s = time.monotonic()
             with _whole_update(algorithm, service, arrived):
                 if not recorder.gathered(arrived):

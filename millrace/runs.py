@@ -242,7 +242,7 @@ def train(
             algorithm and seed if there is one, else a new run.
         preset: The name of a preset (`millrace presets` lists them); "auto" takes that of `env`; "none" takes none.
         callbacks: Objects with some of the methods of `Callback`. They are called between updates, and may end the run.
-        watch: Called with a `Progress` after each update, and several times a second during an evaluation.
+        watch: Called with a `Progress` after each update, and several times a second during an evaluation or a long wait.
         progress: Show how far the run is: in one display in a notebook, in place on a terminal, else in a line every 5 s.
         **keywords: The flags of `millrace train`, by the same names: `learning_rate=1e-3`. `algo` may be a class of your own
             (`millrace.algorithms`). A class that was made in a script or a notebook is given again on resume.

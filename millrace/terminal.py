@@ -181,12 +181,16 @@ class DroppingView:
 
 
 class RateLimitedView:
-    """Shows the first progress, then at most one in `every_s`, and the last one. A new note is printed at once."""
+    """Shows the first progress, then at most one in `every_s`, and the last one. A new note is printed at once.
+
+    While the run makes no update, lines that are not redrawn come ever less often.
+    """
 
     def __init__(self, view: ProgressView, every_s: float, clock: Callable[[], float]) -> None:
         self._view, self._every_s, self._clock = view, every_s, clock
         self._shown_s = -every_s
         self._waiting: Progress | None = None
+        self._updates, self._updated_s = -1, 0.0  # number of updates, and since when it is this one
         self._note = ""
 
     def __call__(self, progress: Progress) -> None:
@@ -195,7 +199,10 @@ class RateLimitedView:
             self._view.print_line(progress.note)
         self._note = progress.note
         self._waiting = progress
-        if self._clock() - self._shown_s >= self._every_s:
+        if progress.updates != self._updates:
+            self._updates, self._updated_s = progress.updates, self._clock()
+        seldom_s = (self._clock() - self._updated_s) / 2 if self._every_s >= LINE_EVERY_S else 0.0
+        if self._clock() - self._shown_s >= max(self._every_s, seldom_s):
             self._show()
 
     def close(self) -> None:
@@ -214,7 +221,7 @@ class PlainLines:
     def show(self, progress: Progress) -> None:
         """Print one line."""
         parts = [f"{progress.env_steps:,} of {progress.total_steps:,} env steps", *main_figures(progress).values()]
-        parts += [progress.doing] if progress.doing else []
+        parts += [progress.waiting] if progress.waiting else []
         self.print_line(" | ".join(parts))
 
     def print_line(self, line: str) -> None:
@@ -346,7 +353,7 @@ def render_block(progress: Progress) -> RenderableType:
 
 def detail_rows(progress: Progress) -> dict[str, str]:
     """The details, as text by name: each stage's share of the time, counts that are not zero, the run folder."""
-    rows = {"now": progress.doing} if progress.doing else {}
+    rows = {"now": progress.waiting} if progress.waiting else {}
     for owner in ("learner", "worker"):
         seconds = {name.removeprefix(f"{owner}_"): s for name, s in progress.stages.items() if name.startswith(owner)}
         if total := sum(seconds.values()):
@@ -391,6 +398,8 @@ class _WarningHandler(logging.Handler):
         self._view = view
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Print one record."""
+        """Print one record, unless the progress shows the same."""
+        if getattr(record, "in_progress", False):
+            return
         level = "" if is_notice(record) else f"{record.levelname.lower()}: "
         self._view.print_line(f"{level}{record.getMessage()}")

@@ -398,6 +398,8 @@ class Status(Message, frozen=True):
     """counts of what happened to every ticket, transition and message"""
     workers_left_out: int = 0
     """number of workers that are not in `workers`, because the message would be too long"""
+    waiting: str = ""
+    """who waits for whom, and for what share of the time, in one line for people; empty if nobody waits long"""
 
 
 ToLearner = (

@@ -20,8 +20,8 @@ log = logging.getLogger("millrace.learner")
 
 MOMENTS = ("on_start", "on_rollouts", "on_update", "on_evaluation", "on_checkpoint", "on_end")
 Show = Callable[[Progress], object]
-"""Called with the progress of the run after each update and evaluation, several times a second during an evaluation, and at
-the end. It is a callback like any other: it may end the run.
+"""Called with the progress of the run after each update and evaluation, several times a second during an evaluation or a
+long wait, and at the end. It is a callback like any other: it may end the run.
 """
 
 
@@ -70,8 +70,8 @@ class Callbacks:
         self._show(progress)
         self._call("on_evaluation", progress)
 
-    def evaluating(self, progress: Progress) -> None:
-        """An evaluation goes on; `progress.doing` says how far it is."""
+    def meanwhile(self, progress: Progress) -> None:
+        """An evaluation or a long wait goes on; `progress.doing` and `progress.waiting` say how far it is, and for what."""
         self._show(progress)
 
     def on_checkpoint(self, progress: Progress) -> None:

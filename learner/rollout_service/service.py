@@ -48,9 +48,12 @@ class RolloutService:
         """
         self._hub.publish(version, parameters, buffers, deal=deal, env_attributes=env_attributes)
 
-    def gather(self) -> list[AcceptedRollout]:
-        """Wait for the rollouts of the next update. Raises `RunError` when the run cannot go on."""
-        return self._hub.gather()
+    def gather(self, watch: Callable[[], None] = lambda: None) -> list[AcceptedRollout]:
+        """Wait for the rollouts of the next update. Raises `RunError` when the run cannot go on.
+
+        `watch` is called several times a second of a long wait.
+        """
+        return self._hub.gather(watch)
 
     def not_used(self, rollouts: list[AcceptedRollout]) -> None:
         """The update of the rollouts that `gather` returned last failed: they are counted as lost."""

@@ -49,6 +49,8 @@ class EvaluationPlan:
     """take the most probable actions; otherwise draw them"""
     send_rows: bool = False
     send_frames: bool = False
+    of_best: bool = False
+    """the weights are those of the best policy of the run"""
 
     @staticmethod
     def of(episodes: int, seed: int, copies: int, max_steps: int, purpose: Purpose = Purpose.EPISODES) -> EvaluationPlan:
@@ -56,7 +58,8 @@ class EvaluationPlan:
 
         `max_steps`: env steps that the whole evaluation may take. Each episode gets an equal share, at least one step.
         """
-        return EvaluationPlan(episode_seeds(seed, episodes, purpose), copies, min(max(1, max_steps // episodes), LARGEST))
+        most_steps, of_best = min(max(1, max_steps // episodes), LARGEST), purpose is Purpose.CONFIRMATION
+        return EvaluationPlan(episode_seeds(seed, episodes, purpose), copies, most_steps, of_best=of_best)
 
     def how_far(self, played: int, env_steps: int, bound: str = "at most", before: tuple[int, int] = (0, 0)) -> str:
         """How far it is, for people: `played` episodes, and `env_steps` of these and of those that are being played.

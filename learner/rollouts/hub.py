@@ -8,11 +8,12 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
 from learner.members.events import EnvironmentRaised, Event, PolicyRaised, WorkerProcessFailed
+from learner.members.held_up import LONG_S
 from learner.members.member_server import MemberServer, ServerCallbacks
 from learner.members.membership import Outgoing
 from learner.members.process_callbacks import ProcessCallbacks
@@ -23,6 +24,7 @@ from learner.rollouts.ledger import Ledger
 from learner.rollouts.stall_watch import StallWatch
 from learner.rollouts.status import status
 from learner.rollouts.ticket_coordinator import CollectingMember, TicketCoordinator
+from learner.rollouts.waiting import LearnerTime
 from learner.rollouts.weight_age import WeightAge
 from learner.run_folder.progress import Progress
 from protocol.address import name_for_people
@@ -40,8 +42,7 @@ log = logging.getLogger("millrace.learner")
 POLL_S = 0.1
 # Least interval between two pulses. A minibatch may take only a tenth of it, and one pulse takes as long as a minibatch.
 PULSE_S = 0.003
-LOG_WAITING_EVERY_S = 10.0
-MOST_NAMES = 50  # of workers in one line
+LOG_WAITING_AFTER_S = 10.0
 FAILURES_WITHIN_S = 3600.0
 
 
@@ -76,6 +77,12 @@ class HubSnapshot(NamedTuple):
     """Number of rollouts used since this learner started, by lag."""
     wait_s: float
     """Seconds spent waiting for rollouts since this learner started."""
+    evaluate_s: float
+    """Seconds spent in evaluations since this learner started."""
+    evaluating: bool
+    """Whether an evaluation is pending."""
+    waiting: str
+    """Who waits for whom, in one line for people; empty if nobody waits long."""
     members: tuple[CollectingMember, ...]
     worker_stages: Stages
     """Seconds in each stage, of all workers since this learner started, also of those that have left."""
@@ -90,12 +97,6 @@ class HubSnapshot(NamedTuple):
     def worker_states(self) -> Counter[str]:
         """Number of workers that are active, draining, or spare (active without a lane)."""
         return Counter(_state(member) for member in self.members)
-
-
-def _names(workers: Sequence[str]) -> str:
-    """The first of these names, as text."""
-    more = len(workers) - MOST_NAMES
-    return one_line(", ".join(workers[:MOST_NAMES]), 4 * MAX_LINE) + (f" and {more} more" if more > 0 else "")
 
 
 def _state(member: CollectingMember) -> str:
@@ -126,7 +127,7 @@ class Hub:
         link.packed_bytes_limit = rollout_bytes(coordinator.run)
         self._processes = processes or ProcessCallbacks()
         self._check_interrupt, self._observer, self._clock = check_interrupt, observer, clock
-        self._wait_s = 0.0  # seconds spent waiting for rollouts
+        self._time = LearnerTime(clock())
         self._lags: list[int] = []  # lag of each rollout of the last `gather`
         self._weight_age = WeightAge()
         self._progress = Progress()
@@ -155,17 +156,22 @@ class Hub:
         self._weight_age.published(version, self._clock())
         self._server.send(self.coordinator.publish(version, sent, buffers, deal=deal, env_attributes=env_attributes))
 
-    def gather(self) -> list[AcceptedRollout]:
-        """The rollouts of the next update. Raises `NoWorkers`, `Stalled`, `EnvironmentFailed` or `PolicyFailed`."""
-        started_s = logged_s = self._clock()
+    def gather(self, watch: Callable[[], None] = lambda: None) -> list[AcceptedRollout]:
+        """The rollouts of the next update. Raises `NoWorkers`, `Stalled`, `EnvironmentFailed` or `PolicyFailed`.
+
+        `watch` is called at least every `POLL_S` of a long wait.
+        """
+        started_s = self._clock()
+        log_at_s = started_s + LOG_WAITING_AFTER_S
         steps = self._worker_steps()
+        self._time.turn("gathering", started_s)
         self._stall_watch.begin(started_s)
         self._turn(0.0)
         while True:
             taken = self.coordinator.take()
             self._server.send(self.coordinator.deal())
             if taken is not None:
-                self._wait_s += self._clock() - started_s
+                self._time.turn("learning", self._clock())
                 self._lags = [self.coordinator.version - arrived.rollout.version for arrived in taken]
                 self._weight_age.used(self._lags)
                 return taken
@@ -173,10 +179,13 @@ class Hub:
             now = self._clock()
             if not self._goes_on(now, len(self.coordinator.ready)):
                 stall_timeout_s = self.settings.stall_timeout_s
-                raise Stalled(f"no rollout came for {stall_timeout_s:.0f} s; {self.waiting_for()}")
-            if now - logged_s > LOG_WAITING_EVERY_S:
-                logged_s, before, steps = now, steps, self._worker_steps()
-                log.log(logging.INFO if steps != before else logging.WARNING, "%s", self.waiting_for())
+                raise Stalled(f"no rollout came for {stall_timeout_s:.0f} s; {self.waiting(now)}")
+            if now - started_s >= LONG_S:
+                watch()
+            if now > log_at_s:  # ever less often
+                log_at_s, before, steps = now + (now - started_s), steps, self._worker_steps()
+                level = logging.INFO if steps != before else logging.WARNING
+                log.log(level, "%s", self.waiting(now), extra={"in_progress": True})
 
     def not_used(self, taken: list[AcceptedRollout]) -> None:
         """The update of the rollouts that `gather` returned last failed: they are counted as lost."""
@@ -192,8 +201,9 @@ class Hub:
         does.
         """
         evaluation, steps_before = self.coordinator.evaluation, self._worker_steps()
-        logged_s = self._clock()
-        self._stall_watch.begin(logged_s)
+        began_s = self._clock()
+        self._time.turn("evaluating", began_s)
+        self._stall_watch.begin(began_s)
         self._server.send(self.coordinator.begin_evaluation(plan, on_rows))
         try:
             while not evaluation.done:
@@ -202,13 +212,11 @@ class Hub:
                 env_steps = self._worker_steps()
                 watch(evaluation.episodes_played, max(0, env_steps - steps_before))  # less, if a worker was lost
                 if not self._goes_on(now, env_steps + evaluation.episodes_played):
-                    stall_timeout_s, waiting = self.settings.stall_timeout_s, self._waiting_for_episodes()
-                    raise Stalled(f"no env step of an evaluation was made for {stall_timeout_s:.0f} s; {waiting}")
-                if now - logged_s > LOG_WAITING_EVERY_S:
-                    logged_s = now
-                    log.info("%s", self._waiting_for_episodes())
+                    stall_timeout_s = self.settings.stall_timeout_s
+                    raise Stalled(f"no env step of an evaluation was made for {stall_timeout_s:.0f} s; {self.waiting(now)}")
         finally:
             played = self.coordinator.end_evaluation()
+            self._time.turn("learning", self._clock())
         self._weight_age.published(self.coordinator.version, self._clock())  # they are used for rollouts from now on
         return played
 
@@ -225,17 +233,13 @@ class Hub:
         self._server.send(self.coordinator.drain(reason))
         self._server.wait_until_all_left(self._clock() + timeout_s, POLL_S)
         if late := [member.hello.worker for member in self.coordinator.members.values()]:
-            log.warning("did not say goodbye within %.0f s: workers %s", timeout_s, _names(late))
+            log.warning("did not say goodbye within %.0f s: workers %s", timeout_s, one_line(", ".join(late)))
         self._observer(self)
 
-    def waiting_for(self) -> str:
-        """A description of what the learner waits for, for the terminal."""
-        coordinator = self.coordinator
-        if not coordinator.members:
-            return f"waiting for a worker to join at {self.link.address}{self._server.missing_reason()}"
-        late = sorted({coordinator.members[ticket.peer].hello.worker for ticket in coordinator.tickets.values()})
-        have, need = len(coordinator.ready), coordinator.rollouts_per_update
-        return f"waiting for rollouts: have {have} of {need}, outstanding with {_names(late) or 'nobody'}"
+    def waiting(self, now: float) -> str:
+        """Who waits for whom, in one line for people; empty if nobody waits long."""
+        no_worker = f"a worker to join at {self.link.address}{self._server.missing_reason()}"
+        return self._time.line(self.coordinator, now, no_worker)
 
     # ---------------------------------------------------------------- what others ask and tell
 
@@ -258,7 +262,8 @@ class Hub:
 
     def snapshot(self) -> HubSnapshot:
         """A snapshot of the current state."""
-        link, coordinator = self.link, self.coordinator
+        link, coordinator, now = self.link, self.coordinator, self._clock()
+        spent_s = self._time.until(now)
         return HubSnapshot(
             progress=self._progress,
             version=coordinator.version,
@@ -266,7 +271,10 @@ class Hub:
             incarnations=coordinator.incarnations(),
             lags=self._lags,
             lag_counts=dict(self._weight_age.lags),
-            wait_s=self._wait_s,
+            wait_s=spent_s["gathering"],
+            evaluate_s=spent_s["evaluating"],
+            evaluating=coordinator.evaluation.pending,
+            waiting=self.waiting(now),
             members=tuple(coordinator.members.values()),
             worker_stages=coordinator.membership.stages(),
             received=(link.received.messages, link.received.bytes),
@@ -290,13 +298,6 @@ class Hub:
         """Env steps of all workers, as of their last heartbeats."""
         heartbeats = (member.heartbeat for member in self.coordinator.members.values())
         return sum(heartbeat.steps for heartbeat in heartbeats if heartbeat is not None)
-
-    def _waiting_for_episodes(self) -> str:
-        coordinator = self.coordinator
-        if not coordinator.members:
-            return self.waiting_for()
-        late = _names([coordinator.members[peer].hello.worker for peer in coordinator.evaluation.holders])
-        return f"evaluating: {coordinator.evaluation.episodes_played} episodes played, others are with {late}"
 
     def _turn(self, timeout_s: float) -> None:
         """One turn of waiting: listen, then check whether the run can go on."""
@@ -327,7 +328,7 @@ class Hub:
 
     def status(self, now: float) -> Status:
         """The answer to `millrace status`."""
-        return status(self.coordinator, self._progress, now)
+        return status(self.coordinator, self._progress, now, self.waiting(now))
 
     def _on_event(self, event: Event) -> None:
         """Count the failures of environments and of the user's policy together.

@@ -7,8 +7,8 @@ from learner.run_folder.progress import Progress
 from protocol.messages import Status
 
 
-def status(coordinator: TicketCoordinator, progress: Progress, now: float) -> Status:
-    """The status message of a run; `progress` is that of the last update."""
+def status(coordinator: TicketCoordinator, progress: Progress, now: float, waiting: str) -> Status:
+    """The status message of a run; `progress` is that of the last update, `waiting` says who waits for whom."""
     return Status(
         env=coordinator.run.env.id,
         version=coordinator.version,
@@ -20,4 +20,5 @@ def status(coordinator: TicketCoordinator, progress: Progress, now: float) -> St
         lag_max=progress.lag_max,
         workers=coordinator.membership.status(now),
         ledger=coordinator.ledger.counts(),
+        waiting=waiting,
     )

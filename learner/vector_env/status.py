@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
+from learner.members.held_up import late
 from learner.vector_env.order_coordinator import OrderCoordinator
 from protocol.messages import Status
 
@@ -22,9 +23,11 @@ def status(coordinator: OrderCoordinator, now: float) -> Status:
         lag_max=0,
         workers=coordinator.membership.status(now),
         ledger={},
+        waiting=late(members, now, "waiting for "),
     )
 
 
 def status_of_run(run: Status, coordinator: OrderCoordinator, now: float) -> Status:
     """The status message of a run that acts on the copies of a vector environment: its own figures, and these workers."""
-    return replace(run, workers=coordinator.membership.status(now))
+    waiting = run.waiting + late(coordinator.members.values(), now, "; " if run.waiting else "waiting for ")
+    return replace(run, workers=coordinator.membership.status(now), waiting=waiting)

@@ -16,6 +16,7 @@ from typing import TextIO
 
 import msgspec
 
+from learner.members.held_up import in_words
 from learner.run_folder.run_lock import learner_of_run
 from millrace.cli.arguments import Arguments
 from protocol.errors import Refused, RunError, UsageError
@@ -26,16 +27,6 @@ from protocol.wire.codec import encode
 from protocol.wire.worker_link import WorkerLink
 from workers.connection_rules import checked_token
 
-LONG_S = 1.0
-DOING = {
-    "describing": "in construction",
-    "making": "in construction",
-    "resetting": "in reset",
-    "stepping": "in step",
-    "evaluating": "in evaluation",
-    "closing": "in close",
-}
-"""What a worker does, in the words of the table. A worker without a supervisor does not say it."""
 ASK_AGAIN_S = WATCH_EVERY_S = 1.0
 DROPS = {
     "lost": "tickets of workers that were lost",
@@ -156,6 +147,7 @@ def as_table(status: Status) -> str:
     return "\n".join(
         [
             _run_line(status),
+            *([_printable(status.waiting)] if status.waiting else []),
             "",
             *_table([_cells(worker, status.version, late) for worker in status.workers]),
             "",
@@ -195,15 +187,9 @@ def _cells(worker: WorkerStatus, version: int, late: bool) -> dict[str, str]:
         "steps/s": f"{worker.steps_per_s:,.0f}",
         "weights": "none" if worker.version < 0 else "newest" if behind <= 0 else f"{behind} behind",
         "silent": f"{worker.silent_s:.1f} s",
-        "doing": _doing(worker),
+        "doing": in_words(_printable(worker.doing), worker.doing_s),
         "memory": f"{worker.resident_bytes / 2**20:,.0f} MB" if worker.resident_bytes else "-",
     } | ({"late actions": f"{worker.late_actions:,}"} if late else {})
-
-
-def _doing(worker: WorkerStatus) -> str:
-    """What it does, and for how long if that is long."""
-    words = DOING.get(worker.doing, _printable(worker.doing) or "-")
-    return f"{words} for {worker.doing_s:.0f} s" if worker.doing_s >= LONG_S else words
 
 
 def _table(rows: list[dict[str, str]]) -> list[str]:

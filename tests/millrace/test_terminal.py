@@ -15,6 +15,8 @@ from rich.console import Console
 from learner.run_folder.progress import Progress
 from learner.standard_streams import never_fails
 from millrace.terminal import (
+    LINE_EVERY_S,
+    REDRAW_EVERY_S,
     LiveBlock,
     PlainLines,
     RateLimitedView,
@@ -97,6 +99,47 @@ def test_the_block_has_everything() -> None:
     ]
 
 
+WAITING = (
+    "waiting 12 s for lane 3 (worker cpu2-w1 on cpu2: in reset for 11 s); so far 71% waiting for rollouts, 29% learning"
+)
+
+
+def test_who_waits_for_whom_is_a_row_whose_first_line_has_the_main_thing() -> None:
+    for width, first in ((140, WAITING), (80, WAITING.partition(" s);")[0]), (40, "waiting 12 s for lane 3")):
+        console = Console(file=io.StringIO(), width=width, force_terminal=True, color_system=None)
+        console.print(render_block(replace(PROGRESS, waiting=WAITING)))
+        assert isinstance(console.file, io.StringIO)
+        (row,) = [line for line in console.file.getvalue().splitlines() if line.startswith("now ")]
+        assert row.removeprefix("now ").strip() == first
+        shown = " ".join(console.file.getvalue().split())
+        assert WAITING in shown, "nothing is cut off"
+
+
+def test_who_waits_for_whom_ends_a_plain_line(capsys: pytest.CaptureFixture[str]) -> None:
+    PlainLines().show(replace(PROGRESS, waiting=WAITING))
+    assert capsys.readouterr().out.endswith(f" | update 243 | {WAITING}\n")
+
+
+def test_lines_without_an_update_come_ever_less_often() -> None:
+    now = [0.0]
+    view = RecordingView()
+    limited = RateLimitedView(view, LINE_EVERY_S, lambda: now[0])
+    while now[0] < 200.0:
+        limited(Progress(env_steps=int(now[0]), updates=int(now[0] >= 150.0)))
+        now[0] += 1.0
+    assert view.shown == [0, 5, 10, 20, 40, 80, 150, 155, 160, 170, 190]
+
+
+def test_a_block_that_is_redrawn_is_not_slowed_by_a_long_wait() -> None:
+    now = [1_000.0]
+    view = RecordingView()
+    limited = RateLimitedView(view, REDRAW_EVERY_S, lambda: now[0])
+    for steps in range(5):
+        limited(Progress(env_steps=steps))
+        now[0] += 1.0
+    assert view.shown == [0, 1, 2, 3, 4]
+
+
 def test_an_empty_progress_is_shown_too() -> None:
     assert detail_rows(Progress()) == {"run": ""}
     Console(file=io.StringIO()).print(render_block(Progress()))
@@ -123,11 +166,13 @@ def test_warnings_of_the_log_are_shown_meanwhile(capsys: pytest.CaptureFixture[s
         logger.warning("worker w1 is gone")
         log_notice(logger, "waiting for workers")
         logger.info("not so important")
+        logger.warning("waiting 12 s for lane 3", extra={"in_progress": True})
     out = capsys.readouterr().out
     assert "waiting for workers" in out.splitlines(), "a notice is shown, and is no warning"
     assert "0 of 5 env steps" in out
     assert "warning: worker w1 is gone" in out
     assert "not so important" not in out
+    assert "lane 3" not in out, "the progress shows it"
     assert logger.parent is not None
     assert not logger.parent.handlers
 

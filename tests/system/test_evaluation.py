@@ -159,7 +159,7 @@ def test_a_signal_during_an_evaluation_ends_the_run_at_once_with_its_checkpoint(
     command = [sys.executable, "-m", "millrace", "train", "CliffWalking-v1", "--steps", "1200", "--rollout-steps", "32"]
     command += ["--run-dir", str(stage.runs), "--eval-max-steps", "1000000000", "--eval-episodes", "100"]
     run = stage.start(command, "train")
-    run.hears("evaluating: ", START_S)
+    run.hears("evaluating for ", START_S)
     saved_at = max(map(_steps, stage.runs.glob("*/checkpoints/*.pt")))
     began_s = time.monotonic()
     run.signal(number)

@@ -188,9 +188,9 @@ def test_a_worker_that_is_stopped_is_given_up_although_its_supervisor_lives(stag
     worker.resume()
 
 
-def test_status_says_what_a_worker_does_and_for_how_long(stage: Stage) -> None:
+def test_status_names_the_lane_and_the_call_of_a_worker_that_hangs_and_for_how_long(stage: Stage) -> None:
     address = f"tcp://127.0.0.1:{free_port()}"
-    learner = stage.learner(address, {**SMALL, "env-kwargs": "step_s 600.0"}, env=f"{ENVS}:Slow-v0")
+    learner = stage.learner(address, {**SMALL, "env-kwargs": "reset_s 600.0"}, env=f"{ENVS}:Slow-v0")
     stage.worker(address, "w0")
     learner.hears("worker w0 .* joined", START_S)
     time.sleep(3)
@@ -201,10 +201,16 @@ def test_status_says_what_a_worker_does_and_for_how_long(stage: Stage) -> None:
         assert done.returncode == 0, done.stderr
         return done.stdout
 
-    (worker,) = json.loads(status("--json"))["workers"]
-    assert worker["doing"] == "stepping"
+    told = json.loads(status("--json"))
+    (worker,) = told["workers"]
+    assert worker["doing"] == "resetting"
     assert 2.0 < worker["doing_s"] < 60.0
-    assert re.search(r"in step for \d+ s", status())
+    assert re.fullmatch(
+        r"waiting \d+ s for lanes 0, 1 \(worker w0 on .*: in reset for \d+ s\)(; so far.*)?", told["waiting"]
+    )
+    table = status().splitlines()
+    assert re.match(r"waiting \d+ s for lanes 0, 1 \(worker w0 on .*: in reset for \d+ s\)", table[1])
+    assert re.search(r"in reset for \d+ s", table[4])
 
 
 @pytest.mark.soak

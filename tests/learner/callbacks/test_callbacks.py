@@ -52,7 +52,7 @@ def test_a_callback_gets_what_it_wants_in_order() -> None:
     callbacks = Callbacks([one], shown.append)
     assert (callbacks.wants("on_update"), callbacks.wants("on_rollouts")) == (True, False)
     tell_all(callbacks)
-    callbacks.evaluating(NOW)
+    callbacks.meanwhile(NOW)
     assert one.told == ["on_start", "on_update 7", "on_end"]
     assert shown == [NOW] * 4, "update, evaluation, end, and during an evaluation"
     assert callbacks.stop_reason is None

@@ -30,8 +30,8 @@ from tests.learner.rollouts.test_ticket_coordinator import Learner
 PROGRESS = Progress(env_steps=1_000, total_steps=10_000, steps_per_s=50.0, return_mean=12.5, lag_mean=0.5, lag_max=2)
 
 
-def told(learner: Learner) -> Status:
-    return status(learner.coordinator, PROGRESS, learner.now)
+def told(learner: Learner, waiting: str = "") -> Status:
+    return status(learner.coordinator, PROGRESS, learner.now, waiting)
 
 
 def counts(learner: Learner, peer: bytes, steps: int, resident: int = 0) -> None:
@@ -162,7 +162,7 @@ def test_a_learner_answers_one_who_is_no_worker(context: zmq.Context[zmq.Socket[
     thread.join(10.0)
     asking.close(0)
     link.close(0)
-    assert found == [status(learner.coordinator, PROGRESS, 0.0)]
+    assert found == [status(learner.coordinator, PROGRESS, 0.0, "")]
     assert not learner.coordinator.members
 
 
@@ -174,6 +174,17 @@ def test_nobody_there_is_said_at_the_deadline(context: zmq.Context[zmq.Socket[by
 
 
 # ------------------------------------------------------------------------------------------------ as it is shown
+
+
+def test_who_waits_for_whom_stands_below_the_line_of_the_run() -> None:
+    learner = Learner(lanes=2)
+    assert as_table(told(learner)).splitlines()[1] == ""
+    waiting = told(learner, "waiting 12 s for lane 3 (worker \x1b[7m on cpu2: in reset for 11 s)")
+    assert as_table(waiting).splitlines()[1:3] == [
+        "waiting 12 s for lane 3 (worker \\x1b[7m on cpu2: in reset for 11 s)",
+        "",
+    ]
+    assert json.loads(in_json(waiting))["waiting"] == waiting.waiting
 
 
 def test_it_is_shown_as_a_table() -> None:

@@ -1,0 +1,48 @@
+"""What a member does, and what holds it up, in words for people. Pure.
+
+Rule: a member is held up by one call of the environment, or by its own silence. Many short calls hold it up by their number,
+so its env steps per second are said instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from learner.members.membership import Member
+
+DOING = {
+    "describing": "in construction",
+    "making": "in construction",
+    "resetting": "in reset",
+    "stepping": "in step",
+    "evaluating": "in evaluation",
+    "closing": "in close",
+}
+"""What a worker does, in words. A worker without a supervisor does not say it."""
+LONG_S = 2.0  # what takes less time is not worth a word; by default, heartbeats come every second
+
+
+def in_words(doing: str, seconds: float) -> str:
+    """What a worker does, and for how long if that is long."""
+    words = DOING.get(doing, doing or "-")
+    return f"{words} for {seconds:.0f} s" if seconds >= LONG_S else words
+
+
+def held_up(member: Member, now: float) -> tuple[float, float, str]:
+    """For how many seconds it is held up, its env steps per second below 0, and who is held up where, in what.
+
+    The largest is that of the member that is held up longest, or else of the slowest.
+    """
+    row, seconds, silent_s = member.status(now), 0.0, now - member.alive_s
+    what = f"{row.steps_per_s:,.1f} steps/s"
+    if silent_s >= LONG_S:
+        seconds, what = silent_s, f"silent for {silent_s:.0f} s"
+    elif row.doing_s >= LONG_S and row.doing in DOING:
+        seconds, what = row.doing_s, in_words(row.doing, row.doing_s)
+    return seconds, -row.steps_per_s, f"worker {row.worker} on {row.host}: {what}"
+
+
+def late(members: Iterable[Member], now: float, before: str) -> str:
+    """Who is held up longest, behind `before`; empty if nobody is held up long."""
+    seconds, _, text = max((held_up(member, now) for member in members), default=(0.0, 0.0, ""))
+    return f"{before}{text}" if seconds >= LONG_S else ""

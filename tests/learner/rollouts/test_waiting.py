@@ -1,0 +1,184 @@
+"""Each sentence that says who waits for whom, and when nothing is said. Pure."""
+
+from __future__ import annotations
+
+import pytest
+
+from learner.members.held_up import LONG_S, late
+from learner.rollouts.evaluation_tickets import EvaluationPlan
+from learner.rollouts.waiting import SHARES_AFTER_S, LearnerTime, Phase
+from protocol.alive import Alive, Doing, WorkerActivity
+from protocol.messages import Goodbye, Heartbeat
+from protocol.random_streams import Purpose
+from tests.learner.rollouts.test_ticket_coordinator import Learner
+from tests.support.fake_ends import BUFFERS, PARAMETERS
+
+A, B = b"a", b"b"
+NO_WORKER = "a worker to join at tcp://box:5555 (the last one was killed by SIGKILL)"
+
+
+class Run:
+    """A learner and its time, with workers of which a supervisor tells."""
+
+    def __init__(self, lanes: int = 2, max_lag: int = 0, workers: tuple[bytes, ...] = (A,)) -> None:
+        self.learner = Learner(lanes, max_lag=max_lag, publish=False)
+        for peer in workers:
+            self.learner.joins(peer, host=f"host-of-{peer.decode()}")
+        self.learner.publish(0)
+        self.time = LearnerTime(self.learner.now)
+
+    def turn(self, phase: Phase, after_s: float = 0.0) -> None:
+        self.learner.now += after_s
+        self.time.turn(phase, self.learner.now)
+
+    def does(self, peer: bytes, doing: Doing, for_s: float = 0.0) -> None:
+        hello = self.learner.coordinator.members[peer].hello
+        said = WorkerActivity(hello.worker, hello.process_nonce, doing, for_s, 0)
+        self.learner.says(b"supervisor", Alive((said,), ()))
+
+    def steps(self, peer: bytes, per_s: float) -> None:
+        """Two heartbeats, a second apart."""
+        session, before = self.learner.session(peer), self.learner.coordinator.members[peer].heartbeat
+        steps = 0 if before is None else before.steps
+        for more in (0, per_s):
+            self.learner.now += 1.0
+            held = tuple(self.learner.tickets(peer))
+            self.learner.says(peer, Heartbeat(session, 0, 0, held, steps + int(more), {}, 0))
+
+    @property
+    def line(self) -> str:
+        return self.time.line(self.learner.coordinator, self.learner.now, NO_WORKER)
+
+
+def test_a_call_that_lasts_is_named_with_its_lanes_worker_and_host() -> None:
+    run = Run(lanes=2, workers=(A, B))
+    run.turn("gathering")
+    run.learner.now += 12.0
+    run.does(A, "stepping", 0.1)
+    run.does(B, "resetting", 11.4)
+    assert run.line == "waiting 12 s for lane 1 (worker b on host-of-b: in reset for 11 s) and 1 more"
+    (ticket,) = run.learner.tickets(A)
+    run.learner.delivers(ticket)
+    assert run.line == "waiting 12 s for lane 1 (worker b on host-of-b: in reset for 11 s)"
+
+
+def test_a_wait_is_said_when_it_lasts() -> None:
+    run = Run()
+    run.turn("gathering")
+    run.learner.now += LONG_S - 0.1
+    assert run.line == ""
+    run.learner.now += 0.1
+    assert run.line.startswith("waiting 2 s for lanes 0, 1 (worker a")
+
+
+def test_many_lanes_of_one_worker_are_cut_after_four() -> None:
+    run = Run(lanes=6)
+    run.turn("gathering")
+    run.learner.now += 5.0
+    run.does(A, "making", 4.0)
+    assert run.line == "waiting 5 s for lanes 0, 1, 2, 3, … (worker a on host-of-a: in construction for 4 s)"
+
+
+def test_of_workers_that_make_short_steps_the_slowest_is_named_with_its_speed() -> None:
+    run = Run(workers=(A, B))
+    run.turn("gathering")
+    run.steps(A, 400)
+    run.steps(B, 3)
+    run.does(A, "stepping", 0.4)
+    run.does(B, "stepping", 0.3)
+    assert run.line == "waiting 4 s for lane 1 (worker b on host-of-b: 3.0 steps/s) and 1 more"
+
+
+def test_a_process_that_is_stopped_is_silent_whatever_it_did_before() -> None:
+    run = Run()
+    run.turn("gathering")
+    run.does(A, "stepping", 0.1)
+    run.learner.now += 4.0
+    assert run.line == "waiting 4 s for lanes 0, 1 (worker a on host-of-a: silent for 4 s)"
+
+
+def test_without_a_worker_it_says_what_is_known_of_the_last_one() -> None:
+    run = Run()
+    run.turn("gathering")
+    run.learner.says(A, Goodbye(run.learner.session(A), "told to stop", ()))
+    run.learner.now += 3.0
+    assert run.line == f"waiting 3 s for {NO_WORKER}"
+    run.turn("starting")
+    run.learner.now += 3.0
+    assert run.line == f"waiting 3 s for {NO_WORKER}"
+
+
+def test_with_a_lag_every_lane_that_may_bring_the_next_rollout_counts_once() -> None:
+    run = Run(lanes=2, max_lag=1, workers=(A, B))
+    assert len(run.learner.tickets()) == 4
+    run.turn("gathering")
+    run.learner.now += 3.0
+    run.does(A, "stepping", 2.6)
+    run.does(B, "stepping", 0.1)
+    assert run.line == "waiting 3 s for lane 0 (worker a on host-of-a: in step for 3 s) and 1 more"
+
+
+@pytest.mark.parametrize(("max_lag", "idle"), [(0, "; 1 of 1 workers wait for weights"), (1, "")])
+def test_while_it_learns_only_workers_without_a_ticket_wait(max_lag: int, idle: str) -> None:
+    run = Run(max_lag=max_lag)
+    for number in run.learner.tickets()[:2]:
+        run.learner.delivers(number)
+    run.learner.take()
+    run.turn("learning")
+    assert run.line == ""
+    run.learner.now += 40.0
+    assert run.line == f"learning for 40 s{idle}; so far 0% waiting for rollouts, 100% learning"
+
+
+def test_between_two_long_waits_it_tells_of_the_last_one() -> None:
+    run = Run()
+    run.turn("gathering")
+    run.turn("learning", after_s=12.0)
+    assert run.line == "waited 12 s for rollouts"
+    run.turn("gathering", after_s=0.5)
+    run.learner.now += 1.0
+    assert run.line == "waited 12 s for rollouts"
+    run.turn("learning", after_s=0.5)
+    assert run.line == "", "the last wait was short"
+
+
+def test_the_shares_are_those_of_training() -> None:
+    run = Run()
+    run.turn("gathering", after_s=1_000.0)
+    run.turn("learning", after_s=15.0)
+    run.turn("evaluating", after_s=SHARES_AFTER_S - 18.1)
+    run.turn("gathering", after_s=1_000.0)
+    run.learner.now += 3.0
+    assert "so far" not in run.line
+    run.learner.now += 0.2
+    assert run.line.endswith("; so far 60% waiting for rollouts, 40% learning")
+
+
+@pytest.mark.parametrize(("purpose", "what"), [(Purpose.EVALUATION, ""), (Purpose.CONFIRMATION, " the best policy")])
+def test_an_evaluation_says_how_far_it_is_and_who_is_held_up(purpose: Purpose, what: str) -> None:
+    run = Run(workers=(A, B))
+    run.learner.deliver_all()
+    run.learner.take()
+    run.learner.balanced(run.learner.coordinator.publish(1, PARAMETERS, BUFFERS, deal=False))
+    run.turn("evaluating")
+    plan = EvaluationPlan.of(10, seed=1, copies=2, max_steps=5_000, purpose=purpose)
+    run.learner.balanced(run.learner.coordinator.begin_evaluation(plan))
+    run.learner.now += 41.0
+    run.does(A, "evaluating", 0.1)
+    run.does(B, "evaluating", 11.0)
+    done = "0 of 10 episodes (at most 500 env steps each)"
+    assert run.line == f"evaluating{what} for 41 s: {done}; worker b on host-of-b: in evaluation for 11 s"
+    for peer in (A, B):
+        run.learner.says(peer, Goodbye(run.learner.session(peer), "told to stop", ()))
+    assert run.line == f"waiting 41 s for {NO_WORKER}"
+
+
+def test_of_a_vector_environment_it_names_who_is_held_up() -> None:
+    run = Run(workers=(A, B))
+    members = run.learner.coordinator.members
+    run.does(A, "stepping", 1.9)
+    run.does(B, "resetting", 1.5)
+    assert late(members.values(), run.learner.now, "waiting for ") == ""
+    run.does(A, "stepping", 2.4)
+    assert late(members.values(), run.learner.now, "waiting for ") == "waiting for worker a on host-of-a: in step for 2 s"
+    assert late((), 0.0, "waiting for ") == ""
