@@ -86,6 +86,7 @@ class MetricsCollector(Collector):
         self._snapshot = snapshot
         self._updates_before: int | None = None  # updates of earlier learners, if the run was resumed
         self._about = {"env": config.env, "algo": config.algo, "seed": str(config.seed)}
+        self._wanted = config.lanes
 
     def observe(self, hub: Hub) -> None:
         """Take a new snapshot if the last one is old enough. Called whenever the hub has listened."""
@@ -117,6 +118,9 @@ class MetricsCollector(Collector):
         """All metrics. Called in a thread of the server, once for each scrape."""
         yield InfoMetricFamily("millrace_build", "Versions of millrace and of what decides its results.", versions())
         yield InfoMetricFamily("millrace_run", "What is trained.", self._about)
+        # Also before the first worker is there: an autoscaler may start none without it.
+        wanted = "Workers with which each lane has one of its own: the number to scale to."
+        yield GaugeMetricFamily("millrace_workers_wanted", wanted, self._wanted)
         now = self._snapshot
         if now.at_s:
             updates = now.progress.updates - (self._updates_before or 0)

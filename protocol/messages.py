@@ -400,6 +400,8 @@ class Status(Message, frozen=True):
     """number of workers that are not in `workers`, because the message would be too long"""
     waiting: str = ""
     """who waits for whom, and for what share of the time, in one line for people; empty if nobody waits long"""
+    workers_wanted: int = 0
+    """number of workers with which each lane has one of its own, and none is spare; 0 while the environment is described"""
 
 
 ToLearner = (

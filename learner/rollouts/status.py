@@ -21,4 +21,5 @@ def status(coordinator: TicketCoordinator, progress: Progress, now: float, waiti
         workers=coordinator.membership.status(now),
         ledger=coordinator.ledger.counts(),
         waiting=waiting,
+        workers_wanted=len(coordinator.lanes),
     )

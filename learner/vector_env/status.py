@@ -24,6 +24,7 @@ def status(coordinator: OrderCoordinator, now: float) -> Status:
         workers=coordinator.membership.status(now),
         ledger={},
         waiting=late(members, now, "waiting for "),
+        workers_wanted=len(coordinator.lanes),
     )
 
 

@@ -97,9 +97,11 @@ def by(found: Metrics, name: str, label: str) -> dict[str, float]:
     return {dict(labels)[label]: value for (known, labels), value in found.items() if known == name}
 
 
-def test_before_the_learner_has_begun_it_tells_what_it_is(scraped: Scraped) -> None:
+def test_before_the_learner_has_begun_it_tells_what_it_is_and_how_many_workers_it_wants(scraped: Scraped) -> None:
+    """An autoscaler starts the first worker, without which nothing begins."""
     found = parsed(scraped.text())
-    assert {name for name, _ in found} == {"millrace_build_info", "millrace_run_info"}
+    assert {name for name, _ in found} == {"millrace_build_info", "millrace_run_info", "millrace_workers_wanted"}
+    assert found["millrace_workers_wanted", ()] == Config(env="CartPole-v1").lanes
     ((_, labels),) = [key for key in found if key[0] == "millrace_run_info"]
     assert dict(labels) == {"env": "CartPole-v1", "algo": "ppo", "seed": "1"}
 

@@ -175,12 +175,38 @@ def test_kubernetes_expands_no_variable_in_our_arguments(capsys: pytest.CaptureF
     assert container(documents(text)["Job"])["args"][-5] == '$$(HOME)\u2028é: {"x"}'
 
 
-def test_the_page_shows_what_kubernetes_knows() -> None:
+def of_the_page() -> dict[str, dict[str, Any]]:
     shown = re.findall(r"<<'END'\n(.*?)^END", (ROOT / "docs/how-to/kubernetes.md").read_text(), re.DOTALL | re.MULTILINE)
-    assert shown
-    for text in shown:
-        for document in yaml.safe_load_all(text):
-            kubernetes_validate.validate(document, KUBERNETES[-1], strict=True)
+    return documents("---\n".join(shown))
+
+
+def test_the_page_shows_what_kubernetes_knows() -> None:
+    kubernetes_validate.validate(of_the_page()["Pod"], KUBERNETES[-1], strict=True)
+
+
+def test_the_autoscaler_of_the_page_scales_the_workers_to_what_their_learner_wants(
+    cluster: dict[str, dict[str, Any]], tmp_path: Path
+) -> None:
+    """Its query, evaluated by Prometheus: 4 while that learner runs, whatever another wants; nothing when it has ended."""
+    scaled = of_the_page()["ScaledObject"]["spec"]
+    assert scaled["scaleTargetRef"]["name"] == cluster["Deployment"]["metadata"]["name"]
+    if (promtool := shutil.which("promtool")) is None:
+        pytest.skip("promtool is not installed (Debian: apt-get install prometheus)")
+    labels = cluster["Job"]["spec"]["template"]["metadata"]["labels"]
+    pods = [("millrace-learner", labels["app.kubernetes.io/name"], "4x4 stale"), ("other-learner", "other", "7x9")]
+    series = [
+        {"series": f'millrace_workers_wanted{{pod="{pod}", app_kubernetes_io_name="{name}"}}', "values": values}
+        for pod, name, values in pods
+    ]
+    (trigger,) = scaled["triggers"]
+    expected = [("1m", [{"labels": "{}", "value": 4}]), ("6m", [])]
+    asked = [{"expr": trigger["metadata"]["query"], "eval_time": at, "exp_samples": samples} for at, samples in expected]
+    test = {"tests": [{"interval": "1m", "input_series": series, "promql_expr_test": asked}]}
+    (tmp_path / "test.yaml").write_text(yaml.safe_dump(test))
+    done = subprocess.run(
+        [promtool, "test", "rules", tmp_path / "test.yaml"], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 # -------------------------------------------------------------------------------------------------------------- Slurm

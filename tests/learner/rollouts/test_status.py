@@ -203,6 +203,14 @@ def test_it_is_shown_as_a_table() -> None:
     assert "1 tickets of workers that were lost" in text or "dropped: nothing" in text
 
 
+@pytest.mark.parametrize("workers", [1, 3])
+def test_it_shows_how_many_workers_could_have_a_lane(workers: int) -> None:
+    learner = Learner(lanes=2)
+    for number in range(workers):
+        learner.joins(b"w%d" % number)
+    assert f"workers: {workers} here, 2 wanted (one for each lane)" in as_table(told(learner)).splitlines()
+
+
 def test_in_json_every_field_has_its_name() -> None:
     learner = Learner(lanes=1)
     learner.joins(b"a")
