@@ -144,8 +144,10 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     not apply while such a call is in progress and within its timeout.
     """
     max_env_failures: Free[Natural] = 3
-    """End the run after more failures than this within an hour. A failure is an exception or an unusable result of the
-    environment or of an `OwnPolicy`, or the end of a worker process without an order: the environment may have ended it.
+    """End the run when a lane fails more often than this in a row, without a rollout in between, and at the latest after 10
+    failures in a row; or when, within an hour, more failures than this came after env steps, and as many again for each env
+    copy and each hour since the learner began. A failure is an exception or an unusable result of the environment or of an
+    `OwnPolicy`, or the end of a worker process without an order: the environment may have ended it.
     """
 
     def fact_names(self) -> tuple[str, ...]:

@@ -11,9 +11,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from learner.members.events import EnvironmentRaised
+from learner.members.failure_count import FailureCount
 from learner.members.membership import Member, Membership, Outgoing
 from learner.members.states import SentUnusable
-from protocol.bounds import escaped, one_line
+from protocol.bounds import one_line
 from protocol.envs.description import DescribedEnv, read_description
 from protocol.errors import BadMessage, EnvironmentFailed, UsageError, UserFacingError
 from protocol.messages import (
@@ -61,10 +62,9 @@ class DescribeCoordinator:
         self.failure: UserFacingError | None = None
         """Why the start cannot go on."""
         self.membership: Membership[Member] = Membership(spec, Member, lambda member, why: None, first_session)
-        self._worker_timeout_s, self._max_env_failures = worker_timeout_s, max_env_failures
+        self._worker_timeout_s, self._failures = worker_timeout_s, FailureCount(max_env_failures)
         self._decliners_to_end, self._accept = decliners_to_end, accept
         self._decliners: set[str] = set()
-        self._env_failures = 0
 
     def receive(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
         """Answer a message."""
@@ -96,10 +96,10 @@ class DescribeCoordinator:
             case Goodbye(_, reason):
                 return self._goodbye(member, reason)
             case Failure(_, error, traceback, lane):
-                hello = member.hello
-                self.membership.events.append(EnvironmentRaised(hello.worker, hello.host, lane, error, escaped(traceback)))
+                failed = member.failed(EnvironmentRaised, error, traceback, lane=lane)
+                self.membership.events.append(failed)
                 self.membership.remove(member, Failure, "failed")
-                self._count_failure(f"worker {hello.worker} ({hello.host}): {error}", escaped(traceback))
+                self._count_failure(failed.worker, f" ({failed.host}): {error}", failed.traceback)
         return []
 
     def reject_message(self, peer: bytes, why: str, now: float) -> list[Outgoing]:
@@ -161,10 +161,9 @@ class DescribeCoordinator:
 
     def _count_exit(self, worker_exit: WorkerExit) -> None:
         if worker_exit.failed:
-            self._count_failure(f"worker {worker_exit.worker} {worker_exit.reason}", "")
+            self._count_failure(worker_exit.worker, f" {worker_exit.reason}", "")
 
-    def _count_failure(self, line: str, detail: str) -> None:
-        self._env_failures += 1
-        if self._env_failures > self._max_env_failures and self.failure is None and self.described is None:
-            counted = f"failure {self._env_failures}; max_env_failures allows {self._max_env_failures}"
-            self.failure = EnvironmentFailed(f"{line}; {counted}", detail)
+    def _count_failure(self, worker: str, what: str, detail: str) -> None:
+        why = self._failures.failed((worker,), False, 0.0)
+        if why and self.failure is None and self.described is None:
+            self.failure = EnvironmentFailed(f"worker {worker}{what}; {why}", detail)

@@ -42,43 +42,42 @@ class WorkerRefused:
 
 
 @dataclass(frozen=True)
-class EnvironmentRaised:
-    """A worker's environment raised an exception."""
+class Failed:
+    """A worker failed in code of the user. It may come back."""
 
-    json_name: ClassVar[str] = "broke"
+    json_name: ClassVar[str]
     worker: str
     host: str
-    lane: int | None
     error: str
     """One line. The worker names the lane in it, if there is one."""
-    traceback: str
+    traceback: str = ""
+    lanes: tuple[int, ...] = ()
+    """The lane that failed, if it is known; else those that the worker held."""
+    stepped: bool = False
+    """Whether the worker's process is known to have made an env step."""
     spare: bool = False
     """Whether it held no lane and no ticket while every lane had a worker. Such a failure does not count against the run."""
 
 
 @dataclass(frozen=True)
-class PolicyRaised:
-    """A policy that the user wrote raised in a worker, or returned what no rollout can hold."""
+class EnvironmentRaised(Failed):
+    """A worker's environment raised an exception."""
 
-    json_name: ClassVar[str] = "policy_broke"
-    worker: str
-    host: str
-    error: str
-    traceback: str
-    spare: bool = False
-    """as of `EnvironmentRaised`"""
+    json_name: ClassVar[str] = "broke"
 
 
 @dataclass(frozen=True)
-class WorkerProcessFailed:
+class PolicyRaised(Failed):
+    """A policy that the user wrote raised in a worker, or returned what no rollout can hold."""
+
+    json_name: ClassVar[str] = "policy_broke"
+
+
+@dataclass(frozen=True)
+class WorkerProcessFailed(Failed):
     """A worker's process ended in a way that it did not announce: its environment is to blame, as if it had raised."""
 
     json_name: ClassVar[str] = "died"
-    worker: str
-    host: str
-    reason: str
-    spare: bool = False
-    """as of `EnvironmentRaised`"""
 
 
 @dataclass(frozen=True)
@@ -104,16 +103,7 @@ class RolloutDropped:
     transitions: int
 
 
-Event = (
-    WorkerJoined
-    | WorkerLeft
-    | WorkerRefused
-    | EnvironmentRaised
-    | PolicyRaised
-    | WorkerProcessFailed
-    | RejoinRequested
-    | RolloutDropped
-)
+Event = WorkerJoined | WorkerLeft | WorkerRefused | Failed | RejoinRequested | RolloutDropped
 
 
 def describe(event: Event) -> str:
@@ -122,7 +112,7 @@ def describe(event: Event) -> str:
     """
     line = one_line(_line(event), 4 * MAX_LINE)
     match event:
-        case EnvironmentRaised(traceback=traceback) | PolicyRaised(traceback=traceback) if traceback:
+        case Failed(traceback=traceback) if traceback:
             return f"{line}\n{indented(traceback)}"
         case _:
             return line
@@ -136,11 +126,9 @@ def _line(event: Event) -> str:
             return f"worker {worker} {why}" + (f"; {tickets} of its tickets are dealt again" if tickets else "")
         case WorkerRefused(worker, why):
             return f"worker {worker} was refused: {why}"
-        case EnvironmentRaised(worker, host, _, error) | PolicyRaised(worker, host, error):
-            return f"worker {worker} ({host}): {error}"
-        case WorkerProcessFailed(worker, host, reason, spare):
-            counts = "" if spare else "; this counts as a failure of the environment"
-            return f"worker {worker} ({host}): its process {reason}{counts}"
+        case Failed(worker, host, error, spare=spare):
+            died = isinstance(event, WorkerProcessFailed) and not spare
+            return f"worker {worker} ({host}): {error}" + ("; this counts as a failure of the environment" if died else "")
         case RejoinRequested(worker, _, late):
             counted = f"; {late} transitions that it sent are counted, not used" if late else ""
             return f"worker {worker} was told to join again: its session had ended{counted}"

@@ -20,6 +20,7 @@ import msgspec
 
 from learner.members.events import (
     Event,
+    Failed,
     RejoinRequested,
     WorkerJoined,
     WorkerLeft,
@@ -29,7 +30,7 @@ from learner.members.events import (
 from learner.members.states import TABLE, KeyRevoked, MemberState, TimedOut
 from protocol.address import key_of_peer, name_for_people, worker_name
 from protocol.alive import NO_ENVIRONMENT_CODE
-from protocol.bounds import Stage, Stages, one_line
+from protocol.bounds import Stage, Stages, escaped, one_line
 from protocol.messages import (
     PROTOCOL_VERSION,
     Alive,
@@ -91,6 +92,8 @@ class Member:
     measured: tuple[int, float] = (0, 0.0)
     """Env steps in the heartbeat by which the speed was last measured, and the time when it arrived."""
 
+    stepped: bool = False
+    """Whether its process is known to have made an env step: it has reported one, or sent a rollout."""
     activity: WorkerActivity | None = None
     """What the worker does, as its supervisor said last."""
     activity_s: float = 0.0
@@ -102,6 +105,13 @@ class Member:
     def alive_s(self) -> float:
         """Time at which the worker was last known to be alive and well."""
         return max(self.heard_s, self.in_env_code_s)
+
+    def failed(
+        self, kind: type[Failed], error: str, traceback: str = "", *, lane: int | None = None, spare: bool = False
+    ) -> Failed:
+        """The event that says that the worker failed, in this lane if it is known."""
+        lanes = (lane,) if lane in self.lanes else tuple(sorted(self.lanes))
+        return kind(self.hello.worker, self.hello.host, error, escaped(traceback), lanes, self.stepped, spare)
 
     def record_activity(self, activity: WorkerActivity, now: float) -> bool:
         """Keep what the supervisor says. True if calls of the environment have returned since it last did."""
@@ -115,6 +125,7 @@ class Member:
         if self.heartbeat is None and not self.hello.is_first_attempt:
             self.stages_before = heartbeat.stages
         self.heartbeat = msgspec.structs.replace(heartbeat, tickets=())  # what is kept of it is small
+        self.stepped |= heartbeat.steps > 0
         steps, since_s = self.measured
         if self.heard_s - since_s >= MEASURE_S:  # new weights trigger an extra heartbeat, too early to measure speed
             self.steps_per_s = max(0, heartbeat.steps - steps) / (self.heard_s - since_s) if since_s else 0.0
@@ -330,7 +341,8 @@ class Membership(Generic[M]):
         member = self._of_process.get((worker, worker_exit.process_nonce))
         if member is not None and (key is None or key == key_of_peer(member.peer)):
             if worker_exit.failed:
-                self.events.append(WorkerProcessFailed(worker, member.hello.host, reason, self._is_spare(member)))
+                spare = self._is_spare(member)
+                self.events.append(member.failed(WorkerProcessFailed, f"its process {reason}", spare=spare))
             self.remove(member, TimedOut, reason)
             return True
         if self._removed_for_silence.get(worker) == worker_exit.process_nonce:  # now it is known why it was silent

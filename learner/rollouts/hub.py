@@ -12,7 +12,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from learner.members.events import EnvironmentRaised, Event, PolicyRaised, WorkerProcessFailed
+from learner.members.events import Event, Failed, PolicyRaised
+from learner.members.failure_count import FailureCount
 from learner.members.held_up import LONG_S
 from learner.members.member_server import MemberServer, ServerCallbacks
 from learner.members.membership import Outgoing
@@ -32,7 +33,7 @@ from protocol.alive import NO_TIMEOUTS, CallTimeouts
 from protocol.arrays import Array
 from protocol.bounds import MAX_LINE, Stages, one_line
 from protocol.errors import BadRollout, EnvironmentFailed, NoWorkers, PolicyFailed, Stalled
-from protocol.messages import Rollout, Status, ToLearner
+from protocol.messages import Evaluated, Rollout, Status, ToLearner
 from protocol.rollout import rollout_bytes, validate
 from protocol.wire.learner_link import LearnerLink
 from protocol.wire.weight_dtypes import WeightsDtype, to_wire_dtype
@@ -43,7 +44,6 @@ POLL_S = 0.1
 # Least interval between two pulses. A minibatch may take only a tenth of it, and one pulse takes as long as a minibatch.
 PULSE_S = 0.003
 LOG_WAITING_AFTER_S = 10.0
-FAILURES_WITHIN_S = 3600.0
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class HubSettings:
     no_workers_timeout_s: float
     stall_timeout_s: float
     max_env_failures: int
-    """How many failures within an hour the run survives."""
+    """How many failures the run survives, as `FailureCount` counts them."""
     weights_dtype: WeightsDtype = "float32"
     """Dtype in which parameters are sent."""
     call_timeouts: CallTimeouts = NO_TIMEOUTS
@@ -131,7 +131,8 @@ class Hub:
         self._lags: list[int] = []  # lag of each rollout of the last `gather`
         self._weight_age = WeightAge()
         self._progress = Progress()
-        self._failed_at_s: list[float] = []  # times of the failures of the last hour
+        run = coordinator.run
+        self._failures = FailureCount(settings.max_env_failures, run.lanes * run.copies, clock())
         self._failure: EnvironmentFailed | PolicyFailed | None = None
         self._no_members_since_s: float | None = None
         self._stall_watch = StallWatch(coordinator, settings.stall_timeout_s, settings.call_timeouts)
@@ -312,6 +313,8 @@ class Hub:
         self._observer(self)
 
     def _answer(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
+        if isinstance(message, Evaluated):
+            self._failures.evaluated()
         if not isinstance(message, Rollout):
             return self.coordinator.receive(peer, message, now)
         try:
@@ -324,6 +327,7 @@ class Hub:
         out = self.coordinator.receive(peer, message, now)
         if len(self.coordinator.ready) > ready:  # of a ticket that this worker held
             self._weight_age.arrived(name_for_people(peer), message.version, now)
+            self._failures.collected(message.lane)
         return out
 
     def status(self, now: float) -> Status:
@@ -331,27 +335,13 @@ class Hub:
         return status(self.coordinator, self._progress, now, self.waiting(now))
 
     def _on_event(self, event: Event) -> None:
-        """Count the failures of environments and of the user's policy together.
-
-        Too many within an hour end the run; the last one decides the kind of the error.
-        """
-        match event:
-            case EnvironmentRaised(worker, host, _, error, traceback, spare) if not spare:
-                self._count_failure(EnvironmentFailed, f"worker {worker} ({host}): {error}", traceback)
-            case PolicyRaised(worker, host, error, traceback, spare) if not spare:
-                self._count_failure(PolicyFailed, f"worker {worker} ({host}): {error}", traceback)
-            case WorkerProcessFailed(worker, host, reason, spare) if not spare:
-                self._count_failure(EnvironmentFailed, f"worker {worker} ({host}): its process {reason}", "")
-            case _:
-                pass
-
-    def _count_failure(self, kind: type[EnvironmentFailed | PolicyFailed], line: str, traceback: str) -> None:
-        now = self._clock()
-        self._failed_at_s = [*(at_s for at_s in self._failed_at_s if now - at_s < FAILURES_WITHIN_S), now]
-        failures, allowed = len(self._failed_at_s), self.settings.max_env_failures
-        if failures > allowed:
-            counted = f"failure {failures} within an hour; max_env_failures allows {allowed}"
-            self._failure = kind(one_line(f"{line}; {counted}", 4 * MAX_LINE), traceback)
+        """Count the failures of environments and of the user's policy together; the last decides the kind of the error."""
+        if not isinstance(event, Failed) or event.spare:
+            return
+        if why := self._failures.failed(event.lanes or (event.worker,), event.stepped, self._clock()):
+            kind = PolicyFailed if isinstance(event, PolicyRaised) else EnvironmentFailed
+            line = f"worker {event.worker} ({event.host}): {event.error}; {why}"
+            self._failure = kind(one_line(line, 4 * MAX_LINE), event.traceback)
 
     def _check_members(self) -> None:
         """Raise `NoWorkers` when there was no member for too long."""

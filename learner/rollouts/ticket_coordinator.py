@@ -27,7 +27,7 @@ from learner.members.states import MemberState, SentUnusable
 from learner.rollouts.evaluation_tickets import EvaluationPlan, EvaluationTickets, OnRows, PlayedEpisode
 from learner.rollouts.lanes import AcceptedRollout, LaneQueue, Ticket, TicketedLane
 from learner.rollouts.ledger import Ledger
-from protocol.bounds import escaped, one_line
+from protocol.bounds import one_line
 from protocol.messages import (
     Alive,
     Array,
@@ -156,12 +156,10 @@ class TicketCoordinator:
                 self.membership.remove(member, Goodbye, f"left: {reason}")
                 return self._deal()
             case Failure(_, error, traceback, lane, of_policy):
-                hello, spare = member.hello, is_spare(member, self.lanes)
-                shown = escaped(traceback)
-                if of_policy and self.run.policy.own is not None:  # no worker can blame a policy that is not the user's
-                    self.events.append(PolicyRaised(hello.worker, hello.host, error, shown, spare))
-                else:
-                    self.events.append(EnvironmentRaised(hello.worker, hello.host, lane, error, shown, spare))
+                # No worker can blame a policy that is not the user's.
+                kind = PolicyRaised if of_policy and self.run.policy.own is not None else EnvironmentRaised
+                spare = is_spare(member, self.lanes)
+                self.events.append(member.failed(kind, error, traceback, lane=lane, spare=spare))
                 self.membership.remove(member, Failure, "failed")
                 return self._deal()
 
@@ -326,6 +324,7 @@ class TicketCoordinator:
         lane.outstanding.remove(ticket.number)
         lane.arrived(rollout.sequence)
         self._placement.ticket_ended(member)
+        member.stepped = True
         self.ready.append(AcceptedRollout(rollout, ticket.incarnation))
         self._oldest_ready = min(self._oldest_ready, rollout.version)
         return self._send_newest_weights(member) + self._deal()

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from learner.members.events import EnvironmentRaised
+from learner.members.events import EnvironmentRaised, Failed
 from learner.members.lane_placement import LanePlacement, PlacedLane, is_spare
 from learner.members.membership import Member, Membership, Outgoing
 from learner.members.states import MemberState, SentUnusable, TimedOut
-from protocol.bounds import escaped, one_line
+from protocol.bounds import one_line
 from protocol.errors import BadMessage
 from protocol.messages import (
     Alive,
@@ -82,7 +82,7 @@ class OrderCoordinator:
         """Packed infos of such an order, by lane, if they came as a message."""
         self.lost: dict[int, str] = {}
         """Lanes whose env copies are gone, with the reason, until the vector environment has handled them."""
-        self.failures: list[EnvironmentRaised] = []
+        self.failures: list[Failed] = []
         """Errors of environments that raised."""
         self._placement = LanePlacement(self.lanes, _by_name)
         self._tickets = 0
@@ -111,8 +111,8 @@ class OrderCoordinator:
             case Goodbye(_, reason):
                 self.membership.remove(member, Goodbye, f"left: {reason}")
             case Failure(_, error, traceback, lane):
-                hello, spare = member.hello, is_spare(member, self.lanes)
-                failure = EnvironmentRaised(hello.worker, hello.host, lane, error, escaped(traceback), spare)
+                spare = is_spare(member, self.lanes)
+                failure = member.failed(EnvironmentRaised, error, traceback, lane=lane, spare=spare)
                 if not spare:
                     self.failures.append(failure)
                 self.membership.events.append(failure)

@@ -461,7 +461,7 @@ def test_evaluate_gives_up_after_the_number_of_failures_that_its_flag_says(tmp_p
     run = a_run_that_acts(tmp_path, "workers.envs.toy:Raises-v0")
     options = ("--transport", "inproc", "--workers", "1", "--max-env-failures", "0")
     assert main(["evaluate", str(run), *options]) == 1
-    assert "failure 1 within an hour; max_env_failures allows 0" in capsys.readouterr().err
+    assert "; failure 1 in a row; max_env_failures allows 0 in a row" in capsys.readouterr().err
 
 
 def test_a_run_without_a_best_policy_is_told_how_one_is_kept(tmp_path: Path, capsys: Captured) -> None:

@@ -110,7 +110,7 @@ def test_an_error_in_it_arrives_with_its_traceback() -> None:
             service.gather()
     assert re.fullmatch(
         r"worker \S+ \(\S+\): policy Broken: act raised ZeroDivisionError: of the user's; "
-        r"failure 2 within an hour; max_env_failures allows 1",
+        r"failure 2 in a row; max_env_failures allows 1 in a row",
         str(raised.value),
     )
     assert raised.value.exit_code == 1

@@ -187,9 +187,15 @@ def test_a_copy_whose_close_fails_does_not_hurt_the_run(stage: Stage, simulator:
 @pytest.mark.parametrize(
     ("fault", "says"),
     [
-        ("sys.exit", "environment mysim:Sim-v0 cannot be made: SystemExit: 0; failure 1; max_env_failures allows 0"),
-        ("raises", "environment mysim:Sim-v0 cannot be made: OSError: no display; failure 1; max_env_failures allows 0"),
-        ("os._exit", "failure 1; max_env_failures allows 0"),
+        (
+            "sys.exit",
+            "environment mysim:Sim-v0 cannot be made: SystemExit: 0; failure 1 in a row; max_env_failures allows 0",
+        ),
+        (
+            "raises",
+            "environment mysim:Sim-v0 cannot be made: OSError: no display; failure 1 in a row; max_env_failures allows 0",
+        ),
+        ("os._exit", "failure 1 in a row; max_env_failures allows 0"),
     ],
 )
 def test_an_environment_that_fails_in_its_constructor_ends_the_start_and_is_named(

@@ -31,6 +31,7 @@ from protocol.errors import EnvironmentFailed, NoWorkers, RunError, UsageError
 from tests.support import preloaded
 from tests.support.saved_policies import load_policy
 from tests.system.run_folders import summary
+from workers.envs.toy import Countdown
 
 SMALL: dict[str, Any] = {"n_epochs": 2, "eval_episodes": 2}  # these tests do not need a run that learns much
 
@@ -230,6 +231,20 @@ def test_an_environment_that_raises_ends_the_run_with_its_own_traceback(tmp_path
     assert "Traceback" in failure.value.detail
     assert "\n" not in str(failure.value)
     assert "worker w" in str(failure.value)
+
+
+class Unreachable(Countdown):
+    """Cannot be reset."""
+
+    def reset(self, **kwargs: Any) -> Any:
+        raise ConnectionRefusedError("no simulator at this port")
+
+
+def test_an_environment_that_raises_at_each_reset_ends_a_run_of_many_copies_soon(tmp_path: Path) -> None:
+    settings: dict[str, Any] = {"run_dir": str(tmp_path), "transport": "inproc", "workers": 2, "envs": 16, "lanes": 16}
+    with pytest.raises(EnvironmentFailed, match=r"first reset: .*no simulator.*; failure 4 in a row; ") as failure:
+        millrace.train(Unreachable, **settings)
+    assert "in reset\n    raise ConnectionRefusedError" in failure.value.detail, "the traceback is not the worker's"
 
 
 def test_a_run_continues_after_an_environment_raised_once(tmp_path: Path) -> None:

@@ -175,7 +175,9 @@ def test_failures_are_counted_and_the_worker_may_come_back() -> None:
         assert made.failure is None
         made.receive(A, Failure(join(made, A, nonce), "OSError: no display", "where\nit was", None), 1.0)
     assert isinstance(made.failure, EnvironmentFailed)
-    assert str(made.failure) == "worker w0 (host): OSError: no display; failure 2; max_env_failures allows 1"
+    assert (
+        str(made.failure) == "worker w0 (host): OSError: no display; failure 2 in a row; max_env_failures allows 1 in a row"
+    )
     assert made.failure.detail == "where\nit was"
 
 
@@ -191,7 +193,7 @@ def test_a_process_that_ends_while_it_describes_is_a_failure() -> None:
     made.receive(b"supervisor", Alive((), (WorkerExit("w0", 3, why, failed=True),)), 1.0)  # not the member's nonce
     assert made.failure is None
     made.receive(b"supervisor", Alive((), (WorkerExit("w0", 2, why, failed=True),)), 1.0)
-    assert "w0 ended with exit code 0 while it described the environment; failure 2" in str(made.failure)
+    assert "w0 ended with exit code 0 while it described the environment; failure 2 in a row" in str(made.failure)
 
 
 def test_heartbeats_are_answered_and_silence_is_the_end() -> None:

@@ -21,6 +21,7 @@ from learner.rollouts.weight_age import WORKERS, WeightAge
 from protocol.errors import BadMessage, BadRollout, EnvironmentFailed
 from protocol.messages import (
     PROTOCOL_VERSION,
+    Evaluated,
     Failure,
     Goodbye,
     Heartbeat,
@@ -130,7 +131,7 @@ def test_of_a_failure_that_would_fill_the_log_only_the_line_is_logged(caplog: py
 
 def test_no_line_of_a_traceback_looks_like_a_line_of_the_log() -> None:
     forged = "2026-11-22 05:00:00,000 learner: all is well"
-    text = describe(EnvironmentRaised("w", "h", 0, "boom\x9b31m", f"{forged}\n\x1b[2J\r{forged}\u2028{forged}\x85{forged}"))
+    text = describe(EnvironmentRaised("w", "h", "boom\x9b31m", f"{forged}\n\x1b[2J\r{forged}\u2028{forged}\x85{forged}"))
     first, *more = text.splitlines()
     assert "\x9b" not in first
     assert more
@@ -142,10 +143,10 @@ def test_a_failure_names_its_lane_once() -> None:
     error = CopyRaised(1, "step")
     error.__cause__ = ValueError("boom")
     for failed in (lane_failed(0, "step 7", error), lane_failed(0, "step 7", Unusable(1, "boom")), LaneFailed(0, "boom")):
-        line = describe(EnvironmentRaised("w", "h", failed.lane, str(failed), ""))
+        line = describe(EnvironmentRaised("w", "h", str(failed)))
         assert line.startswith("worker w (h): lane 0, ")
         assert line.count("lane 0") == 1
-    assert describe(EnvironmentRaised("w", "h", 0, "lane 0: boom", "")).count("lane 0") == 1, "it is shown as it came"
+    assert describe(EnvironmentRaised("w", "h", "lane 0: boom", "")).count("lane 0") == 1, "it is shown as it came"
 
 
 def test_a_message_that_cannot_be_read_forges_no_line(caplog: pytest.LogCaptureFixture) -> None:
@@ -305,19 +306,40 @@ def test_a_spare_worker_cannot_end_the_run_with_failures() -> None:
         noisy.hears("spare", Failure(session, "boom", "", 0))
     noisy.hub._turn(0.0)
     noisy.hears("honest", Failure(1, "boom", "", 0))
-    with pytest.raises(EnvironmentFailed, match="boom; failure 1 within an hour; max_env_failures allows 0"):
+    with pytest.raises(EnvironmentFailed, match="boom; failure 1 in a row; max_env_failures allows 0 in a row"):
         noisy.hub._turn(0.0)
 
 
 @pytest.mark.parametrize(("apart_s", "ends"), [(3590.0, True), (3600.0, False)])
-def test_only_the_failures_of_an_hour_end_the_run(apart_s: float, ends: bool) -> None:
+def test_failures_after_env_steps_end_the_run_if_there_are_too_many_within_an_hour(apart_s: float, ends: bool) -> None:
+    noisy = Noisy(max_env_failures=1)  # of one env copy: two within the first hour
+    for nonce, later_s in ((2, apart_s), (3, 0.0), (4, 0.0)):
+        session = noisy.joins("honest", nonce)
+        noisy.hears("honest", Heartbeat(session, 0, 0, (), 1, {}, 0), Failure(session, "boom", "", 0))
+        noisy.link.now += later_s
+    if ends:
+        with pytest.raises(EnvironmentFailed, match="boom; failure 3 within an hour; max_env_failures allows 1 "):
+            noisy.hub._turn(0.0)
+    else:
+        noisy.hub._turn(0.0)
+
+
+@pytest.mark.parametrize("between", ["nothing", "a rollout", "episodes of an evaluation"])
+def test_work_between_two_failures_ends_the_row(between: str) -> None:
     noisy = Noisy(max_env_failures=1)
-    for nonce in range(2, 5):
+    for nonce in range(2, 12):
         session = noisy.joins("honest", nonce)
         noisy.hears("honest", Failure(session, "boom", "", 0))
-        noisy.link.now += apart_s
-    if ends:
-        with pytest.raises(EnvironmentFailed, match="boom; failure 2 within an hour; max_env_failures allows 1"):
+        session = noisy.joins("honest", 100 * nonce)
+        ((number, ticket),) = noisy.coordinator.tickets.items()
+        if between == "a rollout":
+            noisy.hears("honest", fake_rollout(session, ticket.lane, number, noisy.coordinator.version, 0))
+            noisy.hub.gather()
+            noisy.hub.publish(noisy.coordinator.version + 1, PARAMETERS, BUFFERS)
+        elif between != "nothing":
+            noisy.hears("honest", Evaluated(session, 0, (), ()))
+    if between == "nothing":
+        with pytest.raises(EnvironmentFailed, match="boom; failure 10 in a row; max_env_failures allows 1 in a row"):
             noisy.hub._turn(0.0)
     else:
         noisy.hub._turn(0.0)
@@ -340,7 +362,7 @@ def test_a_failure_is_told_once_and_the_same_traceback_is_not_repeated(caplog: p
 def test_a_worker_cannot_blame_a_policy_that_is_not_the_users() -> None:
     noisy = Noisy(max_env_failures=0)
     noisy.hears("honest", Failure(1, "boom", "", None, of_policy=True))
-    with pytest.raises(EnvironmentFailed, match="boom; failure 1 within an hour; max_env_failures allows 0"):
+    with pytest.raises(EnvironmentFailed, match="boom; failure 1 in a row; max_env_failures allows 0 in a row"):
         noisy.hub._turn(0.0)
 
 

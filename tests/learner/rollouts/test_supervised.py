@@ -110,7 +110,7 @@ def test_an_exit_is_counted_once_and_its_tickets_are_dealt_again() -> None:
     assert learner.says(SUPERVISOR, said) == []
     why = "ended with exit code 0 in a step of its environment"
     assert learner.coordinator.membership.take_events() == [
-        WorkerProcessFailed("a", "host", why),
+        WorkerProcessFailed("a", "host", f"its process {why}", lanes=(0, 1)),
         WorkerLeft("a", why, held, False),
     ]
 

@@ -791,8 +791,19 @@ def test_failure_forgets_the_worker_and_its_traceback_is_kept_for_the_log() -> N
     outs = learner.says(A, Failure(learner.session(A), "ValueError: x", "Traceback: …", 0))
     assert A not in learner.coordinator.members
     assert [permit.incarnation for permit in permits(outs, B)] == [1]
-    assert EnvironmentRaised("a", "host", 0, "ValueError: x", "Traceback: …") in learner.coordinator.events
+    assert EnvironmentRaised("a", "host", "ValueError: x", "Traceback: …", lanes=(0,)) in learner.coordinator.events
     assert learner.coordinator.events[-1] == WorkerLeft("a", "failed", 1, False)
+
+
+@pytest.mark.parametrize(("lane", "lanes"), [(1, (1,)), (None, (0, 1)), (7, (0, 1))])
+def test_a_failure_belongs_to_its_lane_or_to_all_of_the_workers_lanes(lane: int | None, lanes: tuple[int, ...]) -> None:
+    learner = Learner(lanes=2)
+    learner.joins(A)
+    learner.delivers(learner.tickets(A)[0])
+    learner.says(A, Failure(learner.session(A), "ValueError: x", "", lane))
+    (failed,) = [event for event in learner.coordinator.events if isinstance(event, EnvironmentRaised)]
+    assert failed.lanes == lanes
+    assert failed.stepped, "a rollout has env steps"
 
 
 def test_silent_workers_are_removed_in_tick_only() -> None:

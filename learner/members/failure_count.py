@@ -1,0 +1,56 @@
+"""How many failures of its environments a run survives. Pure: failures and finished work in, a verdict out.
+
+Rule: a failure is counted twice, and either count ends the run.
+
+* In a row: the failures of one lane since its last rollout. `max_env_failures` are allowed, and never more than
+  `MOST_IN_A_ROW`, so that what never works ends the run soon also where many failures are allowed. A failure after env steps
+  counts as `AFTER_STEPS`: by chance, a simulator that often dies fails a few times before a rollout is whole.
+* Within an hour: the failures of all lanes that came after env steps. `max_env_failures` are allowed, and as many again for
+  each env copy and each hour since the learner began. So a mistake in an environment's code ends a run that has just begun,
+  and a run of many copies and hours survives crashes in proportion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+MOST_IN_A_ROW = 10
+AFTER_STEPS = 0.25
+HOUR_S = 3600.0
+
+
+class FailureCount:
+    """The failures of a run. A lane has a number; a worker without a lane is counted by its name."""
+
+    def __init__(self, allowed: int, copies: int = 1, began_s: float = 0.0) -> None:
+        """`allowed`: `max_env_failures`. `copies`: the env copies of the run. `began_s`: when the learner began."""
+        self._allowed, self._copies, self._began_s = allowed, copies, began_s
+        self._in_a_row: dict[int | str, float] = {}
+        self._failed_at_s: list[float] = []  # times of the failures of the last hour, of those after env steps
+
+    def failed(self, lanes: Collection[int | str], stepped: bool, now: float) -> str:
+        """Count one failure, which took these lanes down. Returns why the run ends, or an empty string.
+
+        `stepped`: whether the worker's process is known to have made an env step.
+        """
+        for lane in lanes:
+            self._in_a_row[lane] = self._in_a_row.get(lane, 0.0) + (AFTER_STEPS if stepped else 1.0)
+        if stepped:
+            self._failed_at_s = [*(at_s for at_s in self._failed_at_s if now - at_s < HOUR_S), now]
+            failures, copy_hours = len(self._failed_at_s), self._copies * min(1.0, (now - self._began_s) / HOUR_S)
+            if failures > (allowed := int(self._allowed * (1 + copy_hours))):
+                why = f"{self._allowed}, and as many an hour for each of {self._copies} env copies; set it higher if need be"
+                return f"failure {failures} within an hour; max_env_failures allows {allowed} ({why})"
+        in_a_row, allowed = max(map(self._in_a_row.__getitem__, lanes)), min(self._allowed, MOST_IN_A_ROW)
+        if in_a_row <= allowed:
+            return ""
+        why = f" (one after env steps counts as {AFTER_STEPS:g}; shorter rollouts may help)" if in_a_row % 1 else ""
+        return f"failure {in_a_row:g} in a row{why}; max_env_failures allows {allowed} in a row"
+
+    def collected(self, lane: int) -> None:
+        """A rollout of this lane has arrived."""
+        self._in_a_row.pop(lane, None)
+
+    def evaluated(self) -> None:
+        """Episodes of an evaluation were played; they belong to no lane."""
+        self._in_a_row.clear()

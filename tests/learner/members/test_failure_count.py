@@ -1,0 +1,126 @@
+"""Which failures end a run, and which do not: the table of docs/explanation/faults.md."""
+
+from __future__ import annotations
+
+import pytest
+
+from learner.members.failure_count import HOUR_S, MOST_IN_A_ROW, FailureCount
+
+COPIES = 16  # of one lane each
+TWO_HOURS_S = 2 * HOUR_S
+
+
+def fails(count: FailureCount, times: int, *lanes: int | str, every_s: float = 0.0, stepped: bool = False) -> str:
+    """These lanes fail so many times in a row. Returns why the last one ends the run; none before it does."""
+    whys = [count.failed(lanes, stepped, n * every_s) for n in range(times)]
+    assert not any(whys[:-1])
+    return whys[-1]
+
+
+def crashes_and_collects(count: FailureCount, hours: float, every_s: float) -> float | None:
+    """In turn, each copy collects and crashes. Returns the second at which that ends the run."""
+    for n in range(int(hours * HOUR_S / every_s)):
+        count.collected(n % COPIES)
+        if count.failed((n % COPIES,), True, n * every_s):
+            return n * every_s
+    return None
+
+
+def test_sixteen_copies_that_each_crash_once_in_two_hours_do_not_end_the_run() -> None:
+    assert crashes_and_collects(FailureCount(3, COPIES), 200.0, TWO_HOURS_S / COPIES) is None
+
+
+def test_sixteen_copies_that_crash_at_the_same_moment_every_two_hours_do_not_end_it() -> None:
+    count = FailureCount(3, COPIES)
+    for hours in range(2, 200, 2):
+        for lane in range(COPIES):
+            count.collected(lane)
+            assert count.failed((lane,), True, hours * HOUR_S) == ""
+
+
+@pytest.mark.parametrize(("allowed", "last"), [(0, 1), (3, 4), (MOST_IN_A_ROW, 11), (1_000, 11)])
+def test_a_copy_that_crashes_at_each_reset_ends_it_soon_however_many_failures_are_allowed(allowed: int, last: int) -> None:
+    why = fails(FailureCount(allowed, COPIES), last, 5)
+    assert why == f"failure {last} in a row; max_env_failures allows {last - 1} in a row"
+
+
+def test_rollouts_of_other_lanes_do_not_excuse_a_copy_that_crashes_at_each_reset() -> None:
+    count = FailureCount(3, COPIES)
+    for _ in range(3):
+        assert count.failed((5,), False, 0.0) == ""
+        for lane in range(5):
+            count.collected(lane)
+    assert count.failed((5,), False, 0.0) != ""
+
+
+def test_a_difficult_start_of_each_copy_does_not_end_it() -> None:
+    count = FailureCount(3, COPIES)
+    for lane in range(COPIES):
+        assert fails(count, 3, lane) == ""
+
+
+@pytest.mark.parametrize("stepped", [False, True], ids=["within a heartbeat", "after one"])
+def test_a_mistake_that_strikes_after_a_few_steps_ends_a_run_that_has_just_begun(stepped: bool) -> None:
+    count = FailureCount(3, COPIES)
+    whys = [count.failed((n % 2,), stepped, 5.0 * n) for n in range(7)]  # two workers, each with a lane
+    assert any(whys)
+
+
+def test_a_mistake_at_the_end_of_each_episode_ends_such_a_run_although_rollouts_arrive() -> None:
+    assert crashes_and_collects(FailureCount(3, COPIES), 1.0, every_s=5.0) == 15.0
+
+
+@pytest.mark.parametrize(("allowed", "last"), [(3, 13), (MOST_IN_A_ROW, 41), (1_000, 41)])
+def test_failures_after_steps_with_never_a_rollout_between_end_also_an_old_run(allowed: int, last: int) -> None:
+    """By chance, a simulator that dies in one rollout of two loses 13 in a row about once in 8,000 rollouts."""
+    why = fails(FailureCount(allowed, COPIES), last, 5, every_s=HOUR_S, stepped=True)
+    assert why.startswith(f"failure {last / 4:g} in a row (one after env steps counts as 0.25; shorter rollouts may")
+
+
+def test_a_simulator_that_dies_after_every_few_rollouts_trains_to_the_end_if_so_many_failures_are_allowed() -> None:
+    every_s = 2.0  # 1800 failures an hour
+    assert crashes_and_collects(FailureCount(105, COPIES), 10.0, every_s) is not None  # 105 and 16 times 105 are 1785
+    assert crashes_and_collects(FailureCount(106, COPIES), 10.0, every_s) is None
+
+
+def test_failures_within_an_hour_are_allowed_in_proportion_to_copies_and_hours() -> None:
+    count = FailureCount(2, 8, began_s=100.0)
+    for lane in range(6):
+        assert count.failed((lane,), True, 100.0 + HOUR_S / 4) == ""
+    why = count.failed((6,), True, 100.0 + HOUR_S / 4)
+    more = "2, and as many an hour for each of 8 env copies; set it higher if need be"
+    assert why == f"failure 7 within an hour; max_env_failures allows 6 ({more})"
+
+
+def test_at_most_an_hour_counts_however_long_the_learner_has_run() -> None:
+    count = FailureCount(2, 3)
+    whys = [count.failed((lane,), True, 99 * HOUR_S) for lane in range(9)]
+    assert not any(whys[:-1])
+    assert "failure 9 within an hour; max_env_failures allows 8 " in whys[-1]
+
+
+def test_a_machine_on_which_nothing_works_does_not_end_it_while_its_lanes_work_elsewhere() -> None:
+    count = FailureCount(3, COPIES)
+    for n in range(1_000):
+        assert count.failed((n % COPIES,), False, 30.0 * n) == ""
+        count.collected(n % COPIES)
+
+
+def test_a_failure_that_takes_eight_lanes_down_counts_once() -> None:
+    count = FailureCount(3, COPIES)
+    assert fails(count, 3, *range(8), stepped=True) == ""
+    assert fails(count, 1, *range(8), stepped=True).startswith("failure 4 within an hour")
+
+
+def test_episodes_of_an_evaluation_show_that_the_copies_work() -> None:
+    count = FailureCount(3, COPIES)
+    for _ in range(10):
+        assert fails(count, 3, 0, 1) == ""
+        count.evaluated()
+    assert fails(count, 4, 0, 1) != ""
+
+
+def test_each_worker_that_describes_the_environment_is_counted_by_its_name() -> None:
+    count = FailureCount(3)
+    assert {fails(count, 3, f"w{n}") for n in range(16)} == {""}
+    assert fails(count, 1, "w5") == "failure 4 in a row; max_env_failures allows 3 in a row"
