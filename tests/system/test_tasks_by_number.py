@@ -52,6 +52,15 @@ def test_the_bits_are_the_same_for_any_number_of_workers(
     assert result(train(tmp_path, workers, **settings)) == result(one_worker)
 
 
+def test_a_saved_policy_is_evaluated_on_the_same_tasks_wherever_it_acts(one_worker: Path) -> None:
+    in_workers, in_learner = (
+        millrace.evaluate(one_worker, episodes=8, workers=1, transport="inproc", copies=4, inference=inference)
+        for inference in ("workers", "learner")
+    )
+    assert in_learner == in_workers
+    assert [in_workers.facts[name].missing for name in RETURNS] == [6] * 4
+
+
 def test_without_the_tasks_the_bits_are_others(tmp_path: Path, one_worker: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tasks_by_number, "POLES", dict.fromkeys(tasks_by_number.POLES, 0.5))
     assert result(train(tmp_path, 1)) != result(one_worker)

@@ -151,6 +151,11 @@ def test_other_factories_get_nothing(factory: Any) -> None:
     assert takes_copy(factory, {}) == ""
 
 
+def test_only_the_first_parameter_gets_the_copy() -> None:
+    assert takes_copy(lambda size, copy: None, {"size": 5}) == ""
+    assert takes_copy(lambda copy, size: None, {"size": 5}) == "copy"
+
+
 def test_who_forgot_an_argument_reads_which_one() -> None:
     with pytest.raises(
         UsageError,
