@@ -44,7 +44,8 @@ class FailureCount:
         in_a_row, allowed = max(map(self._in_a_row.__getitem__, lanes)), min(self._allowed, MOST_IN_A_ROW)
         if in_a_row <= allowed:
             return ""
-        why = f" (one after env steps counts as {AFTER_STEPS:g}; shorter rollouts may help)" if in_a_row % 1 else ""
+        hint = "; shorter rollouts may help" if stepped else ""
+        why = f" (one after env steps counts as {AFTER_STEPS:g}{hint})" if in_a_row % 1 else ""
         return f"failure {in_a_row:g} in a row{why}; max_env_failures allows {allowed} in a row"
 
     def collected(self, lane: int) -> None:

@@ -44,6 +44,15 @@ def test_a_copy_that_crashes_at_each_reset_ends_it_soon_however_many_failures_ar
     assert why == f"failure {last} in a row; max_env_failures allows {last - 1} in a row"
 
 
+def test_only_failures_after_env_steps_are_told_that_shorter_rollouts_may_help() -> None:
+    count = FailureCount(3, COPIES)
+    assert fails(count, 1, 5, stepped=True) == ""
+    assert (
+        fails(count, 3, 5)
+        == "failure 3.25 in a row (one after env steps counts as 0.25); max_env_failures allows 3 in a row"
+    )
+
+
 def test_rollouts_of_other_lanes_do_not_excuse_a_copy_that_crashes_at_each_reset() -> None:
     count = FailureCount(3, COPIES)
     for _ in range(3):
