@@ -272,7 +272,9 @@ class OneRun:
             0.05,
         )
         left = [path for path in (self.folder / "tmp").iterdir() if path.name.startswith("millrace-")]
-        assert not left or phase in (Phase.DRAINING, Phase.LEAVING), f"temporary folders were left behind: {left}"
+        # A worker removes the folder of its killed learner: before the first one has started, nobody can.
+        without_workers = phase in (Phase.DRAINING, Phase.LEAVING) or not any((self.folder / "runs").glob("*/workers/*"))
+        assert not left or without_workers, f"temporary folders were left behind: {left}"
         for path in left:
             shutil.rmtree(path)
             self.account.folders += 1

@@ -107,8 +107,8 @@ class Marker:
 
         gather, publish, save = RolloutService.gather, RolloutService.publish, checkpoint.save
 
-        def marked_gather(service: RolloutService) -> Any:
-            found = self.during(Phase.COLLECTING, gather, Phase.UPDATING)(service)
+        def marked_gather(service: RolloutService, *args: Any) -> Any:
+            found = self.during(Phase.COLLECTING, gather, Phase.UPDATING)(service, *args)
             self._gathered += 1
             return found
 
