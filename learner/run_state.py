@@ -23,7 +23,7 @@ from learner.run_folder.episode_window import EpisodeWindow
 from learner.run_folder.results import Evaluation
 from learner.run_folder.run_folder import RunFolder
 from protocol.arrays import Floats
-from protocol.bounds import Natural, Real, Seconds, Version
+from protocol.bounds import Natural, Real, Seconds, Version, one_line
 from protocol.errors import BadMessage, CheckpointError, UsageError
 from protocol.policy.layout import buffer_layout, named_views
 from protocol.rollout import Episode
@@ -112,9 +112,8 @@ def start_from(config: Config, policy: PolicySpec, algorithm: Algorithm) -> str:
     try:
         algorithm.start_from(Start(state, len(parameters), critic=parts in ("critic", "all"), optimizer=parts == "all"))
     except MISFITS as error:
-        raise UsageError(
-            f"{where}: from_parts {parts}: expected the state of {config.algo}, got another ({error})"
-        ) from error
+        why = one_line(str(error))
+        raise UsageError(f"{where}: from_parts {parts}: expected the state of {config.algo}, got another ({why})") from error
     if not algorithm.is_finite():
         raise UsageError(f"{where}: expected finite weights and statistics, got NaN or infinity; start from another run")
     return f"starts from {run} ({card.env}): {taken}"

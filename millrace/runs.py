@@ -245,7 +245,8 @@ def train(
         watch: Called with a `Progress` after each update, and several times a second during an evaluation or a long wait.
         progress: Show how far the run is: in one display in a notebook, in place on a terminal, else in a line every 5 s.
         **keywords: The flags of `millrace train`, by the same names: `learning_rate=1e-3`. `algo` may be a class of your own
-            (`millrace.algorithms`). A class that was made in a script or a notebook is given again on resume.
+            (`millrace.algorithms`). A class that was made in a script or a notebook is given again on resume. `start_from`
+            may be a `Run`: the new run begins with its policy (`--from`).
 
     Returns the `Run`. Raises `UserFacingError` with a message of one line. In a script, guard the call with
     `if __name__ == "__main__":`.

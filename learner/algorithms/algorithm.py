@@ -36,8 +36,9 @@ class Start(NamedTuple):
         `weights` and `optimizers`: their names in the state. Of `parameters` and `target`, the first P act. Raises
         `ValueError` if a tensor has another shape or dtype than in the new algorithm.
         """
-        state = self.state
-        taken = {name: state[name] for name in ("observations",) if name in state}
+        state, taken = self.state, dict[str, Any]()
+        if "observations" in state:
+            taken["observations"] = state["observations"]
         if "rewards" in state and "rewards" in fresh:
             taken["rewards"] = {"moments": state["rewards"]["moments"], "returns": {}}
         for name in weights if self.critic else {"parameters", "target"}.intersection(weights):

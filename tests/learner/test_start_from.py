@@ -237,7 +237,8 @@ def test_a_state_of_another_form_is_refused(tmp_path: Path) -> None:
         ({"parameters": state["parameters"].double()}, "got torch.float64"),
         ({"parameters": "text"}, "'str' object"),
         ({"parameters": torch.full_like(state["parameters"], torch.nan)}, "expected finite weights"),
-        ({"observations": moments | {"mean": torch.zeros(3), "squares": torch.zeros(3)}}, "shape"),
+        ({"observations": moments | {"mean": torch.zeros(3)}}, "shape"),
+        ({"rewards": {"moments": moments | {"mean": torch.zeros(3)}}}, "non-scalar"),
         ({"rewards": {}}, "'moments'"),
     ):
         content = {"past": {}, "best_policy": None, "algorithm": state | wrong}
