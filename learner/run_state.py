@@ -102,7 +102,10 @@ def start_from(config: Config, policy: PolicySpec, algorithm: Algorithm) -> str:
         if found := first_difference(*(both if name == "observation" else ((one,) for one in both))):
             wrong = f"{name} of its policy: expected {found[0]} as in this run, got {found[1]}"
             raise UsageError(f"{where}: {wrong}; take the algorithm and the settings of that policy, or another one")
-    if parts != "best" and checkpoint.has_any(run):
+    whole = parts != "best" and checkpoint.has_any(run)
+    if parts == "auto":
+        parts = "critic" if whole and policy.stores_scaled_actions else "policy"
+    if whole:
         saved = _newest(run)
         state, taken = saved.state["algorithm"], f"policy, statistics{BESIDES[parts]}, after {saved.env_steps:,} env steps"
     elif parts in ("policy", "best"):

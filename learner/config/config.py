@@ -42,9 +42,10 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     A folder with policy.json and policy.safetensors alone does as well. All other settings are those of the new run, and
     schedules start anew. A resumed run does not read the folder again: see docs/how-to/start_from.md.
     """
-    from_parts: Fixed[Literal["policy", "best", "critic", "all"]] = "policy"
+    from_parts: Fixed[Literal["auto", "policy", "best", "critic", "all"]] = "auto"
     """What `--from` takes. policy: the newest policy and the statistics. best: the policy of the best evaluation. critic:
     also the critic, the target networks and the temperature. all: also the optimizers. A replay buffer is never taken.
+    auto: critic with sac and td3, whose actor follows the critic at once, if the run has a checkpoint; else policy.
     """
     device: Free[Literal["auto", "cpu", "cuda"]] = "auto"
     """Device of the learner. auto: cuda if PyTorch finds a GPU, else cpu."""

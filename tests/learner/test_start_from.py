@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +112,7 @@ def assert_same(got: Any, expected: Any) -> None:
 @ALL
 def test_the_policy_and_the_statistics_are_taken_and_all_else_starts_anew(tmp_path: Path, algo: str) -> None:
     run, before = earlier_run(algo, tmp_path)
-    algorithm, said = started(algo, tmp_path, run)
+    algorithm, said = started(algo, tmp_path, run, from_parts="policy")
     fresh = made(algo, tmp_path / "new")[1].state_dict()
     P = len(before.weights()[0])
     assert said == f"starts from {run} (made:Env-v0): policy, statistics, after {before.env_steps} env steps"
@@ -144,6 +145,16 @@ def test_all_weights_are_taken_with_the_critic_and_the_moments_of_optimizers_wit
             assert state[name]["param_groups"][0]["lr"] == 0.25
         assert (algorithm.env_steps, algorithm.version) == (0, 0)
         algorithm.update(rows(algorithm, 3), no_pulse)
+
+
+@pytest.mark.parametrize(("algo", "critic"), [("ppo", ""), ("dqn", ""), ("sac", ", critic"), ("td3", ", critic")])
+def test_the_critic_comes_too_where_the_actor_follows_it_at_once(tmp_path: Path, algo: str, critic: str) -> None:
+    run, before = earlier_run(algo, tmp_path)
+    assert f"): policy, statistics{critic}, after " in started(algo, tmp_path, run)[1]
+    shutil.rmtree(run / "checkpoints")
+    algorithm, said = started(algo, tmp_path, run)
+    assert said.endswith("): policy")
+    assert np.array_equal(algorithm.weights()[0], before.weights()[0])
 
 
 def test_a_fixed_temperature_is_a_setting_and_is_not_taken(tmp_path: Path) -> None:

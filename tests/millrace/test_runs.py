@@ -221,7 +221,7 @@ def test_a_run_from_another_takes_it_once_and_gives_the_same_bits_for_any_number
     more: dict[str, Any] = {"start_from": run, "run_dir": tmp_path / "new", "seed": 2, "steps": 128}
     one, two = (millrace.train("CartPole-v1", **more, **SMALL | {"workers": workers}) for workers in (1, 2))
     assert policy_of(one) == policy_of(two)
-    assert (one.config.start_from, one.config.from_parts) == (str(run.path), "policy")
+    assert (one.config.start_from, one.config.from_parts) == (str(run.path), "auto")
     one.resume(steps=192, progress=False)
     shutil.rmtree(run.path)
     two.resume(steps=192, workers=1, progress=False)
