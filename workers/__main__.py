@@ -116,6 +116,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         "--parent", type=int, default=0, help=argparse.SUPPRESS
     )  # be a worker; leave when it is not the parent
     parser.add_argument("--activity", type=int, help=argparse.SUPPRESS)  # descriptor of the page that the parent reads
+    parser.add_argument("--slots", type=int, help=argparse.SUPPRESS)  # descriptor whose locks the parent holds too
     parser.add_argument("--handed", default="", help=argparse.SUPPRESS)  # descriptors of shared memory
     return parser
 

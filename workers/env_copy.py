@@ -1,6 +1,7 @@
 """The env copies that this process makes: which one it is making now, and the slots that they hold.
 
-Rule: a copy holds its slot from before it is made until after it was closed, so no two live copies have the same one.
+Rule: a copy holds its slot from before it is made until after it was closed, so no two live copies have the same one. If
+its constructor raises, it may have started something: then the slot is free when the process and its children have ended.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ class CopySlots:
 
     @contextmanager
     def making(self, copy: EnvCopy) -> Iterator[None]:
-        """Within it, this copy is made, with a slot of its own, which is free again if it cannot be made."""
+        """Within it, this copy is made, with a slot of its own."""
         slot = slots().take()
         self._slots.append(slot)
         _held.append(slot)
@@ -34,7 +35,8 @@ class CopySlots:
         try:
             yield
         except BaseException:
-            self._give_back(slot)
+            self._slots.remove(slot)
+            _held.remove(slot)
             raise
         finally:
             being_made.reset(token)

@@ -27,8 +27,10 @@ from protocol.wire.worker_link import WorkerLink
 from workers.connection_rules import wait_limits_s
 from workers.security import allowed_code
 from workers.session import NO_LEARNER, Session
+from workers.slots import share_slots
 from workers.supervise.activity import Activity, activity, share_activity
-from workers.supervise.worker_process import NONCE_VARIABLE
+from workers.supervise.process_group import live_members
+from workers.supervise.worker_process import KILLED_WITHIN_S, NONCE_VARIABLE, POLL_S
 from workers.supervisor import EXIT_NO_LEARNER
 from workers.watchdog import Watchdog
 from workers.worker import Worker, WorkerOptions, identity, parent_is_gone
@@ -43,6 +45,8 @@ def work(flags: argparse.Namespace, token: Token | None, timeouts: CallTimeouts,
     nonce = int(os.environ.pop(NONCE_VARIABLE, "0")) or None
     if flags.activity is not None:
         share_activity(Activity(flags.activity))
+    if flags.slots is not None:
+        share_slots(flags.slots)
     try:
         link = WorkerLink(flags.address, flags.name, token=token)
     except UserFacingError as error:
@@ -93,9 +97,18 @@ def _end_after_supervisor(parent: int, address: str) -> None:
 
 
 def _kill_own_group() -> None:
-    """End this process with all that its environment has started: the supervisor cannot do it any more."""
+    """End this process after all that its environment has started: the supervisor cannot do it any more.
+
+    This process is the last one, because it alone holds the slots of its env copies now.
+    """
     if os.getpgrp() == os.getpid():
         sys.stderr.flush()
+        give_up_at_s = time.monotonic() + KILLED_WITHIN_S
+        while (others := set(live_members(os.getpid())) - {os.getpid()}) and time.monotonic() < give_up_at_s:
+            for pid in others:
+                with suppress(ProcessLookupError, PermissionError):
+                    os.kill(pid, signal.SIGKILL)
+            time.sleep(POLL_S)
         os.killpg(os.getpid(), signal.SIGKILL)
 
 

@@ -41,7 +41,7 @@ class Slots:
             while slot in self._taken or not _is_locked_by(self.fd, slot):
                 slot += 1
             self._taken.add(slot)
-            os.utime(self.fd)  # what cleans /tmp deletes what is old
+            touch(self.fd)
             return slot
 
     def give_back(self, slot: int) -> None:
@@ -60,6 +60,13 @@ def slots() -> Slots:
     if _of_process is None or _of_process.pid != os.getpid():  # a fork shares the open file, and so the locks
         _of_process = Slots()
     return _of_process
+
+
+def share_slots(fd: int) -> None:
+    """Hold the slots of this process, a worker, together with its supervisor, which has opened the file."""
+    global _of_process
+    os.set_inheritable(fd, False)
+    _of_process = Slots(fd)
 
 
 def open_slots() -> int:
@@ -83,6 +90,12 @@ def free_all(fd: int) -> None:
     """Free every slot that is held through this descriptor, also for those who share it, and close it."""
     _lock(fd, fcntl.F_UNLCK, 0, 0)
     os.close(fd)
+
+
+def touch(fd: int) -> None:
+    """Mark the file as used: what cleans /tmp deletes what is old, and then new processes would see no slot taken."""
+    with suppress(OSError):
+        os.utime(fd)
 
 
 def _unusable(path: Path, why: str) -> UsageError:

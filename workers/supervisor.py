@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from protocol.alive import NO_TIMEOUTS, CallTimeouts, WorkerActivity, WorkerExit
+from protocol.errors import UsageError
 from workers.supervise.ending import Ending
 
 log = logging.getLogger("millrace.worker")
@@ -154,7 +155,7 @@ class Supervisor:
     def _restart(self, slot: _WorkerSlot, now: float) -> None:
         try:
             slot.running = self._start(slot.name)
-        except OSError as error:  # the system has no memory, or no process, for it now
+        except (OSError, UsageError) as error:  # the system has no memory, process or file for it now
             log.warning("worker %s cannot be started, which is tried again: %s", slot.name, error)
             self._schedule(slot, now)
             return

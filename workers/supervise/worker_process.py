@@ -1,8 +1,9 @@
 """A worker in a process of its own, as its supervisor starts it, watches it and ends it.
 
 Rule: the worker has a process group of its own. When the worker has ended, whatever its environment started in that group is
-killed. If a call of the environment takes too long, the worker writes its stacks and is killed. A worker that leaves on
-purpose says so beforehand: any other end is not on purpose, whatever the exit code.
+killed; the slots of its env copies are free when all of it is gone, because this process holds them too. If a call of the
+environment takes too long, the worker writes its stacks and is killed. A worker that leaves on purpose says so beforehand:
+any other end is not on purpose, whatever the exit code.
 """
 
 from __future__ import annotations
@@ -23,8 +24,10 @@ from protocol.alive import NO_ENVIRONMENT_CODE, CallTimeouts, Doing, WorkerActiv
 from protocol.bounds import one_line
 from protocol.keys.key_folder import TOKEN_VARIABLE
 from protocol.keys.keys import Token
+from workers.slots import free_all, open_slots, touch
 from workers.supervise.activity import STACK_SIGNAL, ActivityReader
 from workers.supervise.ending import Ending
+from workers.supervise.process_group import live_members, process_stat
 from workers.watchdog import deepest_frame, where_it_hung
 
 log = logging.getLogger("millrace.worker")
@@ -71,13 +74,17 @@ class WorkerProcess:
     def __init__(self, start: WorkerCommand) -> None:
         self.name, self._log = start.name, start.log
         self.process_nonce = int.from_bytes(os.urandom(6), "little")
+        self._slots = open_slots()
         self._page = ActivityReader()
         self._because = ""  # why the supervisor ends it
         self._kill_at_s = float("inf")
         self._end: Ending | None = None
+        self._exit_code: int | None = None  # of the worker; what it started may not be gone yet
+        self._give_up_at_s = float("inf")
         self._was_reaped = False  # by the system: then its exit code is not known
         command = [sys.executable, "-P", "-m", "workers", start.address, "--name", start.name]
-        command += ["--parent", str(os.getpid()), "--activity", str(self._page.fd), *start.flags]
+        command += ["--parent", str(os.getpid()), "--activity", str(self._page.fd)]
+        command += ["--slots", str(self._slots), *start.flags]
         if start.shared_memory is not None:
             command += ["--handed", ",".join(map(str, start.shared_memory))]
         # The child must find the modules that its parent found: a user's environment may lie beside the user's script.
@@ -94,10 +101,11 @@ class WorkerProcess:
                     stderr=stderr if start.log else None,
                     start_new_session=True,  # only the supervisor gets the Ctrl-C of the terminal
                     env={**os.environ, **SINGLE_THREADED, **secret, "PYTHONPATH": path},
-                    pass_fds=(self._page.fd, *(start.shared_memory or ())),
+                    pass_fds=(self._page.fd, self._slots, *(start.shared_memory or ())),
                 )
         except BaseException:
             self._page.close()
+            free_all(self._slots)
             raise
 
     @property
@@ -106,24 +114,34 @@ class WorkerProcess:
         return self._process.pid
 
     def ended(self) -> Ending | None:
-        """How it ended, or None while it runs."""
-        if self._end is None and self._has_ended():
-            self._kill_group()  # before the process is reaped: until then nobody else can have its id
-            self._end = self._ending(self._process.wait())
+        """How it ended, or None while it runs, or while something that it started is not gone."""
+        if self._runs():
+            return None
+        if self._end is None:
+            if left := live_members(self.pid):
+                if time.monotonic() < self._give_up_at_s:
+                    return None
+                line = "worker %s has ended, and processes %s of its environment do not, so its slots stay taken"
+                log.warning(line, self.name, left)
+            else:
+                free_all(self._slots)
+            assert self._exit_code is not None
+            self._end = self._ending(self._exit_code)
             self._page.close()
         return self._end
 
     def activity(self, now: float) -> WorkerActivity | None:
         """What it does. None if it has ended, or if it is stopped: then nobody speaks for it."""
-        if self.ended() is not None or _is_stopped(self.pid):
+        if not self._runs() or _is_stopped(self.pid):
             return None
         page = self._page.read(now)
         return WorkerActivity(self.name, self.process_nonce, page.doing, page.for_s, page.env_calls)
 
     def enforce(self, timeouts: CallTimeouts, now: float) -> None:
         """End it if a call of its environment takes too long, or if it does not end although it leaves."""
-        if self.ended() is not None:
+        if not self._runs():
             return
+        touch(self._slots)
         if now >= self._kill_at_s:
             self.kill()
         elif not self._because:
@@ -142,14 +160,14 @@ class WorkerProcess:
         With Linux's autogroup, niceness counts only within a session, and a worker is a session of its own. So the session
         gets the niceness, too.
         """
-        if self.ended() is None:
+        if self._runs():
             os.setpriority(os.PRIO_PROCESS, self.pid, LOWEST_PRIORITY)
             with suppress(OSError):  # this system has no autogroup
                 Path(f"/proc/{self.pid}/autogroup").write_text(str(LOWEST_PRIORITY))
 
     def stop(self) -> None:
         """SIGTERM: it finishes the rollout in progress, and leaves."""
-        if self.ended() is None:
+        if self._runs():
             self._process.terminate()
 
     def wait(self, timeout_s: float) -> None:
@@ -172,10 +190,18 @@ class WorkerProcess:
 
     def kill(self) -> None:
         """SIGKILL to its process group, for a worker that hangs."""
-        if self.ended() is None:
+        if self._runs():
             self._kill_group()
 
     # ---------------------------------------------------------------- inside
+
+    def _runs(self) -> bool:
+        """Whether the worker runs. When it has ended, its group is killed and it is reaped."""
+        if self._exit_code is None and self._has_ended():
+            self._kill_group()  # before the process is reaped: until then nobody else can have its id
+            self._exit_code = self._process.wait()
+            self._give_up_at_s = time.monotonic() + KILLED_WITHIN_S
+        return self._exit_code is None
 
     def _has_ended(self) -> bool:
         """Whether it has ended. It is not reaped, where the system can tell without."""
@@ -245,7 +271,4 @@ def _opened(log: Path | None) -> BinaryIO:
 
 def _is_stopped(pid: int) -> bool:
     """Whether the process is stopped by a signal or a debugger. False on a system without /proc."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()[0] in "Tt"
-    except (OSError, IndexError):
-        return False
+    return process_stat(pid)[:1] in (["T"], ["t"])

@@ -1,0 +1,113 @@
+"""When a process group is gone, and who holds the slots of env copies until then."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from workers.slots import Slots
+from workers.supervise import worker_process
+from workers.supervise.process_group import live_members, process_stat
+from workers.supervise.worker_process import WorkerCommand, WorkerProcess
+
+WITHIN_S = 60.0
+SIMULATOR = "simulator = subprocess.Popen(['sleep', '1000'])"
+
+
+@contextmanager
+def group(program: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A process that leads a group and runs this program, and the first line that it prints."""
+    command = [sys.executable, "-c", f"import os, subprocess, sys, threading, time\n{program}"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True) as process:
+        try:
+            assert process.stdout is not None
+            yield process, process.stdout.readline()
+        finally:
+            if process.returncode is None:
+                os.killpg(process.pid, signal.SIGKILL)
+
+
+def ended_but_not_reaped(process: subprocess.Popen[str]) -> None:
+    os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+
+
+def wait_until(is_so: Callable[[], Any]) -> None:
+    deadline_s = time.monotonic() + WITHIN_S
+    while not is_so():
+        assert time.monotonic() < deadline_s
+        os.sched_yield()
+
+
+def test_a_zombie_that_nobody_reaps_is_gone() -> None:
+    with group("print(flush=True)") as (process, _):
+        ended_but_not_reaped(process)
+        assert process_stat(process.pid)[0] == "Z"
+        assert live_members(process.pid) == []
+
+
+def test_a_process_whose_first_thread_has_ended_is_not_gone() -> None:
+    program = "import ctypes; threading.Thread(target=time.sleep, args=(1000,)).start(); print(flush=True)"
+    with group(f"{program}; ctypes.CDLL(None).pthread_exit(None)") as (process, _):
+        wait_until(lambda: process_stat(process.pid)[0] == "Z")
+        assert live_members(process.pid) == [process.pid]
+
+
+def test_what_a_dead_process_started_is_not_gone() -> None:
+    with group(f"{SIMULATOR}; print(simulator.pid, flush=True); os._exit(0)") as (process, simulator):
+        ended_but_not_reaped(process)
+        assert live_members(process.pid) == [int(simulator)]
+
+
+@pytest.mark.parametrize("gives_up", [False, True])
+def test_the_slots_of_a_killed_worker_stay_taken_until_its_simulator_is_gone(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, *, gives_up: bool
+) -> None:
+    program = f"import os, subprocess, sys; from workers.slots import Slots; Slots(int(sys.argv[1])).take(); {SIMULATOR}"
+
+    def popen(command: list[str], **how: Any) -> subprocess.Popen[bytes]:
+        taker = [sys.executable, "-c", f"{program}; print(simulator.pid, flush=True); os.kill(os.getpid(), 9)"]
+        return subprocess.Popen([*taker, command[command.index("--slots") + 1]], **how | {"stdout": subprocess.PIPE})
+
+    monkeypatch.setattr(worker_process, "popen", popen)
+    monkeypatch.setattr(worker_process, "KILLED_WITHIN_S", 0.0 if gives_up else WITHIN_S)
+    worker, others = WorkerProcess(WorkerCommand("ipc:///nobody/listens/here", "w0")), Slots()
+    monkeypatch.setattr(worker, "_kill_group", lambda: None)  # the system takes its time
+    with worker._process:
+        assert worker._process.stdout is not None
+        simulator = int(worker._process.stdout.readline())
+        wait_until(lambda: not worker._runs())
+        try:
+            assert (worker.ended() is not None) == gives_up
+            assert others.take() == 1
+            others.give_back(1)
+        finally:
+            os.kill(simulator, signal.SIGKILL)
+    wait_until(lambda: worker.ended() is not None)
+    assert others.take() == (1 if gives_up else 0)
+    said = [f"worker w0 has ended, and processes [{simulator}] of its environment do not, so its slots stay taken"]
+    assert [record.message for record in caplog.records] == (said if gives_up else [])
+
+
+def test_a_worker_whose_supervisor_was_killed_ends_after_its_simulators() -> None:
+    program = (
+        "from workers import program; members = program.live_members; "
+        "program.live_members = lambda group: print(*(found := members(group)), flush=True) or found"
+    )
+    with group(f"{program}; {SIMULATOR}; print(simulator.pid, flush=True); program._kill_own_group()") as (
+        process,
+        simulator,
+    ):
+        assert process.stdout is not None
+        said = process.stdout.read()
+        seen = [sorted(map(int, line.split())) for line in said.splitlines()]
+        assert seen[0] == sorted([process.pid, int(simulator)])
+        assert seen[-1] == [process.pid]
+        assert process.wait() == -signal.SIGKILL
