@@ -240,7 +240,7 @@ class Hub:
     def waiting(self, now: float) -> str:
         """Who waits for whom, in one line for people; empty if nobody waits long."""
         no_worker = f"a worker to join at {self.link.address}{self._server.missing_reason()}"
-        return self._time.line(self.coordinator, now, no_worker)
+        return self._time.line(self.coordinator, now, no_worker, self._processes.held_up())
 
     # ---------------------------------------------------------------- what others ask and tell
 

@@ -39,12 +39,15 @@ class LearnerTime:
         """Seconds of each phase until now."""
         return self.spent_s | {self.phase: self.spent_s[self.phase] + now - self.since_s}
 
-    def line(self, coordinator: TicketCoordinator, now: float, no_worker: str) -> str:
-        """Who waits for whom; empty if nobody waits long. `no_worker`: what is awaited if there is none."""
+    def line(self, coordinator: TicketCoordinator, now: float, no_worker: str, stepping: str = "") -> str:
+        """Who waits for whom; empty if nobody waits long. `no_worker`: what is awaited if there is none.
+
+        `stepping`: who is held up, if the members do not step the environment themselves.
+        """
         lasts_s, spent_s, members, text = now - self.since_s, self.until(now), coordinator.members, ""
         total_s = spent_s["gathering"] + spent_s["learning"]
         if members and (plan := coordinator.evaluation.plan) is not None:
-            return _played(coordinator, plan, lasts_s, now)
+            return _played(coordinator, plan, lasts_s, now, stepping)
         if lasts_s < LONG_S:
             text = f"waited {self._waited_s:.0f} s for rollouts" if self._waited_s >= LONG_S else ""
         elif self.phase == "learning":
@@ -53,14 +56,14 @@ class LearnerTime:
         elif not members:
             text = f"waiting {lasts_s:.0f} s for {no_worker}"
         elif coordinator.tickets and self.phase == "gathering":
-            text = f"waiting {lasts_s:.0f} s for {_awaited(coordinator, now)}"
+            text = f"waiting {lasts_s:.0f} s for {_awaited(coordinator, now, stepping)}"
         if text and total_s >= SHARES_AFTER_S:
             gather, learn = spent_s["gathering"] / total_s, spent_s["learning"] / total_s
             text += f"; so far {gather:.0%} waiting for rollouts, {learn:.0%} learning"
         return one_line(text)
 
 
-def _awaited(coordinator: TicketCoordinator, now: float) -> str:
+def _awaited(coordinator: TicketCoordinator, now: float, stepping: str) -> str:
     """The lanes of the worker that is held up longest, that worker, and how many other lanes are awaited."""
     lanes: dict[bytes, set[int]] = {}
     for ticket in coordinator.tickets.values():
@@ -68,12 +71,12 @@ def _awaited(coordinator: TicketCoordinator, now: float) -> str:
     (*_, who), peer = max((held_up(coordinator.members[peer], now), peer) for peer in lanes)
     mine, more = sorted(lanes.pop(peer)), sum(map(len, lanes.values()))
     named = ", ".join(map(str, mine[:MOST_LANES])) + ", …" * (len(mine) > MOST_LANES)
-    return f"lane{'s' * (len(mine) > 1)} {named} ({who})" + (f" and {more} more" if more else "")
+    return f"lane{'s' * (len(mine) > 1)} {named} ({stepping or who})" + (f" and {more} more" if more else "")
 
 
-def _played(coordinator: TicketCoordinator, plan: EvaluationPlan, for_s: float, now: float) -> str:
+def _played(coordinator: TicketCoordinator, plan: EvaluationPlan, for_s: float, now: float, stepping: str) -> str:
     """How far an evaluation is, and who is held up longest of those that play it."""
     evaluation = coordinator.evaluation
     (*_, who) = max((held_up(coordinator.members[peer], now) for peer in evaluation.holders), default=("nobody plays",))
     done = f"{evaluation.episodes_played} of {len(plan.seeds)} episodes (at most {plan.most_steps:,} env steps each)"
-    return one_line(f"evaluating{' the best policy' * plan.of_best} for {for_s:.0f} s: {done}; {who}")
+    return one_line(f"evaluating{' the best policy' * plan.of_best} for {for_s:.0f} s: {done}; {stepping or who}")

@@ -454,6 +454,10 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         """Number of workers that have joined."""
         return self._hub.worker_count
 
+    def held_up(self) -> str:
+        """Which worker is held up longest, and in what; empty if none is for long. For any thread."""
+        return self._hub.held_up()
+
     def wait_for(self, workers: int, timeout_s: float) -> None:
         """Wait until this many workers have joined. Raises `NoWorkers`."""
         self._hub.wait_for(workers, timeout_s)

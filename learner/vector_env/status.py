@@ -30,5 +30,4 @@ def status(coordinator: OrderCoordinator, now: float) -> Status:
 
 def status_of_run(run: Status, coordinator: OrderCoordinator, now: float) -> Status:
     """The status message of a run that acts on the copies of a vector environment: its own figures, and these workers."""
-    waiting = run.waiting + late(coordinator.members.values(), now, "; " if run.waiting else "waiting for ")
-    return replace(run, workers=coordinator.membership.status(now), waiting=waiting)
+    return replace(run, workers=coordinator.membership.status(now))

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from learner.members.events import Event, WorkerLeft
+from learner.members.held_up import late
 from learner.members.member_server import MemberServer, ServerCallbacks, ServerSettings
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator
@@ -146,6 +147,10 @@ class StepHub:
     def worker_count(self) -> int:
         """Number of workers that have joined."""
         return len(self._coordinator.members)
+
+    def held_up(self) -> str:
+        """Which worker is held up longest, and in what; empty if none is for long. For any thread."""
+        return late(list(self._coordinator.members.values()), self._clock(), "")
 
     def call_while_waiting(self, callback: Callable[[], None]) -> None:
         """Call this now and then while waiting; what it raises ends the wait."""

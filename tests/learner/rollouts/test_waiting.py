@@ -173,6 +173,14 @@ def test_an_evaluation_says_how_far_it_is_and_who_is_held_up(purpose: Purpose, w
     assert run.line == f"waiting 41 s for {NO_WORKER}"
 
 
+def test_if_the_members_only_act_the_worker_that_steps_is_named() -> None:
+    run = Run()
+    run.turn("gathering")
+    run.learner.now += 5.0
+    line = run.time.line(run.learner.coordinator, run.learner.now, NO_WORKER, "worker w1 on cpu2: in reset for 4 s")
+    assert line == "waiting 5 s for lanes 0, 1 (worker w1 on cpu2: in reset for 4 s)"
+
+
 def test_of_a_vector_environment_it_names_who_is_held_up() -> None:
     run = Run(workers=(A, B))
     members = run.learner.coordinator.members
