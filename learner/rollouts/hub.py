@@ -154,6 +154,7 @@ class Hub:
         Raises `RunError` if a parameter is too large for `weights_dtype`.
         """
         sent = to_wire_dtype(parameters, self.settings.weights_dtype)
+        self._time.learned(self.coordinator, self._clock())
         self._weight_age.published(version, self._clock())
         self._server.send(self.coordinator.publish(version, sent, buffers, deal=deal, env_attributes=env_attributes))
 

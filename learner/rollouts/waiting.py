@@ -25,15 +25,22 @@ class LearnerTime:
 
     def __init__(self, now: float) -> None:
         self.phase: Phase = "starting"
-        self.since_s, self._waited_s = now, 0.0  # how long it waited for rollouts last
+        self.since_s, self._last = now, ""  # who waited last; empty if the last wait for rollouts was short
         self.spent_s: dict[Phase, float] = dict.fromkeys(get_args(Phase), 0.0)
         """seconds of the phases that have ended"""
 
     def turn(self, phase: Phase, now: float) -> None:
         """From now on the learner does this."""
         if self.phase == "gathering":
-            self._waited_s = now - self.since_s
+            waited_s = now - self.since_s
+            self._last = f"waited {waited_s:.0f} s for rollouts" if waited_s >= LONG_S else ""
         self.spent_s, self.phase, self.since_s = self.until(now), phase, now
+
+    def learned(self, coordinator: TicketCoordinator, now: float) -> None:
+        """New weights are about to be sent to the workers that wait for them."""
+        if self.phase == "learning":
+            self._last = _learning(coordinator, now - self.since_s) or self._last
+            self.turn("learning", now)
 
     def until(self, now: float) -> dict[Phase, float]:
         """Seconds of each phase until now."""
@@ -49,10 +56,9 @@ class LearnerTime:
         if members and (plan := coordinator.evaluation.plan) is not None:
             return _played(coordinator, plan, lasts_s, now, stepping)
         if lasts_s < LONG_S:
-            text = f"waited {self._waited_s:.0f} s for rollouts" if self._waited_s >= LONG_S else ""
+            text = self._last
         elif self.phase == "learning":
-            idle = sum(not member.tickets for member in members.values() if member.lanes)
-            text = f"learning for {lasts_s:.0f} s" + (f"; {idle} of {len(members)} workers wait for weights" if idle else "")
+            text = _learning(coordinator, lasts_s)
         elif not members:
             text = f"waiting {lasts_s:.0f} s for {no_worker}"
         elif coordinator.tickets and self.phase == "gathering":
@@ -61,6 +67,14 @@ class LearnerTime:
             gather, learn = spent_s["gathering"] / total_s, spent_s["learning"] / total_s
             text += f"; so far {gather:.0%} waiting for rollouts, {learn:.0%} learning"
         return one_line(text)
+
+
+def _learning(coordinator: TicketCoordinator, for_s: float) -> str:
+    """For how long the learner learns, and how many workers have lanes and no ticket; empty if it is not for long."""
+    members = coordinator.members.values()
+    idle = sum(not member.tickets for member in members if member.lanes) if for_s >= LONG_S else 0
+    waiting = f", {idle} of {len(members)} workers waiting for weights" if idle else ""
+    return f"learning for {for_s:.0f} s{waiting}" if for_s >= LONG_S else ""
 
 
 def _awaited(coordinator: TicketCoordinator, now: float, stepping: str) -> str:

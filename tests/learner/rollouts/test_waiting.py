@@ -118,7 +118,7 @@ def test_with_a_lag_every_lane_that_may_bring_the_next_rollout_counts_once() -> 
     assert run.line == "waiting 3 s for lane 0 (worker a on host-of-a: in step for 3 s) and 1 more"
 
 
-@pytest.mark.parametrize(("max_lag", "idle"), [(0, "; 1 of 1 workers wait for weights"), (1, "")])
+@pytest.mark.parametrize(("max_lag", "idle"), [(0, ", 1 of 1 workers waiting for weights"), (1, "")])
 def test_while_it_learns_only_workers_without_a_ticket_wait(max_lag: int, idle: str) -> None:
     run = Run(max_lag=max_lag)
     for number in run.learner.tickets()[:2]:
@@ -127,7 +127,14 @@ def test_while_it_learns_only_workers_without_a_ticket_wait(max_lag: int, idle: 
     run.turn("learning")
     assert run.line == ""
     run.learner.now += 40.0
-    assert run.line == f"learning for 40 s{idle}; so far 0% waiting for rollouts, 100% learning"
+    learning = f"learning for 40 s{idle}; so far 0% waiting for rollouts, 100% learning"
+    assert run.line == learning
+    run.time.learned(run.learner.coordinator, run.learner.now)
+    run.learner.publish(1)
+    assert run.line == learning, "it tells of what was before the weights were sent"
+    run.turn("gathering")
+    run.turn("learning", after_s=0.5)
+    assert run.line == ""
 
 
 def test_between_two_long_waits_it_tells_of_the_last_one() -> None:
