@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from learner.members.held_up import LONG_S
 from learner.members.member_server import AWAY_S
 from learner.rollouts.hub import LOG_WAITING_AFTER_S, POLL_S, PULSE_S, Hub, HubSettings
 from learner.rollouts.ticket_coordinator import TicketCoordinator
@@ -140,6 +141,32 @@ def test_it_warns_of_a_long_wait_only_while_no_worker_steps(caplog: pytest.LogCa
     hub.gather()
     levels = [record.levelname for record in caplog.records if "for lane 0 (worker w0 on host: " in record.getMessage()]
     assert levels == ["INFO"] * 3 + ["WARNING"], "after 10, 20, 40 and 80 s"
+
+
+def test_a_long_wait_is_shown_while_it_lasts_and_told_to_who_asks() -> None:
+    link, hub, heartbeat = hub_with_a_worker()
+    hub.publish(0, np.zeros(1, np.float32), np.zeros(0, np.float32))
+    began_s = link.now
+    seen: list[tuple[float, str, str]] = []
+    poll = link.poll
+
+    def poll_until_it_has_come(timeout_s: float) -> bool:
+        link.now += timeout_s
+        came = fake_rollout(1, 0, 0, 0, 0) if link.now > began_s + 5.0 else msgspec.structs.replace(heartbeat, tickets=(0,))
+        link.inbox.append((b"w0", came))
+        return poll(timeout_s)
+
+    def watch() -> None:
+        seen.append((hub.snapshot().wait_s, hub.snapshot().waiting, hub.status(link.now).waiting))
+
+    link.poll = poll_until_it_has_come  # type: ignore[method-assign]
+    hub.gather(watch)
+    wait_s, shown, told = seen[0]
+    assert LONG_S <= wait_s < LONG_S + 2 * POLL_S, "what is short is not shown"
+    assert shown == told == "waiting 2 s for lane 0 (worker w0 on host: 0.0 steps/s)"
+    link.now += 7.0
+    hub.publish(1, np.zeros(1, np.float32), np.zeros(0, np.float32))
+    assert hub.snapshot().waiting == "learning for 7 s, 1 of 1 workers waiting for weights"
 
 
 def test_between_short_minibatches_it_listens_now_and_then() -> None:

@@ -137,6 +137,14 @@ def test_while_it_learns_only_workers_without_a_ticket_wait(max_lag: int, idle: 
     assert run.line == ""
 
 
+def test_a_spare_worker_waits_for_a_lane_and_not_for_weights() -> None:
+    run = Run(lanes=1, workers=(A, B))
+    run.learner.deliver_all()
+    run.turn("learning")
+    run.learner.now += 3.0
+    assert run.line == "learning for 3 s, 1 of 2 workers waiting for weights"
+
+
 def test_between_two_long_waits_it_tells_of_the_last_one() -> None:
     run = Run()
     run.turn("gathering")
@@ -145,6 +153,9 @@ def test_between_two_long_waits_it_tells_of_the_last_one() -> None:
     run.turn("gathering", after_s=0.5)
     run.learner.now += 1.0
     assert run.line == "waited 12 s for rollouts"
+    run.turn("learning", after_s=5.5)
+    assert run.line == "waited 6 s for rollouts"
+    run.turn("gathering")
     run.turn("learning", after_s=0.5)
     assert run.line == "", "the last wait was short"
 
