@@ -33,12 +33,14 @@ def _serve(argv: list[str]) -> int:
     plain = logging.Formatter("%(asctime)s learner: %(message)s")
     handler.setFormatter(JsonLines() if "--log-json" in argv else plain)
     logging.basicConfig(level=logging.INFO, handlers=[handler])
-    said_s = [-LINE_EVERY_S]
+    said = (-LINE_EVERY_S, "")
 
     def watch(progress: Progress) -> None:
-        if time.monotonic() - said_s[0] > LINE_EVERY_S:
-            said_s[0] = time.monotonic()
-            log.info("%s", line_of(progress))
+        nonlocal said
+        now, line = time.monotonic(), line_of(progress)
+        if now - said[0] > LINE_EVERY_S and line != said[1]:  # the log itself says what a long wait is for
+            said = (now, line)
+            log.info("%s", line)
 
     try:
         config, resume = read_config("learner", argv)

@@ -42,7 +42,7 @@ def held_up(member: Member, now: float) -> tuple[float, float, str]:
     return seconds, -row.steps_per_s, f"worker {row.worker} on {row.host}: {what}"
 
 
-def late(members: Iterable[Member], now: float, before: str) -> str:
-    """Who is held up longest, behind `before`; empty if nobody is held up long."""
+def late(members: Iterable[Member], now: float) -> str:
+    """Who is held up longest; empty if nobody is held up long."""
     seconds, _, text = max((held_up(member, now) for member in members), default=(0.0, 0.0, ""))
-    return f"{before}{text}" if seconds >= LONG_S else ""
+    return text if seconds >= LONG_S else ""

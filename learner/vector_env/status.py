@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
-from learner.members.held_up import late
 from learner.vector_env.order_coordinator import OrderCoordinator
 from protocol.messages import Status
 
@@ -23,7 +22,6 @@ def status(coordinator: OrderCoordinator, now: float) -> Status:
         lag_max=0,
         workers=coordinator.membership.status(now),
         ledger={},
-        waiting=late(members, now, "waiting for "),
         workers_wanted=len(coordinator.lanes),
     )
 

@@ -150,7 +150,7 @@ class StepHub:
 
     def held_up(self) -> str:
         """Which worker is held up longest, and in what; empty if none is for long. For any thread."""
-        return late(list(self._coordinator.members.values()), self._clock(), "")
+        return late(list(self._coordinator.members.values()), self._clock())
 
     def call_while_waiting(self, callback: Callable[[], None]) -> None:
         """Call this now and then while waiting; what it raises ends the wait."""

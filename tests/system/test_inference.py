@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import signal
 import sys
 import threading
@@ -228,11 +229,14 @@ def test_nan_ends_the_run_with_an_error_that_says_where(tmp_path: Path, env: str
 
 def test_the_run_continues_after_an_environment_hung(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     kwargs = {"once": str(tmp_path / "hung"), "after": 30}
-    settings: dict[str, Any] = {"steps": 2_000, "step_timeout_s": 1.0, "env_kwargs": kwargs, **SMALL, **IN_LEARNER}
+    settings: dict[str, Any] = {"steps": 2_000, "step_timeout_s": 3.0, "env_kwargs": kwargs, **SMALL, **IN_LEARNER}
+    shown: list[str] = []
     with caplog.at_level(logging.WARNING):
-        folder = run(tmp_path, f"{TOY}Hangs-v0", **settings)
+        folder = run(tmp_path, f"{TOY}Hangs-v0", lambda progress: shown.append(progress.waiting), **settings)
     assert summary(folder)["stop_reason"] == "all steps done"
-    assert "a step of its environment took longer than 1 s (--step-timeout-s)" in caplog.text
+    assert "a step of its environment took longer than 3 s (--step-timeout-s)" in caplog.text
+    named = re.compile(r"waiting \d+ s for lanes? .* \(worker w\d on .*: in step for [23] s\)")
+    assert any(map(named.match, shown)), "meanwhile, the worker that steps is named"
 
 
 def test_the_run_fails_if_no_worker_joins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
