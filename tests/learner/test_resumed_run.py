@@ -101,7 +101,7 @@ def test_an_update_gets_what_the_coordinator_says_of_each_rollout() -> None:
         remember=lambda: None,
         is_finite=lambda: True,
     )
-    service = MagicMock(gather=lambda: arrived)
+    service = MagicMock(gather=lambda show: arrived)
     recorder = MagicMock(stop_reason=MagicMock(side_effect=[None, "done"]))
     train(algorithm, service, recorder, 1)  # type: ignore[arg-type]
     (batch,) = batches
