@@ -78,6 +78,11 @@ METRICS: dict[str, dict[str, Meaning]] = {
         "stage/worker_wait": Meaning(SECONDS, "Time in which workers waited for a ticket or for weights."),
         "stage/worker_evaluate": Meaning(SECONDS, "Time in which workers played evaluations."),
     },
+    "Cloning, in a row of its own before the first update": {
+        "clone/loss": Meaning(NONE, "Loss of the cloned policy, and of its critic if it has one, on the whole dataset."),
+        "clone/accuracy": Meaning(NONE, "Discrete actions: fraction of the steps whose action is the most probable one."),
+        "clone/mean_absolute_error": Meaning(NONE, "Box actions: error of the greedy ones; SAC, TD3: in [-1, 1]."),
+    },
     "Updates: all algorithms": {
         "train/learning_rate": Meaning(NONE, "Learning rate of this update."),
         "train/n_updates": Meaning("–", "PPO: epochs so far. DQN, SAC, TD3: gradient steps so far. Others: updates so far."),

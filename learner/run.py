@@ -28,6 +28,7 @@ from learner.members.bound import listen
 from learner.members.describe import described_by_workers
 from learner.members.describe_coordinator import Accept
 from learner.members.process_callbacks import ProcessCallbacks
+from learner.recording.prior_dataset import PriorDataset
 from learner.recording.training_recorder import TrainingRecorder
 from learner.resumption import Resumption, check_spaces
 from learner.rollout_service.service import describe_settings, rollout_service
@@ -206,18 +207,18 @@ class Run:
         if config.start_from and not setup.resumed:
             log_notice(log, start_from(config, spec.policy, self.algorithm))
         if config.prior:
-            if spec.masked:
+            if spec.masked and spec.policy.head == "q":
                 raise UsageError(
                     f"prior {config.prior}: a dataset has no action masks, and this run uses them; take --action-masks none"
                 )
-            _add_prior(self.algorithm, config.prior, spec.policy, setup.check_interrupt)
+            self._prior = _add_prior(self.algorithm, config.prior, spec.policy, setup.check_interrupt)
         state = RunState()
         if setup.resumed:
             state = restore(self.folder, self.algorithm)
         self._interrupts = setup.interrupts
         # The last save gets half of what is left of the grace time, and the workers need time to leave.
         self.folder.writes.at_most = lambda seconds: setup.interrupts.at_most(2 * seconds) / 2
-        self._learns_from_prior = bool(config.prior)
+        self._learns_from_prior, self._clones = bool(config.prior), bool(getattr(config.algorithm, "clone_epochs", 0))
         past = (state.ledger, state.incarnations)
         self.service = rollout_service(config, spec, link, processes, self._check_interrupt, observer, past)
         episodes = EpisodeSettings(_training_recorder(config, self.folder, setup.known, spec), setup.known.evaluation_limit)
@@ -286,6 +287,8 @@ class Run:
             self._check_interrupt()
 
         try:
+            if self._clones:
+                self.recorder.cloned(self.algorithm.clone(self._prior.batches(), pulse))
             self.algorithm.learn_from_prior(pulse)
         except Interrupted:
             self.recorder.save()
@@ -328,20 +331,19 @@ def _why(error: BaseException) -> str:
     return one_line(text if isinstance(error, MillraceError) else f"{type(error).__name__}: {text}")
 
 
-def _add_prior(algorithm: Algorithm, dataset_id: str, policy: PolicySpec, check_interrupt: Callable[[], None]) -> None:
-    from learner.recording.prior_dataset import PriorDataset
-
+def _add_prior(algorithm: Algorithm, dataset_id: str, policy: PolicySpec, check: Callable[[], None]) -> PriorDataset:
     if missing := [name for name in FOR_PRIOR if not hasattr(algorithm, name)]:
         raise UsageError(f"prior {dataset_id}: {type(algorithm).__name__} lacks {', '.join(missing)}")
     dataset = PriorDataset(dataset_id, policy)
 
     def batches() -> Iterator[Batch]:
         for batch in dataset.batches():
-            check_interrupt()
+            check()
             yield batch
 
     algorithm.add_prior(batches(), dataset.rows + dataset.episodes)
     log.info("prior %s: %d transitions of %d episodes", dataset_id, dataset.rows, dataset.episodes)
+    return dataset
 
 
 def _training_recorder(config: Config, folder: RunFolder, known: KnownEnvironment, spec: RunSpec) -> TrainingRecorder | None:

@@ -40,6 +40,7 @@ from learner.run_state import RunState
 from protocol.arrays import Array, Floats
 from protocol.bounds import one_line
 from protocol.errors import RunError, first_line
+from protocol.logs.notices import log_notice
 from protocol.rollout import Batch
 from protocol.specs import RunSpec
 
@@ -117,6 +118,13 @@ class RunRecorder:
             evaluation_return=None if newest is None else newest.return_mean,
             training_return=self._window.return_mean if self._window.full else None,
         )
+
+    def cloned(self, metrics: Mapping[str, float]) -> None:
+        """The policy was cloned: show and log these metrics. An evaluation is due, if the run makes any."""
+        found = ", ".join(f"{name.rpartition('/')[2].replace('_', ' ')} {number:.3g}" for name, number in metrics.items())
+        log_notice(log, f"cloned {self._config.prior}: {found}")
+        self._write_row(self.progress(), metrics)
+        self._evaluations.next_at = 0
 
     def start(self) -> None:
         """The run begins, or goes on, and workers have joined: tell the callbacks."""

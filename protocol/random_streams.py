@@ -45,6 +45,8 @@ class Purpose(IntEnum):
     """reset seed of an env copy that replaces a lost one, from the lost one's; incarnation"""
     SECOND_INSTANCE = 15
     """reset seed of the second instance of `ResetAhead`, from that of the first"""
+    CLONING = 16
+    """the order of demonstrations; epoch"""
 
 
 def generator(seed: int, purpose: Purpose, *indices: int) -> np.random.Generator:

@@ -19,6 +19,8 @@ from torch import Tensor
 
 from learner.algorithms import losses
 from learner.algorithms.algorithm import Algorithm, Start
+from learner.algorithms.cloning.clones import Clones
+from learner.algorithms.cloning.demonstrations import Demonstrations
 from learner.algorithms.kernels import loss_gradients
 from learner.algorithms.kernels.fused import MAX_ROWS, FusedActorCritic, can_fuse
 from learner.algorithms.kernels.loss_gradients import Numbers, OutputGradients
@@ -33,7 +35,7 @@ from protocol.errors import RunError, UsageError
 from protocol.policy.features import features, normalize
 from protocol.policy.masks import FORBIDDEN
 from protocol.policy.networks import ActorCriticNetwork, RecurrentInput
-from protocol.policy.torch_distributions import log_prob_and_entropy
+from protocol.policy.torch_distributions import log_prob_and_entropy, policy_log_prob
 from protocol.random_streams import Purpose, torch_seed
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
@@ -56,7 +58,7 @@ class Estimates(NamedTuple):
     metrics: Metrics  # without the prefix "train/"
 
 
-class ActorCritic(Algorithm):
+class ActorCritic(Clones):
     """The network, the optimizer, schedules and running statistics, and the update that uses them.
 
     A subclass defines `loss`, unless its loss is the policy gradient with a squared value loss. Advantages are generalized
@@ -80,6 +82,7 @@ class ActorCritic(Algorithm):
     """
 
     Config: ClassVar[type[AlgorithmConfig]] = ActorCriticConfig  # see `Algorithm`
+    config: PolicyGradientConfig
     n_epochs = 1  # how many times an update uses each row, if the settings do not say it
     estimates_each_epoch: ClassVar[bool] = False  # True: `estimate` is called before each epoch, under the newest weights
     shuffles_single_minibatch: ClassVar[bool] = False  # whether an epoch of one minibatch shuffles its rows
@@ -101,8 +104,7 @@ class ActorCritic(Algorithm):
         seed: int,
         device: str = "cpu",
     ) -> None:
-        self.config = config
-        self.policy = policy
+        self.config, self.policy, self.seed = config, policy, seed
         self.n_epochs = getattr(config, "n_epochs", self.n_epochs)
         self.net = ActorCriticNetwork(policy, device, seed=seed)
         if policy.action.kind == "box":
@@ -312,6 +314,35 @@ class ActorCritic(Algorithm):
         """The fraction of the run that remains: 1 in the first update, above 0 in the last."""
         return max(0.0, 1 - self.env_steps / self._total_steps)
 
+    # ---------------------------------------------------------------- cloning
+
+    def add_prior(self, batches: Iterable[Batch], observations: int) -> None:
+        """Count the rows of a dataset for all statistics."""
+        for batch in batches:
+            self.rewards(batch)
+            self._normalizer.update(features(self.policy, batch.obs)[:-1], batch.valid)
+        self._buffers = self._normalizer.buffers()
+
+    def scaled(self, reward: Floats) -> Floats:
+        """See `Clones`."""
+        return self._reward_scaler.scaled(reward) if self.config.normalize_rewards else reward
+
+    def cloning_loss(self, rows: Demonstrations) -> tuple[Tensor, Tensor]:
+        """See `Clones`."""
+        params, value = self.net.forward(*self._inputs(rows.obs(rows.at)))
+        with torch.no_grad():
+            last_value = self.net.value(*self._inputs(rows.obs(rows.last)))
+        action, returns, discount = map(self._to_device, (rows.action, rows.returns, rows.discount))
+        log_prob = policy_log_prob(self.policy, params, action)
+        return self.vf_coef * losses.value_loss(value, returns + discount * last_value) - log_prob.mean(), params
+
+    def _inputs(self, leaves: Sequence[Array]) -> tuple[Tensor, list[Tensor]]:
+        """Features [B, D], normalized, and images [B, *leaf] uint8, of leaves [B, *leaf]."""
+        x = features(self.policy, leaves)
+        x = normalize(x, *np.split(self._buffers, 2)) if self.policy.normalize_observations else x
+        images = [array for leaf, array in zip(self.policy.observation, leaves, strict=True) if leaf.is_image]
+        return self._to_device(x), [self._to_device(image) for image in images]
+
     # ---------------------------------------------------------------- a batch as tensors
 
     def observations(self, batch: Batch) -> Observations:
@@ -472,6 +503,7 @@ class ActorCritic(Algorithm):
             "rewards": self._reward_scaler.state_dict(),
             "env_steps": self.env_steps,
             "version": self.version,
+            "clone_steps": self.clone_steps,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -483,6 +515,7 @@ class ActorCritic(Algorithm):
         self._reward_scaler.load_state_dict(state["rewards"])
         self._buffers = self._normalizer.buffers()
         self.env_steps, self.version = state["env_steps"], state["version"]
+        self.clone_steps = state["clone_steps"]
 
     def start_from(self, start: Start) -> None:
         """See `Algorithm.start_from`. The spread of actions is part of the policy."""

@@ -7,6 +7,7 @@ size of the rollouts and the number and speed of the workers. Where these settin
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable
 from fractions import Fraction
 from typing import Any
 
@@ -16,6 +17,8 @@ import torch
 from torch import Tensor
 
 from learner.algorithms.algorithm import Start
+from learner.algorithms.cloning.clones import Clones
+from learner.algorithms.cloning.demonstrations import Demonstrations
 from learner.algorithms.kernels.actor_and_critics import passes_of
 from learner.algorithms.kernels.optimizer_step import avoid_compiler_import
 from learner.algorithms.replay.off_policy import OffPolicy
@@ -23,7 +26,9 @@ from learner.algorithms.replay.replay_buffer import Sample
 from learner.config.hyperparameters import ContinuousConfig
 from protocol.errors import UsageError
 from protocol.policy.networks import ActorAndCritics
+from protocol.policy.torch_distributions import policy_log_prob
 from protocol.random_streams import Purpose, torch_seed
+from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
@@ -40,7 +45,7 @@ class Transitions:
         """[B] each: Σ γⁱ r; γᵏ, or 0 if the task has terminated; weight of the loss"""
 
 
-class Continuous(OffPolicy):
+class Continuous(Clones, OffPolicy):
     """An off-policy algorithm for a bounded Box: the networks, their targets, their optimizers and the source of noise."""
 
     Config = ContinuousConfig
@@ -90,10 +95,25 @@ class Continuous(OffPolicy):
         self._acts_at_once = False  # with a policy that is not from nothing, no uniform actions come first
         self.tensors = {"parameters": self.net.flat, "target": self.target.flat}
         self.optimizers = {name: adam(part, config) for name, part in self.parts().items()}
+        self.optimizer, self.seed = self.optimizers["actor_optimizer"], seed
 
     def parts(self) -> dict[str, Tensor]:
         """The flat tensors that an optimizer each changes, by the optimizer's name."""
         return {"actor_optimizer": self.net.actor, "critic_optimizer": self.net.critics}
+
+    def clone(self, episodes: Iterable[Batch], pulse: Callable[[], None]) -> dict[str, float]:
+        """See `Clones`: the actor alone. It acts from the first env step."""
+        found = super().clone(episodes, pulse)
+        self.target.actor.copy_(self.net.actor)
+        self._acts_at_once = True
+        return found
+
+    def cloning_loss(self, rows: Demonstrations) -> tuple[Tensor, Tensor]:
+        """See `Clones`."""
+        x, _ = self.inputs(rows.obs(rows.at))
+        observed, action = (torch.from_numpy(array).to(self.net.flat.device) for array in (x, rows.action))
+        params = self.net.params(observed)
+        return -policy_log_prob(self.policy, params, action).mean(), params
 
     def steps_due(self) -> int:
         """The gradient steps that the replay ratio demands now."""
@@ -119,7 +139,7 @@ class Continuous(OffPolicy):
         """See `OffPolicy.numbers`."""
         counted = self._counted | {"learning_starts": self._learning_starts}
         more = {"counted": counted, "noise": self._generator.get_state(), "acts_at_once": self._acts_at_once}
-        return super().numbers() | more
+        return super().numbers() | more | {"clone_steps": self.clone_steps}
 
     def start_from(self, start: Start) -> None:
         """See `Algorithm.start_from`. The policy acts from the first env step."""
@@ -130,7 +150,7 @@ class Continuous(OffPolicy):
         """See `OffPolicy.load_numbers`."""
         super().load_numbers(state)
         self._generator.set_state(state["noise"].clone())
-        self._acts_at_once = state["acts_at_once"]
+        self._acts_at_once, self.clone_steps = state["acts_at_once"], state["clone_steps"]
         counted, config = dict(state["counted"]), self.config
         self._learning_starts = counted.pop("learning_starts")
         self._counted = counted

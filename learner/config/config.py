@@ -112,8 +112,9 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """
 
     prior: Fixed[str] = ""
-    """Id of a Minari dataset to learn from too, such as cartpole/ppo-v0. Each minibatch has a share of its transitions,
-    which prior_share sets. Only for algorithms with a replay buffer (pip install 'millrace-rl[record]').
+    """Id of a Minari dataset to learn from too, such as cartpole/ppo-v0 (pip install 'millrace-rl[record]'). clone_epochs
+    starts with a policy that acts as it does. Algorithms with a replay buffer draw a share of each minibatch from it, which
+    prior_share sets.
     """
 
     def stop_rule(self) -> StopRule:

@@ -64,6 +64,10 @@ class PolicyGradientConfig(AlgorithmConfig, frozen=True):
     """Initial logarithm of the standard deviation of continuous (Box) actions."""
     normalize_rewards: Fixed[bool] = False
     """Divide rewards by the running standard deviation of the discounted return, and clip them to ±10."""
+    clone_epochs: Free[Annotated[int, msgspec.Meta(ge=0)]] = 0
+    """Number of epochs of cloning on the dataset of --prior, before the first rollouts are collected: the actor learns its
+    actions, the critic its returns. Needs --prior.
+    """
 
 
 class RecurrentConfig(PolicyGradientConfig, frozen=True):
@@ -256,6 +260,10 @@ class ContinuousConfig(OffPolicyConfig, frozen=True):
     replay_size: Fixed[Count] = 1_000_000
     """Capacity of the replay buffer in transitions; the newest are kept. The final observation of a truncated episode takes
     the place of one.
+    """
+    clone_epochs: Free[Annotated[int, msgspec.Meta(ge=0)]] = 0
+    """Number of epochs of cloning on the dataset of --prior, before prior_steps and the first rollouts: the actor learns its
+    actions. Needs --prior.
     """
     updates_per_step: Free[Annotated[float, msgspec.Meta(gt=0, le=1e6)]] = 1.0
     """Replay ratio: gradient steps for each env step after learning_starts. It is exact, whatever the rollouts are."""

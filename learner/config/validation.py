@@ -11,7 +11,7 @@ import msgspec
 
 from learner.config.algorithm_names import settings_record
 from learner.config.config import TABLES, Config
-from learner.config.hyperparameters import HYPERPARAMETERS, OffPolicyConfig
+from learner.config.hyperparameters import OffPolicyConfig, PolicyGradientConfig, RecurrentConfig
 from learner.config.rollout_config import RolloutConfig
 from protocol.address import advertised_address, check_address
 from protocol.bounds import LARGEST, MAX_FACTS, MAX_NAME, one_line
@@ -183,14 +183,15 @@ def _check_learner_inference(config: Config, at: str) -> None:
 
 
 def _check_prior(config: Config, at: str) -> None:
-    takes_prior = [name for name, record in HYPERPARAMETERS.items() if "prior_share" in record.__struct_fields__]
-    if config.prior and config.algo in HYPERPARAMETERS and config.algo not in takes_prior:
-        raise UsageError(
-            f"{at}prior {config.prior}: {config.algo} takes no prior data; {', '.join(takes_prior)} learn from prior data"
-        )
-    steps: int | None = getattr(config.algorithm, "prior_steps", None)
-    if steps and not config.prior:
-        raise UsageError(f"{at}prior_steps: expected 0 without prior data, got {steps}; name it by --prior")
+    match config.algorithm:
+        case PolicyGradientConfig(clone_epochs=0) if config.prior:
+            raise UsageError(f"{at}prior {config.prior}: {config.algo} can only clone it; add --clone-epochs 50")
+        case RecurrentConfig(core=str(), clone_epochs=epochs) if epochs:
+            raise UsageError(f"{at}clone_epochs: expected 0 with a recurrent core, got {epochs}; take --core none")
+    for name in ("prior_steps", "clone_epochs"):
+        number: int = getattr(config.algorithm, name, 0)
+        if number and not config.prior:
+            raise UsageError(f"{at}{name}: expected 0 without prior data, got {number}; name it by --prior")
 
 
 def _reworded(message: str, settings: dict[str, Any]) -> str:

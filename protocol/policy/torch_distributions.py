@@ -9,9 +9,10 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from protocol.policy.distributions import LOG_SQRT_2PI
-from protocol.specs import ActionSpec
+from protocol.specs import ActionSpec, PolicySpec
 
 LOG_2 = math.log(2)
+SQUASHED_BOUND = 0.999
 
 
 def log_prob_and_entropy(spec: ActionSpec, params: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
@@ -31,6 +32,22 @@ def log_prob_and_entropy(spec: ActionSpec, params: Tensor, action: Tensor) -> tu
             mean, log_std = params.chunk(2, -1)
             z = (action.reshape(mean.shape) - mean) * torch.exp(-log_std)
             return (-0.5 * z * z - log_std - LOG_SQRT_2PI).sum(-1), (log_std + (0.5 + LOG_SQRT_2PI)).sum(-1)
+
+
+def policy_log_prob(policy: PolicySpec, params: Tensor, action: Tensor) -> Tensor:
+    """Log π(action) [B] of an actor's params [B, P] and stored actions [B, *action], from wherever these come.
+
+    A squashed action is taken to be at most `SQUASHED_BOUND` in size: the density of ±1 itself is zero or infinite. A
+    deterministic actor gets normal noise of standard deviation 1 around its action.
+    """
+    match policy.head:
+        case "squashed":
+            bounded = action.clamp(-SQUASHED_BOUND, SQUASHED_BOUND)
+            normal, _ = log_prob_and_entropy(policy.action, params, torch.atanh(bounded))
+            return normal - torch.log1p(-bounded.square()).flatten(1).sum(-1)
+        case "deterministic":
+            params = torch.cat((torch.tanh(params), torch.zeros_like(params)), -1)
+    return log_prob_and_entropy(policy.action, params, action)[0]
 
 
 def squashed_sample(params: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:

@@ -19,6 +19,7 @@ from learner.run_folder import run_folder
 from millrace.cli.main import COMMANDS
 from protocol import errors
 from protocol.errors import UserFacingError
+from tests.learner.algorithms.test_cloning import CONTINUOUS, DISCRETE, cloned, episodes_of, made
 from website import commands_page, python_page, settings_page
 from website.doctest_fences import with_fences
 from website.pages import ROOT
@@ -74,6 +75,8 @@ def test_every_metric_of_a_run_has_a_meaning(which: str) -> None:
 
 def test_every_meaning_is_of_a_metric() -> None:
     found = {"train/NAME"}  # of an algorithm of the user's own
+    for action in (DISCRETE, CONTINUOUS):
+        found |= {*cloned(made("ppo", action), episodes_of(action))}
     for which in RUNS:
         names, _ = logged(which)
         found |= {general(name) for name in names}

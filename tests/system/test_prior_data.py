@@ -11,8 +11,11 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from torch import Tensor
 
+from learner.algorithms.cloning.demonstrations import Demonstrations
 from learner.algorithms.dqn import DQN
+from learner.algorithms.ppo import PPO
 from learner.algorithms.replay.replay_buffer import Sample
 from learner.config.layers import resolve
 from learner.recording.prior_dataset import PriorDataset
@@ -36,6 +39,18 @@ SMALL: dict[str, Any] = {
     "eval_episodes": 1,
     "steps": 1_500,
     "prior": DATASET,
+}
+CLONED: dict[str, Any] = {
+    "algo": "ppo",
+    "preset": "none",
+    "transport": "inproc",
+    "seed": 3,
+    "rollout_steps": 32,
+    "n_epochs": 2,
+    "eval_episodes": 1,
+    "steps": 512,
+    "prior": DATASET,
+    "clone_epochs": 3,
 }
 
 
@@ -82,8 +97,8 @@ def dataset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write(DATASET, "CartPole-v1", episodes=20)
 
 
-def run(tmp_path: Path, name: str, resume: Path | None = None, **settings: Any) -> Path:
-    keywords = SMALL | settings
+def run(tmp_path: Path, name: str, resume: Path | None = None, base: dict[str, Any] = SMALL, **settings: Any) -> Path:
+    keywords = base | settings
     config = resolve("" if resume else "CartPole-v1", run_dir=str(tmp_path / name), resume=resume, **keywords)
     return train(config, resume, lambda _: None)
 
@@ -135,6 +150,35 @@ def test_gradient_steps_before_the_first_rollouts_can_be_interrupted_and_go_on(
     assert policy(resumed) == policy(whole)
 
 
+def test_a_clone_does_not_depend_on_the_number_of_workers_and_a_resumed_run_does_not_clone_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, two = (run(tmp_path, f"{workers}", base=CLONED, workers=workers) for workers in (1, 2))
+    assert policy(one) == policy(two)
+    assert policy(one) != policy(run(tmp_path, "none", base=CLONED, prior="", clone_epochs=0))
+    first, second, *_ = read_rows(one / "metrics.jsonl")
+    assert (first["time/iterations"], second["time/iterations"]) == (0, 1)
+    assert 0.4 < first["clone/accuracy"] < 0.7, "the actions are random"
+    monkeypatch.setattr(PPO, "cloning_loss", None)
+    run(tmp_path, "1", resume=one, base=CLONED, steps=1_024)
+
+
+def test_cloning_that_was_interrupted_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = run(tmp_path, "whole", base=CLONED)
+    loss = PPO.cloning_loss
+
+    def interrupted_loss(self: PPO, rows: Demonstrations) -> tuple[Tensor, Tensor]:
+        if self.clone_steps == 10:
+            signal.raise_signal(signal.SIGTERM)
+        return loss(self, rows)
+
+    with monkeypatch.context() as patched, pytest.raises(Interrupted) as stopped:
+        patched.setattr(PPO, "cloning_loss", interrupted_loss)
+        run(tmp_path, "stopped", base=CLONED)
+    resumed = run(tmp_path, "stopped", resume=stopped.value.run, base=CLONED)
+    assert policy(resumed) == policy(whole)
+
+
 def test_an_interrupt_while_the_dataset_is_read_leaves_no_run_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -155,7 +199,16 @@ def test_an_interrupt_while_the_dataset_is_read_leaves_no_run_folder(
     [
         (["--prior", "acrobot/random-v0"], "prior acrobot/random-v0: observations: expected "),
         (["--prior", "cartpole/rondom-v0"], "no such dataset here; there are: acrobot/random-v0, cartpole/random-v0"),
-        (["--algo", "ppo", "--prior", DATASET], "prior cartpole/random-v0: ppo takes no prior data; dqn"),
+        (["--algo", "ppo", "--prior", DATASET], "prior cartpole/random-v0: ppo can only clone it; add --clone-epochs "),
+        (["--algo", "ppo", "--clone-epochs", "5"], "clone_epochs: expected 0 without prior data, got 5; name it by --prior"),
+        (
+            ["--algo", "ppo", "--prior", DATASET, "--clone-epochs", "5", "--core", "gru"],
+            "clone_epochs: expected 0 with a recurrent core, got 5; take --core none",
+        ),
+        (
+            ["--algo", "a2c", "--prior", "acrobot/random-v0", "--clone-epochs", "5"],
+            "prior acrobot/random-v0: observations: expected ",
+        ),
         (["--prior-steps", "5"], "prior_steps: expected 0 without prior data, got 5; name it by --prior"),
     ],
 )

@@ -1,0 +1,1 @@
+"""Cloning: the start of a policy from demonstrations."""

@@ -1,0 +1,84 @@
+"""Cloning: before its first rollouts, a policy learns to act as demonstrations do, and its critic to predict their returns.
+
+    L = −E[log π(a|o)] + vf_coef · E[(V(o) − G)²]     (SAC and TD3: without the critic)
+    G = Σ γⁱ r over the rest of the episode, + γᵏ V(its last observation) if it was truncated
+
+Rule: a gradient step depends on the demonstrations and on the algorithm's saved state alone, which counts the steps made. So
+cloning that was interrupted goes on with the same bits. Hence the order of each epoch is drawn from the seed and its number.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.optim import Optimizer
+
+from learner.algorithms.algorithm import Algorithm
+from learner.algorithms.cloning.demonstrations import Demonstrations
+from learner.algorithms.kernels.optimizer_step import take_step
+from learner.algorithms.updates import check_finite
+from protocol.arrays import Floats
+from protocol.policy.distributions import distribution
+from protocol.random_streams import Purpose, generator
+from protocol.rollout import Batch
+from protocol.specs import PolicySpec
+
+BATCH_SIZE = 64  # rows of a minibatch, if the settings have no batch_size
+LEARNING_RATE = 1e-3  # that of updates is often lower, so that they change little; here it would take more epochs
+
+
+class Clones(Algorithm):
+    """An algorithm with a policy that can be cloned."""
+
+    config: Any
+    policy: PolicySpec
+    optimizer: Optimizer
+    """That of the flat tensor of parameters to which `cloning_loss` gives a gradient."""
+    version: int
+    seed: int
+    clone_steps = 0
+    """Gradient steps of cloning so far."""
+
+    @abstractmethod
+    def cloning_loss(self, rows: Demonstrations) -> tuple[Tensor, Tensor]:
+        """The loss, a tensor of no dimension, and the params [B, P] of the action distribution."""
+
+    def scaled(self, reward: Floats) -> Floats:
+        """Rewards as the critic learns them."""
+        return reward
+
+    def clone(self, episodes: Iterable[Batch], pulse: Callable[[], None]) -> dict[str, float]:
+        """See `Algorithm`: the loss over all steps, and how near the most probable actions are."""
+        rows = Demonstrations.of(episodes, self.scaled, self.config.gamma)
+        size = len(rows.at)
+        count = math.ceil(size / getattr(self.config, "batch_size", BATCH_SIZE))
+        (flat,) = self.optimizer.param_groups[0]["params"]
+        for epoch in range(self.clone_steps // count, self.config.clone_epochs):
+            order = generator(self.seed, Purpose.CLONING, epoch).permutation(size)
+            for some in np.array_split(order, count)[self.clone_steps % count :]:
+                loss, _ = self.cloning_loss(rows.select(some))
+                flat.grad.zero_()
+                loss.backward()  # type: ignore[no-untyped-call]
+                check_finite({"clone/loss": loss.item(), "grad_norm": flat.grad.norm().item()}, self.version, "other data")
+                self.optimizer.param_groups[0]["lr"] = LEARNING_RATE
+                take_step(self.optimizer)
+                self.clone_steps += 1
+                pulse()
+        with torch.no_grad():
+            parts = [self._measured(rows.select(some)) for some in np.array_split(np.arange(size), count)]
+        mean_loss, error = (float(total) / size for total in np.sum(parts, 0))
+        box = self.policy.action.kind == "box"
+        return {"clone/loss": mean_loss} | ({"clone/mean_absolute_error": error} if box else {"clone/accuracy": 1 - error})
+
+    def _measured(self, rows: Demonstrations) -> tuple[float, float]:
+        """Sums over these steps: of the loss, and of the error of the most probable action. A wrong choice counts as 1."""
+        loss, params = self.cloning_loss(rows)
+        error = abs(distribution(self.policy).mode(params.cpu().numpy()) - rows.action).reshape(len(rows.at), -1)
+        wrong = error.mean(1) if self.policy.action.kind == "box" else error.any(1)
+        return loss.item() * len(rows.at), float(wrong.sum())

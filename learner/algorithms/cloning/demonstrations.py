@@ -1,0 +1,58 @@
+"""Demonstrations as arrays: what was observed and done, and the discounted rewards that followed. Pure.
+
+Rule: each observation is held once, so that images take no more memory than the dataset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from learner.algorithms.returns import EpisodeEnds, gae
+from protocol.arrays import Array, Floats
+from protocol.rollout import Batch
+
+
+class Demonstrations(NamedTuple):
+    """B steps of episodes. Their observations are in `leaves`, [O, *leaf] each."""
+
+    leaves: tuple[Array, ...]
+    at: npt.NDArray[np.int64]
+    """[B] where the observation is"""
+    last: npt.NDArray[np.int64]
+    """[B] where the last observation of the episode is"""
+    action: Array
+    """[B, *action] as rollouts store it"""
+    returns: Floats
+    """[B] Σ γⁱ r over the rest of the episode"""
+    discount: Floats
+    """[B] how much the value of the last observation adds to this: γᵏ, or 0 if the episode was terminated"""
+
+    @classmethod
+    def of(cls, batches: Iterable[Batch], scaled: Callable[[Floats], Floats], gamma: float) -> Demonstrations:
+        """All steps of these episodes, each a batch of one column. `scaled`: makes rewards what the critic learns."""
+        leaves: list[list[Array]] = []
+        rows: list[tuple[Array, ...]] = []
+        start = 0
+        for batch in batches:
+            steps, nothing = np.arange(len(batch.action)), np.zeros((len(batch.action) + 1, 1), np.float32)
+            end = start + len(steps)
+            returns = gae(scaled(batch.reward), nothing, EpisodeEnds.of(batch), gamma, 1.0)[:, 0]
+            discount = (~batch.terminated[-1] * gamma ** (len(steps) - steps)).astype(np.float32)
+            rows.append((start + steps, np.full(len(steps), end), batch.action[:, 0], returns, discount))
+            leaves.append([leaf[:, 0] for leaf in batch.obs])
+            start = end + 1
+        columns: list[Array] = [np.concatenate(column) for column in zip(*rows, strict=True)]
+        return cls(tuple(map(np.concatenate, zip(*leaves, strict=True))), *columns)
+
+    def select(self, some: Array) -> Demonstrations:
+        """These steps alone."""
+        columns: list[Any] = [column[some] for column in self[1:]]
+        return Demonstrations(self.leaves, *columns)
+
+    def obs(self, at: npt.NDArray[np.int64]) -> list[Array]:
+        """The observations that are there, [B, *leaf] each; `at` is `self.at` or `self.last`."""
+        return [leaf[at] for leaf in self.leaves]

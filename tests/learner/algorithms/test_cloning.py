@@ -1,0 +1,220 @@
+"""Cloning: its loss by hand, every kind of action, each step once in an epoch, and going on after an interrupt."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+
+from learner.algorithms import algorithm_class
+from learner.algorithms.cloning.demonstrations import Demonstrations
+from learner.algorithms.ppo import PPO
+from learner.config.hyperparameters import HYPERPARAMETERS
+from protocol.arrays import Array
+from protocol.errors import RunError
+from protocol.policy.distributions import Squashed
+from protocol.policy.torch_distributions import policy_log_prob
+from protocol.rollout import Batch
+from protocol.specs import ActionSpec, Leaf, PolicySpec
+
+BOX = Leaf("", "box", (3,), "float32")
+IMAGE = Leaf("i", "box", (8, 8, 1), "uint8")
+DISCRETE = ActionSpec("discrete", (), "int64", (3,), (0,))
+CONTINUOUS = ActionSpec("box", (2,), "float32", low=(-1.0,) * 2, high=(1.0,) * 2)
+ACTIONS = [
+    DISCRETE,
+    ActionSpec("multidiscrete", (2,), "int64", (2, 3), (0, 0)),
+    ActionSpec("multibinary", (2,), "int8"),
+    CONTINUOUS,
+]
+
+
+def expert(x: Array, action: ActionSpec) -> Array:
+    """A simple function of observations [B, 3]: the actions [B, *action] to learn."""
+    match action.kind:
+        case "discrete":
+            return np.asarray(x.argmax(-1))
+        case "multidiscrete":
+            return np.stack(((x[:, 0] > 0).astype(np.int64), x.argmax(-1)), -1)
+        case "multibinary":
+            return np.asarray(x[:, :2] > 0, np.int64)
+        case _:
+            return np.tanh(0.5 * x[:, :2]).astype(np.float32)
+
+
+def episode(seed: int, T: int, action: ActionSpec, *, image: bool = False, terminated: bool = True) -> Batch:
+    """An episode as `PriorDataset` gives it."""
+    generator = np.random.default_rng(seed)
+    x = generator.normal(1, 2, (T + 1, 3)).astype(np.float32)
+    obs: list[Array] = [x[:, None]]
+    if image:  # it alone shows what to do
+        pictures = np.zeros((T + 1, 1, 8, 8, 1), np.uint8)
+        for picture, choice in zip(pictures[:, 0], x.argmax(-1), strict=True):
+            picture[3 * choice : 3 * choice + 2] = 255
+        obs = [np.zeros_like(x)[:, None], pictures]
+    ended = np.arange(T)[:, None] == T - 1
+    return Batch(
+        obs=tuple(obs),
+        action=expert(x[:-1], action)[:, None],
+        log_prob=np.zeros((T, 1), np.float32),
+        reward=generator.normal(1, 1, (T, 1)).astype(np.float32),
+        terminated=ended & terminated,
+        truncated=ended & (not terminated),
+        valid=np.ones((T, 1), bool),
+        state=np.zeros((1, 0), np.float32),
+        lane=np.array([-1]),
+        fresh=np.array([True]),
+        copies=1,
+        episodes=(),
+    )
+
+
+def made(algo: str, action: ActionSpec, *, image: bool = False, **settings: Any) -> Any:
+    config = msgspec.structs.replace(HYPERPARAMETERS[algo](), net=(32,), **settings)
+    kind = algorithm_class(algo)
+    spec = kind.policy_spec(config, (BOX, IMAGE) if image else (BOX,), action)
+    return kind(config, spec, total_steps=1000, seed=3)
+
+
+def episodes_of(action: ActionSpec, *, image: bool = False) -> list[Batch]:
+    return [episode(i, 40 + i, action, image=image, terminated=bool(i % 2)) for i in range(6)]
+
+
+def cloned(algorithm: Any, batches: list[Batch], pulse: Callable[[], None] = lambda: None) -> dict[str, float]:
+    """As a run calls it."""
+    algorithm.add_prior(batches, sum(len(one.action) + 1 for one in batches))
+    found: dict[str, float] = algorithm.clone(batches, pulse)
+    return found
+
+
+def test_the_loss_is_the_one_that_the_file_states() -> None:
+    """Of two episodes, the second of which is truncated, with rewards and observations as they are."""
+    ppo: PPO = made("ppo", DISCRETE, normalize_rewards=False, normalize_observations=False, gamma=0.9, vf_coef=0.3)
+    batches = [episode(0, 4, DISCRETE), episode(1, 3, DISCRETE, terminated=False)]
+    rows = Demonstrations.of(batches, np.asarray, 0.9)
+    loss, params = ppo.cloning_loss(rows)
+    x = [torch.from_numpy(one.obs[0][:, 0]) for one in batches]
+    with torch.no_grad():
+        log_probs = [torch.log_softmax(ppo.net.params(each[:-1]), -1) for each in x]
+        values = [ppo.net.value(each).double().numpy() for each in x]
+    errors = []
+    for one, value in zip(batches, values, strict=True):
+        rest = 0.0 if one.terminated[-1, 0] else value[-1]
+        for t in reversed(range(len(one.action))):
+            rest = float(one.reward[t, 0]) + 0.9 * rest
+            errors.append((value[t] - rest) ** 2)
+    chosen = [float(p[t, int(one.action[t, 0])]) for one, p in zip(batches, log_probs, strict=True) for t in range(len(p))]
+    assert params.shape == (7, 3)
+    assert loss.item() == pytest.approx(-np.mean(chosen) + 0.3 * np.mean(errors), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("algo", "action", "settings"),
+    [
+        *(("ppo", action, {"clone_epochs": 20, "batch_size": 16}) for action in ACTIONS),
+        ("reinforce", DISCRETE, {"clone_epochs": 80}),
+        ("sac", CONTINUOUS, {"clone_epochs": 20, "batch_size": 16}),
+        ("td3", CONTINUOUS, {"clone_epochs": 20, "batch_size": 16}),
+    ],
+    ids=lambda value: value if isinstance(value, str) else getattr(value, "kind", ""),
+)
+def test_actions_of_every_kind_are_learned(algo: str, action: ActionSpec, settings: dict[str, Any]) -> None:
+    algorithm = made(algo, action, **settings)
+    found = cloned(algorithm, episodes_of(action))
+    assert set(found) == {"clone/loss", "clone/mean_absolute_error" if action.kind == "box" else "clone/accuracy"}
+    if action.kind == "box":
+        assert found["clone/mean_absolute_error"] < 0.2, "0.48 without an observation"
+    else:
+        assert found["clone/accuracy"] > 0.9
+
+
+def test_the_density_of_a_squashed_action_is_the_one_that_workers_compute() -> None:
+    generator = np.random.default_rng(0)
+    params = generator.normal(0, 0.5, (50, 5)).astype(np.float32)
+    params[:, -1] = 0  # no warm-up
+    numpy_distribution = Squashed((2,))
+    noise = numpy_distribution.noise(generator, (50,))
+    action = numpy_distribution.sample(params, noise)
+    inside = (abs(action) < 0.99).all(-1)
+    assert inside.sum() > 20
+    spec = PolicySpec((BOX,), CONTINUOUS, (4,), head="squashed")
+    found = policy_log_prob(spec, torch.from_numpy(params[:, :4]), torch.from_numpy(action))
+    np.testing.assert_allclose(found.numpy()[inside], numpy_distribution.log_prob(params, action, noise)[inside], atol=1e-3)
+
+
+def test_images_are_looked_at() -> None:
+    ppo: PPO = made("ppo", DISCRETE, image=True, clone_epochs=4, batch_size=16)
+    assert cloned(ppo, episodes_of(DISCRETE, image=True))["clone/accuracy"] > 0.9
+
+
+def test_the_critic_learns_the_returns() -> None:
+    """The rewards of these episodes are 1, and each is terminated: the return is the number of steps that are left."""
+    ppo: PPO = made("ppo", DISCRETE, clone_epochs=300, normalize_rewards=False, gamma=1.0, normalize_observations=False)
+    one = episode(0, 4, DISCRETE)
+    one = msgspec.structs.replace(one, reward=np.ones_like(one.reward))
+    cloned(ppo, [one])
+    with torch.no_grad():
+        values = ppo.net.value(torch.from_numpy(one.obs[0][:-1, 0])).tolist()
+    assert values == pytest.approx([4, 3, 2, 1], abs=0.5)
+
+
+def test_each_epoch_uses_each_step_once_and_in_an_order_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    ppo: PPO = made("ppo", DISCRETE, clone_epochs=2, batch_size=100)
+    seen: list[Array] = []
+    select = Demonstrations.select
+
+    def noted(self: Demonstrations, some: Array) -> Demonstrations:
+        seen.append(some)
+        return select(self, some)
+
+    monkeypatch.setattr(Demonstrations, "select", noted)
+    cloned(ppo, episodes_of(DISCRETE))
+    first, second = np.concatenate(seen[:3]), np.concatenate(seen[3:6])
+    assert sorted(first) == sorted(second) == list(range(255))
+    assert (first != second).any()
+
+
+def test_the_statistics_of_observations_are_those_of_the_demonstrations() -> None:
+    ppo: PPO = made("ppo", DISCRETE, clone_epochs=1)
+    cloned(ppo, episodes_of(DISCRETE))
+    x = np.concatenate([one.obs[0][:-1, 0] for one in episodes_of(DISCRETE)])
+    np.testing.assert_allclose(ppo.weights()[1], np.concatenate((x.mean(0), x.std(0))), rtol=1e-5)
+
+
+@pytest.mark.parametrize(("algo", "action"), [("ppo", DISCRETE), ("a2c", CONTINUOUS), ("sac", CONTINUOUS)])
+def test_cloning_that_was_interrupted_goes_on_with_the_same_bits(algo: str, action: ActionSpec) -> None:
+    whole, stopped, resumed = (made(algo, action, clone_epochs=3) for _ in range(3))
+    episodes = episodes_of(action)
+
+    def pulse() -> None:
+        if stopped.clone_steps == 2:
+            raise KeyboardInterrupt
+
+    cloned(whole, episodes)
+    with pytest.raises(KeyboardInterrupt):
+        cloned(stopped, episodes, pulse)
+    resumed.add_prior(episodes, 261)
+    resumed.load_state_dict(stopped.state_dict())
+    resumed.clone(episodes, lambda: None)
+    assert whole.clone_steps == resumed.clone_steps > 2
+    assert torch.equal(whole.net.flat, resumed.net.flat)
+    untrained = made(algo, action, clone_epochs=3)
+    assert not torch.equal(whole.net.flat, untrained.net.flat)
+
+
+def test_a_loss_that_is_not_finite_changes_no_weight(monkeypatch: pytest.MonkeyPatch) -> None:
+    ppo: PPO = made("ppo", DISCRETE, clone_epochs=1, normalize_rewards=False)
+    before, loss = ppo.net.flat.clone(), ppo.cloning_loss
+
+    def endless(rows: Demonstrations) -> Any:
+        found, params = loss(rows)
+        return found * float("inf"), params
+
+    monkeypatch.setattr(ppo, "cloning_loss", endless)
+    with pytest.raises(RunError, match="clone/loss: expected finite"):
+        cloned(ppo, episodes_of(DISCRETE))
+    assert torch.equal(ppo.net.flat, before)
