@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 
 import gymnasium
 
@@ -21,8 +21,8 @@ from protocol.envs.vectorized import make_native, vector_alternative
 from protocol.errors import EnvironmentFailed, UsageError, first_line
 from protocol.space_spec import EnvDescription
 from protocol.specs import DescribeSpec
-from workers.env_copy import CopySlots
-from workers.supervise.activity import CLOSING, DESCRIBING, activity
+from workers.env_copy import close_copy, make_copy
+from workers.supervise.activity import DESCRIBING, activity
 
 
 @contextmanager
@@ -33,18 +33,16 @@ def describing(spec: DescribeSpec) -> Iterator[EnvDescription]:
     is missing, or its spaces are not supported. Raises `EnvironmentFailed` for any exception of its own code, and for an
     exit of the process that its code asks for.
     """
-    page, held = activity(), CopySlots()
-    with _failures_of(spec.env), page.during(DESCRIBING), held.making(FIRST_COPY):
-        env = spec.env.make(spec.render_mode)
+    page = activity()
+    with _failures_of(spec.env), page.during(DESCRIBING):
+        env = make_copy(FIRST_COPY, lambda: spec.env.make(spec.render_mode))
     try:
         with _failures_of(spec.env), page.during(DESCRIBING):
-            _check_vectorized(spec, env, held)
+            _check_vectorized(spec, env)
             description = describe_env(env)
         yield description
     finally:
-        with suppress(BaseException), page.during(CLOSING):
-            env.close()
-        held.give_back()
+        close_copy(env)
 
 
 @contextmanager
@@ -60,20 +58,15 @@ def _failures_of(env: EnvSpec) -> Iterator[None]:
         raise EnvironmentFailed(line, traceback.format_exc()) from error
 
 
-def _check_vectorized(spec: DescribeSpec, env: gymnasium.Env[object, object], held: CopySlots) -> None:
-    """Raise `UsageError` unless the vectorized form that the learner asks for has the spaces of one env copy.
-
-    `held` gets its slot, if it is made.
-    """
+def _check_vectorized(spec: DescribeSpec, env: gymnasium.Env[object, object]) -> None:
+    """Raise `UsageError` unless the vectorized form that the learner asks for has the spaces of one env copy."""
     match spec.vector:
         case "loop":
             return
         case "native":
-            with held.making(FIRST_COPY):
-                whose, made = "its vectorized form", make_native(spec.env, 1)
+            whose, made = "its vectorized form", make_copy(FIRST_COPY, lambda: make_native(spec.env, 1))
             observed, acted = made.single_observation_space, made.single_action_space
-            with suppress(BaseException):
-                made.close()
+            close_copy(made)
         case "envpool":
             whose, pool = "envpool's", envpool_spec(spec.env)
             observed, acted = pool.observation_space, pool.action_space

@@ -7,49 +7,46 @@ its constructor raises, it may have started something: then the slot is free whe
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache
+from typing import Any, TypeVar
 
 from protocol.envs.env_copy import EnvCopy, being_made
 from protocol.errors import UsageError
 from workers.slots import slots
+from workers.supervise.activity import CLOSING, activity
 
-_held: list[int] = []  # the slots of this process's open copies
+_slots: dict[int, int] = {}  # of this process's copies that are being made or are open, by their id
+Made = TypeVar("Made")
 
 
-class CopySlots:
-    """The slots of copies that are closed together."""
+def make_copy(which: EnvCopy, make: Callable[[], Made]) -> Made:
+    """What `make` returns: this copy, made with a slot of its own. `give_back` frees the slot when the copy was closed."""
+    which = replace(which, slot=slots().take())
+    _slots[id(which)] = which.slot
+    token = being_made.set(which)
+    try:
+        made = make()
+        _slots[id(made)] = _slots.pop(id(which))
+        return made
+    finally:
+        being_made.reset(token)
+        _slots.pop(id(which), None)  # if it could not be made, its slot stays taken
 
-    def __init__(self) -> None:
-        self._slots: list[int] = []
 
-    @contextmanager
-    def making(self, copy: EnvCopy) -> Iterator[None]:
-        """Within it, this copy is made, with a slot of its own."""
-        slot = slots().take()
-        self._slots.append(slot)
-        _held.append(slot)
-        token = being_made.set(replace(copy, slot=slot))
-        try:
-            yield
-        except BaseException:
-            self._slots.remove(slot)
-            _held.remove(slot)
-            raise
-        finally:
-            being_made.reset(token)
-
-    def give_back(self) -> None:
-        """The copies are closed."""
-        for slot in [*self._slots]:
-            self._give_back(slot)
-
-    def _give_back(self, slot: int) -> None:
-        self._slots.remove(slot)
-        _held.remove(slot)
+def give_back(copy: object) -> None:
+    """Free the slot of a copy that was closed."""
+    if (slot := _slots.pop(id(copy), None)) is not None:
         slots().give_back(slot)
+
+
+def close_copy(copy: Any) -> None:
+    """Close a copy; what it raises is ignored. Then its slot is free."""
+    with suppress(BaseException), activity().during(CLOSING):
+        copy.close()
+    give_back(copy)
 
 
 def env_copy() -> EnvCopy:
@@ -64,7 +61,7 @@ def env_copy() -> EnvCopy:
     """
     if (copy := being_made.get()) is not None:
         return copy
-    if _held:
+    if _slots:
         raise UsageError(
             "env_copy: this thread is not making an env copy now; ask in the environment's constructor, and keep the answer"
         )

@@ -8,7 +8,6 @@ the new info, as `final_obs` and `final_info`. Disabled: the caller resets.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from copy import deepcopy
 from dataclasses import replace
 from itertools import repeat
@@ -20,10 +19,9 @@ import numpy as np
 
 from protocol.envs.env_copy import FIRST_COPY, EnvCopy
 from protocol.errors import UsageError
-from workers.env_copy import CopySlots
+from workers.env_copy import close_copy, make_copy
 from workers.env_errors import CopyRaised
 from workers.supervise.activity import (
-    CLOSING,
     DOING,
     ENV_CALLS,
     MAKING,
@@ -60,13 +58,13 @@ class EnvLoop:
         `first` says which copy the first one is; the others follow it.
         """
         self.envs: list[gymnasium.Env[Any, Any]] = []
-        self._activity, self._slots = activity(), CopySlots()
+        self._activity = activity()
         for n, make in enumerate(makes):
             pulse()
             try:
                 which = replace(first, number=first.number + n, copy=first.copy + n)
-                with self._activity.during(MAKING), self._slots.making(which):
-                    self.envs.append(make())
+                with self._activity.during(MAKING):
+                    self.envs.append(make_copy(which, make))
             except UsageError:
                 self.close()
                 raise
@@ -159,9 +157,7 @@ class EnvLoop:
     def close(self) -> None:
         """Close every copy. What a copy raises is ignored."""
         for env in self.envs:
-            with suppress(BaseException), self._activity.during(CLOSING):
-                env.close()
-        self._slots.give_back()
+            close_copy(env)
 
 
 def _kept(info: Any) -> Any:

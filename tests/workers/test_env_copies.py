@@ -84,7 +84,7 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> Iterator[set[int]]:
     monkeypatch.setattr(Asks, "made", [])
     monkeypatch.setattr(Asks, "taken", machine.taken)
     monkeypatch.setattr(Asks, "closed_late", [])
-    monkeypatch.setattr(env_copy, "_held", [])
+    monkeypatch.setattr(env_copy, "_slots", {})
     env_copy._of_process.cache_clear()
     yield machine.taken
     assert not Asks.closed_late, "slots that were given back before their copy was closed"
@@ -178,12 +178,13 @@ def test_the_slot_of_a_copy_that_cannot_be_made_is_not_free_because_its_construc
     assert taken == {0, 1}
 
 
-def test_the_second_instance_of_a_copy_has_a_slot_of_its_own(taken: set[int]) -> None:
+@pytest.mark.parametrize("steps", [8, 12])  # two or three episodes, so that either instance plays at the end
+def test_the_second_instance_of_a_copy_has_a_slot_of_its_own(taken: set[int], steps: int) -> None:
     run = run_with()
     env = EnvSpec.of("Asks-v0", wrappers=[ResetAhead])
     copies = open_env_copies(RunSpec(env, run.policy, 8, copies=1, lanes=8, seed=1), 4, no_pulse)
     copies.reset([1], no_pulse)
-    for _ in range(12):  # three episodes
+    for _ in range(steps):
         copies.step(np.zeros(1, np.int64), no_pulse)
     assert Asks.made == [EnvCopy(4, 4, 0, False, 0), EnvCopy(4, 4, 0, False, 1)]
     copies.close()
@@ -221,17 +222,9 @@ def test_each_thread_makes_its_own_copy() -> None:
         return Countdown(3)
 
     found: list[EnvCopy] = []
-    threads = [threading.Thread(target=env_copy_of, args=(make, number)) for number in (5, 9)]
+    threads = [threading.Thread(target=env_copy.make_copy, args=(EnvCopy(number), make)) for number in (5, 9)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join(20)
     assert {(copy.number, copy.slot) for copy in found} in ({(5, 0), (9, 1)}, {(5, 1), (9, 0)})
-
-
-def env_copy_of(make: Any, number: int) -> None:
-    """Make a copy of this number."""
-    slots = env_copy.CopySlots()
-    with slots.making(EnvCopy(number)):
-        make()
-    slots.give_back()

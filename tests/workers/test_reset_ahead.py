@@ -109,6 +109,7 @@ def test_a_reset_runs_while_the_other_instance_steps() -> None:
     Traced.resets_wait_for.clear()  # only a step lets the reset in the thread end
     for _ in range(3):
         assert len(episode(env)[1]) == 3
+        env.instances()  # the reset in the thread has ended, so it saw the step
         Traced.resets_wait_for.clear()
     Traced.resets_wait_for.set()
     env.close()

@@ -31,7 +31,7 @@ from workers.collect.collected_lane import CollectedLane
 from workers.collect.env_copies import EnvCopies, LoopedCopies, VectorCopies
 from workers.collect.envpool_copies import EnvpoolCopies
 from workers.collect.held_rollouts import Assignment
-from workers.env_copy import CopySlots
+from workers.env_copy import make_copy
 from workers.env_errors import CopyRaised, LaneFailed, lane_failed
 from workers.env_loop import Pulse
 from workers.env_results import write_numbers
@@ -45,15 +45,14 @@ StepAll = Callable[[Sequence[int], Array, Pulse], None]
 
 def open_env_copies(run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
     """The env copies of a lane in this process, of the kind that the run asks for."""
-    first, held = EnvCopy(lane * run.copies, lane), CopySlots()
+    first = EnvCopy(lane * run.copies, lane)
     match run.vector:
         case "native":
-            with activity().during(MAKING), held.making(first):
-                env = make_native(run.env, run.copies)
-            return VectorCopies(env, run.facts, masked=run.masked, held=held)
+            with activity().during(MAKING):
+                env = make_copy(first, lambda: make_native(run.env, run.copies))
+            return VectorCopies(env, run.facts, masked=run.masked)
         case "envpool":
-            with held.making(first):
-                return EnvpoolCopies(envpool_spec(run.env), run.copies, run.facts, held)
+            return make_copy(first, lambda: EnvpoolCopies(envpool_spec(run.env), run.copies, run.facts))
         case "loop":
             return LoopedCopies([run.env.make] * run.copies, pulse, run.facts, masked=run.masked, first=first)
 

@@ -27,12 +27,12 @@ from protocol.random_streams import Purpose, env_seed
 from protocol.wire.plain_values import unpack
 from workers.collect.facts import Facts, facts_of_copies, facts_of_info, of_ended
 from workers.collect.mask_reader import MaskReader
-from workers.env_copy import CopySlots
+from workers.env_copy import close_copy
 from workers.env_errors import CopyRaised, Unusable
 from workers.env_loop import EnvLoop, Infos, Pulse
 from workers.env_results import missing_leaf, read_leaves
 from workers.envs.reset_ahead import ResetAhead
-from workers.supervise.activity import CLOSING, RESETTING, STEPPING, activity
+from workers.supervise.activity import RESETTING, STEPPING, activity
 
 # For each leaf of the observation: an array [N, *leaf], or a sequence of N observations. In a masked run the masks follow.
 Leaves = Sequence[Any]
@@ -183,20 +183,12 @@ def set_attribute(copy: int | None, env: Any, name: str, value: Any) -> None:
 class VectorCopies:
     """Any `gymnasium.vector.VectorEnv` with NextStep autoreset."""
 
-    def __init__(
-        self,
-        env: VectorEnv[Any, Any, Any],
-        facts: Sequence[str] = (),
-        *,
-        masked: bool = False,
-        held: CopySlots | None = None,
-    ) -> None:
+    def __init__(self, env: VectorEnv[Any, Any, Any], facts: Sequence[str] = (), *, masked: bool = False) -> None:
         """`facts`: names of the numbers in `info` that belong to an episode. `masked`: read masks of the allowed actions.
 
-        `held`: the slots to give back when it is closed. Raises `UsageError` for another autoreset mode.
+        Raises `UsageError` for another autoreset mode.
         """
         check_resets_next_step(env)
-        self._slots = held or CopySlots()
         self._env, self._activity, self._facts = env, activity(), facts
         self._per_copy = (env.num_envs,)
         self.observation_space = env.single_observation_space
@@ -271,6 +263,4 @@ class VectorCopies:
 
     def close(self) -> None:
         """Close it. What it raises is ignored."""
-        with suppress(BaseException), self._activity.during(CLOSING):
-            self._env.close()
-        self._slots.give_back()
+        close_copy(self._env)

@@ -19,7 +19,7 @@ from protocol.envs.envpool import EnvpoolSpec
 from protocol.envs.spaces import make_flatten
 from workers.collect.env_copies import Leaves, StepResult
 from workers.collect.facts import facts_of_copies, of_ended
-from workers.env_copy import CopySlots
+from workers.env_copy import give_back
 from workers.env_errors import CopyRaised, Unusable
 from workers.env_loop import Pulse
 from workers.supervise.activity import CLOSING, RESETTING, STEPPING, activity
@@ -28,9 +28,9 @@ from workers.supervise.activity import CLOSING, RESETTING, STEPPING, activity
 class EnvpoolCopies:
     """N copies in one pool. The pool is made at the first reset, because envpool takes its seeds when it is made."""
 
-    def __init__(self, pool: EnvpoolSpec, copies: int, facts: Sequence[str] = (), held: CopySlots | None = None) -> None:
-        """`facts`: names of the numbers in `info` that belong to an episode. `held`: its slots, given back in `close`."""
-        self._facts, self._slots = facts, held or CopySlots()
+    def __init__(self, pool: EnvpoolSpec, copies: int, facts: Sequence[str] = ()) -> None:
+        """`facts`: names of the numbers in `info` that belong to an episode."""
+        self._facts = facts
         self.observation_space = pool.observation_space
         self.action_space = pool.action_space
         self._pool, self._activity = pool, activity()
@@ -97,4 +97,4 @@ class EnvpoolCopies:
             with suppress(BaseException), self._activity.during(CLOSING):
                 self._env.close()
             self._env = None
-        self._slots.give_back()
+        give_back(self)

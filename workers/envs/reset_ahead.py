@@ -17,7 +17,7 @@ import gymnasium
 from protocol.envs.env_copy import FIRST_COPY, being_made
 from protocol.errors import UsageError
 from protocol.random_streams import Purpose, env_seed
-from workers.env_copy import CopySlots
+from workers.env_copy import give_back, make_copy
 
 Prepared = tuple[gymnasium.Env[Any, Any], Any, dict[str, Any]]  # an instance, its first observation and its first info
 
@@ -47,7 +47,7 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
             raise UsageError(
                 f"ResetAhead: expected an environment of gymnasium.make, got {type(env).__name__} without a spec"
             )
-        self._spec, self._copy, self._slots = env.spec, being_made.get() or FIRST_COPY, CopySlots()
+        self._spec, self._copy = env.spec, being_made.get() or FIRST_COPY
         self._second: gymnasium.Env[Any, Any] | None = None
         self._second_seed: int | None = None  # of the second instance's next reset
         self._prepared: Future[Prepared] | None = None
@@ -68,8 +68,7 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
         return observation, info
 
     def _make(self) -> gymnasium.Env[Any, Any]:
-        with self._slots.making(self._copy):
-            return gymnasium.make(self._spec)
+        return make_copy(self._copy, lambda: gymnasium.make(self._spec))
 
     def _prepare(self, instance: gymnasium.Env[Any, Any] | None) -> None:
         """Reset the second instance in a thread; make it first if there is none."""
@@ -109,5 +108,8 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
         if self._second is not None:
             with suppress(Exception):
                 self._second.close()
-        super().close()
-        self._slots.give_back()
+        try:
+            super().close()
+        finally:
+            give_back(self.env)  # the two have taken turns
+            give_back(self._second)
