@@ -176,7 +176,7 @@ class DescribeSpec(msgspec.Struct, frozen=True, tag=True):
     """passed to the copy"""
     heartbeat_s: float = 1.0
     learner_timeout_s: float = 30.0
-    """a worker that received nothing from the learner for so long says Hello again"""
+    """a worker whose Heartbeat was followed by no message of the learner for so long says Hello again"""
 
     def rejection_reason(self, code: AllowedCode) -> str:
         """Why a worker that allows only this code cannot take part; empty if it can."""
@@ -210,7 +210,7 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
     """further arrays of each rollout"""
     heartbeat_s: float = 1.0
     learner_timeout_s: float = 30.0
-    """a worker that received nothing from the learner for so long says Hello again"""
+    """a worker whose Heartbeat was followed by no message of the learner for so long says Hello again"""
 
     def rejection_reason(self, code: AllowedCode) -> str:
         """Why a worker that allows only this code cannot take part; empty if it can."""
@@ -242,8 +242,9 @@ class StepSpec(msgspec.Struct, frozen=True, tag=True):
     """so many of the last copies play evaluations; the number of such a copy counts from the first of them"""
     heartbeat_s: float = 1.0
     learner_timeout_s: float = 600.0
-    """a worker that received nothing from the learner for so long says Hello again. The caller may compute for long between
-    two steps, without reading messages; workers that end with the learner's process wait for ever (infinity)
+    """a worker whose Heartbeat was followed by no message of the learner for so long says Hello again. The caller may
+    compute for long between two steps, without reading messages; workers that end with the learner's process wait for ever
+    (infinity)
     """
 
     def first_copy(self, lane: int) -> int:

@@ -7,6 +7,7 @@ worker holds is in `collect/held_rollouts.py`, `evaluate/held_evaluations.py` an
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -179,7 +180,8 @@ class Session:
         self._join_timeout_s = join_timeout_s
         self._rejoin_timeout_s = rejoin_timeout_s
         self._attempt = identity.process_nonce
-        self._last_heard_s = self._due_s = self._joining_s = now
+        self._unanswered_s = math.inf  # when the first Heartbeat was sent since the learner was heard
+        self._due_s = self._joining_s = now
         self._backoff_s = HELLO_FIRST_S
         self._reason = ""
         self._current = _SessionState()
@@ -190,7 +192,7 @@ class Session:
     def handle(self, message: ToWorker, now: float) -> list[Effect]:
         """Handle a message of the learner."""
         if isinstance(message, Drain):  # a Drain also answers the heartbeats of a worker that drains already
-            self._last_heard_s = now
+            self._unanswered_s = math.inf
         if type(message) not in TABLE[self.state]:
             return []
         if not isinstance(message, Welcome) and getattr(message, "session", self.session) != self.session:
@@ -204,7 +206,7 @@ class Session:
                 return self._drain(message, reason)
             case Rejoin():
                 return self._rejoin(message, "the learner does not know this session", now)
-        self._last_heard_s = now
+        self._unanswered_s = math.inf
         match message:
             case Weights(version):
                 if version > self._current.version:
@@ -241,7 +243,7 @@ class Session:
                 self._backoff_s = min(2 * self._backoff_s, HELLO_MOST_S)
                 return [Send(self.identity.hello(self._attempt))]
         assert self.run is not None
-        if now - self._last_heard_s > self.run.learner_timeout_s:
+        if now - self._unanswered_s > self.run.learner_timeout_s:
             return self._rejoin(LearnerSilent(), f"the learner was silent for {self.run.learner_timeout_s:.0f} s", now)
         return self.heartbeat_if_due(now)
 
@@ -252,6 +254,7 @@ class Session:
         if now < self._due_s and self._current.acknowledged_version == self._current.version:
             return []
         self._due_s = now + self.run.heartbeat_s
+        self._unanswered_s = min(self._unanswered_s, now)
         self._current.acknowledged_version = self._current.version
         described = self._current.described
         return [Send(self._heartbeat()), *([] if described is None else [Send(described)])]
@@ -373,7 +376,7 @@ class Session:
         self._transition(message)
         self._current = _SessionState()
         self.run, self.session = message.run, message.session
-        self._last_heard_s = now
+        self._unanswered_s = math.inf
         self._due_s = now + message.run.heartbeat_s
         self._join_timeout_s = self._rejoin_timeout_s
         return [StartSession(message.run)]

@@ -30,7 +30,7 @@ class State(Enum):
 
 
 class LearnerSilent:
-    """Event: no message of the learner arrived for `learner_timeout_s` (or, while joining, for too long)."""
+    """Event: no message of the learner followed a Heartbeat for `learner_timeout_s` (or, while joining, for too long)."""
 
 
 class StopRequested:

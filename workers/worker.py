@@ -126,7 +126,7 @@ class Worker:
         self._heartbeats = HeartbeatThread(lambda: self._do(self._session.heartbeat_if_due(self._clock())))
         self._waited_s = 0.0
         self._statistics = self._earlier = Statistics()  # newest, and as the sessions before this one left them
-        self._heard_s = clock()  # when the learner was last heard, or the connection was made
+        self._unheard_from_s = 0.0  # what `_waited_s` was when it was heard last, or joining or the connection began
 
     def run(self) -> Leave:
         """Work until the conversation is over. Raises nothing that the environment raised."""
@@ -170,7 +170,7 @@ class Worker:
             self._do(self._session.refused(problem.line))
         if not arrived:
             return
-        self._heard_s = self._clock()
+        self._unheard_from_s = self._waited_s
         for message in self._link.receive():
             if isinstance(message, BadMessage):
                 log.warning("the learner sent an unreadable message: %s", message)
@@ -180,15 +180,17 @@ class Worker:
     def _connect_again_if_unheard(self) -> None:
         """Something on the way (a proxy, a tunnel) may keep a connection open whose other end is gone.
 
-        Without a connection, this drops the Hellos that have piled up for a learner that is not there yet.
+        Without a connection, this drops the Hellos that have piled up for a learner that is not there yet. Only time spent
+        listening counts: while a simulator starts or is closed, nothing is read.
         """
-        now = self._clock()
-        if self._session.state is State.JOINING and now - self._heard_s > CONNECT_AGAIN_S:
+        if self._session.state is not State.JOINING:
+            self._unheard_from_s = self._waited_s
+        elif self._waited_s - self._unheard_from_s > CONNECT_AGAIN_S:
             if self._link.connected:
                 log.warning(
                     "no answer over the connection to %s for %.0f s; connecting again", self._link.address, CONNECT_AGAIN_S
                 )
-            self._heard_s = now
+            self._unheard_from_s = self._waited_s
             self._link.connect_again()
 
     def _collect(self, task: Task) -> None:

@@ -58,7 +58,7 @@ NOT_SAVED: dict[type, set[str]] = {
         "activity",
         "activity_s",
     }
-    | {"in_env_code_s"},
+    | {"in_env_code_s", "stepped"},
     TicketedLane: {"newest_used"},  # it marks rollouts as fresh for the algorithm; no message depends on it
     Ticket: set(),
     LanePlacement: {"_tie_break"},

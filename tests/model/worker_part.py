@@ -19,7 +19,7 @@ from workers.session import Effect, Identity, Leave, Send, Session, Task, _Sessi
 from workers.states import State
 
 SAVED: dict[type, set[str]] = {
-    Session: {"identity", "state", "run", "session", "_attempt", "_last_heard_s", "_due_s", "_current"},
+    Session: {"identity", "state", "run", "session", "_attempt", "_unanswered_s", "_due_s", "_current"},
     _SessionState: {"rollouts", "weights", "in_progress", "replies", "acknowledged_version"},
     HeldRollouts: {"_lanes"},
     _HeldLane: {"incarnation", "sequence", "tickets", "kept", "finished"},
@@ -146,7 +146,7 @@ def saved(worker: Worker, now: float) -> Content:
         current.state,
         None if current.run is None else session(current.session),
         name(Kind.ATTEMPT, current._attempt, worker.number),
-        max(current._last_heard_s - now, -TIMEOUT_S - 1.0),
+        max(current._unanswered_s - now, -TIMEOUT_S - 1.0),
         max(current._due_s - now, 0.0),
         tuple(_lane(number, lane) for number, lane in held.rollouts._lanes.items()),
         held.version,
@@ -183,7 +183,7 @@ def loaded(content: Content, number: int, settings: Settings) -> Worker:
     current = Session(who, 0.0, join_timeout_s=FOR_EVER_S, rejoin_timeout_s=FOR_EVER_S)
     current.session = MASK  # before its first session: not that of any message
     current.state, current._attempt = State(state), attempt.value
-    current._last_heard_s, current._due_s, current._backoff_s = heard, due, PAUSE_S
+    current._unanswered_s, current._due_s, current._backoff_s = heard, due, PAUSE_S
     held = current._current
     held.weights = None if version < 0 else weights(version)
     held.in_progress = tuple(each.value for each in in_progress)

@@ -536,9 +536,18 @@ def test_rejoin_is_answered_by_hello_at_once() -> None:
 
 def test_a_worker_joins_a_silent_learner_again() -> None:
     session = ready(collect((0, 0)))
-    assert sent(session.tick(6.0), Heartbeat)
-    assert hello_attempt(session.tick(6.1)) == FIRST + 1
+    assert sent(session.tick(1.0), Heartbeat)
+    assert sent(session.tick(7.0), Heartbeat)
+    assert hello_attempt(session.tick(7.1)) == FIRST + 1
     assert (session.state, session.held_count()) == (State.JOINING, 0)
+
+
+def test_a_learner_that_was_not_spoken_to_is_not_silent() -> None:
+    """A constructor may take longer than learner_timeout_s. Meanwhile the worker sends no Heartbeat, so nobody answers."""
+    session = ready(collect((0, 0)))
+    for now in (100.0, 106.0):
+        assert sent(session.tick(now), Heartbeat)
+    assert sent(session.tick(106.1), Hello)
 
 
 @pytest.mark.parametrize(
@@ -548,9 +557,11 @@ def test_a_worker_joins_a_silent_learner_again() -> None:
 )
 def test_any_message_of_the_session_is_a_sign_of_life(message: ToWorker) -> None:
     session = ready()
+    session.tick(1.0)
     session.handle(message, 5.0)
-    assert sent(session.tick(10.9), Heartbeat)
-    assert sent(session.tick(11.1), Hello)
+    for now in (5.5, 11.5):
+        assert sent(session.tick(now), Heartbeat)
+    assert sent(session.tick(11.6), Hello)
 
 
 # -------------------------------------------------------------------- leaving
@@ -639,7 +650,8 @@ def test_a_draining_worker_does_not_wait_for_a_silent_learner() -> None:
     session = ready(collect((0, 0)))
     task_of(session)
     session.stop()
-    (leave,) = session.tick(6.1)
+    assert sent(session.tick(1.0), Heartbeat)
+    (leave,) = session.tick(7.1)
     assert isinstance(leave, Leave)
     assert "silent" in leave.reason
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import NoReturn, cast
 
@@ -36,10 +36,12 @@ from protocol.wire.compression import Packing
 from protocol.wire.weight_dtypes import WeightsDtype, to_float32, to_wire_dtype
 from protocol.wire.worker_link import WorkerLink
 from tests.support.collectors import TOY, bits, collect, random_collector, run_of
+from workers.collect.collector import Collector
+from workers.evaluate.evaluator import Evaluator
 from workers.session import Leave, Session
 from workers.supervise.activity import ActivityReader, activity
 from workers.supervisor import EXIT_UNSUITABLE
-from workers.worker import Worker, WorkerOptions, identity
+from workers.worker import CONNECT_AGAIN_S, Worker, WorkerOptions, identity, make_local_collector
 
 RUN = msgspec.structs.replace(run_of("CartPole-v1", T=40, N=8), learner_timeout_s=1e9)
 
@@ -82,7 +84,7 @@ class Unanswered(FakeLink):
 
     def poll(self, timeout_s: float) -> bool:
         self.now += timeout_s
-        return False
+        return super().poll(timeout_s)
 
     def connect_again(self) -> None:
         self.made_at.append(self.now)
@@ -190,3 +192,23 @@ def test_a_connection_without_an_answer_is_made_again(looks_open: bool, caplog: 
     assert left.exit_code == 1
     assert [round(at) for at in link.made_at] == [20, 41]
     assert len(caplog.messages) == (2 if looks_open else 0)
+
+
+def test_only_the_time_in_which_a_joining_worker_listens_is_time_without_an_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over a second connection its Hellos come while the learner may still read those that came over the first one."""
+    link = Unanswered()
+    link.messages = [Welcome(1, 1, msgspec.structs.replace(RUN, learner_timeout_s=30.0))]
+    closed_at: list[float] = []
+
+    def close(lanes: Iterable[int]) -> None:
+        link.now += 100.0
+        closed_at.append(link.now)
+
+    def slow_to_close(run: RunSpec) -> tuple[Collector, Evaluator]:
+        collector, evaluator = make_local_collector(run)
+        monkeypatch.setattr(collector, "close", close)
+        return collector, evaluator
+
+    session = Session(replace(identity("w0"), process_nonce=0), 0.0, rejoin_timeout_s=150.0)
+    Worker(cast(WorkerLink, link), session, WorkerOptions(make_collector=slow_to_close), clock=lambda: link.now).run()
+    assert [(at - closed_at[0]) // CONNECT_AGAIN_S for at in link.made_at] == [1, 2]

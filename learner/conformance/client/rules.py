@@ -110,9 +110,9 @@ SESSION = Rule(
 )
 SILENT = Rule(
     "The worker's half",
-    "LearnerSilent: when no message of the learner has arrived for `learner_timeout_s`, the worker says Hello again "
-    "with a later `attempt`; any message counts as a sign of life",
-    "note the time of each message that arrives; when `learner_timeout_s` have passed, join again",
+    "LearnerSilent: when no message of the learner has followed a Heartbeat for `learner_timeout_s`, the worker says Hello "
+    "again with a later `attempt`; any message counts as a sign of life",
+    "note the time of the first Heartbeat after each message that arrives; `learner_timeout_s` later, join again",
 )
 IGNORE_UNREADABLE = Rule(
     "Frames",

@@ -138,7 +138,7 @@ def saved(worker: Worker, now: float) -> Content:
         current.state,
         None if current.run is None else session(current.session),
         name(Kind.ATTEMPT, current._attempt, worker.number),
-        max(current._last_heard_s - now, -TIMEOUT_S - 1.0),
+        max(current._unanswered_s - now, -TIMEOUT_S - 1.0),
         max(current._due_s - now, 0.0),
         tuple(_lane(number, lane) for number, lane in sorted(held.orders._lanes.items())),
         tuple(ticket(number) for number in held.in_progress),
@@ -166,7 +166,7 @@ def loaded(content: Content, number: int, run: Stepping) -> Worker:
     current = worker.session = Session(who, 0.0, join_timeout_s=FOR_EVER_S, rejoin_timeout_s=FOR_EVER_S)
     current.session = MASK  # before its first session: not that of any message
     current.state, current._attempt = State(state), attempt.value
-    current._last_heard_s, current._due_s, current._backoff_s = heard, due, PAUSE_S
+    current._unanswered_s, current._due_s, current._backoff_s = heard, due, PAUSE_S
     held = current._current
     held.in_progress = tuple(each.value for each in in_progress)
     if of_session is not None:
