@@ -122,7 +122,8 @@ class RunRecorder:
     def cloned(self, metrics: Mapping[str, float]) -> None:
         """The policy was cloned: show and log these metrics. An evaluation is due, if the run makes any."""
         found = ", ".join(f"{name.rpartition('/')[2].replace('_', ' ')} {number:.3g}" for name, number in metrics.items())
-        log_notice(log, f"cloned {self._config.prior}: {found}")
+        epochs: int = getattr(self._config.algorithm, "clone_epochs", 0)
+        log_notice(log, f"cloned {self._config.prior} in {epochs} epochs: {found}")
         self._write_row(self.progress(), metrics)
         self._evaluations.next_at = 0
 
