@@ -34,11 +34,12 @@ class WorkerLeft:
 
 @dataclass(frozen=True)
 class WorkerRefused:
-    """A worker was refused."""
+    """A worker was refused, and is no member. If it was one, `tickets` of its tickets are dealt again."""
 
     json_name: ClassVar[str] = "turned"
     worker: str
     why: str
+    tickets: int = 0
 
 
 @dataclass(frozen=True)
@@ -123,9 +124,9 @@ def _line(event: Event) -> str:
         case WorkerJoined(worker, host, pid):
             return f"worker {worker} ({host}, pid {pid}) joined"
         case WorkerLeft(worker, why, tickets):
-            return f"worker {worker} {why}" + (f"; {tickets} of its tickets are dealt again" if tickets else "")
-        case WorkerRefused(worker, why):
-            return f"worker {worker} was refused: {why}"
+            return f"worker {worker} {why}{_dealt_again(tickets)}"
+        case WorkerRefused(worker, why, tickets):
+            return f"worker {worker} was refused: {why}{_dealt_again(tickets)}"
         case Failed(worker, host, error, spare=spare):
             died = isinstance(event, WorkerProcessFailed) and not spare
             return f"worker {worker} ({host}): {error}" + ("; this counts as a failure of the environment" if died else "")
@@ -134,3 +135,7 @@ def _line(event: Event) -> str:
             return f"worker {worker} was told to join again: its session had ended{counted}"
         case RolloutDropped(lane, lag, transitions):
             return f"a rollout of lane {lane} was dropped: {lag} versions old, {transitions} transitions"
+
+
+def _dealt_again(tickets: int) -> str:
+    return f"; {tickets} of its tickets are dealt again" if tickets else ""

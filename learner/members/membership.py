@@ -361,14 +361,16 @@ class Membership(Generic[M]):
         self._none_silent_before_s = min((member.alive_s for member in self.members.values()), default=now) + timeout_s
         return silent
 
-    def remove(self, member: M, event: type, why: str) -> None:
-        """Remove a member."""
+    def remove(self, member: M, event: type, why: str, refusal: str | None = None) -> None:
+        """Remove a member. `refusal`: what it is told, if it is refused."""
         member.state = TABLE[member.state][event]
         del self.members[member.peer]
         _add(self._stages_of_left, member.stages())
         if self._of_process.get(process := (member.hello.worker, member.hello.process_nonce)) is member:
             del self._of_process[process]
-        self.events.append(WorkerLeft(member.hello.worker, why, len(member.tickets), event is Goodbye))
+        worker, tickets = member.hello.worker, len(member.tickets)
+        left = WorkerLeft(worker, why, tickets, event is Goodbye)
+        self.events.append(left if refusal is None else WorkerRefused(worker, refusal, tickets))
         self._on_removed(member, why)
 
     def drain(self, reason: str) -> list[Outgoing]:
@@ -381,8 +383,7 @@ class Membership(Generic[M]):
         return out
 
     def _refuse_and_remove(self, member: M, event: type, why: str, refusal: str) -> list[Outgoing]:
-        self.events.append(WorkerRefused(member.hello.worker, refusal))
-        self.remove(member, event, why)
+        self.remove(member, event, why, refusal)
         return [(member.peer, Refuse(one_line(refusal)))]
 
     def _remember_refusal(self, member: M, why: str) -> None:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from learner.members.events import Event, WorkerLeft
+from learner.members.events import Event, WorkerLeft, WorkerRefused
 from learner.members.held_up import late
 from learner.members.member_server import MemberServer, ServerCallbacks, ServerSettings
 from learner.members.process_callbacks import ProcessCallbacks
@@ -407,7 +407,7 @@ class StepHub:
 
     def _on_event(self, event: Event) -> None:
         """Release the lanes of a worker that has left."""
-        if isinstance(event, WorkerLeft):
+        if isinstance(event, WorkerLeft | WorkerRefused):
             for lane in [lane for lane in self._wake_pipes if self._coordinator.owner(lane) is None]:
                 del self._wake_pipes[lane]
                 self._step_ended(lane)

@@ -65,7 +65,7 @@ def test_a_revoked_worker_leaves_with_the_reason_and_the_run_goes_on_without_it(
     assert revoked.ends() == 2
     assert time.monotonic() - began_s < 5 * crowding()
     assert "was revoked" in revoked.said().splitlines()[-1]
-    learner.hears("worker revoked was shut out: its key lab")
+    learner.hears("worker revoked was refused: its key lab")
 
     late = stage.start([*worker, "late", "--stay"], "late")  # waiting would not heal this
     assert late.ends() == 2
