@@ -29,7 +29,7 @@ from workers.security import allowed_code
 from workers.session import NO_LEARNER, Session
 from workers.slots import share_slots
 from workers.supervise.activity import Activity, activity, share_activity
-from workers.supervise.process_group import live_members
+from workers.supervise.process_group import kill, live_members
 from workers.supervise.worker_process import KILLED_WITHIN_S, NONCE_VARIABLE, POLL_S
 from workers.supervisor import EXIT_NO_LEARNER
 from workers.watchdog import Watchdog
@@ -78,7 +78,7 @@ def work(flags: argparse.Namespace, token: Token | None, timeouts: CallTimeouts,
         sys.stderr.write(f"worker {flags.name}: {_explained(left.reason, link)}\n")
     if parent_is_gone(flags.parent):
         _remove_socket_of_killed_parent(flags.address)
-        _kill_own_group()
+        _kill_own_session()
     return _exit_code(left.exit_code, left.reason)
 
 
@@ -93,10 +93,10 @@ def _end_after_supervisor(parent: int, address: str) -> None:
         time.sleep(LOOK_FOR_PARENT_S)
     time.sleep(LEAVE_WITHIN_S)
     _remove_socket_of_killed_parent(address)
-    _kill_own_group()
+    _kill_own_session()
 
 
-def _kill_own_group() -> None:
+def _kill_own_session() -> None:
     """End this process after all that its environment has started: the supervisor cannot do it any more.
 
     This process is the last one, because it alone holds the slots of its env copies now.
@@ -105,9 +105,7 @@ def _kill_own_group() -> None:
         sys.stderr.flush()
         give_up_at_s = time.monotonic() + KILLED_WITHIN_S
         while (others := set(live_members(os.getpid())) - {os.getpid()}) and time.monotonic() < give_up_at_s:
-            for pid in others:
-                with suppress(ProcessLookupError, PermissionError):
-                    os.kill(pid, signal.SIGKILL)
+            kill(others)
             time.sleep(POLL_S)
         os.killpg(os.getpid(), signal.SIGKILL)
 

@@ -1,4 +1,4 @@
-"""When a process group is gone, and who holds the slots of env copies until then."""
+"""When a worker's session is gone, and who holds the slots of env copies until then."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ import pytest
 
 from workers.slots import Slots
 from workers.supervise import worker_process
-from workers.supervise.process_group import live_members, process_stat
+from workers.supervise.process_group import kill, live_members, process_stat
 from workers.supervise.worker_process import WorkerCommand, WorkerProcess
 
 WITHIN_S = 60.0
 SIMULATOR = "simulator = subprocess.Popen(['sleep', '1000'])"
+RANK = "simulator = subprocess.Popen(['sleep', '1000'], process_group=0)"  # as mpirun starts the ranks of a program
 
 
 @contextmanager
-def group(program: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """A process that leads a group and runs this program, and the first line that it prints."""
+def session(program: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A process that leads a session and runs this program, and the first line that it prints."""
     command = [sys.executable, "-c", f"import os, subprocess, sys, threading, time\n{program}"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True) as process:
         try:
@@ -32,7 +33,7 @@ def group(program: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
             yield process, process.stdout.readline()
         finally:
             if process.returncode is None:
-                os.killpg(process.pid, signal.SIGKILL)
+                kill(live_members(process.pid))
 
 
 def ended_but_not_reaped(process: subprocess.Popen[str]) -> None:
@@ -47,7 +48,7 @@ def wait_until(is_so: Callable[[], Any]) -> None:
 
 
 def test_a_zombie_that_nobody_reaps_is_gone() -> None:
-    with group("print(flush=True)") as (process, _):
+    with session("print(flush=True)") as (process, _):
         ended_but_not_reaped(process)
         assert process_stat(process.pid)[0] == "Z"
         assert live_members(process.pid) == []
@@ -55,13 +56,14 @@ def test_a_zombie_that_nobody_reaps_is_gone() -> None:
 
 def test_a_process_whose_first_thread_has_ended_is_not_gone() -> None:
     program = "import ctypes; threading.Thread(target=time.sleep, args=(1000,)).start(); print(flush=True)"
-    with group(f"{program}; ctypes.CDLL(None).pthread_exit(None)") as (process, _):
+    with session(f"{program}; ctypes.CDLL(None).pthread_exit(None)") as (process, _):
         wait_until(lambda: process_stat(process.pid)[0] == "Z")
         assert live_members(process.pid) == [process.pid]
 
 
-def test_what_a_dead_process_started_is_not_gone() -> None:
-    with group(f"{SIMULATOR}; print(simulator.pid, flush=True); os._exit(0)") as (process, simulator):
+@pytest.mark.parametrize("start", [SIMULATOR, RANK], ids=["of its group", "of another group"])
+def test_what_a_dead_process_started_is_not_gone(start: str) -> None:
+    with session(f"{start}; print(simulator.pid, flush=True); os._exit(0)") as (process, simulator):
         ended_but_not_reaped(process)
         assert live_members(process.pid) == [int(simulator)]
 
@@ -79,7 +81,7 @@ def test_the_slots_of_a_killed_worker_stay_taken_until_its_simulator_is_gone(
     monkeypatch.setattr(worker_process, "popen", popen)
     monkeypatch.setattr(worker_process, "KILLED_WITHIN_S", 0.0 if gives_up else WITHIN_S)
     worker, others = WorkerProcess(WorkerCommand("ipc:///nobody/listens/here", "w0")), Slots()
-    monkeypatch.setattr(worker, "_kill_group", lambda: None)  # the system takes its time
+    monkeypatch.setattr(worker, "_kill_session", lambda: None)  # the system takes its time
     with worker._process:
         assert worker._process.stdout is not None
         simulator = int(worker._process.stdout.readline())
@@ -96,12 +98,26 @@ def test_the_slots_of_a_killed_worker_stay_taken_until_its_simulator_is_gone(
     assert [record.message for record in caplog.records] == (said if gives_up else [])
 
 
-def test_a_worker_whose_supervisor_was_killed_ends_after_its_simulators() -> None:
+def test_what_a_dead_worker_started_is_killed_also_in_a_process_group_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    def popen(command: list[str], **how: Any) -> subprocess.Popen[bytes]:
+        return subprocess.Popen([sys.executable, "-c", f"import subprocess; {RANK}"], **how)
+
+    monkeypatch.setattr(worker_process, "popen", popen)
+    monkeypatch.setattr(worker_process, "KILLED_WITHIN_S", 2 * WITHIN_S)  # it is not given up
+    worker = WorkerProcess(WorkerCommand("ipc:///nobody/listens/here", "w0"))
+    try:
+        wait_until(lambda: worker.ended() is not None)
+    finally:
+        kill(live_members(worker.pid))
+
+
+@pytest.mark.parametrize("start", [SIMULATOR, RANK], ids=["of its group", "of another group"])
+def test_a_worker_whose_supervisor_was_killed_ends_after_its_simulators(start: str) -> None:
     program = (
         "from workers import program; members = program.live_members; "
-        "program.live_members = lambda group: print(*(found := members(group)), flush=True) or found"
+        "program.live_members = lambda leader: print(*(found := members(leader)), flush=True) or found"
     )
-    with group(f"{program}; {SIMULATOR}; print(simulator.pid, flush=True); program._kill_own_group()") as (
+    with session(f"{program}; {start}; print(simulator.pid, flush=True); program._kill_own_session()") as (
         process,
         simulator,
     ):

@@ -69,7 +69,7 @@ def test_the_wait_for_a_process_that_no_signal_ends_has_a_deadline(
     worker = WorkerProcess(WorkerCommand("ipc:///nobody/listens/here", "w0"))
     with monkeypatch.context() as during:
         during.setattr(worker_process, "KILLED_WITHIN_S", 0.1)
-        during.setattr(worker, "_kill_group", lambda: None)
+        during.setattr(worker, "_kill_session", lambda: None)
         worker.wait(0.0)
     assert worker.ended() is None
     assert [record.message for record in caplog.records] == [

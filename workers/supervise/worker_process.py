@@ -1,6 +1,6 @@
 """A worker in a process of its own, as its supervisor starts it, watches it and ends it.
 
-Rule: the worker has a process group of its own. When the worker has ended, whatever its environment started in that group is
+Rule: the worker has a session of its own. When the worker has ended, whatever its environment started in that session is
 killed; the slots of its env copies are free when all of it is gone, because this process holds them too. If a call of the
 environment takes too long, the worker writes its stacks and is killed. A worker that leaves on purpose says so beforehand:
 any other end is not on purpose, whatever the exit code.
@@ -27,7 +27,7 @@ from protocol.keys.keys import Token
 from workers.slots import free_all, open_slots, touch
 from workers.supervise.activity import STACK_SIGNAL, ActivityReader
 from workers.supervise.ending import Ending
-from workers.supervise.process_group import live_members, process_stat
+from workers.supervise.process_group import kill, live_members, process_stat
 from workers.watchdog import deepest_frame, where_it_hung
 
 log = logging.getLogger("millrace.worker")
@@ -189,16 +189,16 @@ class WorkerProcess:
         return True
 
     def kill(self) -> None:
-        """SIGKILL to its process group, for a worker that hangs."""
+        """SIGKILL to all of its session, for a worker that hangs."""
         if self._runs():
-            self._kill_group()
+            self._kill_session()
 
     # ---------------------------------------------------------------- inside
 
     def _runs(self) -> bool:
-        """Whether the worker runs. When it has ended, its group is killed and it is reaped."""
+        """Whether the worker runs. When it has ended, its session is killed and it is reaped."""
         if self._exit_code is None and self._has_ended():
-            self._kill_group()  # before the process is reaped: until then nobody else can have its id
+            self._kill_session()  # before the process is reaped: until then nobody else can have its id
             self._exit_code = self._process.wait()
             self._give_up_at_s = time.monotonic() + KILLED_WITHIN_S
         return self._exit_code is None
@@ -213,9 +213,10 @@ class WorkerProcess:
             self._was_reaped = True
             return True
 
-    def _kill_group(self) -> None:
+    def _kill_session(self) -> None:
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self.pid, signal.SIGKILL)
+        kill(live_members(self.pid))
 
     def _ending(self, code: int) -> Ending:
         """How it ended. `code` is negative if a signal ended it."""
