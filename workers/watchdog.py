@@ -10,9 +10,14 @@ from __future__ import annotations
 
 import faulthandler
 import re
+import sysconfig
+from pathlib import Path
 
 FAULTHANDLER_HEADER = "Timeout ("  # first words of its output
 LONGEST_S = 1e9  # faulthandler refuses a longer time, such as infinity
+OURS = [f"{Path(__file__).parents[1] / package}/" for package in ("millrace", "protocol", "workers")]
+LIBRARIES = ("<", f"{sysconfig.get_path('stdlib')}/", *OURS)  # how paths begin that are not the user's
+INSTALLED = "-packages/"  # in the path of site-packages, and of Debian's dist-packages
 
 
 class Watchdog:
@@ -43,8 +48,14 @@ def where_it_hung(log: str) -> str | None:
 
 
 def deepest_frame(stacks: str) -> str:
-    """Where the main thread is, from the stacks of all threads that faulthandler wrote; empty if it wrote none."""
+    """Where the main thread is, from the stacks of all threads that faulthandler wrote; empty if it wrote none.
+
+    This is the newest call in code of the user's own, which may wait for a library; if there is none, the newest call.
+    """
     # In each stack the newest call comes first. The last stack is that of the main thread.
     each = re.split(r"^(?:Current )?[Tt]hread .*$", stacks, flags=re.MULTILINE)
-    frame = re.search(r'File "(.*)", line (\d+) in (\S+)', each[-1])
-    return f"{frame[1]}:{frame[2]}, in {frame[3]}" if frame else ""
+    frames = re.findall(r'File "(.*)", line (\d+) in (\S+)', each[-1])
+    of_user = [each for each in frames if not each[0].startswith(LIBRARIES) and INSTALLED not in each[0]]
+    for file, line, function in of_user or frames:
+        return f"{file}:{line}, in {function}"
+    return ""

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from workers.watchdog import Watchdog, where_it_hung
+from workers import watchdog
+from workers.watchdog import Watchdog, deepest_frame, where_it_hung
 
 PROGRAM = """
 import re, sys, threading, time
@@ -26,6 +28,7 @@ watchdog.stop()
 time.sleep({after_s})
 print("alive")
 """
+OURS = watchdog.__file__
 FEED_OFTEN = "for _ in range(12): watchdog.feed(time.monotonic()); time.sleep(0.1)"
 
 
@@ -55,6 +58,23 @@ def test_a_process_that_feeds_or_stops_the_watchdog_is_not_ended(tmp_path: Path)
 def test_output_without_a_hang_has_no_line() -> None:
     assert where_it_hung("Traceback …\nValueError: no") is None
     assert where_it_hung("said before\nTimeout (0:02:00)!\n") == "an unknown place"
+
+
+@pytest.mark.parametrize(
+    ("newest_first", "where"),
+    [
+        (
+            [socket.__file__, "/venv/lib/python3.11/site-packages/sim/api.py", "/home/me/my_env.py", OURS],
+            "/home/me/my_env.py",
+        ),
+        (["<frozen importlib._bootstrap>", "/usr/lib/python3/dist-packages/sim.py", OURS], "<frozen importlib._bootstrap>"),
+    ],
+    ids=["in the user's code", "in none of it"],
+)
+def test_the_line_is_the_newest_of_the_users_own_code(newest_first: list[str], where: str) -> None:
+    stack = "\n".join(f'  File "{file}", line 7 in call' for file in newest_first)
+    other = 'Thread 0x1 (most recent call first):\n  File "/home/me/other.py", line 1 in wait\n'
+    assert deepest_frame(f"{other}\nCurrent thread 0x2 (most recent call first):\n{stack}\n") == f"{where}:7, in call"
 
 
 def test_a_time_that_is_longer_than_any_timer_is_no_error() -> None:
