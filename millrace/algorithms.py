@@ -35,6 +35,7 @@ What it learns from:
 
 - `Batch`: rollouts side by side, numpy arrays [T, ΣN, …]. `LossInput`: the rows of a minibatch that `ActorCritic.loss` gets.
 - `Observations` and `Estimates`: argument and result of `ActorCritic.estimate`.
+- `Demonstrations`: what `Clones`, a base of ours, learns from with `--clone-epochs`; `policy_log_prob` is in its loss.
 - `Start`: what a run with `--from` takes from another one; `Algorithm.start_from` gets it.
 - `PolicySpec`, `ActionSpec` and `Leaf`: the policy and the spaces, as plain data.
 
@@ -56,6 +57,8 @@ from __future__ import annotations
 from learner.algorithms.a2c import A2C
 from learner.algorithms.actor_critic import ActorCritic, Estimates
 from learner.algorithms.algorithm import Algorithm, Start
+from learner.algorithms.cloning.clones import Clones
+from learner.algorithms.cloning.demonstrations import Demonstrations
 from learner.algorithms.continuous import Continuous, Transitions
 from learner.algorithms.dqn import DQN
 from learner.algorithms.impala import Impala
@@ -87,7 +90,7 @@ from learner.config.on_resume import Adaptable, Fixed, Free
 from protocol.errors import UsageError
 from protocol.policy.features import features, normalize
 from protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork
-from protocol.policy.torch_distributions import log_prob_and_entropy, squashed_sample
+from protocol.policy.torch_distributions import log_prob_and_entropy, policy_log_prob, squashed_sample
 from protocol.random_streams import Purpose, torch_seed
 from protocol.rollout import Batch
 from protocol.specs import ActionSpec, Leaf, PolicySpec
@@ -109,9 +112,11 @@ __all__ = [
     "Algorithm",
     "AlgorithmConfig",
     "Batch",
+    "Clones",
     "Continuous",
     "ContinuousConfig",
     "DQNConfig",
+    "Demonstrations",
     "EpisodeEnds",
     "Estimates",
     "Fixed",
@@ -143,6 +148,7 @@ __all__ = [
     "gae",
     "log_prob_and_entropy",
     "normalize",
+    "policy_log_prob",
     "scheduled",
     "squashed_sample",
     "torch_seed",
