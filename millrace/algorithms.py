@@ -37,13 +37,14 @@ What it learns from:
 - `Observations` and `Estimates`: argument and result of `ActorCritic.estimate`.
 - `Demonstrations`: what `Clones`, a base of ours, learns from with `--clone-epochs`; `policy_log_prob` is in its loss.
 - `Start`: what a run with `--from` takes from another one; `Algorithm.start_from` gets it.
+- `Demonstrations`: the steps that `Clones.cloning_loss` gets. `Clones` is the base of those that clone (`--clone-epochs`).
 - `PolicySpec`, `ActionSpec` and `Leaf`: the policy and the spaces, as plain data.
 
 Tools:
 
 - `gae`, `vtrace` and `EpisodeEnds`: advantages and targets of arrays [T, N].
-- `ActorCriticNetwork`, `QNetwork` and `ActorAndCritics`: the networks that workers act with, and `log_prob_and_entropy` or
-  `squashed_sample` of their outputs.
+- `ActorCriticNetwork`, `QNetwork` and `ActorAndCritics`: the networks that workers act with, and `log_prob_and_entropy`,
+  `policy_log_prob` or `squashed_sample` of their outputs.
 - `ReplayBuffer`, which gives a `Sample` of transitions, `MixedReplay`, which also draws prior data, and `Transitions`, the
   arrays of a sample. `ObservationNormalizer` and `RewardScaler`: running statistics of observations and of returns.
 - `features` and `normalize`: observations as these networks take them.
