@@ -78,7 +78,7 @@ def _has_children(process: int) -> bool:
     except OSError:
         return True
     parents = preloaded.parent_pids()
-    return not Path(f"/proc/{process}/task/{process}/children").exists() or any(
+    return not os.path.exists(f"/proc/{process}/task/{process}/children") or any(
         child not in parents or _has_children(child) for child in found
     )
 
@@ -93,7 +93,7 @@ def nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
     temporary.mkdir()
     monkeypatch.setenv("TMPDIR", str(temporary))
     monkeypatch.setattr(tempfile, "tempdir", None)
-    monkeypatch.setenv(FILE_VARIABLE, str(temporary / "slots"))
+    monkeypatch.setenv(FILE_VARIABLE, str(tmp_path.with_name(f"{tmp_path.name}-slots")))
     threads = set(threading.enumerate())
     yield
     deadline = time.monotonic() + LEAVE_WITHIN_S
