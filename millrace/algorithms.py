@@ -35,7 +35,6 @@ What it learns from:
 
 - `Batch`: rollouts side by side, numpy arrays [T, ΣN, …]. `LossInput`: the rows of a minibatch that `ActorCritic.loss` gets.
 - `Observations` and `Estimates`: argument and result of `ActorCritic.estimate`.
-- `Demonstrations`: what `Clones`, a base of ours, learns from with `--clone-epochs`; `policy_log_prob` is in its loss.
 - `Start`: what a run with `--from` takes from another one; `Algorithm.start_from` gets it.
 - `Demonstrations`: the steps that `Clones.cloning_loss` gets. `Clones` is the base of those that clone (`--clone-epochs`).
 - `PolicySpec`, `ActionSpec` and `Leaf`: the policy and the spaces, as plain data.
