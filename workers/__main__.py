@@ -24,7 +24,7 @@ from protocol.keys.keys import Token
 from workers.connection_rules import REJOIN_TIMEOUT_S, checked_token
 from workers.supervise.learner_notice import AliveSender
 from workers.supervise.worker_process import WorkerCommand, WorkerProcess
-from workers.supervisor import Supervisor, core_flags, serve_runs, timeout_flags
+from workers.supervisor import Supervisor, core_flags, timeout_flags
 
 log = logging.getLogger("millrace.worker")
 
@@ -141,22 +141,19 @@ def _supervise(flags: argparse.Namespace, token: Token | None, timeouts: CallTim
     passed += [f"--{flag.replace('_', '-')}" for flag in ("stay", "insecure", "no_code") if getattr(flags, flag)]
     passed += [] if flags.core is None else ["--core", str(flags.core)]
 
-    def start(slot: str) -> WorkerProcess:
-        name = flags.name if flags.processes == 1 else f"{flags.name}-{slot}"
-        own_flags = [*passed, *core_flags(cores, slot)]
+    def start(number: str) -> WorkerProcess:
+        name = flags.name if flags.processes == 1 else f"{flags.name}-{number}"
+        own_flags = [*passed, *core_flags(cores, number)]
+        if flags.stay:
+            log.info("worker %s: waiting for a learner at %s", name, flags.address)
         return WorkerProcess(WorkerCommand(flags.address, name, token=token, flags=own_flags))
 
-    def serve() -> int:
-        if flags.stay:
-            log.info("waiting for a learner at %s", flags.address)
-        notice = AliveSender(flags.address, token)
-        try:
-            supervisor = Supervisor(start, flags.processes, timeouts=timeouts, stay=flags.stay)
-            return supervisor.run(lambda: len(signals), lambda line: log.warning("%s", line), notice)
-        finally:
-            notice.close()
-
-    return serve_runs(serve, lambda: len(signals), stay=flags.stay)
+    notice = AliveSender(flags.address, token)
+    try:
+        supervisor = Supervisor(start, flags.processes, timeouts=timeouts, stay=flags.stay)
+        return supervisor.run(lambda: len(signals), lambda line: log.warning("%s", line), notice)
+    finally:
+        notice.close()
 
 
 def _count_signals() -> list[int]:

@@ -5,8 +5,7 @@ in this run (EXIT_UNSUITABLE) is not started again. Any other is restarted with 
 and is reset once a worker has run for `HEALTHY_S`. A worker is on purpose only if it said so beforehand: the exit codes that
 an environment makes are failures. No worker outlives its supervisor.
 
-With `stay`, only a refusal is final: after the end of a run, new workers wait for the next. One that found no learner, or an
-unsuitable run, is started again as after a failure, because the next learner may be another.
+With `stay`, only a refusal is final: each worker that has left a run is followed by a new one, which waits for the next.
 """
 
 from __future__ import annotations
@@ -33,7 +32,6 @@ HANGS_AFTER_S = 8.0  # after the request to leave, or the end of the run: how lo
 EXIT_REFUSED = 2
 # As in sysexits: no learner answered; this worker cannot take part in the run. Others than the supervisor get 1, and 2.
 EXIT_NO_LEARNER, EXIT_UNSUITABLE = 69, 65
-AFTER_RUN_S = 1.0  # a learner tells a worker that comes while it ends to leave, too
 
 
 class Running(Protocol):
@@ -86,12 +84,12 @@ class LearnerNotice(Protocol):
         ...
 
     def run_is_over(self) -> bool:
-        """Whether the learner has answered that the run is over."""
+        """Whether the learner has answered, since the last call, that the run is over."""
         ...
 
 
 @dataclass
-class _WorkerSlot:
+class _NamedWorker:
     """A worker's name, and the process or thread that runs under it at present."""
 
     name: str
@@ -117,18 +115,17 @@ class Supervisor:
     ) -> None:
         """`start` starts the worker of a name; the names are `prefix` and a number.
 
-        `timeouts`: how long a call of the environment may take before the worker's process is killed. `stay`: workers that
-        find no learner, or an unsuitable run, are started again.
+        `timeouts`: how long a call of the environment may take before the worker's process is killed. `stay`: they serve one
+        run after another.
         """
-        self._start, self._clock, self._timeouts = start, clock, timeouts
-        self._final = {0, EXIT_REFUSED} if stay else {0, EXIT_REFUSED, EXIT_NO_LEARNER, EXIT_UNSUITABLE}
+        self._start, self._clock, self._timeouts, self._stay = start, clock, timeouts, stay
         self._stopping = False
         self._low_priority = False
         self._enforce_due_s = 0.0
-        self._slots: list[_WorkerSlot] = []
+        self._workers: list[_NamedWorker] = []
         try:
             for name in (f"{prefix}{number}" for number in range(count)):
-                self._slots.append(_WorkerSlot(name, start(name), clock()))
+                self._workers.append(_NamedWorker(name, start(name), clock()))
         except BaseException:  # of some workers, none is left behind
             self.stop(0.0)
             raise
@@ -142,86 +139,88 @@ class Supervisor:
         enforce = now >= self._enforce_due_s
         if enforce:
             self._enforce_due_s = now + ENFORCE_EVERY_S
-        for slot in self._slots:
-            if slot.running is not None and enforce:
-                slot.running.enforce(self._timeouts, now)
-            if slot.running is not None and (end := slot.running.ended()) is not None:
-                ended.append((WorkerExit(slot.running.name, slot.running.process_nonce, end.reason, end.failed), end))
-                self._record_end(slot, end, now)
-            if slot.restart_s is not None and now >= slot.restart_s and not self._stopping:
-                self._restart(slot, now)
+        for worker in self._workers:
+            if worker.running is not None and enforce:
+                worker.running.enforce(self._timeouts, now)
+            if worker.running is not None and (end := worker.running.ended()) is not None:
+                ended.append((WorkerExit(worker.running.name, worker.running.process_nonce, end.reason, end.failed), end))
+                self._record_end(worker, end, now)
+            if worker.restart_s is not None and now >= worker.restart_s and not self._stopping:
+                self._restart(worker, now)
         return ended
 
-    def _restart(self, slot: _WorkerSlot, now: float) -> None:
+    def _restart(self, worker: _NamedWorker, now: float) -> None:
         try:
-            slot.running = self._start(slot.name)
+            worker.running = self._start(worker.name)
         except (OSError, UsageError) as error:  # the system has no memory, process or file for it now
-            log.warning("worker %s cannot be started, which is tried again: %s", slot.name, error)
-            self._schedule(slot, now)
+            log.warning("worker %s cannot be started, which is tried again: %s", worker.name, error)
+            self._schedule(worker, now)
             return
-        slot.restart_s = None
-        slot.started_s = now
+        worker.restart_s = None
+        worker.started_s = now
         if self._low_priority:
-            slot.running.lower_priority()
+            worker.running.lower_priority()
 
-    def _record_end(self, slot: _WorkerSlot, end: Ending, now: float) -> None:
-        final = end.on_purpose and end.code in self._final
+    def _record_end(self, worker: _NamedWorker, end: Ending, now: float) -> None:
+        left = end.on_purpose and end.code in (0, EXIT_REFUSED, EXIT_NO_LEARNER, EXIT_UNSUITABLE)
         told_early = self._stopping and end.code == -signal.SIGTERM  # to leave, before it could listen to signals
-        slot.running, slot.exit_code = None, end.code if final else 0 if told_early else 1
-        if now - slot.started_s > HEALTHY_S:
-            slot.backoff_s = BACKOFF_FIRST_S
+        worker.running, worker.exit_code = None, end.code if left else 0 if told_early else 1
+        if now - worker.started_s > HEALTHY_S or (left and end.code == 0):
+            worker.backoff_s = BACKOFF_FIRST_S
+        final = left and (end.code == EXIT_REFUSED or not self._stay)
         if not final and not self._stopping:
-            self._schedule(slot, now)
+            self._schedule(worker, now)
 
-    def _schedule(self, slot: _WorkerSlot, now: float) -> None:
-        slot.restart_s = now + slot.backoff_s
-        slot.backoff_s = min(2 * slot.backoff_s, BACKOFF_MOST_S)
+    def _schedule(self, worker: _NamedWorker, now: float) -> None:
+        worker.restart_s = now + worker.backoff_s
+        worker.backoff_s = min(2 * worker.backoff_s, BACKOFF_MOST_S)
 
     def activities(self) -> list[WorkerActivity]:
         """What each running worker does. A stopped process is left out."""
         now = self._clock()
-        found = (slot.running.activity(now) for slot in self._slots if slot.running is not None)
+        found = (worker.running.activity(now) for worker in self._workers if worker.running is not None)
         return [activity for activity in found if activity is not None]
 
     @property
     def count(self) -> int:
         """Number of workers that run or will be restarted."""
-        return sum(slot.running is not None or (slot.restart_s is not None and not self._stopping) for slot in self._slots)
+        restarts = not self._stopping
+        return sum(each.running is not None or (restarts and each.restart_s is not None) for each in self._workers)
 
     @property
     def exit_code(self) -> int:
         """2 if a worker was refused, 1 if one failed, else 0."""
-        codes = {slot.exit_code for slot in self._slots}
+        codes = {worker.exit_code for worker in self._workers}
         return 2 if codes & {EXIT_REFUSED, EXIT_UNSUITABLE} else 1 if codes - {0} else 0
 
     def ask_to_leave(self) -> None:
         """Ask all workers to leave after the rollout in progress, or at once when asked again. Restart none."""
         self._stopping = True
-        for slot in self._slots:
-            if slot.running is not None:
-                slot.running.stop()
+        for worker in self._workers:
+            if worker.running is not None:
+                worker.running.stop()
 
     def lower_priority(self) -> None:
         """Give all workers the lowest CPU priority, also those that will be started again."""
         self._low_priority = True
-        for slot in self._slots:
-            if slot.running is not None:
-                slot.running.lower_priority()
+        for worker in self._workers:
+            if worker.running is not None:
+                worker.running.lower_priority()
 
     def kill(self, name: str) -> bool:
         """End the worker of this name at once; False if no such worker runs here."""
-        running = [slot.running for slot in self._slots if slot.name == name and slot.running is not None]
-        for worker in running:
-            worker.kill()
+        running = [worker.running for worker in self._workers if worker.name == name and worker.running is not None]
+        for process in running:
+            process.kill()
         return bool(running)
 
     def stop(self, timeout_s: float = STOP_WITHIN_S) -> None:
         """Ask all to leave, wait at most `timeout_s` for all together, and kill those still running."""
         self.ask_to_leave()
         deadline_s = self._clock() + timeout_s
-        for slot in self._slots:
-            if slot.running is not None:
-                slot.running.wait(max(0.0, deadline_s - self._clock()))
+        for worker in self._workers:
+            if worker.running is not None:
+                worker.running.wait(max(0.0, deadline_s - self._clock()))
 
     def run(
         self, stop_requests: Callable[[], int], report: Callable[[str], None], notice: LearnerNotice | None = None
@@ -229,12 +228,13 @@ class Supervisor:
         """Watch the workers until none is left; the exit code. Each request to stop is passed on to all of them.
 
         After such a request, or once the run is over, no worker is restarted, and one whose environment hangs is killed.
+        With `stay`, one that hangs after the end of a run is killed too.
         """
         handled, leave_by_s, kill_hanging_from_s = 0, float("inf"), float("inf")
         while True:
             ended = self._ended()
             for each, end in ended:
-                if len(self._slots) > 1 or not end.on_purpose:  # a single worker has said itself why it leaves
+                if len(self._workers) > 1 or not end.on_purpose:  # a single worker has said itself why it leaves
                     report(f"{each.worker} {each.reason}")
             if notice is not None:
                 notice.send(self.activities(), [each for each, _ in ended], self._clock())
@@ -247,29 +247,23 @@ class Supervisor:
                 kill_hanging_from_s = min(kill_hanging_from_s, now + HANGS_AFTER_S)
                 self.ask_to_leave()
             if notice is not None and not self._stopping and notice.run_is_over():
-                self._stopping = True
-                leave_by_s = kill_hanging_from_s = now + HANGS_AFTER_S
+                self._stopping = not self._stay
+                kill_hanging_from_s = min(kill_hanging_from_s, now + HANGS_AFTER_S)
+                leave_by_s = kill_hanging_from_s if self._stopping else leave_by_s
             if now > kill_hanging_from_s:
                 self._kill_hanging(HANGS_AFTER_S, now)
+                if not self._stopping:  # those of the next run are younger than this
+                    kill_hanging_from_s = float("inf")
             if now > leave_by_s:
                 self.stop(0.0)
             time.sleep(POLL_S)
 
     def _kill_hanging(self, longer_than_s: float, now: float) -> None:
         """Kill the workers that have done one thing for too long."""
-        for slot in self._slots:
-            doing = None if slot.running is None else slot.running.activity(now)
-            if slot.running is not None and doing is not None and doing.for_s > longer_than_s:
-                slot.running.kill()
-
-
-def serve_runs(serve: Callable[[], int], stop_requests: Callable[[], int], *, stay: bool) -> int:
-    """Call `serve`, which serves one run and returns an exit code; with `stay` again, until refused or asked to stop."""
-    code = serve()
-    while stay and code != EXIT_REFUSED and not stop_requests():
-        time.sleep(AFTER_RUN_S)
-        code = 0 if stop_requests() else serve()
-    return code
+        for worker in self._workers:
+            doing = None if worker.running is None else worker.running.activity(now)
+            if worker.running is not None and doing is not None and doing.for_s > longer_than_s:
+                worker.running.kill()
 
 
 def core_flags(cores: Sequence[int], name: str) -> list[str]:

@@ -11,7 +11,6 @@ import pytest
 from protocol.alive import CallTimeouts, Doing, WorkerActivity, WorkerExit
 from workers.supervise.ending import Ending
 from workers.supervisor import (
-    AFTER_RUN_S,
     BACKOFF_FIRST_S,
     BACKOFF_MOST_S,
     ENFORCE_EVERY_S,
@@ -22,7 +21,6 @@ from workers.supervisor import (
     LEAVE_WITHIN_S,
     POLL_S,
     Supervisor,
-    serve_runs,
 )
 
 NONCE = 7
@@ -145,48 +143,27 @@ def test_a_worker_that_left_on_purpose_or_was_refused_is_not_restarted(code: int
     assert len(machine.started) == 1
 
 
-@pytest.mark.parametrize("code", [EXIT_NO_LEARNER, EXIT_UNSUITABLE])
-def test_one_that_stays_is_followed_by_another_if_its_learner_is_gone_or_its_run_unsuitable(code: int) -> None:
-    machine = Machine(stay=True)
+@pytest.mark.parametrize("code", [0, EXIT_NO_LEARNER, EXIT_UNSUITABLE])
+def test_one_that_stays_is_followed_by_another_whatever_the_others_do(code: int) -> None:
+    """Of two workers, one is still to be started again when the other leaves with the end of the run."""
+    machine = Machine(workers=2, stay=True)
+    machine.started[0][1].end = Ending(1, "failed")
     machine.die(code, on_purpose=True)
-    assert machine.pause_s() == pytest.approx(BACKOFF_FIRST_S, abs=0.11)
+    machine.pause_s()
+    assert sorted(name for name, _ in machine.started) == ["w0", "w0", "w1", "w1"]
 
 
-@pytest.mark.parametrize("code", [0, 2])
-def test_one_that_stays_is_not_restarted_within_a_run_that_is_over_or_refused_it(code: int) -> None:
+def test_one_that_stays_is_followed_by_another_soon_after_each_of_many_short_runs() -> None:
     machine = Machine(stay=True)
-    machine.die(code, on_purpose=True)
-    assert (machine.host.count, machine.host.exit_code) == (0, code)
+    for _ in range(9):
+        machine.die(0, on_purpose=True)
+        assert machine.pause_s() == pytest.approx(BACKOFF_FIRST_S, abs=0.11)
 
 
-@pytest.mark.parametrize(
-    ("stay", "runs", "stopped_after", "expected"),
-    [
-        (False, [0], 9, 0),
-        (False, [1], 9, 1),
-        (True, [0, 1, 0, 2], 9, 2),  # refused
-        (True, [0, 1], 2, 1),  # stopped while it served the second
-        (True, [0, 1], 2.5, 0),  # stopped in the pause after the second
-    ],
-)
-def test_runs_are_served_one_after_another_until_one_refuses_or_it_is_told_to_stop(
-    monkeypatch: pytest.MonkeyPatch, stay: bool, runs: list[int], stopped_after: float, expected: int
-) -> None:
-    codes, at = iter(runs), 0.0
-
-    def serve() -> int:
-        nonlocal at
-        at = int(at) + 1
-        return next(codes)
-
-    def sleeps(seconds: float) -> None:
-        nonlocal at
-        at += 0.5
-        assert seconds == AFTER_RUN_S
-
-    monkeypatch.setattr("workers.supervisor.time.sleep", sleeps)
-    assert serve_runs(serve, lambda: int(at >= stopped_after), stay=stay) == expected
-    assert next(codes, None) is None
+def test_one_that_stays_and_was_refused_is_not_restarted() -> None:
+    machine = Machine(stay=True)
+    machine.die(2, on_purpose=True)
+    assert (machine.host.count, machine.host.exit_code) == (0, 2)
 
 
 def test_a_worker_that_sigterm_ends_before_it_can_listen_has_left_as_asked() -> None:
@@ -306,6 +283,28 @@ class Notice:
 
     def run_is_over(self) -> bool:
         return self.over
+
+
+def test_of_those_that_stay_only_what_hangs_from_before_the_end_of_a_run_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One worker hangs; the other has left, and its successor makes its environment for the next run for long."""
+    machine, notice = Machine(workers=2, stay=True), Notice()
+    hangs, leaves = machine.started[0][1], machine.started[1][1]
+    hangs.doing, stop_at_s = "stepping", 10 * HANGS_AFTER_S
+
+    def sleeps(seconds: float) -> None:
+        machine.now += seconds
+        notice.over = 1 < machine.now < 2
+        leaves.end = Ending(0, "left", on_purpose=True) if machine.now > 1 else None
+        for _, worker in machine.started[2:]:
+            worker.doing, worker.since_s = "making", 2 + BACKOFF_FIRST_S
+        for _, worker in machine.started:
+            if worker.requests and worker.end is None:
+                worker.end = Ending(-9 if worker is hangs else 0, "ended", on_purpose=worker is not hangs)
+
+    monkeypatch.setattr("workers.supervisor.time.sleep", sleeps)
+    assert machine.host.run(lambda: int(machine.now > stop_at_s), lambda line: None, notice) == 0
+    assert hangs.requests == ["kill"]
+    assert [(name, worker.requests) for name, worker in machine.started[2:]] == [("w1", ["stop"]), ("w0", ["stop"])]
 
 
 @pytest.mark.parametrize("cause", ["the run is over", "told to leave"])

@@ -38,7 +38,6 @@ class AliveSender:
         self._due_s = 0.0
         self._ended: list[tuple[float, WorkerExit]] = []
         self._reported: set[int] = set()  # nonces of the ended workers that the last message named
-        self._over = False
         self._encoder = msgspec.msgpack.Encoder()
 
     def send(self, running: Sequence[WorkerActivity], ended: Sequence[WorkerExit], now: float) -> None:
@@ -59,12 +58,13 @@ class AliveSender:
             self._say(Alive(tuple(joined[first : first + MAX_WORKERS]), reported[:MAX_WORKERS]))
 
     def run_is_over(self) -> bool:
-        """Whether the learner has answered that the run is over."""
+        """Whether the learner has answered, since the last call, that the run is over."""
+        over = False
         if self._socket is not None:
             with suppress(zmq.Again):
-                while not self._over:
-                    self._over = _is_drain(self._socket.recv_multipart(zmq.NOBLOCK)[0])
-        return self._over
+                while not over:
+                    over = _is_drain(self._socket.recv_multipart(zmq.NOBLOCK)[0])
+        return over
 
     def close(self) -> None:
         """Close the connection."""
