@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
 import subprocess
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -77,6 +79,20 @@ def test_the_wait_for_a_process_that_no_signal_ends_has_a_deadline(
     ]
     worker.wait(0.0)  # with a signal that ends it
     assert worker.ended() == Ending(-9, "was killed by SIGKILL while it started")
+
+
+def test_a_worker_is_spoken_for_until_its_end_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It has ended, and its simulator takes long to be gone: the learner must not take it for silent before it hears why."""
+    monkeypatch.setattr(worker_process, "popen", lambda command, **how: subprocess.Popen(["sh", "-c", "exit 3"], **how))
+    worker = WorkerProcess(WorkerCommand("ipc:///nobody/listens/here", "w0"))
+    with monkeypatch.context() as during:
+        during.setattr(worker, "_kill_session", lambda: None)
+        during.setattr(worker_process, "live_members", lambda session: [worker.pid])
+        os.waitid(os.P_PID, worker.pid, os.WEXITED | os.WNOWAIT)
+        assert worker.ended() is None
+        assert worker.activity(time.monotonic()) is not None
+    assert worker.ended() == Ending(3, "ended with exit code 3 while it started")
+    assert worker.activity(time.monotonic()) is None
 
 
 def test_a_process_that_cannot_be_started_leaves_no_descriptor_behind(monkeypatch: pytest.MonkeyPatch) -> None:

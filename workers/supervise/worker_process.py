@@ -131,8 +131,12 @@ class WorkerProcess:
         return self._end
 
     def activity(self, now: float) -> WorkerActivity | None:
-        """What it does. None if it has ended, or if it is stopped: then nobody speaks for it."""
-        if not self._runs() or _is_stopped(self.pid):
+        """What it does. None if it has ended, or if it is stopped: then nobody speaks for it.
+
+        While something that it started is not gone, it does what it did last: a learner that took it for silent in that time
+        would not count its failure.
+        """
+        if self.ended() is not None or _is_stopped(self.pid):
             return None
         page = self._page.read(now)
         return WorkerActivity(self.name, self.process_nonce, page.doing, page.for_s, page.env_calls)
