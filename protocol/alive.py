@@ -16,6 +16,7 @@ Doing = Literal["starting", "waiting", "describing", "making", "resetting", "ste
 
 `making`: an env copy, or the policy with all that it imports.
 """
+NO_SLOT = "no slot is free"  # the beginning of the reason of a worker that leaves, and comes back when there is room
 CLOSE_S = 10.0  # for one env copy; what hangs in `close` has done its work
 NO_ENVIRONMENT_CODE: frozenset[Doing] = frozenset({"starting", "waiting"})
 

@@ -46,7 +46,7 @@ def work(flags: argparse.Namespace, token: Token | None, timeouts: CallTimeouts,
     if flags.activity is not None:
         share_activity(Activity(flags.activity))
     if flags.slots is not None:
-        share_slots(flags.slots)
+        share_slots(flags.slots, flags.copies_per_machine)
     try:
         link = WorkerLink(flags.address, flags.name, token=token)
     except UserFacingError as error:

@@ -279,10 +279,10 @@ class Session:
             effects.append(Send(Failure(self.session, error, last_text(traceback), lane, of_policy)))
         return [] if self.state is State.LEFT else effects + self._leave(WorkerFailed(), 1, error)
 
-    def decline(self, reason: str) -> list[Effect]:
-        """Leave a run in which this worker cannot take part."""
+    def decline(self, reason: str, exit_code: int = EXIT_UNSUITABLE) -> list[Effect]:
+        """Leave a run in which this worker cannot take part, or (with another exit code) not now."""
         goodbye = Send(Goodbye(self.session, one_line(reason), ()))
-        return [goodbye, *self._leave(WorkerFailed(), EXIT_UNSUITABLE, reason)]
+        return [goodbye, *self._leave(WorkerFailed(), exit_code, reason)]
 
     def refused(self, reason: str) -> list[Effect]:
         """Leave, because the learner's endpoint rejects this worker for good."""

@@ -3,46 +3,88 @@
 Rule: no two live env copies on a machine have the same slot. A slot is a lock on one byte of a file that all users of the
 machine share and that stays empty. The lock belongs to an open file and not to a process, so a worker and its supervisor
 hold it together, and the kernel frees it when both are gone.
+
+Rule: with a limit K, the slots are 0 to K - 1. A copy that finds none waits for `WAIT_S`; then its worker leaves the run, so
+that the learner can place its lanes elsewhere, and is started again when there is room.
 """
 
 from __future__ import annotations
 
 import errno
 import fcntl
+import itertools
+import logging
 import os
+import socket
 import stat
 import struct
 import threading
+import time
 from contextlib import suppress
 from pathlib import Path
 
+from protocol.alive import NO_SLOT
 from protocol.errors import UsageError
 
-FILE_VARIABLE = "MILLRACE_SLOTS"
+log = logging.getLogger("millrace.worker")
+
+FILE_VARIABLE, LIMIT_VARIABLE = "MILLRACE_SLOTS", "MILLRACE_COPIES_PER_MACHINE"
 FILE = "/tmp/millrace-slots"  # not of $TMPDIR, which may differ between the users of a machine
 FLAGS = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # a link is not followed, a FIFO does not block
 MODE = 0o666
 FLOCK = "hhqqi4x"  # struct flock on Linux: type, whence, start, length, process
 
+WAIT_S, POLL_S = 30.0, 0.2  # for a slot; the copies of another worker may take long to close
+
+
+class NoSlot(UsageError):
+    """All slots of this machine are taken, and have been for a while."""
+
 
 class Slots:
     """The slots that one process holds. Its threads may use it at the same time."""
 
-    def __init__(self, fd: int | None = None) -> None:
-        """`fd`: the file, as the supervisor opened it. None: open it. Raises `UsageError` if that is not possible."""
+    def __init__(self, fd: int | None = None, most: int = 0) -> None:
+        """`fd`: the file, as the supervisor opened it. None: open it. Raises `UsageError` if that is not possible.
+
+        `most`: how many slots the machine has; 0: no limit.
+        """
+        self.most = most
         self.fd, self.pid = open_slots() if fd is None else fd, os.getpid()
         self._taken: set[int] = set()
         self._lock = threading.Lock()
 
     def take(self) -> int:
-        """Hold the lowest number that is free on this machine, from 0. Give it back when the env copy is closed."""
+        """Hold the lowest number that is free on this machine, from 0. Give it back when the env copy is closed.
+
+        Raises `NoSlot` if none becomes free within `WAIT_S`.
+        """
+        until_s, said = time.monotonic() + WAIT_S, False
+        line = f"{NO_SLOT} on {socket.gethostname()}: other env copies hold all {self.most} of --copies-per-machine"
+        while (slot := self._take_now()) is None:
+            if time.monotonic() >= until_s:
+                raise NoSlot(line)
+            if not said:
+                log.warning("%s; waiting for one", line)
+            said = True
+            time.sleep(POLL_S)
+        return slot
+
+    def have_room(self, copies: int) -> bool:
+        """Whether so many slots are free now."""
+        found = [slot for _ in range(copies) if (slot := self._take_now()) is not None]
+        for slot in found:
+            self.give_back(slot)
+        return len(found) == copies
+
+    def _take_now(self) -> int | None:
         with self._lock:
-            slot = 0
-            while slot in self._taken or not _is_locked_by(self.fd, slot):
-                slot += 1
-            self._taken.add(slot)
-            touch(self.fd)
-            return slot
+            for slot in range(self.most) if self.most else itertools.count():
+                if slot not in self._taken and _is_locked_by(self.fd, slot):
+                    self._taken.add(slot)
+                    touch(self.fd)
+                    return slot
+            return None
 
     def give_back(self, slot: int) -> None:
         """Free a slot that `take` returned."""
@@ -62,11 +104,11 @@ def slots() -> Slots:
     return _of_process
 
 
-def share_slots(fd: int) -> None:
+def share_slots(fd: int, most: int = 0) -> None:
     """Hold the slots of this process, a worker, together with its supervisor, which has opened the file."""
     global _of_process
     os.set_inheritable(fd, False)
-    _of_process = Slots(fd)
+    _of_process = Slots(fd, most)
 
 
 def open_slots() -> int:

@@ -48,9 +48,11 @@ from workers.session import (
     Statistics,
     Task,
 )
+from workers.slots import NoSlot, slots
 from workers.states import State
 from workers.step.stepper import Stepper
 from workers.supervise.activity import MAKING, WAITING, activity
+from workers.supervisor import EXIT_UNSUITABLE
 
 log = logging.getLogger("millrace.worker")
 
@@ -298,10 +300,24 @@ class Worker:
 
     def _fail(self, error: Exception) -> None:
         """The environment's code or the user's policy raised, or our code on their data: report it to the learner."""
+        if isinstance(error, NoSlot) and self._session.state is not State.LEFT:
+            self._decline(error)
+            return
         detail = error.detail if isinstance(error, UserFacingError) else traceback.format_exc()
         lane = error.lane if isinstance(error, LaneFailed) else None
         log.error("%s\n%s", error, detail)
         self._do(self._session.fail(_line(error), detail, lane, of_policy=isinstance(error, PolicyFailed)))
+
+    def _decline(self, error: UsageError) -> None:
+        """Leave the run. Without a slot, this process ends when there is room for a lane: then it is started again."""
+        self._close_all()
+        goodbye, *rest = self._session.decline(_line(error), 1 if isinstance(error, NoSlot) else EXIT_UNSUITABLE)
+        self._do([goodbye])
+        copies = getattr(self._session.run, "copies", 1)
+        while isinstance(error, NoSlot) and not (self._options.stop_requests() or slots().have_room(copies)):
+            self._options.feed_watchdog(self._clock())
+            time.sleep(PULSE_S)
+        self._do(rest)
 
     def _update_statistics(self) -> None:
         if (source := self._collector or self._stepper) is not None:
@@ -382,7 +398,7 @@ class Worker:
                     heartbeats.stop()
                 self._do(self._session.described(description))
         except UsageError as error:
-            self._do(self._session.decline(str(error)))
+            self._decline(error)
         except Exception as error:
             self._fail(error)
 

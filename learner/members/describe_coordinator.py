@@ -14,6 +14,7 @@ from learner.members.events import EnvironmentRaised
 from learner.members.failure_count import FailureCount
 from learner.members.membership import Member, Membership, Outgoing
 from learner.members.states import SentUnusable
+from protocol.alive import NO_SLOT
 from protocol.bounds import one_line
 from protocol.envs.description import DescribedEnv, read_description
 from protocol.errors import BadMessage, EnvironmentFailed, UsageError, UserFacingError
@@ -144,7 +145,7 @@ class DescribeCoordinator:
         )
 
     def _goodbye(self, member: Member, reason: str) -> list[Outgoing]:
-        if reason == TOLD_TO_STOP or self.described is not None:
+        if reason == TOLD_TO_STOP or reason.startswith(NO_SLOT) or self.described is not None:
             self.membership.remove(member, Goodbye, f"left: {reason}")
             return []
         return self._unsuitable(member, Goodbye, reason)

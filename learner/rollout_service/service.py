@@ -131,6 +131,7 @@ def rollout_service(
         ledger=ledger,
         incarnations=incarnations,
     )
+    coordinator.max_env_copies = config.max_env_copies
     settings = HubSettings(
         config.no_workers_timeout_s,
         config.stall_timeout_s,

@@ -109,6 +109,8 @@ class TicketCoordinator:
         self.tickets: dict[int, Ticket] = {}
         self.ready: list[AcceptedRollout] = []
         self.evaluation = EvaluationTickets(run.policy, len(run.facts))
+        self.max_env_copies = 0
+        """most env copies on all workers, with those of evaluations; 0: no limit"""
         self._held_back = False  # whether to deal no ticket for a rollout, because an evaluation is about to begin
         self._placement, self._queue = LanePlacement(self.lanes, _by_joining), LaneQueue(self.lanes)
         self._oldest_ready = version  # no rollout that is ready is older
@@ -398,7 +400,7 @@ class TicketCoordinator:
             return []
         out = self._placement.place(self.members.values())
         if self.evaluation.pending:
-            return out + self.evaluation.deal(self.membership.active())
+            return out + self.evaluation.deal(self._evaluators())
         if self._held_back:
             return out
         allowed = self.rollouts_per_update * (self.version - self._first_version + 1 + self.max_lag)
@@ -419,6 +421,14 @@ class TicketCoordinator:
         for peer, numbers in dealt.items():
             out += self._collect(self.members[peer], numbers)
         return out
+
+    def _evaluators(self) -> list[CollectingMember]:
+        """Those who may play evaluations: with a limit of copies, the first to join, because a worker keeps its copies."""
+        active, plan = self.membership.active(), self.evaluation.plan
+        if not self.max_env_copies or plan is None:
+            return active
+        free = self.max_env_copies - self.run.lanes * self.run.copies
+        return active[: max(1, free // min(plan.copies, len(plan.seeds)))]
 
 
 def _by_joining(member: Member) -> int:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from learner.callbacks.callbacks import Watch
 from learner.config.config import Config
-from learner.config.validation import idle_workers, workers_to_wait_for
+from learner.config.validation import check_copies, idle_workers, workers_to_wait_for
 from learner.interrupts import Interrupts
 from learner.members.endpoint import BindSettings
 from learner.members.process_callbacks import ProcessCallbacks
@@ -29,6 +29,7 @@ from learner.torch_setup import one_thread
 from millrace.launch.endpoint import open_endpoint
 from millrace.launch.local_worker_options import no_flags, stopped_on_error, worker_flags
 from protocol.env_spec import EnvSpec
+from workers.slots import slots
 from workers.supervisor import STOP_WITHIN_S, Supervisor
 
 log = logging.getLogger("millrace.learner")
@@ -44,6 +45,8 @@ def train(config: Config, resume: Path | None, watch: Watch, env: EnvSpec | None
 
 def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec | None) -> Path:
     env = env or named_environment(config)
+    check_copies(config, config.copies_per_machine)
+    slots().most = config.copies_per_machine  # of workers in threads
     if config.inference == "learner":
         from millrace.launch import learner_inference as inference
 

@@ -9,6 +9,7 @@ import socket
 import stat
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -17,7 +18,8 @@ from pathlib import Path
 import pytest
 
 from protocol.errors import UsageError
-from workers.slots import FILE_VARIABLE, Slots, free_all, open_slots, slots
+from workers import slots as module
+from workers.slots import FILE_VARIABLE, NoSlot, Slots, free_all, open_slots, slots
 
 
 @pytest.fixture
@@ -140,3 +142,33 @@ def test_without_open_file_locks_processes_still_share_no_slot(monkeypatch: pyte
         assert own.take() == 3
     own.give_back(0)
     assert [own.take(), own.take()] == [0, 1]
+
+
+# ---------------------------------------------------------------------------------------------- a limit of copies
+
+
+def test_with_a_limit_a_copy_waits_until_a_slot_is_free(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    licensed, other = Slots(most=2), Slots()
+    assert (licensed.take(), other.take()) == (0, 1)
+    monkeypatch.setattr(time, "sleep", lambda seconds: other.give_back(1))  # while it waits
+    assert licensed.take() == 1
+    assert len(caplog.messages) == 1
+    assert caplog.messages[0].startswith("no slot is free on ")
+    assert caplog.messages[0].endswith("other env copies hold all 2 of --copies-per-machine; waiting for one")
+
+
+def test_a_copy_that_waited_long_enough_gives_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "WAIT_S", 0.0)
+    licensed = Slots(most=1)
+    licensed.take()
+    with pytest.raises(NoSlot, match=r"other env copies hold all 1 of --copies-per-machine$"):
+        licensed.take()
+
+
+def test_there_is_room_if_so_many_slots_are_free_and_asking_takes_none() -> None:
+    licensed, other = Slots(most=3), Slots()
+    other.take()
+    assert [licensed.have_room(copies) for copies in (1, 2, 3)] == [True, True, False]
+    assert other.take() == 1

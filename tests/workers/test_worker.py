@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import NoReturn, cast
@@ -11,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from protocol.alive import NO_ENVIRONMENT_CODE
+from protocol.alive import NO_ENVIRONMENT_CODE, NO_SLOT
 from protocol.arrays import Array
 from protocol.messages import (
     Collect,
@@ -36,9 +37,11 @@ from protocol.wire.compression import Packing
 from protocol.wire.weight_dtypes import WeightsDtype, to_float32, to_wire_dtype
 from protocol.wire.worker_link import WorkerLink
 from tests.support.collectors import TOY, bits, collect, random_collector, run_of
+from workers import slots as slot_file
 from workers.collect.collector import Collector
 from workers.evaluate.evaluator import Evaluator
 from workers.session import Leave, Session
+from workers.slots import Slots
 from workers.supervise.activity import ActivityReader, activity
 from workers.supervisor import EXIT_UNSUITABLE
 from workers.worker import CONNECT_AGAIN_S, Worker, WorkerOptions, identity, make_local_collector
@@ -150,6 +153,27 @@ def test_a_collector_that_cannot_be_made_is_a_failure_that_the_learner_hears() -
     assert isinstance(failure, Failure)
     assert failure.error == "RuntimeError: CUDA error: out of memory"
     assert "in no_device" in failure.traceback
+
+
+def test_a_worker_without_a_slot_leaves_without_a_failure_and_ends_when_there_is_room(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(slot_file, "WAIT_S", 0.0)
+    monkeypatch.setattr(slot_file, "_of_process", Slots(most=RUN.copies))
+    others, waited = Slots(), [0]
+    others.take()
+
+    def pause(seconds: float) -> None:
+        waited[0] += 1
+        others.give_back(0)
+
+    monkeypatch.setattr(time, "sleep", pause)
+    link = FakeLink(said_to_a_worker(RUN))
+    assert work(link).exit_code == 1  # its supervisor starts it again
+    assert waited == [1]
+    goodbye = link.heard()[-1]
+    assert isinstance(goodbye, Goodbye)
+    assert goodbye.reason.startswith(NO_SLOT)
 
 
 def test_a_worker_that_makes_its_policy_is_not_silent() -> None:

@@ -13,7 +13,7 @@ from learner.config.config import Config
 from learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
 from learner.config.layers import config_from_toml, lower_layers, resolve
 from learner.config.presets import PRESETS, named_presets
-from learner.config.validation import idle_workers, unused_target, workers_to_wait_for
+from learner.config.validation import check_copies, idle_workers, unused_target, workers_to_wait_for
 from learner.run_folder.run_format import write_format
 from protocol.errors import UsageError
 
@@ -284,3 +284,15 @@ def test_arguments_of_the_environment_that_policy_json_cannot_hold_are_refused(t
     settings: dict[str, Any] = {table: {"limit": float("inf")}}
     with pytest.raises(UsageError, match=f"^{table} limit: expected a finite number, got inf"):
         resolve("CartPole-v1", **settings)
+
+
+def test_a_limit_of_copies_that_a_run_cannot_keep_is_refused() -> None:
+    sizes: dict[str, Any] = {"preset": "none", "envs": 6, "lanes": 3, "workers": 3, "eval_copies": 4, "eval_episodes": 10}
+    expected = "expected at least 10, for 6 env copies and 4 that play evaluations; take fewer envs, eval_copies or workers"
+    assert refusal(**sizes, max_env_copies=9) == f"max_env_copies 9: {expected}"
+    check_copies(resolve("CartPole-v1", **sizes, max_env_copies=10), 10)  # one worker at a time plays evaluations
+    with pytest.raises(UsageError, match=r"^copies_per_machine 9: expected at least 10, .* 4 that play"):
+        check_copies(resolve("CartPole-v1", **sizes, max_env_copies=10), 9)
+    check_copies(resolve("CartPole-v1", **sizes), 18)
+    with pytest.raises(UsageError, match=r"^copies_per_machine 17: expected at least 18, .* 12 that play"):
+        check_copies(resolve("CartPole-v1", **sizes), 17)

@@ -14,6 +14,7 @@ from learner.members.describe import LOG_WAITING_EVERY_S, DescribeSettings, desc
 from learner.members.describe_coordinator import Accept, DescribeCoordinator, accept_any
 from learner.members.membership import Outgoing
 from learner.members.process_callbacks import ProcessCallbacks
+from protocol.alive import NO_SLOT
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.errors import EnvironmentFailed, NoWorkers, Stalled, UsageError
@@ -162,9 +163,10 @@ def test_the_start_ends_once_all_workers_of_the_launcher_have_declined() -> None
 
 
 @pytest.mark.parametrize("decliners_to_end", [0, 1])
-def test_a_worker_that_was_told_to_stop_says_nothing_of_the_environment(decliners_to_end: int) -> None:
+@pytest.mark.parametrize("reason", [TOLD_TO_STOP, f"{NO_SLOT} on here"])
+def test_a_worker_that_must_leave_says_nothing_of_the_environment(decliners_to_end: int, reason: str) -> None:
     made = coordinator(decliners_to_end=decliners_to_end)
-    made.receive(A, Goodbye(join(made, A), TOLD_TO_STOP, ()), 1.0)
+    made.receive(A, Goodbye(join(made, A), reason, ()), 1.0)
     assert made.failure is None
     assert isinstance(made.receive(A, hello(A), 2.0)[0][1], Welcome)
 
