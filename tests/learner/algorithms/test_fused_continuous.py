@@ -79,7 +79,7 @@ def everything(passes: ActorAndCriticsPasses, net: ActorAndCritics, rows: int, s
     st.integers(1, 1100),
     st.integers(0, 999),
 )
-@settings(max_examples=30)
+@settings(max_examples=30, deadline=None)
 def test_passes_in_numpy_are_those_of_autograd(net: list[int], activation: str, head: str, rows: int, seed: int) -> None:
     """Weights are large, so that the logarithms of many standard deviations leave their bounds."""
     ours, reference = networks(seed, 1.5, net=tuple(net), activation=activation, head=head)
