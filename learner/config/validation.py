@@ -177,8 +177,9 @@ def _check_numbers(record: msgspec.Struct, at: str) -> None:
     """Raise `UsageError` for NaN, and for a whole number that is too large for a message."""
     for name, value in msgspec.structs.asdict(record).items():
         most = LARGEST_SEED if name == "seed" else LARGEST
-        if isinstance(value, int) and value > most:
-            raise UsageError(f"{at}{name}: expected int <= {most}, got {value}")
+        for each in value if isinstance(value, tuple) else (value,):
+            if isinstance(each, int) and each > most:
+                raise UsageError(f"{at}{name}: expected int <= {most}, got {one_line(str(each))}")
         if isinstance(value, float) and math.isnan(value):
             raise UsageError(f"{at}{name}: expected a number, got {value}")
 
