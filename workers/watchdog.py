@@ -17,6 +17,7 @@ FAULTHANDLER_HEADER = "Timeout ("  # first words of its output
 LONGEST_S = 1e9  # faulthandler refuses a longer time, such as infinity
 OURS = [f"{Path(__file__).parents[1] / package}/" for package in ("millrace", "protocol", "workers")]
 LIBRARIES = ("<", f"{sysconfig.get_path('stdlib')}/", *OURS)  # how paths begin that are not the user's
+ENVIRONMENTS = f"{Path(__file__).parent / 'envs'}/"  # ours are as those of a user
 INSTALLED = "-packages/"  # in the path of site-packages, and of Debian's dist-packages
 
 
@@ -55,7 +56,11 @@ def deepest_frame(stacks: str) -> str:
     # In each stack the newest call comes first. The last stack is that of the main thread.
     each = re.split(r"^(?:Current )?[Tt]hread .*$", stacks, flags=re.MULTILINE)
     frames = re.findall(r'File "(.*)", line (\d+) in (\S+)', each[-1])
-    of_user = [each for each in frames if not each[0].startswith(LIBRARIES) and INSTALLED not in each[0]]
+    of_user = [each for each in frames if each[0].startswith(ENVIRONMENTS) or not _is_of_library(each[0])]
     for file, line, function in of_user or frames:
         return f"{file}:{line}, in {function}"
     return ""
+
+
+def _is_of_library(file: str) -> bool:
+    return file.startswith(LIBRARIES) or INSTALLED in file

@@ -41,7 +41,7 @@ def _converted(values: Any, kind: type[Record], settings: dict[str, Any], where:
             raise UsageError(f"{where}: {table}: expected table, got {settings[table]!r:.60}".removeprefix(": "))
     try:
         return msgspec.convert(values, kind)
-    except msgspec.ValidationError as error:
+    except (msgspec.ValidationError, UnicodeEncodeError) as error:  # the latter for a path that is no text
         raise UsageError(f"{where}: {_reworded(str(error), settings)}".removeprefix(": ")) from error
 
 

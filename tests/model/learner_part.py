@@ -44,7 +44,15 @@ SAVED: dict[type, set[str]] = {
 }
 """What of each object is saved."""
 NOT_SAVED: dict[type, set[str]] = {
-    TicketCoordinator: {"run", "rollouts_per_update", "max_lag", "worker_timeout_s", "evaluation", "_absent"}
+    TicketCoordinator: {
+        "run",
+        "rollouts_per_update",
+        "max_lag",
+        "max_env_copies",
+        "worker_timeout_s",
+        "evaluation",
+        "_absent",
+    }
     | {"_first_version", "_used_before"},  # no run of the model changes its lanes, so counting from 0 gives the same
     Membership: {"events", "draining", "progress", "_run", "_member_class", "_on_removed", "_is_spare"}
     | {"_removed_for_silence", "_stages_of_left"},
