@@ -54,7 +54,8 @@ def chart(all_series: Sequence[Series], width: int, height: int, x_label: str, d
     ys = [series.y for series in all_series if series.y.size]
     low, high = (min(float(y.min()) for y in ys), max(float(y.max()) for y in ys)) if ys else (0.0, 1.0)
     if low == high:
-        low, high = low - 1, high + 1
+        margin = max(1.0, 1e-9 * abs(low))  # beside a very large number, 1 is lost
+        low, high = low - margin, high + margin
     low, high = (0.0 if 0 <= low < 0.4 * high else low - 0.05 * (high - low)), high + 0.05 * (high - low)
     plot_w, plot_h = width - LEFT - RIGHT, height - TOP - BOTTOM
 

@@ -289,6 +289,15 @@ def test_a_curve_is_drawn_where_it_was_measured() -> None:
     assert path.split("L")[-1].split()[0] == "186.0"  # the last point is among them
 
 
+@pytest.mark.parametrize("value", [0.0, 500.0, -1e300])
+def test_a_curve_that_does_not_vary_is_drawn_in_the_middle(value: float) -> None:
+    x, y = np.array([0.0, 1.0]), np.array([value, value])
+    (path,) = re.findall(r' d="([^"]*)"', chart([Series("line", 0, x, y)], 200, 100, "", ""))
+    heights = {float(each) for each in re.findall(r"[ML][\d.]+[ ,]([\d.]+)", path)}
+    assert len(heights) == 1
+    assert 20 < heights.pop() < 80
+
+
 def test_ticks_are_round_and_within() -> None:
     assert ticks(0, 100_000, 5) == [0, 20_000, 40_000, 60_000, 80_000, 100_000]
     assert ticks(-1290, -140, 5) == [-1200, -1000, -800, -600, -400, -200]
