@@ -18,6 +18,7 @@ import numpy.typing as npt
 from learner.policy_player import saved_policy
 from millrace.arguments import checked
 from protocol.arrays import Array, Bools, Floats
+from protocol.bounds import one_line
 from protocol.envs.spaces import action_converter_of
 from protocol.errors import UsageError, check_at_least
 from protocol.policy.distributions import distribution
@@ -162,7 +163,8 @@ class LoadedPolicy:
             found = dict(_by_path(observation, ""))
             missing = [leaf.path for leaf in leaves if leaf.path not in found]
             if missing:
-                raise UsageError(f"observation: expected {missing[0]}, got {', '.join(sorted(found)) or 'nothing'}")
+                got = ", ".join(sorted(found)) or "nothing"
+                raise UsageError(one_line(f"observation: expected {missing[0]}, got {got}"))
         arrays = [_checked(found[leaf.path], leaf) for leaf in leaves]
         numbers = {None if array.shape == leaf.shape else len(array) for array, leaf in zip(arrays, leaves, strict=True)}
         if len(numbers) > 1:
