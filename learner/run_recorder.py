@@ -186,7 +186,6 @@ class RunRecorder:
         self._stages_s["update"] += update_s - self._gathered_s
         self._stages_s["other"] += self._gathered_s
         snapshot = self._service.snapshot()
-        evaluated_s = snapshot.evaluate_s
         self._update |= {"metrics": named(metrics), "lags": tuple(snapshot.lags)}
         progress = self._progress(snapshot)
         self._write_row(progress, metrics)
@@ -203,7 +202,8 @@ class RunRecorder:
             since_last_s=began_s - self._saved_s, episodes_since_last=self._episodes_since_save, updates=self.version
         ):
             self.save()
-        self._stages_s["other"] += time.monotonic() - began_s - (self._service.snapshot().evaluate_s - evaluated_s)
+        evaluated_s = self._service.snapshot().evaluate_s - snapshot.evaluate_s if evaluates else 0.0
+        self._stages_s["other"] += time.monotonic() - began_s - evaluated_s
 
     def evaluate_if_due(self) -> None:
         """Make the evaluation before which the run was interrupted, if there is one. The weights must be published."""

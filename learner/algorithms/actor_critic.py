@@ -32,7 +32,7 @@ from learner.algorithms.updates import check_finite, scheduled
 from learner.config.hyperparameters import ActorCriticConfig, AlgorithmConfig, PolicyGradientConfig, RecurrentConfig
 from protocol.arrays import Array, Bools, Floats
 from protocol.errors import RunError, UsageError
-from protocol.policy.features import features, normalize
+from protocol.policy.features import features
 from protocol.policy.masks import FORBIDDEN
 from protocol.policy.networks import ActorCriticNetwork, RecurrentInput
 from protocol.policy.torch_distributions import log_prob_and_entropy, policy_log_prob
@@ -338,18 +338,14 @@ class ActorCritic(Clones):
 
     def _inputs(self, leaves: Sequence[Array]) -> tuple[Tensor, list[Tensor]]:
         """Features [B, D], normalized, and images [B, *leaf] uint8, of leaves [B, *leaf]."""
-        x = features(self.policy, leaves)
-        x = normalize(x, *np.split(self._buffers, 2)) if self.policy.normalize_observations else x
-        images = [array for leaf, array in zip(self.policy.observation, leaves, strict=True) if leaf.is_image]
+        _, x, images = self._normalizer.inputs(leaves, self._buffers)
         return self._to_device(x), [self._to_device(image) for image in images]
 
     # ---------------------------------------------------------------- a batch as tensors
 
     def observations(self, batch: Batch) -> Observations:
         """The observations as the workers' policy saw them."""
-        raw = features(self.policy, batch.obs)
-        x = normalize(raw, *np.split(self._buffers, 2)) if self.policy.normalize_observations else raw
-        images = [array for leaf, array in zip(self.policy.observation, batch.obs, strict=True) if leaf.is_image]
+        raw, x, images = self._normalizer.inputs(batch.obs, self._buffers)
         return Observations(raw, self._flat_tensor(x), tuple(map(self._flat_tensor, images)), self._recurrent_input(batch))
 
     def _recurrent_input(self, batch: Batch) -> RecurrentInput | None:

@@ -10,6 +10,7 @@ Values that are not far count as they are, bit for bit.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,8 @@ import numpy.typing as npt
 import torch
 
 from learner.algorithms.returns import EpisodeEnds, discounted_return
-from protocol.arrays import Doubles, Floats
-from protocol.policy.features import CLIP, leaf_of_features
+from protocol.arrays import Array, Doubles, Floats
+from protocol.policy.features import CLIP, features, leaf_of_features, normalize
 from protocol.policy.layout import buffer_size
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
@@ -72,12 +73,21 @@ class ObservationNormalizer:
     """Means and standard deviations of the features of Box observations. One-hot and binary features are not normalized."""
 
     def __init__(self, spec: PolicySpec) -> None:
-        self._enabled = spec.normalize_observations
+        self._spec, self._enabled = spec, spec.normalize_observations
         leaves = leaf_of_features(spec)
         self._box_features = np.array([leaf.kind == "box" for leaf in leaves], bool)
         self._is_float64 = np.array([leaf.dtype == "float64" for leaf in leaves], bool)
         self._moments = RunningMoments((len(leaves),), np.where(self._is_float64, ROUNDING_64, ROUNDING_32))
         assert not self._enabled or buffer_size(spec) == 2 * len(leaves)
+
+    def inputs(self, leaves: Sequence[Array], published: Floats) -> tuple[Array, Array, list[Array]]:
+        """Features [..., D] of leaves [..., *leaf], the same as a network takes them, and the images among the leaves.
+
+        `published`: `buffers` as workers act with them, which may be older than what was counted.
+        """
+        raw = features(self._spec, leaves)
+        x = normalize(raw, *np.split(published, 2)) if self._enabled else raw
+        return raw, x, [array for leaf, array in zip(self._spec.observation, leaves, strict=True) if leaf.is_image]
 
     def update(self, features: Floats | Doubles, valid: npt.NDArray[np.bool_]) -> None:
         """Count features [T, N, D], not yet normalized, of the rows [T, N] that are valid."""

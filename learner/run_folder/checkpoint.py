@@ -50,7 +50,7 @@ def save(folder: Path, state: dict[str, Any], env_steps: int, keep: int) -> Path
         for left in regular_files(folder, f"{FOLDER}/*{TEMPORARY}"):  # from a process that was killed
             left.unlink()
         write_atomically(path, lambda file: torch.save(record, file))
-        for old in [each for each in regular_files(folder, f"{FOLDER}/*{SUFFIX}") if each <= path][:-keep]:
+        for old in [each for each in _files(folder) if each <= path][:-keep]:
             old.unlink()
     except (OSError, RuntimeError) as error:
         refused = error.__context__  # torch raises a RuntimeError of its own over what the file raised
@@ -64,7 +64,7 @@ def newest(folder: Path) -> tuple[Checkpoint, list[str]]:
 
     Raises `CheckpointError` if there is none, or if the newest whole one is of another format.
     """
-    paths = regular_files(folder, f"{FOLDER}/*{SUFFIX}")[::-1]
+    paths = _files(folder)[::-1]
     if not paths:
         raise CheckpointError(f"run {folder}: expected a checkpoint in {FOLDER}/, got none; start afresh without it")
     warnings: list[str] = []
@@ -78,7 +78,12 @@ def newest(folder: Path) -> tuple[Checkpoint, list[str]]:
 
 def has_any(folder: Path) -> bool:
     """Whether a folder has checkpoints, whole or not."""
-    return bool(regular_files(folder, f"{FOLDER}/*{SUFFIX}"))
+    return bool(_files(folder))
+
+
+def _files(folder: Path) -> list[Path]:
+    """The checkpoint files of a run folder, the oldest first."""
+    return regular_files(folder, f"{FOLDER}/*{SUFFIX}")
 
 
 def load(path: Path) -> Checkpoint:

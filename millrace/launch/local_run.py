@@ -46,7 +46,8 @@ def train(config: Config, resume: Path | None, watch: Watch, env: EnvSpec | None
 def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec | None) -> Path:
     env = env or named_environment(config)
     check_copies(config, config.copies_per_machine)
-    slots().most = config.copies_per_machine  # of workers in threads
+    if config.transport == "inproc":  # workers are threads of this process, which opens no file of slots otherwise
+        slots().most = config.copies_per_machine
     if config.inference == "learner":
         from millrace.launch import learner_inference as inference
 

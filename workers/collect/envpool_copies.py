@@ -8,7 +8,6 @@ reaches it: a copy that has made all its steps is truncated here, and reset expl
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -19,10 +18,10 @@ from protocol.envs.envpool import EnvpoolSpec
 from protocol.envs.spaces import make_flatten
 from workers.collect.env_copies import Leaves, StepResult
 from workers.collect.facts import facts_of_copies, of_ended
-from workers.env_copy import give_back
+from workers.env_copy import close_copy, give_back
 from workers.env_errors import CopyRaised, Unusable
 from workers.env_loop import Pulse
-from workers.supervise.activity import CLOSING, RESETTING, STEPPING, activity
+from workers.supervise.activity import RESETTING, STEPPING, activity
 
 
 class EnvpoolCopies:
@@ -94,7 +93,6 @@ class EnvpoolCopies:
     def close(self) -> None:
         """Close the pool and its threads. What it raises is ignored."""
         if self._env is not None:
-            with suppress(BaseException), self._activity.during(CLOSING):
-                self._env.close()
+            close_copy(self._env)
             self._env = None
         give_back(self)

@@ -25,7 +25,7 @@ from learner.algorithms.replay.replay_buffer import Sample
 from learner.algorithms.updates import scheduled
 from learner.config.hyperparameters import AlgorithmConfig, OffPolicyConfig
 from protocol.arrays import Array, Floats
-from protocol.policy.features import features, normalize
+from protocol.policy.features import features
 from protocol.rollout import Batch
 from protocol.specs import PolicySpec
 
@@ -155,10 +155,8 @@ class OffPolicy(Algorithm):
 
     def inputs(self, leaves: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Features [B, D], normalized with the current statistics, and images [B, *leaf] uint8, of leaves [B, *leaf]."""
-        x = features(self.policy, leaves)
-        if self.policy.normalize_observations:
-            x = normalize(x, *np.split(self.statistics, 2))
-        return x, [array for leaf, array in zip(self.policy.observation, leaves, strict=True) if leaf.is_image]
+        _, x, images = self.normalizer.inputs(leaves, self.statistics)
+        return x, images
 
     def is_finite(self) -> bool:
         """Whether all weights are finite, also those that do not act, and the observation statistics."""

@@ -241,13 +241,19 @@ def test_without_timeouts_there_is_no_budget() -> None:
     assert made._longest_s(copies=1, steps=1) == math.inf
 
 
-def test_a_worker_that_sits_on_an_evaluation_is_refused_when_its_budget_is_spent() -> None:
+def about_to_evaluate() -> Learner:
+    """A learner after its first update, with two workers on two hosts; no ticket is dealt."""
     learner = Learner()
     learner.joins(A)
     learner.deliver_all()
     assert learner.coordinator.take() is not None
     learner.balanced(learner.coordinator.publish(1, PARAMETERS, BUFFERS, deal=False))
     learner.joins(B, host="other")
+    return learner
+
+
+def test_a_worker_that_sits_on_an_evaluation_is_refused_when_its_budget_is_spent() -> None:
+    learner = about_to_evaluate()
     plan = EvaluationPlan(seeds=(1, 2, 3, 4), copies=2, most_steps=10)
     learner.balanced(learner.coordinator.begin_evaluation(plan))
     made, steps = watch(learner), 0
@@ -266,12 +272,7 @@ def test_a_worker_that_sits_on_an_evaluation_is_refused_when_its_budget_is_spent
 
 @pytest.mark.parametrize(("most", "evaluators"), [(0, {A, B}), (5, {A, B}), (4, {A}), (1, {A})])
 def test_with_a_limit_of_copies_as_few_workers_play_evaluations_as_it_allows(most: int, evaluators: set[bytes]) -> None:
-    learner = Learner()
-    learner.joins(A)
-    learner.deliver_all()
-    assert learner.coordinator.take() is not None
-    learner.balanced(learner.coordinator.publish(1, PARAMETERS, BUFFERS, deal=False))
-    learner.joins(B, host="other")
+    learner = about_to_evaluate()
     learner.coordinator.max_env_copies = most and most + learner.coordinator.run.lanes * learner.coordinator.run.copies - 1
     learner.balanced(learner.coordinator.begin_evaluation(EvaluationPlan(seeds=(1, 2, 3, 4), copies=2, most_steps=10)))
     assert set(learner.coordinator.evaluation.holders) == evaluators
