@@ -37,6 +37,7 @@ from workers.worker import Worker, WorkerOptions, identity, parent_is_gone
 
 LEAVE_AT_ONCE = 2  # requests to leave: the rollout in progress is abandoned
 LOOK_FOR_PARENT_S, LEAVE_WITHIN_S = 0.5, 2.0  # after the supervisor's death
+CLOSED_WITHIN_S = 1.0  # the sockets of a killed process
 AFTER_SUPERVISOR_S = 60.0  # how much later than the supervisor the watchdog ends a worker that hangs
 
 
@@ -114,15 +115,23 @@ def _remove_socket_of_killed_parent(address: str) -> None:
     """Remove the socket, and the folder that the learner made for it: a killed learner could not.
 
     The parent may have been the supervisor of a `millrace worker`: then the learner lives, and the next worker needs it.
+    Linux gives the children of a killed process away before its last thread has freed the memory and closed the sockets.
     """
     scheme, _, path = address.partition("://")
     if scheme == "ipc" and Path(path).parent.name.startswith("millrace-"):
-        with socket.socket(socket.AF_UNIX) as caller:
-            if caller.connect_ex(path) not in (errno.ECONNREFUSED, errno.ENOENT):
+        lives_at_s = time.monotonic() + CLOSED_WITHIN_S
+        while _listens(path):
+            if time.monotonic() > lives_at_s:
                 return
+            time.sleep(POLL_S)
         Path(path).unlink(missing_ok=True)
         with suppress(OSError):
             Path(path).parent.rmdir()
+
+
+def _listens(path: str) -> bool:
+    with socket.socket(socket.AF_UNIX) as caller:
+        return caller.connect_ex(path) not in (errno.ECONNREFUSED, errno.ENOENT)
 
 
 def _explained(reason: str, link: WorkerLink) -> str:

@@ -108,7 +108,10 @@ def test_a_process_that_cannot_be_started_leaves_no_descriptor_behind(monkeypatc
 
 
 @pytest.mark.parametrize("learner_lives", [True, False])
-def test_a_worker_whose_supervisor_was_killed_removes_the_socket_of_a_dead_learner_only(*, learner_lives: bool) -> None:
+def test_a_worker_whose_supervisor_was_killed_removes_the_socket_of_a_dead_learner_only(
+    monkeypatch: pytest.MonkeyPatch, *, learner_lives: bool
+) -> None:
+    monkeypatch.setattr(program, "CLOSED_WITHIN_S", 0.0)
     with tempfile.TemporaryDirectory(prefix="millrace-") as folder, socket.socket(socket.AF_UNIX) as learner:
         path = Path(folder) / "learner"
         learner.bind(str(path))
@@ -116,3 +119,13 @@ def test_a_worker_whose_supervisor_was_killed_removes_the_socket_of_a_dead_learn
             learner.listen()
         program._remove_socket_of_killed_parent(f"ipc://{path}")
         assert (path.exists(), Path(folder).exists()) == (learner_lives, learner_lives)
+
+
+def test_the_socket_of_a_learner_that_is_still_closing_is_removed_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    with tempfile.TemporaryDirectory(prefix="millrace-") as folder, socket.socket(socket.AF_UNIX) as learner:
+        path = Path(folder) / "learner"
+        learner.bind(str(path))
+        learner.listen()
+        monkeypatch.setattr(time, "sleep", lambda seconds: learner.close())
+        program._remove_socket_of_killed_parent(f"ipc://{path}")
+        assert not Path(folder).exists()
