@@ -22,7 +22,6 @@ from protocol.errors import UsageError, UserFacingError, check_at_least
 from protocol.keys.key_folder import TOKEN_VARIABLE, read_token
 from protocol.keys.keys import Token
 from workers.connection_rules import REJOIN_TIMEOUT_S, checked_token
-from workers.slots import LIMIT_VARIABLE
 from workers.supervise.learner_notice import AliveSender
 from workers.supervise.worker_process import WorkerCommand, WorkerProcess
 from workers.supervisor import Supervisor, core_flags, timeout_flags
@@ -95,15 +94,6 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     network.add_argument("--core", type=int, metavar="CORE", help="run only on this CPU core")
     network.add_argument("--pin", action="store_true", help="with --processes: pin each worker to one CPU core")
 
-    network.add_argument(
-        "--copies-per-machine",
-        type=int,
-        default=os.environ.get(LIMIT_VARIABLE, "0"),
-        metavar="K",
-        help="make an env copy only while fewer than K live on this machine, in all runs that have this limit, as for "
-        f"licences; a worker without room waits (default: the variable {LIMIT_VARIABLE}, else no limit)",
-    )
-
     faults = parser.add_argument_group("faults")
     faults.add_argument(
         "--join-timeout-s",
@@ -136,7 +126,6 @@ def _check(flags: argparse.Namespace) -> None:
     if flags.address.startswith("inproc://"):
         raise UsageError(f"address {flags.address}: expected ipc://PATH or tcp://HOST:PORT; inproc reaches no other process")
     check_at_least("processes", flags.processes, 1)
-    check_at_least("copies_per_machine", flags.copies_per_machine, 0)
     check_worker_name(flags.name if flags.processes == 1 else f"{flags.name}-w{flags.processes - 1}")
     for name in ("join_timeout_s", "construct_timeout_s", "reset_timeout_s", "step_timeout_s"):
         if not getattr(flags, name) >= 0:  # also true for NaN
@@ -150,7 +139,6 @@ def _supervise(flags: argparse.Namespace, token: Token | None, timeouts: CallTim
     cores = sorted(os.sched_getaffinity(0)) if flags.pin else []
     passed = ["--join-timeout-s", str(flags.join_timeout_s), *timeout_flags(timeouts)]
     passed += [f"--{flag.replace('_', '-')}" for flag in ("stay", "insecure", "no_code") if getattr(flags, flag)]
-    passed += ["--copies-per-machine", str(flags.copies_per_machine)]
     passed += [] if flags.core is None else ["--core", str(flags.core)]
 
     def start(number: str) -> WorkerProcess:

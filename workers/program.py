@@ -47,7 +47,7 @@ def work(flags: argparse.Namespace, token: Token | None, timeouts: CallTimeouts,
     if flags.activity is not None:
         share_activity(Activity(flags.activity))
     if flags.slots is not None:
-        share_slots(flags.slots, flags.copies_per_machine)
+        share_slots(flags.slots)
     try:
         link = WorkerLink(flags.address, flags.name, token=token)
     except UserFacingError as error:

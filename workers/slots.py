@@ -4,7 +4,7 @@ Rule: no two live env copies on a machine have the same slot. A slot is a lock o
 machine share and that stays empty. The lock belongs to an open file and not to a process, so a worker and its supervisor
 hold it together, and the kernel frees it when both are gone.
 
-Rule: with a limit K, the slots are 0 to K - 1. A copy that finds none waits for `WAIT_S`; then its worker leaves the run, so
+Rule: with a limit K of this machine (`LIMIT_VARIABLE`), the slots are 0 to K - 1. A copy that finds none waits for `WAIT_S`; then its worker leaves the run, so
 that the learner can place its lanes elsewhere, and is started again when there is room.
 """
 
@@ -60,7 +60,7 @@ class Slots:
         Raises `NoSlot` if none becomes free within `WAIT_S`.
         """
         until_s, said = time.monotonic() + WAIT_S, False
-        line = f"{NO_SLOT} on {socket.gethostname()}: other env copies hold all {self.most} of --copies-per-machine"
+        line = f"{NO_SLOT} on {socket.gethostname()}: other env copies hold all {self.most} of {LIMIT_VARIABLE}"
         while (slot := self._take_now()) is None:
             if time.monotonic() >= until_s:
                 raise NoSlot(line)
@@ -100,19 +100,31 @@ def slots() -> Slots:
     """The slots of this process."""
     global _of_process
     if _of_process is None or _of_process.pid != os.getpid():  # a fork shares the open file, and so the locks
-        _of_process = Slots()
+        _of_process = Slots(most=copies_per_machine())
     return _of_process
 
 
-def share_slots(fd: int, most: int = 0) -> None:
+def share_slots(fd: int) -> None:
     """Hold the slots of this process, a worker, together with its supervisor, which has opened the file."""
     global _of_process
     os.set_inheritable(fd, False)
-    _of_process = Slots(fd, most)
+    _of_process = Slots(fd, copies_per_machine())
+
+
+def copies_per_machine() -> int:
+    """How many env copies may live on this machine, in all processes that have this limit; 0: any number.
+
+    Raises `UsageError`.
+    """
+    text = os.environ.get(LIMIT_VARIABLE) or "0"
+    if not text.isdecimal():
+        raise UsageError(f"{LIMIT_VARIABLE}: expected a whole number, or 0 for no limit, got {text!r:.60}")
+    return int(text)
 
 
 def open_slots() -> int:
-    """A descriptor whose locks belong to it and its copies. Raises `UsageError` if the file cannot be used."""
+    """A descriptor whose locks belong to it and its copies. Raises `UsageError` if the file or the limit cannot be used."""
+    copies_per_machine()  # before any worker starts
     path = Path(os.environ.get(FILE_VARIABLE, FILE))
     try:
         with suppress(FileExistsError):

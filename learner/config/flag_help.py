@@ -30,7 +30,7 @@ GROUPS = {
     "evaluation": ("eval_env_kwargs", "eval_copies", "eval_max_steps", "info_keys"),
     "worker": (
         "lanes", "max_lag", "vector", "action_masks", "inference", "images_dtype", "torch_threads", "pin_workers",
-        "copies_per_machine", "max_env_copies", "min_workers", "launched_workers",
+        "max_env_copies", "min_workers", "launched_workers",
     ),
     "network": ("transport", "bind", "advertise", "keys", "insecure", "compress", "weights_dtype"),
     "timeout and failure": (

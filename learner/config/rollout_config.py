@@ -79,14 +79,9 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """Keep each local worker process on one core (train only). none: do so if max_lag is 0 and the number of workers is a
     multiple of the number of cores.
     """
-    copies_per_machine: Free[Natural] = 0
-    """Make an env copy on this machine only while fewer than this many live on it, in all runs that have this limit, as for
-    licences. Copies that play evaluations count too. A worker without room waits. 0: what MILLRACE_COPIES_PER_MACHINE says,
-    else no limit. For workers elsewhere it is a flag of `millrace worker`.
-    """
     max_env_copies: Free[Natural] = 0
     """Most env copies of the run on all machines, as for floating licences: those of its lanes, and those that play
-    evaluations, on as few workers as needed. 0: no limit.
+    evaluations, on as few workers as needed. 0: no limit. The variable MILLRACE_COPIES_PER_MACHINE limits those of a machine.
     """
     min_workers: Free[Natural] = 0
     """Start training when this many workers have joined. 0: wait for all local workers (train) or one worker

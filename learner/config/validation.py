@@ -62,32 +62,21 @@ def validate(config: Config, where: str = "") -> Config:
     if config.inference == "learner":
         _check_learner_inference(config, at)
     _check_prior(config, at)
-    check_copies(config, 0)
+    check_copies(config, "max_env_copies", config.max_env_copies)
     encoder = getattr(config.algorithm, "encoder", None)
     if encoder is not None and not is_name(encoder):
         raise UsageError(f"{at}encoder {encoder}: expected module:factory, as in my_package.networks:encoder")
     return config
 
 
-def check_copies(config: Config, copies_per_machine: int) -> None:
-    """Raise `UsageError` if a limit of env copies is too low for the run, all of whose workers are on one machine or not.
-
-    `copies_per_machine`: 0, or the limit of the machine that they are on.
-    """
-    episodes = config.evaluation_settings().size().episodes
-    copies = min(config.eval_copies, episodes)  # of one worker that plays evaluations
-    workers = 1 if config.inference == "learner" else min(config.workers, -(-episodes // copies))
-    if config.max_env_copies:
-        workers = min(workers, max(1, (config.max_env_copies - config.envs) // copies))
-    for name, most, evaluate in (
-        ("max_env_copies", config.max_env_copies, copies),
-        ("copies_per_machine", copies_per_machine, workers * copies),
-    ):
-        if 0 < most < config.envs + evaluate:
-            raise UsageError(
-                f"{name} {most}: expected at least {config.envs + evaluate}, for {config.envs} env copies and {evaluate} "
-                "that play evaluations; take fewer envs, eval_copies or workers"
-            )
+def check_copies(config: Config, limit: str, most: int) -> None:
+    """Raise `UsageError` if `most` env copies (0: any number) are too few for the run. `limit`: what sets this number."""
+    evaluate = min(config.eval_copies, config.evaluation_settings().size().episodes)  # on one worker
+    if 0 < most < config.envs + evaluate:
+        raise UsageError(
+            f"{limit} {most}: expected at least {config.envs + evaluate}, for {config.envs} env copies and {evaluate} "
+            "that play evaluations; take fewer envs or eval_copies"
+        )
 
 
 def idle_workers(config: Config) -> str:

@@ -9,6 +9,8 @@ import logging
 from contextlib import ExitStack
 from pathlib import Path
 
+import msgspec
+
 from learner.callbacks.callbacks import Watch
 from learner.config.config import Config
 from learner.config.validation import check_copies, idle_workers, workers_to_wait_for
@@ -29,7 +31,7 @@ from learner.torch_setup import one_thread
 from millrace.launch.endpoint import open_endpoint
 from millrace.launch.local_worker_options import no_flags, stopped_on_error, worker_flags
 from protocol.env_spec import EnvSpec
-from workers.slots import slots
+from workers.slots import LIMIT_VARIABLE, copies_per_machine
 from workers.supervisor import STOP_WITHIN_S, Supervisor
 
 log = logging.getLogger("millrace.learner")
@@ -45,9 +47,9 @@ def train(config: Config, resume: Path | None, watch: Watch, env: EnvSpec | None
 
 def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec | None) -> Path:
     env = env or named_environment(config)
-    check_copies(config, config.copies_per_machine)
-    if config.transport == "inproc":  # workers are threads of this process, which opens no file of slots otherwise
-        slots().most = config.copies_per_machine
+    if most := copies_per_machine():  # all copies of the run are on this machine
+        check_copies(config, LIMIT_VARIABLE, most)
+        config = msgspec.structs.replace(config, max_env_copies=min(most, config.max_env_copies or most))
     if config.inference == "learner":
         from millrace.launch import learner_inference as inference
 

@@ -76,18 +76,12 @@ def worker_flags(config: Config, run: Path) -> WorkerFlags:
             os.close(open_regular(log))
     except OSError as error:
         raise UsageError(f"{error.filename}: {reason(error)}; the workers' logs go there: remove it") from error
-    cores, limits = worker_cores(config), limit_flags(config)
+    cores, timeouts = worker_cores(config), timeout_flags(config.call_timeouts())
 
     def flags(name: str) -> tuple[list[str], Path]:
-        return [*limits, *core_flags(cores, name)], logs / f"{name}.log"
+        return [*timeouts, *core_flags(cores, name)], logs / f"{name}.log"
 
     return flags
-
-
-def limit_flags(config: RolloutConfig) -> list[str]:
-    """The flags of local workers that say how long a call may take, and how many env copies this machine may have."""
-    limit = ["--copies-per-machine", str(config.copies_per_machine)] if config.copies_per_machine else []
-    return [*timeout_flags(config.call_timeouts()), *limit]
 
 
 def worker_cores(config: RolloutConfig) -> list[int]:

@@ -19,13 +19,13 @@ from learner.rollout_service.service import RolloutService, describe_settings, r
 from learner.rollout_service.spec import rollout_spec
 from learner.rollouts.ledger import Ledger
 from millrace.launch.endpoint import open_endpoint
-from millrace.launch.local_worker_options import limit_flags, stopped_on_error, worker_cores
+from millrace.launch.local_worker_options import stopped_on_error, worker_cores
 from millrace.own_policy import OwnPolicy
 from millrace.policies import PolicyChoice
 from protocol.env_spec import EnvSpec
 from protocol.envs.description import DescribedEnv
 from protocol.specs import DescribeSpec, RunSpec
-from workers.supervisor import Supervisor, core_flags
+from workers.supervisor import Supervisor, core_flags, timeout_flags
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ def start(
     if listens:
         endpoint.announce(config.advertise)
     else:
-        cores, limits = worker_cores(config), limit_flags(config)
-        start_worker = endpoint.starter(lambda name: ([*limits, *core_flags(cores, name)], None))
+        cores, timeouts = worker_cores(config), timeout_flags(config.call_timeouts())
+        start_worker = endpoint.starter(lambda name: ([*timeouts, *core_flags(cores, name)], None))
         supervisor = Supervisor(start_worker, config.workers, timeouts=config.call_timeouts())
         resources.callback(supervisor.stop)
         processes = ProcessCallbacks(supervisor.poll, supervisor.activities, expected=config.workers)

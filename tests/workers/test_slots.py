@@ -19,7 +19,7 @@ import pytest
 
 from protocol.errors import UsageError
 from workers import slots as module
-from workers.slots import FILE_VARIABLE, NoSlot, Slots, free_all, open_slots, slots
+from workers.slots import FILE_VARIABLE, LIMIT_VARIABLE, NoSlot, Slots, free_all, open_slots, share_slots, slots
 
 
 @pytest.fixture
@@ -156,15 +156,31 @@ def test_with_a_limit_a_copy_waits_until_a_slot_is_free(
     assert licensed.take() == 1
     assert len(caplog.messages) == 1
     assert caplog.messages[0].startswith("no slot is free on ")
-    assert caplog.messages[0].endswith("other env copies hold all 2 of --copies-per-machine; waiting for one")
+    assert caplog.messages[0].endswith("other env copies hold all 2 of MILLRACE_COPIES_PER_MACHINE; waiting for one")
 
 
 def test_a_copy_that_waited_long_enough_gives_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "WAIT_S", 0.0)
     licensed = Slots(most=1)
     licensed.take()
-    with pytest.raises(NoSlot, match=r"other env copies hold all 1 of --copies-per-machine$"):
+    with pytest.raises(NoSlot, match=r"other env copies hold all 1 of MILLRACE_COPIES_PER_MACHINE$"):
         licensed.take()
+
+
+def test_the_variable_is_the_limit_of_every_process_and_what_is_no_number_is_refused_before_a_worker_starts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, "_of_process", None)
+    monkeypatch.setenv(LIMIT_VARIABLE, "3")
+    assert slots().most == 3
+    share_slots(fd := open_slots())
+    assert (slots().fd, slots().most) == (fd, 3)
+    monkeypatch.setenv(LIMIT_VARIABLE, "")
+    os.close(open_slots())
+    for wrong in ("-1", "four"):
+        monkeypatch.setenv(LIMIT_VARIABLE, wrong)
+        with pytest.raises(UsageError, match=f"^{LIMIT_VARIABLE}: expected a whole number, or 0 for no limit, got '{wrong}'"):
+            open_slots()
 
 
 def test_there_is_room_if_so_many_slots_are_free_and_asking_takes_none() -> None:
