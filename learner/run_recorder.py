@@ -344,7 +344,6 @@ class RunRecorder:
             ledger=snapshot.ledger.counts(),
             stages=self._stages(snapshot),
             note=self._evaluations.note,
-            doing=snapshot.waiting if snapshot.evaluating else "",
             waiting=snapshot.waiting,
             settings=self._settings,
             evaluation=self._evaluations.newest,

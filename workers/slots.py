@@ -4,8 +4,9 @@ Rule: no two live env copies on a machine have the same slot. A slot is a lock o
 machine share and that stays empty. The lock belongs to an open file and not to a process, so a worker and its supervisor
 hold it together, and the kernel frees it when both are gone.
 
-Rule: with a limit K of this machine (`LIMIT_VARIABLE`), the slots are 0 to K - 1. A copy that finds none waits for `WAIT_S`; then its worker leaves the run, so
-that the learner can place its lanes elsewhere, and is started again when there is room.
+Rule: with a limit K of this machine (`LIMIT_VARIABLE`), the slots are 0 to K - 1. A copy that finds none waits for
+`WAIT_S`; then its worker leaves the run, so that the learner can place its lanes elsewhere, and is started again when there
+is room.
 """
 
 from __future__ import annotations

@@ -71,7 +71,7 @@ class Callbacks:
         self._call("on_evaluation", progress)
 
     def meanwhile(self, progress: Progress) -> None:
-        """An evaluation or a long wait goes on; `progress.doing` and `progress.waiting` say how far it is, and for what."""
+        """An evaluation or a long wait goes on; `progress.waiting` says how far it is, or for what."""
         self._show(progress)
 
     def on_checkpoint(self, progress: Progress) -> None:

@@ -81,7 +81,7 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """
     max_env_copies: Free[Natural] = 0
     """Most env copies of the run on all machines, as for floating licences: those of its lanes, and those that play
-    evaluations, on as few workers as needed. 0: no limit. The variable MILLRACE_COPIES_PER_MACHINE limits those of a machine.
+    evaluations, on as few workers as needed. 0: no limit. For a machine, set the variable MILLRACE_COPIES_PER_MACHINE.
     """
     min_workers: Free[Natural] = 0
     """Start training when this many workers have joined. 0: wait for all local workers (train) or one worker

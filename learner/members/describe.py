@@ -94,5 +94,5 @@ def described_by_workers(
 
 def _waiting_for(link: LearnerLink, server: MemberServer, workers: list[str]) -> str:
     if not workers:
-        return f"waiting for a worker to join at {link.address}{server.missing_reason()}"
+        return f"waiting for {server.awaited()}"
     return f"waiting for a description of the environment from {', '.join(workers[:8])}"

@@ -6,8 +6,6 @@ so its env steps per second are said instead.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 from learner.members.membership import Member
 
 DOING = {
@@ -40,9 +38,3 @@ def held_up(member: Member, now: float) -> tuple[float, float, str]:
     elif row.doing_s >= LONG_S and row.doing in DOING:
         seconds, what = row.doing_s, in_words(row.doing, row.doing_s)
     return seconds, -row.steps_per_s, f"worker {row.worker} on {row.host}: {what}"
-
-
-def late(members: Iterable[Member], now: float) -> str:
-    """Who is held up longest; empty if nobody is held up long."""
-    seconds, _, text = max((held_up(member, now) for member in members), default=(0.0, 0.0, ""))
-    return text if seconds >= LONG_S else ""

@@ -205,17 +205,21 @@ class MemberServer:
         address = self._link.address
         reached_at = advertised_address(address, "", socket.gethostname())
         start = f"millrace worker {reached_at}{'' if self._link.keyring is None else ' --token FILE'}"
-        joined = f"{len(self._membership.members)} joined{self.missing_reason()}"
+        joined = f"{len(self._membership.members)} joined{self._missing_reason()}"
         awaited = "1 worker" if workers == 1 else f"{workers} workers"
         return NoWorkers(f"waited {timeout_s:g} s for {awaited} at {address}, {joined}; start one: {start}")
 
-    def missing_reason(self) -> str:
+    def awaited(self) -> str:
+        """What is awaited without a worker, with the known reasons why workers may be missing."""
+        return f"a worker to join at {self._link.address}{self._missing_reason()}"
+
+    # ---------------------------------------------------------------- inside
+
+    def _missing_reason(self) -> str:
         """The known reasons why workers may be missing, in parentheses; empty if there are none."""
         if self._last_turned_away:
             return f" (the last one {self._last_turned_away})"
         return f" ({self._link.refused} were not let in; the log says why)" if self._link.refused else ""
-
-    # ---------------------------------------------------------------- inside
 
     def _answer(self, peer: bytes, message: ToLearner | Inquire | BadMessage, now: float) -> Sequence[Outgoing]:
         """Answer one message. Whatever goes wrong costs its sender its membership, and never ends the run."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
+from learner.members.membership import Member
 from protocol.alive import WorkerActivity, WorkerExit
 
 
@@ -20,7 +21,7 @@ class ProcessCallbacks:
     """Returns the number of processes that step the environment. None: one per member."""
     lower_priority: Callable[[], None] = lambda: None
     """Gives these processes, and those that replace them, the lowest CPU priority."""
-    held_up: Callable[[], str] = lambda: ""
-    """Returns who is held up long of the workers that step the environment, if the members do not; else nothing."""
+    stepping: Callable[[], list[Member]] = list
+    """Returns the workers that step the environment, if the learner's members do not; else none."""
     expected: int = 0
     """Number of processes that the user asked for. 0: any number."""

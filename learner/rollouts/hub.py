@@ -32,7 +32,7 @@ from protocol.address import name_for_people
 from protocol.alive import NO_TIMEOUTS, CallTimeouts
 from protocol.arrays import Array
 from protocol.bounds import MAX_LINE, Stages, one_line
-from protocol.errors import BadRollout, EnvironmentFailed, NoWorkers, PolicyFailed, Stalled
+from protocol.errors import BadRollout, EnvironmentFailed, PolicyFailed, Stalled
 from protocol.messages import Evaluated, Rollout, Status, ToLearner
 from protocol.rollout import rollout_bytes, validate
 from protocol.wire.learner_link import LearnerLink
@@ -79,8 +79,6 @@ class HubSnapshot(NamedTuple):
     """Seconds spent waiting for rollouts since this learner started."""
     evaluate_s: float
     """Seconds spent in evaluations since this learner started."""
-    evaluating: bool
-    """Whether an evaluation is pending."""
     waiting: str
     """Who waits for whom, in one line for people; empty if nobody waits long."""
     members: tuple[CollectingMember, ...]
@@ -127,7 +125,6 @@ class Hub:
         link.packed_bytes_limit = rollout_bytes(coordinator.run)
         self._processes = processes or ProcessCallbacks()
         self._check_interrupt, self._observer, self._clock = check_interrupt, observer, clock
-        self._time = LearnerTime(clock())
         self._lags: list[int] = []  # lag of each rollout of the last `gather`
         self._weight_age = WeightAge()
         self._progress = Progress()
@@ -138,6 +135,7 @@ class Hub:
         self._stall_watch = StallWatch(coordinator, settings.stall_timeout_s, settings.call_timeouts)
         callbacks = ServerCallbacks(self._answer, self.status, self._on_event)
         self._server = MemberServer(link, coordinator, callbacks, self._processes, clock=clock)
+        self._time = LearnerTime(coordinator, clock(), self._server.awaited, self._processes.stepping)
 
     # ---------------------------------------------------------------- what the loop calls
 
@@ -154,7 +152,7 @@ class Hub:
         Raises `RunError` if a parameter is too large for `weights_dtype`.
         """
         sent = to_wire_dtype(parameters, self.settings.weights_dtype)
-        self._time.learned(self.coordinator, self._clock())
+        self._time.learned(self._clock())
         self._weight_age.published(version, self._clock())
         self._server.send(self.coordinator.publish(version, sent, buffers, deal=deal, env_attributes=env_attributes))
 
@@ -240,8 +238,7 @@ class Hub:
 
     def waiting(self, now: float) -> str:
         """Who waits for whom, in one line for people; empty if nobody waits long."""
-        no_worker = f"a worker to join at {self.link.address}{self._server.missing_reason()}"
-        return self._time.line(self.coordinator, now, no_worker, self._processes.held_up())
+        return self._time.line(now)
 
     # ---------------------------------------------------------------- what others ask and tell
 
@@ -275,7 +272,6 @@ class Hub:
             lag_counts=dict(self._weight_age.lags),
             wait_s=spent_s["gathering"],
             evaluate_s=spent_s["evaluating"],
-            evaluating=coordinator.evaluation.pending,
             waiting=self.waiting(now),
             members=tuple(coordinator.members.values()),
             worker_stages=coordinator.membership.stages(),
@@ -353,4 +349,4 @@ class Hub:
         if self._no_members_since_s is None:
             self._no_members_since_s = now
         if now - self._no_members_since_s > timeout_s:
-            raise NoWorkers(f"no worker for {timeout_s:.0f} s at {self.link.address}{self._server.missing_reason()}")
+            raise self._server.no_workers(1, timeout_s)

@@ -62,10 +62,9 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
     """seconds spent in each stage so far"""
     note: str = ""
     """a message to the user, in one line"""
-    doing: str = ""
-    """what the run does instead of training, as "evaluating for 41 s: 37 of 100 episodes"; empty while it trains"""
     waiting: str = ""
-    """who waits for whom, and for what share of the time; empty if nobody waits long"""
+    """who waits for whom, and for what share of the time, or how far an evaluation is: "evaluating for 41 s: 37 of 100
+    episodes (…"; empty if nobody waits long"""
 
     settings: dict[str, Any] = {}
     """all settings of the run, by name; those of the algorithm in `algorithm`"""

@@ -17,6 +17,7 @@ from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoA
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from learner.members.membership import Member
 from learner.vector_env.arguments import Options, action_arrays, seed_list, take_reset_mask
 from learner.vector_env.batch_arrays import BatchArrays
 from learner.vector_env.batch_layout import BatchLayout
@@ -452,11 +453,11 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
     @property
     def workers(self) -> int:
         """Number of workers that have joined."""
-        return self._hub.worker_count
+        return len(self.members())
 
-    def held_up(self) -> str:
-        """Which worker is held up longest, and in what; empty if none is for long. For any thread."""
-        return self._hub.held_up()
+    def members(self) -> list[Member]:
+        """The workers that have joined, as the learner sees them. For any thread."""
+        return self._hub.members
 
     def wait_for(self, workers: int, timeout_s: float) -> None:
         """Wait until this many workers have joined. Raises `NoWorkers`."""

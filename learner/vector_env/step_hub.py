@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from learner.members.events import Event, WorkerLeft, WorkerRefused
-from learner.members.held_up import late
 from learner.members.member_server import MemberServer, ServerCallbacks, ServerSettings
+from learner.members.membership import Member
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator
 from learner.vector_env.status import status, status_of_run
@@ -144,13 +144,9 @@ class StepHub:
         return self._link.address
 
     @property
-    def worker_count(self) -> int:
-        """Number of workers that have joined."""
-        return len(self._coordinator.members)
-
-    def held_up(self) -> str:
-        """Which worker is held up longest, and in what; empty if none is for long. For any thread."""
-        return late(list(self._coordinator.members.values()), self._clock())
+    def members(self) -> list[Member]:
+        """The workers that have joined. For any thread."""
+        return list(self._coordinator.members.values())
 
     def call_while_waiting(self, callback: Callable[[], None]) -> None:
         """Call this now and then while waiting; what it raises ends the wait."""

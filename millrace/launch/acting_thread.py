@@ -50,7 +50,7 @@ def acting_processes(thread: Supervisor, lanes: SplitVectorEnv, env: ZmqVectorEn
         lanes.raise_if_no_workers()
         return thread.poll()
 
-    return ProcessCallbacks(ended, thread.activities, lambda: env.workers, held_up=env.held_up, expected=expected)
+    return ProcessCallbacks(ended, thread.activities, lambda: env.workers, stepping=env.members, expected=expected)
 
 
 def acting_policy(spec: PolicySpec, device: str, images: ImagesDtype) -> Policy:

@@ -82,7 +82,7 @@ def test_a_watch_that_raises(tmp_path: Path, error: BaseException, max_lag: int)
 
 def test_a_watch_that_raises_in_an_evaluation(tmp_path: Path) -> None:
     def watch(progress: Progress) -> None:
-        if progress.doing:
+        if progress.waiting.startswith("evaluating"):
             raise UsersError
 
     with pytest.raises(UsersError):
@@ -95,7 +95,7 @@ def test_a_watch_that_raises_in_an_evaluation(tmp_path: Path) -> None:
 def test_a_watch_that_raises_at_the_very_end(tmp_path: Path) -> None:
     def watch(progress: Progress) -> None:
         finished = (folder_of(tmp_path / "runs") / "summary.json").exists()
-        if finished and not progress.doing:
+        if finished and not progress.waiting.startswith("evaluating"):
             raise UsersError
 
     with pytest.raises(UsersError):
@@ -172,7 +172,7 @@ def test_a_run_that_is_killed_early_resumes_from_its_first_update_and_says_what_
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     def watch(progress: Progress) -> None:
-        if progress.updates == 4 and not progress.doing:
+        if progress.updates == 4 and not progress.waiting.startswith("evaluating"):
             shutil.copytree(progress.run, tmp_path / "killed")  # what a killed process leaves
 
     run(tmp_path, watch)
@@ -192,7 +192,7 @@ def test_a_run_whose_folder_is_gone_continues_in_a_new_one(
     elsewhere = tmp_path / "elsewhere"
 
     def watch(progress: Progress) -> None:
-        if progress.updates == 3 and not progress.doing:
+        if progress.updates == 3 and not progress.waiting.startswith("evaluating"):
             Path(progress.run).rename(elsewhere)
             if how == "deleted":
                 shutil.rmtree(elsewhere)
@@ -217,7 +217,9 @@ def test_a_run_whose_folder_is_gone_continues_in_a_new_one(
 
 def test_a_run_folder_that_is_made_again_has_the_best_policy(tmp_path: Path) -> None:
     def watch(progress: Progress) -> None:
-        if progress.updates == 12 and not progress.doing:  # after the best evaluation: the later ones are no better
+        if progress.updates == 12 and not progress.waiting.startswith(
+            "evaluating"
+        ):  # after the best evaluation: the later ones are no better
             shutil.rmtree(progress.run)
 
     folder = run(tmp_path, watch, eval_every=64)
@@ -237,7 +239,7 @@ def test_a_part_of_the_folder_that_cannot_be_written_costs_warnings_and_then_the
     caplog.set_level(logging.WARNING, "millrace")
 
     def watch(progress: Progress) -> None:
-        if progress.updates == 3 and not progress.doing and not (tmp_path / "done").exists():
+        if progress.updates == 3 and not progress.waiting.startswith("evaluating") and not (tmp_path / "done").exists():
             (tmp_path / "done").touch()
             folder = Path(progress.run)
             if what == "all":

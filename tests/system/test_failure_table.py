@@ -75,9 +75,9 @@ def test_a_run_without_workers_saves_a_checkpoint_and_fails(stage: Stage) -> Non
     began_s = time.monotonic()
     assert learner.ends() == 1
     within("all workers gone, the run ended", time.monotonic() - began_s, NOTICED_S + 2)
-    assert "no worker for 1 s at tcp://127.0.0.1:" in learner.said().splitlines()[-1]
+    assert "waited 1 s for 1 worker at tcp://127.0.0.1:" in learner.said().splitlines()[-1]
     summary = learner.summary()
-    assert "no worker for 1 s" in summary["stop_reason"]
+    assert "waited 1 s for 1 worker" in summary["stop_reason"]
     assert int(learner.checkpoints()[-1].stem) == summary["env_steps"], "the last update was not saved"
     ledger = accounted(summary)
     assert ledger["lost"] > 0

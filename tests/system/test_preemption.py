@@ -72,7 +72,7 @@ def restarted(tmp_path: Path, after: int, **settings: Any) -> Path:
 
 def interrupts_at(update: int) -> Watch:
     def watch(progress: Progress) -> None:
-        if progress.updates == update and not progress.doing:
+        if progress.updates == update and not progress.waiting.startswith("evaluating"):
             raise KeyboardInterrupt
 
     return watch
@@ -164,7 +164,7 @@ def test_a_run_that_has_reached_its_return_does_not_train_on(tmp_path: Path, mon
     assert summary(whole)["stop_reason"] == "target return 1 reached"
 
     def watch(progress: Progress) -> None:
-        if "the best policy" in progress.doing:
+        if "the best policy" in progress.waiting:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):

@@ -179,7 +179,7 @@ def test_the_variable_is_the_limit_of_every_process_and_what_is_no_number_is_ref
     os.close(open_slots())
     for wrong in ("-1", "four"):
         monkeypatch.setenv(LIMIT_VARIABLE, wrong)
-        with pytest.raises(UsageError, match=f"^{LIMIT_VARIABLE}: expected a whole number, or 0 for no limit, got '{wrong}'"):
+        with pytest.raises(UsageError, match=f"^{LIMIT_VARIABLE}: expected a whole number, .*, got '{wrong}'"):
             open_slots()
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from learner.members.held_up import LONG_S
 from learner.members.member_server import AWAY_S
+from learner.members.membership import Member
 from learner.members.process_callbacks import ProcessCallbacks
 from learner.rollouts.hub import LOG_WAITING_AFTER_S, POLL_S, PULSE_S, Hub, HubSettings
 from learner.rollouts.ticket_coordinator import TicketCoordinator
@@ -149,8 +150,9 @@ def test_it_warns_of_a_long_wait_only_while_no_worker_steps(caplog: pytest.LogCa
 
 def test_a_long_wait_is_shown_while_it_lasts_and_told_to_who_asks() -> None:
     link, hub, heartbeat = hub_with_a_worker(
-        processes=ProcessCallbacks(held_up=lambda: "worker w9 on far: in reset for 2 s")
+        processes=ProcessCallbacks(stepping=lambda: [Member(b"w9", w9, 1, 0, heard_s=link.now)])
     )
+    w9 = Hello(PROTOCOL_VERSION, "w9", "far", 1, 1, "fake", 1)
     hub.publish(0, np.zeros(1, np.float32), np.zeros(0, np.float32))
     began_s = link.now
     seen: list[str] = []
@@ -168,7 +170,7 @@ def test_a_long_wait_is_shown_while_it_lasts_and_told_to_who_asks() -> None:
 
     link.poll = poll_until_it_has_come  # type: ignore[method-assign]
     hub.gather(watch)
-    assert seen[0] == "waiting 2 s for lane 0 (worker w9 on far: in reset for 2 s)", "that is who steps the copies"
+    assert seen[0] == "waiting 2 s for lane 0 (worker w9 on far: 0.0 steps/s)", "that is who steps the copies"
     assert len(seen) > 20
     link.now += 7.0
     hub.publish(1, np.zeros(1, np.float32), np.zeros(0, np.float32))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from learner.members.held_up import LONG_S, late
+from learner.members.held_up import LONG_S
+from learner.members.membership import Member
 from learner.rollouts.evaluation_tickets import EvaluationPlan
 from learner.rollouts.waiting import SHARES_AFTER_S, LearnerTime, Phase
 from protocol.alive import Alive, Doing, WorkerActivity
@@ -25,7 +26,8 @@ class Run:
         for peer in workers:
             self.learner.joins(peer, host=f"host-of-{peer.decode()}")
         self.learner.publish(0)
-        self.time = LearnerTime(self.learner.now)
+        self.stepping: list[Member] = []
+        self.time = LearnerTime(self.learner.coordinator, self.learner.now, lambda: NO_WORKER, lambda: self.stepping)
 
     def turn(self, phase: Phase, after_s: float = 0.0) -> None:
         self.learner.now += after_s
@@ -47,7 +49,7 @@ class Run:
 
     @property
     def line(self) -> str:
-        return self.time.line(self.learner.coordinator, self.learner.now, NO_WORKER)
+        return self.time.line(self.learner.now)
 
 
 def test_a_call_that_lasts_is_named_with_its_lanes_worker_and_host() -> None:
@@ -129,7 +131,7 @@ def test_while_it_learns_only_workers_without_a_ticket_wait(max_lag: int, idle: 
     run.learner.now += 40.0
     learning = f"learning for 40 s{idle}; so far 0% waiting for rollouts, 100% learning"
     assert run.line == learning
-    run.time.learned(run.learner.coordinator, run.learner.now)
+    run.time.learned(run.learner.now)
     run.learner.publish(1)
     assert run.line == learning, "it tells of what was before the weights were sent"
     run.turn("gathering")
@@ -192,19 +194,12 @@ def test_an_evaluation_says_how_far_it_is_and_who_is_held_up(purpose: Purpose, w
 
 
 def test_if_the_members_only_act_the_worker_that_steps_is_named() -> None:
-    run = Run()
-    run.turn("gathering")
-    run.learner.now += 5.0
-    line = run.time.line(run.learner.coordinator, run.learner.now, NO_WORKER, "worker w1 on cpu2: in reset for 4 s")
-    assert line == "waiting 5 s for lanes 0, 1 (worker w1 on cpu2: in reset for 4 s)"
-
-
-def test_of_a_vector_environment_it_names_who_is_held_up() -> None:
-    run = Run(workers=(A, B))
-    members = run.learner.coordinator.members
-    run.does(A, "stepping", 1.9)
-    run.does(B, "resetting", 1.5)
-    assert late(members.values(), run.learner.now) == ""
-    run.does(A, "stepping", 2.4)
-    assert late(members.values(), run.learner.now) == "worker a on host-of-a: in step for 2 s"
-    assert late((), 0.0) == ""
+    acting, stepping = Run(), Run(workers=(A, B))
+    acting.turn("gathering")
+    acting.learner.now += 5.0
+    stepping.learner.now = acting.learner.now
+    for peer in (A, B):
+        stepping.learner.says(peer, Heartbeat(stepping.learner.session(peer), 0, 0, (), 0, {}, 0))
+    stepping.does(B, "resetting", 4.0)
+    acting.stepping = list(stepping.learner.coordinator.members.values())
+    assert acting.line == "waiting 5 s for lanes 0, 1 (worker b on host-of-b: in reset for 4 s)"
