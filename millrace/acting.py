@@ -18,7 +18,6 @@ import numpy.typing as npt
 from learner.policy_player import saved_policy
 from millrace.arguments import checked
 from protocol.arrays import Array, Bools, Floats
-from protocol.bounds import one_line
 from protocol.envs.spaces import action_converter_of
 from protocol.errors import UsageError, check_at_least
 from protocol.policy.distributions import distribution
@@ -103,7 +102,10 @@ class LoadedPolicy:
         >>> int(policy([0.0, 0.0, 0.1, 0.0])) in (0, 1)
         True
         """
-        leaves, is_one = self._leaves(observation)
+        try:
+            leaves, is_one = self._leaves(observation)
+        except UsageError as error:
+            raise UsageError(f"{self!r}: {error}") from None
         n = len(leaves[0][0])
         if mask is None and self._is_masked and isinstance(observation, Mapping):
             mask = observation.get(MASK)
@@ -163,8 +165,8 @@ class LoadedPolicy:
             found = dict(_by_path(observation, ""))
             missing = [leaf.path for leaf in leaves if leaf.path not in found]
             if missing:
-                got = ", ".join(sorted(found)) or "nothing"
-                raise UsageError(one_line(f"observation: expected {missing[0]}, got {got}"))
+                got = "one array" if "" in found else ", ".join(sorted(found)) or "nothing"
+                raise UsageError(f"observation: expected {missing[0]}, got {got}")
         arrays = [_checked(found[leaf.path], leaf) for leaf in leaves]
         numbers = {None if array.shape == leaf.shape else len(array) for array, leaf in zip(arrays, leaves, strict=True)}
         if len(numbers) > 1:

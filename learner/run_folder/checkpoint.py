@@ -111,7 +111,7 @@ def _read(path: Path) -> Checkpoint:
         raise
     except Exception as error:  # zipfile and torch raise a dozen types for damaged files
         raise _Unreadable(reason(error)) from error
-    if not isinstance(record, dict) or "format" not in record:
+    if not isinstance(record, dict) or not isinstance(record.get("format"), int):
         raise CheckpointError(f"checkpoint {path}: expected one of millrace, got another program's file")
     if record["format"] != FORMAT:
         raise CheckpointError(

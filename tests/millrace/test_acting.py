@@ -203,8 +203,10 @@ def test_a_part_of_a_dict_that_is_missing_or_of_another_number_is_named(tmp_path
     assert policy(whole).shape == ()
     assert policy({**whole, "more": 1}).shape == (), "what the policy does not use is ignored"
     name = next(iter(whole))
-    with pytest.raises(millrace.UsageError, match=f"observation: expected {name}"):
+    with pytest.raises(millrace.UsageError, match=f"^<.*{policy.run}.*>: observation: expected {name}"):
         policy({key: value for key, value in whole.items() if key != name})
+    with pytest.raises(millrace.UsageError, match=f"observation: expected {name}, got one array$"):
+        policy(whole[name])
     with pytest.raises(millrace.UsageError, match="for the same number of env copies, got different ones"):
         policy({**whole, name: _stacked(whole[name])})
 

@@ -154,9 +154,10 @@ def test_another_format_is_said_and_not_passed_over(tmp_path: Path, monkeypatch:
         checkpoint.newest(tmp_path)
 
 
-def test_another_programs_file_is_said(tmp_path: Path) -> None:
+@pytest.mark.parametrize("content", [torch.ones(3), {"weights": torch.ones(3)}, {"format": torch.ones(3)}])
+def test_another_programs_file_is_said(tmp_path: Path, content: object) -> None:
     path = tmp_path / "model.pt"
-    torch.save({"weights": torch.ones(3)}, path)
+    torch.save(content, path)
     with pytest.raises(CheckpointError, match="expected one of millrace, got another program's file"):
         checkpoint.load(path)
 
